@@ -1,0 +1,1 @@
+"""Floor 7: what a state means: energy, violation, wrenches, rank."""

@@ -1,0 +1,126 @@
+"""Energy, violation and wrenches of a state, and where its bodies are."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.constraints.rows import Violation, linearize
+from jaxcon.core import checks
+from jaxcon.core.lanes import times, total
+from jaxcon.core.typing import Array
+from jaxcon.geometry.pose import Motion
+from jaxcon.model.state import Energy, State
+
+
+def energy(system: Any, state: State) -> Energy:
+    """Kinetic energy ½ vᵀMv and the potential of gravity and springs, () [J] each."""
+    return system.energy(state.q, state.v, state.time)
+
+
+def violation(system: Any, state: State) -> Violation:
+    """φ and φ̇ of a state, by constraint."""
+    return linearize(system, state.q, state.v, state.time).violation
+
+
+def position(system: Any, state: State, body: str, point: Any = None) -> Array:
+    """Where a body is, or a point given in its frame, (dim,) [m], world frame."""
+    motion = system.motion(body, state.q, state.v)
+    return motion.position if point is None else motion.point(_local(motion, point))
+
+
+def velocity(system: Any, state: State, body: str, point: Any = None) -> Array:
+    """How fast a body, or a point given in its frame, moves, (dim,) [m/s], world frame."""
+    motion = system.motion(body, state.q, state.v)
+    return motion.velocity if point is None else motion.point_velocity(_local(motion, point))
+
+
+def orientation(system: Any, state: State, body: str) -> Array:
+    """Its angle () [rad] in the plane, or quaternion wxyz (4,), body to world, in space."""
+    return _oriented(system, state, body).orientation
+
+
+def angular_velocity(system: Any, state: State, body: str) -> Array:
+    """() in the plane, (3,) in the body frame in space [rad/s]."""
+    return _oriented(system, state, body).angular_velocity
+
+
+def wrench(system: Any, state: State, info: Any, name: str, body: str | None = None) -> Array:
+    """What a constraint does to a body: force and torque, world frame, at the anchor.
+
+    The generalized force Jᵀλ of the constraint's rows on the body, moved to the constraint's anchor
+    on its second body.
+
+    Args:
+        system: a `BodySystem`.
+        state: where; the state from which the step of `info` started.
+        info: a `StepInfo` or `Solution`, for its multipliers.
+        name: of the constraint.
+        body: on which body; the second one unless given. On the world it is the opposite of that
+            on the other body.
+
+    Returns:
+        (F, τ): (dim,) on a particle, (3,) in the plane, (6,) in space [N, N m].
+
+    Raises:
+        ValueError: no such constraint, or it does not act on this body.
+    """
+    snapshot = system.snapshot(state.q, state.v, state.time)
+    group = next((g for g in system.constraints if name in g.names), None)
+    if group is None:
+        known = [n for g in system.constraints for n in g.names]
+        raise ValueError(f"constraint '{name}' is unknown; known are {known}.")
+    index = group.names.index(name)
+    layout = linearize(system, state.q, state.v, state.time).layout
+    multipliers = info.multipliers[layout.rows(name)]
+    owner, sign = _acts_on(system, group, index, body)
+    columns, block = next(
+        (c, rows)
+        for c, rows in group.rows(snapshot).jacobian
+        if c.start + c.indices[index] == system.layout.v(owner)[0]
+    )
+    lanes = [total(times(row[c], x) for row, x in zip(block, multipliers, strict=True))
+             for c in range(columns.components)]
+    force = jnp.stack([jnp.broadcast_to(x, (len(columns.indices),))[index] for x in lanes])
+    motion = system.principal_motion(owner, state.q, state.v)
+    anchor = group.anchor(snapshot, index)
+    return sign * _about(motion, force, motion.position if anchor is None else anchor)
+
+
+def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str, int]:
+    """The moving body whose force answers for `body`, and the sign with which it does."""
+    sides = [
+        None if p.group is None else system.layout.groups[p.group].names[p.indices[index]]
+        for p in group.places
+    ]
+    if body in system.fixed or (body is None and sides[-1] is None):
+        return next(name for name in reversed(sides) if name), -1
+    chosen = sides[-1] if body is None else body
+    if chosen not in sides:
+        raise ValueError(f"constraint '{group.names[index]}' acts on {sides}, not on '{body}'.")
+    return chosen, 1
+
+
+def _about(motion: Motion, force: Array, anchor: Array) -> Array:
+    """The wrench (F, τ) about an anchor, world frame, of a generalized force on a body."""
+    if motion.orientation is None:
+        return force
+    arm = motion.position - anchor
+    if motion.position.shape == (2,):
+        torque = force[2] + arm[0] * force[1] - arm[1] * force[0]
+        return jnp.append(force[:2], torque)
+    torque = motion.rotation @ force[3:] + jnp.cross(arm, force[:3])
+    return jnp.concatenate([force[:3], torque])
+
+
+def _local(motion: Motion, point: Any) -> Array:
+    dtype, shape = motion.position.dtype, motion.position.shape
+    return checks.number("point", "it", point, dtype, shape)
+
+
+def _oriented(system: Any, state: State, body: str) -> Motion:
+    motion = system.motion(body, state.q, state.v)
+    if motion.orientation is None:
+        raise ValueError(f"'{body}' is a particle: it has no orientation.")
+    return motion

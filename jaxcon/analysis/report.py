@@ -1,0 +1,115 @@
+"""What a scene amounts to: degrees of freedom, rank, redundant rows. Host code, for people."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jaxcon.constraints.rows import linearize
+from jaxcon.core.typing import Array
+from jaxcon.model.state import State
+
+
+@dataclass(frozen=True)
+class Report:
+    """The structure of a system at one state; `print` it.
+
+    Attributes:
+        coordinates, velocities: n_q, n_v.
+        rows: n_c.
+        rank: number of independent rows.
+        degrees_of_freedom: n_v − rank.
+        redundant: (constraint, row in it) of each row that depends on those before it.
+        condition: of J M⁻¹ Jᵀ with rows scaled to unit length, independent rows only.
+        violation: ‖φ‖ and ‖φ̇‖ by constraint.
+    """
+
+    coordinates: int
+    velocities: int
+    rows: int
+    rank: int
+    degrees_of_freedom: int
+    redundant: tuple[tuple[str, int], ...]
+    condition: float
+    violation: dict[str, tuple[float, float]]
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.coordinates} coordinates, {self.velocities} velocities",
+            f"{self.rows} constraint rows of rank {self.rank}: "
+            f"{self.degrees_of_freedom} degrees of freedom",
+            f"condition of the independent rows: {self.condition:.2g}",
+        ]
+        if self.redundant:
+            named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
+            lines.append(f"redundant rows (each depends on rows before it): {named}")
+        lines += [
+            f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
+            for name, (phi, rate) in self.violation.items()
+        ]
+        return "\n".join(lines)
+
+
+def report(system: Any, state: State) -> Report:
+    """Degrees of freedom, rank, redundant rows by name, and violation.
+
+    Rows are compared in the metric of M⁻¹, scaled to unit length; a row counts as dependent where
+    the part that earlier rows do not explain is below 1e-9 (float64) or 1e-4 (float32).
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: of one world.
+
+    Returns:
+        A `Report`.
+    """
+    rows = linearize(system, state.q, state.v, state.time)
+    jacobian = np.asarray(rows.jacobian.dense(), np.float64)
+    mass = np.asarray(system.mass(state.q).dense(), np.float64)
+    # J M⁻¹ Jᵀ = Ĵ Ĵᵀ with Ĵ = J L⁻ᵀ and M = L Lᵀ
+    scaled = np.linalg.solve(np.linalg.cholesky(mass), jacobian.T).T
+    length = np.linalg.norm(scaled, axis=1, keepdims=True)
+    scaled = scaled / np.where(length > 0, length, 1)
+    tolerance = 1e-9 if state.q.dtype == np.float64 else 1e-4
+    dependent = dependent_rows(scaled, tolerance)
+    kept = np.delete(scaled, dependent, axis=0)
+    singular = np.linalg.svd(kept, compute_uv=False)
+    owners = _owners(rows.layout)
+    rank = len(scaled) - len(dependent)
+    return Report(
+        coordinates=state.q.shape[0],
+        velocities=state.v.shape[0],
+        rows=len(scaled),
+        rank=rank,
+        degrees_of_freedom=state.v.shape[0] - rank,
+        redundant=tuple(owners[i] for i in dependent),
+        condition=float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
+        violation={
+            name: (float(rows.violation[name]), float(rows.violation.rate(name)))
+            for name in rows.layout.names
+        },
+    )
+
+
+def dependent_rows(rows: Array | np.ndarray, tolerance: float) -> list[int]:
+    """Numbers of the unit rows that are combinations of the rows before them (Gram–Schmidt)."""
+    basis = np.zeros((0, rows.shape[1]))
+    dependent = []
+    for i, row in enumerate(np.asarray(rows)):
+        rest = row - basis.T @ (basis @ row)
+        rest = rest - basis.T @ (basis @ rest)
+        size = np.linalg.norm(rest)
+        if size > tolerance:
+            basis = np.vstack([basis, rest / size])
+        else:
+            dependent.append(i)
+    return dependent
+
+
+def _owners(layout: Any) -> dict[int, tuple[str, int]]:
+    """Constraint and row in it, by row number."""
+    return {
+        int(row): (name, i) for name in layout.names for i, row in enumerate(layout.rows(name))
+    }

@@ -1,0 +1,94 @@
+"""What a constraint answers, and joints of one class side by side."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+
+from jaxcon.core.lanes import Vector
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, Lane
+from jaxcon.constraints.primitives import Row
+from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import Elements
+from jaxcon.solvers.jacobian import Columns
+
+
+class RowSet(NamedTuple):
+    """The rows of equal constraints, row-major: row r of every element, then row r + 1.
+
+    Attributes:
+        value, rate, bias: φ, φ̇, γ by row, lanes (element,).
+        jacobian: for each body, its columns and its part of every row.
+    """
+
+    value: tuple[Lane, ...]
+    rate: tuple[Lane, ...]
+    bias: tuple[Lane, ...]
+    jacobian: tuple[tuple[Columns, tuple[Vector, ...]], ...]
+
+
+class Constraint(Protocol):
+    """A group of equal constraints in a system."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the constraints."""
+        ...
+
+    def rows(self, snapshot: Any) -> RowSet:
+        """φ, φ̇, J and γ at one instant."""
+        ...
+
+
+class Joint(Protocol):
+    """How a joint is described: two bodies, numbers at assembly, and its rows."""
+
+    name: str
+    body_a: str
+    body_b: str
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The numbers of the joint in the frames of its bodies, from their poses at assembly."""
+        ...
+
+    @staticmethod
+    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+        """The rows, from those numbers and the motion of the two bodies, by lanes."""
+        ...
+
+
+@pytree
+class Joints(Elements):
+    """Joints of one class, `joint`, between bodies of the same kinds."""
+
+    joint: Any = static(default=None)
+
+    def rows(self, snapshot: Any) -> RowSet:
+        """φ, φ̇, J and γ at one instant."""
+        return self.gather(snapshot, self.joint.rows(self.params, *self.frames(snapshot)))
+
+    def coordinate(self, snapshot: Any) -> Row:
+        """The joint's angle or travel with its rate, bias and pulls."""
+        return self.joint.coordinate(self.params, *self.frames(snapshot))
+
+    def anchor(self, snapshot: Any, i: int) -> Array | None:
+        """The anchor of one joint on its second body, world frame, (dim,)."""
+        one = self.select((i,))
+        point = one.frames(snapshot)[1].point(one.params.get("anchor_b"))
+        return jnp.stack([x.reshape(()) for x in point.position])
+
+    def gather(self, snapshot: Any, rows: list[Row]) -> RowSet:
+        """The rows as a set, without the columns of the world."""
+        sides = [
+            (snapshot.system.columns(place), tuple(row.pulls[side] for row in rows))
+            for side, place in enumerate(self.places)
+            if place.group is not None
+        ]
+        return RowSet(
+            tuple(row.value for row in rows),
+            tuple(row.rate for row in rows),
+            tuple(row.bias for row in rows),
+            tuple(sides),
+        )

@@ -1,0 +1,96 @@
+"""Prescribed motion: a joint's coordinate as a function of time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints.base import RowSet
+from jaxcon.core import numerics
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.model.layout import Place
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A joint's coordinate follows a given motion: θ = θ*(t), one row.
+
+    θ is the angle of a revolute joint [rad] or the travel of a prismatic one [m], zero at assembly.
+    λ is the torque or force that the drive applies. In space angles are compared modulo whole
+    turns, so a crank may be driven round and round.
+
+    Attributes:
+        name: unique in the scene.
+        joint: name of the driven joint.
+        motion: `motion(t, params)` → θ* (); pure and hashable, twice differentiable in t.
+        params: any pytree of arrays.
+    """
+
+    name: str
+    joint: str
+    motion: Callable[..., Array]
+    params: PyTree = None
+
+
+@pytree
+class Drives:
+    """One driven joint coordinate."""
+
+    params: PyTree
+    law: Drive = static()
+    group: int = static()
+    index: int = static()
+    places: tuple[Place, ...] = static()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the constraint."""
+        return (self.law.name,)
+
+    def get(self, i: int) -> dict[str, Any]:
+        """The parameters of the motion."""
+        return {"params": self.params}
+
+    def set(self, changes: Any) -> Drives:
+        """With other parameters."""
+        new = changes.get(self.law.name, {}).get("params", self.params)
+        return dataclasses.replace(self, params=new)
+
+    def rows(self, snapshot: Any) -> RowSet:
+        """φ = θ − θ*(t), φ̇ = θ̇ − θ̇*, γ = γ_θ − θ̈*, by two nested derivatives of the motion."""
+        joint = snapshot.system.constraints[self.group].select((self.index,))
+        row = joint.coordinate(snapshot)
+        target, rate, bias = self._motion(snapshot.t)
+        error = row.value - target
+        error = error if snapshot.system.layout.dim == 2 or not joint.joint.turns else numerics.wrap(error)
+        row = row._replace(value=error, rate=row.rate - rate, bias=row.bias - bias)
+        return joint.gather(snapshot, [row])
+
+    def anchor(self, snapshot: Any, i: int) -> Array | None:
+        """The anchor of the driven joint."""
+        return snapshot.system.constraints[self.group].anchor(snapshot, self.index)
+
+    def _motion(self, t: Any) -> tuple[Array, Array, Array]:
+        """θ*, θ̇*, θ̈*."""
+
+        def motion(t: Any) -> Array:
+            target = jnp.asarray(self.law.motion(t, self.params))
+            if target.shape != jnp.shape(t):
+                raise ValueError(
+                    f"Drive '{self.law.name}': its motion must return a number, got shape"
+                    f" {target.shape}."
+                )
+            return target
+
+        def with_rate(t: Any) -> tuple[Array, Array]:
+            return jax.jvp(motion, (t,), (jnp.ones_like(t),))
+
+        (target, rate), (_, bias) = jax.jvp(with_rate, (t,), (jnp.ones_like(t),))
+        return target, rate, bias
+

@@ -1,0 +1,265 @@
+"""Joints between two bodies, each the sum of its primitives (chapter 3.6.1, corrected).
+
+Points, axes and lengths are given in the world frame at assembly and kept in the frames of the two
+bodies. To add a joint, write a class like these and one row in `tests/scenes.py`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.constraints import primitives
+from jaxcon.constraints.primitives import Row
+from jaxcon.core import checks, numerics
+from jaxcon.core.typing import Array
+from jaxcon.geometry import quaternion
+from jaxcon.geometry.pose import Pose
+
+
+@dataclass(frozen=True)
+class Coincident:
+    """Two points stay together: 2 rows in the plane, 3 in space; particles too.
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        point: where, world frame at assembly, (dim,) [m].
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    point: Any
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The point in both frames."""
+        point = vector(self, "point", self.point, a)
+        return {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
+
+    @staticmethod
+    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+        """p_b − p_a = 0."""
+        return primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
+
+
+@dataclass(frozen=True)
+class Spherical(Coincident):
+    """A ball joint in space: two points stay together, every turn is free (3 rows)."""
+
+    dims = (3,)
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Two points keep their distance, φ = ‖p_b − p_a‖ − l: λ is minus the tension [N].
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        length: l > 0 [m]; the distance at assembly unless given.
+        point_a, point_b: world points at assembly, (dim,) [m]; the centres of mass unless given.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    length: Any = None
+    point_a: Any = None
+    point_b: Any = None
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The two points in their frames, and the length."""
+        start = a.position if self.point_a is None else vector(self, "point_a", self.point_a, a)
+        end = b.position if self.point_b is None else vector(self, "point_b", self.point_b, b)
+        length = numerics.norm(end - start) if self.length is None else self.length
+        length = checks.number(label(self), "length", length, a.position.dtype)
+        checks.positive(label(self), "length", length)
+        return {
+            "anchor_a": a.local_point(start),
+            "anchor_b": b.local_point(end),
+            "length": length,
+        }
+
+    @staticmethod
+    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+        """‖p_b − p_a‖ − l = 0."""
+        points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
+        return [primitives.distance(*points, p["length"])]
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """Two bodies keep their relative pose: 3 rows in the plane, 6 in space.
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        point: where they are joined, world frame at assembly, (dim,) [m]; the second body's
+            centre of mass unless given. The wrench is read there.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    point: Any = None
+    oriented = True
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The point in both frames, and the orientation of b in a."""
+        point = b.position if self.point is None else vector(self, "point", self.point, a)
+        anchors = {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
+        return anchors | {"orientation": relative_orientation(a, b)}
+
+    @staticmethod
+    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+        """p_b − p_a = 0 and the orientations agree."""
+        points = primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
+        return points + primitives.same_orientation(a, b, p["orientation"])
+
+
+@dataclass(frozen=True)
+class Revolute:
+    """A hinge: 2 rows in the plane, 5 in space.
+
+    Two points meet and, in space, an axis n of a stays normal to two directions of b that span the
+    plane normal to it: n·b₁ = n·b₂ = 0.
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        point: on the axis, world frame at assembly, (dim,) [m].
+        axis: world frame at assembly, (3,), any length but zero; only in space.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    point: Any
+    axis: Any = None
+    oriented = True
+    turns = True
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The point in both frames, the axes, and pointers that read the angle."""
+        point = vector(self, "point", self.point, a)
+        anchors = {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
+        if point.shape == (2,):
+            return anchors | {"angle": b.orientation - a.orientation}
+        n, u, w = triad(self, a)
+        return anchors | {
+            "axis": a.local_direction(n),
+            "first_a": a.local_direction(u),
+            "second_a": a.local_direction(w),
+            "first_b": b.local_direction(u),
+            "second_b": b.local_direction(w),
+        }
+
+    @staticmethod
+    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+        """p_b − p_a = 0, n·b₁ = n·b₂ = 0."""
+        rows = primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
+        if "axis" not in p:
+            return rows
+        n = a.direction(p["axis"])
+        across = (b.direction(p["first_b"]), b.direction(p["second_b"]))
+        return rows + [primitives.angle_between(n, u) for u in across]
+
+    @staticmethod
+    def coordinate(p: dict[str, Any], a: Any, b: Any) -> Row:
+        """The angle of b in a about the axis, zero at assembly [rad]; over turns in the plane."""
+        if "axis" not in p:
+            return primitives.same_orientation(a, b, p["angle"])[0]
+        first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
+        return primitives.turn(first, second, b.direction(p["first_b"]))
+
+
+@dataclass(frozen=True)
+class Prismatic:
+    """A slider: 2 rows in the plane, 5 in space; only travel along an axis of a is free.
+
+    The point of b stays on the axis through the point of a, u·(p_b − p_a) = 0 for the directions u
+    normal to the axis, and the orientations agree.
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        axis: world frame at assembly, (dim,), any length but zero.
+        point: on the axis, world frame at assembly, (dim,) [m]; the second body's centre of mass
+            unless given.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    axis: Any
+    point: Any = None
+    oriented = True
+    turns = False
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The point in both frames, the axis and its normals in a, the orientation of b in a."""
+        point = b.position if self.point is None else vector(self, "point", self.point, a)
+        axis, *normals = triad(self, a)
+        params = {
+            "anchor_a": a.local_point(point),
+            "anchor_b": b.local_point(point),
+            "axis": a.local_direction(axis),
+            "first_a": a.local_direction(normals[0]),
+            "orientation": relative_orientation(a, b),
+        }
+        return params if len(normals) == 1 else params | {"second_a": a.local_direction(normals[1])}
+
+    @staticmethod
+    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+        """u·(p_b − p_a) = 0 for u normal to the axis, and the orientations agree."""
+        points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
+        normals = [p[side] for side in ("first_a", "second_a") if side in p]
+        rows = [primitives.travel(a.direction(u), *points) for u in normals]
+        return rows + primitives.same_orientation(a, b, p["orientation"])
+
+    @staticmethod
+    def coordinate(p: dict[str, Any], a: Any, b: Any) -> Row:
+        """How far b has moved along the axis since assembly [m]."""
+        points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
+        return primitives.travel(a.direction(p["axis"]), *points)
+
+
+def label(joint: Any) -> str:
+    """What errors call a joint: its class and name."""
+    return f"{type(joint).__name__} '{joint.name}'"
+
+
+def vector(joint: Any, what: str, x: Any, pose: Pose) -> Array:
+    """A vector of a joint, checked."""
+    x = checks.number(label(joint), what, x, pose.position.dtype, pose.position.shape)
+    checks.finite(label(joint), what, x)
+    return x
+
+
+def triad(joint: Any, pose: Pose) -> list[Array]:
+    """The unit axis of a joint and the directions normal to it, right-handed.
+
+    Raises:
+        ValueError: the axis is missing, has the wrong shape or length zero.
+    """
+    if joint.axis is None:
+        raise ValueError(f"{label(joint)}: in space an axis (3,) is needed, got none.")
+    axis = vector(joint, "axis", joint.axis, pose)
+    checks.nonzero(label(joint), "axis", axis)
+    n = axis / numerics.norm(axis)
+    if n.shape == (2,):
+        return [n, jnp.stack([-n[1], n[0]])]
+    smallest = jnp.argmin(jnp.abs(n))
+    across = jnp.cross(n, jnp.eye(3, dtype=n.dtype)[smallest])
+    u = across / numerics.norm(across)
+    return [n, u, jnp.cross(n, u)]
+
+
+def relative_orientation(a: Pose, b: Pose) -> Array:
+    """θ_b − θ_a in the plane, q_a* q_b in space."""
+    if a.position.shape == (2,):
+        return b.orientation - a.orientation  # type: ignore[operator]
+    return quaternion.multiply(quaternion.conjugate(a.orientation), b.orientation)

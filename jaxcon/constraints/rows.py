@@ -1,0 +1,139 @@
+"""All rows of a system at one instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.base import RowSet
+from jaxcon.core import numerics
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, Lane
+from jaxcon.solvers.jacobian import Block, Jacobian
+
+
+@dataclass(frozen=True)
+class RowLayout:
+    """Which rows belong to which constraint: (name, first, rows, stride) each."""
+
+    entries: tuple[tuple[str, int, int, int], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the constraints, in the order in which they were grouped."""
+        return tuple(name for name, *_ in self.entries)
+
+    def rows(self, name: str) -> np.ndarray:
+        """The row numbers of a constraint.
+
+        Raises:
+            ValueError: no constraint has this name.
+        """
+        for entry, first, count, stride in self.entries:
+            if entry == name:
+                return first + stride * np.arange(count)
+        raise ValueError(f"constraint '{name}' is unknown; known are {list(self.names)}.")
+
+    @property
+    def size(self) -> int:
+        """The number of rows."""
+        return sum(count for _, _, count, _ in self.entries)
+
+
+@pytree
+class Violation:
+    """How far a state is off its constraints; `violation["hinge"]` is ‖φ‖ of one of them.
+
+    Attributes:
+        position: φ by row (n_c,); zero for velocity-level rows.
+        velocity: φ̇ or ψ by row (n_c,).
+        layout: rows by constraint.
+    """
+
+    position: Array
+    velocity: Array
+    layout: RowLayout = static()
+
+    @property
+    def worst(self) -> Array:
+        """max |φ|, ()."""
+        return jnp.max(jnp.abs(self.position), initial=0)
+
+    @property
+    def worst_rate(self) -> Array:
+        """max |φ̇|, ()."""
+        return jnp.max(jnp.abs(self.velocity), initial=0)
+
+    def __getitem__(self, name: str) -> Array:
+        """‖φ‖ of a constraint, ()."""
+        return numerics.norm(self.position[self.layout.rows(name)])
+
+    def rate(self, name: str) -> Array:
+        """‖φ̇‖ or ‖ψ‖ of a constraint, ()."""
+        return numerics.norm(self.velocity[self.layout.rows(name)])
+
+
+@pytree
+class Rows:
+    """The constraints of a system, linearized: φ̈ = J a + γ.
+
+    Attributes:
+        residual: φ (n_c,); zero for velocity-level rows.
+        rate: φ̇ (n_c,), or ψ.
+        jacobian: J = ∂φ̇/∂v, (n_c, n_v).
+        bias: γ (n_c,).
+        layout: rows by constraint.
+    """
+
+    residual: Array
+    rate: Array
+    jacobian: Jacobian
+    bias: Array
+    layout: RowLayout = static()
+
+    @property
+    def violation(self) -> Violation:
+        """φ and φ̇ by constraint."""
+        return Violation(self.residual, self.rate, self.layout)
+
+
+def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
+    """φ, φ̇, J and γ of every constraint at one instant.
+
+    Args:
+        system: with `constraints`.
+        q: positions, (n_q,).
+        v: velocities, (n_v,).
+        t: time, () [s].
+
+    Returns:
+        The rows, grouped by constraints of equal structure.
+    """
+    snapshot = system.snapshot(q, v, t)
+    sets = [group.rows(snapshot) for group in system.constraints]
+    blocks: list[Block] = []
+    entries: list[tuple[str, int, int, int]] = []
+    start = 0
+    for group, rows in zip(system.constraints, sets, strict=True):
+        k = len(group.names)
+        blocks += [Block(value, start, columns) for columns, value in rows.jacobian]
+        entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
+        start += k * len(rows.value)
+    jacobian = Jacobian(tuple(blocks), (start, v.shape[0]))
+    residual, rate, bias = (_flat(sets, field, v) for field in ("value", "rate", "bias"))
+    return Rows(residual, rate, jacobian, bias, RowLayout(tuple(entries)))
+
+
+def _flat(sets: list[RowSet], field: str, like: Array) -> Array:
+    """One array (n_c,) from lanes, row-major inside each set."""
+    lanes = [_spread(lane, rows, like) for rows in sets for lane in getattr(rows, field)]
+    return jnp.concatenate(lanes) if lanes else jnp.zeros((0, *like.shape[1:]), like.dtype)
+
+
+def _spread(lane: Lane, rows: RowSet, like: Array) -> Array:
+    elements = len(rows.jacobian[0][0].indices)
+    return jnp.broadcast_to(jnp.asarray(lane, like.dtype), (elements, *like.shape[1:]))
+

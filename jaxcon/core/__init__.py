@@ -1,0 +1,1 @@
+"""Floor 0: pytrees, lanes, guards, checks and status codes."""

@@ -1,0 +1,62 @@
+"""Checks of what a user gave: each error names the culprit, what was got and what was expected.
+
+Shapes and dtypes are checked always; values only where they are concrete, since a tracer has none.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core.typing import Array
+
+
+def is_concrete(x: Any) -> bool:
+    """Whether every leaf has a value now."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(x))
+
+
+def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = ()) -> Array:
+    """The value as an array of this dtype and shape.
+
+    Raises:
+        ValueError: another shape, another floating dtype of a JAX array, or not a number.
+    """
+    got = getattr(x, "dtype", None)
+    if isinstance(x, jax.Array) and jnp.issubdtype(got, jnp.floating) and got != dtype:
+        raise ValueError(
+            f"{owner}: {what} is {got}, but the scene is {jnp.dtype(dtype).name};"
+            " mixed dtypes are not promoted: convert it, or build the scene with dtype=."
+        )
+    try:
+        array = jnp.asarray(x, dtype)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{owner}: {what} must be numbers, got {x!r}.") from error
+    if array.shape != shape:
+        raise ValueError(f"{owner}: {what} must have shape {shape}, got {array.shape}.")
+    return array
+
+
+def positive(owner: str, what: str, x: Any, strictly: bool = True) -> None:
+    """Checks that every value is positive (or not negative) and finite."""
+    if is_concrete(x):
+        values = np.asarray(x)
+        good = (values > 0) if strictly else (values >= 0)
+        if not np.all(good & np.isfinite(values)):
+            bound = "positive" if strictly else "zero or more"
+            raise ValueError(f"{owner}: {what} must be {bound} and finite, got {values.tolist()}.")
+
+
+def nonzero(owner: str, what: str, x: Any) -> None:
+    """Checks that a vector has a direction."""
+    if is_concrete(x):
+        values = np.asarray(x)
+        if not np.all(np.isfinite(values)) or not np.linalg.norm(values) > 0:
+            raise ValueError(f"{owner}: {what} must have a length, got {values.tolist()}.")
+
+
+def finite(owner: str, what: str, x: Any) -> None:
+    """Checks that every value is finite."""
+    if is_concrete(x) and not np.all(np.isfinite(np.asarray(x))):
+        raise ValueError(f"{owner}: {what} must be finite, got {np.asarray(x).tolist()}.")

@@ -1,0 +1,181 @@
+"""Small vectors and matrices by components, each component a lane.
+
+A lane is an array whose axes all enumerate bodies or worlds, never components. Every operation is
+then one elementwise instruction over long contiguous memory, which XLA vectorises, where a small
+`einsum` would be a loop of short ones. A component that is known when tracing (the 0s and 1s of a
+coordinate axis) stays a Python number, and products with it are never emitted.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core.typing import Array, Lane
+
+
+def _is(x: Lane, number: int) -> bool:
+    return isinstance(x, int | float) and x == number
+
+
+def times(x: Lane, y: Lane) -> Lane:
+    """x y, without an instruction where a factor is the Python number 0, 1 or −1."""
+    for a, b in ((x, y), (y, x)):
+        if _is(a, 0):
+            return 0.0
+        if _is(a, 1):
+            return b
+        if _is(a, -1):
+            return -b
+    return x * y
+
+
+def plus(x: Lane, y: Lane) -> Lane:
+    """x + y, without an instruction where a term is the Python number 0."""
+    if _is(x, 0):
+        return y
+    return x if _is(y, 0) else x + y
+
+
+def total(terms: Any) -> Lane:
+    """The sum of lanes."""
+    return functools.reduce(plus, terms, 0.0)
+
+
+@jax.tree_util.register_pytree_node_class
+class Vector:
+    """A vector whose components are lanes; `Vector(x, y, z)`."""
+
+    __slots__ = ("components",)
+
+    def __init__(self, *components: Any) -> None:
+        self.components = components
+
+    @classmethod
+    def of(cls, x: Any) -> Vector:
+        """From an array whose first axis enumerates components, from a sequence, or as it is."""
+        if isinstance(x, Vector):
+            return x
+        if isinstance(x, jax.Array):
+            return cls(*(jax.lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0])))
+        return cls(*x)
+
+    def stack(self) -> Array:
+        """The array with the components along the first axis."""
+        shape = jnp.broadcast_shapes(*(jnp.shape(c) for c in self))
+        return jnp.stack([jnp.broadcast_to(c, shape) for c in _common(self.components)])
+
+    def map(self, function: Callable[[Lane], Lane]) -> Vector:
+        """The function of each component."""
+        return Vector(*map(function, self))
+
+    def dot(self, other: Vector) -> Lane:
+        """Σ xᵢ yᵢ."""
+        return total(times(x, y) for x, y in zip(self, other, strict=True))
+
+    def cross(self, other: Vector) -> Any:
+        """x × y: a vector in space, and in the plane its one component along the normal."""
+        if len(self) == 2:
+            (a, b), (c, d) = self, other
+            return plus(times(a, d), -times(b, c))
+        (a, b, c), (x, y, z) = self, other
+        return Vector(
+            plus(times(b, z), -times(c, y)),
+            plus(times(c, x), -times(a, z)),
+            plus(times(a, y), -times(b, x)),
+        )
+
+    def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
+        """Components are children."""
+        return self.components, None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: Any) -> Vector:
+        """From children."""
+        return cls(*children)
+
+    def __iter__(self) -> Iterator[Lane]:
+        return iter(self.components)
+
+    def __len__(self) -> int:
+        return len(self.components)
+
+    def __getitem__(self, index: Any) -> Any:
+        return self.components[index]
+
+    def __add__(self, other: Vector) -> Vector:
+        return Vector(*(plus(x, y) for x, y in zip(self, other, strict=True)))
+
+    def __sub__(self, other: Vector) -> Vector:
+        return self + (-other)
+
+    def __neg__(self) -> Vector:
+        return self.map(lambda x: times(-1, x))
+
+    def __mul__(self, scale: Lane) -> Vector:
+        return self.map(lambda x: times(x, scale))
+
+    __rmul__ = __mul__
+
+    def __repr__(self) -> str:
+        return f"Vector{self.components}"
+
+
+class Matrix(Vector):
+    """A matrix of lanes as a vector of row vectors."""
+
+    __slots__ = ()
+
+    def __matmul__(self, x: Vector) -> Vector:
+        return Vector(*(row.dot(x) for row in self))
+
+    @property
+    def T(self) -> Matrix:
+        """The transpose."""
+        return Matrix(*(Vector(*column) for column in zip(*self, strict=True)))
+
+
+jax.tree_util.register_pytree_node_class(Matrix)
+
+
+def zeros(n: int) -> Vector:
+    """The zero vector of n components, known when tracing."""
+    return Vector(*(0.0,) * n)
+
+
+def axes(n: int) -> tuple[Vector, ...]:
+    """The n coordinate axes, known when tracing."""
+    return tuple(Vector(*(1.0 if i == j else 0.0 for j in range(n))) for i in range(n))
+
+
+def perpendicular(x: Vector) -> Vector:
+    """x turned by +90° in the plane."""
+    return Vector(times(-1, x[1]), x[0])
+
+
+def _common(components: tuple[Any, ...]) -> list[Any]:
+    """Components of one dtype: that of the arrays among them, the default where there are none."""
+    dtypes = [c.dtype for c in components if isinstance(c, jax.Array)]
+    dtype = dtypes[0] if dtypes else jnp.result_type(float)
+    return [c if isinstance(c, jax.Array) else jnp.asarray(c, dtype) for c in components]
+
+
+def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Lets a function of vectors also take arrays whose first axis enumerates components.
+
+    The result is an array where every vector argument was one, and a Vector otherwise.
+    """
+
+    @functools.wraps(function)
+    def wrapped(*args: Any) -> Any:
+        if any(isinstance(x, Vector) for x in args):
+            return function(*args)
+        arrays = [jnp.asarray(x) for x in args]
+        result = function(*(Vector.of(x) if x.ndim else x for x in arrays))
+        return result.stack() if isinstance(result, Vector) else result
+
+    return wrapped

@@ -1,0 +1,52 @@
+"""What became of a world: codes that survive jit and vmap, and their meaning in words."""
+
+from enum import IntEnum
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core.typing import Array
+
+
+class Status(IntEnum):
+    """The first failure of a world; 0 is healthy."""
+
+    OK = 0
+    NON_FINITE = 1
+    SINGULAR = 2
+
+
+MEANING = {
+    Status.NON_FINITE: "a state, force or parameter is NaN or infinite; likely (a) a step too large"
+    " for the fastest motion, (b) a NaN in the control or parameters, (c) an unstable gain",
+    Status.SINGULAR: "the constraint rows are dependent or the mass matrix is singular; `report`"
+    " names redundant rows; likely (a) a closed spatial loop of revolute joints, (b) the same"
+    " constraint twice, (c) a singular position of the mechanism",
+}
+
+
+class SimulationError(RuntimeError):
+    """A world failed; the message names which and why."""
+
+
+def first(earlier: Array, later: Array) -> Array:
+    """The earlier code unless it is OK: the first failure sticks."""
+    return jnp.where(earlier == Status.OK, later, earlier)
+
+
+def raise_for_status(result: object) -> None:
+    """Raises where a world failed. For use outside jit.
+
+    Args:
+        result: a State, StepInfo or Solution, of one world or a batch.
+
+    Raises:
+        SimulationError: some `status` is not OK; the message names world, code and likely causes.
+    """
+    status = np.asarray(getattr(result, "status", result))
+    failed = np.argwhere(np.atleast_1d(status) != Status.OK)
+    if failed.size:
+        code = Status(int(np.atleast_1d(status)[tuple(failed[0])]))
+        where = "" if status.ndim == 0 else f" in {len(failed)} of {status.size} worlds"
+        index = "" if status.ndim == 0 else f", first in world {tuple(map(int, failed[0]))}"
+        raise SimulationError(f"{code.name}{where}{index}: {MEANING[code]}.")

@@ -1,0 +1,229 @@
+"""Elements of one class on bodies of the same kinds, gathered side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints import custom
+from jaxcon.constraints.base import Joints
+from jaxcon.constraints.drive import Drives
+from jaxcon.core import checks
+from jaxcon.dynamics.inputs import Resolved
+from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import stack
+from jaxcon.model.forces import (
+    CustomForce,
+    CustomForces,
+    ExternalWrench,
+    ExternalWrenches,
+    ForceElements,
+    JointSprings,
+)
+from jaxcon.model.layout import WORLD, Group, Layout, Place
+from jaxcon.model.system import MassProperties
+
+
+def lay_out(
+    dim: int, bodies: dict[str, Resolved], elements: Iterable[Any]
+) -> tuple[Layout, tuple[MassProperties, ...]]:
+    """The order of coordinates and control channels, and the mass properties in that order."""
+    kinds = {body.kind: None for body in bodies.values() if body.kind is not None}
+    groups: list[Group] = []
+    inertia: list[MassProperties] = []
+    q = v = 0
+    for kind in kinds:
+        names = tuple(name for name, body in bodies.items() if body.kind == kind)
+        groups.append(Group(kind, names, q, v))
+        q, v = q + kind.n_q * len(names), v + kind.n_v * len(names)
+        rows = [{"mass": bodies[n].mass, "moments": bodies[n].moments} for n in names]
+        inertia.append(MassProperties(**stack(rows)))
+    controls: list[tuple[str, int, int]] = []
+    u = 0
+    for element in elements:
+        width = 0
+        if isinstance(element, ExternalWrench) and element.body in bodies:
+            kind = bodies[element.body].kind
+            width = 0 if kind is None else kind.n_v
+        elif isinstance(element, CustomForce):
+            width = element.controls
+        if width:
+            controls.append((element.name, u, u + width))
+            u += width
+    fixed = tuple(name for name, body in bodies.items() if body.kind is None)
+    return Layout(dim, tuple(groups), fixed, tuple(controls)), tuple(inertia)
+
+
+class Elements:
+    """Finds the bodies of elements, checks them, and gathers equal ones."""
+
+    def __init__(self, dim: int, dtype: Any, layout: Layout, poses: dict[str, Pose]) -> None:
+        self.dim, self.dtype, self.layout, self.poses = dim, dtype, layout, poses
+
+    def joints(self, joints: list[Any]) -> list[Any]:
+        """Joints by class and by the kinds of their bodies."""
+        for joint in joints:
+            self._check_joint(joint)
+        groups = self._gather(joints, lambda j: (j.body_a, j.body_b))
+        return [Joints(p, names, places, joint=cls) for cls, p, names, places in groups]
+
+    def forces(self, forces: list[Any]) -> list[Any]:
+        """Force elements by class and by the kinds of their bodies."""
+        for force in forces:
+            self._check_bodies(force, force.bodies)
+        groups = self._gather(forces, lambda f: f.bodies)
+        return [ForceElements(p, names, places, law=cls) for cls, p, names, places in groups]
+
+    def wrenches(self, wrenches: list[Any]) -> list[Any]:
+        """External wrenches by the kind of their body."""
+        for wrench in wrenches:
+            self._check_bodies(wrench, wrench.bodies)
+        result = []
+        for _, params, names, places in self._gather(wrenches, lambda w: w.bodies):
+            starts = tuple(self.layout.control(name).start for name in names)
+            result.append(ExternalWrenches(params, names, places, starts=starts))
+        return result
+
+    def drives(self, drives: list[Any], joints: list[Any]) -> list[Any]:
+        """Prescribed motions, one group each."""
+        result = []
+        for drive in drives:
+            group, index = self._find_joint(drive, joints)
+            params = jax.tree.map(lambda x: jnp.asarray(x, self.dtype), drive.params)
+            places = joints[group].select((index,)).places
+            result.append(Drives(params, _bare(drive), group, index, places))
+        return result
+
+    def joint_springs(self, springs: list[Any], joints: list[Any]) -> list[Any]:
+        """Springs about joint coordinates, by the group of their joints."""
+        found: dict[int, list[tuple[Any, int]]] = {}
+        for spring in springs:
+            group, index = self._find_joint(spring, joints)
+            found.setdefault(group, []).append((spring, index))
+        result = []
+        for group, members in found.items():
+            params = stack([spring.attach(self.dtype) for spring, _ in members])
+            names = tuple(spring.name for spring, _ in members)
+            indices = tuple(index for _, index in members)
+            places = joints[group].select(indices).places
+            result.append(JointSprings(params, names, places, group=group, joints=indices))
+        return result
+
+    def customs(self, constraints: list[Any]) -> list[Any]:
+        """User constraints on bodies, one group each."""
+        result = []
+        for constraint in constraints:
+            self._check_user(constraint)
+            moving = [name for name in constraint.bodies if name in self.layout.bodies]
+            places = tuple(self._place((name,)) for name in moving)
+            result.append(custom.CustomOnBodies(self._params(constraint), _bare(constraint), places))
+        return result
+
+    def user_forces(self, forces: list[Any]) -> list[Any]:
+        """User forces, one group each."""
+        result = []
+        for force in forces:
+            self._check_user(force)
+            places = tuple(self._place((name,)) for name in force.bodies)
+            channel = (0, 0)
+            if force.controls:
+                own = self.layout.control(force.name)
+                channel = (own.start, own.stop)
+            params = self._params(force)
+            result.append(
+                CustomForces(params, (force.name,), places, force.function, channel, force.bodies)
+            )
+        return result
+
+    def check(self, system: Any, state: Any) -> None:
+        """Calls every user's constraint once, abstractly, to check what it returns."""
+        for group in system.constraints:
+            if isinstance(group, custom.Custom):
+                custom.check_function(group, system.snapshot(state.q, state.v, state.time))
+
+    def _params(self, element: Any) -> Any:
+        def convert(x: Any) -> Any:
+            got = getattr(x, "dtype", None)
+            if got is not None and not jnp.issubdtype(got, jnp.floating):
+                return jnp.asarray(x)
+            shape = jnp.shape(x)
+            return checks.number(f"'{element.name}'", "params", x, self.dtype, shape)
+
+        return jax.tree.map(convert, element.params)
+
+    def _gather(self, elements: list[Any], bodies: Any) -> list[Any]:
+        groups: dict[Any, list[Any]] = {}
+        for element in elements:
+            names = bodies(element)
+            params = element.attach(*(self.poses[name] for name in names))
+            sides = tuple(self._group(name) for name in names)
+            fields = tuple(params)
+            groups.setdefault((type(element), sides, fields), []).append((element, params))
+        result = []
+        for (cls, sides, _), members in groups.items():
+            names = tuple(element.name for element, _ in members)
+            columns = zip(*(bodies(element) for element, _ in members), strict=True)
+            places = tuple(
+                Place(None, ()) if side is None else self._place(column)
+                for side, column in zip(sides, columns, strict=True)
+            )
+            result.append((cls, stack([p for _, p in members]), names, places))
+        return result
+
+    def _group(self, name: str) -> int | None:
+        return self.layout.locate(name)[0] if name in self.layout.bodies else None
+
+    def _place(self, names: tuple[str, ...]) -> Place:
+        if names[0] not in self.layout.bodies:
+            return Place(None, ())
+        located = [self.layout.locate(name) for name in names]
+        return Place(located[0][0], tuple(index for _, index in located))
+
+    def _check_bodies(self, element: Any, names: tuple[str, ...]) -> None:
+        owner = f"{type(element).__name__} '{element.name}'"
+        for name in names:
+            if name not in self.poses:
+                known = [WORLD, *self.layout.bodies, *self.layout.fixed]
+                raise ValueError(f"{owner}: body '{name}' is unknown; known are {known}.")
+        if len(set(names)) < len(names):
+            raise ValueError(f"{owner}: it joins body '{names[0]}' to itself.")
+        if not any(name in self.layout.bodies for name in names):
+            raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")
+
+    def _check_joint(self, joint: Any) -> None:
+        owner = f"{type(joint).__name__} '{joint.name}'"
+        names = (joint.body_a, joint.body_b)
+        self._check_bodies(joint, names)
+        if self.dim not in getattr(joint, "dims", (2, 3)):
+            raise ValueError(f"{owner}: this joint exists in {joint.dims[0]} dimensions only.")
+        for name in names:
+            if getattr(joint, "oriented", False) and self.poses[name].orientation is None:
+                raise ValueError(f"{owner}: it needs an orientation, but '{name}' is a particle.")
+        if self.dim == 2 and getattr(joint, "axis", None) is not None and joint.turns:
+            raise ValueError(f"{owner}: in the plane the axis is the normal; give none.")
+
+    def _check_user(self, element: Any) -> None:
+        owner = f"{type(element).__name__} '{element.name}'"
+        if not isinstance(element.bodies, tuple) or not element.bodies:
+            raise ValueError(f"{owner}: bodies must be a tuple of names, got {element.bodies!r}.")
+        self._check_bodies(element, element.bodies)
+
+    def _find_joint(self, element: Any, joints: list[Any]) -> tuple[int, int]:
+        owner = f"{type(element).__name__} '{element.name}'"
+        for group, candidates in enumerate(joints):
+            if element.joint in candidates.names:
+                if not hasattr(getattr(candidates, "joint", None), "coordinate"):
+                    raise ValueError(f"{owner}: '{element.joint}' has no coordinate.")
+                return group, candidates.names.index(element.joint)
+        known = [name for group in joints for name in group.names]
+        raise ValueError(f"{owner}: joint '{element.joint}' is unknown; known are {known}.")
+
+
+def _bare(description: Any) -> Any:
+    """The description without its numbers: static, hashable."""
+    import dataclasses
+
+    return dataclasses.replace(description, params=None)

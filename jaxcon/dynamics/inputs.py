@@ -1,0 +1,129 @@
+"""What a user says of a body, turned into its principal frame at the centre of mass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.core import checks
+from jaxcon.core.typing import Array
+from jaxcon.geometry import inertia as solids
+from jaxcon.geometry import quaternion
+from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.model.bodies import Particle, PlanarRigid, SpatialRigid
+
+
+@dataclass(frozen=True)
+class BodyInput:
+    """The arguments of `add_body` or `add_particle`, as given."""
+
+    name: str
+    mass: Any
+    inertia: Any
+    position: Any
+    orientation: Any
+    velocity: Any
+    angular_velocity: Any
+    rigid: bool
+    fixed: bool
+
+
+@dataclass(frozen=True)
+class Resolved:
+    """A body by its principal frame.
+
+    Attributes:
+        kind: how it moves.
+        motion: of the principal frame at assembly.
+        mass, moments: [kg], [kg m²].
+        offset: the user's frame in the principal frame; None where they coincide.
+    """
+
+    kind: Any
+    motion: Motion
+    mass: Array | None
+    moments: Array | None
+    offset: Pose | None
+
+
+def resolve(body: BodyInput, dim: int, dtype: Any) -> Resolved:
+    """Checks a body and finds its principal frame.
+
+    Raises:
+        ValueError: a wrong shape or dtype, or a mass or inertia that is not positive.
+    """
+    motion = _motion(body, dim, dtype)
+    if body.fixed:
+        return Resolved(None, motion, None, None, None)
+    if not body.rigid:
+        return Resolved(Particle(dim), motion, _mass(body, body.mass, dtype), None, None)
+    solid = _solid(body, dim, dtype)
+    mass = _mass(body, solid.mass, dtype)
+    kind = PlanarRigid() if dim == 2 else SpatialRigid()
+    if solid.center is None and solid.axes is None:
+        return Resolved(kind, motion, mass, solid.moments, None)
+    center = jnp.zeros(dim, dtype)
+    if solid.center is not None:
+        center = checks.number(_label(body), "inertia.center", solid.center, dtype, (dim,))
+    own = Pose(center, solid.axes if dim == 3 else jnp.zeros((), dtype))
+    if dim == 2:
+        return Resolved(kind, motion.seen_from(own), mass, solid.moments, Pose(-center, None))
+    axes = quaternion.IDENTITY.stack().astype(dtype) if own.orientation is None else own.orientation
+    own = Pose(center, axes.astype(dtype))
+    offset = Pose(-own.local_direction(center), quaternion.conjugate(own.orientation))
+    return Resolved(kind, motion.seen_from(own), mass, solid.moments, offset)
+
+
+def _motion(body: BodyInput, dim: int, dtype: Any) -> Motion:
+    zero = (0.0,) * dim
+    spin_shape = () if dim == 2 else (3,)
+
+    def given(what: str, x: Any, default: Any, shape: tuple[int, ...]) -> Array:
+        value = checks.number(_label(body), what, default if x is None else x, dtype, shape)
+        checks.finite(_label(body), what, value)
+        return value
+
+    position = given("position", body.position, zero, (dim,))
+    velocity = given("velocity", body.velocity, zero, (dim,))
+    if not body.rigid:
+        return Motion(position, None, velocity, None)
+    spin = given("angular_velocity", body.angular_velocity, jnp.zeros(spin_shape, dtype), spin_shape)
+    if dim == 2:
+        return Motion(position, given("angle", body.orientation, 0.0, ()), velocity, spin)
+    turn = given("quaternion", body.orientation, (1.0, 0.0, 0.0, 0.0), (4,))
+    checks.nonzero(_label(body), "quaternion", turn)
+    return Motion(position, quaternion.normalize(turn), velocity, spin)
+
+
+def _solid(body: BodyInput, dim: int, dtype: Any) -> solids.Inertia:
+    """The inertia with moments as an array, whatever form the user gave."""
+    given = body.inertia
+    if isinstance(given, solids.Inertia):
+        if body.mass is not None:
+            raise ValueError(f"{_label(body)}: give mass= or an Inertia, not both.")
+    elif given is None:
+        raise ValueError(f"{_label(body)}: inertia is needed; a body without one is a particle.")
+    elif dim == 3 and jnp.shape(given) == (3, 3):
+        given = solids.from_tensor(body.mass, checks.number(_label(body), "inertia", given, dtype, (3, 3)))
+    else:
+        given = solids.Inertia(body.mass, given)
+    moments = given.moments
+    if dim == 2 and len(jnp.shape(moments)) == 1:
+        moments = moments[2]
+    moments = checks.number(_label(body), "inertia", moments, dtype, () if dim == 2 else (3,))
+    checks.positive(_label(body), "inertia", moments)
+    if dim == 3:
+        solids.check_triangle(_label(body), moments)
+    return solids.Inertia(given.mass, moments, given.center, given.axes)
+
+
+def _mass(body: BodyInput, mass: Any, dtype: Any) -> Array:
+    value = checks.number(_label(body), "mass", mass, dtype)
+    checks.positive(_label(body), "mass", value)
+    return value
+
+
+def _label(body: BodyInput) -> str:
+    return f"{'body' if body.rigid else 'particle'} '{body.name}'"

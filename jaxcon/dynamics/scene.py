@@ -1,0 +1,182 @@
+"""The builder: a scene in the user's words, checked and laid out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints.custom import Holonomic, VelocityLevel
+from jaxcon.constraints.drive import Drive
+from jaxcon.core import checks
+from jaxcon.core.status import Status
+from jaxcon.dynamics import grouping
+from jaxcon.dynamics.inputs import BodyInput, resolve
+from jaxcon.geometry.pose import Pose
+from jaxcon.model.forces import CustomForce, ExternalWrench, JointSpring
+from jaxcon.model.layout import WORLD
+from jaxcon.model.state import State
+from jaxcon.model.system import BodySystem
+
+
+class Scene:
+    """Bodies, constraints and forces by name; `build` checks them and makes a system.
+
+    Args:
+        dim: 2 or 3.
+        gravity: (dim,) [m/s²]; 9.81 downwards (along the last axis) unless given.
+        dtype: of every number; JAX's default float unless given.
+
+    Numbers may be traced, so that a scene can be built under `jit`, `vmap` and `grad`; names and
+    structure may not.
+    """
+
+    def __init__(self, dim: int = 3, gravity: Any = None, dtype: Any = None) -> None:
+        if dim not in (2, 3):
+            raise ValueError(f"Scene: dim must be 2 or 3, got {dim!r}.")
+        self.dim = dim
+        self.dtype = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
+        if self.dtype not in (jnp.float32, jnp.float64):
+            raise ValueError(f"Scene: dtype must be float32 or float64, got {self.dtype}.")
+        if self.dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
+            raise ValueError(
+                "Scene: float64 needs jax.config.update('jax_enable_x64', True) at the start."
+            )
+        default = (0.0,) * (dim - 1) + (-9.81,)
+        gravity = default if gravity is None else gravity
+        self.gravity = checks.number("Scene", "gravity", gravity, self.dtype, (dim,))
+        self._bodies: dict[str, BodyInput] = {}
+        self._elements: dict[str, Any] = {}
+
+    def add_body(
+        self,
+        name: str,
+        *,
+        mass: Any = None,
+        inertia: Any = None,
+        position: Any = None,
+        quaternion: Any = None,
+        angle: Any = None,
+        velocity: Any = None,
+        angular_velocity: Any = None,
+        fixed: bool = False,
+    ) -> None:
+        """Adds a rigid body.
+
+        Args:
+            name: unique in the scene.
+            mass: () [kg].
+            inertia: about the centre of mass [kg m²]: () in the plane; in space principal moments
+                (3,) or a full tensor (3, 3); or an `Inertia`, which also brings mass and centre.
+            position: of the body's frame, world, (dim,) [m]. The frame lies at the centre of mass
+                unless an `Inertia` says otherwise.
+            quaternion: body to world, wxyz, (4,); in space.
+            angle: () [rad]; in the plane.
+            velocity: of the body's frame, world, (dim,) [m/s].
+            angular_velocity: () in the plane, (3,) in the body frame in space [rad/s].
+            fixed: whether it is part of the world; it then needs no mass and has no coordinates.
+
+        Raises:
+            ValueError: the name is taken, or `quaternion` in the plane or `angle` in space.
+        """
+        if (quaternion if self.dim == 2 else angle) is not None:
+            wrong, right = ("quaternion", "angle") if self.dim == 2 else ("angle", "quaternion")
+            raise ValueError(
+                f"body '{name}': in {self.dim} dimensions give {right}=, not {wrong}=."
+            )
+        orientation = angle if self.dim == 2 else quaternion
+        self._take_name(name)
+        self._bodies[name] = BodyInput(
+            name, mass, inertia, position, orientation, velocity, angular_velocity, True, fixed
+        )
+
+    def add_particle(
+        self, name: str, *, mass: Any, position: Any = None, velocity: Any = None
+    ) -> None:
+        """Adds a point mass: `dim` coordinates, no orientation.
+
+        Args:
+            name: unique in the scene.
+            mass: () [kg].
+            position: world, (dim,) [m].
+            velocity: world, (dim,) [m/s].
+
+        Raises:
+            ValueError: the name is taken.
+        """
+        self._take_name(name)
+        self._bodies[name] = BodyInput(name, mass, None, position, None, velocity, None, False, False)
+
+    def add(self, element: Any) -> None:
+        """Adds a joint, constraint or force element.
+
+        Raises:
+            ValueError: its name is taken.
+            TypeError: it is neither a constraint nor a force.
+        """
+        roles = ("attach", "function", "motion", "rows", "forces")
+        if not hasattr(element, "name") or not any(hasattr(element, role) for role in roles):
+            raise TypeError(f"Scene.add takes a joint, constraint or force, got {element!r}.")
+        self._take_name(element.name)
+        self._elements[element.name] = element
+
+    def build(self) -> tuple[BodySystem, State]:
+        """Checks the scene, lays it out, and attaches every element where its bodies now are.
+
+        Returns:
+            The system, and the state at assembly.
+
+        Raises:
+            ValueError: an unknown name, a joint between a body and itself, a wrong shape or dtype,
+                a value out of range; the message names the culprit.
+        """
+        bodies = {name: resolve(b, self.dim, self.dtype) for name, b in self._bodies.items()}
+        layout, inertia = grouping.lay_out(self.dim, bodies, self._elements.values())
+        world = jnp.zeros(self.dim, self.dtype)
+        upright = jnp.zeros((), self.dtype) if self.dim == 2 else jnp.eye(4, dtype=self.dtype)[0]
+        fixed = {n: b.motion.pose for n, b in bodies.items() if b.kind is None}
+        fixed[WORLD] = Pose(world, upright)
+        poses = {n: b.motion.pose for n, b in bodies.items()} | fixed
+        elements = grouping.Elements(self.dim, self.dtype, layout, poses)
+        kinds = ([], [], [], [], [], [], [])
+        order = (Drive, (Holonomic, VelocityLevel), JointSpring, ExternalWrench, CustomForce)
+        for element in self._elements.values():
+            index = next((i for i, kind in enumerate(order) if isinstance(element, kind)), None)
+            if index is None:
+                index = 5 if hasattr(element, "rows") else 6
+            kinds[index].append(element)
+        drives, customs, joint_springs, wrenches, user_forces, joints, simple = kinds
+        constraints = elements.joints(joints)
+        constraints += elements.drives(drives, constraints) + elements.customs(customs)
+        forces = elements.forces(simple) + elements.joint_springs(joint_springs, constraints)
+        forces += elements.wrenches(wrenches) + elements.user_forces(user_forces)
+        offsets = {n: b.offset for n, b in bodies.items() if b.offset is not None}
+        system = BodySystem(
+            self.gravity, inertia, tuple(constraints), tuple(forces), offsets, fixed, layout
+        )
+        state = self._state(layout, bodies)
+        elements.check(system, state)
+        return system, state
+
+    def _state(self, layout: Any, bodies: Any) -> State:
+        q, v = [], []
+        for group in layout.groups:
+            pairs = [group.kind.coordinates(bodies[name].motion) for name in group.names]
+            q.append(jnp.stack([x for x, _ in pairs], axis=-1).ravel())
+            v.append(jnp.stack([y for _, y in pairs], axis=-1).ravel())
+        if not q:
+            raise ValueError("Scene: there is no body that moves; add one with add_body.")
+        status = jnp.asarray(Status.OK, jnp.int32)
+        return State(jnp.concatenate(q), jnp.concatenate(v), jnp.zeros((), self.dtype), status)
+
+    def _take_name(self, name: str) -> None:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"Scene: a name must be a non-empty string, got {name!r}.")
+        if name in (WORLD, "gravity"):
+            raise ValueError(f"Scene: the name '{name}' is reserved.")
+        if name in self._bodies or name in self._elements:
+            raise ValueError(f"Scene: the name '{name}' is taken; every name must be unique.")
+
+
+__all__ = ["Scene"]

@@ -1,0 +1,1 @@
+"""Floor 1: rotations, poses and inertia."""

@@ -1,0 +1,162 @@
+"""Mass, centre of mass and principal moments of common solids and of any tensor.
+
+Each constructor returns an `Inertia` in the solid's own frame, whose origin lies at its geometric
+centre. `Scene.add_body(inertia=…)` takes it: the simulated frame then lies at the centre of mass
+along the principal axes, which makes the mass matrix constant and diagonal, while positions given
+and read stay in the solid's frame.
+
+References:
+    Goldstein, Classical Mechanics (3rd ed.), section 5.3.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core import checks
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array
+from jaxcon.geometry import quaternion
+
+
+@pytree
+class Inertia:
+    """Mass properties of a rigid body in its own frame.
+
+    Attributes:
+        mass: () [kg].
+        moments: principal moments about the centre of mass, (3,) [kg m²].
+        center: centre of mass, (3,) [m].
+        axes: principal axes, unit quaternion (4,) principal to own frame; None where they coincide.
+    """
+
+    mass: Any
+    moments: Any
+    center: Any = None
+    axes: Array | None = None
+
+
+def sphere(mass: Any, radius: Any) -> Inertia:
+    """Homogeneous ball: I = 2/5 m r²."""
+    _check("sphere", mass=mass, radius=radius)
+    moment = mass * radius**2 * 0.4
+    return Inertia(mass, (moment, moment, moment))
+
+
+def box(mass: Any, size: Any) -> Inertia:
+    """Homogeneous box with edges size (3,): I_x = m (b² + c²) / 12, and so on."""
+    _check("box", mass=mass, size=size)
+    x, y, z = (edge**2 for edge in size)
+    return Inertia(mass, (mass * (y + z) / 12, mass * (z + x) / 12, mass * (x + y) / 12))
+
+
+def cylinder(mass: Any, radius: Any, length: Any) -> Inertia:
+    """Homogeneous cylinder along z: I_z = m r² / 2, I_x = I_y = m (3 r² + l²) / 12."""
+    _check("cylinder", mass=mass, radius=radius, length=length)
+    across = mass * (3 * radius**2 + length**2) / 12
+    return Inertia(mass, (across, across, mass * radius**2 / 2))
+
+
+def rod(mass: Any, length: Any, radius: Any) -> Inertia:
+    """Rod along x of circular section: I_x = m r² / 2, I_y = I_z = m (3 r² + l²) / 12.
+
+    A rod without thickness cannot be turned about itself in space; in the plane use
+    `inertia=mass * length**2 / 12`.
+    """
+    _check("rod", mass=mass, length=length, radius=radius)
+    across = mass * (3 * radius**2 + length**2) / 12
+    return Inertia(mass, (mass * radius**2 / 2, across, across))
+
+
+def capsule(mass: Any, radius: Any, length: Any) -> Inertia:
+    """Homogeneous capsule along z: a cylinder of this length between two half balls.
+
+    A half ball of mass m_h has its centre of mass 3r/8 from its flat face, and m_h r² · 83/320
+    about it across.
+    """
+    _check("capsule", mass=mass, radius=radius, length=length)
+    share = 3 * length / (3 * length + 4 * radius)  # the cylinder's share of the volume
+    tube, balls = mass * share, mass * (1 - share)
+    arm = length / 2 + 3 * radius / 8
+    along = tube * radius**2 / 2 + balls * radius**2 * 0.4
+    across = tube * (3 * radius**2 + length**2) / 12 + balls * (radius**2 * (83 / 320) + arm**2)
+    return Inertia(mass, (across, across, along))
+
+
+def from_tensor(mass: Any, tensor: Any, center: Any = None) -> Inertia:
+    """From a full tensor (3, 3) about the centre of mass, by its principal axes.
+
+    Args:
+        mass: () [kg].
+        tensor: symmetric, (3, 3) [kg m²].
+        center: centre of mass in the same frame, (3,) [m]; the origin unless given.
+
+    Raises:
+        ValueError: not 3×3, not symmetric, not positive definite, or against the triangle
+            inequality, which no distribution of mass can violate.
+    """
+    tensor = jnp.asarray(tensor)
+    if tensor.shape != (3, 3):
+        raise ValueError(f"inertia: the tensor must have shape (3, 3), got {tensor.shape}.")
+    moments, axes = principal_axes(tensor)
+    if checks.is_concrete(tensor):
+        _check_tensor(tensor, moments)
+    return Inertia(mass, moments, center, quaternion.from_matrix(axes))
+
+
+@jax.custom_jvp
+def principal_axes(tensor: Array) -> tuple[Array, Array]:
+    """I = A diag(moments) Aᵀ with A a rotation.
+
+    Args:
+        tensor: symmetric, (3, 3) [kg m²].
+
+    Returns:
+        moments (3,), ascending, and A (3, 3). Tangents of the axes follow
+        dA = A Ω, Ω_ij = dI_ij / (I_j − I_i); where two moments coincide any axes of their plane
+        are principal, and these do not turn: the tangent is finite, and the part of dI that would
+        turn them is left out.
+    """
+    moments, axes = jnp.linalg.eigh((tensor + tensor.T) / 2)
+    return moments, axes.at[:, 2].multiply(jnp.linalg.det(axes))
+
+
+@principal_axes.defjvp
+def _principal_axes_jvp(primals: Any, tangents: Any) -> Any:
+    moments, axes = principal_axes(*primals)
+    (d_tensor,) = tangents
+    inside = axes.T @ ((d_tensor + d_tensor.T) / 2) @ axes
+    gap = moments[None, :] - moments[:, None]
+    apart = jnp.abs(gap) > 1e3 * jnp.finfo(moments.dtype).eps * jnp.max(jnp.abs(moments))
+    turn = jnp.where(apart, inside / jnp.where(apart, gap, 1), 0)
+    return (moments, axes), (jnp.diagonal(inside), axes @ turn)
+
+
+def _check(solid: str, **values: Any) -> None:
+    for what, value in values.items():
+        checks.positive(solid, what, value)
+
+
+def _check_tensor(tensor: Array, moments: Array) -> None:
+    if float(jnp.max(jnp.abs(tensor - tensor.T))) > 1e-6 * float(jnp.max(jnp.abs(tensor))):
+        raise ValueError(f"inertia: the tensor must be symmetric, got {tensor.tolist()}.")
+    checks.positive("inertia", "the principal moments", moments)
+    check_triangle("inertia", moments)
+
+
+def check_triangle(owner: str, moments: Any) -> None:
+    """Checks I₁ + I₂ ≥ I₃, which every real body satisfies.
+
+    Raises:
+        ValueError: one moment exceeds the sum of the others by more than round-off.
+    """
+    if checks.is_concrete(moments):
+        values = sorted(float(x) for x in moments)
+        if values[2] > (values[0] + values[1]) * (1 + 1e-5):
+            raise ValueError(
+                f"{owner}: principal moments {values} violate the triangle inequality"
+                " I₁ + I₂ ≥ I₃, which every distribution of mass satisfies."
+            )

@@ -1,0 +1,91 @@
+"""Where a body is and how it moves, as arrays for user functions and accessors.
+
+The hot path works on lanes instead (`model.bodies`); these classes are the readable face.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array
+from jaxcon.geometry import quaternion
+
+
+@pytree
+class Pose:
+    """Position and orientation of a frame in the world.
+
+    Attributes:
+        position: (2,) or (3,) [m].
+        orientation: angle () [rad] in the plane, unit quaternion (4,) in space, None for a particle.
+    """
+
+    position: Array
+    orientation: Array | None = None
+
+    @property
+    def rotation(self) -> Array:
+        """R, body to world: (2, 2) or (3, 3); the identity for a particle."""
+        if self.orientation is None:
+            return jnp.eye(self.position.shape[0], dtype=self.position.dtype)
+        if self.position.shape[0] == 3:
+            return quaternion.matrix(self.orientation)
+        c, s = jnp.cos(self.orientation), jnp.sin(self.orientation)
+        return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
+
+    def point(self, local: Array) -> Array:
+        """x + R s: a point of the body in the world frame."""
+        return self.position + self.direction(local)
+
+    def direction(self, local: Array) -> Array:
+        """R u: a direction of the body in the world frame."""
+        return self.rotation @ local
+
+    def local_point(self, world: Array) -> Array:
+        """Rᵀ (p − x): a world point in the body frame."""
+        return self.local_direction(world - self.position)
+
+    def local_direction(self, world: Array) -> Array:
+        """Rᵀ n: a world direction in the body frame."""
+        return self.rotation.T @ world
+
+
+@pytree
+class Motion(Pose):
+    """A pose and its rate of change.
+
+    Attributes:
+        velocity: of the frame's origin, world frame, (2,) or (3,) [m/s].
+        angular_velocity: () in the plane, (3,) in the body frame in space [rad/s]; None for a
+            particle.
+    """
+
+    velocity: Array = None  # type: ignore[assignment]
+    angular_velocity: Array | None = None
+
+    @property
+    def pose(self) -> Pose:
+        """The pose alone."""
+        return Pose(self.position, self.orientation)
+
+    def seen_from(self, offset: Pose | None) -> Motion:
+        """The motion of a frame fixed in this body at the pose `offset` in it."""
+        if offset is None:
+            return self
+        position, velocity = self.point(offset.position), self.point_velocity(offset.position)
+        if self.position.shape[0] == 2 or offset.orientation is None:
+            return Motion(position, self.orientation, velocity, self.angular_velocity)
+        turned = quaternion.multiply(self.orientation, offset.orientation)
+        omega = offset.rotation.T @ self.angular_velocity  # type: ignore[operator]
+        return Motion(position, turned, velocity, omega)
+
+    def point_velocity(self, local: Array) -> Array:
+        """ẋ + R (ω × s): the velocity of a point of the body, world frame [m/s]."""
+        if self.angular_velocity is None:
+            return self.velocity
+        if self.position.shape[0] == 3:
+            return self.velocity + self.rotation @ jnp.cross(self.angular_velocity, local)
+        lever = self.rotation @ local
+        turned = jnp.stack([-lever[1], lever[0]])
+        return self.velocity + self.angular_velocity * turned

@@ -1,0 +1,140 @@
+"""Unit quaternions `wxyz`, body to world.
+
+Every function takes arrays whose first axis enumerates components, or Vectors of lanes; trailing
+axes are batches. Angular velocities are in the body frame, so that q̇ = ½ q ⊗ (0, ω).
+
+References:
+    Solà, Quaternion kinematics for the error-state Kalman filter (2017), sections 1-4.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.core import numerics
+from jaxcon.core.lanes import Matrix, Vector, componentwise, plus, times
+from jaxcon.core.typing import Array, Lane
+
+IDENTITY = Vector(1.0, 0.0, 0.0, 0.0)
+
+
+@componentwise
+def multiply(p: Any, q: Any) -> Any:
+    """p ⊗ q: first turn by q, then by p.
+
+    Args:
+        p: (4, …).
+        q: (4, …).
+
+    Returns:
+        (4, …).
+    """
+    scalar, vector = split(p)
+    other, direction = split(q)
+    turned = direction * scalar + vector * other + vector.cross(direction)
+    return Vector(plus(times(scalar, other), times(-1, vector.dot(direction))), *turned)
+
+
+@componentwise
+def conjugate(q: Any) -> Any:
+    """q*: the inverse of a unit quaternion (4, …)."""
+    return Vector(q[0], *(times(-1, x) for x in q[1:]))
+
+
+@componentwise
+def rotate(q: Any, x: Any) -> Any:
+    """q x q*: a vector of the body (3, …) in the world frame."""
+    scalar, vector = split(q)
+    twice = vector.cross(x) * 2.0
+    return x + twice * scalar + vector.cross(twice)
+
+
+@componentwise
+def matrix(q: Any) -> Any:
+    """The rotation matrix R (3, 3, …) with R x = q x q*."""
+    return rotation(q)
+
+
+def rotation(q: Vector) -> Matrix:
+    """The rotation matrix of lanes, R x = q x q*."""
+    w, x, y, z = q
+    xx, yy, zz = times(x, x), times(y, y), times(z, z)
+    xy, xz, yz = times(x, y), times(x, z), times(y, z)
+    wx, wy, wz = times(w, x), times(w, y), times(w, z)
+
+    def diagonal(a: Lane, b: Lane) -> Lane:
+        return plus(1.0, times(-2.0, plus(a, b)))
+
+    def twice(a: Lane, b: Lane, sign: int) -> Lane:
+        return times(2.0, plus(a, times(sign, b)))
+
+    return Matrix(
+        Vector(diagonal(yy, zz), twice(xy, wz, -1), twice(xz, wy, 1)),
+        Vector(twice(xy, wz, 1), diagonal(xx, zz), twice(yz, wx, -1)),
+        Vector(twice(xz, wy, -1), twice(yz, wx, 1), diagonal(xx, yy)),
+    )
+
+
+@componentwise
+def derivative(q: Any, omega: Any) -> Any:
+    """q̇ = ½ q ⊗ (0, ω), ω (3, …) in the body frame [rad/s]."""
+    return multiply(q, Vector(0.0, *omega)) * 0.5
+
+
+@componentwise
+def exp(phi: Any) -> Any:
+    """The turn by ‖φ‖ about φ (3, …) [rad]: (cos ½‖φ‖, φ sin ½‖φ‖ / ‖φ‖), smooth at φ = 0."""
+    cos, sinc = numerics.cos_sinc(phi.dot(phi) * 0.25)
+    return Vector(cos, *(phi * (sinc * 0.5)))
+
+
+@componentwise
+def log(q: Any) -> Any:
+    """The rotation vector φ (3, …) [rad] of the shorter turn: exp(φ) = ± q, smooth at identity."""
+    scalar, vector = split(q)
+    sine = numerics.norm(vector)
+    half = jnp.arctan2(sine, jnp.abs(scalar))
+    series = 2 * (1 + sine * sine * (1 / 6 + sine * sine * (3 / 40)))
+    small = sine < 1e-3
+    scale = jnp.where(small, series, 2 * half / jnp.where(small, 1, sine))
+    return vector * jnp.where(scalar < 0, -scale, scale)
+
+
+@componentwise
+def normalize(q: Any) -> Any:
+    """q / ‖q‖ (4, …)."""
+    return numerics.unit(q)
+
+
+def from_axis_angle(axis: Any, angle: Any) -> Array:
+    """The turn by an angle () [rad] about an axis (3,) of any length but zero."""
+    direction = numerics.unit(Vector.of(jnp.asarray(axis)))
+    return exp(direction.stack() * angle)
+
+
+def from_matrix(r: Array) -> Array:
+    """The unit quaternion (4,) of a rotation matrix (3, 3), differentiable at every rotation.
+
+    The column of 4 q qᵀ with the largest diagonal entry, which is never near zero.
+
+    References:
+        Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978).
+    """
+    r00, r11, r22 = r[0, 0], r[1, 1], r[2, 2]
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]
+    outer = jnp.stack(
+        [
+            jnp.stack([1 + r00 + r11 + r22, x, y, z]),
+            jnp.stack([x, 1 + r00 - r11 - r22, xy, xz]),
+            jnp.stack([y, xy, 1 - r00 + r11 - r22, yz]),
+            jnp.stack([z, xz, yz, 1 - r00 - r11 + r22]),
+        ]
+    )
+    largest = outer[jnp.argmax(jnp.diagonal(outer))]
+    return largest / jnp.sqrt(jnp.sum(largest * largest))
+
+
+def split(q: Vector) -> tuple[Lane, Vector]:
+    """The scalar and the vector part."""
+    return q[0], Vector(*q[1:])

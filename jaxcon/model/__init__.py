@@ -1,0 +1,1 @@
+"""Floor 2: what a system is and where its coordinates lie."""

@@ -1,0 +1,162 @@
+"""How each kind of body moves: particles and rigid bodies, in the plane and in space."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.core.lanes import Vector, zeros
+from jaxcon.core.typing import Array
+from jaxcon.geometry import quaternion
+from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.model.frames import Frame, PlanarFrame, SpatialFrame
+
+
+@dataclass(frozen=True)
+class Particle:
+    """A point mass: q = x, v = ẋ."""
+
+    dim: int
+
+    @property
+    def n_q(self) -> int:
+        """Coordinates a body."""
+        return self.dim
+
+    @property
+    def n_v(self) -> int:
+        """Velocities a body."""
+        return self.dim
+
+    def frame(self, q: Vector, v: Vector) -> Any:
+        """The bodies' motion."""
+        return Frame(q, v)
+
+    def kinematics(self, q: Vector, v: Vector) -> Vector:
+        """q̇ = v."""
+        return v
+
+    def retract(self, q: Vector, step: Vector) -> Vector:
+        """q + Δ."""
+        return q + step
+
+    def normalize(self, q: Vector) -> Vector:
+        """Nothing to do."""
+        return q
+
+    def mass(self, mass: Array, moments: Any) -> Vector:
+        """The diagonal of M: m for each direction."""
+        return Vector(*(mass,) * self.dim)
+
+    def gyroscopic(self, v: Vector, moments: Any) -> Vector:
+        """None."""
+        return zeros(self.n_v)
+
+    def motion(self, q: Array, v: Array) -> Motion:
+        """The motion of one body for a user's function."""
+        return Motion(q, None, v, None)
+
+    def coordinates(self, motion: Motion) -> tuple[Array, Array]:
+        """q and v of one body."""
+        return motion.position, motion.velocity
+
+
+@dataclass(frozen=True)
+class PlanarRigid(Particle):
+    """A rigid body in the plane: q = (x, y, θ), v = q̇."""
+
+    dim: int = 2
+
+    @property
+    def n_q(self) -> int:
+        """Coordinates a body."""
+        return 3
+
+    @property
+    def n_v(self) -> int:
+        """Velocities a body."""
+        return 3
+
+    def frame(self, q: Vector, v: Vector) -> Any:
+        """The bodies' motion."""
+        return PlanarFrame.of(q, v)
+
+    def mass(self, mass: Array, moments: Array) -> Vector:
+        """The diagonal of M: (m, m, I)."""
+        return Vector(mass, mass, moments)
+
+    def motion(self, q: Array, v: Array) -> Motion:
+        """The motion of one body for a user's function."""
+        return Motion(q[:2], q[2], v[:2], v[2])
+
+    def coordinates(self, motion: Any) -> tuple[Array, Array]:
+        """q and v of one body."""
+        return (
+            jnp.append(motion.position, motion.orientation),
+            jnp.append(motion.velocity, motion.angular_velocity),
+        )
+
+
+@dataclass(frozen=True)
+class SpatialRigid(Particle):
+    """A rigid body in space: q = (x, quaternion wxyz), v = (ẋ world, ω body)."""
+
+    dim: int = 3
+
+    @property
+    def n_q(self) -> int:
+        """Coordinates a body."""
+        return 7
+
+    @property
+    def n_v(self) -> int:
+        """Velocities a body."""
+        return 6
+
+    def frame(self, q: Vector, v: Vector) -> Any:
+        """The bodies' motion."""
+        return SpatialFrame.of(q, v)
+
+    def kinematics(self, q: Vector, v: Vector) -> Vector:
+        """q̇ = (ẋ, ½ q ⊗ ω)."""
+        return Vector(*v[:3], *quaternion.derivative(Vector(*q[3:]), Vector(*v[3:])))
+
+    def retract(self, q: Vector, step: Vector) -> Vector:
+        """(x + Δx, normalized q ⊗ exp(Δφ)): exact for a constant body rate."""
+        turned = quaternion.multiply(Vector(*q[3:]), quaternion.exp(Vector(*step[3:])))
+        return Vector(*(Vector(*q[:3]) + Vector(*step[:3])), *quaternion.normalize(turned))
+
+    def normalize(self, q: Vector) -> Vector:
+        """Brings the quaternion back to unit length."""
+        return Vector(*q[:3], *quaternion.normalize(Vector(*q[3:])))
+
+    def mass(self, mass: Array, moments: Array) -> Vector:
+        """The diagonal of M: (m, m, m, I₁, I₂, I₃)."""
+        return Vector(mass, mass, mass, *Vector.of(moments))
+
+    def gyroscopic(self, v: Vector, moments: Array) -> Vector:
+        """−ω × Iω [N m], Euler's equations in the body frame."""
+        i1, i2, i3 = Vector.of(moments)
+        x, y, z = v[3:]
+        return Vector(*zeros(3), (i2 - i3) * y * z, (i3 - i1) * z * x, (i1 - i2) * x * y)
+
+    def motion(self, q: Array, v: Array) -> Motion:
+        """The motion of one body for a user's function."""
+        return Motion(q[:3], q[3:], v[:3], v[3:])
+
+    def coordinates(self, motion: Any) -> tuple[Array, Array]:
+        """q and v of one body."""
+        return (
+            jnp.concatenate([motion.position, motion.orientation]),
+            jnp.concatenate([motion.velocity, motion.angular_velocity]),
+        )
+
+
+def rest(pose: Pose) -> Motion:
+    """The motion of a frame that does not move."""
+    spin = None if pose.orientation is None else jnp.zeros_like(pose.position)
+    if pose.position.shape[0] == 2 and spin is not None:
+        spin = jnp.zeros((), pose.position.dtype)
+    return Motion(pose.position, pose.orientation, jnp.zeros_like(pose.position), spin)

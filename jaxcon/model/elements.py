@@ -1,0 +1,84 @@
+"""Equal elements side by side: the numbers of many joints or springs as lanes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core import checks
+from jaxcon.core.lanes import Vector
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array
+from jaxcon.model.layout import Place, take
+
+
+@pytree
+class Elements:
+    """Elements of one class on bodies of the same kinds.
+
+    Attributes:
+        params: by field, a lane (element,) or a Vector of such.
+        names: of the elements.
+        places: the bodies they act on, one Place for each side.
+    """
+
+    params: dict[str, Any]
+    names: tuple[str, ...] = static()
+    places: tuple[Place, ...] = static()
+
+    def frames(self, snapshot: Any) -> tuple[Any, ...]:
+        """The motion of the bodies on each side."""
+        return tuple(snapshot.frame(place) for place in self.places)
+
+    def get(self, i: int) -> dict[str, Any]:
+        """The numbers of one element, by field."""
+        return {field: element_at(x, i) for field, x in self.params.items()}
+
+    def set(self, changes: Mapping[str, Any]) -> Any:
+        """The elements with other numbers; `changes` by name and field."""
+        params = dict(self.params)
+        for i, name in enumerate(self.names):
+            for field, value in changes.get(name, {}).items():
+                params[field] = replace_at(f"{name}.{field}", params[field], i, value)
+        return dataclasses.replace(self, params=params)
+
+    def select(self, indices: tuple[int, ...]) -> Any:
+        """Some of the elements."""
+        places = [
+            Place(p.group, tuple(p.indices[i] for i in indices) if p.indices else ())
+            for p in self.places
+        ]
+        return dataclasses.replace(
+            self,
+            params=jax.tree.map(lambda x: take(x, indices), self.params),
+            names=tuple(self.names[i] for i in indices),
+            places=tuple(places),
+        )
+
+
+def stack(elements: list[dict[str, Any]]) -> dict[str, Any]:
+    """The numbers of elements side by side: arrays (), (n,) become lanes, Vectors of lanes."""
+    stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *elements)
+    return jax.tree.map(lambda x: x if x.ndim == 1 else Vector.of(x), stacked)
+
+
+def element_at(x: Any, i: int) -> Array:
+    """The number () or vector (n,) of one element."""
+    return Vector(*(lane[i] for lane in x)).stack() if isinstance(x, Vector) else x[i]
+
+
+def replace_at(owner: str, x: Any, i: int, value: Any) -> Any:
+    """The lanes with one element's number or vector replaced.
+
+    Raises:
+        ValueError: a wrong shape or dtype, naming the owner.
+    """
+    if not isinstance(x, Vector):
+        return x.at[i].set(checks.number(owner, "the new value", value, x.dtype))
+    new = checks.number(owner, "the new value", value, x[0].dtype, (len(x),))
+    pairs = zip(x, Vector.of(new), strict=True)
+    return Vector(*(lane.at[i].set(component) for lane, component in pairs))

@@ -1,0 +1,345 @@
+"""Force elements: springs, constant and user forces, wrenches as control.
+
+Each class describes one element for the user; its static methods say what many of them do, lane by
+lane, and are what the step traces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core import checks, numerics
+from jaxcon.core.lanes import Vector, times, zeros
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, Lane, PyTree
+from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import Elements
+from jaxcon.model.layout import Place
+
+Pulls = Iterable[tuple[Place, Vector]]
+
+
+@pytree
+class ForceElements(Elements):
+    """Force elements of one class, `law`."""
+
+    law: Any = static(default=None)
+
+    def pulls(self, snapshot: Any, control: Any) -> Pulls:
+        """The generalized forces on the bodies of each side."""
+        forces = self.law.forces(self.params, *self.frames(snapshot))
+        return zip(self.places, forces, strict=True)
+
+    def potential(self, snapshot: Any) -> Iterable[Lane]:
+        """The energy stored in each element [J]."""
+        return (self.law.potential(self.params, *self.frames(snapshot)),)
+
+
+@dataclass(frozen=True)
+class Spring:
+    """A spring and damper between two points: tension T = k (‖d‖ − l) + c d‖d‖/dt.
+
+    At ‖d‖ = 0 the force has no direction and is zero.
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        stiffness: k [N/m].
+        damping: c [N s/m].
+        rest_length: l [m]; the distance at assembly unless given.
+        point_a, point_b: world points at assembly, (dim,) [m]; the centres of mass unless given.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    stiffness: Any
+    damping: Any = 0.0
+    rest_length: Any = None
+    point_a: Any = None
+    point_b: Any = None
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The names of the bodies it acts on."""
+        return (self.body_a, self.body_b)
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The numbers of the element, anchors in the frames of the bodies at assembly."""
+        dtype, shape = a.position.dtype, a.position.shape
+        start = _point(self, "point_a", self.point_a, a, dtype, shape)
+        end = _point(self, "point_b", self.point_b, b, dtype, shape)
+        owner = f"spring '{self.name}'"
+        length = numerics.norm(end - start) if self.rest_length is None else self.rest_length
+        params = {
+            "anchor_a": a.local_point(start),
+            "anchor_b": b.local_point(end),
+            "stiffness": checks.number(owner, "stiffness", self.stiffness, dtype),
+            "damping": checks.number(owner, "damping", self.damping, dtype),
+            "rest_length": checks.number(owner, "rest_length", length, dtype),
+        }
+        for field in ("stiffness", "damping", "rest_length"):
+            checks.positive(owner, field, params[field], strictly=False)
+        return params
+
+    @staticmethod
+    def forces(p: dict[str, Any], a: Any, b: Any) -> tuple[Vector, Vector]:
+        """−T d/‖d‖ at the second point and its opposite at the first."""
+        start, end = a.point(p["anchor_a"]), b.point(p["anchor_b"])
+        d = end.position - start.position
+        length = numerics.norm(d)
+        direction = d * numerics.safe_divide(1.0, length)
+        speed = direction.dot(end.velocity - start.velocity)
+        tension = p["stiffness"] * (length - p["rest_length"]) + p["damping"] * speed
+        force = direction * -tension
+        return start.pull(-force), end.pull(force)
+
+    @staticmethod
+    def potential(p: dict[str, Any], a: Any, b: Any) -> Lane:
+        """½ k (‖d‖ − l)²."""
+        d = b.point(p["anchor_b"]).position - a.point(p["anchor_a"]).position
+        return p["stiffness"] * (numerics.norm(d) - p["rest_length"]) ** 2 / 2
+
+
+@dataclass(frozen=True)
+class Force:
+    """A constant force, fixed in the world frame, at a point of a body.
+
+    Attributes:
+        name: unique in the scene.
+        body: its name.
+        force: (dim,) [N].
+        point: world point at assembly, (dim,) [m]; the centre of mass unless given.
+    """
+
+    name: str
+    body: str
+    force: Any
+    point: Any = None
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The name of the body it acts on."""
+        return (self.body,)
+
+    def attach(self, a: Pose) -> dict[str, Array]:
+        """The numbers of the element."""
+        dtype, shape = a.position.dtype, a.position.shape
+        start = _point(self, "point", self.point, a, dtype, shape)
+        force = checks.number(f"force '{self.name}'", "force", self.force, dtype, shape)
+        checks.finite(f"force '{self.name}'", "force", force)
+        return {"anchor": a.local_point(start), "force": force}
+
+    @staticmethod
+    def forces(p: dict[str, Any], a: Any) -> tuple[Vector]:
+        """The force at the point."""
+        return (a.point(p["anchor"]).pull(Vector.of(p["force"])),)
+
+    @staticmethod
+    def potential(p: dict[str, Any], a: Any) -> Lane:
+        """−F · p."""
+        return times(-1, a.point(p["anchor"]).position.dot(Vector.of(p["force"])))
+
+
+@dataclass(frozen=True)
+class JointSpring:
+    """A spring and damper about a joint's coordinate θ: force −k (θ − θ₀) − c θ̇.
+
+    θ is the angle of a revolute joint [rad] or the travel of a prismatic one [m], from assembly. In
+    space the angle is measured in [−π, π].
+
+    Attributes:
+        name: unique in the scene.
+        joint: name of the joint.
+        stiffness: k [N m/rad] or [N/m].
+        damping: c [N m s/rad] or [N s/m].
+        rest: θ₀ [rad] or [m].
+    """
+
+    name: str
+    joint: str
+    stiffness: Any
+    damping: Any = 0.0
+    rest: Any = 0.0
+
+    def attach(self, dtype: Any) -> dict[str, Array]:
+        """The numbers of the element."""
+        owner = f"joint spring '{self.name}'"
+        params = {
+            "stiffness": checks.number(owner, "stiffness", self.stiffness, dtype),
+            "damping": checks.number(owner, "damping", self.damping, dtype),
+            "rest": checks.number(owner, "rest", self.rest, dtype),
+        }
+        for field in ("stiffness", "damping"):
+            checks.positive(owner, field, params[field], strictly=False)
+        return params
+
+
+@pytree
+class JointSprings(Elements):
+    """Springs about the coordinates of joints of one group."""
+
+    group: int = static(default=0)
+    joints: tuple[int, ...] = static(default=())
+
+    def pulls(self, snapshot: Any, control: Any) -> Pulls:
+        """The generalized forces on the bodies of each side."""
+        coordinate = self._coordinate(snapshot)
+        stretch = coordinate.value - self.params["rest"]
+        force = -self.params["stiffness"] * stretch - self.params["damping"] * coordinate.rate
+        return [(p, pull * force) for p, pull in zip(self.places, coordinate.pulls, strict=True)]
+
+    def potential(self, snapshot: Any) -> Iterable[Lane]:
+        """½ k (θ − θ₀)²."""
+        stretch = self._coordinate(snapshot).value - self.params["rest"]
+        return (self.params["stiffness"] * stretch**2 / 2,)
+
+    def _coordinate(self, snapshot: Any) -> Any:
+        joints = snapshot.system.constraints[self.group].select(self.joints)
+        return joints.coordinate(snapshot)
+
+
+@dataclass(frozen=True)
+class ExternalWrench:
+    """A wrench on a body as control: (F, τ) in the world frame, at a point of the body.
+
+    Its channel in the control array has dim entries for a particle, 3 in the plane (F_x, F_y, τ)
+    and 6 in space; `system.layout.control(name)` is its slice.
+
+    Attributes:
+        name: unique in the scene; also that of the control channel.
+        body: name of the body.
+        point: where the force acts, world point at assembly, (dim,) [m]; the centre of
+            mass unless given.
+    """
+
+    name: str
+    body: str
+    point: Any = None
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The name of the body it acts on."""
+        return (self.body,)
+
+    def attach(self, a: Pose) -> dict[str, Array]:
+        """The numbers of the element."""
+        dtype, shape = a.position.dtype, a.position.shape
+        return {"anchor": a.local_point(_point(self, "point", self.point, a, dtype, shape))}
+
+
+@pytree
+class ExternalWrenches(Elements):
+    """Wrenches whose first control inputs lie at `starts`."""
+
+    starts: tuple[int, ...] = static(default=())
+
+    def pulls(self, snapshot: Any, control: Any) -> Pulls:
+        """The generalized forces on the bodies; none where there is no control."""
+        if control is None:
+            return []
+        (frame,) = self.frames(snapshot)
+        n = snapshot.system.layout.groups[self.places[0].group].kind.n_v
+        wrench = Vector(*(control[np.asarray(self.starts) + i] for i in range(n)))
+        return [(self.places[0], world_wrench(frame, self.params["anchor"], wrench))]
+
+    def potential(self, snapshot: Any) -> Iterable[Lane]:
+        """None."""
+        return ()
+
+
+@dataclass(frozen=True)
+class CustomForce:
+    """A user's force on named bodies: `function(*motions, t, control, params)` → wrenches.
+
+    The function gets the `Motion` of each body and returns one wrench for each (a tuple where there
+    are several): the force, then the torque about the body's position, world frame: (dim,) for a
+    particle, (3,) in the plane, (6,) in space.
+
+    Attributes:
+        name: unique in the scene; also that of the control channel, if there is one.
+        bodies: their names.
+        function: pure, hashable; define it once, since every new function object is a new trace.
+        params: any pytree of arrays.
+        controls: number of control inputs; the function gets them as (controls,), or None.
+    """
+
+    name: str
+    bodies: tuple[str, ...]
+    function: Callable[..., Any]
+    params: PyTree = None
+    controls: int = 0
+
+
+@pytree
+class CustomForces(Elements):
+    """One user's force; `params` are the user's own."""
+
+    function: Any = static(default=None)
+    channel: tuple[int, int] = static(default=(0, 0))
+    bodies: tuple[str, ...] = static(default=())
+
+    def get(self, i: int) -> Any:
+        """The user's parameters."""
+        return {"params": self.params}
+
+    def set(self, changes: Any) -> CustomForces:
+        """With other parameters."""
+        new = changes.get(self.names[0], {}).get("params", self.params)
+        return CustomForces(
+            new, self.names, self.places, self.function, self.channel, self.bodies
+        )
+
+    def pulls(self, snapshot: Any, control: Any) -> Pulls:
+        """The generalized forces on the bodies."""
+        motions = [snapshot.motion(name) for name in self.bodies]
+        start, stop = self.channel
+        own = control[start:stop] if control is not None and stop > start else None
+        wrenches = self.function(*motions, snapshot.t, own, self.params)
+        wrenches = wrenches if isinstance(wrenches, tuple) else (wrenches,)
+        for place, wrench, name in zip(self.places, wrenches, self.bodies, strict=True):
+            frame = snapshot.frame(place)
+            n = snapshot.system.columns(place).components
+            if jnp.shape(wrench) != (n,):
+                raise ValueError(
+                    f"force '{self.names[0]}': the wrench on '{name}' must have shape ({n},),"
+                    f" got {jnp.shape(wrench)}."
+                )
+            lanes = Vector(*(x[None] for x in wrench))
+            offset = snapshot.system.offsets.get(name)
+            anchor = None if offset is None else Vector(*(x[None] for x in offset.position))
+            yield place, world_wrench(frame, anchor, lanes)
+
+    def potential(self, snapshot: Any) -> Iterable[Lane]:
+        """None."""
+        return ()
+
+
+def world_wrench(frame: Any, anchor: Any, wrench: Vector) -> Vector:
+    """The generalized force of (F, τ) in the world frame, F at an anchor (the origin if None)."""
+    dim = len(frame.position)
+    force, torque = Vector(*wrench[:dim]), wrench[dim:]
+    pull = frame.point(zeros(dim) if anchor is None else anchor).pull(force)
+    if not torque:
+        return pull
+    local = torque[0] if dim == 2 else frame.rotation.T @ Vector(*torque)
+    return pull + frame.turn(local)
+
+
+def _point(owner: Any, what: str, point: Any, pose: Pose, dtype: Any, shape: Any) -> Array:
+    if point is None:
+        return pose.position
+    point = checks.number(f"'{owner.name}'", what, point, dtype, shape)
+    checks.finite(f"'{owner.name}'", what, point)
+    if pose.orientation is None and checks.is_concrete((point, pose.position)):
+        if not np.allclose(point, pose.position, atol=1e-6):
+            raise ValueError(
+                f"'{owner.name}': {what} is {np.asarray(point).tolist()}, but the particle has no"
+                f" other point than its position {np.asarray(pose.position).tolist()}."
+            )
+    return point

@@ -1,0 +1,94 @@
+"""The user's own coordinates: q with M(q, θ) and f(q, v, t, u, θ)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.model.layout import Place
+from jaxcon.model.state import Energy
+from jaxcon.model.system import Snapshot
+from jaxcon.solvers.jacobian import Columns
+from jaxcon.solvers.saddle import Diagonal, Full, Mass
+
+WHOLE = Place(0, (0,))
+"""All coordinates at once, as the one element of one group."""
+
+
+@pytree
+class GeneralizedCoordinates:
+    """A system on the user's own coordinates; `GeneralizedSystem` makes one.
+
+    Attributes:
+        constraints: groups of one constraint each.
+        params: θ, any pytree; shared by mass, force, potential and constraints.
+        mass_function, force_function, potential: the user's functions.
+        size: number of coordinates, where known.
+    """
+
+    constraints: tuple[Any, ...]
+    params: PyTree
+    mass_function: Callable[..., Array] = static()
+    force_function: Callable[..., Array] = static()
+    potential: Callable[..., Array] | None = static(default=None)
+    size: int | None = static(default=None)
+
+    @property
+    def n_v(self) -> int:
+        """Number of velocities."""
+        if self.size is None:
+            raise ValueError("GeneralizedSystem: give size=, or call jc.init with q first.")
+        return self.size
+
+    def snapshot(self, q: Array, v: Array, t: Any) -> Snapshot:
+        """The system at one instant."""
+        return Snapshot(dataclasses.replace(self, size=v.shape[0]), q, v, t)
+
+    def mass(self, q: Array) -> Mass:
+        """M(q, θ), (n_v, n_v), or its diagonal (n_v,) where the user's function gives that."""
+        m = self.mass_function(q, self.params)
+        n = q.shape[0]
+        if m.shape not in ((n,), (n, n)):
+            raise ValueError(
+                f"GeneralizedSystem: mass must return ({n},) or ({n}, {n}), got {m.shape}."
+            )
+        return Diagonal(m) if m.ndim == 1 else Full(m)
+
+    def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
+        """f(q, v, t, u, θ), (n_v,)."""
+        f = self.force_function(q, v, t, control, self.params)
+        if f.shape != q.shape:
+            raise ValueError(f"GeneralizedSystem: force must return {q.shape}, got {f.shape}.")
+        return f
+
+    def kinematics(self, q: Array, v: Array) -> Array:
+        """q̇ = v."""
+        return v
+
+    def retract(self, q: Array, step: Array) -> Array:
+        """q + Δ."""
+        return q + step
+
+    def normalize(self, q: Array) -> Array:
+        """q as it is."""
+        return q
+
+    def columns(self, place: Place) -> Columns:
+        """All velocities."""
+        return Columns(0, self.n_v, 1, place.indices)
+
+    def energy(self, q: Array, v: Array, t: Any) -> Energy:
+        """½ vᵀMv, and the user's potential(q, t, θ) where there is one [J]."""
+        potential = jnp.zeros((), q.dtype)
+        if self.potential is not None:
+            potential = self.potential(q, t, self.params)
+        return Energy(v @ self.mass(q).apply(v) / 2, potential)
+
+    def with_params(self, params: PyTree) -> GeneralizedCoordinates:
+        """The same system with another θ; nothing is retraced by it."""
+        return dataclasses.replace(self, params=params)

@@ -1,0 +1,157 @@
+"""Where everything lies in the flat arrays: host data, hashable, part of the trace.
+
+Bodies of one kind form a group. Inside a group coordinates are component-major: all x, then all y,
+and so on, so that reshaping a slice of q to (component, body) moves nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxcon.core.lanes import Vector
+from jaxcon.core.typing import Array, Lane
+
+WORLD = "world"
+"""The name of the frame that does not move."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Bodies of one kind, side by side.
+
+    Attributes:
+        kind: how such a body moves (`model.bodies`).
+        names: of its bodies.
+        q, v: where the group's coordinates and velocities begin.
+    """
+
+    kind: Any
+    names: tuple[str, ...]
+    q: int
+    v: int
+
+    def unpack(self, q: Array, v: Array) -> tuple[Vector, Vector]:
+        """The group's coordinates and velocities by components, each lane (body, …)."""
+        return (
+            _block(q, self.q, self.kind.n_q, len(self.names)),
+            _block(v, self.v, self.kind.n_v, len(self.names)),
+        )
+
+
+def _block(x: Array, start: int, components: int, bodies: int) -> Vector:
+    lanes = jax.lax.slice_in_dim(x, start, start + components * bodies)
+    return Vector.of(lanes.reshape((components, bodies, *x.shape[1:])))
+
+
+@dataclass(frozen=True)
+class Place:
+    """Which bodies a set of elements acts on: those with these indices in one group.
+
+    `group` is None for frames that are fixed to the world.
+    """
+
+    group: int | None
+    indices: tuple[int, ...]
+
+    def take(self, x: Lane) -> Lane:
+        """The lanes of these bodies, from a lane (body, …)."""
+        return take(x, self.indices)
+
+
+def take(x: Lane, indices: tuple[int, ...]) -> Lane:
+    """x[indices] along the first axis: nothing, a slice, or a gather, as needed."""
+    if not isinstance(x, jax.Array):
+        return x
+    first = indices[0]
+    if indices == tuple(range(first, first + len(indices))):
+        whole = len(indices) == x.shape[0]
+        return x if whole else jax.lax.slice_in_dim(x, first, first + len(indices))
+    return x[np.asarray(indices)]
+
+
+def accumulate(target: Lane, indices: tuple[int, ...], x: Lane, bodies: int) -> Lane:
+    """target + Σ x over the bodies it acts on, from lanes (element, …) to a lane (body, …)."""
+    if not isinstance(x, jax.Array):
+        if x == 0:
+            return target
+        raise TypeError("A force component must be an array or the number 0.")
+    if indices == tuple(range(bodies)):
+        return target + x
+    return target.at[np.asarray(indices)].add(x)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The map from names to places.
+
+    Attributes:
+        dim: 2 or 3.
+        groups: of bodies with coordinates, in the order of q.
+        fixed: names of the frames fixed to the world.
+        controls: name and slice of each control channel.
+    """
+
+    dim: int
+    groups: tuple[Group, ...]
+    fixed: tuple[str, ...]
+    controls: tuple[tuple[str, int, int], ...]
+
+    @property
+    def n_q(self) -> int:
+        """Number of position coordinates."""
+        return sum(g.kind.n_q * len(g.names) for g in self.groups)
+
+    @property
+    def n_v(self) -> int:
+        """Number of velocities."""
+        return sum(g.kind.n_v * len(g.names) for g in self.groups)
+
+    @property
+    def n_u(self) -> int:
+        """Number of control inputs."""
+        return max((stop for _, _, stop in self.controls), default=0)
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies with coordinates."""
+        return tuple(name for group in self.groups for name in group.names)
+
+    def locate(self, name: str) -> tuple[int, int]:
+        """Group and index of a body.
+
+        Raises:
+            ValueError: no body has this name, or it has no coordinates.
+        """
+        for i, group in enumerate(self.groups):
+            if name in group.names:
+                return i, group.names.index(name)
+        reason = "is fixed to the world" if name in (WORLD, *self.fixed) else "is unknown"
+        raise ValueError(f"body '{name}' {reason}; the bodies that move are {list(self.bodies)}.")
+
+    def q(self, name: str) -> np.ndarray:
+        """Indices of a body's coordinates in q."""
+        group, index = self.locate(name)
+        g = self.groups[group]
+        return g.q + index + len(g.names) * np.arange(g.kind.n_q)
+
+    def v(self, name: str) -> np.ndarray:
+        """Indices of a body's velocities in v."""
+        group, index = self.locate(name)
+        g = self.groups[group]
+        return g.v + index + len(g.names) * np.arange(g.kind.n_v)
+
+    def control(self, name: str) -> slice:
+        """Where a control channel lies in the control array.
+
+        Raises:
+            ValueError: no element has a control channel of this name.
+        """
+        for owner, start, stop in self.controls:
+            if owner == name:
+                return slice(start, stop)
+        known = [owner for owner, _, _ in self.controls]
+        raise ValueError(f"'{name}' has no control channel; those that have are {known}.")

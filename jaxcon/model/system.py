@@ -1,0 +1,237 @@
+"""Bodies in the plane or in space: their mass, the forces on them, and how they move."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core import checks
+from jaxcon.core.lanes import Vector, total, zeros
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, Lane
+from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.model.bodies import rest
+from jaxcon.model.elements import element_at, replace_at
+from jaxcon.model.frames import WorldFrame
+from jaxcon.model.layout import Layout, Place, accumulate
+from jaxcon.model.state import Energy
+from jaxcon.solvers.jacobian import Columns
+from jaxcon.solvers.saddle import Diagonal
+
+
+@pytree
+class MassProperties:
+    """Of the bodies of one group.
+
+    Attributes:
+        mass: (bodies,) [kg].
+        moments: (bodies,) in the plane, in space a Vector of three such [kg m²]; None for
+            particles.
+    """
+
+    mass: Array
+    moments: Any
+
+
+class Snapshot:
+    """A system at one instant: the frames of its bodies, computed once and shared."""
+
+    def __init__(self, system: Any, q: Array, v: Array, t: Any) -> None:
+        self.system, self.q, self.v, self.t = system, q, v, t
+
+    @cached_property
+    def frames(self) -> tuple[Any, ...]:
+        """The motion of each group of bodies."""
+        groups = self.system.layout.groups
+        return tuple(g.kind.frame(*g.unpack(self.q, self.v)) for g in groups)
+
+    def motion(self, name: str) -> Motion:
+        """The motion of one body as arrays, for a user's function."""
+        return self.system.motion(name, self.q, self.v)
+
+    def map(self, function: Any) -> Snapshot:
+        """The same with every number replaced by a function of it."""
+        return Snapshot(*jax.tree.map(function, (self.system, self.q, self.v, self.t)))
+
+    def frame(self, place: Place) -> Any:
+        """The motion of some bodies of one group, or of the world."""
+        if place.group is None:
+            return WorldFrame(self.system.layout.dim)
+        return self.frames[place.group].gather(place.take)
+
+
+@pytree
+class BodySystem:
+    """Particles and rigid bodies under forces and constraints; `Scene.build` makes one.
+
+    Attributes:
+        gravity: (dim,) [m/s²].
+        inertia: mass properties of each group of bodies.
+        constraints: groups of equal constraints.
+        forces: groups of equal force elements.
+        offsets: by name, the body's own frame as given by the user, in its principal frame; only
+            for bodies where they differ.
+        fixed: by name, the pose of each frame that is fixed to the world.
+        layout: names and indices.
+    """
+
+    gravity: Array
+    inertia: tuple[MassProperties, ...]
+    constraints: tuple[Any, ...]
+    forces: tuple[Any, ...]
+    offsets: dict[str, Pose]
+    fixed: dict[str, Pose]
+    layout: Layout = static()
+
+    @property
+    def n_v(self) -> int:
+        """Number of velocities."""
+        return self.layout.n_v
+
+    def snapshot(self, q: Array, v: Array, t: Any) -> Snapshot:
+        """The system at one instant."""
+        return Snapshot(self, q, v, t)
+
+    def mass(self, q: Array) -> Diagonal:
+        """M: constant and diagonal, since frames lie at centres of mass along principal axes."""
+        groups = zip(self.layout.groups, self.inertia, strict=True)
+        return Diagonal(_join([g.kind.mass(p.mass, p.moments) for g, p in groups], q))
+
+    def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
+        """f (n_v,): gravity, gyroscopic force −ω × Iω, force elements and control."""
+        snapshot = self.snapshot(q, v, t)
+        forces = [list(self._own_force(i, q, v)) for i in range(len(self.layout.groups))]
+        for element in self.forces:
+            for place, pull in element.pulls(snapshot, control):
+                if place.group is None:
+                    continue
+                bodies = len(self.layout.groups[place.group].names)
+                target = forces[place.group]
+                for component, x in enumerate(pull):
+                    target[component] = accumulate(target[component], place.indices, x, bodies)
+        return _join([Vector(*f) for f in forces], q)
+
+    def _own_force(self, group: int, q: Array, v: Array) -> Vector:
+        """Gravity and gyroscopic force on the bodies of a group."""
+        layout, properties = self.layout.groups[group], self.inertia[group]
+        _, velocity = layout.unpack(q, v)
+        weight = [properties.mass * g for g in Vector.of(self.gravity)]
+        rest = zeros(layout.kind.n_v - self.layout.dim)
+        spread = jnp.zeros_like(velocity[0])
+        gyroscopic = layout.kind.gyroscopic(velocity, properties.moments)
+        return (Vector(*weight, *rest) + gyroscopic).map(lambda x: spread + x)
+
+    def kinematics(self, q: Array, v: Array) -> Array:
+        """q̇ (n_q,) of the velocities v."""
+        return self._each("kinematics", q, v)
+
+    def retract(self, q: Array, step: Array) -> Array:
+        """q ⊕ Δ: moves along a finite velocity step Δ = h v (n_v,), rotations by their exponential."""
+        return self._each("retract", q, step)
+
+    def normalize(self, q: Array) -> Array:
+        """q with its quaternions brought back to unit length."""
+        if all(g.kind.n_q == g.kind.n_v for g in self.layout.groups):
+            return q
+        v = jnp.zeros((self.n_v, *q.shape[1:]), q.dtype)
+        groups = self.layout.groups
+        return _join([g.kind.normalize(g.unpack(q, v)[0]) for g in groups], q)
+
+    def _each(self, verb: str, q: Array, v: Array) -> Array:
+        groups = self.layout.groups
+        return _join([getattr(g.kind, verb)(*g.unpack(q, v)) for g in groups], q)
+
+    def columns(self, place: Place) -> Columns:
+        """Where the velocities of some bodies lie in v."""
+        group = self.layout.groups[place.group or 0]
+        return Columns(group.v, group.kind.n_v, len(group.names), place.indices)
+
+    def motion(self, name: str, q: Array, v: Array) -> Motion:
+        """The motion of a body in the frame in which the user gave it, as arrays.
+
+        Raises:
+            ValueError: the name is unknown.
+        """
+        if name in self.fixed:
+            return rest(self.fixed[name])
+        return self.principal_motion(name, q, v).seen_from(self.offsets.get(name))
+
+    def principal_motion(self, name: str, q: Array, v: Array) -> Motion:
+        """The motion of a body's principal frame at its centre of mass, as arrays."""
+        kind = self.layout.groups[self.layout.locate(name)[0]].kind
+        return kind.motion(q[self.layout.q(name)], v[self.layout.v(name)])
+
+    def energy(self, q: Array, v: Array, t: Any) -> Energy:
+        """½ vᵀMv, and the potential of gravity and springs; user forces have none [J]."""
+        snapshot = self.snapshot(q, v, t)
+        potential: Lane = 0.0
+        for frame, properties in zip(snapshot.frames, self.inertia, strict=True):
+            height = frame.position.dot(Vector.of(self.gravity))
+            potential = potential - jnp.sum(properties.mass * height)
+        stored = total(jnp.sum(x) for f in self.forces for x in f.potential(snapshot))
+        return Energy(jnp.sum(self.mass(q).values * v * v) / 2, potential + stored)
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """Every number by name: `gravity`, and for each body, constraint and force its fields."""
+        result: dict[str, Any] = {"gravity": self.gravity}
+        for group, properties in zip(self.layout.groups, self.inertia, strict=True):
+            for i, name in enumerate(group.names):
+                fields = {"mass": properties.mass[i]}
+                if properties.moments is not None:
+                    fields["inertia"] = element_at(properties.moments, i)
+                result[name] = fields
+        for element in (*self.constraints, *self.forces):
+            result.update({name: element.get(i) for i, name in enumerate(element.names)})
+        return result
+
+    def with_params(self, changes: Mapping[str, Any]) -> BodySystem:
+        """The same system with other numbers; nothing is retraced by it.
+
+        Args:
+            changes: as `params`, as much of it as changes: `{"rod": {"length": 2.0}}`.
+
+        Raises:
+            ValueError: an unknown name or field, or a wrong shape.
+        """
+        known = self.params
+        for name, fields in changes.items():
+            if name not in known:
+                raise ValueError(f"with_params: '{name}' is unknown; known are {list(known)}.")
+            unknown = set(fields) - set(known[name]) if isinstance(known[name], dict) else set()
+            if unknown:
+                raise ValueError(f"'{name}' has no {unknown}, it has {set(known[name])}.")
+        gravity = self.gravity
+        if "gravity" in changes:
+            shape = (self.layout.dim,)
+            gravity = checks.number("gravity", "it", changes["gravity"], gravity.dtype, shape)
+        return dataclasses.replace(
+            self,
+            gravity=gravity,
+            inertia=tuple(
+                _with_inertia(p, g.names, changes)
+                for g, p in zip(self.layout.groups, self.inertia, strict=True)
+            ),
+            constraints=tuple(element.set(changes) for element in self.constraints),
+            forces=tuple(element.set(changes) for element in self.forces),
+        )
+
+
+def _with_inertia(p: MassProperties, names: tuple[str, ...], changes: Mapping[str, Any]) -> Any:
+    fields = {"mass": p.mass, "inertia": p.moments}
+    for i, name in enumerate(names):
+        for field, value in changes.get(name, {}).items():
+            fields[field] = replace_at(f"{name}.{field}", fields[field], i, value)
+    return MassProperties(fields["mass"], fields["inertia"])
+
+
+def _join(groups: list[Vector], like: Array) -> Array:
+    """One flat array, component-major inside each group."""
+    if not groups:
+        return jnp.zeros((0, *like.shape[1:]), like.dtype)
+    return jnp.concatenate([x for group in groups for x in group])

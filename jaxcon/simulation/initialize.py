@@ -1,0 +1,64 @@
+"""The first state of a world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints.custom import Custom, check_function
+from jaxcon.core import checks
+from jaxcon.core.status import Status
+from jaxcon.model.state import State
+from jaxcon.simulation.method import Method
+
+
+def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
+    """A state at q and v with the memory of the method.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        method: whose stabiliser may need memory.
+        q: positions, (n_q,).
+        v: velocities, (n_v,).
+        time: () [s].
+
+    Returns:
+        The state; nothing is projected.
+
+    Raises:
+        ValueError: wrong shapes, mixed dtypes, or a user's function that returns the wrong shape.
+    """
+    dtype = getattr(q, "dtype", None) or getattr(v, "dtype", None) or jnp.result_type(float)
+    if not jnp.issubdtype(dtype, jnp.floating):
+        dtype = jnp.result_type(float)
+    layout = getattr(system, "layout", None)
+    n_q = jnp.shape(q) if layout is None else (layout.n_q,)
+    if len(n_q) != 1:
+        raise ValueError(f"init: q must have shape (n_q,), got {n_q}.")
+    q = checks.number("init", "q", q, dtype, n_q)
+    v = checks.number("init", "v", v, dtype, n_q if layout is None else (layout.n_v,))
+    check_dtype(system, dtype)
+    snapshot = system.snapshot(q, v, jnp.zeros((), dtype))
+    for group in snapshot.system.constraints:
+        if isinstance(group, Custom):
+            check_function(group, snapshot)
+    status = jnp.asarray(Status.OK, jnp.int32)
+    memory = method.stabilizer.init(system, q, v)
+    return State(q, v, jnp.asarray(time, dtype), status, memory)
+
+
+def check_dtype(system: Any, dtype: Any) -> None:
+    """Checks that the system's numbers have the dtype of the state.
+
+    Raises:
+        ValueError: they have another floating dtype.
+    """
+    for leaf in jax.tree.leaves(system):
+        got = getattr(leaf, "dtype", dtype)
+        if jnp.issubdtype(got, jnp.floating) and got != dtype:
+            raise ValueError(
+                f"the state is {jnp.dtype(dtype).name}, but the system holds {got}: mixed dtypes"
+                " are not promoted; build both with one dtype."
+            )

@@ -1,0 +1,68 @@
+"""What happens to a world that fails: it stops, and its gradient with it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core.status import Status
+from jaxcon.core.typing import Array, PyTree
+
+
+def contain(function: Callable[..., Any], args: PyTree) -> Any:
+    """function(*args), with no gradient through a world that failed.
+
+    A forward `where` is not enough: the transpose of a NaN derivative multiplies a zero cotangent
+    by NaN. So tangents are masked on both sides of the linearized function, T ↦ P (f′ (P T)) with
+    P = 1 in healthy worlds and 0 in failed ones; its transpose is masked on both sides as well, and
+    the gradient by parameters shared between worlds is that of the healthy ones.
+
+    Args:
+        function: returns a pytree and the status of this world, ().
+        args: pytree of its arguments.
+
+    Returns:
+        What the function returns.
+    """
+    leaves, structure = jax.tree.flatten(args)
+    arrays = [jnp.asarray(x) for x in leaves]
+    inexact = [jnp.issubdtype(x.dtype, jnp.inexact) for x in arrays]
+
+    def call(floats: list[Array], others: list[Array]) -> Any:
+        iterators = {True: iter(floats), False: iter(others)}
+        merged = [next(iterators[flag]) for flag in inexact]
+        return function(*jax.tree.unflatten(structure, merged))
+
+    contained = jax.custom_jvp(call)
+
+    @contained.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        floats, others = primals
+        output, pushforward = jax.linearize(lambda x: call(x, others), floats)
+        healthy = output[1] == Status.OK
+        return output, _mask(healthy, pushforward(_mask(healthy, tangents[0])))
+
+    floats = [x for x, flag in zip(arrays, inexact, strict=True) if flag]
+    others = [x for x, flag in zip(arrays, inexact, strict=True) if not flag]
+    return contained(floats, others)
+
+
+def keep(healthy: Array, new: PyTree, old: PyTree) -> PyTree:
+    """The new values in healthy worlds, the old ones in failed worlds."""
+    return jax.tree.map(lambda x, y: jnp.where(healthy, x, y), new, old)
+
+
+def stop_failed(status: Array, tree: PyTree) -> PyTree:
+    """The same values, without a gradient where the world failed."""
+    healthy = status == Status.OK
+    return keep(healthy, tree, jax.lax.stop_gradient(tree))
+
+
+def _mask(healthy: Array, tangents: PyTree) -> PyTree:
+    def mask(x: Any) -> Any:
+        return x if x.dtype == jax.dtypes.float0 else jnp.where(healthy, x, 0)
+
+    return jax.tree.map(mask, tangents)

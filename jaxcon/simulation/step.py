@@ -1,0 +1,136 @@
+"""One step: linearize, assemble, solve, advance, correct."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints.rows import Violation
+from jaxcon.core import status
+from jaxcon.core.pytree import pytree
+from jaxcon.core.status import Status
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics.forward import accelerate
+from jaxcon.model.state import State
+from jaxcon.simulation.initialize import check_dtype
+from jaxcon.simulation.method import Method
+from jaxcon.simulation.recovery import contain, keep
+from jaxcon.simulation.stability import warn_if_unstable
+from jaxcon.solvers.saddle import Solution
+
+
+@pytree
+class StepInfo:
+    """What a step saw at its start; zeros in a world that failed.
+
+    Attributes:
+        acceleration: a, (n_v,).
+        multipliers: λ, (n_c,).
+        violation: φ and φ̇ by constraint.
+        status: of the world after the step, ().
+    """
+
+    acceleration: Array
+    multipliers: Array
+    violation: Violation
+    status: Array
+
+
+def step(
+    system: Any, method: Method, state: State, control: PyTree, dt: Any
+) -> tuple[State, StepInfo]:
+    """The state one step later. Pure: jit, vmap, grad, jvp and scan it.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        method: integrator, stabiliser and solver.
+        state: from `Scene.build` or `init`.
+        control: (n_u,) by `system.layout.controls`, what the user's force expects, or None.
+        dt: h, () [s].
+
+    Returns:
+        The new state and what the step saw at its start. A world that fails keeps its last finite
+        state, says why in `status`, and has no gradient; the others do not notice.
+
+    Raises:
+        ValueError: shapes or dtypes disagree (at trace time).
+    """
+    check_step(system, method, state, control)
+    warn_if_unstable(method, dt)
+    h = jnp.asarray(dt, state.q.dtype)
+    (state, info), _ = contain(_step, (system, method, state, control, h))
+    return state, info
+
+
+def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
+    stabilizer = method.stabilizer.resolve(method.integrator.default_rate(dt))
+    at = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
+    new, solution, rows = method.integrator.advance(at, system, state, dt)
+    new = stabilizer.correct(system, method.solver, new, dt)
+    code = status.first(state.status, judge(new, solution))
+    healthy = code == Status.OK
+    info = StepInfo(solution.acceleration, solution.multipliers, rows.violation, code)
+    info = keep(healthy, info, jax.tree.map(jnp.zeros_like, info))
+    new = dataclasses.replace(keep(healthy, new, state), status=code)
+    return (new, dataclasses.replace(info, status=code)), code
+
+
+def judge(state: State, solution: Solution) -> Array:
+    """What the solver said, or NON_FINITE where the new state is."""
+    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v))
+    code = jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32)
+    return status.first(solution.status, code)
+
+
+def forward_dynamics(
+    system: Any, state: State, control: PyTree, method: Method, dt: Any
+) -> Solution:
+    """a and λ at a state, under the method's feedback.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: where.
+        control: as of `step`.
+        method: its stabiliser and solver are used.
+        dt: h, () [s], on which default gains depend.
+
+    Returns:
+        acceleration (n_v,), multipliers (n_c,), status ().
+    """
+    check_step(system, method, state, control)
+    h = jnp.asarray(dt, state.q.dtype)
+    stabilizer = method.stabilizer.resolve(method.integrator.default_rate(h))
+    at = accelerate(system, stabilizer, method.solver, control, state.memory, h)
+    return at(state.q, state.v, state.time)[0]
+
+
+def check_step(system: Any, method: Method, state: State, control: PyTree) -> None:
+    """Checks that system, state, control and method fit together.
+
+    Raises:
+        ValueError: wrong shapes, mixed dtypes, or memory of another method.
+    """
+    layout = getattr(system, "layout", None)
+    if layout is not None:
+        expected = {"q": (layout.n_q,), "v": (layout.n_v,)}
+        for what, shape in expected.items():
+            got = jnp.shape(getattr(state, what))
+            if got != shape:
+                raise ValueError(
+                    f"step: state.{what} must have shape {shape}, got {got}; batches go through"
+                    " jax.vmap."
+                )
+        if control is not None and jnp.shape(control) != (layout.n_u,):
+            raise ValueError(
+                f"step: control must have shape ({layout.n_u},), got {jnp.shape(control)};"
+                f" its channels are {list(layout.controls)}."
+            )
+    if getattr(control, "dtype", state.q.dtype) != state.q.dtype:
+        raise ValueError(f"step: control is {control.dtype}, but the state is {state.q.dtype}.")
+    check_dtype(system, state.q.dtype)
+    memory = method.stabilizer.init(system, state.q, state.v)
+    if jax.tree.structure(memory) != jax.tree.structure(state.memory):
+        raise ValueError("step: the state has the memory of another method; start with jc.init.")

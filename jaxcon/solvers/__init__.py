@@ -1,0 +1,1 @@
+"""Floor 1: the saddle system and what solves it. No joint is known here."""

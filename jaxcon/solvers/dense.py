@@ -1,0 +1,57 @@
+"""The whole saddle matrix, factored as it is (chapter 3.2.5, method 1): the reference."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array
+from jaxcon.solvers.saddle import Saddle, Solution, free_motion, judge
+
+
+@pytree
+class Dense:
+    """Solves K (a, λ) = (f, b) with K = [[M, −Jᵀ], [J, C]] by LU with pivoting.
+
+    Slow and plain, it needs neither a definite A nor an invertible M alone: the solver that all
+    others are held to. K is first scaled to S K S with S = diag(1/√M_ii, 1/√(J M⁻¹ Jᵀ + C)_ii
+    approximated by the diagonal of M), so that pivots compare across units.
+    """
+
+    def solve(self, system: Saddle) -> Solution:
+        """The acceleration (n_v,), multipliers (n_c,) and status.
+
+        The status is SINGULAR where K is singular to working precision.
+        """
+        if not system.target.size:
+            return free_motion(system)
+        j = system.jacobian.dense()
+        scale = jax.lax.stop_gradient(_scale(system, j))
+        matrix = saddle_matrix(system, j) * scale[None] * scale[:, None]
+        factor = jax.scipy.linalg.lu_factor(jax.lax.stop_gradient(matrix))
+        right = jnp.concatenate([system.force, system.target]) * scale
+        solution = scale * jax.lax.custom_linear_solve(
+            lambda x: matrix @ x,
+            right,
+            lambda _, x: jax.scipy.linalg.lu_solve(factor, x),
+            lambda _, x: jax.scipy.linalg.lu_solve(factor, x, trans=1),
+        )
+        pivots = jnp.abs(jnp.diagonal(factor[0]))
+        singular = ~jnp.all(pivots > matrix.shape[0] * jnp.finfo(matrix.dtype).eps)
+        n = system.force.shape[0]
+        status = judge(solution, singular & jnp.all(jnp.isfinite(matrix)))
+        return Solution(solution[:n], solution[n:], status)
+
+
+def saddle_matrix(system: Saddle, jacobian: Array) -> Array:
+    """K = [[M, −Jᵀ], [J, C]], (n_v + n_c, n_v + n_c)."""
+    n_c = jacobian.shape[0]
+    compliance = jnp.zeros(n_c, jacobian.dtype) if system.compliance is None else system.compliance
+    upper = jnp.concatenate([system.mass.dense(), -jacobian.T], axis=1)
+    return jnp.concatenate([upper, jnp.concatenate([jacobian, jnp.diag(compliance)], axis=1)])
+
+
+def _scale(system: Saddle, jacobian: Array) -> Array:
+    inertia = system.mass.diagonal
+    weight = jacobian**2 @ (1 / inertia)
+    weight = weight if system.compliance is None else weight + system.compliance
+    return 1 / jnp.sqrt(jnp.concatenate([inertia, jnp.where(weight > 0, weight, 1)]))

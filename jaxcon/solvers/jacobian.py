@@ -1,0 +1,115 @@
+"""J by blocks: which rows touch which bodies is structure, what they are is numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core.lanes import Vector, plus, times, total
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, Lane
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The velocities of some bodies of a group.
+
+    Component c of element i lies in column start + c · bodies + indices[i].
+    """
+
+    start: int
+    components: int
+    bodies: int
+    indices: tuple[int, ...]
+
+    def take(self, v: Array) -> Vector:
+        """The velocities by components, each lane (element,)."""
+        block = jax.lax.slice_in_dim(v, self.start, self.start + self.components * self.bodies)
+        lanes = block.reshape((self.components, self.bodies, *v.shape[1:]))
+        return Vector.of(lanes[:, np.asarray(self.indices)])
+
+    def index(self) -> np.ndarray:
+        """Column numbers, (components, elements)."""
+        component = self.bodies * np.arange(self.components)[:, None]
+        return self.start + component + np.asarray(self.indices)
+
+
+@pytree
+class Block:
+    """The rows of equal constraints on one body each.
+
+    Row r of element i lies in row start + r · elements + i of J.
+
+    Attributes:
+        value: rows, each a Vector over velocity components of lanes (element,).
+    """
+
+    value: tuple[Vector, ...]
+    start: int = static()
+    columns: Columns = static()
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows an element, and elements."""
+        return len(self.value), len(self.columns.indices)
+
+
+@pytree
+class Jacobian:
+    """J (n_c, n_v) as the sum of its blocks."""
+
+    blocks: tuple[Block, ...]
+    shape: tuple[int, int] = static()
+
+    def apply(self, v: Array) -> Array:
+        """J v, (n_c,)."""
+        rows: dict[int, list[Lane]] = {}
+        for block in self.blocks:
+            moved = block.columns.take(v)
+            values = [row.dot(moved) for row in block.value]
+            known = rows.get(block.start, [0.0] * len(values))
+            rows[block.start] = [plus(a, b) for a, b in zip(known, values, strict=True)]
+        return _join(rows, self.shape[0], v)
+
+    def transpose(self, multipliers: Array) -> Array:
+        """Jᵀ λ, (n_v,)."""
+        result = jnp.zeros((self.shape[1], *multipliers.shape[1:]), multipliers.dtype)
+        for block in self.blocks:
+            m, k = block.shape
+            part = jax.lax.slice_in_dim(multipliers, block.start, block.start + m * k)
+            force = Vector.of(part.reshape((m, k, *multipliers.shape[1:])))
+            for component, column in enumerate(block.columns.index()):
+                terms = zip(block.value, force, strict=True)
+                pull = total(times(row[component], f) for row, f in terms)
+                if isinstance(pull, jax.Array):
+                    result = result.at[column].add(pull)
+        return result
+
+    def dense(self) -> Array:
+        """J as one array (n_c, n_v): one concatenation and one gather by a fixed index."""
+        entries: list[Array] = []
+        index = np.full(self.shape, -1)
+        filled = 0
+        for block in self.blocks:
+            m, k = block.shape
+            columns = block.columns.index()
+            for r in range(m):
+                row = block.start + r * k + np.arange(k)
+                for value, column in zip(block.value[r], columns, strict=True):
+                    if isinstance(value, jax.Array) or value != 0:
+                        entries.append(jnp.broadcast_to(value, (k,)))
+                        index[row, column] = filled + np.arange(k)
+                        filled += k
+        dtype = jnp.result_type(*entries) if entries else jnp.result_type(float)
+        flat = [x.astype(dtype) for x in entries]
+        return jnp.concatenate([*flat, jnp.zeros(1, dtype)])[index]
+
+
+def _join(rows: dict[int, list[Lane]], n_rows: int, like: Array) -> Array:
+    if not rows:
+        return jnp.zeros((n_rows, *like.shape[1:]), like.dtype)
+    return jnp.concatenate([x for start in sorted(rows) for x in rows[start]])

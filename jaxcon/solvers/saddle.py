@@ -1,0 +1,124 @@
+"""The saddle system that a solver sees: matrices, never joints.
+
+    [ M  −Jᵀ ] [a]   [f]
+    [ J   C  ] [λ] = [b]
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core.pytree import pytree
+from jaxcon.core.status import Status
+from jaxcon.core.typing import Array
+from jaxcon.solvers.jacobian import Jacobian
+
+
+@pytree
+class Diagonal:
+    """A diagonal mass matrix by its entries (n_v,)."""
+
+    values: Array
+
+    def solve(self, x: Array) -> Array:
+        """M⁻¹ x for a vector (n_v,) or for columns (n_v, k)."""
+        return x / (self.values if x.ndim == 1 else self.values[:, None])
+
+    def apply(self, x: Array) -> Array:
+        """M x, (n_v,)."""
+        return self.values * x
+
+    def dense(self) -> Array:
+        """M, (n_v, n_v)."""
+        return jnp.diag(self.values)
+
+    @property
+    def diagonal(self) -> Array:
+        """Its entries, (n_v,)."""
+        return self.values
+
+
+@pytree
+class Full:
+    """A symmetric positive definite mass matrix (n_v, n_v)."""
+
+    values: Array
+
+    def solve(self, x: Array) -> Array:
+        """M⁻¹ x for a vector (n_v,) or for columns (n_v, k); NaN where M is not definite."""
+        return jax.scipy.linalg.solve(self.values, x, assume_a="pos")
+
+    def apply(self, x: Array) -> Array:
+        """M x, (n_v,)."""
+        return self.values @ x
+
+    def dense(self) -> Array:
+        """M, (n_v, n_v)."""
+        return self.values
+
+    @property
+    def diagonal(self) -> Array:
+        """Its diagonal, (n_v,)."""
+        return jnp.diagonal(self.values)
+
+
+Mass = Diagonal | Full
+
+
+@pytree
+class Saddle:
+    """M a = f + Jᵀλ, J a + C λ = b.
+
+    Attributes:
+        mass: M.
+        force: f, (n_v,) [N, N m].
+        jacobian: J, (n_c, n_v).
+        target: b, (n_c,).
+        compliance: the diagonal of C, (n_c,); None where it is zero.
+    """
+
+    mass: Mass
+    force: Array
+    jacobian: Jacobian
+    target: Array
+    compliance: Array | None = None
+
+
+class Solution(NamedTuple):
+    """What a solver returns; unpacks as `a, λ, status`.
+
+    Attributes:
+        acceleration: a, (n_v,).
+        multipliers: λ, (n_c,).
+        status: `Status` code, ().
+    """
+
+    acceleration: Array
+    multipliers: Array
+    status: Array
+
+
+class Solver(Protocol):
+    """What every solver answers."""
+
+    def solve(self, system: Saddle) -> Solution:
+        """The acceleration and the multipliers of a saddle system."""
+        ...
+
+
+def free_motion(system: Saddle) -> Solution:
+    """a = M⁻¹ f, where there is no constraint."""
+    acceleration = system.mass.solve(system.force)
+    return Solution(acceleration, jnp.zeros_like(system.target), judge(acceleration))
+
+
+def judge(x: Array, singular: Any = None) -> Array:
+    """The status of a solution: SINGULAR where the solver saw it, NON_FINITE where x is."""
+    finite = jnp.all(jnp.isfinite(x))
+    status = jnp.where(finite, Status.OK, Status.NON_FINITE)
+    if singular is not None:
+        status = jnp.where(singular, Status.SINGULAR, status)
+    return status.astype(jnp.int32)

@@ -1,0 +1,60 @@
+"""The Schur complement on the multipliers (chapter 3.2.5, method 2)."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array
+from jaxcon.solvers.saddle import Mass, Saddle, Solution, free_motion, judge
+
+
+@pytree
+class Schur:
+    """Solves M a = f + Jᵀλ, J a + C λ = b through A = J M⁻¹ Jᵀ + C (the Delassus operator).
+
+    Eliminating a = M⁻¹(f + Jᵀλ) from the second row leaves A λ = b − J M⁻¹ f, with A symmetric and
+    positive definite where the rows are independent; it is factored by Cholesky.
+
+    The derivative is that of the solution, not of the factorization: dλ = A⁻¹(db − dA λ) reuses
+    the factor, in forward and in reverse mode.
+
+    References:
+        Featherstone, Rigid Body Dynamics Algorithms (2008), section 8.
+    """
+
+    def solve(self, system: Saddle) -> Solution:
+        """The acceleration (n_v,), multipliers (n_c,) and status.
+
+        The status is SINGULAR where A is not positive definite to working precision.
+        """
+        if not system.target.size:
+            return free_motion(system)
+        j = system.jacobian.dense()
+        a = delassus(system.mass, j, system.compliance)
+        factor = jnp.linalg.cholesky(jax.lax.stop_gradient(a), symmetrize_input=False)
+        free = system.mass.solve(system.force)
+        multipliers = jax.lax.custom_linear_solve(
+            lambda x: a @ x,
+            system.target - j @ free,
+            lambda _, x: jax.scipy.linalg.cho_solve((factor, True), x),
+            symmetric=True,
+        )
+        acceleration = free + system.mass.solve(j.T @ multipliers)
+        status = judge(acceleration, _dependent(factor, a) & jnp.all(jnp.isfinite(a)))
+        return Solution(acceleration, multipliers, status)
+
+
+def delassus(mass: Mass, jacobian: Array, compliance: Array | None) -> Array:
+    """A = J M⁻¹ Jᵀ + C, (n_c, n_c), from a dense J (n_c, n_v)."""
+    a = jacobian @ mass.solve(jacobian.T)
+    return a if compliance is None else a + jnp.diag(compliance)
+
+
+def _dependent(factor: Array, a: Array) -> Array:
+    """Whether a row is, to round-off, a combination of the rows before it.
+
+    The square of a Cholesky pivot over the diagonal entry is the part of a row that the earlier
+    ones do not explain: 1 for an orthogonal row, round-off for a dependent one.
+    """
+    share = jnp.diagonal(factor) ** 2 / jnp.diagonal(a)
+    return ~jnp.all(share > a.shape[0] * jnp.finfo(a.dtype).eps)

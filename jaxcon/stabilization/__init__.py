@@ -1,0 +1,1 @@
+"""Floor 5: what keeps a state on the constraint manifold."""

@@ -1,0 +1,120 @@
+"""Feedback on the acceleration level (chapter 3.3)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints.rows import RowLayout, Rows
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array, PyTree
+
+
+@pytree
+class Unstabilized:
+    """b = −γ: constraints hold at the acceleration level only, and errors grow with time."""
+
+    def init(self, system: Any, q: Array, v: Array) -> PyTree:
+        """No memory."""
+        return ()
+
+    def resolve(self, rate: Any) -> Unstabilized:
+        """Itself: there is nothing to choose."""
+        return self
+
+    def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
+        """b (n_c,)."""
+        return -rows.bias
+
+    def correct(self, system: Any, solver: Any, state: Any, dt: Any) -> Any:
+        """The state as it is."""
+        return state
+
+
+@pytree
+class Baumgarte(Unstabilized):
+    """b = −γ − 2α φ̇ − β² φ, so that the error obeys φ̈ + 2α φ̇ + β² φ = 0.
+
+    Velocity-level rows have φ = 0 and decay as ψ̇ = −2α ψ. Every gain is a leaf. It is a number,
+    an array by row (n_c,), or a mapping from constraint names to numbers, with the default for the
+    others.
+
+    The default is critical damping at a rate that is safe for the integrator at the step used:
+    a fixed part of 1/h for semi-implicit Euler, and bounded independently of h for Runge–Kutta
+    methods, whose stages violate the constraints by O(h²), which a gain of O(1/h²) would turn into
+    an error of order zero.
+
+    Attributes:
+        alpha: α [1/s].
+        beta: β [1/s].
+        fallback: rate of the constraints without a gain of their own [1/s].
+
+    References:
+        Baumgarte, Stabilization of constraints and integrals of motion in dynamical systems (1972).
+    """
+
+    alpha: Any = None
+    beta: Any = None
+    fallback: Any = None
+
+    @classmethod
+    def critical(cls, rate: Any) -> Baumgarte:
+        """α = β = rate [1/s]: the fastest decay without oscillation."""
+        return cls(rate, rate)
+
+    @classmethod
+    def from_rate(cls, rate: Any, damping_ratio: Any) -> Baumgarte:
+        """β = rate [1/s] and α = ζ β: 1 is critical, less oscillates, more is slow.
+
+        Args:
+            rate: number, array by row (n_c,), or a mapping by constraint name.
+            damping_ratio: ζ, a number or array (n_c,).
+        """
+        return cls(jax.tree.map(lambda x: damping_ratio * x, rate), rate)
+
+    def resolve(self, rate: Any) -> Baumgarte:
+        """The same with this rate where none was given."""
+        fallback = rate if self.fallback is None else self.fallback
+        alpha = fallback if self.alpha is None else self.alpha
+        beta = fallback if self.beta is None else self.beta
+        return dataclasses.replace(self, alpha=alpha, beta=beta, fallback=fallback)
+
+    def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
+        """b (n_c,)."""
+        alpha = by_row(self.alpha, self.fallback, rows)
+        beta = by_row(self.beta, self.fallback, rows)
+        return -rows.bias - 2 * alpha * rows.rate - beta * beta * rows.residual
+
+
+def by_row(gain: Any, fallback: Any, rows: Rows) -> Array:
+    """A gain as a number () or an array by row (n_c,).
+
+    Raises:
+        ValueError: an unknown constraint name, or an array of another size.
+    """
+    dtype = rows.bias.dtype
+    if isinstance(gain, Mapping):
+        return _from_names(gain, fallback, rows.layout, dtype)
+    gain = jnp.asarray(gain, dtype)
+    if gain.ndim and gain.shape != rows.bias.shape:
+        raise ValueError(
+            f"Baumgarte: a gain must be a number, an array {rows.bias.shape} by row, or a mapping"
+            f" by constraint name; got shape {gain.shape}."
+        )
+    return gain
+
+
+def _from_names(gain: Mapping[str, Any], fallback: Any, layout: RowLayout, dtype: Any) -> Array:
+    unknown = set(gain) - set(layout.names)
+    if unknown:
+        raise ValueError(
+            f"Baumgarte: there is no constraint {sorted(unknown)}; there are {list(layout.names)}."
+        )
+    result = jnp.full(layout.size, jnp.asarray(fallback, dtype), dtype)
+    for name, value in gain.items():
+        result = result.at[layout.rows(name)].set(jnp.asarray(value, dtype))
+    return result
