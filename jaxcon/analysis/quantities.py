@@ -80,8 +80,10 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
         for c, rows in group.rows(snapshot).jacobian
         if c.start + c.indices[index] == system.layout.v(owner)[0]
     )
-    lanes = [total(times(row[c], x) for row, x in zip(block, multipliers, strict=True))
-             for c in range(columns.components)]
+    lanes = [
+        total(times(row[c], x) for row, x in zip(block, multipliers, strict=True))
+        for c in range(columns.components)
+    ]
     force = jnp.stack([jnp.broadcast_to(x, (len(columns.indices),))[index] for x in lanes])
     motion = system.principal_motion(owner, state.q, state.v)
     anchor = group.anchor(snapshot, index)
@@ -97,9 +99,9 @@ def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str
     if body in system.fixed or (body is None and sides[-1] is None):
         return next(name for name in reversed(sides) if name), -1
     chosen = sides[-1] if body is None else body
-    if chosen not in sides:
+    if not chosen or chosen not in sides:
         raise ValueError(f"constraint '{group.names[index]}' acts on {sides}, not on '{body}'.")
-    return chosen, 1
+    return str(chosen), 1
 
 
 def _about(motion: Motion, force: Array, anchor: Array) -> Array:

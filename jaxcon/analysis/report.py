@@ -110,6 +110,4 @@ def dependent_rows(rows: Array | np.ndarray, tolerance: float) -> list[int]:
 
 def _owners(layout: Any) -> dict[int, tuple[str, int]]:
     """Constraint and row in it, by row number."""
-    return {
-        int(row): (name, i) for name in layout.names for i, row in enumerate(layout.rows(name))
-    }
+    return {int(row): (name, i) for name in layout.names for i, row in enumerate(layout.rows(name))}

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 
+from jaxcon.constraints.primitives import Row
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
-from jaxcon.constraints.primitives import Row
 from jaxcon.geometry.pose import Pose
 from jaxcon.model.elements import Elements
 from jaxcon.solvers.jacobian import Columns

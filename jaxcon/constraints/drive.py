@@ -68,7 +68,11 @@ class Drives:
         row = joint.coordinate(snapshot)
         target, rate, bias = self._motion(snapshot.t)
         error = row.value - target
-        error = error if snapshot.system.layout.dim == 2 or not joint.joint.turns else numerics.wrap(error)
+        error = (
+            error
+            if snapshot.system.layout.dim == 2 or not joint.joint.turns
+            else numerics.wrap(error)
+        )
         row = row._replace(value=error, rate=row.rate - rate, bias=row.bias - bias)
         return joint.gather(snapshot, [row])
 
@@ -93,4 +97,3 @@ class Drives:
 
         (target, rate), (_, bias) = jax.jvp(with_rate, (t,), (jnp.ones_like(t),))
         return target, rate, bias
-

@@ -17,6 +17,7 @@ from jaxcon.core import checks, numerics
 from jaxcon.core.typing import Array
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import own_point
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,7 @@ class Coincident:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames."""
-        point = vector(self, "point", self.point, a)
-        return {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
+        return anchors(self, a, b)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
@@ -72,8 +72,8 @@ class Distance:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The two points in their frames, and the length."""
-        start = a.position if self.point_a is None else vector(self, "point_a", self.point_a, a)
-        end = b.position if self.point_b is None else vector(self, "point_b", self.point_b, b)
+        start = own_point(self, "point_a", self.point_a, a)
+        end = own_point(self, "point_b", self.point_b, b)
         length = numerics.norm(end - start) if self.length is None else self.length
         length = checks.number(label(self), "length", length, a.position.dtype)
         checks.positive(label(self), "length", length)
@@ -109,9 +109,7 @@ class Fixed:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, and the orientation of b in a."""
-        point = b.position if self.point is None else vector(self, "point", self.point, a)
-        anchors = {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
-        return anchors | {"orientation": relative_orientation(a, b)}
+        return anchors(self, a, b) | {"orientation": relative_orientation(a, b)}
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
@@ -144,12 +142,11 @@ class Revolute:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axes, and pointers that read the angle."""
-        point = vector(self, "point", self.point, a)
-        anchors = {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
-        if point.shape == (2,):
-            return anchors | {"angle": b.orientation - a.orientation}
+        points = anchors(self, a, b)
+        if a.position.shape == (2,):
+            return points | {"angle": b.orientation - a.orientation}
         n, u, w = triad(self, a)
-        return anchors | {
+        return points | {
             "axis": a.local_direction(n),
             "first_a": a.local_direction(u),
             "second_a": a.local_direction(w),
@@ -201,11 +198,8 @@ class Prismatic:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in a, the orientation of b in a."""
-        point = b.position if self.point is None else vector(self, "point", self.point, a)
         axis, *normals = triad(self, a)
-        params = {
-            "anchor_a": a.local_point(point),
-            "anchor_b": b.local_point(point),
+        params = anchors(self, a, b) | {
             "axis": a.local_direction(axis),
             "first_a": a.local_direction(normals[0]),
             "orientation": relative_orientation(a, b),
@@ -232,11 +226,11 @@ def label(joint: Any) -> str:
     return f"{type(joint).__name__} '{joint.name}'"
 
 
-def vector(joint: Any, what: str, x: Any, pose: Pose) -> Array:
-    """A vector of a joint, checked."""
-    x = checks.number(label(joint), what, x, pose.position.dtype, pose.position.shape)
-    checks.finite(label(joint), what, x)
-    return x
+def anchors(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
+    """The joint's point in both frames; the second body's position unless given."""
+    point = own_point(joint, "point", b.position if joint.point is None else joint.point, b)
+    own_point(joint, "point", point, a)
+    return {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
 
 
 def triad(joint: Any, pose: Pose) -> list[Array]:
@@ -247,7 +241,7 @@ def triad(joint: Any, pose: Pose) -> list[Array]:
     """
     if joint.axis is None:
         raise ValueError(f"{label(joint)}: in space an axis (3,) is needed, got none.")
-    axis = vector(joint, "axis", joint.axis, pose)
+    axis = checks.number(label(joint), "axis", joint.axis, pose.position.dtype, pose.position.shape)
     checks.nonzero(label(joint), "axis", axis)
     n = axis / numerics.norm(axis)
     if n.shape == (2,):
@@ -261,5 +255,5 @@ def triad(joint: Any, pose: Pose) -> list[Array]:
 def relative_orientation(a: Pose, b: Pose) -> Array:
     """θ_b − θ_a in the plane, q_a* q_b in space."""
     if a.position.shape == (2,):
-        return b.orientation - a.orientation  # type: ignore[operator]
+        return b.orientation - a.orientation
     return quaternion.multiply(quaternion.conjugate(a.orientation), b.orientation)

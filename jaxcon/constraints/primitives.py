@@ -43,9 +43,7 @@ class Row(NamedTuple):
 def meet(p: Point, r: Point) -> list[Row]:
     """r − p = 0 in the world frame: as many rows as the space has dimensions."""
     d, ḋ, bias = r.position - p.position, r.velocity - p.velocity, r.bias - p.bias
-    return [
-        Row(d[i], ḋ[i], bias[i], (-p.pull(e), r.pull(e))) for i, e in enumerate(axes(len(d)))
-    ]
+    return [Row(d[i], ḋ[i], bias[i], (-p.pull(e), r.pull(e))) for i, e in enumerate(axes(len(d)))]
 
 
 def angle_between(u: Direction, w: Direction) -> Row:

@@ -136,4 +136,3 @@ def _flat(sets: list[RowSet], field: str, like: Array) -> Array:
 def _spread(lane: Lane, rows: RowSet, like: Array) -> Array:
     elements = len(rows.jacobian[0][0].indices)
     return jnp.broadcast_to(jnp.asarray(lane, like.dtype), (elements, *like.shape[1:]))
-

@@ -8,13 +8,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxcon.core.typing import Array
 
 
 def is_concrete(x: Any) -> bool:
     """Whether every leaf has a value now."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(x))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
 
 
 def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = ()) -> Array:
@@ -23,10 +24,9 @@ def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = (
     Raises:
         ValueError: another shape, another floating dtype of a JAX array, or not a number.
     """
-    got = getattr(x, "dtype", None)
-    if isinstance(x, jax.Array) and jnp.issubdtype(got, jnp.floating) and got != dtype:
+    if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating) and x.dtype != dtype:
         raise ValueError(
-            f"{owner}: {what} is {got}, but the scene is {jnp.dtype(dtype).name};"
+            f"{owner}: {what} is {x.dtype}, but the scene is {jnp.dtype(dtype).name};"
             " mixed dtypes are not promoted: convert it, or build the scene with dtype=."
         )
     try:

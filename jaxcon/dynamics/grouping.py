@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxcon.constraints import custom
 from jaxcon.constraints.base import Joints
-from jaxcon.constraints.drive import Drives
+from jaxcon.constraints.custom import CustomOnBodies, Holonomic, VelocityLevel
+from jaxcon.constraints.drive import Drive, Drives
 from jaxcon.core import checks
 from jaxcon.dynamics.inputs import Resolved
 from jaxcon.geometry.pose import Pose
@@ -21,10 +22,14 @@ from jaxcon.model.forces import (
     ExternalWrench,
     ExternalWrenches,
     ForceElements,
+    JointSpring,
     JointSprings,
 )
 from jaxcon.model.layout import WORLD, Group, Layout, Place
 from jaxcon.model.system import MassProperties
+
+SPECIAL = (Drive, Holonomic, VelocityLevel, JointSpring, ExternalWrench, CustomForce)
+"""Elements that are not attached to their bodies by `attach` alone."""
 
 
 def lay_out(
@@ -57,11 +62,28 @@ def lay_out(
     return Layout(dim, tuple(groups), fixed, tuple(controls)), tuple(inertia)
 
 
-class Elements:
-    """Finds the bodies of elements, checks them, and gathers equal ones."""
+class Gather:
+    """Finds the bodies of elements, checks them, and puts equal ones side by side."""
 
     def __init__(self, dim: int, dtype: Any, layout: Layout, poses: dict[str, Pose]) -> None:
         self.dim, self.dtype, self.layout, self.poses = dim, dtype, layout, poses
+
+    def constraints(self, elements: Iterable[Any]) -> list[Any]:
+        """Joints first, then the motions prescribed to them, then the user's constraints."""
+        plain = [e for e in elements if not isinstance(e, SPECIAL) and hasattr(e, "rows")]
+        joints = self.joints(plain)
+        drives = self.drives(_of(elements, Drive), joints)
+        return joints + drives + self.customs(_of(elements, Holonomic, VelocityLevel))
+
+    def forces(self, elements: Iterable[Any], constraints: list[Any]) -> list[Any]:
+        """Force elements of every class."""
+        plain = [e for e in elements if not isinstance(e, SPECIAL) and hasattr(e, "forces")]
+        return [
+            *self.simple_forces(plain),
+            *self.joint_springs(_of(elements, JointSpring), constraints),
+            *self.wrenches(_of(elements, ExternalWrench)),
+            *self.user_forces(_of(elements, CustomForce)),
+        ]
 
     def joints(self, joints: list[Any]) -> list[Any]:
         """Joints by class and by the kinds of their bodies."""
@@ -70,8 +92,8 @@ class Elements:
         groups = self._gather(joints, lambda j: (j.body_a, j.body_b))
         return [Joints(p, names, places, joint=cls) for cls, p, names, places in groups]
 
-    def forces(self, forces: list[Any]) -> list[Any]:
-        """Force elements by class and by the kinds of their bodies."""
+    def simple_forces(self, forces: list[Any]) -> list[Any]:
+        """Springs, constant forces and their like by class and by the kinds of their bodies."""
         for force in forces:
             self._check_bodies(force, force.bodies)
         groups = self._gather(forces, lambda f: f.bodies)
@@ -119,7 +141,7 @@ class Elements:
             self._check_user(constraint)
             moving = [name for name in constraint.bodies if name in self.layout.bodies]
             places = tuple(self._place((name,)) for name in moving)
-            result.append(custom.CustomOnBodies(self._params(constraint), _bare(constraint), places))
+            result.append(CustomOnBodies(self._params(constraint), _bare(constraint), places))
         return result
 
     def user_forces(self, forces: list[Any]) -> list[Any]:
@@ -137,12 +159,6 @@ class Elements:
                 CustomForces(params, (force.name,), places, force.function, channel, force.bodies)
             )
         return result
-
-    def check(self, system: Any, state: Any) -> None:
-        """Calls every user's constraint once, abstractly, to check what it returns."""
-        for group in system.constraints:
-            if isinstance(group, custom.Custom):
-                custom.check_function(group, system.snapshot(state.q, state.v, state.time))
 
     def _params(self, element: Any) -> Any:
         def convert(x: Any) -> Any:
@@ -222,8 +238,10 @@ class Elements:
         raise ValueError(f"{owner}: joint '{element.joint}' is unknown; known are {known}.")
 
 
+def _of(elements: Iterable[Any], *classes: type) -> list[Any]:
+    return [element for element in elements if isinstance(element, classes)]
+
+
 def _bare(description: Any) -> Any:
     """The description without its numbers: static, hashable."""
-    import dataclasses
-
     return dataclasses.replace(description, params=None)

@@ -89,7 +89,9 @@ def _motion(body: BodyInput, dim: int, dtype: Any) -> Motion:
     velocity = given("velocity", body.velocity, zero, (dim,))
     if not body.rigid:
         return Motion(position, None, velocity, None)
-    spin = given("angular_velocity", body.angular_velocity, jnp.zeros(spin_shape, dtype), spin_shape)
+    spin = given(
+        "angular_velocity", body.angular_velocity, jnp.zeros(spin_shape, dtype), spin_shape
+    )
     if dim == 2:
         return Motion(position, given("angle", body.orientation, 0.0, ()), velocity, spin)
     turn = given("quaternion", body.orientation, (1.0, 0.0, 0.0, 0.0), (4,))
@@ -106,7 +108,9 @@ def _solid(body: BodyInput, dim: int, dtype: Any) -> solids.Inertia:
     elif given is None:
         raise ValueError(f"{_label(body)}: inertia is needed; a body without one is a particle.")
     elif dim == 3 and jnp.shape(given) == (3, 3):
-        given = solids.from_tensor(body.mass, checks.number(_label(body), "inertia", given, dtype, (3, 3)))
+        given = solids.from_tensor(
+            body.mass, checks.number(_label(body), "inertia", given, dtype, (3, 3))
+        )
     else:
         given = solids.Inertia(body.mass, given)
     moments = given.moments

@@ -7,14 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.constraints.custom import Holonomic, VelocityLevel
-from jaxcon.constraints.drive import Drive
+from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.status import Status
 from jaxcon.dynamics import grouping
 from jaxcon.dynamics.inputs import BodyInput, resolve
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.forces import CustomForce, ExternalWrench, JointSpring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
@@ -106,7 +104,9 @@ class Scene:
             ValueError: the name is taken.
         """
         self._take_name(name)
-        self._bodies[name] = BodyInput(name, mass, None, position, None, velocity, None, False, False)
+        self._bodies[name] = BodyInput(
+            name, mass, None, position, None, velocity, None, False, False
+        )
 
     def add(self, element: Any) -> None:
         """Adds a joint, constraint or force element.
@@ -138,25 +138,17 @@ class Scene:
         fixed = {n: b.motion.pose for n, b in bodies.items() if b.kind is None}
         fixed[WORLD] = Pose(world, upright)
         poses = {n: b.motion.pose for n, b in bodies.items()} | fixed
-        elements = grouping.Elements(self.dim, self.dtype, layout, poses)
-        kinds = ([], [], [], [], [], [], [])
-        order = (Drive, (Holonomic, VelocityLevel), JointSpring, ExternalWrench, CustomForce)
-        for element in self._elements.values():
-            index = next((i for i, kind in enumerate(order) if isinstance(element, kind)), None)
-            if index is None:
-                index = 5 if hasattr(element, "rows") else 6
-            kinds[index].append(element)
-        drives, customs, joint_springs, wrenches, user_forces, joints, simple = kinds
-        constraints = elements.joints(joints)
-        constraints += elements.drives(drives, constraints) + elements.customs(customs)
-        forces = elements.forces(simple) + elements.joint_springs(joint_springs, constraints)
-        forces += elements.wrenches(wrenches) + elements.user_forces(user_forces)
+        gather = grouping.Gather(self.dim, self.dtype, layout, poses)
+        constraints = gather.constraints(self._elements.values())
+        forces = gather.forces(self._elements.values(), constraints)
         offsets = {n: b.offset for n, b in bodies.items() if b.offset is not None}
         system = BodySystem(
             self.gravity, inertia, tuple(constraints), tuple(forces), offsets, fixed, layout
         )
         state = self._state(layout, bodies)
-        elements.check(system, state)
+        for group in constraints:
+            if isinstance(group, Custom):
+                check_function(group, system.snapshot(state.q, state.v, state.time))
         return system, state
 
     def _state(self, layout: Any, bodies: Any) -> State:
@@ -177,6 +169,3 @@ class Scene:
             raise ValueError(f"Scene: the name '{name}' is reserved.")
         if name in self._bodies or name in self._elements:
             raise ValueError(f"Scene: the name '{name}' is taken; every name must be unique.")
-
-
-__all__ = ["Scene"]

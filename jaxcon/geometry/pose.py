@@ -5,6 +5,8 @@ The hot path works on lanes instead (`model.bodies`); these classes are the read
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 
 from jaxcon.core.pytree import pytree
@@ -18,11 +20,12 @@ class Pose:
 
     Attributes:
         position: (2,) or (3,) [m].
-        orientation: angle () [rad] in the plane, unit quaternion (4,) in space, None for a particle.
+        orientation: angle () [rad] in the plane, unit quaternion (4,) in space; None for a
+            particle.
     """
 
     position: Array
-    orientation: Array | None = None
+    orientation: Any = None
 
     @property
     def rotation(self) -> Array:
@@ -61,8 +64,8 @@ class Motion(Pose):
             particle.
     """
 
-    velocity: Array = None  # type: ignore[assignment]
-    angular_velocity: Array | None = None
+    velocity: Any = None
+    angular_velocity: Any = None
 
     @property
     def pose(self) -> Pose:
@@ -77,7 +80,7 @@ class Motion(Pose):
         if self.position.shape[0] == 2 or offset.orientation is None:
             return Motion(position, self.orientation, velocity, self.angular_velocity)
         turned = quaternion.multiply(self.orientation, offset.orientation)
-        omega = offset.rotation.T @ self.angular_velocity  # type: ignore[operator]
+        omega = offset.rotation.T @ self.angular_velocity
         return Motion(position, turned, velocity, omega)
 
     def point_velocity(self, local: Array) -> Array:

@@ -8,11 +8,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
+from jaxcon.geometry.pose import Pose
 from jaxcon.model.layout import Place, take
 
 
@@ -82,3 +84,23 @@ def replace_at(owner: str, x: Any, i: int, value: Any) -> Any:
     new = checks.number(owner, "the new value", value, x[0].dtype, (len(x),))
     pairs = zip(x, Vector.of(new), strict=True)
     return Vector(*(lane.at[i].set(component) for lane, component in pairs))
+
+
+def own_point(element: Any, what: str, point: Any, pose: Pose) -> Array:
+    """A world point that is to be attached to a body: its position unless given.
+
+    Raises:
+        ValueError: a wrong shape or dtype, not finite, or off a particle, which has no other point.
+    """
+    if point is None:
+        return pose.position
+    owner = f"{type(element).__name__} '{element.name}'"
+    point = checks.number(owner, what, point, pose.position.dtype, pose.position.shape)
+    checks.finite(owner, what, point)
+    known = pose.orientation is None and checks.is_concrete((point, pose.position))
+    if known and not np.allclose(point, pose.position, rtol=1e-5, atol=1e-6):
+        raise ValueError(
+            f"{owner}: {what} is {point.tolist()}, but a particle has no other point than its"
+            f" position {pose.position.tolist()}."
+        )
+    return point

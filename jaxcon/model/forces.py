@@ -18,7 +18,7 @@ from jaxcon.core.lanes import Vector, times, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import Elements
+from jaxcon.model.elements import Elements, own_point
 from jaxcon.model.layout import Place
 
 Pulls = Iterable[tuple[Place, Vector]]
@@ -71,9 +71,9 @@ class Spring:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The numbers of the element, anchors in the frames of the bodies at assembly."""
-        dtype, shape = a.position.dtype, a.position.shape
-        start = _point(self, "point_a", self.point_a, a, dtype, shape)
-        end = _point(self, "point_b", self.point_b, b, dtype, shape)
+        dtype = a.position.dtype
+        start = own_point(self, "point_a", self.point_a, a)
+        end = own_point(self, "point_b", self.point_b, b)
         owner = f"spring '{self.name}'"
         length = numerics.norm(end - start) if self.rest_length is None else self.rest_length
         params = {
@@ -130,7 +130,7 @@ class Force:
     def attach(self, a: Pose) -> dict[str, Array]:
         """The numbers of the element."""
         dtype, shape = a.position.dtype, a.position.shape
-        start = _point(self, "point", self.point, a, dtype, shape)
+        start = own_point(self, "point", self.point, a)
         force = checks.number(f"force '{self.name}'", "force", self.force, dtype, shape)
         checks.finite(f"force '{self.name}'", "force", force)
         return {"anchor": a.local_point(start), "force": force}
@@ -229,8 +229,7 @@ class ExternalWrench:
 
     def attach(self, a: Pose) -> dict[str, Array]:
         """The numbers of the element."""
-        dtype, shape = a.position.dtype, a.position.shape
-        return {"anchor": a.local_point(_point(self, "point", self.point, a, dtype, shape))}
+        return {"anchor": a.local_point(own_point(self, "point", self.point, a))}
 
 
 @pytree
@@ -291,9 +290,7 @@ class CustomForces(Elements):
     def set(self, changes: Any) -> CustomForces:
         """With other parameters."""
         new = changes.get(self.names[0], {}).get("params", self.params)
-        return CustomForces(
-            new, self.names, self.places, self.function, self.channel, self.bodies
-        )
+        return CustomForces(new, self.names, self.places, self.function, self.channel, self.bodies)
 
     def pulls(self, snapshot: Any, control: Any) -> Pulls:
         """The generalized forces on the bodies."""
@@ -329,17 +326,3 @@ def world_wrench(frame: Any, anchor: Any, wrench: Vector) -> Vector:
         return pull
     local = torque[0] if dim == 2 else frame.rotation.T @ Vector(*torque)
     return pull + frame.turn(local)
-
-
-def _point(owner: Any, what: str, point: Any, pose: Pose, dtype: Any, shape: Any) -> Array:
-    if point is None:
-        return pose.position
-    point = checks.number(f"'{owner.name}'", what, point, dtype, shape)
-    checks.finite(f"'{owner.name}'", what, point)
-    if pose.orientation is None and checks.is_concrete((point, pose.position)):
-        if not np.allclose(point, pose.position, atol=1e-6):
-            raise ValueError(
-                f"'{owner.name}': {what} is {np.asarray(point).tolist()}, but the particle has no"
-                f" other point than its position {np.asarray(pose.position).tolist()}."
-            )
-    return point

@@ -131,7 +131,7 @@ class BodySystem:
         return self._each("kinematics", q, v)
 
     def retract(self, q: Array, step: Array) -> Array:
-        """q ⊕ Δ: moves along a finite velocity step Δ = h v (n_v,), rotations by their exponential."""
+        """q ⊕ Δ for a finite step Δ = h v (n_v,); rotations by their exponential."""
         return self._each("retract", q, step)
 
     def normalize(self, q: Array) -> Array:

@@ -43,7 +43,7 @@ def largest_stable_rate(integrator: Any, dt: float, damping_ratio: float = 1.0) 
 
 
 def warn_if_unstable(method: Any, dt: Any) -> None:
-    """Warns where concrete gains are unstable at a concrete step; a tracer has no value to judge."""
+    """Warns where gains are unstable at the step, if neither is traced."""
     stabilizer = method.stabilizer
     alpha, beta = getattr(stabilizer, "alpha", None), getattr(stabilizer, "beta", None)
     if alpha is None or beta is None or not checks.is_concrete((alpha, beta, dt)):

@@ -66,7 +66,7 @@ def step(
 
 
 def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
-    stabilizer = method.stabilizer.resolve(method.integrator.default_rate(dt))
+    stabilizer = method.stabilizer.resolve(method.integrator.default_gains(dt))
     at = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
     new, solution, rows = method.integrator.advance(at, system, state, dt)
     new = stabilizer.correct(system, method.solver, new, dt)
@@ -102,7 +102,7 @@ def forward_dynamics(
     """
     check_step(system, method, state, control)
     h = jnp.asarray(dt, state.q.dtype)
-    stabilizer = method.stabilizer.resolve(method.integrator.default_rate(h))
+    stabilizer = method.stabilizer.resolve(method.integrator.default_gains(h))
     at = accelerate(system, stabilizer, method.solver, control, state.memory, h)
     return at(state.q, state.v, state.time)[0]
 
@@ -128,8 +128,10 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> No
                 f"step: control must have shape ({layout.n_u},), got {jnp.shape(control)};"
                 f" its channels are {list(layout.controls)}."
             )
-    if getattr(control, "dtype", state.q.dtype) != state.q.dtype:
-        raise ValueError(f"step: control is {control.dtype}, but the state is {state.q.dtype}.")
+    for leaf in jax.tree.leaves(control):
+        got = getattr(leaf, "dtype", state.q.dtype)
+        if jnp.issubdtype(got, jnp.floating) and got != state.q.dtype:
+            raise ValueError(f"step: control is {got}, but the state is {state.q.dtype}.")
     check_dtype(system, state.q.dtype)
     memory = method.stabilizer.init(system, state.q, state.v)
     if jax.tree.structure(memory) != jax.tree.structure(state.memory):

@@ -1,7 +1,7 @@
 """The saddle system that a solver sees: matrices, never joints.
 
-    [ M  −Jᵀ ] [a]   [f]
-    [ J   C  ] [λ] = [b]
+[ M  −Jᵀ ] [a]   [f]
+[ J   C  ] [λ] = [b]
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ class Unstabilized:
         """No memory."""
         return ()
 
-    def resolve(self, rate: Any) -> Unstabilized:
+    def resolve(self, gains: tuple[Any, Any]) -> Unstabilized:
         """Itself: there is nothing to choose."""
         return self
 
@@ -43,15 +43,14 @@ class Baumgarte(Unstabilized):
     an array by row (n_c,), or a mapping from constraint names to numbers, with the default for the
     others.
 
-    The default is critical damping at a rate that is safe for the integrator at the step used:
-    a fixed part of 1/h for semi-implicit Euler, and bounded independently of h for Runge–Kutta
-    methods, whose stages violate the constraints by O(h²), which a gain of O(1/h²) would turn into
-    an error of order zero.
+    The default is what suits the integrator at the step used: gains in proportion to 1/h for
+    semi-implicit Euler, and bounded independently of h for Runge–Kutta methods, whose stages
+    violate the constraints by O(h²), which β² of O(1/h²) would turn into an error of order zero.
 
     Attributes:
         alpha: α [1/s].
         beta: β [1/s].
-        fallback: rate of the constraints without a gain of their own [1/s].
+        fallback: (α, β) of the constraints without gains of their own [1/s].
 
     References:
         Baumgarte, Stabilization of constraints and integrals of motion in dynamical systems (1972).
@@ -76,17 +75,17 @@ class Baumgarte(Unstabilized):
         """
         return cls(jax.tree.map(lambda x: damping_ratio * x, rate), rate)
 
-    def resolve(self, rate: Any) -> Baumgarte:
-        """The same with this rate where none was given."""
-        fallback = rate if self.fallback is None else self.fallback
-        alpha = fallback if self.alpha is None else self.alpha
-        beta = fallback if self.beta is None else self.beta
+    def resolve(self, gains: tuple[Any, Any]) -> Baumgarte:
+        """The same with these (α, β) where none were given."""
+        fallback = gains if self.fallback is None else self.fallback
+        alpha = fallback[0] if self.alpha is None else self.alpha
+        beta = fallback[1] if self.beta is None else self.beta
         return dataclasses.replace(self, alpha=alpha, beta=beta, fallback=fallback)
 
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
         """b (n_c,)."""
-        alpha = by_row(self.alpha, self.fallback, rows)
-        beta = by_row(self.beta, self.fallback, rows)
+        alpha = by_row(self.alpha, self.fallback[0], rows)
+        beta = by_row(self.beta, self.fallback[1], rows)
         return -rows.bias - 2 * alpha * rows.rate - beta * beta * rows.residual
 
 

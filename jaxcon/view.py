@@ -1,0 +1,104 @@
+"""Floor 7: pictures. matplotlib is imported inside, so that simulating needs none."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core.typing import PyTree
+from jaxcon.simulation.method import Method
+from jaxcon.simulation.rollout import rollout
+
+
+def pyplot() -> Any:
+    """matplotlib's pyplot.
+
+    Raises:
+        ImportError: it is not installed; names the extra that brings it.
+    """
+    try:
+        import matplotlib.pyplot as plt
+    except ImportError as error:
+        raise ImportError("Pictures need matplotlib: pip install 'jaxcon[plot]'.") from error
+    return plt
+
+
+def links(system: Any, q: Any) -> dict[str, np.ndarray]:
+    """For each moving body the world points (n, dim) where joints and springs hold it [m].
+
+    Bodies held at one point only are drawn from their centre of mass.
+    """
+    v = jnp.zeros(system.n_v, q.dtype)
+    layout = system.layout
+    result = {}
+    for name in layout.bodies:
+        motion = system.principal_motion(name, q, v)
+        anchors = []
+        for group in (*system.constraints, *system.forces):
+            anchors += _anchors(group, layout.locate(name))
+        points = [np.asarray(motion.position)] if len(anchors) < 2 else []
+        points += [np.asarray(motion.point(jnp.asarray(a))) for a in anchors]
+        result[name] = np.array(points)
+    return result
+
+
+def _anchors(group: Any, located: tuple[int, int]) -> list[Any]:
+    """Where the elements of a group hold a body, in its frame."""
+    found = []
+    for side, place in zip(("anchor_a", "anchor_b"), getattr(group, "places", ()), strict=False):
+        if place.group == located[0] and isinstance(group.params, dict) and side in group.params:
+            hits = [i for i, index in enumerate(place.indices) if index == located[1]]
+            found += [group.get(i)[side] for i in hits]
+    return found
+
+
+def draw(system: Any, q: Any, axes: Any = None, **style: Any) -> Any:
+    """Draws each body as a line through the points where it is held.
+
+    Args:
+        system: a `BodySystem`.
+        q: positions, (n_q,).
+        axes: matplotlib axes; new ones unless given. Scenes in space are drawn seen along y.
+        style: for the lines.
+
+    Returns:
+        The axes.
+    """
+    axes = pyplot().subplots()[1] if axes is None else axes
+    first, second = (0, 1) if system.layout.dim == 2 else (0, 2)
+    for i, (name, points) in enumerate(links(system, q).items()):
+        options = {"color": f"C{i}", "marker": "o", "markersize": 3, "lw": 2, "label": name}
+        axes.plot(points[:, first], points[:, second], **(options | style))
+    axes.set_aspect("equal")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]" if second == 1 else "z [m]")
+    return axes
+
+
+def main_job(result: Any, tuning: Any, world: PyTree, step: float, path: str) -> None:
+    """One picture: the mechanism through a turn, violation over time, and the loss."""
+    plt = pyplot()
+    system, state = world
+    dt = jnp.asarray(step, state.q.dtype)
+    run = jax.jit(lambda s: rollout(system, Method(), s, None, dt, 300, every=30))
+    _, trajectory = run(state)
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 4))
+    for i, q in enumerate(trajectory.q):
+        draw(system, q, left, alpha=0.2 + 0.08 * i, label=None)
+    draw(system, state.q, left)
+    left.legend(fontsize=8, loc="lower right")
+    left.set_title("a crank-rocker through one turn")
+    middle.semilogy(result.times, result.violation)
+    middle.set(xlabel="time [s]", ylabel="worst |φ| of all copies [m]", title="violation")
+    middle.set_ylim(bottom=min(1e-6, result.violation.min()))
+    right.plot(10**tuning.history, label="tuning")
+    right.axhline(10 ** tuning.default[1], color="gray", ls="--", label="default gains")
+    right.set(yscale="log", xlabel="iteration", ylabel="rms of φ and h φ̇ [m]")
+    right.set_title("gains tuned by gradient")
+    right.legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
