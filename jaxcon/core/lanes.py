@@ -14,6 +14,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core.typing import Array, Lane
 
@@ -155,6 +156,31 @@ def axes(n: int) -> tuple[Vector, ...]:
 def perpendicular(x: Vector) -> Vector:
     """x turned by +90° in the plane."""
     return Vector(times(-1, x[1]), x[0])
+
+
+def take(x: Lane, indices: tuple[int, ...]) -> Lane:
+    """x[indices] along the first axis: nothing, a slice, or a gather, as needed."""
+    if not isinstance(x, jax.Array):
+        return x
+    first = indices[0]
+    if indices == tuple(range(first, first + len(indices))):
+        whole = len(indices) == x.shape[0]
+        return x if whole else jax.lax.slice_in_dim(x, first, first + len(indices))
+    if indices == tuple(range(first, first - len(indices), -1)):
+        last = indices[-1]
+        return jax.lax.rev(jax.lax.slice_in_dim(x, last, last + len(indices)), (0,))
+    return x[np.asarray(indices)]
+
+
+def accumulate(target: Lane, indices: tuple[int, ...], x: Lane, bodies: int) -> Lane:
+    """target + Σ x over the bodies it acts on, from lanes (element, …) to a lane (body, …)."""
+    if not isinstance(x, jax.Array):
+        if x == 0:
+            return target
+        raise TypeError("A force component must be an array or the number 0.")
+    if indices == tuple(range(bodies)):
+        return target + x
+    return target.at[np.asarray(indices)].add(x)
 
 
 def _common(components: tuple[Any, ...]) -> list[Any]:

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
-from jaxcon.core.lanes import Vector
+from jaxcon.core.lanes import Vector, take
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.layout import Place, take
+from jaxcon.model.layout import Place
 
 
 @pytree

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxcon.core.lanes import Vector
+from jaxcon.core.lanes import Vector, take
 from jaxcon.core.typing import Array, Lane
 
 WORLD = "world"
@@ -60,28 +60,6 @@ class Place:
     def take(self, x: Lane) -> Lane:
         """The lanes of these bodies, from a lane (body, …)."""
         return take(x, self.indices)
-
-
-def take(x: Lane, indices: tuple[int, ...]) -> Lane:
-    """x[indices] along the first axis: nothing, a slice, or a gather, as needed."""
-    if not isinstance(x, jax.Array):
-        return x
-    first = indices[0]
-    if indices == tuple(range(first, first + len(indices))):
-        whole = len(indices) == x.shape[0]
-        return x if whole else jax.lax.slice_in_dim(x, first, first + len(indices))
-    return x[np.asarray(indices)]
-
-
-def accumulate(target: Lane, indices: tuple[int, ...], x: Lane, bodies: int) -> Lane:
-    """target + Σ x over the bodies it acts on, from lanes (element, …) to a lane (body, …)."""
-    if not isinstance(x, jax.Array):
-        if x == 0:
-            return target
-        raise TypeError("A force component must be an array or the number 0.")
-    if indices == tuple(range(bodies)):
-        return target + x
-    return target.at[np.asarray(indices)].add(x)
 
 
 @dataclass(frozen=True)

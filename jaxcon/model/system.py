@@ -11,14 +11,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core import checks
-from jaxcon.core.lanes import Vector, total, zeros
+from jaxcon.core.lanes import Vector, accumulate, total, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.model.bodies import rest
 from jaxcon.model.elements import element_at, replace_at
 from jaxcon.model.frames import WorldFrame
-from jaxcon.model.layout import Layout, Place, accumulate
+from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal

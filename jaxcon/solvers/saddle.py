@@ -24,8 +24,12 @@ class Diagonal:
     values: Array
 
     def solve(self, x: Array) -> Array:
-        """M⁻¹ x for a vector (n_v,) or for columns (n_v, k)."""
-        return x / (self.values if x.ndim == 1 else self.values[:, None])
+        """M⁻¹ x, (n_v,)."""
+        return x / self.values
+
+    def solve_columns(self, x: Array) -> Array:
+        """M⁻¹ X, (n_v, k)."""
+        return x / self.values[:, None]
 
     def apply(self, x: Array) -> Array:
         """M x, (n_v,)."""
@@ -48,7 +52,11 @@ class Full:
     values: Array
 
     def solve(self, x: Array) -> Array:
-        """M⁻¹ x for a vector (n_v,) or for columns (n_v, k); NaN where M is not definite."""
+        """M⁻¹ x, (n_v,); NaN where M is not definite."""
+        return jax.scipy.linalg.solve(self.values, x, assume_a="pos")
+
+    def solve_columns(self, x: Array) -> Array:
+        """M⁻¹ X, (n_v, k); NaN where M is not definite."""
         return jax.scipy.linalg.solve(self.values, x, assume_a="pos")
 
     def apply(self, x: Array) -> Array:

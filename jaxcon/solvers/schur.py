@@ -46,7 +46,7 @@ class Schur:
 
 def delassus(mass: Mass, jacobian: Array, compliance: Array | None) -> Array:
     """A = J M⁻¹ Jᵀ + C, (n_c, n_c), from a dense J (n_c, n_v)."""
-    a = jacobian @ mass.solve(jacobian.T)
+    a = jacobian @ mass.solve_columns(jacobian.T)
     return a if compliance is None else a + jnp.diag(compliance)
 
 

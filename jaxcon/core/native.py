@@ -1,0 +1,176 @@
+"""Functions that are batched natively: `vmap` moves the batch to the last axis and calls them once.
+
+A function written by lanes needs no batching rule of its own: it takes arrays with any number of
+trailing batch axes. Plain `jax.vmap` does not know that; it puts the batch first and rewrites every
+instruction. `call` wraps such a function in a primitive whose batching rule hands it the whole
+batch, last axis contiguous. The derivative of a native function is a native function too: the rules
+below bind the same primitive again, for the tangent map and for its transpose, so that `grad`,
+`jvp`, `vmap(grad)`, `grad(vmap)`, `hessian` and `scan` compose with it and stay native.
+
+An argument that is not mapped gets a trailing axis of size 1, and the function broadcasts it: a
+parameter shared by all worlds is read once. The transpose of that broadcast is a sum over worlds,
+which is right when `grad` is outside `vmap` and wrong when it is inside. So a transposed map, when
+it is batched, gets all its arguments in full and returns one cotangent a world.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+from jaxcon.core.typing import Array, PyTree
+
+
+class Native:
+    """A function of arrays with trailing batch axes, compared by identity.
+
+    Attributes:
+        function: (arrays) → list of arrays.
+        full: whether batched arguments must have the whole batch, not a trailing 1.
+    """
+
+    def __init__(self, function: Callable[..., Any], full: bool = False) -> None:
+        self.function, self.full = function, full
+        self.compiled = jax.jit(self.__call__)
+        self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
+        self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
+        self.shapes = functools.lru_cache(maxsize=64)(self._shapes)
+
+    def __call__(self, *args: Array) -> list[Array]:
+        return list(self.function(*args))
+
+    def _shapes(self, *avals: Any) -> list[Any]:
+        """Shape and dtype of the results."""
+        return jax.eval_shape(self, *(jax.ShapeDtypeStruct(*aval) for aval in avals))
+
+    def _tangent(self, moved: tuple[bool, ...]) -> Native:
+        """(x, ẋ of the moved arguments) → the tangents of the floating results."""
+        n = len(moved)
+
+        def tangent(*args: Array) -> list[Array]:
+            primals, tangents = list(args[:n]), []
+            places = [i for i in range(n) if moved[i]]
+            for i, x in zip(places, args[n:], strict=True):
+                shape = jnp.broadcast_shapes(x.shape, primals[i].shape)
+                primals[i] = jnp.broadcast_to(primals[i], shape)
+                tangents.append(jnp.broadcast_to(x, shape))
+
+            def along(*xs: Array) -> list[Array]:
+                replaced = dict(zip(places, xs, strict=True))
+                results = self(*(replaced.get(i, primals[i]) for i in range(n)))
+                return [y for y in results if jnp.issubdtype(y.dtype, jnp.inexact)]
+
+            return jax.jvp(along, [primals[i] for i in places], tangents)[1]
+
+        return Native(tangent, self.full)
+
+    def _transposed(self, linear: tuple[bool, ...], avals: Any, rank: int) -> Native:
+        """(the other arguments, ȳ) → cotangents of the arguments in which it is linear."""
+        n = len(linear)
+        places = [i for i in range(n) if linear[i]]
+        others = [i for i in range(n) if not linear[i]]
+
+        def transposed(*args: Array) -> list[Array]:
+            fixed = dict(zip(others, args[: len(others)], strict=True))
+            cotangents = list(args[len(others) :])
+            batch = cotangents[0].shape[rank:]
+
+            def along(*xs: Array) -> list[Array]:
+                replaced = fixed | dict(zip(places, xs, strict=True))
+                return self(*(replaced[i] for i in range(n)))
+
+            inputs = [jax.ShapeDtypeStruct((*shape, *batch), dtype) for shape, dtype in avals]
+            return list(jax.linear_transpose(along, *inputs)(cotangents))
+
+        return Native(transposed, True)
+
+
+native_p = Primitive("native")
+native_p.multiple_results = True
+
+
+@functools.lru_cache(maxsize=256)
+def _native(function: Callable[..., Any], structure: Any) -> tuple[Native, list[Any]]:
+    """The function of leaves, and a place where its result's structure is left when tracing."""
+    result: list[Any] = [None]
+
+    def flat(*leaves: Array) -> list[Array]:
+        output = function(*jax.tree.unflatten(structure, leaves))
+        arrays, result[0] = jax.tree.flatten(output)
+        return [jnp.asarray(x) for x in arrays]
+
+    return Native(flat), result
+
+
+def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
+    """function(*args), batched natively under `vmap`.
+
+    Args:
+        function: pure, defined once; takes pytrees of arrays and returns one. Given trailing batch
+            axes on all leaves (of the batch's size or of size 1) it must return them on all
+            results.
+        args: pytrees of arrays.
+
+    Returns:
+        What the function returns.
+    """
+    leaves, structure = jax.tree.flatten(args)
+    native, result = _native(function, structure)
+    arrays = native_p.bind(*(jnp.asarray(x) for x in leaves), fun=native)
+    return jax.tree.unflatten(result[0], arrays)
+
+
+def _abstract(*args: Any, fun: Native) -> list[Any]:
+    shapes = fun.shapes(*((x.shape, x.dtype) for x in args))
+    return [jax.core.ShapedArray(y.shape, y.dtype) for y in shapes]
+
+
+def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+
+    def last(x: Array, axis: int | None) -> Array:
+        if axis is not None:
+            return jnp.moveaxis(x, axis, -1)
+        return jnp.broadcast_to(x[..., None], (*x.shape, size)) if fun.full else x[..., None]
+
+    results = native_p.bind(*map(last, args, axes), fun=fun)
+    results = [jnp.broadcast_to(y, (*y.shape[:-1], size)) for y in results]
+    return results, [y.ndim - 1 for y in results]
+
+
+def _jvp(primals: Any, tangents: Any, *, fun: Native) -> Any:
+    results = native_p.bind(*primals, fun=fun)
+    moved = tuple(type(x) is not ad.Zero for x in tangents)
+    given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
+    moving = iter(native_p.bind(*primals, *given, fun=fun.tangent(moved)))
+    return results, [
+        next(moving)
+        if jnp.issubdtype(y.dtype, jnp.inexact)
+        else ad.Zero(jax.core.ShapedArray(y.shape, jax.dtypes.float0))
+        for y in results
+    ]
+
+
+def _transpose(cotangents: Any, *args: Any, fun: Native) -> Any:
+    linear = tuple(ad.is_undefined_primal(x) for x in args)
+    fixed = [x for x, flag in zip(args, linear, strict=True) if not flag]
+    pairs = zip(args, linear, strict=True)
+    avals = tuple((x.aval.shape, x.aval.dtype) for x, flag in pairs if flag)
+    cotangents = [ad.instantiate_zeros(x) for x in cotangents]
+    transposed = fun.transposed(linear, avals, cotangents[0].ndim)
+    found = iter(native_p.bind(*fixed, *cotangents, fun=transposed))
+    return [next(found) if flag else None for flag in linear]
+
+
+native_p.def_impl(lambda *args, fun: fun.compiled(*args))
+native_p.def_abstract_eval(_abstract)
+mlir.register_lowering(native_p, mlir.lower_fun(lambda *a, fun: fun(*a), multiple_results=True))
+batching.primitive_batchers[native_p] = _batched
+ad.primitive_jvps[native_p] = _jvp
+ad.primitive_transposes[native_p] = _transpose
