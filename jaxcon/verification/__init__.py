@@ -1,0 +1,97 @@
+"""The library held against reference numbers of others: benchmarks, papers and closed forms.
+
+Each case builds a scene through the public interface, simulates it in float64 and compares it with
+numbers from `data/`, which say where they come from. `CASES` names them all and `run` runs them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+
+import jax
+
+import jaxcon as jc
+from jaxcon.verification import (
+    andrews,
+    closed_forms,
+    convergence,
+    departures,
+    four_bar,
+    gradients,
+    nonholonomic,
+    pendulums,
+    rheonomic,
+    rotations,
+    stabilisation,
+    statics,
+)
+from jaxcon.verification.case import Check
+
+CASES: dict[str, Callable[[], list[Check]]] = {
+    case.__name__: case
+    for case in (
+        pendulums.simple_pendulum,
+        pendulums.double_pendulum,
+        pendulums.chain_pendulum,
+        pendulums.spherical_pendulum,
+        rotations.tumbling_body,
+        rotations.symmetric_body,
+        rotations.steady_top,
+        rotations.heavy_top,
+        rheonomic.bead_on_hoop,
+        nonholonomic.chaplygin_sleigh,
+        nonholonomic.ball_on_turntable,
+        nonholonomic.nonholonomic_particle,
+        closed_forms.atwood,
+        closed_forms.incline,
+        closed_forms.conical_pendulum,
+        closed_forms.physical_pendulum,
+        departures.ladder,
+        departures.sphere_departure,
+        andrews.andrews_squeezer,
+        four_bar.four_bar,
+        four_bar.trapezoid,
+        statics.static_reactions,
+        statics.tension,
+        statics.power,
+        statics.balance,
+        stabilisation.feedback_in_time,
+        stabilisation.feedback_in_steps,
+        stabilisation.feedback_limits,
+        convergence.order_in_plane,
+        convergence.order_in_space,
+        gradients.pendulum_gradients,
+    )
+}
+"""Every case by name; each returns its checks."""
+
+
+def run(names: Iterable[str] | None = None) -> Iterator[list[Check]]:
+    """Runs cases one after the other.
+
+    Args:
+        names: of cases; all unless given.
+
+    Yields:
+        The checks of each case. A case whose simulation fails has one check, of value NaN.
+
+    Raises:
+        ValueError: a name is unknown, or JAX is not in double precision.
+    """
+    chosen = list(CASES if names is None else names)
+    unknown = sorted(set(chosen) - set(CASES))
+    if unknown:
+        raise ValueError(f"verification: there is no case {unknown}; there are {list(CASES)}.")
+    if not jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "verification: the references hold to ten digits and more, so float64 is needed:"
+            " jax.config.update('jax_enable_x64', True) at the start."
+        )
+    for name in chosen:
+        try:
+            yield CASES[name]()
+        except jc.SimulationError as error:
+            yield [Check(name, f"the simulation: {error}", float("nan"), 0.0)]
+
+
+__all__ = ["CASES", "Check", "run"]

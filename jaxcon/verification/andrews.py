@@ -1,0 +1,145 @@
+"""Andrews' squeezing mechanism: seven angles, six loop conditions, motion within milliseconds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcon as jc
+from jaxcon.verification import references
+from jaxcon.verification.case import Check, relative, scaled
+from jaxcon.verification.references import column
+from jaxcon.verification.sampling import RK4, sample, solve
+
+
+def mass(q: jax.Array, p: dict[str, Any]) -> jax.Array:
+    """M(q), (7, 7) [kg m²], for q = (β, Θ, γ, Φ, δ, Ω, ε)."""
+    cos, sin = jnp.cos(q), jnp.sin(q)
+    e, f = p["e"] - p["ea"], p["zf"] - p["fa"]
+    m45 = p["m4"] * (e**2 + p["zt"] * e * sin[3]) + p["i4"]
+    m67 = p["m6"] * (f**2 - p["u"] * f * sin[5]) + p["i6"]
+    m12 = p["m2"] * (p["da"] ** 2 - p["da"] * p["rr"] * cos[1]) + p["i2"]
+    crank = p["rr"] ** 2 - 2 * p["da"] * p["rr"] * cos[1] + p["da"] ** 2
+    upper = p["zt"] ** 2 + 2 * p["zt"] * e * sin[3] + e**2
+    lower = f**2 - 2 * p["u"] * f * sin[5] + p["u"] ** 2
+    diagonal = [
+        p["m1"] * p["ra"] ** 2 + p["m2"] * crank + p["i1"] + p["i2"],
+        p["m2"] * p["da"] ** 2 + p["i2"],
+        p["m3"] * (p["sa"] ** 2 + p["sb"] ** 2) + p["i3"],
+        p["m4"] * e**2 + p["i4"],
+        p["m4"] * upper + p["m5"] * (p["ta"] ** 2 + p["tb"] ** 2) + p["i4"] + p["i5"],
+        p["m6"] * f**2 + p["i6"],
+        p["m6"] * lower + p["m7"] * (p["ua"] ** 2 + p["ub"] ** 2) + p["i6"] + p["i7"],
+    ]
+    m = jnp.diag(jnp.stack(diagonal))
+    for i, j, value in ((0, 1, m12), (3, 4, m45), (5, 6, m67)):
+        m = m.at[i, j].set(value).at[j, i].set(value)
+    return m
+
+
+def force(q: jax.Array, v: jax.Array, t: Any, control: Any, p: dict[str, Any]) -> jax.Array:
+    """f(q, q̇), (7,) [N m]: the driving torque, the spring, and the terms quadratic in q̇."""
+    cos, sin = jnp.cos(q), jnp.sin(q)
+    pull, g = spring(q, p), 2
+    on_knee = p["m4"] * p["zt"] * (p["e"] - p["ea"]) * cos[3]
+    on_foot = p["m6"] * p["u"] * (p["zf"] - p["fa"]) * cos[5]
+    on_crank = p["m2"] * p["da"] * p["rr"] * sin[1]
+    return jnp.stack(
+        [
+            p["mom"] - on_crank * v[1] * (v[1] + 2 * v[0]),
+            on_crank * v[0] ** 2,
+            pull[0] * (p["sc"] * cos[g] - p["sd"] * sin[g])
+            + pull[1] * (p["sd"] * cos[g] + p["sc"] * sin[g]),
+            on_knee * v[4] ** 2,
+            -on_knee * v[3] * (v[3] + 2 * v[4]),
+            -on_foot * v[6] ** 2,
+            on_foot * v[5] * (v[5] + 2 * v[6]),
+        ]
+    )
+
+
+def spring(q: jax.Array, p: dict[str, Any]) -> jax.Array:
+    """−c₀ (L − l₀) d/L: the force of the spring on the triangle, whose angle is γ, (2,) [N]."""
+    cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
+    d = jnp.stack(
+        [
+            p["sd"] * cos + p["sc"] * sin + p["xb"] - p["xc"],
+            p["sd"] * sin - p["sc"] * cos + p["yb"] - p["yc"],
+        ]
+    )
+    length = jnp.sqrt(jnp.sum(d * d))
+    return -p["c0"] * (length - p["l0"]) / length * d
+
+
+def loops(q: jax.Array, t: Any, p: dict[str, Any]) -> jax.Array:
+    """Three loops close at the common joint of crank and triangle arms, (6,) [m]."""
+    beta, theta, gamma, phi, delta, omega, epsilon = q
+    x = p["rr"] * jnp.cos(beta) - p["d"] * jnp.cos(beta + theta)
+    y = p["rr"] * jnp.sin(beta) - p["d"] * jnp.sin(beta + theta)
+    up, down = phi + delta, omega + epsilon
+    return jnp.stack(
+        [
+            x - p["ss"] * jnp.sin(gamma) - p["xb"],
+            y + p["ss"] * jnp.cos(gamma) - p["yb"],
+            x - p["e"] * jnp.sin(up) - p["zt"] * jnp.cos(delta) - p["xa"],
+            y + p["e"] * jnp.cos(up) - p["zt"] * jnp.sin(delta) - p["ya"],
+            x - p["zf"] * jnp.cos(down) - p["u"] * jnp.sin(epsilon) - p["xa"],
+            y - p["zf"] * jnp.sin(down) + p["u"] * jnp.cos(epsilon) - p["ya"],
+        ]
+    )
+
+
+def andrews(method: jc.Method = RK4) -> tuple[Any, jc.State]:
+    """The mechanism at rest, with SI parameters as leaves of the system.
+
+    Args:
+        method: with which it will be simulated.
+
+    Returns:
+        The system and its first state.
+
+    References:
+        Mazzia, Magherini, Test Set for Initial Value Problem Solvers (2008), problem Andrews.
+    """
+    data = references.load("ivp_andrews")
+    params = {name: jnp.asarray(value) for name, value in data["parameters"].items()}
+    closed = jc.Holonomic(loops, name="loops")
+    system = jc.GeneralizedSystem(mass=mass, force=force, constraints=(closed,), params=params)
+    q, v = (jnp.array(data["initial"][key], float) for key in ("q", "v"))
+    return system, jc.init(system, method, q, v)
+
+
+def andrews_squeezer() -> list[Check]:
+    """M(q) a = f(q, q̇) + Jᵀλ to t = 0.03 s; the reference's multipliers have the other sign.
+
+    q is held to the eleven digits that the reference asks for. At 0.03 s some rates are thousands
+    of times smaller than that of the crank, whose error they inherit through the loops; a and λ
+    follow from q and q̇ alone. So these are held to nine digits, and on the way relative to the
+    largest component of each row. The published end state is itself good to 9.6 digits in q.
+    """
+    case, data = "andrews_squeezer", references.load("ivp_andrews")
+    rows, published = data["corrected_reference"]["rows"], data["published_reference_t0p03"]
+    system, state = andrews()
+    states = sample(system, state, [r["t"] for r in rows], 1.25e-6)
+    solutions = solve(system, states)
+    a, multipliers = np.asarray(solutions.acceleration), -np.asarray(solutions.multipliers)
+    first = jc.forward_dynamics(system, state, None, RK4, 1e-6)
+    initial, end = data["initial"], published["values"]
+    q, v, n = states.q, states.v, len(rows) - 1
+    vdot12, lam12 = first.acceleration[:2], -first.multipliers[:2]
+    return [
+        Check(case, "q at 0.03 s, relative", relative(q[n], rows[n]["q"]), 1e-11),
+        Check(case, "q̇ at 0.03 s, relative", relative(v[n], rows[n]["v"]), 1e-9),
+        Check(case, "a at 0.03 s, relative", relative(a[n], rows[n]["vdot"]), 1e-9),
+        Check(case, "λ at 0.03 s, relative", relative(multipliers[n], rows[n]["lam"]), 1e-9),
+        Check(case, "q on the way, relative", relative(q, column(rows, "q")), 1e-11),
+        Check(case, "q̇ on the way", scaled(v, column(rows, "v")), 1e-9),
+        Check(case, "a on the way", scaled(a, column(rows, "vdot")), 1e-9),
+        Check(case, "λ on the way", scaled(multipliers, column(rows, "lam")), 1e-9),
+        Check(case, "q at 0.03 s, as published", relative(q[n], end[:7]), 1e-9),
+        Check(case, "a at the start", relative(vdot12, initial["vdot12"]), 1e-9),
+        Check(case, "λ at the start", relative(lam12, initial["lam12"]), 1e-9),
+    ]

@@ -1,0 +1,145 @@
+"""Textbook mechanisms whose accelerations and forces are one line of algebra.
+
+The rope that goes taut needs an impact law; it is left to the cases with unilateral constraints.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcon as jc
+from jaxcon.verification import references
+from jaxcon.verification.case import Check, relative
+from jaxcon.verification.nonholonomic import rolling_ball
+from jaxcon.verification.sampling import RK4, rows_of, run, sample, solve
+
+G = 9.81
+BOUND = 1e-10
+forward = jax.jit(jc.forward_dynamics)
+
+
+def constants(name: str) -> dict[str, Any]:
+    """The numbers of one of the mechanisms."""
+    cases = references.load("an_small_closed_forms")["cases"]
+    return next(case for case in cases if case["id"] == name)
+
+
+def rope(left: jc.Pose, right: jc.Pose, t: Any, params: Any) -> jax.Array:
+    """y₁ + y₂ = 0: λ is the tension of a rope over a massless pulley."""
+    return (left.position[1] + right.position[1])[None]
+
+
+def wound(weight: jc.Pose, pulley: jc.Pose, t: Any, lever: Any) -> jax.Array:
+    """y + l θ = 0: a weight on a rope that leaves a pulley on the side of its lever l."""
+    return (weight.position[1] + lever * pulley.orientation)[None]
+
+
+def atwood() -> list[Check]:
+    """a = (m₁ − m₂) g / (m₁ + m₂ + I/r²) for two weights on a rope over a pulley."""
+    light, heavy = constants("atwood"), constants("atwood_pulley_inertia")
+    scene = two_weights()
+    scene.add(jc.Holonomic(rope, bodies=("left", "right")))
+    fall, tension = solve_one(*scene.build())
+    scene, r = two_weights(), 0.2
+    scene.add_body("pulley", mass=1.0, inertia=r**2 / 2)
+    scene.add(jc.Revolute("axle", jc.WORLD, "pulley", point=(0.0, 0.0)))
+    scene.add(jc.Holonomic(wound, ("left", "pulley"), "left rope", jnp.array(r)))
+    scene.add(jc.Holonomic(wound, ("right", "pulley"), "right rope", jnp.array(-r)))
+    system, state = scene.build()
+    slower = solve_one(system, state)[0]
+    left = system.layout.v("left")[1]
+    return [
+        Check("atwood", "acceleration", relative(-fall[2], light["acceleration"]), BOUND),
+        Check("atwood", "tension = λ", relative(tension[0], light["tension"]), BOUND),
+        Check("atwood", "heavy pulley", relative(-slower[left], heavy["acceleration"]), BOUND),
+    ]
+
+
+def two_weights() -> jc.Scene:
+    """3 kg and 2 kg in the plane, at rest at y = 0."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -G))
+    scene.add_particle("left", mass=3.0)
+    scene.add_particle("right", mass=2.0)
+    return scene
+
+
+def incline() -> list[Check]:
+    """a = (5/7) g sin α for a ball that rolls down an incline; friction (2/7) m g sin α."""
+    data, alpha, mass = constants("rolling_ball_incline"), np.radians(25.0), 1.3
+    gravity = (G * np.sin(alpha), 0.0, -G * np.cos(alpha))
+    system, state = rolling_ball(mass, 0.2, 0.0, gravity, position=(0.0, 0.0, 0.2))
+    a, multipliers = solve_one(system, state)
+    friction = abs(multipliers[rows_of(system, state, "rolling")[0]])
+    normal = multipliers[rows_of(system, state, "height")[0]]
+    weight, share = friction / (mass * G), friction / normal
+    return [
+        Check("incline", "acceleration", relative(a[0], data["acceleration"]), BOUND),
+        Check("incline", "friction/weight", relative(weight, data["friction_over_weight"]), BOUND),
+        Check("incline", "friction/normal force", relative(share, data["min_mu"]), BOUND),
+    ]
+
+
+def conical_pendulum() -> list[Check]:
+    """Ω² = g / (l cos θ): the bob goes round at constant height, with tension m Ω² l."""
+    data, length, tilt, mass = constants("conical_pendulum"), 1.2, 0.4, 2.0
+    radius, height = length * np.sin(tilt), -length * np.cos(tilt)
+    scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -G))
+    velocity = (0.0, radius * data["rate"], 0.0)
+    scene.add_particle("bob", mass=mass, position=(radius, 0.0, height), velocity=velocity)
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    states = sample(system, state, (0.5, 1.0, 1.5), 5e-4)
+    q, angle = np.asarray(states.q), data["rate"] * np.asarray(states.time)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.full(3, height / radius)], -1) * radius
+    tension = -np.asarray(solve(system, states).multipliers[:, 0]) / mass
+    expected = np.full(3, data["tension_over_m"])
+    return [
+        Check("conical_pendulum", "position to 1.5 s", relative(q, circle), BOUND),
+        Check("conical_pendulum", "tension/m = −λ/m", relative(tension, expected), BOUND),
+    ]
+
+
+def physical_pendulum() -> list[Check]:
+    """θ̈ = 3g/(2l) and pin force m g/4 at the horizontal; ω² = 3g/l and 5/2 m g at the bottom.
+
+    The quarter period is K(sin 45°)/√(3g/(2l)), K by the arithmetic-geometric mean.
+    """
+    data, length = constants("physical_pendulum_pin_force"), 1.0
+    scene = jc.Scene(dim=2, gravity=(0.0, -G))
+    scene.add_body("rod", mass=1.0, inertia=length**2 / 12, position=(length / 2, 0.0))
+    scene.add(jc.Revolute("pin", jc.WORLD, "rod", point=(0.0, 0.0)))
+    system, state = scene.build()
+    steps = 1000
+    quarter = quarter_turn() / np.sqrt(1.5 * G / length)
+    bottom = jax.tree.map(lambda x: x[1], run(system, RK4, state, quarter / steps, steps, 1))
+    at_rest, moving = (forward(system, s, None, RK4, 1e-3) for s in (state, bottom))
+    up = jc.wrench(system, state, at_rest, "pin")[1]
+    up_below = jc.wrench(system, bottom, moving, "pin")[1]
+    found = {
+        "initial_angular_acceleration": -at_rest.acceleration[2],
+        "initial_pin_force_up": up,
+        "bottom_angular_speed": -bottom.v[2],
+        "bottom_pin_force_up": up_below,
+    }
+    return [
+        Check("physical_pendulum", key.replace("_", " "), relative(x, data[key]), BOUND)
+        for key, x in found.items()
+    ]
+
+
+def quarter_turn() -> float:
+    """K(k) for k² = ½: π / (2 agm(1, √½))."""
+    a, b = 1.0, np.sqrt(0.5)
+    for _ in range(6):
+        a, b = (a + b) / 2, np.sqrt(a * b)
+    return np.pi / (2 * a)
+
+
+def solve_one(system: Any, state: jc.State) -> tuple[np.ndarray, np.ndarray]:
+    """Acceleration and multipliers at one state."""
+    solution = forward(system, state, None, RK4, 1e-3)
+    return np.asarray(solution.acceleration), np.asarray(solution.multipliers)

@@ -1,0 +1,149 @@
+"""One planar four-bar built in three ways, and a four-bar of another library."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcon as jc
+from jaxcon.verification import references
+from jaxcon.verification.case import Check, error, turned
+from jaxcon.verification.linkage import NAMES, G, Linkage, crank_rocker, hanging_trapezoid, planar
+from jaxcon.verification.references import column
+from jaxcon.verification.sampling import RK4, sample
+
+
+def upright(rocker: jc.Pose, t: Any, params: Any) -> jax.Array:
+    """z · b = 0 for the direction b across the rocker in the plane: it does not spin."""
+    across = jnp.array([0.0, 1.0, 0.0], rocker.position.dtype)
+    return jc.quaternion.rotate(rocker.orientation, across)[2:]
+
+
+def spatial(bar: Linkage) -> tuple[Any, jc.State]:
+    """Three bodies in space: 18 velocities, 5 + 5 + 3 + 3 + 1 rows, all independent.
+
+    Four hinges would hold the linkage in its plane three times over. Two hinges hold crank and
+    coupler there; between two ball joints the rocker could still spin, which takes one more row.
+    """
+    scene = jc.Scene(dim=3, gravity=(0.0, -G, 0.0))
+    for i, name in enumerate(NAMES):
+        half = bar.angles[i] / 2
+        scene.add_body(
+            name,
+            mass=bar.masses[i],
+            inertia=np.array([0.1, 1.0, 1.0]) * bar.inertias[i],
+            position=(*(bar.starts[i] + bar.halves[i]), 0.0),
+            quaternion=(np.cos(half), 0.0, 0.0, np.sin(half)),
+            velocity=(*bar.velocities[i], 0.0),
+            angular_velocity=(0.0, 0.0, bar.rates[i]),
+        )
+    knee, end = bar.starts[1], bar.starts[1] + 2 * bar.halves[1]
+    z = (0.0, 0.0, 1.0)
+    scene.add(jc.Revolute("pivot", jc.WORLD, "crank", point=(0.0, 0.0, 0.0), axis=z))
+    scene.add(jc.Revolute("knee", "crank", "coupler", point=(*knee, 0.0), axis=z))
+    scene.add(jc.Spherical("end", "coupler", "rocker", point=(*end, 0.0)))
+    scene.add(jc.Spherical("anchor", jc.WORLD, "rocker", point=(bar.base, 0.0, 0.0)))
+    scene.add(jc.Holonomic(upright, bodies=("rocker",), name="no spin"))
+    return scene.build()
+
+
+def middles(q: jax.Array, p: dict[str, Any]) -> jax.Array:
+    """The centres of mass by the three angles, (3, 2) [m]."""
+    along = p["lengths"][:, None] * jnp.stack([jnp.cos(q), jnp.sin(q)], -1)
+    anchor = jnp.stack([p["base"], jnp.zeros_like(p["base"])])
+    return jnp.stack([along[0] / 2, along[0] + along[1] / 2, anchor + along[2] / 2])
+
+
+def mass(q: jax.Array, p: dict[str, Any]) -> jax.Array:
+    """M = Σ mᵢ JᵢᵀJᵢ + diag(I), (3, 3), with Jᵢ the derivative of a centre of mass."""
+    slopes = jax.jacfwd(middles)(q, p)
+    weighted = p["masses"][:, None, None] * slopes
+    return jnp.tensordot(weighted, slopes, axes=((0, 1), (0, 1))) + jnp.diag(p["inertias"])
+
+
+def potential(q: jax.Array, t: Any, p: dict[str, Any]) -> jax.Array:
+    """Σ mᵢ g yᵢ, () [J]."""
+    return G * jnp.dot(p["masses"], middles(q, p)[:, 1])
+
+
+def force(q: jax.Array, v: jax.Array, t: Any, control: Any, p: dict[str, Any]) -> jax.Array:
+    """∂(T − V)/∂q − Ṁ q̇, (3,): the terms of Lagrange's equations without q̈."""
+    _, slope = jax.jvp(lambda q: mass(q, p) @ v, (q,), (v,))
+    kinetic = jax.grad(lambda q: v @ mass(q, p) @ v / 2)(q)
+    return kinetic - jax.grad(potential)(q, t, p) - slope
+
+
+def loop(q: jax.Array, t: Any, p: dict[str, Any]) -> jax.Array:
+    """The end of the coupler meets the end of the rocker, (2,) [m]."""
+    x, y = p["lengths"] * jnp.cos(q), p["lengths"] * jnp.sin(q)
+    return jnp.stack([x[0] + x[1] - x[2] - p["base"], y[0] + y[1] - y[2]])
+
+
+def angular(bar: Linkage) -> tuple[Any, jc.State]:
+    """Three angles and one loop: 3 velocities, 2 rows."""
+    fields = ("lengths", "masses", "inertias", "base")
+    params = {field: jnp.asarray(getattr(bar, field)) for field in fields}
+    system = jc.GeneralizedSystem(
+        mass=mass,
+        force=force,
+        constraints=(jc.Holonomic(loop),),
+        params=params,
+        potential=potential,
+    )
+    return system, jc.init(system, RK4, jnp.asarray(bar.angles), jnp.asarray(bar.rates))
+
+
+def four_bar() -> list[Check]:
+    """The same linkage in the plane, in space and by angles moves in the same way."""
+    case, bar = "four_bar", crank_rocker()
+    times, dt = np.linspace(0.1, 1.0, 10).tolist(), 5e-4
+    checks, found = [], []
+    for name, build in (("plane", planar), ("space", spatial), ("angles", angular)):
+        system, state = build(bar)
+        report = jc.report(system, state)
+        missing = abs(report.degrees_of_freedom - 1) + len(report.redundant)
+        checks.append(Check(case, f"{name}: one freedom, no row redundant", missing, 0.0))
+        found.append(sample(system, state, times, dt))
+    plane, space, angles = (np.asarray(states.q) for states in found)
+    middle = jax.vmap(middles, (0, None))(jnp.asarray(angles), system.params).swapaxes(1, 2)
+    flat = plane.reshape(-1, 3, 3)  # x, y, θ of three bodies
+    solid = space.reshape(-1, 7, 3)
+    turn = 2 * np.arctan2(solid[:, 6], solid[:, 3])
+    return [
+        *checks,
+        Check(case, "centres of mass, angles − plane [m]", error(middle, flat[:, :2]), 1e-9),
+        Check(case, "centres of mass, space − plane [m]", error(solid[:, :2], flat[:, :2]), 1e-9),
+        Check(case, "angles, angles − plane [rad]", error(angles, flat[:, 2]), 1e-9),
+        Check(case, "angles, space − plane [rad]", turned(turn, flat[:, 2]), 1e-9),
+        Check(case, "out of the plane [m]", error(solid[:, 2], np.zeros((10, 3))), 1e-9),
+    ]
+
+
+def trapezoid() -> list[Check]:
+    """A hanging isosceles trapezoid of three equal links, in equilibrium and swung.
+
+    The reference turns about +y and so clockwise in the plane of x and z: its angles are negated.
+    Its own error is 3e-10, and it prints ten decimals.
+
+    References:
+        RobotLocomotion/drake, examples/multibody/four_bar: geometry and inertia.
+    """
+    case, rows = "trapezoid", references.load("drake_four_bar")["reference"]
+    at_rest, swung = (hanging_trapezoid(rate) for rate in (0.0, -rows[0]["qA_rate"]))
+    still = jc.forward_dynamics(*planar(at_rest), None, RK4, 1e-3).acceleration
+    states = sample(*planar(swung), [r["t"] for r in rows], 5e-4)
+    q, v = (np.asarray(x).reshape(-1, 3, 3) for x in (states.q, states.v))
+    keys = ("qA", "coupler_abs", "qC")
+    angles = -np.stack([column(rows, key) for key in keys], -1)
+    center = column(rows, "coupler_com")[:, [0, 2]]
+    return [
+        Check(case, "acceleration in equilibrium", error(still, np.zeros(9)), 1e-12),
+        Check(case, "angles to 5 s [rad]", turned(q[:, 2], angles), 3e-10),
+        Check(
+            case, "rate of the crank [rad/s]", error(-v[:, 2, 0], column(rows, "qA_rate")), 3e-10
+        ),
+        Check(case, "middle of the coupler [m]", error(q[:, :2, 1], center), 3e-10),
+    ]

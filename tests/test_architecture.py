@@ -1,0 +1,130 @@
+"""Which module may import which, and that importing changes nothing; read from the source."""
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import jaxcon as jc
+
+ROOT = Path(jc.__file__).parent
+FLOORS = {
+    "core": 0,
+    "geometry": 1,
+    "solvers": 1,
+    "model": 2,
+    "constraints": 3,
+    "dynamics": 4,
+    "stabilization": 5,
+    "simulation": 6,
+    "view": 7,
+    "analysis": 7,
+    "io": 7,
+    "learning": 8,
+    "verification": 8,
+    "scenes": 8,
+    "demo": 8,
+    "__main__": 8,
+}
+MODULES = sorted(ROOT.rglob("*.py"))
+
+
+def room(path):
+    """The folder of a module in the package, or its own name at the top."""
+    return path.relative_to(ROOT).with_suffix("").parts[0]
+
+
+def imports(path):
+    """Names of the modules of jaxcon that a file imports."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}:{node.lineno}: imports are absolute"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        yield from (name for name in names if name.split(".")[0] == "jaxcon")
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_a_module_imports_its_own_folder_and_lower_floors(path):
+    own = room(path)
+    if own == "__init__":
+        return
+    assert own in FLOORS, f"{own} has no floor"
+    for name in imports(path):
+        other = (name.split(".") + [""])[1]
+        if own == "__main__" and other in ("", "__version__"):
+            continue
+        public = other not in FLOORS
+        assert not (public and FLOORS[own] < 8), f"{path}: {name} is the public face of the house"
+        if public or other == own:
+            continue
+        top = FLOORS[own] == FLOORS[other] == 8
+        assert FLOORS[other] < FLOORS[own] or top, f"{path}: {name} is not on a lower floor"
+
+
+def test_the_check_sees_imports():
+    names = set(imports(ROOT / "model" / "system.py"))
+    assert "jaxcon.solvers.saddle.Diagonal" in names
+    assert len(names) > 5
+
+
+NOT_IN_THE_LIBRARY = {
+    "float64 for all": re.compile(r"jnp\.float64|dtype=float\b|jax\.numpy\.float64"),
+    "the global configuration": re.compile(r"jax\.config\.update|config\.update\("),
+    "a sum by a small einsum": re.compile(r"\beinsum\b"),
+}
+MAY_SAY = {"float64 for all": {"dynamics/scene.py"}, "a sum by a small einsum": {"core/lanes.py"}}
+"""The check of the dtype given to a scene, and a docstring."""
+
+
+@pytest.mark.parametrize("what", NOT_IN_THE_LIBRARY)
+def test_the_library_does_not_touch(what):
+    for path in MODULES:
+        inside = str(path.relative_to(ROOT))
+        if room(path) in ("__main__", "verification", "demo") or inside in MAY_SAY.get(what, ()):
+            continue
+        for number, line in enumerate(path.read_text().splitlines(), 1):
+            assert not NOT_IN_THE_LIBRARY[what].search(line), f"{inside}:{number}: {line}"
+
+
+def test_every_public_name_exists_and_says_what_it_is():
+    assert sorted(set(jc.__all__)) == sorted(jc.__all__)
+    for name in jc.__all__:
+        thing = getattr(jc, name)
+        assert name == "WORLD" or inspect.getdoc(thing), name
+
+
+def test_every_public_method_says_what_it_does():
+    for name in jc.__all__:
+        thing = getattr(jc, name)
+        if not inspect.isclass(thing) or issubclass(thing, Exception):
+            continue
+        for key, member in vars(thing).items():
+            if not key.startswith("_") and callable(member):
+                assert inspect.getdoc(member), f"{name}.{key}"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_every_module_has_a_docstring(path):
+    assert ast.get_docstring(ast.parse(path.read_text()))
+
+
+def test_importing_changes_no_global_configuration():
+    """Compared in a fresh interpreter, which also must not import what is optional."""
+    program = """
+import sys, jax
+before = dict(jax.config.values)
+import jaxcon
+changed = {k for k, v in jax.config.values.items() if before.get(k) != v}
+assert not changed, changed
+assert "matplotlib" not in sys.modules and "mujoco" not in sys.modules
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr

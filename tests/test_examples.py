@@ -1,0 +1,88 @@
+"""The README, CONTRIBUTING and the examples run as they stand."""
+
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def blocks(file: str) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", (ROOT / file).read_text(), re.DOTALL)
+
+
+def test_readme_code_runs_in_order():
+    code = blocks("README.md")
+    assert len(code) == 4
+    names: dict = {}
+    for block in code:
+        exec(block, names)  # noqa: S102
+    assert names["path"].q.shape == (1000, 5)
+
+
+def test_readme_opens_with_ten_lines_and_two_commands():
+    readme = (ROOT / "README.md").read_text()
+    lines = [line for line in blocks("README.md")[0].splitlines() if line]
+    assert len(lines) == 10
+    commands = re.findall(r"```sh\n(.*?)\n```", readme, re.DOTALL)
+    assert [c.count("\n") for c in commands] == [0, 0]
+    assert "python -m jaxcon" in commands[0]
+    assert "python -m pytest" in commands[1]
+
+
+def test_joint_of_contributing_holds_a_point_on_a_plane():
+    import jax
+    import jax.numpy as jnp
+
+    import jaxcon as jc
+
+    names: dict = {}
+    exec(blocks("CONTRIBUTING.md")[0], names)  # noqa: S102
+    scene = jc.Scene()
+    inertia = jc.inertia.box(1.0, (1.0, 0.4, 0.2))
+    scene.add_body("plate", inertia=inertia, position=(0.0, 0.0, 1.0), velocity=(1.0, 0.0, 0.0))
+    scene.add(
+        names["PointOnPlane"](
+            "slide", jc.WORLD, "plate", point=(0.5, 0.0, 1.0), axis=(0.0, 0.0, 2.0)
+        )
+    )
+    system, state = scene.build()
+    run = jax.jit(lambda s: jc.rollout(system, jc.Method(jc.RK4()), s, None, 1e-3, 300)[0])
+    tip = jc.position(system, run(state), "plate", (0.5, 0.0, 0.0))
+    assert jnp.abs(tip[2] - 1.0) < 1e-9
+
+
+@pytest.mark.parametrize("example", sorted((ROOT / "examples").glob("*.py")), ids=lambda p: p.stem)
+def test_example_runs(example, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.setattr(sys, "argv", [str(example)])
+    runpy.run_path(str(example), run_name="__main__")
+    assert capsys.readouterr().out
+
+
+def test_main_job_small(tmp_path):
+    picture = tmp_path / "picture.png"
+    command = [sys.executable, "-m", "jaxcon", "--copies", "64", "--seconds", "1"]
+    done = subprocess.run(
+        [*command, "--picture", str(picture)], capture_output=True, text=True, check=True
+    )
+    assert "environment-steps per second" in done.stdout
+    assert "tuned" in done.stdout
+    assert picture.stat().st_size > 10_000
+
+
+def test_verify_writes_json_and_refuses_unknown_cases(tmp_path):
+    command = [sys.executable, "-m", "jaxcon", "verify"]
+    unknown = subprocess.run([*command, "no_such_case"], capture_output=True, text=True, check=False)
+    assert unknown.returncode == 2
+    assert "no_such_case" in unknown.stdout
+
+
+def test_andrews_of_the_example_meets_its_reference():
+    example = runpy.run_path(str(ROOT / "examples" / "andrews.py"))
+    assert example["relative_error"]() < 1e-8

@@ -1,0 +1,231 @@
+"""Rows written by hand against derivatives of their residual, off the constraints.
+
+Along q̇ = N(q) v with v constant: φ̇ = ∂φ/∂q N v + ∂φ/∂t, J = ∂φ̇/∂v, γ = dφ̇/dt. The residuals
+themselves are held against formulas written here, with matrices.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+import scenes
+from compiling import quick_jit
+from jaxcon.constraints.rows import linearize
+from tolerances import DERIVATIVE, DIFFERENCE
+
+
+def by_hand(system, q, v, t):
+    rows = linearize(system, q, v, t)
+    return rows.residual, rows.rate, rows.jacobian.dense(), rows.bias
+
+
+def by_derivation(system, level, q, v, t):
+    """φ̇, J, γ and ∂φ/∂t from φ alone; from ψ alone in rows where `level`."""
+
+    def residual(q, t):
+        return linearize(system, q, v, t).residual
+
+    def rate(q, v, t):
+        given = linearize(system, q, v, t).rate
+        derived = jax.jvp(residual, (q, t), (system.kinematics(q, v), jnp.ones_like(t)))[1]
+        return jnp.where(level, given, derived)
+
+    along = (system.kinematics(q, v), jnp.ones_like(t))
+    value, bias = jax.jvp(lambda q, t: rate(q, v, t), (q, t), along)
+    return value, jax.jacfwd(rate, argnums=1)(q, v, t), bias, rate(q, 0 * v, t)
+
+
+def level_rows(built):
+    """Which rows have no φ."""
+    layout = linearize(built.system, built.off.q, built.off.v, built.off.time).layout
+    level = np.zeros(layout.size, bool)
+    for name in built.velocity_level:
+        level[layout.rows(name)] = True
+    return level
+
+
+@pytest.mark.parametrize("name", scenes.NAMES)
+def test_rows_are_derivatives_of_the_residual(name):
+    built = scenes.build(name)
+    level, s = level_rows(built), built.off
+    residual, rate, jacobian, bias = by_hand(built.system, s.q, s.v, s.time)
+    derive = quick_jit(lambda q, v, t: by_derivation(built.system, level, q, v, t))
+    expected = derive(s.q, s.v, s.time)
+    close = {"rtol": DERIVATIVE, "atol": DERIVATIVE}
+    np.testing.assert_allclose(rate, expected[0], **close)
+    np.testing.assert_allclose(jacobian, expected[1], **close)
+    np.testing.assert_allclose(bias, expected[2], **close)
+    np.testing.assert_allclose(jacobian @ s.v + expected[3], rate, **close)
+    assert np.all(np.abs(residual[~level]) > 1e-6), "the state is not off the constraints"
+    np.testing.assert_array_equal(residual[level], 0)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_rates_along_a_motion_in_time(dim):
+    """The same by central differences of a motion at constant v."""
+    built = scenes.build(f"mixed-{dim}d")
+    system, s, h = built.system, built.off, 1e-5
+    keep = ~level_rows(built)
+    ahead, behind = (
+        by_hand(system, system.retract(s.q, x * s.v), s.v, s.time + x) for x in (h, -h)
+    )
+    _, rate, _, bias = by_hand(system, s.q, s.v, s.time)
+    slope = (ahead[0] - behind[0]) / (2 * h)
+    np.testing.assert_allclose(rate[keep], slope[keep], rtol=DIFFERENCE, atol=DIFFERENCE)
+    slope = (ahead[1] - behind[1]) / (2 * h)
+    np.testing.assert_allclose(bias, slope, rtol=DIFFERENCE, atol=DIFFERENCE)
+
+
+class Body:
+    """A body's frame by a matrix, from the coordinates; the world where there is no name."""
+
+    def __init__(self, built, name):
+        dim = built.system.layout.dim
+        self.x, self.r = np.zeros(dim), np.eye(dim)
+        if name == jc.WORLD:
+            return
+        q = np.asarray(built.off.q)[built.system.layout.q(name)]
+        self.x = q[:dim]
+        if dim == 2:
+            c, s = np.cos(q[2]), np.sin(q[2])
+            self.r = np.array([[c, -s], [s, c]])
+        else:
+            self.r = matrix(q[3:])
+
+    def point(self, anchor):
+        return self.x + self.r @ np.asarray(anchor)
+
+
+def matrix(q):
+    """The rotation matrix of a unit quaternion, from (w + k)(w + k) with k the cross product."""
+    w, (x, y, z) = q[0], q[1:]
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * k + 2 * k @ k
+
+
+def gap(p, a, b):
+    return b.point(p["anchor_b"]) - a.point(p["anchor_a"])
+
+
+def distance(p, a, b):
+    return [np.linalg.norm(gap(p, a, b)) - p["length"]]
+
+
+def revolute(p, a, b):
+    if "axis" not in p:
+        return gap(p, a, b)
+    n, across = a.r @ p["axis"], (b.r @ p["first_b"], b.r @ p["second_b"])
+    return [*gap(p, a, b), *(n @ u for u in across)]
+
+
+def turned(p, a, b):
+    """The angle left in the plane, 2 sin(θ/2) n of the turn left in space."""
+    if a.x.shape == (2,):
+        left = a.r.T @ b.r
+        angle = np.arctan2(left[1, 0], left[0, 0]) - p["orientation"]
+        return [np.angle(np.exp(1j * angle))]
+    left = a.r.T @ b.r @ matrix(np.asarray(p["orientation"])).T
+    sine = np.array([left[2, 1] - left[1, 2], left[0, 2] - left[2, 0], left[1, 0] - left[0, 1]]) / 2
+    cosine = (np.trace(left) - 1) / 2
+    return sine / np.cos(np.arccos(cosine) / 2)
+
+
+def fixed(p, a, b):
+    return [*gap(p, a, b), *turned(p, a, b)]
+
+
+def prismatic(p, a, b):
+    normals = [p[side] for side in ("first_a", "second_a") if side in p]
+    return [*((a.r @ u) @ gap(p, a, b) for u in normals), *turned(p, a, b)]
+
+
+RESIDUALS = {
+    "coincident": gap,
+    "spherical": gap,
+    "distance": distance,
+    "revolute": revolute,
+    "fixed": fixed,
+    "prismatic": prismatic,
+}
+FORMULAS = [
+    f"{kind}-{dim}d-{topology}"
+    for kind in RESIDUALS
+    for dim in scenes.JOINTS[kind].dims
+    for topology in ("tree", "between")
+]
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_residual_is_the_formula(name):
+    built = scenes.build(name)
+    pair = (jc.WORLD, "first") if name.endswith("tree") else ("first", "second")
+    p = {key: np.asarray(x) for key, x in built.system.params["joint"].items()}
+    expected = np.array(RESIDUALS[name.split("-")[0]](p, *(Body(built, b) for b in pair)))
+    got = np.array(linearize(built.system, built.off.q, built.off.v, built.off.time).residual)
+    if "orientation" in p and built.system.layout.dim == 2:  # angles there count whole turns
+        got[-1] = np.angle(np.exp(1j * got[-1]))
+    np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", scenes.names("tree", "between", "loop"))
+def test_rows_hold_where_the_scene_was_assembled(name):
+    built = scenes.build(name)
+    assert jc.violation(built.system, built.state).worst < 1e-13
+
+
+FREEDOM = {
+    "coincident": (1, 3),
+    "spherical": (None, 3),
+    "distance": (2, 5),
+    "revolute": (1, 1),
+    "prismatic": (1, 1),
+    "fixed": (0, 0),
+    "driven_revolute": (0, 0),
+    "driven_prismatic": (0, 0),
+    "holonomic": (2, 5),
+    "velocity_level": (2, 5),
+}
+
+
+@pytest.mark.parametrize("name", scenes.names("tree"))
+def test_joints_leave_their_freedom(name):
+    kind, dim, _ = name.split("-")
+    built = scenes.build(name)
+    left = jc.report(built.system, built.off).degrees_of_freedom
+    assert left == FREEDOM[kind][int(dim[0]) - 2]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_distance_of_zero_has_no_direction_and_is_finite(dim):
+    scene = jc.Scene(dim=dim)
+    scene.add_particle("a", mass=1.0, position=(1.0,) * dim)
+    scene.add(jc.Distance("rod", jc.WORLD, "a"))
+    system, state = scene.build()
+
+    def rows(q):
+        found = linearize(system, q, jnp.ones(dim), state.time)
+        return found.residual, found.rate, found.jacobian.dense(), found.bias
+
+    derivatives = (rows, jax.jacfwd(rows), jax.jacrev(rows))
+    for leaf in jax.tree.leaves([f(jnp.zeros(dim)) for f in derivatives]):
+        assert jnp.all(jnp.isfinite(leaf))
+
+
+@pytest.mark.parametrize("kind", ["fixed", "prismatic", "driven_revolute"])
+def test_derivatives_of_rows_at_the_identity_are_finite(kind):
+    """Where both bodies are upright and the joint is as at assembly."""
+    scene = jc.Scene()
+    for name in ("first", "second"):
+        scene.add_body(name, mass=1.0, inertia=(1.0, 1.0, 1.0))
+    site = scenes.Site("first", "second", 3, np.zeros(3), np.array([0.0, 0.0, 1.0]), np.ones(3))
+    for element in scenes.JOINTS[kind].make(site):
+        scene.add(element)
+    system, state = scene.build()
+
+    def rows(q):
+        return by_hand(system, q, state.v, state.time)
+
+    for leaf in jax.tree.leaves(quick_jit(jax.jacrev(rows))(state.q)):
+        assert jnp.all(jnp.isfinite(leaf))

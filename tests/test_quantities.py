@@ -1,0 +1,192 @@
+"""Wrenches balance, energy is that of textbooks, accessors read what was given."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+import scenes
+from jaxcon.constraints.rows import linearize
+from tolerances import IDENTITY
+
+IDEAL = jc.Method(stabilizer=jc.Unstabilized())
+
+
+def solved(name):
+    built = scenes.build(name)
+    return built.system, built.state, jc.forward_dynamics(built.system, built.state, None, IDEAL, 1e-3)
+
+
+JOINTED = [
+    f"{kind}-{dim}d-between"
+    for kind in ("coincident", "distance", "revolute", "prismatic", "fixed")
+    for dim in (2, 3)
+]
+
+
+def moved(wrench, arm):
+    """The torque about another point, arm away from the old one."""
+    if len(wrench) == 3:
+        return wrench[2] + arm[0] * wrench[1] - arm[1] * wrench[0]
+    return wrench[3:] + np.cross(arm, wrench[:3])
+
+
+@pytest.mark.parametrize("name", JOINTED)
+def test_wrenches_on_the_two_bodies_balance(name):
+    """Equal and opposite, about one point."""
+    system, state, solution = solved(name)
+    on_first = np.asarray(jc.wrench(system, state, solution, "joint", body="first"))
+    on_second = np.asarray(jc.wrench(system, state, solution, "joint"))
+    np.testing.assert_allclose(on_first, -on_second, rtol=1e-10, atol=1e-10)
+    np.testing.assert_array_equal(
+        on_second, jc.wrench(system, state, solution, "joint", body="second")
+    )
+
+
+@pytest.mark.parametrize("name", JOINTED)
+def test_wrenches_explain_the_motion(name):
+    """Newton and Euler for the body that hangs on nothing but the joint."""
+    system, state, solution = solved(name)
+    dim, columns = system.layout.dim, system.layout.v("first")
+    mass = np.asarray(system.mass(state.q).values)[columns]
+    free = np.asarray(system.force(state.q, state.v, state.time))[columns]
+    push = mass * np.asarray(solution.acceleration)[columns] - free
+    motion = system.principal_motion("first", state.q, state.v)
+    wrench = np.asarray(jc.wrench(system, state, solution, "joint", body="first"))
+    np.testing.assert_allclose(wrench[:dim], push[:dim], rtol=1e-9, atol=1e-9)
+    rows = system.params["joint"]
+    anchor = system.principal_motion("second", state.q, state.v).point(rows["anchor_b"])
+    torque = moved(wrench, np.asarray(anchor - motion.position))
+    world = push[2] if dim == 2 else np.asarray(motion.rotation) @ push[3:]
+    np.testing.assert_allclose(torque, world, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("order", [(jc.WORLD, "lamp"), ("lamp", jc.WORLD)])
+def test_a_lamp_fixed_to_the_world(dim, order):
+    """The world carries the weight and its moment about the joint."""
+    scene = jc.Scene(dim=dim)
+    center = np.zeros(dim)
+    center[0] = 0.5
+    inertia = 0.1 if dim == 2 else (0.1, 0.2, 0.2)
+    scene.add_body("lamp", mass=2.0, inertia=inertia, position=center)
+    scene.add(jc.Fixed("bolt", *order, point=(0.0,) * dim))
+    system, state = scene.build()
+    solution = jc.forward_dynamics(system, state, None, IDEAL, 1e-3)
+    weight = 2.0 * 9.81
+    # gravity turns the lamp clockwise about its bolt, so the bolt turns it back
+    expected = [0, weight, 0.5 * weight] if dim == 2 else [0, 0, weight, 0, -0.5 * weight, 0]
+    on_lamp = jc.wrench(system, state, solution, "bolt", body="lamp")
+    np.testing.assert_allclose(on_lamp, expected, atol=1e-9)
+    on_world = jc.wrench(system, state, solution, "bolt", body=jc.WORLD)
+    np.testing.assert_allclose(on_world, -np.array(expected), atol=1e-9)
+    default = on_lamp if order[1] == "lamp" else on_world
+    np.testing.assert_array_equal(jc.wrench(system, state, solution, "bolt"), default)
+
+
+def test_a_particle_feels_a_force_alone():
+    scene = jc.Scene(dim=3)
+    scene.add_particle("bob", mass=2.0, position=(0.0, 0.0, -1.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    solution = jc.forward_dynamics(system, state, None, IDEAL, 1e-3)
+    np.testing.assert_allclose(solution.multipliers, [-19.62])
+    wrench = jc.wrench(system, state, solution, "rod")
+    np.testing.assert_allclose(wrench, [0, 0, 19.62], atol=1e-12)
+    back = jc.wrench(system, state, solution, "rod", body=jc.WORLD)
+    np.testing.assert_allclose(back, [0, 0, -19.62], atol=1e-12)
+
+
+def test_wrench_from_the_info_of_a_step():
+    system, state, solution = solved("revolute-3d-between")
+    _, info = jc.step(system, IDEAL, state, None, 1e-3)
+    np.testing.assert_allclose(
+        jc.wrench(system, state, info, "joint"), jc.wrench(system, state, solution, "joint")
+    )
+
+
+def test_wrench_of_equal_joints_side_by_side():
+    """Three lamps of different weights on joints of one kind: each feels its own."""
+    scene = jc.Scene(dim=2)
+    for i in range(3):
+        scene.add_body(f"lamp{i}", mass=1.0 + i, inertia=0.1, position=(i, 0))
+        scene.add(jc.Fixed(f"bolt{i}", jc.WORLD, f"lamp{i}"))
+    system, state = scene.build()
+    solution = jc.forward_dynamics(system, state, None, IDEAL, 1e-3)
+    for i in range(3):
+        got = jc.wrench(system, state, solution, f"bolt{i}")
+        np.testing.assert_allclose(got, [0, 9.81 * (1 + i), 0], atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "match"),
+    [("door", None, "'door' is unknown.*'joint'"), ("joint", "lamp", "'joint' acts on.*'lamp'")],
+)
+def test_wrench_of_something_else(name, body, match):
+    system, state, solution = solved("revolute-2d-between")
+    with pytest.raises(ValueError, match=match):
+        jc.wrench(system, state, solution, name, body=body)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_energy_by_hand(dim):
+    """½ m v² + ½ ω·Iω + m g h, of a body whose frame is not at its centre of mass."""
+    built = scenes.build(f"fixed-{dim}d-between")
+    system, state = built.system, built.state
+    kinetic = potential = 0.0
+    for name in ("first", "second"):
+        p = system.params[name]
+        motion = system.principal_motion(name, state.q, state.v)
+        omega = np.atleast_1d(motion.angular_velocity)
+        kinetic += float(p["mass"]) * np.sum(np.square(motion.velocity)) / 2
+        kinetic += np.sum(np.asarray(p["inertia"]) * omega**2) / 2
+        potential += float(p["mass"]) * 9.81 * float(motion.position[-1])
+    energy = jc.energy(system, state)
+    np.testing.assert_allclose(energy.kinetic, kinetic, rtol=IDENTITY)
+    np.testing.assert_allclose(energy.potential, potential, rtol=IDENTITY)
+
+
+def test_energy_of_generalized_coordinates():
+    built = scenes.build("polar")
+    at = dataclasses.replace(built.state, v=jnp.asarray([0.3, -0.8]))
+    r, angle = np.asarray(at.q)
+    energy = jc.energy(built.system, at)
+    np.testing.assert_allclose(energy.kinetic, 0.75 * (0.09 + r**2 * 0.64), rtol=IDENTITY)
+    np.testing.assert_allclose(energy.potential, -1.5 * 9.81 * r * np.cos(angle), rtol=IDENTITY)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_points_move_with_their_body(dim):
+    built = scenes.build(f"mixed-{dim}d")
+    system, s, h = built.system, built.off, 1e-6
+    point = np.arange(1.0, dim + 1)
+    ahead, behind = (
+        dataclasses.replace(s, q=system.retract(s.q, x * s.v)) for x in (h, -h)
+    )
+    for name in ("first", "second"):
+        slope = jc.position(system, ahead, name, point) - jc.position(system, behind, name, point)
+        got = jc.velocity(system, s, name, point)
+        np.testing.assert_allclose(got, slope / (2 * h), rtol=1e-6, atol=1e-6)
+
+
+def test_a_particle_has_no_orientation():
+    built = scenes.build("mixed-2d")
+    for question in (jc.orientation, jc.angular_velocity):
+        with pytest.raises(ValueError, match="'bob' is a particle"):
+            question(built.system, built.state, "bob")
+
+
+def test_violation_by_name():
+    built = scenes.build("mixed-2d")
+    rows = linearize(built.system, built.off.q, built.off.v, built.off.time)
+    violation = jc.violation(built.system, built.off)
+    index = rows.layout.rows("hinge")
+    np.testing.assert_allclose(violation["hinge"], np.linalg.norm(rows.residual[index]))
+    np.testing.assert_allclose(violation.rate("hinge"), np.linalg.norm(rows.rate[index]))
+    np.testing.assert_allclose(violation.worst, np.max(np.abs(rows.residual)))
+    np.testing.assert_allclose(violation.worst_rate, np.max(np.abs(rows.rate)))
+    assert violation["skate"] == 0
+    with pytest.raises(ValueError, match="'door' is unknown.*'hinge'"):
+        violation["door"]

@@ -1,0 +1,117 @@
+"""Degrees of freedom, rank and redundant rows of mechanisms known from textbooks."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+
+
+def add_link(scene, name, start, end):
+    """A slender body between two points, in the plane or in space."""
+    inertia = 0.3 if scene.dim == 2 else (0.1, 0.3, 0.3)
+    middle = (np.asarray(start) + np.asarray(end)) / 2
+    scene.add_body(name, mass=1.0, inertia=inertia, position=middle)
+
+
+def four_bar(dim):
+    """World – crank – coupler – rocker – world, hinged about the normal of its plane."""
+    corners = np.array([[0.0, 0.0], [0.0, 1.0], [2.0, 1.5], [2.5, 0.0]])
+    axis = None
+    if dim == 3:
+        corners = np.column_stack([corners[:, 0], np.zeros(4), corners[:, 1]])
+        axis = (0.0, 1.0, 0.0)
+    scene = jc.Scene(dim=dim)
+    names = ("crank", "coupler", "rocker")
+    for i, name in enumerate(names):
+        add_link(scene, name, corners[i], corners[i + 1])
+    pairs = ((jc.WORLD, "crank"), ("crank", "coupler"), ("coupler", "rocker"), ("rocker", jc.WORLD))
+    for i, ((a, b), corner) in enumerate(zip(pairs, corners, strict=True)):
+        scene.add(jc.Revolute(f"hinge{i}", a, b, point=corner, axis=axis))
+    return scene.build()
+
+
+def test_planar_four_bar():
+    report = jc.report(*four_bar(2))
+    assert (report.velocities, report.rows, report.rank) == (9, 8, 8)
+    assert report.degrees_of_freedom == 1
+    assert report.redundant == ()
+
+
+def test_spatial_four_bar_of_four_revolutes():
+    """It moves although 18 − 20 < 0: three rows of the last hinge are redundant."""
+    report = jc.report(*four_bar(3))
+    assert (report.velocities, report.rows, report.rank) == (18, 20, 17)
+    assert report.degrees_of_freedom == 1
+    assert len(report.redundant) == 3
+    assert {name for name, _ in report.redundant} == {"hinge3"}
+    assert "redundant rows" in str(report)
+    assert "hinge3" in str(report)
+
+
+def test_a_door_on_two_hinges():
+    """One of the hinges adds nothing: five redundant rows, named."""
+    scene = jc.Scene()
+    scene.add_body("door", mass=20.0, inertia=(2.0, 3.0, 1.0), position=(0.5, 0.0, 1.0))
+    for name, height in (("lower", 0.3), ("upper", 1.7)):
+        point = (0.0, 0.0, height)
+        scene.add(jc.Revolute(name, jc.WORLD, "door", point=point, axis=(0.0, 0.0, 1.0)))
+    report = jc.report(*scene.build())
+    assert (report.rows, report.rank, report.degrees_of_freedom) == (10, 5, 1)
+    assert len(set(report.redundant)) == 5
+    assert {name for name, _ in report.redundant} <= {"lower", "upper"}
+    assert "upper[4]" in str(report)
+
+
+def test_the_same_constraint_twice_is_named():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    scene.add(jc.Distance("again", jc.WORLD, "bob"))
+    system, state = scene.build()
+    assert jc.report(system, state).redundant == (("again", 0),)
+
+
+def test_condition_does_not_depend_on_units_of_rows():
+    """Two orthogonal rods have condition 1, at an angle θ it is (1 + c)/(1 − c)."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=3.0)
+    c = np.cos(0.5)
+    scene.add(jc.Distance("a", jc.WORLD, "bob", point_a=(1.0, 0.0)))
+    scene.add(jc.Distance("b", jc.WORLD, "bob", point_a=(50 * c, 50 * np.sin(0.5))))
+    report = jc.report(*scene.build())
+    assert report.condition == pytest.approx((1 + c) / (1 - c))
+
+
+def test_violation_is_listed_by_constraint():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(3.0, 4.0), velocity=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=4.5))
+    report = jc.report(*scene.build())
+    np.testing.assert_allclose(report.violation["rod"], (0.5, 0.6))
+    assert "rod: violation 5.00e-01, rate 6.00e-01" in str(report)
+
+
+def test_without_constraints():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0)
+    report = jc.report(*scene.build())
+    assert (report.rows, report.degrees_of_freedom, report.condition) == (0, 2, 1.0)
+
+
+def test_float32_has_its_own_tolerance():
+    scene = jc.Scene(dtype=jnp.float32)
+    scene.add_body("door", mass=20.0, inertia=(2.0, 3.0, 1.0), position=(0.5, 0.1, 1.0))
+    for name, height in (("lower", 0.3), ("upper", 1.7)):
+        point = (0.0, 0.0, height)
+        scene.add(jc.Revolute(name, jc.WORLD, "door", point=point, axis=(0.1, 0.2, 1.0)))
+    # the axes are parallel, the points not on one axis: the door cannot move at all
+    assert jc.report(*scene.build()).degrees_of_freedom == 0
+
+
+def test_generalized_coordinates_have_a_report():
+    import scenes
+
+    built = scenes.build("polar")
+    report = jc.report(built.system, built.state)
+    assert (report.coordinates, report.rows, report.degrees_of_freedom) == (2, 1, 1)
