@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -60,16 +62,9 @@ def run_verify(names: Sequence[str], file: Path | None) -> int:
     failed = sum(not check.passed for check in checks)
     print(f"{len(checks) - failed} passed, {failed} failed")
     if file:
-        rows = [
-            {
-                "case": c.case,
-                "figure": c.figure,
-                "value": c.value,
-                "bound": c.bound,
-                "passed": c.passed,
-            }
-            for c in checks
-        ]
+        rows = [dataclasses.asdict(check) | {"passed": check.passed} for check in checks]
+        for row in rows:  # JSON has no infinity: null is "no bound", or a figure that is none
+            row.update((k, None) for k in ("value", "bound") if not math.isfinite(row[k]))
         file.write_text(json.dumps(rows, indent=1) + "\n")
     return 1 if failed else 0
 

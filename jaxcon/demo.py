@@ -133,7 +133,7 @@ def tune(worlds: PyTree, steps: int = 250, iterations: int = 60, rate: float = 1
         history.append(float(value))
         best = min(best, (float(value), gains), key=lambda pair: pair[0])
         change, memory = optimizer.update(slope, memory)
-        gains = optax.apply_updates(gains, change)
+        gains = jnp.asarray(optax.apply_updates(gains, change))
     default = jnp.log(jnp.asarray(Method().integrator.default_gains(STEP), start.dtype))
     first, second = (float(gradient(x)[0]) for x in (start, default))
     return Tuning(
@@ -157,7 +157,9 @@ def main(copies: int = 1024, seconds: float = 5.0, picture: str = "jaxcon.png") 
     print("Baumgarte gains by gradient through 250 steps of 64 linkages")
     for label in ("start", "default", "tuned"):
         (alpha, beta), value = getattr(tuning, label)
-        print(f"  {label:8s} alpha {alpha:7.2f}  beta {beta:7.2f} 1/s   violation {10**value:.2e} m")
+        print(
+            f"  {label:8s} alpha {alpha:7.2f}  beta {beta:7.2f} 1/s   violation {10**value:.2e} m"
+        )
     from jaxcon import view
 
     view.main_job(result, tuning, jax.tree.map(lambda x: x[0], worlds), STEP, picture)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 
-from jaxcon.constraints.rows import linearize
+from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core.typing import Array
 from jaxcon.model.state import State
 
@@ -65,9 +66,8 @@ def report(system: Any, state: State) -> Report:
     Returns:
         A `Report`.
     """
-    rows = linearize(system, state.q, state.v, state.time)
-    jacobian = np.asarray(rows.jacobian.dense(), np.float64)
-    mass = np.asarray(system.mass(state.q).dense(), np.float64)
+    rows, dense_j, dense_m = _linearized(system, state)
+    jacobian, mass = np.asarray(dense_j, np.float64), np.asarray(dense_m, np.float64)
     # J M⁻¹ Jᵀ = Ĵ Ĵᵀ with Ĵ = J L⁻ᵀ and M = L Lᵀ
     scaled = np.linalg.solve(np.linalg.cholesky(mass), jacobian.T).T
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
@@ -91,6 +91,13 @@ def report(system: Any, state: State) -> Report:
             for name in rows.layout.names
         },
     )
+
+
+@jax.jit
+def _linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
+    """The rows with J and M as arrays."""
+    rows = linearize(system, state.q, state.v, state.time)
+    return rows, rows.jacobian.dense(), system.mass(state.q).dense()
 
 
 def dependent_rows(rows: Array | np.ndarray, tolerance: float) -> list[int]:

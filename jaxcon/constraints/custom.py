@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcon.constraints import autodiff
 from jaxcon.constraints.base import RowSet
-from jaxcon.core import checks
+from jaxcon.core import checks, native
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
@@ -113,11 +113,8 @@ class Custom:
 
     def rows(self, snapshot: Any) -> RowSet:
         """φ, φ̇, J and γ at one instant."""
-        q, v, kinematics, call = self.problem(snapshot)
-        t = snapshot.t
-        value = self.law.value(call, q, t)
-        rate, jacobian, bias = autodiff.rows(self.law.rate(call, kinematics), kinematics, q, v, t)
-        value = jnp.zeros_like(rate) if value is None else value
+        given = (snapshot.system, self, snapshot.q, snapshot.v, snapshot.t)
+        value, rate, bias, jacobian = native.per_world(_numbers, snapshot.q.ndim - 1)(*given)
         blocks = [
             (snapshot.system.columns(place), tuple(_lanes(row) for row in block))
             for place, block in zip(self.places, jacobian, strict=True)
@@ -172,6 +169,14 @@ class CustomOnBodies(Custom):
         q = [snapshot.q[layout.q(name)] for name in moving]
         v = [snapshot.v[layout.v(name)] for name in moving]
         return q, v, kinematics, call
+
+
+def _numbers(system: Any, group: Custom, q: Array, v: Array, t: Any) -> Any:
+    """φ, φ̇, γ (m,) and J by bodies (m, d), in one world."""
+    q, v, kinematics, call = group.problem(system.snapshot(q, v, t))
+    value = group.law.value(call, q, t)
+    rate, jacobian, bias = autodiff.rows(group.law.rate(call, kinematics), kinematics, q, v, t)
+    return jnp.zeros_like(rate) if value is None else value, rate, bias, jacobian
 
 
 def check_function(group: Custom, snapshot: Any) -> None:

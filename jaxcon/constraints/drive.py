@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.base import RowSet
-from jaxcon.core import numerics
+from jaxcon.core import native, numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.layout import Place
@@ -66,7 +66,8 @@ class Drives:
         """φ = θ − θ*(t), φ̇ = θ̇ − θ̇*, γ = γ_θ − θ̈*, by two nested derivatives of the motion."""
         joint = snapshot.system.constraints[self.group].select((self.index,))
         row = joint.coordinate(snapshot)
-        target, rate, bias = self._motion(snapshot.t)
+        motion = native.per_world(self._motion, snapshot.q.ndim - 1)
+        target, rate, bias = (x[None] for x in motion(snapshot.t, self.params))
         error = row.value - target
         error = (
             error
@@ -80,11 +81,11 @@ class Drives:
         """The anchor of the driven joint."""
         return snapshot.system.constraints[self.group].anchor(snapshot, self.index)
 
-    def _motion(self, t: Any) -> tuple[Array, Array, Array]:
+    def _motion(self, t: Any, params: PyTree) -> tuple[Array, Array, Array]:
         """θ*, θ̇*, θ̈*."""
 
         def motion(t: Any) -> Array:
-            target = jnp.asarray(self.law.motion(t, self.params))
+            target = jnp.asarray(self.law.motion(t, params))
             if target.shape != jnp.shape(t):
                 raise ValueError(
                     f"Drive '{self.law.name}': its motion must return a number, got shape"

@@ -134,6 +134,10 @@ class Matrix(Vector):
     def __matmul__(self, x: Vector) -> Vector:
         return Vector(*(row.dot(x) for row in self))
 
+    def stack(self) -> Array:
+        """The array with rows along the first axis and columns along the second."""
+        return jnp.stack([row.stack() for row in self])
+
     @property
     def T(self) -> Matrix:
         """The transpose."""

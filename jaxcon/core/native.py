@@ -21,6 +21,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -43,6 +44,7 @@ class Native:
         self.shapes = functools.lru_cache(maxsize=64)(self._shapes)
 
     def __call__(self, *args: Array) -> list[Array]:
+        """The function itself."""
         return list(self.function(*args))
 
     def _shapes(self, *avals: Any) -> list[Any]:
@@ -85,8 +87,8 @@ class Native:
                 replaced = fixed | dict(zip(places, xs, strict=True))
                 return self(*(replaced[i] for i in range(n)))
 
-            inputs = [jax.ShapeDtypeStruct((*shape, *batch), dtype) for shape, dtype in avals]
-            return list(jax.linear_transpose(along, *inputs)(cotangents))
+            inputs = [jnp.zeros((*shape, *batch), dtype) for shape, dtype in avals]
+            return list(jax.vjp(along, *inputs)[1](cotangents))
 
         return Native(transposed, True)
 
@@ -126,9 +128,46 @@ def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
     return jax.tree.unflatten(result[0], arrays)
 
 
+def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
+    """The function of one world, on arrays with `rank` trailing batch axes.
+
+    Args:
+        function: takes and returns pytrees of arrays without batch axes.
+        rank: how many trailing axes enumerate worlds; each of the batch's size or of size 1.
+    """
+    if rank == 0:
+        return function
+    inner = per_world(function, rank - 1)
+
+    def mapped(*args: PyTree) -> PyTree:
+        leaves, structure = jax.tree.flatten(args)
+        batched = [isinstance(x, jax.Array) and x.shape[-1] != 1 for x in leaves]
+        shared = [
+            x[..., 0] if isinstance(x, jax.Array) and not b else x
+            for x, b in zip(leaves, batched, strict=True)
+        ]
+
+        def one(*own: Array) -> PyTree:
+            given = iter(own)
+            merged = [next(given) if b else x for x, b in zip(shared, batched, strict=True)]
+            return inner(*jax.tree.unflatten(structure, merged))
+
+        own = [x for x, b in zip(leaves, batched, strict=True) if b]
+        if not own:
+            return jax.tree.map(lambda x: jnp.asarray(x)[..., None], one())
+        return jax.vmap(one, in_axes=-1, out_axes=-1)(*own)
+
+    return mapped
+
+
+def lift(x: Array, like: Array) -> Array:
+    """A number of each world, (…), with leading axes to meet an array (n, …)."""
+    return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)
+
+
 def _abstract(*args: Any, fun: Native) -> list[Any]:
     shapes = fun.shapes(*((x.shape, x.dtype) for x in args))
-    return [jax.core.ShapedArray(y.shape, y.dtype) for y in shapes]
+    return [ShapedArray(y.shape, y.dtype) for y in shapes]
 
 
 def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
@@ -152,7 +191,7 @@ def _jvp(primals: Any, tangents: Any, *, fun: Native) -> Any:
     return results, [
         next(moving)
         if jnp.issubdtype(y.dtype, jnp.inexact)
-        else ad.Zero(jax.core.ShapedArray(y.shape, jax.dtypes.float0))
+        else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
         for y in results
     ]
 

@@ -107,14 +107,14 @@ def _solid(body: BodyInput, dim: int, dtype: Any) -> solids.Inertia:
             raise ValueError(f"{_label(body)}: give mass= or an Inertia, not both.")
     elif given is None:
         raise ValueError(f"{_label(body)}: inertia is needed; a body without one is a particle.")
-    elif dim == 3 and jnp.shape(given) == (3, 3):
+    elif dim == 3 and jnp.asarray(given).shape == (3, 3):
         given = solids.from_tensor(
             body.mass, checks.number(_label(body), "inertia", given, dtype, (3, 3))
         )
     else:
         given = solids.Inertia(body.mass, given)
     moments = given.moments
-    if dim == 2 and len(jnp.shape(moments)) == 1:
+    if dim == 2 and jnp.asarray(moments).shape == (3,):
         moments = moments[2]
     moments = checks.number(_label(body), "inertia", moments, dtype, () if dim == 2 else (3,))
     checks.positive(_label(body), "inertia", moments)

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core import checks, numerics
+from jaxcon.core import checks, native, numerics
 from jaxcon.core.lanes import Vector, times, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
@@ -294,23 +294,30 @@ class CustomForces(Elements):
 
     def pulls(self, snapshot: Any, control: Any) -> Pulls:
         """The generalized forces on the bodies."""
-        motions = [snapshot.motion(name) for name in self.bodies]
+        rank = snapshot.q.ndim - 1
         start, stop = self.channel
         own = control[start:stop] if control is not None and stop > start else None
-        wrenches = self.function(*motions, snapshot.t, own, self.params)
-        wrenches = wrenches if isinstance(wrenches, tuple) else (wrenches,)
+        given = (snapshot.system, self.params, snapshot.q, snapshot.v, snapshot.t, own)
+        wrenches = native.per_world(self._wrenches, rank)(*given)
         for place, wrench, name in zip(self.places, wrenches, self.bodies, strict=True):
             frame = snapshot.frame(place)
             n = snapshot.system.columns(place).components
-            if jnp.shape(wrench) != (n,):
+            if wrench.shape[: wrench.ndim - rank] != (n,):
                 raise ValueError(
                     f"force '{self.names[0]}': the wrench on '{name}' must have shape ({n},),"
-                    f" got {jnp.shape(wrench)}."
+                    f" got {wrench.shape[: wrench.ndim - rank]}."
                 )
             lanes = Vector(*(x[None] for x in wrench))
             offset = snapshot.system.offsets.get(name)
             anchor = None if offset is None else Vector(*(x[None] for x in offset.position))
             yield place, world_wrench(frame, anchor, lanes)
+
+    def _wrenches(self, system: Any, params: PyTree, q: Any, v: Any, t: Any, own: Any) -> Any:
+        """The user's wrenches in one world."""
+        motions = [system.motion(name, q, v) for name in self.bodies]
+        wrenches = self.function(*motions, t, own, params)
+        wrenches = wrenches if isinstance(wrenches, tuple) else (wrenches,)
+        return tuple(jnp.asarray(wrench) for wrench in wrenches)
 
     def potential(self, snapshot: Any) -> Iterable[Lane]:
         """None."""

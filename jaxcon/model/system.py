@@ -120,7 +120,7 @@ class BodySystem:
         """Gravity and gyroscopic force on the bodies of a group."""
         layout, properties = self.layout.groups[group], self.inertia[group]
         _, velocity = layout.unpack(q, v)
-        weight = [properties.mass * g for g in Vector.of(self.gravity)]
+        weight = [properties.mass * g[None] for g in Vector.of(self.gravity)]
         rest = zeros(layout.kind.n_v - self.layout.dim)
         spread = jnp.zeros_like(velocity[0])
         gyroscopic = layout.kind.gyroscopic(velocity, properties.moments)

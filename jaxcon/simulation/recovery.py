@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.native import lift
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 
@@ -41,9 +42,12 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     @contained.defjvp
     def _(primals: Any, tangents: Any) -> Any:
         floats, others = primals
-        output, pushforward = jax.linearize(lambda x: call(x, others), floats)
+        batch = jax.eval_shape(call, floats, others)[1].shape
+        full = [_spread(x, batch) for x in floats]
+        moved = [_spread(x, batch) for x in tangents[0]]
+        output, pushforward = jax.linearize(lambda x: call(x, others), full)
         healthy = output[1] == Status.OK
-        return output, _mask(healthy, pushforward(_mask(healthy, tangents[0])))
+        return output, _mask(healthy, pushforward(_mask(healthy, moved)))
 
     floats = [x for x, flag in zip(arrays, inexact, strict=True) if flag]
     others = [x for x, flag in zip(arrays, inexact, strict=True) if not flag]
@@ -52,7 +56,7 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
 
 def keep(healthy: Array, new: PyTree, old: PyTree) -> PyTree:
     """The new values in healthy worlds, the old ones in failed worlds."""
-    return jax.tree.map(lambda x, y: jnp.where(healthy, x, y), new, old)
+    return jax.tree.map(lambda x, y: jnp.where(lift(healthy, x), x, y), new, old)
 
 
 def stop_failed(status: Array, tree: PyTree) -> PyTree:
@@ -61,8 +65,13 @@ def stop_failed(status: Array, tree: PyTree) -> PyTree:
     return keep(healthy, tree, jax.lax.stop_gradient(tree))
 
 
+def _spread(x: Any, batch: tuple[int, ...]) -> Any:
+    """A number shared by worlds, repeated for each: its tangent must be masked world by world."""
+    return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(batch)], *batch))
+
+
 def _mask(healthy: Array, tangents: PyTree) -> PyTree:
     def mask(x: Any) -> Any:
-        return x if x.dtype == jax.dtypes.float0 else jnp.where(healthy, x, 0)
+        return x if x.dtype == jax.dtypes.float0 else jnp.where(lift(healthy, x), x, 0)
 
     return jax.tree.map(mask, tangents)

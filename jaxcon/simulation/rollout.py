@@ -58,18 +58,17 @@ def rollout(
     feedback = controls if callable(controls) else None
     inputs = None if feedback else _split(controls, steps, every)
 
-    def one(state: State, control: PyTree) -> tuple[State, StepInfo]:
-        return step(system, method, state, feedback(state) if feedback else control, dt)
+    def one(carry: tuple[State, StepInfo], control: PyTree) -> Any:
+        state, _ = carry
+        return step(system, method, state, feedback(state) if feedback else control, dt), None
 
     def several(state: State, controls: PyTree) -> tuple[State, PyTree]:
-        first = jax.tree.map(lambda x: x[0], controls)
-        if every > 1:
-            rest = jax.tree.map(lambda x: x[:-1], controls)
-            state, _ = jax.lax.scan(lambda s, u: (one(s, u)[0], None), state, rest, every - 1)
-            first = jax.tree.map(lambda x: x[-1], controls)
-        state, info = one(state, first)
+        (state, info), _ = jax.lax.scan(one, (state, empty), controls, every)
         return state, record(state, info)
 
+    first = jax.tree.map(lambda x: x[0, 0], inputs)
+    shapes = jax.eval_shape(lambda s: one((s, None), first)[0][1], state)  # type: ignore[arg-type]
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     final, trajectory = jax.lax.scan(several, state, inputs, steps // every)
     return stop_failed(final.status, final), stop_failed(final.status, trajectory)
 

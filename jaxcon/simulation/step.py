@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
-from jaxcon.core import status
+from jaxcon.core import native, status
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
@@ -61,7 +61,17 @@ def step(
     check_step(system, method, state, control)
     warn_if_unstable(method, dt)
     h = jnp.asarray(dt, state.q.dtype)
-    (state, info), _ = contain(_step, (system, method, state, control, h))
+    return native.call(contained_step, system, method, state, control, h)
+
+
+def contained_step(
+    system: Any, method: Method, state: State, control: PyTree, dt: Array
+) -> tuple[State, StepInfo]:
+    """One step of worlds along trailing axes; those that fail stop, with their gradients."""
+    if not hasattr(system, "layout") and state.q.ndim > 1:
+        one = native.per_world(contained_step, state.q.ndim - 1)
+        return one(system, method, state, control, dt)
+    (state, info), _ = contain(_step, (system, method, state, control, dt))
     return state, info
 
 
@@ -80,7 +90,7 @@ def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array)
 
 def judge(state: State, solution: Solution) -> Array:
     """What the solver said, or NON_FINITE where the new state is."""
-    finite = jnp.all(jnp.isfinite(state.q)) & jnp.all(jnp.isfinite(state.v))
+    finite = jnp.all(jnp.isfinite(state.q), axis=0) & jnp.all(jnp.isfinite(state.v), axis=0)
     code = jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32)
     return status.first(solution.status, code)
 

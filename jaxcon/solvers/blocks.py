@@ -1,7 +1,7 @@
-"""Small dense matrices by lanes: the blocks of a sparse factorization, in unrolled scalar formulas.
+"""Small dense matrices by lanes: blocks of a sparse factorization in unrolled scalar formulas.
 
-A matrix is a list of rows of lanes. `settle` ends a fusion: XLA would otherwise merge the chain of a
-factorization into one kernel for each of its results, and compute shared values again in each.
+A matrix is a list of rows of lanes. `settle` ends a fusion: XLA would otherwise merge the chain of
+a factorization into one kernel for each of its results, and compute shared values again in each.
 """
 
 from __future__ import annotations

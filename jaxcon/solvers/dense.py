@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 from jaxcon.solvers.saddle import Saddle, Solution, free_motion, judge
@@ -24,22 +25,28 @@ class Dense:
         """
         if not system.target.size:
             return free_motion(system)
-        j = system.jacobian.dense()
-        scale = jax.lax.stop_gradient(_scale(system, j))
-        matrix = saddle_matrix(system, j) * scale[None] * scale[:, None]
-        factor = jax.scipy.linalg.lu_factor(jax.lax.stop_gradient(matrix))
-        right = jnp.concatenate([system.force, system.target]) * scale
-        solution = scale * jax.lax.custom_linear_solve(
-            lambda x: matrix @ x,
-            right,
-            lambda _, x: jax.scipy.linalg.lu_solve(factor, x),
-            lambda _, x: jax.scipy.linalg.lu_solve(factor, x, trans=1),
-        )
-        pivots = jnp.abs(jnp.diagonal(factor[0]))
-        singular = ~jnp.all(pivots > matrix.shape[0] * jnp.finfo(matrix.dtype).eps)
-        n = system.force.shape[0]
-        status = judge(solution, singular & jnp.all(jnp.isfinite(matrix)))
-        return Solution(solution[:n], solution[n:], status)
+        rank = system.target.ndim - 1
+        return native.per_world(_solve, rank)(system)
+
+
+def _solve(system: Saddle) -> Solution:
+    """Of one world."""
+    j = system.jacobian.dense()
+    scale = jax.lax.stop_gradient(_scale(system, j))
+    matrix = saddle_matrix(system, j) * scale[None] * scale[:, None]
+    factor = jax.scipy.linalg.lu_factor(jax.lax.stop_gradient(matrix))
+    right = jnp.concatenate([system.force, system.target]) * scale
+    solution = scale * jax.lax.custom_linear_solve(
+        lambda x: matrix @ x,
+        right,
+        lambda _, x: jax.scipy.linalg.lu_solve(factor, x),
+        lambda _, x: jax.scipy.linalg.lu_solve(factor, x, trans=1),
+    )
+    pivots = jnp.abs(jnp.diagonal(factor[0]))
+    singular = ~jnp.all(pivots > matrix.shape[0] * jnp.finfo(matrix.dtype).eps)
+    n = system.force.shape[0]
+    status = judge(solution, singular & jnp.all(jnp.isfinite(matrix)))
+    return Solution(solution[:n], solution[n:], status)
 
 
 def saddle_matrix(system: Saddle, jacobian: Array) -> Array:

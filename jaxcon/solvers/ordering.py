@@ -1,8 +1,9 @@
 """The order in which a sparse block matrix is eliminated: host code, once for each structure.
 
-Nodes are constraints (one element of one block row each); two nodes are neighbours where they touch
-a common body, since their block of A = J M⁻¹ Jᵀ is then not zero. Eliminating a node makes its later
-neighbours neighbours of each other. Minimum degree keeps that fill small: a tree of joints has none.
+Nodes are constraints (one element of one block row each). Two nodes are neighbours where they
+touch a common body, since their block of A = J M⁻¹ Jᵀ is then not zero. Eliminating a node makes
+its later neighbours neighbours of each other. Minimum degree keeps that fill small: a tree of
+joints of two bodies each has none.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ RUN = 6
 
 @dataclass(frozen=True)
 class Node:
-    """One constraint: element `element` of the row group that starts at row `group`, `size` rows."""
+    """One constraint: an element of the row group that starts at row `group`, of `size` rows."""
 
     group: int
     element: int
@@ -66,6 +67,11 @@ class Run:
 
     nodes: tuple[Node, ...]
     parent: Node
+
+    @property
+    def elements(self) -> tuple[int, ...]:
+        """Of the nodes, ascending."""
+        return tuple(sorted(node.element for node in self.nodes))
 
     @property
     def descending(self) -> bool:
@@ -181,7 +187,7 @@ def _steps(
 
 
 def _continues(order: list[Node], later: Any, entries: Any, i: int, j: int) -> bool:
-    """Whether a run from i to j may go on to j + 1: same group, next element, same kind of block."""
+    """Whether a run from i to j may go on: same group, next element, same kind of block."""
     node, following = order[j], order[j + 1]
     if later[node] != [following] or node.group != following.group:
         return False

@@ -125,7 +125,7 @@ def free_motion(system: Saddle) -> Solution:
 
 def judge(x: Array, singular: Any = None) -> Array:
     """The status of a solution: SINGULAR where the solver saw it, NON_FINITE where x is."""
-    finite = jnp.all(jnp.isfinite(x))
+    finite = jnp.all(jnp.isfinite(x), axis=0)
     status = jnp.where(finite, Status.OK, Status.NON_FINITE)
     if singular is not None:
         status = jnp.where(singular, Status.SINGULAR, status)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 from jaxcon.solvers.saddle import Mass, Saddle, Solution, free_motion, judge
@@ -29,19 +30,25 @@ class Schur:
         """
         if not system.target.size:
             return free_motion(system)
-        j = system.jacobian.dense()
-        a = delassus(system.mass, j, system.compliance)
-        factor = jnp.linalg.cholesky(jax.lax.stop_gradient(a), symmetrize_input=False)
-        free = system.mass.solve(system.force)
-        multipliers = jax.lax.custom_linear_solve(
-            lambda x: a @ x,
-            system.target - j @ free,
-            lambda _, x: jax.scipy.linalg.cho_solve((factor, True), x),
-            symmetric=True,
-        )
-        acceleration = free + system.mass.solve(j.T @ multipliers)
-        status = judge(acceleration, _dependent(factor, a) & jnp.all(jnp.isfinite(a)))
-        return Solution(acceleration, multipliers, status)
+        rank = system.target.ndim - 1
+        return native.per_world(_solve, rank)(system)
+
+
+def _solve(system: Saddle) -> Solution:
+    """Of one world."""
+    j = system.jacobian.dense()
+    a = delassus(system.mass, j, system.compliance)
+    factor = jnp.linalg.cholesky(jax.lax.stop_gradient(a), symmetrize_input=False)
+    free = system.mass.solve(system.force)
+    multipliers = jax.lax.custom_linear_solve(
+        lambda x: a @ x,
+        system.target - j @ free,
+        lambda _, x: jax.scipy.linalg.cho_solve((factor, True), x),
+        symmetric=True,
+    )
+    acceleration = free + system.mass.solve(j.T @ multipliers)
+    status = judge(acceleration, _dependent(factor, a) & jnp.all(jnp.isfinite(a)))
+    return Solution(acceleration, multipliers, status)
 
 
 def delassus(mass: Mass, jacobian: Array, compliance: Array | None) -> Array:

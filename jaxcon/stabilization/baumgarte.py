@@ -99,10 +99,13 @@ def by_row(gain: Any, fallback: Any, rows: Rows) -> Array:
     if isinstance(gain, Mapping):
         return _from_names(gain, fallback, rows.layout, dtype)
     gain = jnp.asarray(gain, dtype)
-    if gain.ndim and gain.shape != rows.bias.shape:
+    worlds = rows.bias.ndim - 1
+    if gain.ndim == worlds:
+        return gain[None]
+    if gain.ndim != worlds + 1 or gain.shape[0] != rows.bias.shape[0]:
         raise ValueError(
-            f"Baumgarte: a gain must be a number, an array {rows.bias.shape} by row, or a mapping"
-            f" by constraint name; got shape {gain.shape}."
+            f"Baumgarte: a gain must be a number, an array {rows.bias.shape[:1]} by row, or a"
+            f" mapping by constraint name; got shape {gain.shape[: gain.ndim - worlds]}."
         )
     return gain
 
@@ -113,7 +116,10 @@ def _from_names(gain: Mapping[str, Any], fallback: Any, layout: RowLayout, dtype
         raise ValueError(
             f"Baumgarte: there is no constraint {sorted(unknown)}; there are {list(layout.names)}."
         )
-    result = jnp.full(layout.size, jnp.asarray(fallback, dtype), dtype)
-    for name, value in gain.items():
-        result = result.at[layout.rows(name)].set(jnp.asarray(value, dtype))
+    values = {name: jnp.asarray(value, dtype) for name, value in gain.items()}
+    fallback = jnp.asarray(fallback, dtype)
+    batch = jnp.broadcast_shapes(fallback.shape, *(x.shape for x in values.values()))
+    result = jnp.broadcast_to(fallback, (layout.size, *batch))
+    for name, value in values.items():
+        result = result.at[layout.rows(name)].set(value[None])
     return result
