@@ -160,6 +160,21 @@ def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
     return mapped
 
 
+def batch_of(tree: PyTree, rank: int) -> tuple[int, ...]:
+    """The shape of the `rank` trailing batch axes over all arrays of a tree."""
+    shapes = (x.shape[x.ndim - rank :] for x in jax.tree.leaves(tree) if isinstance(x, jax.Array))
+    return jnp.broadcast_shapes(*shapes)
+
+
+def spread(tree: PyTree, batch: tuple[int, ...]) -> PyTree:
+    """A tree with what worlds share repeated for each of them."""
+
+    def one(x: Array) -> Array:
+        return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(batch)], *batch))
+
+    return jax.tree.map(one, tree)
+
+
 def lift(x: Array, like: Array) -> Array:
     """A number of each world, (…), with leading axes to meet an array (n, …)."""
     return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)

@@ -234,4 +234,6 @@ def _join(groups: list[Vector], like: Array) -> Array:
     """One flat array, component-major inside each group."""
     if not groups:
         return jnp.zeros((0, *like.shape[1:]), like.dtype)
-    return jnp.concatenate([x for group in groups for x in group])
+    lanes = [x for group in groups for x in group]
+    batch = jnp.broadcast_shapes(*(x.shape[1:] for x in lanes))
+    return jnp.concatenate([jnp.broadcast_to(x, (x.shape[0], *batch)) for x in lanes])

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.native import lift
+from jaxcon.core.native import lift, spread
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 
@@ -43,8 +43,8 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     def _(primals: Any, tangents: Any) -> Any:
         floats, others = primals
         batch = jax.eval_shape(call, floats, others)[1].shape
-        full = [_spread(x, batch) for x in floats]
-        moved = [_spread(x, batch) for x in tangents[0]]
+        # a tangent shared by worlds must be masked in each of them
+        full, moved = spread(floats, batch), spread(tangents[0], batch)
         output, pushforward = jax.linearize(lambda x: call(x, others), full)
         healthy = output[1] == Status.OK
         return output, _mask(healthy, pushforward(_mask(healthy, moved)))
@@ -63,11 +63,6 @@ def stop_failed(status: Array, tree: PyTree) -> PyTree:
     """The same values, without a gradient where the world failed."""
     healthy = status == Status.OK
     return keep(healthy, tree, jax.lax.stop_gradient(tree))
-
-
-def _spread(x: Any, batch: tuple[int, ...]) -> Any:
-    """A number shared by worlds, repeated for each: its tangent must be masked world by world."""
-    return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(batch)], *batch))
 
 
 def _mask(healthy: Array, tangents: PyTree) -> PyTree:

@@ -71,6 +71,8 @@ def contained_step(
     if not hasattr(system, "layout") and state.q.ndim > 1:
         one = native.per_world(contained_step, state.q.ndim - 1)
         return one(system, method, state, control, dt)
+    args = (system, method, state, control, dt)
+    state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
     (state, info), _ = contain(_step, (system, method, state, control, dt))
     return state, info
 
