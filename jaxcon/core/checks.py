@@ -24,12 +24,15 @@ def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = (
     Raises:
         ValueError: another shape, another floating dtype of a JAX array, or not a number.
     """
-    if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jnp.floating) and x.dtype != dtype:
+    known = isinstance(x, jax.Array) and not x.aval.weak_type  # a Python number is no choice
+    if known and jnp.issubdtype(x.dtype, jnp.floating) and x.dtype != dtype:
         raise ValueError(
             f"{owner}: {what} is {x.dtype}, but the scene is {jnp.dtype(dtype).name};"
             " mixed dtypes are not promoted: convert it, or build the scene with dtype=."
         )
     try:
+        if isinstance(x, str):
+            raise TypeError("a string is no number")
         array = jnp.asarray(x, dtype)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{owner}: {what} must be numbers, got {x!r}.") from error

@@ -165,7 +165,7 @@ class Gather:
             got = getattr(x, "dtype", None)
             if got is not None and not jnp.issubdtype(got, jnp.floating):
                 return jnp.asarray(x)
-            shape = jnp.shape(x)
+            shape = jnp.asarray(x).shape
             return checks.number(f"'{element.name}'", "params", x, self.dtype, shape)
 
         return jax.tree.map(convert, element.params)

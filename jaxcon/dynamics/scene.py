@@ -12,7 +12,7 @@ from jaxcon.core import checks
 from jaxcon.core.status import Status
 from jaxcon.dynamics import grouping
 from jaxcon.dynamics.inputs import BodyInput, resolve
-from jaxcon.geometry.pose import Pose
+from jaxcon.geometry.pose import Pose, WorldPose
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
@@ -137,7 +137,8 @@ class Scene:
         upright = jnp.zeros((), self.dtype) if self.dim == 2 else jnp.eye(4, dtype=self.dtype)[0]
         fixed = {n: b.motion.pose for n, b in bodies.items() if b.kind is None}
         fixed[WORLD] = Pose(world, upright)
-        poses = {n: b.motion.pose for n, b in bodies.items()} | fixed
+        poses = {n: b.motion.pose for n, b in bodies.items()}
+        poses |= {n: WorldPose(pose.position, upright) for n, pose in fixed.items()}
         gather = grouping.Gather(self.dim, self.dtype, layout, poses)
         constraints = gather.constraints(self._elements.values())
         forces = gather.forces(self._elements.values(), constraints)

@@ -55,6 +55,19 @@ class Pose:
 
 
 @pytree
+class WorldPose(Pose):
+    """A frame fixed to the world: its own points and directions are those of the world."""
+
+    def local_point(self, world: Array) -> Array:
+        """The point itself."""
+        return world
+
+    def local_direction(self, world: Array) -> Array:
+        """The direction itself."""
+        return world
+
+
+@pytree
 class Motion(Pose):
     """A pose and its rate of change.
 

@@ -34,7 +34,7 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
     if not jnp.issubdtype(dtype, jnp.floating):
         dtype = jnp.result_type(float)
     layout = getattr(system, "layout", None)
-    n_q = jnp.shape(q) if layout is None else (layout.n_q,)
+    n_q = jnp.asarray(q).shape if layout is None else (layout.n_q,)
     if len(n_q) != 1:
         raise ValueError(f"init: q must have shape (n_q,), got {n_q}.")
     q = checks.number("init", "q", q, dtype, n_q)

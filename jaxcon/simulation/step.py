@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
-from jaxcon.core import native, status
+from jaxcon.core import checks, native, status
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
@@ -58,9 +58,9 @@ def step(
     Raises:
         ValueError: shapes or dtypes disagree (at trace time).
     """
-    check_step(system, method, state, control)
-    warn_if_unstable(method, dt)
-    h = jnp.asarray(dt, state.q.dtype)
+    control = check_step(system, method, state, control)
+    h = checks.number("step", "dt", dt, state.q.dtype)
+    warn_if_unstable(method, h)
     return native.call(contained_step, system, method, state, control, h)
 
 
@@ -112,15 +112,15 @@ def forward_dynamics(
     Returns:
         acceleration (n_v,), multipliers (n_c,), status ().
     """
-    check_step(system, method, state, control)
-    h = jnp.asarray(dt, state.q.dtype)
+    control = check_step(system, method, state, control)
+    h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
     stabilizer = method.stabilizer.resolve(method.integrator.default_gains(h))
     at = accelerate(system, stabilizer, method.solver, control, state.memory, h)
     return at(state.q, state.v, state.time)[0]
 
 
-def check_step(system: Any, method: Method, state: State, control: PyTree) -> None:
-    """Checks that system, state, control and method fit together.
+def check_step(system: Any, method: Method, state: State, control: PyTree) -> PyTree:
+    """Checks that system, state, control and method fit together; returns the control as arrays.
 
     Raises:
         ValueError: wrong shapes, mixed dtypes, or memory of another method.
@@ -135,9 +135,11 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> No
                     f"step: state.{what} must have shape {shape}, got {got}; batches go through"
                     " jax.vmap."
                 )
-        if control is not None and jnp.shape(control) != (layout.n_u,):
+        if control is not None and not hasattr(control, "dtype"):
+            control = jnp.asarray(control, state.q.dtype)
+        if control is not None and control.shape != (layout.n_u,):
             raise ValueError(
-                f"step: control must have shape ({layout.n_u},), got {jnp.shape(control)};"
+                f"step: control must have shape ({layout.n_u},), got {control.shape};"
                 f" its channels are {list(layout.controls)}."
             )
     for leaf in jax.tree.leaves(control):
@@ -148,3 +150,4 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> No
     memory = method.stabilizer.init(system, state.q, state.v)
     if jax.tree.structure(memory) != jax.tree.structure(state.memory):
         raise ValueError("step: the state has the memory of another method; start with jc.init.")
+    return control

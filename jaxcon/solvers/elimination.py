@@ -26,6 +26,7 @@ class Elimination:
 
     Attributes:
         share: the smallest part of a row that the rows before it do not explain, by world.
+        finite: whether A is, by world.
     """
 
     def __init__(self, matrices: tuple[Jacobian, Array, Any], run: int, batch: Any) -> None:
@@ -39,6 +40,10 @@ class Elimination:
             self._soften(compliance)
         self.updates: dict[tuple[Node, Node], Block] = {}
         self.share: Any = jnp.ones(self.batch, self.dtype)
+        self.finite: Any = jnp.ones(self.batch, bool)
+        for block in self.diagonal.values():
+            for r, row in enumerate(block):
+                self.finite &= jnp.all(jnp.isfinite(row[r]), axis=0)
         self.factors = [
             self._run(step) if isinstance(step, Run) else self._single(step)
             for step in self.plan.steps

@@ -64,5 +64,6 @@ class Sparse:
             symmetric=True,
         )
         acceleration = free + system.mass.solve(j.transpose(multipliers))
-        dependent = elimination.share <= len(system.target) * jnp.finfo(free.dtype).eps
+        explained = elimination.share > len(system.target) * jnp.finfo(free.dtype).eps
+        dependent = ~explained & elimination.finite
         return Solution(acceleration, multipliers, judge(acceleration, dependent))
