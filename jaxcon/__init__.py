@@ -42,6 +42,7 @@ from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
 from jaxcon.solvers.dense import Dense
 from jaxcon.solvers.schur import Schur
+from jaxcon.solvers.sparse import Sparse
 from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
 
 __version__ = "0.1.0"
@@ -76,6 +77,7 @@ __all__ = [
     "SemiImplicitEuler",
     "SimulationError",
     "Spherical",
+    "Sparse",
     "Spring",
     "State",
     "Status",

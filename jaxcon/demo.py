@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -18,10 +19,13 @@ from jaxcon.core.status import raise_for_status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
+from jaxcon.solvers.sparse import Sparse
 from jaxcon.stabilization.baumgarte import Baumgarte
 
 STEP = 2e-3
 """h [s]"""
+METHOD = Method(solver=Sparse())
+"""Semi-implicit Euler, default feedback, sparse elimination."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,7 @@ def simulate(worlds: PyTree, seconds: float, chunks: int = 50) -> Simulation:
 
     def run(system: Any, state: Any) -> Any:
         dt = jnp.asarray(STEP, state.q.dtype)
-        final, worst = rollout(system, Method(), state, None, dt, steps, record=record)
+        final, worst = rollout(system, METHOD, state, None, dt, steps, record=record)
         return final, jnp.max(worst)
 
     begin = time.perf_counter()
@@ -99,7 +103,7 @@ def loss(gains: Array, worlds: PyTree, steps: int) -> Array:
         worlds: batch of systems and states.
         steps: of the rollout that is differentiated.
     """
-    method = Method(stabilizer=Baumgarte(jnp.exp(gains[0]), jnp.exp(gains[1])))
+    method = dataclasses.replace(METHOD, stabilizer=Baumgarte(*jnp.exp(gains)))
 
     def record(state: Any, info: Any) -> Array:
         off = info.violation

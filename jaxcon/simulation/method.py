@@ -17,7 +17,7 @@ class Method:
     Attributes:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
         stabilizer: `Baumgarte(…)` or `Unstabilized()`.
-        solver: `Schur()` or `Dense()`.
+        solver: `Schur()`, `Sparse()` or `Dense()`.
     """
 
     integrator: Any = SemiImplicitEuler()
