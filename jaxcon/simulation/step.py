@@ -60,7 +60,7 @@ def step(
     """
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
-    warn_if_unstable(method, h)
+    warn_if_unstable(method, dt)  # as given: under jit an array made here would be traced
     return native.call(contained_step, system, method, state, control, h)
 
 
