@@ -79,7 +79,7 @@ def simulate(worlds: PyTree, seconds: float, chunks: int = 50) -> Simulation:
     compile_time = time.perf_counter() - begin
     start = jax.vmap(energy)(systems, states)
     worst, spent = [], 0.0
-    for _ in tqdm(range(chunks), desc="simulating", unit="chunk"):
+    for _ in tqdm(range(chunks), desc="simulating", unit="chunk", disable=None):
         begin = time.perf_counter()
         states, off = jax.block_until_ready(compiled(systems, states))
         spent += time.perf_counter() - begin
@@ -132,7 +132,7 @@ def tune(worlds: PyTree, steps: int = 250, iterations: int = 60, rate: float = 1
     optimizer = optax.adam(optax.cosine_decay_schedule(0.3, iterations))
     gains = start = jnp.full(2, np.log(rate), worlds[1].q.dtype)
     memory, history, best = optimizer.init(gains), [], (np.inf, gains)
-    for _ in tqdm(range(iterations), desc="tuning", unit="iteration"):
+    for _ in tqdm(range(iterations), desc="tuning", unit="iteration", disable=None):
         value, slope = gradient(gains)
         history.append(float(value))
         best = min(best, (float(value), gains), key=lambda pair: pair[0])

@@ -93,7 +93,6 @@ def main_job(result: Any, tuning: Any, world: PyTree, step: float, path: str) ->
     left.set_title("a crank-rocker through one turn")
     middle.semilogy(result.times, result.violation)
     middle.set(xlabel="time [s]", ylabel="worst |φ| of all copies [m]", title="violation")
-    middle.set_ylim(bottom=min(1e-6, result.violation.min()))
     right.plot(10**tuning.history, label="tuning")
     right.axhline(10 ** tuning.default[1], color="gray", ls="--", label="default gains")
     right.set(yscale="log", xlabel="iteration", ylabel="rms of φ and h φ̇ [m]")

@@ -11,28 +11,30 @@ from jaxcon.core import checks
 from jaxcon.core.lanes import times, total
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Motion
-from jaxcon.model.state import Energy, State
+from jaxcon.model.state import Energy, State, check_state
 
 
 def energy(system: Any, state: State) -> Energy:
     """Kinetic energy ½ vᵀMv and the potential of gravity and springs, () [J] each."""
+    check_state(system, state)
     return system.energy(state.q, state.v, state.time)
 
 
 def violation(system: Any, state: State) -> Violation:
     """φ and φ̇ of a state, by constraint."""
+    check_state(system, state)
     return linearize(system, state.q, state.v, state.time).violation
 
 
 def position(system: Any, state: State, body: str, point: Any = None) -> Array:
     """Where a body is, or a point given in its frame, (dim,) [m], world frame."""
-    motion = system.motion(body, state.q, state.v)
+    motion = _motion(system, state, body)
     return motion.position if point is None else motion.point(_local(motion, point))
 
 
 def velocity(system: Any, state: State, body: str, point: Any = None) -> Array:
     """How fast a body, or a point given in its frame, moves, (dim,) [m/s], world frame."""
-    motion = system.motion(body, state.q, state.v)
+    motion = _motion(system, state, body)
     return motion.velocity if point is None else motion.point_velocity(_local(motion, point))
 
 
@@ -65,7 +67,14 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
 
     Raises:
         ValueError: no such constraint, or it does not act on this body.
+        TypeError: `info` has no multipliers.
     """
+    check_state(system, state)
+    if not hasattr(info, "multipliers"):
+        raise TypeError(
+            f"wrench: info must be a StepInfo or the Solution of forward_dynamics, got"
+            f" {type(info).__name__}."
+        )
     snapshot = system.snapshot(state.q, state.v, state.time)
     group = next((g for g in system.constraints if name in g.names), None)
     if group is None:
@@ -121,8 +130,13 @@ def _local(motion: Motion, point: Any) -> Array:
     return checks.number("point", "it", point, dtype, shape)
 
 
+def _motion(system: Any, state: State, body: str) -> Motion:
+    check_state(system, state)
+    return system.motion(body, state.q, state.v)
+
+
 def _oriented(system: Any, state: State, body: str) -> Motion:
-    motion = system.motion(body, state.q, state.v)
+    motion = _motion(system, state, body)
     if motion.orientation is None:
         raise ValueError(f"'{body}' is a particle: it has no orientation.")
     return motion

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core.typing import Array
-from jaxcon.model.state import State
+from jaxcon.model.state import State, check_state
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,10 @@ class Report:
         ]
         if self.redundant:
             named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
-            lines.append(f"redundant rows (each depends on rows before it): {named}")
+            lines.append(
+                f"redundant rows (each depends on rows before it): {named}; keep only independent"
+                " ones, for example close a loop with a joint or a Holonomic of fewer rows"
+            )
         lines += [
             f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
             for name, (phi, rate) in self.violation.items()
@@ -66,6 +69,7 @@ def report(system: Any, state: State) -> Report:
     Returns:
         A `Report`.
     """
+    check_state(system, state)
     rows, dense_j, dense_m = _linearized(system, state)
     jacobian, mass = np.asarray(dense_j, np.float64), np.asarray(dense_m, np.float64)
     # J M⁻¹ Jᵀ = Ĵ Ĵᵀ with Ĵ = J L⁻ᵀ and M = L Lᵀ

@@ -98,6 +98,11 @@ class Custom:
         """Of the constraint."""
         return (self.law.name,)
 
+    @property
+    def velocity_level(self) -> bool:
+        """Whether it has no φ."""
+        return isinstance(self.law, VelocityLevel)
+
     def get(self, i: int) -> dict[str, Any]:
         """The user's parameters."""
         return {"params": self.params}

@@ -77,6 +77,19 @@ class Drives:
         row = row._replace(value=error, rate=row.rate - rate, bias=row.bias - bias)
         return joint.gather(snapshot, [row])
 
+    def check(self, dtype: Any) -> None:
+        """Calls the motion once, abstractly.
+
+        Raises:
+            ValueError: it cannot be called, or returns no number.
+        """
+        try:
+            jax.eval_shape(self._motion, jnp.zeros((), dtype), self.params)
+        except TypeError as error:
+            raise ValueError(
+                f"Drive '{self.law.name}': motion(t, params) cannot be called: {error}."
+            ) from error
+
     def anchor(self, snapshot: Any, i: int) -> Array | None:
         """The anchor of the driven joint."""
         return snapshot.system.constraints[self.group].anchor(snapshot, self.index)

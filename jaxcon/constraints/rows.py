@@ -17,9 +17,15 @@ from jaxcon.solvers.jacobian import Block, Jacobian
 
 @dataclass(frozen=True)
 class RowLayout:
-    """Which rows belong to which constraint: (name, first, rows, stride) each."""
+    """Which rows belong to which constraint.
+
+    Attributes:
+        entries: (name, first, rows, stride) of each.
+        velocity_level: names of those that have no φ.
+    """
 
     entries: tuple[tuple[str, int, int, int], ...]
+    velocity_level: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -45,7 +51,7 @@ class RowLayout:
 
 @pytree
 class Violation:
-    """How far a state is off its constraints; `violation["hinge"]` is ‖φ‖ of one of them.
+    """How far a state is off its constraints; `violation["hinge"]` is that of one.
 
     Attributes:
         position: φ by row (n_c,); zero for velocity-level rows.
@@ -68,7 +74,9 @@ class Violation:
         return jnp.max(jnp.abs(self.velocity), initial=0)
 
     def __getitem__(self, name: str) -> Array:
-        """‖φ‖ of a constraint, ()."""
+        """‖φ‖ of a constraint, or ‖ψ‖ of a velocity-level one, ()."""
+        if name in self.layout.velocity_level:
+            return self.rate(name)
         return numerics.norm(self.position[self.layout.rows(name)])
 
     def rate(self, name: str) -> Array:
@@ -124,7 +132,8 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
         start += k * len(rows.value)
     jacobian = Jacobian(tuple(blocks), (start, v.shape[0]))
     residual, rate, bias = (_flat(sets, field, v) for field in ("value", "rate", "bias"))
-    return Rows(residual, rate, jacobian, bias, RowLayout(tuple(entries)))
+    free = [n for g in system.constraints if getattr(g, "velocity_level", False) for n in g.names]
+    return Rows(residual, rate, jacobian, bias, RowLayout(tuple(entries), tuple(free)))
 
 
 def _flat(sets: list[RowSet], field: str, like: Array) -> Array:

@@ -49,4 +49,8 @@ def raise_for_status(result: object) -> None:
         code = Status(int(np.atleast_1d(status)[tuple(failed[0])]))
         where = "" if status.ndim == 0 else f" in {len(failed)} of {status.size} worlds"
         index = "" if status.ndim == 0 else f", first in world {tuple(map(int, failed[0]))}"
-        raise SimulationError(f"{code.name}{where}{index}: {MEANING[code]}.")
+        times = getattr(result, "time", None)
+        when = (
+            "" if times is None else f", at t = {float(np.atleast_1d(times)[tuple(failed[0])]):g} s"
+        )
+        raise SimulationError(f"{code.name}{where}{index}{when}: {MEANING[code]}.")

@@ -116,7 +116,9 @@ class Gather:
             group, index = self._find_joint(drive, joints)
             params = jax.tree.map(lambda x: jnp.asarray(x, self.dtype), drive.params)
             places = joints[group].select((index,)).places
-            result.append(Drives(params, _bare(drive), group, index, places))
+            drives_one = Drives(params, _bare(drive), group, index, places)
+            drives_one.check(self.dtype)
+            result.append(drives_one)
         return result
 
     def joint_springs(self, springs: list[Any], joints: list[Any]) -> list[Any]:

@@ -27,6 +27,29 @@ class State:
     memory: PyTree = ()
 
 
+def check_state(system: Any, state: Any) -> None:
+    """Checks that these are a system and a state of one world of it.
+
+    Raises:
+        TypeError: they are something else, such as a Scene that was not built.
+        ValueError: the state has another shape, such as that of a batch or trajectory.
+    """
+    if not hasattr(system, "snapshot") or not isinstance(state, State):
+        raise TypeError(
+            f"expected a system and a State, got {type(system).__name__} and"
+            f" {type(state).__name__}; `system, state = scene.build()` makes them."
+        )
+    layout = getattr(system, "layout", None)
+    expected = state.v.shape if layout is None else (layout.n_v,)
+    for what, got in (("q", state.q.shape), ("v", state.v.shape)):
+        shape = (layout.n_q,) if layout is not None and what == "q" else expected
+        if got != shape or len(got) != 1:
+            raise ValueError(
+                f"state.{what} must have shape {shape}, got {got}; for batches and trajectories use"
+                " jax.vmap: jax.vmap(lambda s: jc.position(system, s, name))(trajectory)."
+            )
+
+
 @pytree
 class Energy:
     """Mechanical energy [J]."""

@@ -196,16 +196,28 @@ class BodySystem:
         Args:
             changes: as `params`, as much of it as changes: `{"rod": {"length": 2.0}}`.
 
+        A mass changed alone leaves the inertia as it is.
+
         Raises:
-            ValueError: an unknown name or field, or a wrong shape.
+            ValueError: an unknown name or field, a wrong shape, or a mass that is not positive.
         """
         known = self.params
         for name, fields in changes.items():
             if name not in known:
                 raise ValueError(f"with_params: '{name}' is unknown; known are {list(known)}.")
-            unknown = set(fields) - set(known[name]) if isinstance(known[name], dict) else set()
-            if unknown:
-                raise ValueError(f"'{name}' has no {unknown}, it has {set(known[name])}.")
+            if name == "gravity":
+                continue
+            if not isinstance(fields, Mapping):
+                raise ValueError(
+                    f"with_params: give '{name}' as a mapping of its fields"
+                    f" {sorted(known[name])}, got {fields!r}."
+                )
+            if unknown := set(fields) - set(known[name]):
+                raise ValueError(
+                    f"'{name}' has no {sorted(unknown)}, it has {sorted(known[name])}."
+                )
+            for field in fields.keys() & {"mass", "inertia"}:
+                checks.positive(name, field, fields[field])
         gravity = self.gravity
         if "gravity" in changes:
             shape = (self.layout.dim,)

@@ -23,3 +23,18 @@ class Method:
     integrator: Any = SemiImplicitEuler()
     stabilizer: Any = Baumgarte()
     solver: Any = Schur()
+
+    def check(self) -> None:
+        """Checks that each part is a value of its kind.
+
+        Raises:
+            TypeError: a part is a class or a name, not a value like `RK4()`.
+        """
+        parts = {"integrator": "advance", "stabilizer": "target", "solver": "solve"}
+        for part, verb in parts.items():
+            value = getattr(self, part)
+            if isinstance(value, type) or not hasattr(value, verb):
+                raise TypeError(
+                    f"Method: {part} must be a value such as"
+                    f" {type(getattr(Method(), part)).__name__}(), got {value!r}."
+                )

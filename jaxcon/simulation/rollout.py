@@ -52,7 +52,13 @@ def rollout(
 
     Raises:
         ValueError: `every` does not divide `steps`, or controls of another length.
+        TypeError: `steps` or `every` is not an integer.
     """
+    for what, number in (("steps", steps), ("every", every)):
+        if not isinstance(number, int):
+            raise TypeError(
+                f"rollout: {what} must be an integer known when tracing, got {number!r}."
+            )
     if steps < 0 or every < 1 or steps % every:
         raise ValueError(f"rollout: every={every} must divide steps={steps}.")
     feedback = controls if callable(controls) else None
@@ -79,7 +85,10 @@ def _split(controls: PyTree, steps: int, every: int) -> PyTree:
     def split(x: Any) -> Any:
         x = jnp.asarray(x)
         if x.ndim == 0 or x.shape[0] != steps:
-            raise ValueError(f"rollout: controls must have {steps} rows, got shape {x.shape}.")
+            raise ValueError(
+                f"rollout: controls must have {steps} rows, one a step, got shape {x.shape}; repeat"
+                " a constant one with jnp.tile, or give a function of the state."
+            )
         return x.reshape((steps // every, every, *x.shape[1:]))
 
     return jax.tree.map(split, controls)

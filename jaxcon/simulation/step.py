@@ -14,7 +14,7 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import accelerate
-from jaxcon.model.state import State
+from jaxcon.model.state import State, check_state
 from jaxcon.simulation.initialize import check_dtype
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.recovery import contain, keep
@@ -60,6 +60,7 @@ def step(
     """
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
+    checks.positive("step", "dt", dt, strictly=False)
     warn_if_unstable(method, dt)  # as given: under jit an array made here would be traced
     return native.call(contained_step, system, method, state, control, h)
 
@@ -125,16 +126,10 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
     Raises:
         ValueError: wrong shapes, mixed dtypes, or memory of another method.
     """
+    check_state(system, state)
+    method.check()
     layout = getattr(system, "layout", None)
     if layout is not None:
-        expected = {"q": (layout.n_q,), "v": (layout.n_v,)}
-        for what, shape in expected.items():
-            got = jnp.shape(getattr(state, what))
-            if got != shape:
-                raise ValueError(
-                    f"step: state.{what} must have shape {shape}, got {got}; batches go through"
-                    " jax.vmap."
-                )
         if control is not None and not hasattr(control, "dtype"):
             control = jnp.asarray(control, state.q.dtype)
         if control is not None and control.shape != (layout.n_u,):
