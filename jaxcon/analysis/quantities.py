@@ -105,12 +105,18 @@ def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str
         None if p.group is None else system.layout.groups[p.group].names[p.indices[index]]
         for p in group.places
     ]
-    if body in system.fixed or (body is None and sides[-1] is None):
-        return next(name for name in reversed(sides) if name), -1
-    chosen = sides[-1] if body is None else body
-    if not chosen or chosen not in sides:
-        raise ValueError(f"constraint '{group.names[index]}' acts on {sides}, not on '{body}'.")
-    return str(chosen), 1
+    moving = [side for side in sides if side]
+    users = getattr(getattr(group, "law", None), "bodies", ())
+    world = None in sides or any(name in system.fixed for name in users)
+    target = sides[-1] if body is None else None if body in system.fixed else body
+    if target in moving:
+        return str(target), 1
+    if target is None and world and len(moving) == 1:
+        return moving[0], -1
+    raise ValueError(
+        f"constraint '{group.names[index]}' acts on {moving}{' and the world' if world else ''}:"
+        f" the wrench on '{body}' does not follow from its multipliers."
+    )
 
 
 def _about(motion: Motion, force: Array, anchor: Array) -> Array:

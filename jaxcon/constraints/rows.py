@@ -53,6 +53,8 @@ class RowLayout:
 class Violation:
     """How far a state is off its constraints; `violation["hinge"]` is that of one.
 
+    Batches and trajectories of it, with leading axes, are read in the same way.
+
     Attributes:
         position: φ by row (n_c,); zero for velocity-level rows.
         velocity: φ̇ or ψ by row (n_c,).
@@ -65,23 +67,28 @@ class Violation:
 
     @property
     def worst(self) -> Array:
-        """max |φ|, ()."""
-        return jnp.max(jnp.abs(self.position), initial=0)
+        """max |φ| over rows, ()."""
+        return jnp.max(jnp.abs(self.position), axis=-1, initial=0)
 
     @property
     def worst_rate(self) -> Array:
-        """max |φ̇|, ()."""
-        return jnp.max(jnp.abs(self.velocity), initial=0)
+        """max |φ̇| over rows, ()."""
+        return jnp.max(jnp.abs(self.velocity), axis=-1, initial=0)
 
     def __getitem__(self, name: str) -> Array:
         """‖φ‖ of a constraint, or ‖ψ‖ of a velocity-level one, ()."""
         if name in self.layout.velocity_level:
             return self.rate(name)
-        return numerics.norm(self.position[self.layout.rows(name)])
+        return _norm(self.position[..., self.layout.rows(name)])
 
     def rate(self, name: str) -> Array:
         """‖φ̇‖ or ‖ψ‖ of a constraint, ()."""
-        return numerics.norm(self.velocity[self.layout.rows(name)])
+        return _norm(self.velocity[..., self.layout.rows(name)])
+
+
+def _norm(x: Array) -> Array:
+    """The norm over the last axis."""
+    return numerics.norm(jnp.moveaxis(x, -1, 0))
 
 
 @pytree

@@ -11,6 +11,9 @@ An argument that is not mapped gets a trailing axis of size 1, and the function 
 parameter shared by all worlds is read once. The transpose of that broadcast is a sum over worlds,
 which is right when `grad` is outside `vmap` and wrong when it is inside. So a transposed map, when
 it is batched, gets all its arguments in full and returns one cotangent a world.
+
+The reverse pass keeps the arguments of each call and nothing from inside it: a call is a
+checkpoint, and its derivative evaluates the function once more.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.core import ShapedArray
+from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -48,8 +51,21 @@ class Native:
         return list(self.function(*args))
 
     def _shapes(self, *avals: Any) -> list[Any]:
-        """Shape and dtype of the results."""
-        return jax.eval_shape(self, *(jax.ShapeDtypeStruct(*aval) for aval in avals))
+        """Shape and dtype of the results.
+
+        Raises:
+            TypeError: a user's function holds a traced value that is not among the arguments; its
+                derivative would silently be zero.
+        """
+        inputs = (jax.ShapeDtypeStruct(*aval) for aval in avals)
+        closed, shapes = jax.make_jaxpr(self, return_shape=True)(*inputs)
+        if any(isinstance(x, Tracer) for x in closed.consts):
+            raise TypeError(
+                "a function of the scene (a force, constraint, motion, mass or potential) closes"
+                " over a traced value, which would be invisible to vmap and grad: pass it through"
+                " params= instead."
+            )
+        return shapes
 
     def _tangent(self, moved: tuple[bool, ...]) -> Native:
         """(x, ẋ of the moved arguments) → the tangents of the floating results."""
@@ -124,7 +140,9 @@ def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
     """
     leaves, structure = jax.tree.flatten(args)
     native, result = _native(function, structure)
-    arrays = native_p.bind(*(jnp.asarray(x) for x in leaves), fun=native)
+    arrays = [jnp.asarray(x) for x in leaves]
+    native.shapes(*((x.shape, x.dtype) for x in arrays))
+    arrays = native_p.bind(*arrays, fun=native)
     return jax.tree.unflatten(result[0], arrays)
 
 
@@ -188,7 +206,8 @@ def _abstract(*args: Any, fun: Native) -> list[Any]:
 def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
 
-    def last(x: Array, axis: int | None) -> Array:
+    def last(x: Any, axis: int | None) -> Array:
+        x = jnp.asarray(x)  # a constant of the trace may come as a Python number
         if axis is not None:
             return jnp.moveaxis(x, axis, -1)
         return jnp.broadcast_to(x[..., None], (*x.shape, size)) if fun.full else x[..., None]

@@ -19,9 +19,9 @@ class Status(IntEnum):
 MEANING = {
     Status.NON_FINITE: "a state, force or parameter is NaN or infinite; likely (a) a step too large"
     " for the fastest motion, (b) a NaN in the control or parameters, (c) an unstable gain",
-    Status.SINGULAR: "the constraint rows are dependent or the mass matrix is singular; `report`"
-    " names redundant rows; likely (a) a closed spatial loop of revolute joints, (b) the same"
-    " constraint twice, (c) a singular position of the mechanism",
+    Status.SINGULAR: "the constraint rows are dependent, or the mass matrix is not positive"
+    " definite; `report` names redundant rows; likely (a) a closed spatial loop of revolute joints,"
+    " (b) the same constraint twice, (c) a singular position of the mechanism",
 }
 
 

@@ -114,7 +114,7 @@ class Gather:
         result = []
         for drive in drives:
             group, index = self._find_joint(drive, joints)
-            params = jax.tree.map(lambda x: jnp.asarray(x, self.dtype), drive.params)
+            params = self._params(drive)
             places = joints[group].select((index,)).places
             drives_one = Drives(params, _bare(drive), group, index, places)
             drives_one.check(self.dtype)

@@ -55,6 +55,11 @@ def resolve(body: BodyInput, dim: int, dtype: Any) -> Resolved:
         ValueError: a wrong shape or dtype, or a mass or inertia that is not positive.
     """
     motion = _motion(body, dim, dtype)
+    moving = (body.mass, body.inertia, body.velocity, body.angular_velocity)
+    if body.fixed and any(x is not None for x in moving):
+        raise ValueError(
+            f"{_label(body)}: it is fixed to the world, so it takes no mass, inertia or velocity."
+        )
     if body.fixed:
         return Resolved(None, motion, None, None, None)
     if not body.rigid:

@@ -44,7 +44,8 @@ class ForceElements(Elements):
 class Spring:
     """A spring and damper between two points: tension T = k (‖d‖ − l) + c d‖d‖/dt.
 
-    At ‖d‖ = 0 the force has no direction and is zero.
+    The force on the second point is (k l − c d‖d‖/dt) n − k d with n = d/‖d‖: smooth at d = 0 where
+    l = 0, and there n, which has no direction, counts as zero.
 
     Attributes:
         name: unique in the scene.
@@ -95,15 +96,16 @@ class Spring:
         length = numerics.norm(d)
         direction = d * numerics.safe_divide(1.0, length)
         speed = direction.dot(end.velocity - start.velocity)
-        tension = p["stiffness"] * (length - p["rest_length"]) + p["damping"] * speed
-        force = direction * -tension
+        slack = p["stiffness"] * p["rest_length"] - p["damping"] * speed
+        force = direction * slack - d * p["stiffness"]
         return start.pull(-force), end.pull(force)
 
     @staticmethod
     def potential(p: dict[str, Any], a: Any, b: Any) -> Lane:
-        """½ k (‖d‖ − l)²."""
+        """½ k (‖d‖ − l)², written so that its curvature at d = 0 is that of k d·d."""
         d = b.point(p["anchor_b"]).position - a.point(p["anchor_a"]).position
-        return p["stiffness"] * (numerics.norm(d) - p["rest_length"]) ** 2 / 2
+        length = p["rest_length"]
+        return p["stiffness"] * (d.dot(d) - 2 * length * numerics.norm(d) + length**2) / 2
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ class JointSpring:
     """A spring and damper about a joint's coordinate θ: force −k (θ − θ₀) − c θ̇.
 
     θ is the angle of a revolute joint [rad] or the travel of a prismatic one [m], from assembly. In
-    space the angle is measured in [−π, π].
+    space θ − θ₀ is taken modulo whole turns, in [−π, π]: the spring pulls the shorter way round.
 
     Attributes:
         name: unique in the scene.
@@ -189,19 +191,22 @@ class JointSprings(Elements):
 
     def pulls(self, snapshot: Any, control: Any) -> Pulls:
         """The generalized forces on the bodies of each side."""
-        coordinate = self._coordinate(snapshot)
-        stretch = coordinate.value - self.params["rest"]
+        coordinate, stretch = self._stretch(snapshot)
         force = -self.params["stiffness"] * stretch - self.params["damping"] * coordinate.rate
         return [(p, pull * force) for p, pull in zip(self.places, coordinate.pulls, strict=True)]
 
     def potential(self, snapshot: Any) -> Iterable[Lane]:
         """½ k (θ − θ₀)²."""
-        stretch = self._coordinate(snapshot).value - self.params["rest"]
+        stretch = self._stretch(snapshot)[1]
         return (self.params["stiffness"] * stretch**2 / 2,)
 
-    def _coordinate(self, snapshot: Any) -> Any:
+    def _stretch(self, snapshot: Any) -> tuple[Any, Lane]:
+        """The joint's coordinate, and how far it is from rest."""
         joints = snapshot.system.constraints[self.group].select(self.joints)
-        return joints.coordinate(snapshot)
+        coordinate = joints.coordinate(snapshot)
+        stretch = coordinate.value - self.params["rest"]
+        spatial_angle = snapshot.system.layout.dim == 3 and joints.joint.turns
+        return coordinate, numerics.wrap(stretch) if spatial_angle else stretch
 
 
 @dataclass(frozen=True)
@@ -300,6 +305,8 @@ class CustomForces(Elements):
         given = (snapshot.system, self.params, snapshot.q, snapshot.v, snapshot.t, own)
         wrenches = native.per_world(self._wrenches, rank)(*given)
         for place, wrench, name in zip(self.places, wrenches, self.bodies, strict=True):
+            if place.group is None:  # the world takes up any force
+                continue
             frame = snapshot.frame(place)
             n = snapshot.system.columns(place).components
             if wrench.shape[: wrench.ndim - rank] != (n,):

@@ -42,7 +42,7 @@ class GeneralizedCoordinates:
     def n_v(self) -> int:
         """Number of velocities."""
         if self.size is None:
-            raise ValueError("GeneralizedSystem: give size=, or call jc.init with q first.")
+            raise ValueError("GeneralizedSystem: its size is that of q, which is not known here.")
         return self.size
 
     def snapshot(self, q: Array, v: Array, t: Any) -> Snapshot:

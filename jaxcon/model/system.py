@@ -23,6 +23,10 @@ from jaxcon.model.state import Energy
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal
 
+POSITIVE = {"mass", "inertia", "length"}
+NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
+"""Fields whose values are checked where they are known."""
+
 
 @pytree
 class MassProperties:
@@ -148,7 +152,9 @@ class BodySystem:
 
     def columns(self, place: Place) -> Columns:
         """Where the velocities of some bodies lie in v."""
-        group = self.layout.groups[place.group or 0]
+        if place.group is None:
+            raise ValueError("the world has no velocities")
+        group = self.layout.groups[place.group]
         return Columns(group.v, group.kind.n_v, len(group.names), place.indices)
 
     def motion(self, name: str, q: Array, v: Array) -> Motion:
@@ -199,7 +205,7 @@ class BodySystem:
         A mass changed alone leaves the inertia as it is.
 
         Raises:
-            ValueError: an unknown name or field, a wrong shape, or a mass that is not positive.
+            ValueError: an unknown name or field, a wrong shape, or a value out of range.
         """
         known = self.params
         for name, fields in changes.items():
@@ -216,8 +222,10 @@ class BodySystem:
                 raise ValueError(
                     f"'{name}' has no {sorted(unknown)}, it has {sorted(known[name])}."
                 )
-            for field in fields.keys() & {"mass", "inertia"}:
-                checks.positive(name, field, fields[field])
+            for field in fields.keys() & POSITIVE | fields.keys() & NOT_NEGATIVE:
+                shape = known[name][field].shape
+                value = checks.number(name, field, fields[field], self.gravity.dtype, shape)
+                checks.positive(name, field, value, strictly=field in POSITIVE)
         gravity = self.gravity
         if "gravity" in changes:
             shape = (self.layout.dim,)

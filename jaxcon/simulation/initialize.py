@@ -30,9 +30,10 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
     Raises:
         ValueError: wrong shapes, mixed dtypes, or a user's function that returns the wrong shape.
     """
-    dtype = getattr(q, "dtype", None) or getattr(v, "dtype", None) or jnp.result_type(float)
-    if not jnp.issubdtype(dtype, jnp.floating):
-        dtype = jnp.result_type(float)
+    # only an array of JAX is a choice of dtype; numpy's are numbers like others
+    chosen = [x for x in (q, v, *jax.tree.leaves(system)) if isinstance(x, jax.Array)]
+    floating = (x.dtype for x in chosen if jnp.issubdtype(x.dtype, jnp.floating))
+    dtype = next(floating, jnp.result_type(float))
     layout = getattr(system, "layout", None)
     n_q = jnp.asarray(q).shape if layout is None else (layout.n_q,)
     if len(n_q) != 1:

@@ -75,6 +75,21 @@ class RungeKutta:
     a: tuple[tuple[float, ...], ...] = static()
     b: tuple[float, ...] = static()
 
+    def check(self) -> None:
+        """Checks the tableau.
+
+        Raises:
+            ValueError: rows of the wrong lengths, or weights that do not add up to 1.
+        """
+        lengths = [len(row) for row in self.a]
+        if lengths != list(range(1, len(lengths) + 1)) or len(self.b) != len(lengths) + 1:
+            raise ValueError(
+                f"RungeKutta: with {len(self.b)} weights the rows of a must have 1 to"
+                f" {len(self.b) - 1} entries, got {lengths}."
+            )
+        if abs(sum(self.b) - 1) > 1e-9:
+            raise ValueError(f"RungeKutta: the weights b must add up to 1, got {sum(self.b)}.")
+
     def advance(self, accelerate: Accelerate, system: Any, state: State, dt: Any) -> Any:
         """The state one step later, and the solution and rows at its start."""
         q, v, t, h = state.q, state.v, state.time, dt[None]
@@ -129,5 +144,6 @@ def RK4() -> RungeKutta:  # noqa: N802
 def combine(weights: tuple[float, ...], slopes: list[Any]) -> tuple[Any, Any]:
     """Σ wᵢ (q̇ᵢ, aᵢ), without the terms of weight zero."""
     used = [(w, slope) for w, slope in zip(weights, slopes, strict=True) if w]
+    used = used or [(0.0, slopes[0])]
     dq = functools.reduce(operator.add, (w * slope[0] for w, slope in used))
     return dq, functools.reduce(operator.add, (w * slope[1] for w, slope in used))

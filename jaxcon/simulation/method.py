@@ -30,6 +30,8 @@ class Method:
         Raises:
             TypeError: a part is a class or a name, not a value like `RK4()`.
         """
+        if hasattr(self.integrator, "check") and not isinstance(self.integrator, type):
+            self.integrator.check()
         parts = {"integrator": "advance", "stabilizer": "target", "solver": "solve"}
         for part, verb in parts.items():
             value = getattr(self, part)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.errors import TracerIntegerConversionError
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from jaxcon.core.status import Status
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.method import Method
-from jaxcon.simulation.recovery import stop_failed
-from jaxcon.simulation.step import StepInfo, step
+from jaxcon.simulation.recovery import contain, stop_failed
+from jaxcon.simulation.stability import warn_if_unstable
+from jaxcon.simulation.step import StepInfo, step_quietly
 
 Record = Callable[[State, StepInfo], PyTree]
 
@@ -54,29 +59,52 @@ def rollout(
         ValueError: `every` does not divide `steps`, or controls of another length.
         TypeError: `steps` or `every` is not an integer.
     """
-    for what, number in (("steps", steps), ("every", every)):
-        if not isinstance(number, int):
-            raise TypeError(
-                f"rollout: {what} must be an integer known when tracing, got {number!r}."
-            )
+    steps, every = _integer("steps", steps), _integer("every", every)
     if steps < 0 or every < 1 or steps % every:
         raise ValueError(f"rollout: every={every} must divide steps={steps}.")
-    feedback = controls if callable(controls) else None
-    inputs = None if feedback else _split(controls, steps, every)
+    policy = controls if callable(controls) else None
+    inputs = None if policy else _split(controls, steps, every)
+    warn_if_unstable(method, dt)
 
-    def one(carry: tuple[State, StepInfo], control: PyTree) -> Any:
+    def one(carry: tuple[State, Any], control: PyTree) -> tuple[tuple[State, StepInfo], None]:
         state, _ = carry
-        return step(system, method, state, feedback(state) if feedback else control, dt), None
+        control = contained_policy(policy, state) if policy else control
+        return step_quietly(system, method, state, control, dt), None
 
     def several(state: State, controls: PyTree) -> tuple[State, PyTree]:
         (state, info), _ = jax.lax.scan(one, (state, empty), controls, every)
         return state, record(state, info)
 
-    first = jax.tree.map(lambda x: x[0, 0], inputs)
-    shapes = jax.eval_shape(lambda s: one((s, None), first)[0][1], state)  # type: ignore[arg-type]
+    first = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), inputs)
+    shapes = jax.eval_shape(lambda s, u: one((s, None), u)[0][1], state, first)
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     final, trajectory = jax.lax.scan(several, state, inputs, steps // every)
     return stop_failed(final.status, final), stop_failed(final.status, trajectory)
+
+
+def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
+    """policy(state), with no gradient in a world where its result is not finite."""
+    closed, shapes = jax.make_jaxpr(policy, return_shape=True)(state)
+    structure = jax.tree.structure(shapes)
+
+    def judged(state: State, constants: Any) -> tuple[PyTree, Any]:
+        # what the policy closes over, traced or not, as arguments whose tangents can be masked
+        function = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))
+        control = jax.tree.unflatten(structure, function(*jax.tree.leaves(state)))
+        finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(control)]
+        good = jnp.all(jnp.stack(finite)) & (state.status == Status.OK)
+        return control, jnp.where(good, Status.OK, Status.NON_FINITE)
+
+    return contain(judged, (state, closed.consts))[0]
+
+
+def _integer(what: str, number: Any) -> int:
+    try:
+        return operator.index(number)
+    except (TypeError, TracerIntegerConversionError) as error:
+        raise TypeError(
+            f"rollout: {what} must be an integer known when tracing, got {number!r}."
+        ) from error
 
 
 def _split(controls: PyTree, steps: int, every: int) -> PyTree:

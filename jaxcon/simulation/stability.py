@@ -48,7 +48,10 @@ def warn_if_unstable(method: Any, dt: Any) -> None:
     alpha, beta = getattr(stabilizer, "alpha", None), getattr(stabilizer, "beta", None)
     if alpha is None or beta is None or not checks.is_concrete((alpha, beta, dt)):
         return
-    h = float(dt)
+    try:
+        h = float(dt)
+    except (TypeError, ValueError):  # the step itself says what is wrong with it
+        return
     for name, a, b in _pairs(alpha, beta):
         if method.integrator.growth(a, b, h) > 1 + MARGIN:
             ratio = a / b if b else 1.0
@@ -57,7 +60,7 @@ def warn_if_unstable(method: Any, dt: Any) -> None:
                 f"Baumgarte gains alpha={a:.6g}, beta={b:.6g}{name} are unstable at dt={h:.6g} with"
                 f" {type(method.integrator).__name__}: errors grow. At this damping ratio"
                 f" ({ratio:.3g}) the largest stable rate is {limit:.6g} 1/s.",
-                stacklevel=4,
+                stacklevel=3,
             )
             return
 

@@ -58,10 +58,17 @@ def step(
     Raises:
         ValueError: shapes or dtypes disagree (at trace time).
     """
+    warn_if_unstable(method, dt)  # as given: under jit an array made of it would be traced
+    return step_quietly(system, method, state, control, dt)
+
+
+def step_quietly(
+    system: Any, method: Method, state: State, control: PyTree, dt: Any
+) -> tuple[State, StepInfo]:
+    """`step` without a warning of unstable gains, for those who have given it."""
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
     checks.positive("step", "dt", dt, strictly=False)
-    warn_if_unstable(method, dt)  # as given: under jit an array made here would be traced
     return native.call(contained_step, system, method, state, control, h)
 
 
@@ -130,7 +137,7 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
     method.check()
     layout = getattr(system, "layout", None)
     if layout is not None:
-        if control is not None and not hasattr(control, "dtype"):
+        if control is not None and not isinstance(control, jax.Array):
             control = jnp.asarray(control, state.q.dtype)
         if control is not None and control.shape != (layout.n_u,):
             raise ValueError(

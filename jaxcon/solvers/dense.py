@@ -21,7 +21,8 @@ class Dense:
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.
 
-        The status is SINGULAR where K is singular to working precision.
+        The status is SINGULAR where K is singular to working precision. A mass matrix that is
+        not definite goes unnoticed where K is regular.
         """
         if not system.target.size:
             return free_motion(system)
@@ -59,6 +60,7 @@ def saddle_matrix(system: Saddle, jacobian: Array) -> Array:
 
 def _scale(system: Saddle, jacobian: Array) -> Array:
     inertia = system.mass.diagonal
+    inertia = jnp.where(inertia > 0, inertia, 1)
     weight = jacobian**2 @ (1 / inertia)
     weight = weight if system.compliance is None else weight + system.compliance
     return 1 / jnp.sqrt(jnp.concatenate([inertia, jnp.where(weight > 0, weight, 1)]))

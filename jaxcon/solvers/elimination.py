@@ -41,9 +41,9 @@ class Elimination:
         self.updates: dict[tuple[Node, Node], Block] = {}
         self.share: Any = jnp.ones(self.batch, self.dtype)
         self.finite: Any = jnp.ones(self.batch, bool)
-        for block in self.diagonal.values():
-            for r, row in enumerate(block):
-                self.finite &= jnp.all(jnp.isfinite(row[r]), axis=0)
+        for lane in jax.tree.leaves((self.diagonal, self.couplings)):
+            if isinstance(lane, jax.Array):
+                self.finite &= jnp.all(jnp.isfinite(lane), axis=0)
         self.factors = [
             self._run(step) if isinstance(step, Run) else self._single(step)
             for step in self.plan.steps

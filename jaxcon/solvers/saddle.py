@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -44,20 +45,42 @@ class Diagonal:
         """Its entries, (n_v,)."""
         return self.values
 
+    @property
+    def singular(self) -> Array:
+        """Whether an entry is finite and not positive, ()."""
+        return jnp.any(jnp.isfinite(self.values) & (self.values <= 0), axis=0)
+
 
 @pytree
 class Full:
-    """A symmetric positive definite mass matrix (n_v, n_v)."""
+    """A symmetric positive definite mass matrix (n_v, n_v), factored once where it is used."""
 
     values: Array
 
+    @cached_property
+    def factor(self) -> Array:
+        """The Cholesky factor, NaN where M is not definite; constant under differentiation."""
+        return jnp.linalg.cholesky(jax.lax.stop_gradient(self.values), symmetrize_input=False)
+
+    @property
+    def singular(self) -> Array:
+        """Whether M is finite and not positive definite, ()."""
+        finite = jnp.all(jnp.isfinite(self.values))
+        return finite & ~jnp.all(jnp.isfinite(self.factor))
+
     def solve(self, x: Array) -> Array:
         """M⁻¹ x, (n_v,); NaN where M is not definite."""
-        return jax.scipy.linalg.solve(self.values, x, assume_a="pos")
+        return self.solve_columns(x[:, None])[:, 0]
 
     def solve_columns(self, x: Array) -> Array:
         """M⁻¹ X, (n_v, k); NaN where M is not definite."""
-        return jax.scipy.linalg.solve(self.values, x, assume_a="pos")
+        factor = self.factor
+        return jax.lax.custom_linear_solve(
+            lambda y: self.values @ y,
+            x,
+            lambda _, y: jax.scipy.linalg.cho_solve((factor, True), y),
+            symmetric=True,
+        )
 
     def apply(self, x: Array) -> Array:
         """M x, (n_v,)."""
@@ -120,7 +143,8 @@ class Solver(Protocol):
 def free_motion(system: Saddle) -> Solution:
     """a = M⁻¹ f, where there is no constraint."""
     acceleration = system.mass.solve(system.force)
-    return Solution(acceleration, jnp.zeros_like(system.target), judge(acceleration))
+    status = judge(acceleration, system.mass.singular)
+    return Solution(acceleration, jnp.zeros_like(system.target), status)
 
 
 def judge(x: Array, singular: Any = None) -> Array:

@@ -26,7 +26,7 @@ class Schur:
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.
 
-        The status is SINGULAR where A is not positive definite to working precision.
+        The status is SINGULAR where A or M is not positive definite to working precision.
         """
         if not system.target.size:
             return free_motion(system)
@@ -47,7 +47,8 @@ def _solve(system: Saddle) -> Solution:
         symmetric=True,
     )
     acceleration = free + system.mass.solve(j.T @ multipliers)
-    status = judge(acceleration, _dependent(factor, a) & jnp.all(jnp.isfinite(a)))
+    dependent = _dependent(factor, a) & jnp.all(jnp.isfinite(a))
+    status = judge(acceleration, dependent | system.mass.singular)
     return Solution(acceleration, multipliers, status)
 
 
