@@ -1,4 +1,4 @@
-"""`quick_jit`: jit with XLA's costly passes left out, for tests that compile much and run little."""
+"""`quick_jit`: jit without XLA's costly passes, for tests that compile much and run little."""
 
 import functools
 from collections.abc import Callable

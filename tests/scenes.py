@@ -1,7 +1,9 @@
 """The scenes of the product tests: one table of joints, three places in which each is put.
 
-A row says how a joint is made between two bodies; every test that runs over `NAMES` or `JOINTS`
-then covers it in the plane and in space, on a tree, between moving bodies and closing a loop.
+A row says how a joint is made between two bodies; every test that runs over `NAMES` then covers it
+in the plane and in space, on a tree, between moving bodies and closing a loop. The joints of one
+place share a scene, each with bodies of its own, so that one compilation serves all of them;
+`build("revolute-3d-loop")` is the scene of one joint alone.
 """
 
 from __future__ import annotations
@@ -16,9 +18,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from compiling import quick_jit
 
 import jaxcon as jc
-from compiling import quick_jit
 from jaxcon.constraints.rows import linearize
 
 
@@ -33,6 +35,13 @@ class Site:
     axis: np.ndarray
     other: np.ndarray
     """A second point, for joints that have two."""
+    suffix: str = ""
+    """Of the names of the elements."""
+
+    @property
+    def joint(self) -> tuple[str, str, str]:
+        """The name of the joint and of its bodies."""
+        return ("joint" + self.suffix, self.a, self.b)
 
 
 @dataclass(frozen=True)
@@ -40,7 +49,7 @@ class Joint:
     """One row of the table.
 
     Attributes:
-        make: elements that make the joint, the joint itself called "joint".
+        make: elements that make the joint, the joint itself called "joint", a drive "drive".
         parameter: element and field of a number to differentiate by.
         dims: dimensions in which it exists.
         velocity_level: whether "joint" has no φ.
@@ -53,28 +62,28 @@ class Joint:
 
 
 def coincident(s: Site) -> list[Any]:
-    return [jc.Coincident("joint", s.a, s.b, point=s.point)]
+    return [jc.Coincident(*s.joint, point=s.point)]
 
 
 def spherical(s: Site) -> list[Any]:
-    return [jc.Spherical("joint", s.a, s.b, point=s.point)]
+    return [jc.Spherical(*s.joint, point=s.point)]
 
 
 def distance(s: Site) -> list[Any]:
-    return [jc.Distance("joint", s.a, s.b, point_a=s.point, point_b=s.other)]
+    return [jc.Distance(*s.joint, point_a=s.point, point_b=s.other)]
 
 
 def revolute(s: Site) -> list[Any]:
     axis = None if s.dim == 2 else s.axis
-    return [jc.Revolute("joint", s.a, s.b, point=s.point, axis=axis)]
+    return [jc.Revolute(*s.joint, point=s.point, axis=axis)]
 
 
 def prismatic(s: Site) -> list[Any]:
-    return [jc.Prismatic("joint", s.a, s.b, axis=s.axis, point=s.point)]
+    return [jc.Prismatic(*s.joint, axis=s.axis, point=s.point)]
 
 
 def fixed(s: Site) -> list[Any]:
-    return [jc.Fixed("joint", s.a, s.b, point=s.point)]
+    return [jc.Fixed(*s.joint, point=s.point)]
 
 
 def wave(t: Any, p: Any) -> Any:
@@ -84,12 +93,16 @@ def wave(t: Any, p: Any) -> Any:
 WAVE = {"size": 0.4, "frequency": 3.0}
 
 
+def drive(s: Site) -> Any:
+    return jc.Drive("drive" + s.suffix, s.joint[0], wave, params=WAVE)
+
+
 def driven_revolute(s: Site) -> list[Any]:
-    return [*revolute(s), jc.Drive("drive", "joint", wave, params=WAVE)]
+    return [*revolute(s), drive(s)]
 
 
 def driven_prismatic(s: Site) -> list[Any]:
-    return [*prismatic(s), jc.Drive("drive", "joint", wave, params=WAVE)]
+    return [*prismatic(s), drive(s)]
 
 
 def breathing(a: Any, b: Any, t: Any, p: Any) -> Any:
@@ -99,9 +112,8 @@ def breathing(a: Any, b: Any, t: Any, p: Any) -> Any:
 
 
 def holonomic(s: Site) -> list[Any]:
-    # the anchor is in b's own frame, so what the square must be follows from the poses at assembly
-    params = {"anchor": np.full(s.dim, 0.3), "square": 1.0}
-    return [jc.Holonomic(breathing, bodies=(s.a, s.b), name="joint", params=params)]
+    params = {"anchor": np.full(s.dim, 0.3), "square": 1.0}  # the square: see start_breathing
+    return [jc.Holonomic(breathing, bodies=(s.a, s.b), name=s.joint[0], params=params)]
 
 
 def skate(a: Any, b: Any, t: Any, p: Any) -> Any:
@@ -112,7 +124,7 @@ def skate(a: Any, b: Any, t: Any, p: Any) -> Any:
 
 def velocity_level(s: Site) -> list[Any]:
     params = {"anchor": np.full(s.dim, 0.3), "edge": np.arange(1.0, s.dim + 1)}
-    return [jc.VelocityLevel(skate, bodies=(s.a, s.b), name="joint", params=params)]
+    return [jc.VelocityLevel(skate, bodies=(s.a, s.b), name=s.joint[0], params=params)]
 
 
 JOINTS = {
@@ -138,61 +150,86 @@ class Built:
         system: what `build` gave.
         state: on the constraints, moving, at time 0.
         off: off the constraints in position and velocity, at another time.
-        parameter: element and field to differentiate by; None on generalized coordinates.
+        parameters: elements and fields to differentiate by.
         velocity_level: names of the constraints without φ.
     """
 
     system: Any
     state: jc.State
     off: jc.State
-    parameter: tuple[str, str] | None
+    parameters: tuple[tuple[str, str], ...] = ()
     velocity_level: tuple[str, ...] = ()
 
 
-def joint_scene(kind: str, dim: int, topology: str, dtype: Any) -> Built:
-    """One joint of the table: to the world, between two bodies, or closing a loop of them."""
-    random = seeded(kind, dim, topology)
+def joints_scene(kinds: tuple[str, ...], dim: int, topology: str, dtype: Any) -> Built:
+    """Joints of the table, each to the world, between two bodies, or closing a loop of them."""
+    random = seeded(kinds, dim, topology)
     scene = jc.Scene(dim=dim, dtype=dtype)
-    bodies = ["first"] if topology == "tree" else ["first", "second"]
-    for name in bodies:
-        add_random_body(scene, name, random, dtype)
-    a, b = (jc.WORLD, "first") if topology == "tree" else ("first", "second")
-    point, axis, other = random.normal(size=(3, dim))
-    for element in JOINTS[kind].make(Site(a, b, dim, point, axis, point + axis + 0.5 * other)):
+    parameters: list[tuple[str, str]] = []
+    for kind in kinds:
+        suffix = "" if len(kinds) == 1 else "_" + kind
+        add_joint(scene, kind, topology, suffix, random)
+        element, field = JOINTS[kind].parameter
+        parameters += [(element + suffix, field), ("first" + suffix, "mass")]
+    system, state = scene.build()
+    level = tuple(
+        "joint" + ("" if len(kinds) == 1 else "_" + kind)
+        for kind in kinds
+        if JOINTS[kind].velocity_level
+    )
+    return finish(start_breathing(system, state), state, random, tuple(parameters), level)
+
+
+def add_joint(scene: jc.Scene, kind: str, topology: str, suffix: str, random: Any) -> None:
+    """Bodies at random places and the joint between them."""
+    first, second = "first" + suffix, "second" + suffix
+    for name in (first,) if topology == "tree" else (first, second):
+        add_random_body(scene, name, random)
+    a, b = (jc.WORLD, first) if topology == "tree" else (first, second)
+    point, other = near((0.8, 0.4), random, scene.dim), near((1.2, 1.1), random, scene.dim)
+    site = Site(a, b, scene.dim, point, random.normal(size=scene.dim), other, suffix)
+    for element in JOINTS[kind].make(site):
         scene.add(element)
     if topology == "loop":
-        scene.add(jc.Distance("left", jc.WORLD, "first", point_b=random.normal(size=dim)))
-        scene.add(jc.Distance("right", "second", jc.WORLD, point_a=random.normal(size=dim)))
-    system, state = scene.build()
-    if kind == "holonomic":
-        system = start_breathing(system, state, a, b)
-    level = ("joint",) if JOINTS[kind].velocity_level else ()
-    return finish(system, state, random, JOINTS[kind].parameter, level)
+        left, right = (near(x, random, scene.dim) for x in ((-0.5, 0.3), (2.0, 0.8)))
+        far = near((3.0, -1.5), random, scene.dim)
+        scene.add(jc.Distance("left" + suffix, jc.WORLD, first, point_b=left))
+        scene.add(jc.Distance("right" + suffix, second, jc.WORLD, point_a=right, point_b=far))
 
 
-def start_breathing(system: Any, state: jc.State, a: str, b: str) -> Any:
-    """The same with the square of the user's distance as it is at assembly."""
-    params = system.params["joint"]["params"]
-    gap = jc.position(system, state, b, params["anchor"])
-    gap = gap - (0 if a == jc.WORLD else jc.position(system, state, a))
-    return system.with_params({"joint": {"params": params | {"square": gap @ gap}}})
+def near(place: tuple[float, float], random: Any, dim: int) -> np.ndarray:
+    """A random point near a place of the plane."""
+    return np.pad(place, (0, dim - 2)) + 0.2 * random.normal(size=dim)
 
 
-def add_random_body(scene: Any, name: str, random: Any, dtype: Any) -> None:
-    """A body somewhere; "second" has its centre of mass and principal axes off its frame."""
+def start_breathing(system: Any, state: jc.State) -> Any:
+    """The same with the squares of the user's distances as they are at assembly."""
+    changes = {}
+    for group in system.constraints:
+        if getattr(getattr(group, "law", None), "function", None) is breathing:
+            a, b = group.law.bodies
+            gap = jc.position(system, state, b, group.params["anchor"])
+            gap = gap - (0 if a == jc.WORLD else jc.position(system, state, a))
+            changes[group.law.name] = {"params": group.params | {"square": gap @ gap}}
+    return system.with_params(changes)
+
+
+def add_random_body(scene: jc.Scene, name: str, random: Any) -> None:
+    """A body somewhere; a "second" has its centre of mass and principal axes off its frame."""
     dim = scene.dim
-    motion: dict[str, Any] = {"position": random.normal(size=dim)}
+    place = (1.5, 0.5) if name.startswith("second") else (0.1, -0.1)
+    motion: dict[str, Any] = {"position": near(place, random, dim)}
     motion["velocity"] = random.normal(size=dim)
     motion["angular_velocity"] = random.normal(size=() if dim == 2 else 3)
     motion["angle" if dim == 2 else "quaternion"] = random.normal(size=() if dim == 2 else 4)
     mass = random.uniform(0.5, 2.0)
-    if name == "second" and dim == 3:
+    if name.startswith("second") and dim == 3:
         spread = random.normal(size=(3, 3))
         moment = spread @ spread.T
-        tensor = jnp.asarray(np.trace(moment) * np.eye(3) - moment, dtype)
+        tensor = jnp.asarray(np.trace(moment) * np.eye(3) - moment, scene.dtype)
         solid = jc.inertia.from_tensor(mass, tensor, center=(0.2, -0.1, 0.3))
         scene.add_body(name, inertia=solid, **motion)
-    elif name == "second":
+    elif name.startswith("second"):
         solid = jc.inertia.Inertia(mass, 0.7, center=(0.2, -0.1))
         scene.add_body(name, inertia=solid, **motion)
     else:
@@ -203,8 +240,8 @@ def mixed_scene(dim: int, dtype: Any) -> Built:
     """Particles and rigid bodies together, every kind of constraint that a particle may have."""
     random = seeded("mixed", dim)
     scene = jc.Scene(dim=dim, dtype=dtype)
-    add_random_body(scene, "first", random, dtype)
-    add_random_body(scene, "second", random, dtype)
+    add_random_body(scene, "first", random)
+    add_random_body(scene, "second", random)
     places = random.normal(size=(4, dim))
     for name, place in zip(("bead", "bob", "mate", "free"), places, strict=True):
         scene.add_particle(name, mass=random.uniform(0.5, 2.0), position=place)
@@ -219,7 +256,8 @@ def mixed_scene(dim: int, dtype: Any) -> Built:
     scene.add(jc.Spring("spring", "free", "bob", stiffness=3.0, damping=0.2, rest_length=0.5))
     scene.add(jc.ExternalWrench("push", "second"))
     system, state = scene.build()
-    return finish(system, state, random, ("rod", "length"), ("skate",))
+    parameters = (("rod", "length"), ("bob", "mass"), ("spring", "stiffness"))
+    return finish(system, state, random, parameters, ("skate",))
 
 
 def polar_mass(q: Any, p: Any) -> Any:
@@ -229,9 +267,7 @@ def polar_mass(q: Any, p: Any) -> Any:
 def polar_force(q: Any, v: Any, t: Any, u: Any, p: Any) -> Any:
     (r, angle), (speed, rate) = q, v
     pull = r * rate**2 + p["gravity"] * jnp.cos(angle)
-    return p["mass"] * jnp.stack(
-        [pull, -2 * r * speed * rate - p["gravity"] * r * jnp.sin(angle)]
-    )
+    return p["mass"] * jnp.stack([pull, -2 * r * speed * rate - p["gravity"] * r * jnp.sin(angle)])
 
 
 def polar_potential(q: Any, t: Any, p: Any) -> Any:
@@ -253,7 +289,7 @@ def polar_scene(dtype: Any) -> Built:
         params={name: jnp.asarray(x, dtype) for name, x in params.items()},
     )
     state = jc.init(system, jc.Method(), jnp.asarray([1.2, 0.7], dtype), np.zeros(2))
-    return finish(system, state, seeded("polar"), None)
+    return finish(system, state, seeded("polar"))
 
 
 def arm_mass(q: Any, p: Any) -> Any:
@@ -279,7 +315,7 @@ def arm_scene(dtype: Any) -> Built:
         params={"moment": jnp.asarray(1.3, dtype), "coupling": jnp.asarray(0.7, dtype)},
     )
     state = jc.init(system, jc.Method(), jnp.asarray([0.4, -0.9], dtype), np.zeros(2))
-    return finish(system, state, seeded("arm"), None, ("speed",))
+    return finish(system, state, seeded("arm"), (), ("speed",))
 
 
 OTHERS = {
@@ -288,21 +324,18 @@ OTHERS = {
     "polar": polar_scene,
     "arm": arm_scene,
 }
-NAMES = (
-    *(
-        f"{kind}-{dim}d-{topology}"
-        for kind, joint in JOINTS.items()
-        for dim in joint.dims
-        for topology in TOPOLOGIES
-    ),
-    *OTHERS,
-)
-"""Every scene."""
+NAMES = (*(f"all-{dim}d-{topology}" for dim in (2, 3) for topology in TOPOLOGIES), *OTHERS)
+"""Every scene; together they hold every joint in every place."""
 
 
 def names(*topologies: str) -> tuple[str, ...]:
-    """Every joint in these places, without the other scenes."""
-    return tuple(name for name in NAMES if name.rpartition("-")[2] in topologies)
+    """The scene of each joint alone, in these places."""
+    return tuple(
+        f"{kind}-{dim}d-{topology}"
+        for kind, joint in JOINTS.items()
+        for dim in joint.dims
+        for topology in topologies
+    )
 
 
 @functools.cache
@@ -311,11 +344,14 @@ def build(name: str, dtype: str = "float64") -> Built:
     if name in OTHERS:
         return OTHERS[name](jnp.dtype(dtype))
     kind, dim, topology = name.split("-")
-    return joint_scene(kind, int(dim[0]), topology, jnp.dtype(dtype))
+    kinds = (kind,)
+    if kind == "all":
+        kinds = tuple(key for key, joint in JOINTS.items() if int(dim[0]) in joint.dims)
+    return joints_scene(kinds, int(dim[0]), topology, jnp.dtype(dtype))
 
 
 def finish(
-    system: Any, state: jc.State, random: Any, parameter: Any, velocity_level: Any = ()
+    system: Any, state: jc.State, random: Any, parameters: Any = (), velocity_level: Any = ()
 ) -> Built:
     """Adds velocities that the constraints allow, and a state off the constraints."""
     dtype = state.q.dtype
@@ -325,7 +361,7 @@ def finish(
     off = dataclasses.replace(
         state, q=system.retract(state.q, step), v=v, time=jnp.asarray(0.3, dtype)
     )
-    return Built(system, on, off, parameter, velocity_level)
+    return Built(system, on, off, parameters, velocity_level)
 
 
 def allowed(system: Any, state: jc.State, v: jax.Array) -> jax.Array:

@@ -3,13 +3,15 @@
 The words of each case must appear in the message in this order.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scenes
 
 import jaxcon as jc
-import scenes
 
 
 def scene(dim=3, **options):
@@ -90,8 +92,14 @@ def nothing(q, t, p):
 
 MISTAKES = {
     # names
-    "unknown body": (lambda: build(jc.Distance("d", "arm", "lag")), ["Distance 'd'", "'lag' is unknown", "'leg'"]),
-    "unknown body of a force": (lambda: build(jc.Force("f", "lag", Z)), ["Force 'f'", "'lag' is unknown", "'leg'"]),
+    "unknown body": (
+        lambda: build(jc.Distance("d", "arm", "lag")),
+        ["Distance 'd'", "'lag' is unknown", "'leg'"],
+    ),
+    "unknown body of a force": (
+        lambda: build(jc.Force("f", "lag", Z)),
+        ["Force 'f'", "'lag' is unknown", "'leg'"],
+    ),
     "unknown joint of a drive": (
         lambda: build(jc.Drive("d", "hinge", scenes.wave)),
         ["Drive 'd'", "joint 'hinge' is unknown"],
@@ -110,16 +118,25 @@ MISTAKES = {
         lambda: twice(jc.Fixed("j", "arm", "leg"), jc.Fixed("j", "arm", "bob")),
         ["'j' is taken"],
     ),
-    "joint named as a body": (lambda: scene().add(jc.Fixed("arm", "arm", "leg")), ["'arm' is taken"]),
+    "joint named as a body": (
+        lambda: scene().add(jc.Fixed("arm", "arm", "leg")),
+        ["'arm' is taken"],
+    ),
     "two nameless user constraints": (
         lambda: twice(jc.Holonomic(flat, ("arm",)), jc.Holonomic(flat, ("leg",))),
         ["'holonomic' is taken"],
     ),
-    "reserved name": (lambda: scene().add_body("world", mass=1, inertia=Z), ["'world' is reserved"]),
+    "reserved name": (
+        lambda: scene().add_body("world", mass=1, inertia=Z),
+        ["'world' is reserved"],
+    ),
     "empty name": (lambda: scene().add_particle("", mass=1), ["name", "''"]),
     "name that is a number": (lambda: scene().add_particle(3, mass=1), ["name", "3"]),
     # who is joined
-    "joint to itself": (lambda: build(jc.Distance("d", "arm", "arm")), ["Distance 'd'", "'arm' to itself"]),
+    "joint to itself": (
+        lambda: build(jc.Distance("d", "arm", "arm")),
+        ["Distance 'd'", "'arm' to itself"],
+    ),
     "joint of the world to itself": (
         lambda: build(jc.Distance("d", jc.WORLD, jc.WORLD)),
         ["Distance 'd'", "itself"],
@@ -138,15 +155,15 @@ MISTAKES = {
     ),
     "point away from a particle": (
         lambda: build(jc.Coincident("j", "arm", "bob", point=ORIGIN)),
-        ["Coincident 'j'", "bob|particle", "2"],
+        ["Coincident 'j'", "particle", "2.0"],
     ),
     "point of a distance away from a particle": (
         lambda: build(jc.Distance("j", "arm", "bob", point_b=(5.0, 0.0, 0.0))),
-        ["Distance 'j'", "point_b", "5", "particle", "2"],
+        ["Distance 'j'", "point_b", "5.0", "particle", "2.0"],
     ),
     "spring on a point away from a particle": (
         lambda: build(jc.Spring("s", "arm", "bob", 1.0, point_b=(5.0, 0.0, 0.0))),
-        ["'s'", "point_b", "5", "particle", "2"],
+        ["Spring 's'", "point_b", "5.0", "particle", "2.0"],
     ),
     "spherical joint in the plane": (
         lambda: build(jc.Spherical("j", "arm", "leg", point=(0, 0)), dim=2),
@@ -162,16 +179,28 @@ MISTAKES = {
     ),
     "not an element": (lambda: scene().add("hinge"), ["joint, constraint or force", "hinge"]),
     "a class": (lambda: scene().add(jc.Revolute), ["joint, constraint or force", "Revolute"]),
-    "a class of constraints": (lambda: scene().add(jc.Holonomic), ["joint, constraint or force", "Holonomic"]),
+    "a class of constraints": (
+        lambda: scene().add(jc.Holonomic),
+        ["joint, constraint or force", "Holonomic"],
+    ),
     # numbers out of range
     "mass of zero": (lambda: body(mass=0.0), ["body 'arm'", "mass", "positive", "0.0"]),
     "negative mass": (lambda: particle(mass=-1), ["particle 'bob'", "mass", "positive", "-1.0"]),
-    "mass that is not a number": (lambda: particle(mass=float("nan")), ["particle 'bob'", "mass", "nan"]),
+    "mass that is not a number": (
+        lambda: particle(mass=float("nan")),
+        ["particle 'bob'", "mass", "nan"],
+    ),
     "infinite mass": (lambda: particle(mass=np.inf), ["particle 'bob'", "mass", "finite", "inf"]),
     "no mass": (lambda: particle(mass=None), ["particle 'bob'", "mass", "None"]),
     "body without mass": (lambda: body(mass=None), ["body 'arm'", "mass", "None"]),
-    "inertia of zero": (lambda: body(inertia=(1, 1, 0)), ["body 'arm'", "inertia", "positive", "0.0"]),
-    "negative inertia": (lambda: body(2, inertia=-1), ["body 'arm'", "inertia", "positive", "-1.0"]),
+    "inertia of zero": (
+        lambda: body(inertia=(1, 1, 0)),
+        ["body 'arm'", "inertia", "positive", "0.0"],
+    ),
+    "negative inertia": (
+        lambda: body(2, inertia=-1),
+        ["body 'arm'", "inertia", "positive", "-1.0"],
+    ),
     "no inertia": (lambda: body(inertia=None), ["body 'arm'", "inertia is needed"]),
     "inertia against the triangle inequality": (
         lambda: body(inertia=(1, 1, 3)),
@@ -181,7 +210,10 @@ MISTAKES = {
         lambda: body(inertia=[[1, 1, 0], [0, 1, 0], [0, 0, 1]]),
         ["symmetric"],
     ),
-    "tensor that is not definite": (lambda: body(inertia=np.diag([1.0, 1.0, -1.0])), ["moments", "-1.0"]),
+    "tensor that is not definite": (
+        lambda: body(inertia=np.diag([1.0, 1.0, -1.0])),
+        ["moments", "-1.0"],
+    ),
     "mass twice": (
         lambda: body(mass=1.0, inertia=jc.inertia.sphere(1.0, 1.0)),
         ["body 'arm'", "mass= or an Inertia, not both"],
@@ -191,7 +223,10 @@ MISTAKES = {
         lambda: body(position=(0, np.nan, 0)),
         ["body 'arm'", "position", "finite", "nan"],
     ),
-    "quaternion of zero": (lambda: body(quaternion=(0, 0, 0, 0)), ["body 'arm'", "quaternion", "length"]),
+    "quaternion of zero": (
+        lambda: body(quaternion=(0, 0, 0, 0)),
+        ["body 'arm'", "quaternion", "length"],
+    ),
     "axis of length zero": (
         lambda: build(jc.Revolute("j", "arm", "leg", point=ORIGIN, axis=ORIGIN)),
         ["Revolute 'j'", "axis", "length", "0.0"],
@@ -232,12 +267,18 @@ MISTAKES = {
         lambda: body(position=(0, 0)),
         ["body 'arm'", "position", r"\(3,\)", r"\(2,\)"],
     ),
-    "inertia of the plane in space": (lambda: body(inertia=1.0), ["body 'arm'", "inertia", r"\(3,\)", r"\(\)"]),
+    "inertia of the plane in space": (
+        lambda: body(inertia=1.0),
+        ["body 'arm'", "inertia", r"\(3,\)", r"\(\)"],
+    ),
     "inertia of space in the plane": (
         lambda: body(2, inertia=np.eye(2)),
         ["body 'arm'", "inertia", r"\(\)", r"\(2, 2\)"],
     ),
-    "mass as a list": (lambda: particle(mass=[1.0]), ["particle 'bob'", "mass", r"\(\)", r"\(1,\)"]),
+    "mass as a list": (
+        lambda: particle(mass=[1.0]),
+        ["particle 'bob'", "mass", r"\(\)", r"\(1,\)"],
+    ),
     "mass as a word": (lambda: particle(mass="heavy"), ["particle 'bob'", "mass", "heavy"]),
     "ragged position": (lambda: body(position=[1, [2], 3]), ["body 'arm'", "position", "numbers"]),
     "complex mass": (lambda: particle(mass=1j), ["particle 'bob'", "mass", "1j"]),
@@ -245,11 +286,10 @@ MISTAKES = {
         lambda: build(jc.Coincident("j", "arm", "leg", point=(0, 0))),
         ["Coincident 'j'", "point", r"\(3,\)", r"\(2,\)"],
     ),
-    "no point": (
-        lambda: build(jc.Coincident("j", "arm", "leg", point=None)),
-        ["Coincident 'j'", "point", "None"],
+    "gravity as a number": (
+        lambda: jc.Scene(gravity=-9.81),
+        ["Scene", "gravity", r"\(3,\)", r"\(\)"],
     ),
-    "gravity as a number": (lambda: jc.Scene(gravity=-9.81), ["Scene", "gravity", r"\(3,\)", r"\(\)"]),
     "four dimensions": (lambda: jc.Scene(dim=4), ["dim must be 2 or 3", "4"]),
     "dimension as a word": (lambda: jc.Scene(dim="2"), ["dim must be 2 or 3", "'2'"]),
     "half precision": (lambda: jc.Scene(dtype=jnp.float16), ["float32 or float64", "float16"]),
@@ -265,7 +305,10 @@ MISTAKES = {
         lambda: body(2, quaternion=(1, 0, 0, 0)),
         ["body 'arm'", "2 dimensions", "angle=, not quaternion="],
     ),
-    "angle in space": (lambda: body(angle=1.0), ["body 'arm'", "3 dimensions", "quaternion=, not angle="]),
+    "angle in space": (
+        lambda: body(angle=1.0),
+        ["body 'arm'", "3 dimensions", "quaternion=, not angle="],
+    ),
     "hinge axis in the plane": (
         lambda: build(jc.Revolute("j", "arm", "leg", point=(0, 0), axis=Z), dim=2),
         ["Revolute 'j'", "in the plane", "axis"],
@@ -332,7 +375,10 @@ def ring(q, t, p):
 
 
 GENERALIZED = {
-    "a joint": (lambda: generalized(jc.Fixed("j", "a", "b")), ["Holonomic and VelocityLevel", "Fixed"]),
+    "a joint": (
+        lambda: generalized(jc.Fixed("j", "a", "b")),
+        ["Holonomic and VelocityLevel", "Fixed"],
+    ),
     "a constraint on bodies": (
         lambda: generalized(jc.Holonomic(ring, bodies=("a",), name="h")),
         ["'h'", "no bodies"],
@@ -367,14 +413,10 @@ def stepping(**options):
 
 
 def with_q(q):
-    import dataclasses
-
     return dataclasses.replace(scenes.build("mixed-2d").state, q=q)
 
 
 def with_memory(memory):
-    import dataclasses
-
     return dataclasses.replace(scenes.build("mixed-2d").state, memory=memory)
 
 
@@ -460,10 +502,12 @@ def test_controls_may_be_numpy_arrays_and_lists():
 
 
 def test_numpy_float64_in_a_float32_scene():
-    """Numpy's default is float64; what it holds is converted, as a Python number is."""
+    """Numpy's numbers are converted, as Python's are; an array of JAX is a choice of dtype."""
     built = scenes.build("mixed-2d", "float32")
-    new, _ = jc.step(built.system, jc.Method(), built.state, np.ones(3), np.float64(1e-3))
+    new, _ = jc.step(built.system, jc.Method(), built.state, None, np.float64(1e-3))
     assert new.q.dtype == new.v.dtype == new.time.dtype == jnp.float32
+    with pytest.raises(ValueError, match="control is float64, but the state is float32"):
+        jc.step(built.system, jc.Method(), built.state, jnp.ones(3), 1e-3)
 
 
 def test_the_step_size_may_be_any_number():

@@ -3,10 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tolerances import DERIVATIVE, IDENTITY
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
-from tolerances import DERIVATIVE, IDENTITY
 
 
 def rows_of(system, state):
@@ -121,9 +121,7 @@ def test_velocity_level_rows_decay_under_feedback():
     """ψ̇ = −2α ψ."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("wheel", mass=2.0, inertia=0.2, velocity=(1.0, 0.0))
-    scene.add(
-        jc.VelocityLevel(rolling, bodies=("wheel",), name="roll", params={"radius": 0.3})
-    )
+    scene.add(jc.VelocityLevel(rolling, bodies=("wheel",), name="roll", params={"radius": 0.3}))
     system, state = scene.build()
     method = jc.Method(stabilizer=jc.Baumgarte.critical(rate=4.0), integrator=jc.RK4())
     for _ in range(5):

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import jaxcon as jc
 import scenes
 from compiling import quick_jit
 from tolerances import IDENTITY
+
+import jaxcon as jc
 
 both = pytest.mark.parametrize("dim", [2, 3])
 
@@ -20,7 +20,7 @@ def two_bodies(dim, *elements, gravity=None, damp=()):
     random = np.random.default_rng(dim)
     scene = jc.Scene(dim=dim, gravity=gravity)
     for name in ("first", "second"):
-        scenes.add_random_body(scene, name, random, jnp.float64)
+        scenes.add_random_body(scene, name, random)
     scene.add_particle("bob", mass=0.7, position=random.normal(size=dim), velocity=(1.0,) * dim)
     turn = {"angle": 0.4} if dim == 2 else {"quaternion": (0.5, 0.5, 0.5, -0.5)}
     scene.add_body("wall", fixed=True, position=(0.3,) * dim, **turn)
@@ -56,7 +56,9 @@ def elements(dim):
 @pytest.mark.parametrize("name", elements(2))
 def test_force_is_minus_the_slope_of_the_potential(dim, name):
     system, state = two_bodies(dim, *elements(dim)[name])
-    q = system.retract(state.q, jnp.asarray(0.2 * np.random.default_rng(1).normal(size=state.v.shape)))
+    q = system.retract(
+        state.q, jnp.asarray(0.2 * np.random.default_rng(1).normal(size=state.v.shape))
+    )
     rest = jnp.zeros_like(state.v)
 
     def potential(step):
@@ -215,6 +217,6 @@ def test_custom_force_of_the_wrong_shape():
     def wrong(a, t, u, p):
         return jnp.zeros(2)
 
+    system, state = two_bodies(2, jc.CustomForce("bad", ("first",), wrong))
     with pytest.raises(ValueError, match="force 'bad'.*'first'.*\\(3,\\).*\\(2,\\)"):
-        system, state = two_bodies(2, jc.CustomForce("bad", ("first",), wrong))
         system.force(state.q, state.v, state.time)

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick_jit
+from tolerances import IDENTITY, QUADRATURE
 
 import jaxcon as jc
-from compiling import quick_jit
 from jaxcon.geometry import inertia
-from tolerances import IDENTITY, QUADRATURE
 
 MASS = 2.5
 
@@ -68,9 +68,7 @@ SOLIDS = {
     "cylinder": (inertia.cylinder(MASS, 0.4, 1.1), cylinder(0.4, -0.55, 0.55)),
     "capsule": (
         inertia.capsule(MASS, 0.4, 1.1),
-        together(
-            cylinder(0.4, -0.55, 0.55), ball(0.4, 0, 1, 0.55), ball(0.4, -1, 0, -0.55)
-        ),
+        together(cylinder(0.4, -0.55, 0.55), ball(0.4, 0, 1, 0.55), ball(0.4, -1, 0, -0.55)),
     ),
 }
 

@@ -1,12 +1,12 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 import scenes
+from tolerances import IDENTITY
+
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.lanes import Vector
 from jaxcon.solvers.jacobian import Block, Columns, Jacobian
-from tolerances import IDENTITY
 
 
 @pytest.fixture

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from compiling import quick_jit
+from tolerances import DIFFERENCE, IDENTITY
+
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.geometry import quaternion
-from tolerances import DIFFERENCE, IDENTITY
 
 
 def unit(x):

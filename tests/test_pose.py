@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tolerances import IDENTITY
 
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Motion, Pose
-from tolerances import IDENTITY
 
 
 def random_motion(dim):

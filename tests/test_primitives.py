@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import jaxcon as jc
 import scenes
 from compiling import quick_jit
-from jaxcon.constraints.rows import linearize
 from tolerances import DERIVATIVE, DIFFERENCE
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
 
 
 def by_hand(system, q, v, t):
@@ -46,18 +46,24 @@ def level_rows(built):
     return level
 
 
-@pytest.mark.parametrize("name", scenes.NAMES)
+@pytest.mark.parametrize("name", [n for n in scenes.NAMES if "loop" not in n])
 def test_rows_are_derivatives_of_the_residual(name):
+    """A joint that closes a loop has the rows of a joint between two moving bodies."""
     built = scenes.build(name)
     level, s = level_rows(built), built.off
-    residual, rate, jacobian, bias = by_hand(built.system, s.q, s.v, s.time)
+    residual, rate, jacobian, bias = quick_jit(by_hand)(built.system, s.q, s.v, s.time)
     derive = quick_jit(lambda q, v, t: by_derivation(built.system, level, q, v, t))
     expected = derive(s.q, s.v, s.time)
+    layout = linearize(built.system, s.q, s.v, s.time).layout
     close = {"rtol": DERIVATIVE, "atol": DERIVATIVE}
-    np.testing.assert_allclose(rate, expected[0], **close)
-    np.testing.assert_allclose(jacobian, expected[1], **close)
-    np.testing.assert_allclose(bias, expected[2], **close)
-    np.testing.assert_allclose(jacobian @ s.v + expected[3], rate, **close)
+    for constraint in layout.names:
+        rows = layout.rows(constraint)
+        close["err_msg"] = constraint
+        np.testing.assert_allclose(rate[rows], expected[0][rows], **close)
+        np.testing.assert_allclose(jacobian[rows], expected[1][rows], **close)
+        np.testing.assert_allclose(bias[rows], expected[2][rows], **close)
+        moved = jacobian[rows] @ s.v + expected[3][rows]
+        np.testing.assert_allclose(moved, rate[rows], **close)
     assert np.all(np.abs(residual[~level]) > 1e-6), "the state is not off the constraints"
     np.testing.assert_array_equal(residual[level], 0)
 
@@ -169,7 +175,7 @@ def test_residual_is_the_formula(name):
     np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", scenes.names("tree", "between", "loop"))
+@pytest.mark.parametrize("name", scenes.NAMES)
 def test_rows_hold_where_the_scene_was_assembled(name):
     built = scenes.build(name)
     assert jc.violation(built.system, built.state).worst < 1e-13

@@ -2,11 +2,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from compiling import quick_jit
+from tolerances import DIFFERENCE, IDENTITY
+
 from jaxcon.core.lanes import Vector
 from jaxcon.geometry import quaternion
-from tolerances import DIFFERENCE, IDENTITY
 
 ONE = np.array([1.0, 0.0, 0.0, 0.0])
 

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import jaxcon as jc
 import scenes
 from tolerances import IDENTITY
+
+import jaxcon as jc
 
 both = pytest.mark.parametrize("dim", [2, 3])
 
@@ -45,7 +45,9 @@ def test_positions_are_read_in_the_frame_in_which_they_were_given(dim):
         tensor = jnp.asarray([[1.0, 0.1, 0.2], [0.1, 1.2, 0.0], [0.2, 0.0, 1.1]])
         solid = jc.inertia.from_tensor(2.0, tensor, center=(0.2, -0.1, 0.3))
         turn = {"quaternion": (0.8, 0.0, 0.6, 0.0)}
-    scene.add_body("a", inertia=solid, position=place, velocity=speed, angular_velocity=spin, **turn)
+    scene.add_body(
+        "a", inertia=solid, position=place, velocity=speed, angular_velocity=spin, **turn
+    )
     system, state = scene.build()
     np.testing.assert_allclose(jc.position(system, state, "a"), place, atol=IDENTITY)
     np.testing.assert_allclose(jc.velocity(system, state, "a"), speed, atol=IDENTITY)
@@ -125,6 +127,24 @@ def test_a_scene_is_built_under_jit_vmap_and_grad():
     lengths = jnp.asarray([1.0, 2.0])
     np.testing.assert_allclose(jax.jit(jax.vmap(height))(lengths), -1.5 * 9.81 / lengths)
     np.testing.assert_allclose(jax.grad(height)(2.0), 1.5 * 9.81 / 4, rtol=1e-10)
+
+
+def test_a_scene_in_space_is_built_under_jit():
+    """With numbers that are known and numbers that are traced."""
+    known = jnp.asarray([1.0, 1.0, 1.0])
+
+    def start(mass, moment):
+        scene = jc.Scene()
+        scene.add_body("a", mass=mass, inertia=(moment, 1.0, 1.0), position=(1.0, 2.0, 3.0))
+        scene.add_body("b", mass=1.0, inertia=known)
+        scene.add(jc.Revolute("hinge", "a", "b", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)))
+        system, state = scene.build()
+        return state.q, system.params["a"]
+
+    q, params = jax.jit(start)(2.0, 1.5)
+    np.testing.assert_array_equal(q[:6], (1, 0, 2, 0, 3, 0))
+    assert params["mass"] == 2.0
+    np.testing.assert_array_equal(params["inertia"], (1.5, 1.0, 1.0))
 
 
 def test_mixed_dimensions_of_rank_are_not_needed():

@@ -15,6 +15,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree
@@ -154,7 +155,7 @@ def check_triangle(owner: str, moments: Any) -> None:
         ValueError: one moment exceeds the sum of the others by more than round-off.
     """
     if checks.is_concrete(moments):
-        values = sorted(float(x) for x in moments)
+        values = np.sort(np.asarray(moments)).tolist()
         if values[2] > (values[0] + values[1]) * (1 + 1e-5):
             raise ValueError(
                 f"{owner}: principal moments {values} violate the triangle inequality"

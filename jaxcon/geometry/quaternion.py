@@ -108,8 +108,10 @@ def normalize(q: Any) -> Any:
 
 def from_axis_angle(axis: Any, angle: Any) -> Array:
     """The turn by an angle () [rad] about an axis (3,) of any length but zero."""
-    direction = numerics.unit(Vector.of(jnp.asarray(axis)))
-    return exp(direction.stack() * angle)
+    axis = jnp.asarray(axis)
+    if not jnp.issubdtype(axis.dtype, jnp.floating):
+        axis = axis.astype(jnp.result_type(float))
+    return exp(numerics.unit(Vector.of(axis)).stack() * angle)
 
 
 def from_matrix(r: Array) -> Array:

@@ -102,10 +102,11 @@ class Spring:
 
     @staticmethod
     def potential(p: dict[str, Any], a: Any, b: Any) -> Lane:
-        """½ k (‖d‖ − l)², written so that its curvature at d = 0 is that of k d·d."""
+        """½ k (‖d‖ − l)², as ½ k d·d where l = 0, so that its curvature at d = 0 is right."""
         d = b.point(p["anchor_b"]).position - a.point(p["anchor_a"]).position
         length = p["rest_length"]
-        return p["stiffness"] * (d.dot(d) - 2 * length * numerics.norm(d) + length**2) / 2
+        stretch = numerics.norm(d) - length
+        return p["stiffness"] * jnp.where(length == 0, d.dot(d), stretch**2) / 2
 
 
 @dataclass(frozen=True)

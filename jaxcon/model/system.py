@@ -224,7 +224,8 @@ class BodySystem:
                 )
             for field in fields.keys() & POSITIVE | fields.keys() & NOT_NEGATIVE:
                 shape = known[name][field].shape
-                value = checks.number(name, field, fields[field], self.gravity.dtype, shape)
+                owner, given = f"{name}.{field}", fields[field]
+                value = checks.number(owner, "the new value", given, self.gravity.dtype, shape)
                 checks.positive(name, field, value, strictly=field in POSITIVE)
         gravity = self.gravity
         if "gravity" in changes:

@@ -169,7 +169,7 @@ class SingleFactor:
     def back(self, y: list[Lane], x: Vectors) -> None:
         """x_p = A_pp⁻¹ b_p − Σ G_qᵀ x_q."""
         for q, gain in zip(self.step.later, self.gains, strict=True):
-            pull = blocks.apply(blocks.transpose(gain), x.nodes[q])
+            pull = blocks.apply(blocks.transpose(gain), x.solution(q))
             y = [blocks.minus(a, c) for a, c in zip(y, pull, strict=True)]
         x.nodes[self.step.node] = settle(y)
 
@@ -208,7 +208,7 @@ class RunFactor:
             solution = [a - c for a, c in zip(own, pull, strict=True)]
             return solution, solution
 
-        start, step = x.nodes[self.step.parent], self.step
+        start, step = x.solution(self.step.parent), self.step
         _, solution = jax.lax.scan(substitute, start, (self.gain, y), reverse=not step.descending)
         x.runs[step.nodes[0].group, step.elements[0]] = solution
 
@@ -233,6 +233,16 @@ class Vectors:
         if node not in self.nodes:
             self.nodes[node] = [x[node.element] for x in self.groups[node.group]]
         return self.nodes[node]
+
+    def solution(self, node: Node) -> list[Lane]:
+        """The lanes of one node that was solved by itself or in a run."""
+        if node in self.nodes:
+            return self.nodes[node]
+        for (group, first), lanes in self.runs.items():
+            place = node.element - first
+            if group == node.group and 0 <= place < lanes[0].shape[0]:
+                return [x[place] for x in lanes]
+        raise KeyError(node)
 
     def subtract(self, node: Node, amount: list[Lane]) -> None:
         """Subtracts from one node."""

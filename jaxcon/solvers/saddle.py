@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -53,11 +52,11 @@ class Diagonal:
 
 @pytree
 class Full:
-    """A symmetric positive definite mass matrix (n_v, n_v), factored once where it is used."""
+    """A symmetric positive definite mass matrix (n_v, n_v)."""
 
     values: Array
 
-    @cached_property
+    @property
     def factor(self) -> Array:
         """The Cholesky factor, NaN where M is not definite; constant under differentiation."""
         return jnp.linalg.cholesky(jax.lax.stop_gradient(self.values), symmetrize_input=False)

@@ -1,0 +1,250 @@
+"""One world fails: it says so and stops, the others do not notice, nor do their gradients."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+
+WORLDS, SICK, STEPS, DT = 4, 2, 12, 1e-2
+HEALTHY = [i for i in range(WORLDS) if i != SICK]
+
+
+def fading(cart, t, p):
+    """A row that vanishes at a time: from then on it constrains nothing."""
+    return jnp.maximum(p["until"] - t, 0.0) * cart.velocity[1:]
+
+
+@pytest.fixture(scope="module")
+def scene():
+    s = jc.Scene(dim=2)
+    s.add_body("arm", mass=1.0, inertia=0.3, position=(0.5, 0.0), angular_velocity=1.0)
+    s.add_particle("bob", mass=0.5, position=(1.5, 0.0))
+    s.add_particle("cart", mass=0.7, position=(0.0, 2.0), velocity=(1.0, 0.0))
+    s.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
+    s.add(jc.Distance("rod", "arm", "bob", point_a=(1.0, 0.0)))
+    s.add(jc.VelocityLevel(fading, ("cart",), name="rail", params={"until": 100.0}))
+    s.add(jc.Spring("spring", "cart", "bob", stiffness=5.0, rest_length=1.0))
+    s.add(jc.ExternalWrench("push", "bob"))
+    return s.build()
+
+
+def healthy_numbers(state):
+    """What differs from world to world."""
+    random = np.random.default_rng(0)
+    return {
+        "q": np.tile(state.q, (WORLDS, 1)),
+        "v": np.asarray(state.v) + 0.1 * random.normal(size=(WORLDS, state.v.shape[0])),
+        "control": random.normal(size=(WORLDS, STEPS, 2)),
+        "mass": random.uniform(0.5, 1.0, size=WORLDS),
+        "stiffness": random.uniform(4.0, 6.0, size=WORLDS),
+        "until": np.full(WORLDS, 100.0),
+    }
+
+
+def sicken(numbers, what):
+    sick = {key: x.copy() for key, x in numbers.items()}
+    if what == "state":
+        sick["q"][SICK, 0] = np.nan
+    elif what == "velocity":
+        sick["v"][SICK, 1] = np.inf
+    elif what == "control":
+        sick["control"][SICK, 5, 0] = np.nan
+    elif what == "mass":
+        sick["mass"][SICK] = np.nan
+    elif what == "singular later":
+        sick["until"][SICK] = 6.5 * DT
+    elif what == "singular at once":
+        sick["until"][SICK] = 0.0
+    elif what == "blow-up":
+        sick["stiffness"][SICK] = 1e60
+    return sick
+
+
+NON_FINITE, SINGULAR = jc.Status.NON_FINITE, jc.Status.SINGULAR
+# what fails: its status and how many steps the world lives, where theory says
+SICKNESSES = {
+    "state": (NON_FINITE, 0),
+    "velocity": (NON_FINITE, 0),
+    "control": (NON_FINITE, 5),
+    "mass": (NON_FINITE, 0),
+    "singular later": (SINGULAR, 7),
+    "singular at once": (SINGULAR, 0),
+    "blow-up": (None, None),
+}
+every_sickness = pytest.mark.parametrize("what", SICKNESSES)
+SOLVERS = {"schur": jc.Schur(), "dense": jc.Dense()}
+
+
+def start(system, state, x):
+    changes = {
+        "bob": {"mass": x["mass"]},
+        "spring": {"stiffness": x["stiffness"]},
+        "rail": {"params": {"until": x["until"]}},
+    }
+    return system.with_params(changes), dataclasses.replace(state, q=x["q"], v=x["v"])
+
+
+@pytest.fixture(scope="module", params=SOLVERS)
+def simulate(scene, request):
+    """All worlds at once: final states, trajectories and what the last step saw."""
+    method = jc.Method(solver=SOLVERS[request.param])
+
+    def one(x):
+        system, state = start(*scene, x)
+
+        def record(state, info):
+            return state, info
+
+        return jc.rollout(system, method, state, x["control"], DT, STEPS, record=record)
+
+    return jax.jit(jax.vmap(one))
+
+
+@every_sickness
+def test_status_says_which_world_and_why(scene, simulate, what):
+    final, _ = simulate(sicken(healthy_numbers(scene[1]), what))
+    code = SICKNESSES[what][0]
+    assert np.all(final.status[np.array(HEALTHY)] == jc.Status.OK)
+    assert final.status[SICK] != jc.Status.OK
+    assert code is None or final.status[SICK] == code
+
+
+@every_sickness
+def test_other_worlds_are_bit_identical(scene, simulate, what):
+    numbers = healthy_numbers(scene[1])
+    good, sick = simulate(numbers), simulate(sicken(numbers, what))
+    for a, b in zip(jax.tree.leaves(good), jax.tree.leaves(sick), strict=True):
+        np.testing.assert_array_equal(np.asarray(a)[HEALTHY], np.asarray(b)[HEALTHY])
+
+
+@every_sickness
+def test_the_world_stays_at_its_last_finite_state(scene, simulate, what):
+    numbers, (_, life) = healthy_numbers(scene[1]), SICKNESSES[what]
+    sick = sicken(numbers, what)
+    final, (states, infos) = simulate(sick)
+    code = np.asarray(states.status[SICK])
+    if life is None:
+        life = int(np.argmax(code != 0))
+        assert 0 < life < STEPS
+    np.testing.assert_array_equal(code != 0, np.arange(STEPS) >= life)
+    last = sick["q"][SICK] if life == 0 else states.q[SICK, life - 1]
+    for q in (*states.q[SICK, life:], final.q[SICK]):
+        np.testing.assert_array_equal(q, last)
+    np.testing.assert_array_equal(states.time[SICK, life:], np.full(STEPS - life, life * DT) + 0.0)
+    for leaf in (infos.acceleration, infos.multipliers):
+        np.testing.assert_array_equal(leaf[SICK, life:], 0)
+    if what != "state" and what != "velocity":
+        assert np.all(np.isfinite(states.q))
+        assert np.all(np.isfinite(states.v))
+
+
+SHARED = {"gravity": np.array([0.3, -9.81]), "arm": 1.3, "gain": 15.0, "stiffness": 1.0}
+
+
+def loss(scene, shared, x):
+    """Of one world, by numbers that all worlds share."""
+    system, state = start(*scene, x | {"stiffness": x["stiffness"] * shared["stiffness"]})
+    system = system.with_params({"gravity": shared["gravity"], "arm": {"mass": shared["arm"]}})
+    method = jc.Method(stabilizer=jc.Baumgarte.critical(rate=shared["gain"]))
+    final, kept = jc.rollout(system, method, state, x["control"], DT, STEPS, every=4)
+    return jnp.sum(final.q**2) + jnp.sum(final.v**2) + jnp.sum(kept.q)
+
+
+@pytest.fixture(scope="module")
+def gradients(scene):
+    """The gradient by the shared numbers, by both orders of grad and vmap, and of each world."""
+
+    def each(shared, x):
+        return jax.vmap(lambda x: loss(scene, shared, x))(x)
+
+    def one(shared, x):
+        return jax.grad(lambda s: loss(scene, s, x))(shared)
+
+    outside = jax.jit(jax.grad(lambda s, x: jnp.sum(each(s, x))))
+    inside = jax.jit(jax.vmap(one, in_axes=(None, 0)))
+    return outside, inside
+
+
+@every_sickness
+def test_gradients_are_those_of_the_batch_without_the_world(scene, gradients, what):
+    outside, inside = gradients
+    shared = jax.tree.map(jnp.asarray, SHARED)
+    numbers = healthy_numbers(scene[1])
+    sick = sicken(numbers, what)
+    good = inside(shared, numbers)
+    expected = jax.tree.map(lambda x: np.sum(np.asarray(x)[HEALTHY], axis=0), good)
+    by_world = inside(shared, sick)
+    summed = jax.tree.map(lambda x: np.sum(x, axis=0), by_world)
+    for found in (summed, outside(shared, sick)):
+        for name, leaf in found.items():
+            np.testing.assert_allclose(leaf, expected[name], rtol=1e-12, err_msg=name)
+    for name, leaf in by_world.items():
+        np.testing.assert_array_equal(np.asarray(leaf)[SICK], 0, err_msg=name)
+
+
+def test_forward_mode_stops_too(scene):
+    shared = jax.tree.map(jnp.asarray, SHARED)
+    sick = sicken(healthy_numbers(scene[1]), "control")
+    tangent = jax.tree.map(jnp.ones_like, shared)
+
+    def total(s):
+        return jax.vmap(lambda x: loss(scene, s, x))(sick)
+
+    _, change = jax.jit(lambda: jax.jvp(total, (shared,), (tangent,)))()
+    assert np.all(np.isfinite(change))
+    assert change[SICK] == 0
+    assert np.all(change[np.array(HEALTHY)] != 0)
+
+
+def test_the_gradient_of_one_step_stops_too(scene):
+    system, state = scene
+    bad = dataclasses.replace(state, v=state.v.at[0].set(jnp.nan))
+
+    def value(gravity):
+        changed = system.with_params({"gravity": gravity})
+        return jnp.sum(jc.step(changed, jc.Method(), bad, None, DT)[0].q)
+
+    np.testing.assert_array_equal(jax.grad(value)(jnp.asarray([0.0, -9.81])), 0)
+
+
+def test_the_first_failure_sticks(scene):
+    system, state = scene
+    failed = dataclasses.replace(state, status=jnp.asarray(jc.Status.SINGULAR, jnp.int32))
+    new, info = jc.step(system, jc.Method(), failed, None, DT)
+    assert new.status == info.status == jc.Status.SINGULAR
+    np.testing.assert_array_equal(new.q, failed.q)
+    bad = dataclasses.replace(failed, v=state.v.at[0].set(jnp.nan))
+    assert jc.step(system, jc.Method(), bad, None, DT)[0].status == jc.Status.SINGULAR
+
+
+def test_raise_for_status_names_world_and_cause(scene, simulate):
+    good, _ = simulate(healthy_numbers(scene[1]))
+    jc.raise_for_status(good)
+    for what, words in (("control", "NON_FINITE"), ("singular later", "SINGULAR")):
+        final, _ = simulate(sicken(healthy_numbers(scene[1]), what))
+        with pytest.raises(jc.SimulationError, match=rf"{words} in 1 of 4 worlds.*world \(2,\)"):
+            jc.raise_for_status(final)
+    with pytest.raises(jc.SimulationError, match="SINGULAR.*report"):
+        jc.raise_for_status(dataclasses.replace(scene[1], status=np.asarray(2)))
+    with pytest.raises(jc.SimulationError, match="NaN"):
+        jc.raise_for_status(dataclasses.replace(scene[1], status=np.asarray(1)))
+
+
+def test_a_healthy_world_keeps_its_gradient_through_the_guard(scene):
+    """Against differences, so that the guard does not stop what it should let pass."""
+    x = jax.tree.map(lambda x: x[0], healthy_numbers(scene[1]))
+    shared = jax.tree.map(jnp.asarray, SHARED)
+    value = jax.jit(lambda s: loss(scene, s, x))
+    gradient = jax.jit(jax.grad(lambda s: loss(scene, s, x)))(shared)
+    for name in SHARED:
+        step = {key: jnp.full_like(y, 1e-5 if key == name else 0) for key, y in shared.items()}
+        ahead, behind = (
+            value(jax.tree.map(lambda a, d, sign=sign: a + sign * d, shared, step))
+            for sign in (1, -1)
+        )
+        slope = (ahead - behind) / 2e-5
+        np.testing.assert_allclose(jnp.sum(gradient[name]), slope, rtol=1e-6, err_msg=name)

@@ -1,0 +1,142 @@
+"""Functions batched natively give what plain vmap gives, under every transformation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tolerances import IDENTITY
+
+from jaxcon.core import native
+
+
+def swing(q, p):
+    """Two coordinates by lanes: written for any number of trailing batch axes."""
+    x, y = q[0], q[1]
+    pull = p["stiffness"] * (x * x + y * y)
+    return {"q": jnp.stack([y - pull * x, jnp.sin(x) * p["gain"][1] + y]), "size": jnp.sqrt(pull)}
+
+
+def called(q, p):
+    return native.call(swing, q, p)
+
+
+RANDOM = np.random.default_rng(0)
+Q = jnp.asarray(RANDOM.normal(size=(5, 2)))
+P = {"stiffness": jnp.asarray(1.3), "gain": jnp.asarray([0.4, 0.7])}
+PS = {
+    "stiffness": jnp.asarray(RANDOM.uniform(1, 2, size=5)),
+    "gain": jnp.asarray(RANDOM.normal(size=(5, 2))),
+}
+ONE = ({"stiffness": None, "gain": None}, {"stiffness": 0, "gain": 0})
+SHARED, OWN = (Q, P, (0, ONE[0])), (Q, PS, (0, ONE[1]))
+PARTLY = (Q, {"stiffness": PS["stiffness"], "gain": P["gain"]}, (0, {"stiffness": 0, "gain": None}))
+ALONE = (Q[0], PS, (None, ONE[1]))
+batches = pytest.mark.parametrize(
+    ("q", "p", "axes"), [SHARED, OWN, PARTLY, ALONE], ids=["shared", "own", "partly", "alone"]
+)
+
+
+def close(got, expected):
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(a, b, rtol=IDENTITY, atol=IDENTITY)
+
+
+def total(function):
+    """A number from everything that the function returns."""
+    return lambda q, p: sum(jnp.sum(x**2) for x in jax.tree.leaves(function(q, p)))
+
+
+def transformations(f):
+    """What is made of a function of one world, by name."""
+    g = total(f)
+    return {
+        "value": f,
+        "grad": jax.grad(g, argnums=(0, 1)),
+        "jvp": lambda q, p: jax.jvp(f, (q, p), jax.tree.map(jnp.ones_like, (q, p))),
+        "hessian": jax.hessian(g),
+        "jacfwd": jax.jacfwd(f),
+        "jacrev": jax.jacrev(f),
+    }
+
+
+NAMES = tuple(transformations(swing))
+
+
+@pytest.mark.parametrize("what", NAMES)
+def test_one_world(what):
+    close(transformations(called)[what](Q[0], P), transformations(swing)[what](Q[0], P))
+
+
+@batches
+@pytest.mark.parametrize("what", NAMES)
+def test_vmap_outside(what, q, p, axes):
+    ours, plain = (
+        jax.jit(jax.vmap(transformations(f)[what], in_axes=axes))(q, p) for f in (called, swing)
+    )
+    close(ours, plain)
+
+
+@batches
+def test_vmap_inside_grad(q, p, axes):
+    """The gradient of a shared number is the sum over worlds, of an own number its own."""
+
+    def loss(f):
+        return lambda q, p: jnp.sum(jax.vmap(total(f), in_axes=axes)(q, p))
+
+    ours, plain = (jax.jit(jax.grad(loss(f), argnums=(0, 1)))(q, p) for f in (called, swing))
+    close(ours, plain)
+
+
+def test_vmap_of_vmap():
+    q = jnp.stack([Q, 2 * Q])
+    nested = [
+        jax.vmap(jax.vmap(jax.grad(total(f)), in_axes=axes), in_axes=(0, None))(q, PS)
+        for f, axes in ((called, OWN[2]), (swing, OWN[2]))
+    ]
+    close(*nested)
+
+
+@pytest.mark.parametrize("out", [0, 1])
+def test_axes_elsewhere(out):
+    found = [
+        jax.vmap(lambda q, f=f: f(q, P)["q"], in_axes=1, out_axes=out)(Q.T) for f in (called, swing)
+    ]
+    close(*found)
+
+
+def test_scan_of_a_batch_under_grad():
+    def final(f):
+        def run(q, p):
+            step = lambda q, _: (0.1 * f(q, p)["q"], None)  # noqa: E731
+            return jnp.sum(jax.lax.scan(step, q, None, 4)[0] ** 2)
+
+        return jax.jit(jax.grad(lambda q, p: jnp.sum(jax.vmap(run, (0, None))(q, p)), (0, 1)))
+
+    close(final(called)(Q, P), final(swing)(Q, P))
+
+
+def counted(q):
+    return {"n": jnp.asarray(3, jnp.int32) + 0 * q[0].astype(jnp.int32), "x": q * 2}
+
+
+def test_integers_pass_without_a_derivative():
+    def value(q):
+        found = native.call(counted, q)
+        return jnp.sum(found["x"]) + 0.0 * found["n"].astype(float)
+
+    close(jax.vmap(jax.grad(value))(Q), np.full((5, 2), 2.0))
+    assert jax.vmap(lambda q: native.call(counted, q)["n"])(Q).dtype == jnp.int32
+
+
+def test_a_function_is_traced_once_for_a_shape():
+    traces = []
+
+    def traced(x):
+        traces.append(x.shape)
+        return x * 2
+
+    for _ in range(3):
+        native.call(traced, jnp.ones(2))
+        jax.vmap(lambda x: native.call(traced, x))(jnp.ones((4, 2)))
+    assert len(traces) <= 4
+    assert (2, 4) in traces, "the batch is the last axis"

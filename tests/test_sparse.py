@@ -1,0 +1,170 @@
+"""Sparse elimination against the dense solver on chains, trees, loops and unconnected parts."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from tolerances import DIFFERENCE
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
+from jaxcon.dynamics.assembly import saddle
+from jaxcon.solvers.saddle import Diagonal, Saddle
+from jaxcon.solvers.sparse import Sparse
+
+
+def particles(places, rods, ground=()):
+    """Particles at places, rods between pairs of them, and to the world."""
+    scene, random = jc.Scene(dim=2), np.random.default_rng(0)
+    for i, place in enumerate(places):
+        mass, velocity = random.uniform(0.5, 2.0), random.normal(size=2)
+        scene.add_particle(f"p{i}", mass=mass, position=place, velocity=velocity)
+    for a, b in rods:
+        scene.add(jc.Distance(f"{a}-{b}", f"p{a}", f"p{b}"))
+    for a in ground:
+        scene.add(jc.Distance(f"{a}", jc.WORLD, f"p{a}", point_a=(a + 0.3, 5.0)))
+    return scene.build()
+
+
+def scatter(n):
+    """Points along a line, off it by random amounts."""
+    return np.column_stack([np.arange(n), np.random.default_rng(1).normal(size=n)])
+
+
+def links(n, closed):
+    """A chain of rigid links in the plane, hung at its start and, if closed, at its end."""
+    scene, random = jc.Scene(dim=2), np.random.default_rng(2)
+    points = scatter(n + 1)
+    for i in range(n):
+        scene.add_body(
+            f"l{i}",
+            mass=random.uniform(0.5, 2.0),
+            inertia=random.uniform(0.5, 2.0),
+            position=(points[i] + points[i + 1]) / 2,
+            angular_velocity=random.normal(),
+        )
+        a = jc.WORLD if i == 0 else f"l{i - 1}"
+        scene.add(jc.Revolute(f"j{i}", a, f"l{i}", point=points[i]))
+    if closed:
+        scene.add(jc.Revolute("end", f"l{n - 1}", jc.WORLD, point=points[n]))
+    return scene.build()
+
+
+GRAPHS = {
+    "one": lambda: particles(scatter(1), [], [0]),
+    "two apart": lambda: particles(scatter(2), [], [0, 1]),
+    "short chain": lambda: particles(scatter(3), [(0, 1), (1, 2)], [0]),
+    "long chain": lambda: particles(scatter(20), [(i, i + 1) for i in range(19)], [0]),
+    "chain backwards": lambda: particles(scatter(20), [(i + 1, i) for i in range(19)][::-1], [19]),
+    "chain hung at both ends": lambda: particles(
+        scatter(12), [(i, i + 1) for i in range(11)], [0, 11]
+    ),
+    "star": lambda: particles(scatter(7), [(0, i) for i in range(1, 7)], [0]),
+    "tree": lambda: particles(scatter(15), [((i - 1) // 2, i) for i in range(1, 15)], [0]),
+    "two chains": lambda: particles(
+        scatter(16), [(i, i + 1) for i in range(15) if i != 7], [0, 15]
+    ),
+    "truss": lambda: particles(
+        scatter(8), [(i, i + 1) for i in range(7)] + [(i, i + 2) for i in range(6)], [0, 3]
+    ),
+    "links": lambda: links(10, False),
+    "links in a loop": lambda: links(10, True),
+}
+every_graph = pytest.mark.parametrize("name", GRAPHS)
+
+
+def problem(name):
+    system, state = GRAPHS[name]()
+    rows = linearize(system, state.q, state.v, state.time)
+    random = np.random.default_rng(3)
+    force = jnp.asarray(random.normal(size=state.v.shape))
+    target = jnp.asarray(random.normal(size=rows.bias.shape))
+    return saddle(system, state.q, rows, force, target)
+
+
+@every_graph
+@pytest.mark.parametrize("run", [2, 4, 1000], ids=["runs", "some", "unrolled"])
+def test_the_solution_is_that_of_the_dense_solver(name, run):
+    system = problem(name)
+    expected = jc.Dense().solve(system)
+    got = quick_jit(lambda: Sparse(run=run).solve(system))()
+    assert got.status == jc.Status.OK
+    np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["long chain", "truss", "links in a loop"])
+def test_with_compliance(name):
+    system = problem(name)
+    compliance = jnp.asarray(np.random.default_rng(4).uniform(0, 1, size=system.target.shape))
+    system = dataclasses.replace(system, compliance=compliance)
+    expected = jc.Dense().solve(system)
+    got = quick_jit(lambda: Sparse().solve(system))()
+    np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["tree", "links in a loop"])
+def test_its_gradient_is_that_of_the_dense_solver(name):
+    system = problem(name)
+    random = np.random.default_rng(5)
+    weights = [jnp.asarray(random.normal(size=x.shape)) for x in (system.force, system.target)]
+
+    blocks = [block.value for block in system.jacobian.blocks]
+
+    def spread(block, x):
+        return jnp.broadcast_to(x, block.shape[1:])
+
+    def value(solver, mass, force, target, scale):
+        """By the numbers of the system and a factor of each block of its Jacobian."""
+        scaled = [
+            dataclasses.replace(block, value=tuple(row * spread(block, x) for row in value))
+            for block, value, x in zip(system.jacobian.blocks, blocks, scale, strict=True)
+        ]
+        jacobian = dataclasses.replace(system.jacobian, blocks=tuple(scaled))
+        changed = Saddle(Diagonal(mass), force, jacobian, target)
+        a, multipliers, _ = solver.solve(changed)
+        return weights[0] @ a + weights[1] @ multipliers
+
+    numbers = (system.mass.values, system.force, system.target, jnp.ones(len(blocks)))
+    ours, dense = (
+        quick_jit(jax.grad(lambda *x, s=solver: value(s, *x), argnums=(0, 1, 2, 3)))(*numbers)
+        for solver in (Sparse(), jc.Dense())
+    )
+    for got, expected in zip(ours, dense, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=DIFFERENCE, atol=1e-8)
+
+
+def test_a_batch_is_a_loop():
+    system = problem("long chain")
+    random = np.random.default_rng(6)
+    forces = jnp.asarray(random.normal(size=(3, *system.force.shape)))
+
+    def one(force):
+        return Sparse().solve(dataclasses.replace(system, force=force))
+
+    batch, alone = quick_jit(jax.vmap(one))(forces), quick_jit(one)
+    for i, force in enumerate(forces):
+        np.testing.assert_allclose(batch.multipliers[i], alone(force).multipliers, rtol=1e-11)
+
+
+@pytest.mark.parametrize("name", ["short chain", "long chain", "links"])
+def test_a_dependent_row_is_singular(name):
+    """The last rod is given twice, at the end of the order or in the middle of it."""
+    system, state = GRAPHS[name]()
+    rows = linearize(system, state.q, state.v, state.time)
+    last = rows.jacobian.blocks[-1]
+    n = rows.layout.size
+    members = [b for b in rows.jacobian.blocks if b.start == last.start]
+    more = [dataclasses.replace(b, start=n) for b in members]
+    size = last.shape[0] * last.shape[1]
+    jacobian = dataclasses.replace(
+        rows.jacobian, blocks=(*rows.jacobian.blocks, *more), shape=(n + size, state.v.shape[0])
+    )
+    twice = dataclasses.replace(
+        saddle(system, state.q, rows, state.v, jnp.ones(n)), jacobian=jacobian
+    )
+    twice = dataclasses.replace(twice, target=jnp.ones(n + size))
+    assert quick_jit(lambda: Sparse().solve(twice))().status == jc.Status.SINGULAR
