@@ -102,20 +102,19 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
 def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str, int]:
     """The moving body whose force answers for `body`, and the sign with which it does."""
     sides = [
-        None if p.group is None else system.layout.groups[p.group].names[p.indices[index]]
+        p.fixed[index] if p.group is None else system.layout.groups[p.group].names[p.indices[index]]
         for p in group.places
     ]
-    moving = [side for side in sides if side]
-    users = getattr(getattr(group, "law", None), "bodies", ())
-    world = None in sides or any(name in system.fixed for name in users)
-    target = sides[-1] if body is None else None if body in system.fixed else body
+    sides = list(getattr(getattr(group, "law", None), "bodies", sides))
+    moving = [side for side in sides if side in system.layout.bodies]
+    target = sides[-1] if body is None else body
     if target in moving:
-        return str(target), 1
-    if target is None and world and len(moving) == 1:
+        return target, 1
+    if target in sides and len(moving) == 1:
         return moving[0], -1
     raise ValueError(
-        f"constraint '{group.names[index]}' acts on {moving}{' and the world' if world else ''}:"
-        f" the wrench on '{body}' does not follow from its multipliers."
+        f"constraint '{group.names[index]}' acts on {sides}: the wrench on '{target}' does not"
+        " follow from its multipliers."
     )
 
 

@@ -185,7 +185,7 @@ class Gather:
             names = tuple(element.name for element, _ in members)
             columns = zip(*(bodies(element) for element, _ in members), strict=True)
             places = tuple(
-                Place(None, ()) if side is None else self._place(column)
+                Place(None, (), column) if side is None else self._place(column)
                 for side, column in zip(sides, columns, strict=True)
             )
             result.append((cls, stack([p for _, p in members]), names, places))

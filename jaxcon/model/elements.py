@@ -51,7 +51,11 @@ class Elements:
     def select(self, indices: tuple[int, ...]) -> Any:
         """Some of the elements."""
         places = [
-            Place(p.group, tuple(p.indices[i] for i in indices) if p.indices else ())
+            Place(
+                p.group,
+                tuple(p.indices[i] for i in indices if p.indices),
+                tuple(p.fixed[i] for i in indices if p.fixed),
+            )
             for p in self.places
         ]
         return dataclasses.replace(

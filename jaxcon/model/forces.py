@@ -102,11 +102,12 @@ class Spring:
 
     @staticmethod
     def potential(p: dict[str, Any], a: Any, b: Any) -> Lane:
-        """½ k (‖d‖ − l)², as ½ k d·d where l = 0, so that its curvature at d = 0 is right."""
+        """½ k (‖d‖ − l)², expanded where l = 0, so that its curvature at d = 0 is right."""
         d = b.point(p["anchor_b"]).position - a.point(p["anchor_a"]).position
         length = p["rest_length"]
-        stretch = numerics.norm(d) - length
-        return p["stiffness"] * jnp.where(length == 0, d.dot(d), stretch**2) / 2
+        span = numerics.norm(d)
+        expanded = d.dot(d) - 2 * length * span + length**2
+        return p["stiffness"] * jnp.where(length == 0, expanded, (span - length) ** 2) / 2
 
 
 @dataclass(frozen=True)

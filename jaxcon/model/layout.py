@@ -51,11 +51,15 @@ def _block(x: Array, start: int, components: int, bodies: int) -> Vector:
 class Place:
     """Which bodies a set of elements acts on: those with these indices in one group.
 
-    `group` is None for frames that are fixed to the world.
+    Attributes:
+        group: None for frames that are fixed to the world.
+        indices: in the group, one for each element.
+        fixed: names of frames that are fixed to the world, one for each element.
     """
 
     group: int | None
     indices: tuple[int, ...]
+    fixed: tuple[str, ...] = ()
 
     def take(self, x: Lane) -> Lane:
         """The lanes of these bodies, from a lane (body, …)."""

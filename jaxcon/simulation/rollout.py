@@ -91,8 +91,9 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
         # what the policy closes over, traced or not, as arguments whose tangents can be masked
         function = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))
         control = jax.tree.unflatten(structure, function(*jax.tree.leaves(state)))
-        finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(control)]
-        good = jnp.all(jnp.stack(finite)) & (state.status == Status.OK)
+        good = state.status == Status.OK
+        for x in jax.tree.leaves(control):
+            good &= jnp.all(jnp.isfinite(x))
         return control, jnp.where(good, Status.OK, Status.NON_FINITE)
 
     return contain(judged, (state, closed.consts))[0]

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Violation
 from jaxcon.core import checks, native, status
@@ -144,6 +145,9 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
                 f"step: control must have shape ({layout.n_u},), got {control.shape};"
                 f" its channels are {list(layout.controls)}."
             )
+    control = jax.tree.map(
+        lambda x: jnp.asarray(x, state.q.dtype) if isinstance(x, np.ndarray | float) else x, control
+    )
     for leaf in jax.tree.leaves(control):
         got = getattr(leaf, "dtype", state.q.dtype)
         if jnp.issubdtype(got, jnp.floating) and got != state.q.dtype:

@@ -65,5 +65,5 @@ class Sparse:
         )
         acceleration = free + system.mass.solve(j.transpose(multipliers))
         explained = elimination.share > len(system.target) * jnp.finfo(free.dtype).eps
-        dependent = ~explained & elimination.finite
+        dependent = (~explained & elimination.finite) | system.mass.singular
         return Solution(acceleration, multipliers, judge(acceleration, dependent))
