@@ -248,3 +248,35 @@ def test_a_healthy_world_keeps_its_gradient_through_the_guard(scene):
         )
         slope = (ahead - behind) / 2e-5
         np.testing.assert_allclose(jnp.sum(gradient[name]), slope, rtol=1e-6, err_msg=name)
+
+
+@pytest.mark.parametrize("solver", [jc.Schur(), jc.Sparse()])
+def test_a_mass_that_is_not_positive_is_singular(solver):
+    system = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.stack([1.0 + 0 * q[0], p]),
+        force=lambda q, v, t, u, p: -q,
+        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q[0] - q[1]])),),
+        params=jnp.zeros(()),
+    )
+    state = jc.init(system, jc.Method(), jnp.ones(2), jnp.zeros(2))
+    new, _ = jc.step(system, jc.Method(solver=solver), state, None, 1e-3)
+    assert new.status == jc.Status.SINGULAR
+
+
+def test_a_policy_that_fails_in_one_world_does_not_spoil_the_others():
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("b", mass=1.0, inertia=1.0, position=(1.0, 0.0), angle=0.3)
+    scene.add(jc.ExternalWrench("w", "b"))
+    system, state = scene.build()
+
+    def final(theta, c):
+        def policy(s):
+            return theta * jnp.stack([0 * c, 0 * c, jnp.sqrt(c) * s.q[2] + 1])
+
+        return jnp.sum(jc.rollout(system, jc.Method(), state, policy, 1e-2, 5)[0].q)
+
+    def gradient(cs):
+        return jax.grad(lambda x: jnp.sum(jax.vmap(final, (None, 0))(x, cs)))(0.7)
+
+    sick, healthy = jnp.array([1.0, -1.0, 2.0]), jnp.array([1.0, 2.0])
+    np.testing.assert_allclose(gradient(sick), gradient(healthy), rtol=1e-12)

@@ -1,11 +1,15 @@
 """Functions batched natively give what plain vmap gives, under every transformation."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from tolerances import IDENTITY
 
+import jaxcon as jc
+from jaxcon import scenes as scenes_of_library
 from jaxcon.core import native
 
 
@@ -140,3 +144,28 @@ def test_a_function_is_traced_once_for_a_shape():
         jax.vmap(lambda x: native.call(traced, x))(jnp.ones((4, 2)))
     assert len(traces) <= 4
     assert (2, 4) in traces, "the batch is the last axis"
+
+
+def test_gains_that_are_python_numbers_batch():
+    system, state = scenes_of_library.four_bar()
+    method = jc.Method(stabilizer=jc.Baumgarte.critical(10))
+
+    def run(v):
+        start = dataclasses.replace(state, v=v)
+        return jc.rollout(system, method, start, None, 1e-3, 3)[0].q
+
+    batch = jnp.stack([state.v, 2 * state.v])
+    np.testing.assert_allclose(jax.vmap(run)(batch), jnp.stack([run(v) for v in batch]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("transform", [jax.grad, lambda f: jax.jit(jax.grad(f)), jax.vmap])
+def test_a_force_that_closes_over_a_traced_number_is_refused(transform):
+    def final(k):
+        scene = jc.Scene(dim=2)
+        scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+        scene.add(jc.CustomForce("pull", ("bob",), lambda m, t, u, p: -k * m.position))
+        system, state = scene.build()
+        return jc.rollout(system, jc.Method(), state, None, 1e-2, 2)[0].q[0]
+
+    with pytest.raises(TypeError, match="params="):
+        transform(final)(jnp.ones(2) if transform is jax.vmap else 1.0)

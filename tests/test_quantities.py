@@ -193,3 +193,31 @@ def test_violation_by_name():
     np.testing.assert_allclose(violation["skate"], np.linalg.norm(rows.rate[index]))
     with pytest.raises(ValueError, match="'door' is unknown.*'hinge'"):
         violation["door"]
+
+
+def test_the_wrench_on_a_fixed_body_is_asked_for_by_its_own_name():
+    scene = jc.Scene(dim=2)
+    for name in ("wall", "other"):
+        scene.add_body(name, fixed=True)
+    scene.add_body("arm", mass=2.0, inertia=1.0, position=(1.0, 0.0))
+    scene.add(jc.Revolute("hinge", "wall", "arm", point=(0.0, 0.0)))
+    system, state = scene.build()
+    solution = jc.forward_dynamics(system, state, None, jc.Method(), 1e-3)
+    on_arm = jc.wrench(system, state, solution, "hinge")
+    np.testing.assert_allclose(jc.wrench(system, state, solution, "hinge", "wall"), -on_arm)
+    for name in ("other", jc.WORLD):
+        with pytest.raises(ValueError, match="'wall', 'arm'"):
+            jc.wrench(system, state, solution, "hinge", name)
+
+
+def test_violation_of_a_trajectory_is_that_of_its_states():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.1))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Baumgarte.critical(50.0))
+    _, seen = jc.rollout(system, method, state, None, 1e-3, 4, record=lambda s, i: (s, i))
+    states, infos = seen
+    expected = [float(abs(np.linalg.norm(q) - 1.1)) for q in (state.q, *states.q[:3])]
+    np.testing.assert_allclose(infos.violation["rod"], expected, rtol=1e-9)
+    np.testing.assert_allclose(infos.violation.worst, expected, rtol=1e-9)
