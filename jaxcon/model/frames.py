@@ -108,10 +108,6 @@ class WorldFrame:
         """The world takes up no torque."""
         return Vector()
 
-    def gather(self, take: Callable[[Lane], Lane]) -> WorldFrame:
-        """Itself."""
-        return self
-
 
 @pytree
 class PlanarFrame(Frame):

@@ -24,6 +24,10 @@ class Method:
     stabilizer: Any = Baumgarte()
     solver: Any = Schur()
 
+    def feedback(self, dt: Any) -> Any:
+        """The stabiliser, its missing gains chosen for the integrator at this step."""
+        return self.stabilizer.resolve(self.integrator.default_gains(dt))
+
     def check(self) -> None:
         """Checks that each part is a value of its kind.
 

@@ -81,13 +81,12 @@ def contained_step(
         one = native.per_world(contained_step, state.q.ndim - 1)
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
-    state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
-    (state, info), _ = contain(_step, (system, method, state, control, dt))
-    return state, info
+    whole = native.spread(state, native.batch_of(args, state.q.ndim - 1))
+    return contain(_step, (system, method, whole, control, dt))[0]
 
 
 def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
-    stabilizer = method.stabilizer.resolve(method.integrator.default_gains(dt))
+    stabilizer = method.feedback(dt)
     at = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
     new, solution, rows = method.integrator.advance(at, system, state, dt)
     new = stabilizer.correct(system, method.solver, new, dt)
@@ -123,8 +122,7 @@ def forward_dynamics(
     """
     control = check_step(system, method, state, control)
     h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
-    stabilizer = method.stabilizer.resolve(method.integrator.default_gains(h))
-    at = accelerate(system, stabilizer, method.solver, control, state.memory, h)
+    at = accelerate(system, method.feedback(h), method.solver, control, state.memory, h)
     return at(state.q, state.v, state.time)[0]
 
 
