@@ -19,6 +19,7 @@ from jaxcon.constraints.joints import (
     Prismatic,
     Revolute,
     Spherical,
+    Universal,
 )
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
@@ -82,6 +83,7 @@ __all__ = [
     "State",
     "Status",
     "StepInfo",
+    "Universal",
     "Unstabilized",
     "VelocityLevel",
     "angular_velocity",

@@ -82,6 +82,11 @@ def prismatic(s: Site) -> list[Any]:
     return [jc.Prismatic(*s.joint, axis=s.axis, point=s.point)]
 
 
+def universal(s: Site) -> list[Any]:
+    across = np.cross(s.axis, s.other)
+    return [jc.Universal(*s.joint, point=s.point, axis_a=s.axis, axis_b=across)]
+
+
 def fixed(s: Site) -> list[Any]:
     return [jc.Fixed(*s.joint, point=s.point)]
 
@@ -133,6 +138,7 @@ JOINTS = {
     "distance": Joint(distance, ("joint", "length")),
     "revolute": Joint(revolute, ("joint", "anchor_b")),
     "prismatic": Joint(prismatic, ("joint", "anchor_b")),
+    "universal": Joint(universal, ("joint", "anchor_b"), dims=(3,)),
     "fixed": Joint(fixed, ("joint", "anchor_b")),
     "driven_revolute": Joint(driven_revolute, ("drive", "params")),
     "driven_prismatic": Joint(driven_prismatic, ("drive", "params")),
@@ -168,7 +174,7 @@ def joints_scene(kinds: tuple[str, ...], dim: int, topology: str, dtype: Any) ->
     parameters: list[tuple[str, str]] = []
     for kind in kinds:
         suffix = "" if len(kinds) == 1 else "_" + kind
-        add_joint(scene, kind, topology, suffix, random)
+        add_joint(scene, kind, topology, suffix, seeded((kind,), dim, topology))
         element, field = JOINTS[kind].parameter
         parameters += [(element + suffix, field), ("first" + suffix, "mass")]
     system, state = scene.build()

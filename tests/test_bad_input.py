@@ -169,6 +169,14 @@ MISTAKES = {
         lambda: build(jc.Spherical("j", "arm", "leg", point=(0, 0)), dim=2),
         ["Spherical 'j'", "3 dimensions only"],
     ),
+    "universal joint in the plane": (
+        lambda: build(jc.Universal("j", "arm", "leg", (0, 0), (1, 0), (0, 1)), dim=2),
+        ["Universal 'j'", "3 dimensions only"],
+    ),
+    "universal joint on a particle": (
+        lambda: build(jc.Universal("j", jc.WORLD, "bob", ORIGIN, (1, 0, 0), Z)),
+        ["Universal 'j'", "orientation", "'bob' is a particle"],
+    ),
     "drive of a joint without a coordinate": (
         lambda: build(jc.Fixed("bolt", "arm", "leg"), jc.Drive("d", "bolt", scenes.wave)),
         ["Drive 'd'", "'bolt' has no coordinate"],
@@ -234,6 +242,14 @@ MISTAKES = {
     "slider axis of length zero": (
         lambda: build(jc.Prismatic("j", "arm", "leg", axis=ORIGIN)),
         ["Prismatic 'j'", "axis", "length", "0.0"],
+    ),
+    "cross axis of length zero": (
+        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=Z, axis_b=ORIGIN)),
+        ["Universal 'j'", "axis_b", "length", "0.0"],
+    ),
+    "cross axes that are not perpendicular": (
+        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=Z, axis_b=(0, 3, 4))),
+        ["Universal 'j'", "axis_a and axis_b", "perpendicular", "0.8"],
     ),
     "distance of zero": (
         lambda: build(jc.Distance("d", "arm", "leg", length=0)),
@@ -324,6 +340,14 @@ MISTAKES = {
     "no slider axis": (
         lambda: build(jc.Prismatic("j", "arm", "leg", axis=None), dim=2),
         ["Prismatic 'j'", "axis", "none"],
+    ),
+    "no cross axis": (
+        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=None, axis_b=Z)),
+        ["Universal 'j'", r"axis_a \(3,\)", "none"],
+    ),
+    "cross axis of the plane": (
+        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=(1, 0), axis_b=Z)),
+        ["Universal 'j'", "axis_a", r"\(3,\)", r"\(2,\)"],
     ),
     "nothing moves": (lambda: jc.Scene().build(), ["no body that moves"]),
     # users' functions

@@ -3,9 +3,30 @@
 import sys
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+
+import jaxcon as jc
+
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import drift  # noqa: E402
+from benchmarks import (  # noqa: E402
+    accuracy,
+    drift,
+    equivalence,
+    mechanisms,
+    regression,
+    roofline,
+    tables,
+    targets,
+    throughput,
+    timing,
+)
+
+SMALL = ("chain-3", "planar-chain-3", "four-bar", "n-four-bar-2", "rope-5", "stewart")
 
 
 def test_drift_grows_without_feedback_and_stays_small_with_it():
@@ -19,3 +40,89 @@ def test_drift_grows_without_feedback_and_stays_small_with_it():
         perturbed, clean, _ = rows[integrator, "default"]
         assert perturbed < 1e-4
         assert clean < 1e-4
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_a_mechanism_starts_on_its_constraints_and_stays(name):
+    mechanism = mechanisms.find(name)
+    system, state = mechanism.build(jnp.float64)
+    start = jc.violation(system, state)
+    assert max(start.worst, start.worst_rate) < 1e-13
+
+    @quick_jit
+    def run(s):
+        final, _ = jc.rollout(system, jc.Method(), s, None, 2e-3, 50, record=lambda s, i: None)
+        return final, jc.violation(system, final).worst, mechanism.markers(system, final)
+
+    final, violation, places = run(state)
+    jc.raise_for_status(final)
+    assert violation < targets.VIOLATION * mechanism.link
+    assert np.max(np.abs(places - mechanism.markers(system, state))) > 1e-3
+
+
+@pytest.mark.parametrize("name", SMALL)
+def test_mujoco_simulates_the_same_mechanism(name):
+    pytest.importorskip("mujoco")
+    difference = equivalence.compare(mechanisms.find(name))
+    assert difference.same, difference
+
+
+def test_the_four_bar_is_the_ready_made_one():
+    system, state = mechanisms.find("four-bar").build(jnp.float64)
+    expected, start = jc.scenes.four_bar()
+    for name in ("crank", "coupler", "rocker"):
+        for read in (jc.position, jc.velocity, jc.angular_velocity):
+            np.testing.assert_allclose(read(system, state, name), read(expected, start, name))
+
+
+def test_the_motion_of_the_n_four_bar_is_the_published_one():
+    """IFToMM A02, N = 2, the top of the first crank after a second."""
+    angle = mechanisms.crank_angle(2, 1.0)
+    top = np.cos(angle), np.sin(angle)
+    np.testing.assert_allclose(top, (-0.19502030194944, -0.98079920566217), atol=1e-9)
+
+
+def test_an_unknown_mechanism_is_named():
+    for name in ("chain", "chain-", "chain-x", "five-bar"):
+        with pytest.raises(ValueError, match=f"'{name}' is unknown.*chain-<n>"):
+            mechanisms.find(name)
+
+
+def test_operations_are_counted():
+    def polynomial(x):
+        return x * x + 3.0 * x
+
+    def looped(x):
+        return jax.lax.scan(lambda c, _: (jnp.sin(c), None), x, None, 5)[0].sum()
+
+    assert roofline.count(jax.make_jaxpr(polynomial)(np.ones(8)).jaxpr) == 24
+    assert roofline.count(jax.make_jaxpr(looped)(np.ones(8)).jaxpr) == 48
+    assert roofline.count(jax.make_jaxpr(jnp.dot)(np.ones((2, 3)), np.ones(3)).jaxpr) == 12
+    found = roofline.work("pendulum", jc.Method(), np.float32)
+    assert 100 < found.operations < 10_000
+    assert found.state == (7 + 6 + 1 + 1) * 4
+
+
+def test_a_rate_counts_only_where_the_run_is_accurate():
+    work, rate = roofline.Work(1.0, 1), {1: timing.Rate(30.0, 29.0, 31.0)}
+    good = accuracy.Accuracy(1e-4, 1e-3, 6e-4, True)
+    bad = accuracy.Accuracy(1e-4, 1e-3, 4e-4, True)
+    for found, said in ((good, "aim"), (bad, "does not count")):
+        peer = timing.Rate(1.0, 1.0, 1.0)
+        row = tables.Row("pendulum", "float32", rate, {1: 1.0}, found, work, peer)
+        assert tables.verdict(row) == said
+    assert not accuracy.Accuracy(1e-2, 0.0, 1.0, True).counts
+    assert not accuracy.Accuracy(0.0, 0.0, 1.0, False).counts
+
+
+def test_a_rate_is_measured():
+    rate, seconds = throughput.run_batch("pendulum", jc.Method(), np.float32, 2, work=20, repeats=2)
+    assert 0 < rate.least <= rate.median <= rate.most
+    assert seconds > 0
+
+
+def test_what_fell_is_named():
+    before = {"a": {"over_mujoco": 4.0, "over_peak": 1.0}, "b": {"over_peak": 1.0}}
+    now = {"a": {"over_mujoco": 2.0, "over_peak": 1.0}, "b": {"over_peak": 0.9}, "c": {}}
+    assert regression.slower(before, now, 1.5) == ["a: over_mujoco fell from 4 to 2"]
+    assert not regression.slower(before, now, 2.5)

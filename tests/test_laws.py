@@ -21,7 +21,7 @@ both = pytest.mark.parametrize("dim", [2, 3])
 @functools.cache
 def ideal_scene(dim, topology):
     """Every joint that does not move in time, side by side, and the names of its bodies."""
-    kinds = ("coincident", "spherical", "distance", "revolute", "prismatic", "fixed")
+    kinds = ("coincident", "spherical", "distance", "revolute", "prismatic", "universal", "fixed")
     kinds = tuple(kind for kind in kinds if dim in scenes.JOINTS[kind].dims)
     return kinds, scenes.joints_scene(kinds, dim, topology, jnp.dtype("float64"))
 

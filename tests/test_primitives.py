@@ -126,6 +126,10 @@ def revolute(p, a, b):
     return [*gap(p, a, b), *(n @ u for u in across)]
 
 
+def universal(p, a, b):
+    return [*gap(p, a, b), (a.r @ p["axis_a"]) @ (b.r @ p["axis_b"])]
+
+
 def turned(p, a, b):
     """The angle left in the plane, 2 sin(θ/2) n of the turn left in space."""
     if a.x.shape == (2,):
@@ -152,6 +156,7 @@ RESIDUALS = {
     "spherical": gap,
     "distance": distance,
     "revolute": revolute,
+    "universal": universal,
     "fixed": fixed,
     "prismatic": prismatic,
 }
@@ -187,6 +192,7 @@ FREEDOM = {
     "distance": (2, 5),
     "revolute": (1, 1),
     "prismatic": (1, 1),
+    "universal": (None, 2),
     "fixed": (0, 0),
     "driven_revolute": (0, 0),
     "driven_prismatic": (0, 0),

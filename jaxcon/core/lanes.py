@@ -176,15 +176,48 @@ def take(x: Lane, indices: tuple[int, ...]) -> Lane:
     return x[np.asarray(indices)]
 
 
-def accumulate(target: Lane, indices: tuple[int, ...], x: Lane, bodies: int) -> Lane:
-    """target + Σ x over the bodies it acts on, from lanes (element, …) to a lane (body, …)."""
-    if not isinstance(x, jax.Array):
-        if x == 0:
-            return target
-        raise TypeError("A force component must be an array or the number 0.")
-    if indices == tuple(range(bodies)):
-        return target + x
-    return target.at[np.asarray(indices)].add(x)
+PIECES = 8
+"""Runs of bodies from which a sum over bodies gathers its terms instead of slicing them."""
+
+
+def collect(terms: list[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
+    """Σ of lanes (element, …) over the bodies on which their elements act, as a lane (body, …).
+
+    Args:
+        terms: the body of each element, and the lane.
+        bodies: how many bodies there are.
+    """
+    arrays = [(indices, x) for indices, x in terms if not _is(x, 0)]
+    if not arrays:
+        return 0.0
+    if all(indices == tuple(range(bodies)) for indices, _ in arrays):
+        return total(x for _, x in arrays)
+    shape = jnp.broadcast_shapes(*(x.shape[1:] for _, x in arrays))
+    own: list[list[tuple[int, int]]] = [[] for _ in range(bodies)]
+    for t, (indices, _) in enumerate(arrays):
+        for element, body in enumerate(indices):
+            own[body].append((t, element))
+    starts = [i for i in range(bodies) if not i or own[i] != [(t, e + 1) for t, e in own[i - 1]]]
+    if len(starts) > PIECES:
+        return _gathered([x for _, x in arrays], own, shape)
+    pieces = []
+    for first, end in zip(starts, [*starts[1:], bodies], strict=True):
+        rows = (jax.lax.slice_in_dim(arrays[t][1], e, e + end - first) for t, e in own[first])
+        piece = total(rows) if own[first] else jnp.zeros((), arrays[0][1].dtype)
+        pieces.append(jnp.broadcast_to(piece, (end - first, *shape)))
+    return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
+
+
+def _gathered(lanes: list[Array], own: list[list[tuple[int, int]]], shape: Any) -> Array:
+    """The same from one array of all terms and a row of zeros, by as many gathers as needed."""
+    rows = [jnp.broadcast_to(x, (x.shape[0], *shape)) for x in lanes]
+    every = jnp.concatenate([*rows, jnp.zeros((1, *shape), rows[0].dtype)])
+    first = np.cumsum([0, *(len(x) for x in rows)])
+    places = np.full((max(map(len, own)), len(own)), first[-1])
+    for body, terms in enumerate(own):
+        for k, (t, element) in enumerate(terms):
+            places[k, body] = first[t] + element
+    return total(every[index] for index in places)
 
 
 def _common(components: tuple[Any, ...]) -> list[Any]:

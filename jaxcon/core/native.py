@@ -28,6 +28,7 @@ from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from jaxcon.core import fusion
 from jaxcon.core.typing import Array, PyTree
 
 
@@ -41,7 +42,8 @@ class Native:
 
     def __init__(self, function: Callable[..., Any], full: bool = False) -> None:
         self.function, self.full = function, full
-        self.compiled = jax.jit(self.__call__)
+        self.settled = fusion.settled(self.__call__)
+        self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
         self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
         self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
         self.shapes = functools.lru_cache(maxsize=64)(self._shapes)
@@ -49,6 +51,10 @@ class Native:
     def __call__(self, *args: Array) -> list[Array]:
         """The function itself."""
         return list(self.function(*args))
+
+    def eager(self, *args: Array) -> list[Array]:
+        """The function outside jit: compiled, unless that is switched off."""
+        return self(*args) if jax.config.values["jax_disable_jit"] else self.compiled(*args)
 
     def _shapes(self, *avals: Any) -> list[Any]:
         """Shape and dtype of the results.
@@ -241,9 +247,16 @@ def _transpose(cotangents: Any, *args: Any, fun: Native) -> Any:
     return [next(found) if flag else None for flag in linear]
 
 
-native_p.def_impl(lambda *args, fun: fun.compiled(*args))
+native_p.def_impl(lambda *args, fun: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
-mlir.register_lowering(native_p, mlir.lower_fun(lambda *a, fun: fun(*a), multiple_results=True))
+mlir.register_lowering(
+    native_p, mlir.lower_fun(lambda *args, fun: fun(*args), multiple_results=True)
+)
+mlir.register_lowering(
+    native_p,
+    mlir.lower_fun(lambda *args, fun: fun.settled(*args), multiple_results=True),
+    platform="cpu",
+)
 batching.primitive_batchers[native_p] = _batched
 ad.primitive_jvps[native_p] = _jvp
 ad.primitive_transposes[native_p] = _transpose

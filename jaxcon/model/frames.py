@@ -6,7 +6,7 @@ row is made: where, how fast, with which acceleration when a = 0, and which gene
 world force n is (`pull`). So no joint knows in which dimension it lives.
 
 For a point s of a spatial body with rotation R and body rate ω:
-    p = x + R s,  ṗ = ẋ + R(ω × s),  p̈ = ẍ + R(ω̇ × s) + R(ω × (ω × s)),
+    p = x + R s,  ṗ = ẋ + Rω × R s,  p̈ = ẍ + R(ω̇ × s) + Rω × (Rω × R s),
 so a force n at p does the work n·ṗ = n·ẋ + (s × Rᵀn)·ω.
 """
 
@@ -152,11 +152,17 @@ class PlanarFrame(Frame):
 
 @pytree
 class SpatialFrame(Frame):
-    """Rigid bodies in space; `omega` in the body frame [rad/s], `rotation` body to world."""
+    """Rigid bodies in space.
+
+    Attributes:
+        omega, spin: the angular velocity in the body frame and in the world frame [rad/s].
+        rotation: body to world.
+    """
 
     quaternion: Vector
     omega: Vector
     rotation: Matrix
+    spin: Vector
     oriented: ClassVar[bool] = True
 
     @classmethod
@@ -164,28 +170,31 @@ class SpatialFrame(Frame):
         """From coordinates (x, q) and velocities (ẋ, ω)."""
         turn = Vector(*q[3:])
         rotation = quaternion.rotation(turn)
-        return cls(Vector(*q[:3]), Vector(*v[:3]), turn, Vector(*v[3:]), rotation)
+        omega = Vector(*v[3:])
+        return cls(Vector(*q[:3]), Vector(*v[:3]), turn, omega, rotation, rotation @ omega)
 
     def point(self, anchor: Any) -> Point:
-        """p = x + R s, ṗ = ẋ + R(ω × s), bias R(ω × (ω × s)), pull (n, s × Rᵀn)."""
+        """p = x + R s, ṗ = ẋ + Rω × R s, bias Rω × (Rω × R s), pull (n, s × Rᵀn)."""
         s = Vector.of(anchor)
-        swing = self.omega.cross(s)
+        arm = self.rotation @ s
+        swing = self.spin.cross(arm)
         return Point(
-            self.position + self.rotation @ s,
-            self.velocity + self.rotation @ swing,
-            self.rotation @ self.omega.cross(swing),
+            self.position + arm,
+            self.velocity + swing,
+            self.spin.cross(swing),
             lambda n: Vector(*n, *s.cross(self.rotation.T @ n)),
         )
 
     def direction(self, axis: Any) -> Direction:
-        """u = R û, u̇ = R(ω × û), bias R(ω × (ω × û)), pull (0, û × Rᵀn)."""
-        u = Vector.of(axis)
-        swing = self.omega.cross(u)
+        """u = R û, u̇ = Rω × u, bias Rω × (Rω × u), pull (0, û × Rᵀn)."""
+        axis = Vector.of(axis)
+        u = self.rotation @ axis
+        swing = self.spin.cross(u)
         return Direction(
-            self.rotation @ u,
-            self.rotation @ swing,
-            self.rotation @ self.omega.cross(swing),
-            lambda n: Vector(*zeros(3), *u.cross(self.rotation.T @ n)),
+            u,
+            swing,
+            self.spin.cross(swing),
+            lambda n: Vector(*zeros(3), *axis.cross(self.rotation.T @ n)),
         )
 
     def turn(self, torque: Vector) -> Vector:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core import checks
-from jaxcon.core.lanes import Vector, accumulate, total, zeros
+from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.geometry.pose import Motion, Pose
@@ -109,16 +109,21 @@ class BodySystem:
     def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f (n_v,): gravity, gyroscopic force −ω × Iω, force elements and control."""
         snapshot = self.snapshot(q, v, t)
-        forces = [list(self._own_force(i, q, v)) for i in range(len(self.layout.groups))]
+        groups = self.layout.groups
+        own = [self._own_force(i, q, v) for i in range(len(groups))]
+        terms = [
+            [[(tuple(range(len(g.names))), x)] for x in f] for g, f in zip(groups, own, strict=True)
+        ]
         for element in self.forces:
             for place, pull in element.pulls(snapshot, control):
-                if place.group is None:
-                    continue
-                bodies = len(self.layout.groups[place.group].names)
-                target = forces[place.group]
-                for component, x in enumerate(pull):
-                    target[component] = accumulate(target[component], place.indices, x, bodies)
-        return _join([Vector(*f) for f in forces], q)
+                if place.group is not None:
+                    for known, x in zip(terms[place.group], pull, strict=True):
+                        known.append((place.indices, x))
+        forces = (
+            Vector(*(collect(x, len(g.names)) for x in t))
+            for g, t in zip(groups, terms, strict=True)
+        )
+        return _join(list(forces), q)
 
     def _own_force(self, group: int, q: Array, v: Array) -> Vector:
         """Gravity and gyroscopic force on the bodies of a group."""

@@ -1,7 +1,6 @@
 """Small dense matrices by lanes: blocks of a sparse factorization in unrolled scalar formulas.
 
-A matrix is a list of rows of lanes. `settle` ends a fusion: XLA would otherwise merge the chain of
-a factorization into one kernel for each of its results, and compute shared values again in each.
+A matrix is a list of rows of lanes.
 """
 
 from __future__ import annotations
@@ -16,24 +15,13 @@ from jaxcon.core.typing import Lane
 Block = list[list[Lane]]
 
 
-def settle(x: Any) -> Any:
-    """The same values, computed once and stored."""
-    return on_arrays(jax.lax.optimization_barrier, x)
-
-
 def freeze(x: Any) -> Any:
     """The same values, constant under differentiation."""
-    return on_arrays(jax.lax.stop_gradient, x)
 
+    def one(leaf: Any) -> Any:
+        return jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf
 
-def on_arrays(function: Any, x: Any) -> Any:
-    """A function of the arrays of a tree; its Python numbers stay known when tracing."""
-    leaves, structure = jax.tree.flatten(x)
-    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array)]
-    results = function([leaves[i] for i in places])
-    for i, y in zip(places, results, strict=True):
-        leaves[i] = y
-    return jax.tree.unflatten(structure, leaves)
+    return jax.tree.map(one, x)
 
 
 def minus(x: Lane, y: Lane) -> Lane:
@@ -57,16 +45,26 @@ def ldl(a: Block) -> tuple[Block, list[Lane]]:
     return lower, inverse
 
 
-def ldl_solve(lower: Block, inverse: list[Lane], b: list[Lane]) -> list[Lane]:
-    """(L D Lᵀ)⁻¹ b."""
-    n = len(b)
+def forward(lower: Block, b: list[Lane]) -> list[Lane]:
+    """L⁻¹ b."""
     y: list[Lane] = []
-    for i in range(n):
-        y.append(minus(b[i], total(map(times, lower[i], y))))
-    x = [times(value, w) for value, w in zip(y, inverse, strict=True)]
+    for row, value in zip(lower, b, strict=True):
+        y.append(minus(value, total(times(x, z) for x, z in zip(row, y, strict=False))))
+    return y
+
+
+def backward(lower: Block, y: list[Lane]) -> list[Lane]:
+    """L⁻ᵀ y."""
+    n = len(y)
+    x = list(y)
     for i in reversed(range(n)):
         x[i] = minus(x[i], total(times(lower[k][i], x[k]) for k in range(i + 1, n)))
     return x
+
+
+def scale(x: list[Lane], weights: list[Lane]) -> list[Lane]:
+    """The products of components."""
+    return [times(value, w) for value, w in zip(x, weights, strict=True)]
 
 
 def transpose(a: Block) -> Block:
@@ -83,6 +81,12 @@ def product(a: Block, b: Block) -> Block:
     """A B."""
     columns = transpose(b)
     return [[total(map(times, row, column)) for column in columns] for row in a]
+
+
+def lower_product(a: Block, b: Block) -> Block:
+    """The lower triangle of A Bᵀ, zero above it."""
+    n = len(a)
+    return [[total(map(times, a[r], b[c])) if c <= r else 0.0 for c in range(n)] for r in range(n)]
 
 
 def add(a: Block, b: Block) -> Block:

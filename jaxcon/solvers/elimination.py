@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxcon.core.lanes import Vector, plus, take, times, total
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers import blocks, ordering
-from jaxcon.solvers.blocks import Block, settle
+from jaxcon.solvers.blocks import Block
 from jaxcon.solvers.jacobian import Jacobian
 from jaxcon.solvers.ordering import Node, Plan, Run, Single
 
@@ -20,9 +20,9 @@ from jaxcon.solvers.ordering import Node, Plan, Run, Single
 class Elimination:
     """The factorization of one A, step by step of its plan.
 
-    Eliminating node p with pivot block A_pp leaves G_q = A_qp A_pp⁻¹ for each later neighbour q,
-    and A_qr −= G_q A_pr. Then b_q −= G_q b_p on the way down, and on the way back
-    x_p = A_pp⁻¹ b_p − Σ G_qᵀ x_q.
+    Eliminating node p with pivot block A_pp = L D Lᵀ leaves H_q = A_qp L⁻ᵀ D⁻¹ for each later
+    neighbour q, and A_qr −= H_q D H_rᵀ. Then y_p = L⁻¹ b_p and b_q −= H_q y_p on the way down, and
+    on the way back x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q).
 
     Attributes:
         share: the smallest part of a row that the rows before it do not explain, by world.
@@ -35,15 +35,13 @@ class Elimination:
         self.plan = ordering.plan(structure, run)
         self.batch, self.dtype = batch, inverse_mass.dtype
         self.groups = {block.start: block.shape for block in jacobian.blocks}
-        self.diagonal, self.couplings = settle(_blocks_of(self.plan, jacobian, inverse_mass))
+        self.diagonal, self.couplings = _blocks_of(self.plan, jacobian, inverse_mass)
         if compliance is not None:
             self._soften(compliance)
         self.updates: dict[tuple[Node, Node], Block] = {}
         self.share: Any = jnp.ones(self.batch, self.dtype)
-        self.finite: Any = jnp.ones(self.batch, bool)
-        for lane in jax.tree.leaves((self.diagonal, self.couplings)):
-            if isinstance(lane, jax.Array):
-                self.finite &= jnp.all(jnp.isfinite(lane), axis=0)
+        traces = (total(block[r][r] for r in range(len(block))) for block in self.diagonal.values())
+        self.finite = jnp.isfinite(total(jnp.sum(x, axis=0) for x in traces))
         self.factors = [
             self._run(step) if isinstance(step, Run) else self._single(step)
             for step in self.plan.steps
@@ -63,13 +61,14 @@ class Elimination:
         original = [pivot[r][r] for r in range(node.size)]
         if (node, node) in self.updates:
             pivot = blocks.subtract(pivot, self.updates[node, node])
-        lower, inverse = settle(blocks.ldl(pivot))
+        lower, inverse = blocks.ldl(pivot)
         self._judge(original, inverse)
-        sides = [self._coupling(q, node) for q in step.later]
-        gains = settle([[blocks.ldl_solve(lower, inverse, row) for row in a] for a in sides])
+        sides = [_halve(lower, self._coupling(q, node)) for q in step.later]
+        gains = [[blocks.scale(row, inverse) for row in a] for a in sides]
         for i, (q, side) in enumerate(zip(step.later, sides, strict=True)):
-            for r, gain in zip(step.later[: i + 1], gains, strict=False):
+            for r, gain in zip(step.later[:i], gains, strict=False):
                 self._update(q, r, blocks.product(side, blocks.transpose(gain)))
+            self._update(q, q, blocks.lower_product(side, gains[i]))
         return SingleFactor(step, lower, inverse, gains)
 
     def _run(self, step: Run) -> RunFactor:
@@ -93,7 +92,7 @@ class Elimination:
             _eliminate, start, (pivots, sides), reverse=step.descending
         )
         self.share = jnp.minimum(self.share, jnp.min(jnp.stack(share), axis=(0, 1)))
-        full = [[last[max(r, c)][min(r, c)] for c in range(size)] for r in range(size)]
+        full = [[last[r][c] if c <= r else 0.0 for c in range(size)] for r in range(size)]
         self._update(step.parent, step.parent, full)
         return RunFactor(step, lower, inverse, gain)
 
@@ -137,22 +136,28 @@ class Elimination:
                 self.diagonal[start][r][r] = plus(self.diagonal[start][r][r], part)
 
 
+def _halve(lower: Block, side: Block) -> Block:
+    """A_qp L⁻ᵀ."""
+    return [blocks.forward(lower, row) for row in side]
+
+
 def _eliminate(update: Any, at: Any) -> Any:
     """One node of a run: its pivot less the update, its gain, and the update of the next pivot."""
     pivot, side = at
     size = len(pivot)
     rows = zip(pivot, update, strict=True)
     changed = [[x - u for x, u in zip(p, w, strict=False)] for p, w in rows]
-    lower, inverse = settle(blocks.ldl(changed))
+    lower, inverse = blocks.ldl(changed)
     share = [1 / (inverse[r] * pivot[r][r]) for r in range(size)]
-    gain = settle([blocks.ldl_solve(lower, inverse, row) for row in side])
-    following = [[total(map(times, side[r], gain[c])) for c in range(r + 1)] for r in range(size)]
+    half = _halve(lower, side)
+    gain = [blocks.scale(row, inverse) for row in half]
+    following = [[total(map(times, half[r], gain[c])) for c in range(r + 1)] for r in range(size)]
     return following, (lower, inverse, gain, share)
 
 
 @dataclass(frozen=True)
 class SingleFactor:
-    """One eliminated node: L, D⁻¹ of its pivot, and G_q for its later neighbours."""
+    """One eliminated node: L, D⁻¹ of its pivot, and H_q for its later neighbours."""
 
     step: Single
     lower: Block
@@ -160,18 +165,18 @@ class SingleFactor:
     gains: list[Block]
 
     def down(self, b: Vectors) -> list[Lane]:
-        """b_q −= G_q b_p; returns A_pp⁻¹ b_p."""
-        right = b.get(self.step.node)
+        """y_p = L⁻¹ b_p and b_q −= H_q y_p; returns D⁻¹ y_p."""
+        y = blocks.forward(self.lower, b.get(self.step.node))
         for q, gain in zip(self.step.later, self.gains, strict=True):
-            b.subtract(q, blocks.apply(gain, right))
-        return settle(blocks.ldl_solve(self.lower, self.inverse, right))
+            b.subtract(q, blocks.apply(gain, y))
+        return blocks.scale(y, self.inverse)
 
     def back(self, y: list[Lane], x: Vectors) -> None:
-        """x_p = A_pp⁻¹ b_p − Σ G_qᵀ x_q."""
+        """x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q)."""
         for q, gain in zip(self.step.later, self.gains, strict=True):
             pull = blocks.apply(blocks.transpose(gain), x.solution(q))
             y = [blocks.minus(a, c) for a, c in zip(y, pull, strict=True)]
-        x.nodes[self.step.node] = settle(y)
+        x.nodes[self.step.node] = blocks.backward(self.lower, y)
 
 
 @dataclass(frozen=True)
@@ -184,13 +189,13 @@ class RunFactor:
     gain: Block
 
     def down(self, b: Vectors) -> list[Lane]:
-        """The same in a scan that carries G b to the next node."""
+        """The same in a scan that carries H y to the next node."""
 
         def eliminate(update: Any, at: Any) -> Any:
             lower, inverse, gain, right = at
             right = [x - u for x, u in zip(right, update, strict=True)]
-            y = settle(blocks.ldl_solve(lower, inverse, right))
-            return blocks.apply(gain, right), y
+            y = blocks.forward(lower, right)
+            return blocks.apply(gain, y), blocks.scale(y, inverse)
 
         right = b.get_run(self.step)
         start = [jnp.zeros(b.batch, x.dtype) for x in right]
@@ -203,13 +208,16 @@ class RunFactor:
         """The same in a scan that carries the solution of the next node."""
 
         def substitute(following: Any, at: Any) -> Any:
-            gain, own = at
+            lower, gain, own = at
             pull = blocks.apply(blocks.transpose(gain), following)
-            solution = [a - c for a, c in zip(own, pull, strict=True)]
+            rest = [a - c for a, c in zip(own, pull, strict=True)]
+            solution = blocks.backward(lower, rest)
             return solution, solution
 
         start, step = x.solution(self.step.parent), self.step
-        _, solution = jax.lax.scan(substitute, start, (self.gain, y), reverse=not step.descending)
+        _, solution = jax.lax.scan(
+            substitute, start, (self.lower, self.gain, y), reverse=not step.descending
+        )
         x.runs[step.nodes[0].group, step.elements[0]] = solution
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.lanes import Vector, plus, times, total
+from jaxcon.core.lanes import Vector, collect, plus, times, total
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 
@@ -76,17 +77,30 @@ class Jacobian:
 
     def transpose(self, multipliers: Array) -> Array:
         """Jᵀ λ, (n_v,)."""
-        result = jnp.zeros((self.shape[1], *multipliers.shape[1:]), multipliers.dtype)
+        terms: dict[int, tuple[Columns, list[Any]]] = {}
         for block in self.blocks:
             m, k = block.shape
             part = jax.lax.slice_in_dim(multipliers, block.start, block.start + m * k)
             force = Vector.of(part.reshape((m, k, *multipliers.shape[1:])))
-            for component, column in enumerate(block.columns.index()):
-                terms = zip(block.value, force, strict=True)
-                pull = total(times(row[component], f) for row, f in terms)
-                if isinstance(pull, jax.Array):
-                    result = result.at[column].add(pull)
-        return result
+            columns = block.columns
+            _, known = terms.setdefault(
+                columns.start, (columns, [[] for _ in range(columns.components)])
+            )
+            for component in range(columns.components):
+                pairs = zip(block.value, force, strict=True)
+                pull = total(times(row[component], f) for row, f in pairs)
+                known[component].append((columns.indices, pull))
+        lanes: list[Array] = []
+        free = 0
+        for start, (columns, components) in sorted(terms.items()):
+            lanes.append(jnp.zeros((start - free, *multipliers.shape[1:]), multipliers.dtype))
+            for known in components:
+                lane = collect(known, columns.bodies)
+                shape = (columns.bodies, *multipliers.shape[1:])
+                lanes.append(jnp.broadcast_to(jnp.asarray(lane, multipliers.dtype), shape))
+            free = start + columns.components * columns.bodies
+        lanes.append(jnp.zeros((self.shape[1] - free, *multipliers.shape[1:]), multipliers.dtype))
+        return jnp.concatenate([x for x in lanes if x.shape[0]])
 
     def dense(self) -> Array:
         """J as one array (n_c, n_v): one concatenation and one gather by a fixed index."""

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import ordering
-from jaxcon.solvers.blocks import freeze, settle
+from jaxcon.solvers.blocks import freeze
 from jaxcon.solvers.elimination import Elimination
 from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
@@ -48,7 +48,7 @@ class Sparse:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
             return Schur().solve(system)
-        j, compliance = settle(system.jacobian), system.compliance
+        j, compliance = system.jacobian, system.compliance
         free = system.mass.solve(system.force)
         matrices = freeze((j, 1 / system.mass.values, compliance))
         elimination = Elimination(matrices, self.run, free.shape[1:])

@@ -1,0 +1,92 @@
+"""Rates with their spread, compile times, and the machine on which they were measured."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Work per second: the median of several repeats and their extremes."""
+
+    median: float
+    least: float
+    most: float
+
+    def __str__(self) -> str:
+        """As a table shows it, in millions."""
+        spread = f"{self.least / 1e6:.3g} to {self.most / 1e6:.3g}"
+        return f"{self.median / 1e6:.3g} M ({spread})"
+
+
+def rate(run: Callable[[], Any], work: float, repeats: int = 5) -> Rate:
+    """How much work a second a function does that returns arrays or None; it has run before."""
+    rates = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        rates.append(work / (time.perf_counter() - start))
+    return Rate(float(np.median(rates)), min(rates), max(rates))
+
+
+def compile_seconds(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
+    """The compiled function, and how long tracing and compiling it took [s].
+
+    JAX's cache on the disk, where it is turned on, makes this the time of reading it.
+    """
+    start = time.perf_counter()
+    compiled = jax.jit(function).lower(*args).compile()
+    return compiled, time.perf_counter() - start
+
+
+def cores() -> int:
+    """How many this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def machine() -> dict[str, Any]:
+    """What a file of results says about where they were measured."""
+    return {
+        "cores": cores(),
+        "processor": platform.processor() or platform.machine(),
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+        "peers": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Of the peers that are installed."""
+    from importlib import metadata
+
+    found = {}
+    for package in ("mujoco", "mujoco-mjx"):
+        try:
+            found[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def plain(value: Any) -> Any:
+    """A result as JSON can hold it; numbers that are not finite are null."""
+    if hasattr(value, "__dataclass_fields__"):
+        return plain(asdict(value))
+    if isinstance(value, dict):
+        return {str(key): plain(x) for key, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(x) for x in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,241 @@
+"""Which values a compiled function stores, and which it computes again where they are needed.
+
+XLA's compiler for CPUs merges elementwise operations into kernels of one result each. A value that
+several kernels need is computed in every one of them, with all that it was made of: a long chain of
+shared values, as from frames to Jacobians to factors to solutions, grows into kernels that repeat
+each other's work a thousand times over. Barriers do not stop it; they are removed before kernels
+are formed. What does is a call that may not be inlined. `settled` therefore cuts a function into
+stages, each a call that computes values which do not depend on each other, and which the stages
+after it read from cache. All of it together is one kernel of one thread, so that nothing is spent
+on launching kernels and passing them between threads.
+
+The attributes are hints: a compiler that does not know them gives the same results. They are those
+of XLA 0.7 (2025) and later, `xla/service/call_inliner.cc` and `xla/service/cpu/thunk_emitter.cc`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
+
+from jaxcon.core.program import Constant, Operation, Program
+from jaxcon.core.typing import Array
+
+WORTH = 4
+"""Operations from which it pays to store a value that several kernels need."""
+
+KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
+
+
+def _names(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+MOVES = _names(
+    "reshape squeeze expand_dims slice rev transpose broadcast_in_dim convert_element_type iota"
+    " dynamic_slice"
+)
+"""Operations that compute nothing: kernels read through them."""
+
+ARITHMETIC = _names(
+    "add sub mul neg abs sign square integer_pow max min and or not xor eq ne lt le gt ge"
+    " is_finite floor ceil round select_n add_any clamp nextafter"
+)
+"""Elementwise operations."""
+
+COSTLY = _names(
+    "div sqrt rsqrt pow exp log log1p expm1 sin cos tan tanh atan2 asin acos atan rem cbrt erf"
+    " logistic exp2 sinh cosh asinh acosh atanh"
+)
+"""Elementwise operations that are always worth storing."""
+
+SHIFTS = MOVES | {"concatenate", "pad"}
+"""Operations of which every operand is in the result."""
+
+OTHERS = _names("concatenate dynamic_update_slice pad gather scan split stack unstack")
+"""Operations that end a stage and may be part of a kernel."""
+
+
+def settled(function: Callable[..., Any]) -> Callable[..., list[Array]]:
+    """The function of arrays that returns a list of them, cut into stages."""
+
+    def run(*args: Array) -> list[Array]:
+        return Stages(jax.make_jaxpr(function)(*args))(*args)
+
+    return run
+
+
+class Stages:
+    """A program as a sequence of stages and of operations that no kernel of a stage contains.
+
+    Attributes:
+        steps: in order: an operation, or the values that a stage computes.
+        whole: whether all of it fits in one kernel.
+    """
+
+    def __init__(self, closed: Any) -> None:
+        self.program = Program(closed, _settled_body)
+        self.steps = _in_stages(self.program, worth_storing(self.program))
+        self.whole = all(_elementwise(op) or op.name in OTHERS for op in self.program.operations)
+
+    def __call__(self, *args: Array) -> list[Array]:
+        """The results."""
+        outputs = self.program.outputs
+        values: dict[int, Any] = dict(zip(self.program.inputs, args, strict=True))
+        wanted = [x for x in outputs if not isinstance(x, Constant) and x not in values]
+        wanted = list(dict.fromkeys(wanted))
+        if wanted and self.whole:
+            self._store(values, wanted, self._run)
+        else:
+            self._run(values, wanted)
+        return [self.program.evaluate(values, x) for x in outputs]
+
+    def _run(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
+        """Computes values, stage by stage."""
+        for step in self.steps:
+            if isinstance(step, Operation):
+                operands = [self.program.evaluate(values, x) for x in step.inputs]
+                values.update(zip(step.outputs, step(operands), strict=True))
+            else:
+                self._store(values, step, self._evaluate)
+        self._evaluate(values, wanted)
+
+    def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
+        for x in wanted:
+            self.program.evaluate(values, x)
+
+    def _store(self, values: dict[int, Any], wanted: list[int], how: Callable[..., None]) -> None:
+        """Computes values in a kernel of their own."""
+        leaves = self.program.leaves(values, wanted)
+
+        def compute(*given: Array) -> list[Array]:
+            own: dict[int, Any] = dict(zip(leaves, given, strict=True))
+            how(own, wanted)
+            return [own[x] for x in wanted]
+
+        sure = set(self.program.leaves(values, wanted, _surely_read))
+        doubtful = [i for i, x in enumerate(leaves) if x not in sure]
+        results = _kernel(compute, [values[x] for x in leaves], doubtful)
+        values.update(zip(wanted, results, strict=True))
+
+
+def worth_storing(program: Program) -> set[int]:
+    """The values that more than one kernel needs and that cost some work to make.
+
+    Backwards, a value becomes the result of a kernel where it is needed by two kernels after it, or
+    by an operation that is no part of one. Forwards, those that turn out cheap, given what else is
+    stored, are taken back.
+    """
+    stored, ends = _needed_twice(program)
+    work: dict[int, frozenset[int]] = {}
+    for op in filter(_elementwise, program.operations):
+        (name,) = op.outputs
+        unstored = (x for x in op.inputs if not isinstance(x, Constant) and x not in stored)
+        parts = (work.get(x, frozenset()) for x in unstored)
+        own = frozenset().union(*parts)
+        if op.name not in MOVES:
+            own |= {name}
+        cheap = len(own) < WORTH and op.name not in COSTLY
+        if name in stored and name not in ends and cheap:
+            stored.discard(name)
+        work[name] = own if cheap else frozenset(list(own)[:WORTH])
+    return stored
+
+
+def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
+    """Values that several kernels need, and those among them that end one in any case."""
+    readers = program.readers()
+    results = {x for x in program.outputs if not isinstance(x, Constant)}
+    stored: set[int] = set()
+    ends: set[int] = set()
+    kernels: dict[int, set[int]] = {}
+    for op in filter(_elementwise, reversed(program.operations)):
+        (name,) = op.outputs
+        needed: set[int] = {name} if name in results else set()
+        for reader in readers.get(name, ()):
+            after = reader.outputs[0]
+            if not _elementwise(reader):
+                needed.add(name)
+            else:
+                needed |= kernels[after]
+        if name in needed:
+            ends.add(name)
+        if op.name not in MOVES and (len(needed) > 1 or name in needed):
+            stored.add(name)
+            needed = {name}
+        kernels[name] = set(sorted(needed)[:2])
+    return stored, ends
+
+
+def _in_stages(program: Program, stored: set[int]) -> list[Operation | list[int]]:
+    """Operations and stages in order: a value joins the last stage unless it depends on it."""
+    steps: list[Any] = []
+    made: dict[int, int] = {}
+    for op in program.operations:
+        after = max((made.get(x, -1) for x in op.inputs if not isinstance(x, Constant)), default=-1)
+        if not _elementwise(op):
+            steps.append(op)
+            after = len(steps) - 1
+        elif op.outputs[0] in stored:
+            joins = steps and isinstance(steps[-1], list) and after < len(steps) - 1
+            if joins:
+                steps[-1].append(op.outputs[0])
+            else:
+                steps.append([op.outputs[0]])
+            after = len(steps) - 1
+        made.update(dict.fromkeys(op.outputs, after))
+    return steps
+
+
+def _elementwise(op: Operation) -> bool:
+    """Whether it becomes a part of the kernels that read it."""
+    return op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY
+
+
+def _surely_read(op: Operation) -> bool:
+    """Whether no compiler can find that the result does not depend on an operand.
+
+    Arithmetic in floating point is such, since NaN spreads through it; a choice between two values
+    is not, since they may turn out to be the same.
+    """
+    return op.name in SHIFTS or (op.inexact and op.name in (ARITHMETIC | COSTLY) - {"select_n"})
+
+
+def _kernel(
+    function: Callable[..., list[Array]], args: list[Array], doubtful: list[int]
+) -> list[Array]:
+    """Calls a function as one kernel.
+
+    XLA's kernels must read all of their arguments. The barrier hides which of them are constants,
+    and those that the function may not read (`doubtful`) are read for one result more. For that
+    reason, too, it always returns a tuple: a computation that ends in one large array would be
+    split among threads, which a kernel inside a kernel cannot be.
+    """
+
+    def kernel(*args: Array) -> list[Array]:
+        seen = jnp.zeros((), bool)
+        for i in doubtful:
+            seen |= _depends(args[i])
+        return [*function(*args), seen]
+
+    hidden = jax.lax.optimization_barrier(args)
+    with set_xla_metadata(**KERNEL):
+        return jax.jit(kernel)(*hidden)[:-1]
+
+
+def _depends(x: Array) -> Array:
+    """A bit that no compiler can know without reading the array."""
+    first = x[(0,) * x.ndim]
+    if x.dtype == bool:
+        return first
+    return first != first if jnp.issubdtype(x.dtype, jnp.inexact) else first > 0  # noqa: PLR0124
+
+
+def _settled_body(closed: Any) -> Any:
+    """The body of a loop, cut into stages itself."""
+    inputs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in closed.jaxpr.invars]
+    return jax.make_jaxpr(Stages(closed))(*inputs)

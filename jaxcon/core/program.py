@@ -1,0 +1,256 @@
+"""A traced function as a flat list of operations: calls inlined, repetitions removed."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core as jex
+
+from jaxcon.core.typing import Array
+
+INLINED = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "core_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "checkpoint": "jaxpr",
+    "remat2": "jaxpr",
+}
+"""Primitives that only call a function, and the parameter that holds it."""
+
+IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
+"""Primitives that return their arguments."""
+
+REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
+    "reduce_sum": jax.lax.add,
+    "reduce_max": jax.lax.max,
+    "reduce_min": jax.lax.min,
+    "reduce_and": jax.lax.bitwise_and,
+    "reduce_or": jax.lax.bitwise_or,
+}
+"""Reductions that are done by halves, elementwise, where they run over the first axes."""
+
+
+class Constant:
+    """A literal or a captured array among the operands of an operation."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+
+Operand = int | Constant
+"""The number of a value, or a constant."""
+
+
+@dataclass
+class Operation:
+    """One instruction on numbered values."""
+
+    primitive: Any
+    params: dict[str, Any]
+    inputs: list[Operand]
+    outputs: list[int]
+    inexact: bool
+
+    @property
+    def name(self) -> str:
+        """Of the primitive."""
+        return self.primitive.name
+
+    def __call__(self, operands: list[Any]) -> list[Any]:
+        """Its results."""
+        results = self.primitive.bind(*operands, **self.params)
+        return results if self.primitive.multiple_results else [results]
+
+
+class Program:
+    """A function as operations in order.
+
+    Attributes:
+        operations: in order.
+        inputs: numbers of the arguments.
+        outputs: of the results.
+        makers: the operation that makes a value.
+    """
+
+    def __init__(self, closed: Any, inner: Callable[[Any], Any]) -> None:
+        """Flattens a closed jaxpr; `inner` rewrites the bodies of loops."""
+        self.operations: list[Operation] = []
+        self._inner = inner
+        self._known: dict[Any, list[int]] = {}
+        self._count = 0
+        self.inputs = [self._new() for _ in closed.jaxpr.invars]
+        self.outputs = self._inline_closed(closed, list(self.inputs))
+        self.makers = {name: op for op in self.operations for name in op.outputs}
+
+    def readers(self) -> dict[int, list[Operation]]:
+        """The operations that read each value."""
+        readers: dict[int, list[Operation]] = {}
+        for op in self.operations:
+            for x in op.inputs:
+                if not isinstance(x, Constant):
+                    readers.setdefault(x, []).append(op)
+        return readers
+
+    def evaluate(self, values: dict[int, Any], wanted: Operand) -> Any:
+        """A value from known ones, remembering what is computed on the way."""
+        if isinstance(wanted, Constant):
+            return wanted.value
+        todo = [wanted]
+        while todo:
+            op = self.makers.get(todo[-1])
+            if todo[-1] in values or op is None:
+                todo.pop()
+                continue
+            missing = [x for x in op.inputs if not isinstance(x, Constant) and x not in values]
+            if missing:
+                todo += missing
+                continue
+            operands = [x.value if isinstance(x, Constant) else values[x] for x in op.inputs]
+            values.update(zip(op.outputs, op(operands), strict=True))
+        return values[wanted]
+
+    def leaves(
+        self,
+        known: Any,
+        wanted: list[int],
+        through: Callable[[Operation], bool] = lambda op: True,
+    ) -> list[int]:
+        """The known values from which others are made, as far as it is by certain operations."""
+        found: dict[int, None] = {}
+        seen: set[int] = set()
+        todo = list(reversed(wanted))
+        while todo:
+            x = todo.pop()
+            if x in seen:
+                continue
+            seen.add(x)
+            if x in known:
+                found[x] = None
+            elif through(self.makers[x]):
+                todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
+        return list(found)
+
+    def _new(self) -> int:
+        self._count += 1
+        return self._count
+
+    def _inline_closed(self, jaxpr: Any, args: list[Operand]) -> list[Operand]:
+        """Appends the operations of a jaxpr; returns its results."""
+        if isinstance(jaxpr, jex.ClosedJaxpr):
+            jaxpr, args = jaxpr.jaxpr, [*map(Constant, jaxpr.consts), *args]
+        names = dict(zip([*jaxpr.constvars, *jaxpr.invars], args, strict=True))
+
+        def read(x: Any) -> Operand:
+            return Constant(x.val) if isinstance(x, jex.Literal) else names[x]
+
+        for equation in jaxpr.eqns:
+            results = self._append(equation, [read(x) for x in equation.invars])
+            names.update(zip(equation.outvars, results, strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def _append(self, equation: Any, args: list[Operand]) -> list[Operand]:
+        name, params = equation.primitive.name, equation.params
+        if name in INLINED:
+            return self._inline_closed(params[INLINED[name]], args)
+        if name in IDENTITIES:
+            return args
+        if name == "custom_linear_solve":
+            lengths = params["const_lengths"]
+            first = lengths.matvec + lengths.vecmat
+            last = first + lengths.solve
+            given = [*args[first:last], *args[last + lengths.transpose_solve :]]
+            return self._inline_closed(params["jaxprs"].solve, given)
+        if name == "native":
+            avals = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
+            return self._inline_closed(jax.make_jaxpr(params["fun"])(*avals), args)
+        folded = _known_result(equation, args)
+        if folded is not None:
+            return folded
+        if name in REDUCTIONS and _leading(params["axes"], equation.invars[0].aval.shape):
+            fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
+            return self._inline_closed(jax.make_jaxpr(fold)(equation.invars[0].aval), args)
+        if name == "scan":
+            params = params | {"jaxpr": self._inner(params["jaxpr"])}
+        return self._emit(equation, params, args)
+
+    def _emit(self, equation: Any, params: Any, args: list[Operand]) -> list[Any]:
+        """Appends an operation, or finds the same one done before."""
+        primitive = equation.primitive
+        key = _key(primitive, params, args)
+        if key is not None and key in self._known:
+            return self._known[key]
+        outputs = [self._new() for _ in equation.outvars]
+        inexact = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
+        self.operations.append(Operation(primitive, params, args, outputs, inexact))
+        if key is not None:
+            self._known[key] = outputs
+        return outputs
+
+
+def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -> Array:
+    """The reduction over the first axes: the second half onto the first, until one is left."""
+    x = x.reshape((-1, *x.shape[axes:]))
+    while len(x) > 1:
+        half, odd = divmod(len(x), 2)
+        folded = operation(x[:half], x[half : 2 * half])
+        if odd and half > 1:
+            folded = jax.lax.concatenate([folded, x[-1:]], 0)
+        elif odd:
+            folded = operation(folded, x[-1:])
+        x = folded
+    return x[0]
+
+
+def _leading(axes: Any, shape: tuple[int, ...]) -> bool:
+    """Whether these are the first axes, none of them empty."""
+    return tuple(axes) == tuple(range(len(axes))) and all(shape[: len(axes)])
+
+
+def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
+    """The result of an operation that does not depend on all its operands.
+
+    The compiler would find it out later, when what is stored has been decided.
+    """
+    name, aval = equation.primitive.name, equation.outvars[0].aval
+    if len(equation.outvars) == 1 and 0 in aval.shape:
+        return [Constant(np.zeros(aval.shape, aval.dtype))]
+    exponent = args[1] if name == "pow" and len(args) == 2 else None
+    power = equation.params.get("y") if name == "integer_pow" else exponent
+    if isinstance(power, Constant) and jnp.shape(power.value) == ():
+        power = power.value
+    if isinstance(power, int | float | np.generic) and power == 0:
+        return [Constant(np.ones(aval.shape, aval.dtype))]
+    if name == "select_n" and all(x is args[1] or x == args[1] for x in args[2:]):
+        return [args[1]]
+    if name == "select_n" and isinstance(args[0], Constant) and jnp.shape(args[0].value) == ():
+        return [args[1 + int(args[0].value)]]
+    return None
+
+
+def _key(primitive: Any, params: Any, args: list[Operand]) -> Any:
+    """What makes an operation the same as another; None where that cannot be told."""
+    if primitive.name in ("scan", "while", "cond"):
+        return None
+    parts: list[Any] = []
+    for x in args:
+        if not isinstance(x, Constant):
+            parts.append(x)
+        elif jnp.shape(x.value) == () and not jnp.issubdtype(jnp.result_type(x.value), jnp.integer):
+            parts.append((str(jnp.result_type(x.value)), repr(x.value)))
+        else:
+            parts.append((type(x.value).__name__, id(x.value)))
+    key = (primitive, tuple(sorted(params.items(), key=lambda item: item[0])), tuple(parts))
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
