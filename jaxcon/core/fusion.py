@@ -15,6 +15,7 @@ of XLA 0.7 (2025) and later, `xla/service/call_inliner.cc` and `xla/service/cpu/
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -60,6 +61,13 @@ OTHERS = _names("concatenate dynamic_update_slice pad gather scan split stack un
 """Operations that end a stage and may be part of a kernel."""
 
 
+WHOLE, PART = 100, 24
+"""Steps in one kernel, and in each where there are more: compiling takes longer than in proportion."""
+
+Step = Operation | list[int]
+"""An operation by itself, or the values of a stage."""
+
+
 def settled(function: Callable[..., Any]) -> Callable[..., list[Array]]:
     """The function of arrays that returns a list of them, cut into stages."""
 
@@ -73,36 +81,34 @@ class Stages:
     """A program as a sequence of stages and of operations that no kernel of a stage contains.
 
     Attributes:
-        steps: in order: an operation, or the values that a stage computes.
-        whole: whether all of it fits in one kernel.
+        parts: steps of one kernel each, and which of their values are needed later; a step is an
+            operation, or the values that a stage computes.
     """
 
     def __init__(self, closed: Any) -> None:
         self.program = Program(closed, _settled_body)
-        self.steps = _in_stages(self.program, worth_storing(self.program))
-        self.whole = all(_elementwise(op) or op.name in OTHERS for op in self.program.operations)
+        steps = _in_stages(self.program, worth_storing(self.program))
+        self.parts = _with_results(self.program, _in_parts(steps))
 
     def __call__(self, *args: Array) -> list[Array]:
         """The results."""
-        outputs = self.program.outputs
         values: dict[int, Any] = dict(zip(self.program.inputs, args, strict=True))
-        wanted = [x for x in outputs if not isinstance(x, Constant) and x not in values]
-        wanted = list(dict.fromkeys(wanted))
-        if wanted and self.whole:
-            self._store(values, wanted, self._run)
-        else:
-            self._run(values, wanted)
-        return [self.program.evaluate(values, x) for x in outputs]
+        for steps, wanted in self.parts:
+            run = functools.partial(self._run, steps)
+            if all(map(_fits, steps)):
+                self._store(values, wanted, run)
+            else:
+                run(values, wanted)
+        return [self.program.evaluate(values, x) for x in self.program.outputs]
 
-    def _run(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
+    def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
         """Computes values, stage by stage."""
-        for step in self.steps:
+        for step in steps:
             if isinstance(step, Operation):
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
                 self._store(values, step, self._evaluate)
-        self._evaluate(values, wanted)
 
     def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
         for x in wanted:
@@ -171,7 +177,7 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
     return stored, ends
 
 
-def _in_stages(program: Program, stored: set[int]) -> list[Operation | list[int]]:
+def _in_stages(program: Program, stored: set[int]) -> list[Step]:
     """Operations and stages in order: a value joins the last stage unless it depends on it."""
     steps: list[Any] = []
     made: dict[int, int] = {}
@@ -189,6 +195,41 @@ def _in_stages(program: Program, stored: set[int]) -> list[Operation | list[int]
             after = len(steps) - 1
         made.update(dict.fromkeys(op.outputs, after))
     return steps
+
+
+def _in_parts(steps: list[Step]) -> list[list[Step]]:
+    """Consecutive steps: as many as one kernel may have, or one that no kernel can contain."""
+    most = WHOLE if len(steps) <= WHOLE else PART
+    parts: list[list[Step]] = []
+    for step in steps:
+        if parts and _fits(step) and _fits(parts[-1][-1]) and len(parts[-1]) < most:
+            parts[-1].append(step)
+        else:
+            parts.append([step])
+    return parts
+
+
+def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[Step], list[int]]]:
+    """The parts, each with those of its values that parts after it or the results need."""
+    made = [[x for step in part for x in _values(step)] for part in parts]
+    known = {*program.inputs, *(x for part in made for x in part)}
+    needed = set(program.leaves(known, [x for x in program.outputs if not isinstance(x, Constant)]))
+    results: list[tuple[list[Step], list[int]]] = []
+    for part, own in reversed(list(zip(parts, made, strict=True))):
+        results.append((part, [x for x in own if x in needed]))
+        operands = [y for x in own for y in program.makers[x].inputs]
+        needed |= set(program.leaves(known, [y for y in operands if not isinstance(y, Constant)]))
+    return [(part, wanted) for part, wanted in reversed(results) if wanted]
+
+
+def _values(step: Step) -> list[int]:
+    """What a step computes."""
+    return step.outputs if isinstance(step, Operation) else step
+
+
+def _fits(step: Step) -> bool:
+    """Whether a kernel may contain it."""
+    return not isinstance(step, Operation) or step.name in OTHERS
 
 
 def _elementwise(op: Operation) -> bool:
@@ -211,28 +252,28 @@ def _kernel(
     """Calls a function as one kernel.
 
     XLA's kernels must read all of their arguments. The barrier hides which of them are constants,
-    and those that the function may not read (`doubtful`) are read for one result more. For that
-    reason, too, it always returns a tuple: a computation that ends in one large array would be
-    split among threads, which a kernel inside a kernel cannot be.
+    and those that the function may not read (`doubtful`) are read for results that nobody needs.
+    For that reason, too, there is always one of these: a computation that ends in one large array
+    would be split among threads, which a kernel inside a kernel cannot be.
     """
+    count = 0
 
     def kernel(*args: Array) -> list[Array]:
-        seen = jnp.zeros((), bool)
-        for i in doubtful:
-            seen |= _depends(args[i])
-        return [*function(*args), seen]
+        nonlocal count
+        results = function(*args)
+        count = len(results)
+        return [*results, *(_read(args[i]) for i in doubtful), jnp.zeros((), bool)]
 
-    hidden = jax.lax.optimization_barrier(args)
-    with set_xla_metadata(**KERNEL):
-        return jax.jit(kernel)(*hidden)[:-1]
+    first, *others = jax.jit(kernel)(*jax.lax.optimization_barrier(args))
+    # what is said of a result of a call is said of the call
+    return [set_xla_metadata(first, **KERNEL), *others][:count]
 
 
-def _depends(x: Array) -> Array:
-    """A bit that no compiler can know without reading the array."""
-    first = x[(0,) * x.ndim]
+def _read(x: Array) -> Array:
+    """What no compiler can know without reading the array."""
     if x.dtype == bool:
-        return first
-    return first != first if jnp.issubdtype(x.dtype, jnp.inexact) else first > 0  # noqa: PLR0124
+        return ~x
+    return x != x if jnp.issubdtype(x.dtype, jnp.inexact) else x > 0  # noqa: PLR0124
 
 
 def _settled_body(closed: Any) -> Any:

@@ -176,6 +176,12 @@ def take(x: Lane, indices: tuple[int, ...]) -> Lane:
     return x[np.asarray(indices)]
 
 
+def replaced(x: Array, place: int, y: Array) -> Array:
+    """A lane (element, …) with another value for one element."""
+    parts = (x[:place], jnp.broadcast_to(y, x.shape[1:])[None], x[place + 1 :])
+    return jnp.concatenate([part for part in parts if len(part)])
+
+
 PIECES = 8
 """Runs of bodies from which a sum over bodies gathers its terms instead of slicing them."""
 

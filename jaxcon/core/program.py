@@ -90,6 +90,7 @@ class Program:
         self.inputs = [self._new() for _ in closed.jaxpr.invars]
         self.outputs = self._inline_closed(closed, list(self.inputs))
         self.makers = {name: op for op in self.operations for name in op.outputs}
+        self._drop_unused()
 
     def readers(self) -> dict[int, list[Operation]]:
         """The operations that read each value."""
@@ -106,10 +107,10 @@ class Program:
             return wanted.value
         todo = [wanted]
         while todo:
-            op = self.makers.get(todo[-1])
-            if todo[-1] in values or op is None:
+            if todo[-1] in values:
                 todo.pop()
                 continue
+            op = self.makers[todo[-1]]
             missing = [x for x in op.inputs if not isinstance(x, Constant) and x not in values]
             if missing:
                 todo += missing
@@ -138,6 +139,16 @@ class Program:
             elif through(self.makers[x]):
                 todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
         return list(found)
+
+    def _drop_unused(self) -> None:
+        """Leaves out operations on which no result depends."""
+        needed = {x for x in self.outputs if not isinstance(x, Constant)}
+        kept: list[Operation] = []
+        for op in reversed(self.operations):
+            if not needed.isdisjoint(op.outputs):
+                kept.append(op)
+                needed.update(x for x in op.inputs if not isinstance(x, Constant))
+        self.operations = kept[::-1]
 
     def _new(self) -> int:
         self._count += 1

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.lanes import Vector, plus, take, times, total
+from jaxcon.core.lanes import Vector, plus, replaced, take, times, total
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers import blocks, ordering
 from jaxcon.solvers.blocks import Block
@@ -82,12 +82,18 @@ class Elimination:
             [spread(take(x, step.elements)) for x in row]
             for row in self.diagonal[step.nodes[0].group]
         ]
-        for node in step.nodes:
+        first, *others = step.nodes
+        for node in others:
             for r, row in enumerate(self.updates.get((node, node), ())):
                 place = node.element - step.elements[0]
-                pivots[r] = [x.at[place].add(-u) for x, u in zip(pivots[r], row, strict=True)]
+                pairs = zip(pivots[r], row, strict=True)
+                pivots[r] = [replaced(x, place, blocks.minus(x[place], u)) for x, u in pairs]
         sides = [[spread(x) for x in row] for row in self._run_coupling(step)]
-        start = [[jnp.zeros(self.batch, self.dtype)] * (r + 1) for r in range(size)]
+        known = self.updates.get((first, first), [[0.0] * size] * size)
+        start = [
+            [jnp.broadcast_to(jnp.asarray(x, self.dtype), self.batch) for x in row[: r + 1]]
+            for r, row in enumerate(known)
+        ]
         last, (lower, inverse, gain, share) = jax.lax.scan(
             _eliminate, start, (pivots, sides), reverse=step.descending
         )
@@ -197,8 +203,7 @@ class RunFactor:
             y = blocks.forward(lower, right)
             return blocks.apply(gain, y), blocks.scale(y, inverse)
 
-        right = b.get_run(self.step)
-        start = [jnp.zeros(b.batch, x.dtype) for x in right]
+        right, start = b.get_run(self.step)
         at = (self.lower, self.inverse, self.gain, right)
         last, y = jax.lax.scan(eliminate, start, at, reverse=self.step.descending)
         b.subtract(self.step.parent, last)
@@ -229,6 +234,7 @@ class Vectors:
     ) -> None:
         self.shapes, self.batch = shapes, batch
         self.groups: dict[int, list[Lane]] = {}
+        self.taken: dict[Node, list[Lane]] = {}
         self.nodes: dict[Node, list[Lane]] = {}
         self.runs: dict[tuple[int, int], list[Lane]] = {}
         if values is not None:
@@ -237,10 +243,10 @@ class Vectors:
                 self.groups[start] = list(Vector.of(rows.reshape((m, k, *values.shape[1:]))))
 
     def get(self, node: Node) -> list[Lane]:
-        """The lanes of one node."""
-        if node not in self.nodes:
-            self.nodes[node] = [x[node.element] for x in self.groups[node.group]]
-        return self.nodes[node]
+        """The lanes of one node, less what was subtracted from it."""
+        own = [x[node.element] for x in self.groups[node.group]]
+        taken = self.taken.get(node, [0.0] * node.size)
+        return [blocks.minus(x, y) for x, y in zip(own, taken, strict=True)]
 
     def solution(self, node: Node) -> list[Lane]:
         """The lanes of one node that was solved by itself or in a run."""
@@ -254,18 +260,20 @@ class Vectors:
 
     def subtract(self, node: Node, amount: list[Lane]) -> None:
         """Subtracts from one node."""
-        pairs = zip(self.get(node), amount, strict=True)
-        self.nodes[node] = [blocks.minus(x, y) for x, y in pairs]
+        known = self.taken.get(node, [0.0] * node.size)
+        self.taken[node] = [plus(x, y) for x, y in zip(known, amount, strict=True)]
 
-    def get_run(self, step: Run) -> list[Lane]:
-        """The lanes of the nodes of a run, ascending, (element, …)."""
+    def get_run(self, step: Run) -> tuple[list[Array], list[Array]]:
+        """The lanes of the nodes of a run, ascending, and what to subtract from the first."""
         lanes = [take(x, step.elements) for x in self.groups[step.nodes[0].group]]
-        for node in step.nodes:
-            if node in self.nodes:
-                place = node.element - step.elements[0]
-                pairs = zip(lanes, self.nodes[node], strict=True)
-                lanes = [x.at[place].set(y) for x, y in pairs]
-        return lanes
+        first, *others = step.nodes
+        for node in (node for node in others if node in self.taken):
+            place = node.element - step.elements[0]
+            pairs = zip(lanes, self.get(node), strict=True)
+            lanes = [replaced(x, place, y) for x, y in pairs]
+        taken = self.taken.get(first, [0.0] * first.size)
+        dtype = lanes[0].dtype
+        return lanes, [jnp.broadcast_to(jnp.asarray(y, dtype), self.batch) for y in taken]
 
     def join(self) -> Array:
         """One array (n_c, …)."""

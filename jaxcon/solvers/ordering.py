@@ -114,23 +114,29 @@ def plan(structure: Any, run: int = RUN) -> Plan:
             neighbours[second].add(first)
             for key, flip in (((first, second), False), ((second, first), True)):
                 entries[key] = (*entries.get(key, ()), Entry(c, i, flip))
-    order, later = minimum_degree(neighbours)
+    grounded = [node for node in neighbours if _bodies(structure, node) == 1]
+    order, later = minimum_degree(neighbours, distances(neighbours, grounded))
     return Plan(tuple(couplings), entries, tuple(_steps(order, later, entries, run)))
 
 
-def minimum_degree(neighbours: dict[Any, set[Any]]) -> tuple[list[Any], dict[Any, list[Any]]]:
+def minimum_degree(
+    neighbours: dict[Any, set[Any]], distance: Mapping[Any, int] | None = None
+) -> tuple[list[Any], dict[Any, list[Any]]]:
     """An elimination order, and for each node its later neighbours in that order, fill included.
 
     Among nodes of equal degree the one next to the last eliminated comes first, so that chains are
-    eliminated from one end to the other.
+    eliminated from one end to the other; and before that the one next to the ground. A chain is
+    well conditioned from the ground on: each pivot is then that of a joint whose one side is held.
+    From its free end, the pivots of n links fall like 1/n³.
     """
+    distance = distance or dict.fromkeys(neighbours, 0)
     graph = {node: set(around) for node, around in neighbours.items()}
     rank = {node: i for i, node in enumerate(graph)}
     order: list[Any] = []
     later: dict[Any, set[Any]] = {}
     near: set[Any] = set()
     while graph:
-        node = min(graph, key=lambda x: (len(graph[x]), x not in near, -rank[x]))
+        node = min(graph, key=lambda x: (len(graph[x]), x not in near, distance[x], rank[x]))
         around = graph.pop(node)
         for other in around:
             graph[other] |= around - {other}
@@ -139,6 +145,21 @@ def minimum_degree(neighbours: dict[Any, set[Any]]) -> tuple[list[Any], dict[Any
         order.append(node)
     position = {node: i for i, node in enumerate(order)}
     return order, {node: sorted(s, key=position.__getitem__) for node, s in later.items()}
+
+
+def distances(neighbours: dict[Any, set[Any]], start: list[Any]) -> dict[Any, int]:
+    """How many nodes away each is from the nearest of some; all of them where there is none."""
+    result = dict.fromkeys(start, 0)
+    front = start
+    while front:
+        front = [other for node in front for other in neighbours[node] if other not in result]
+        result.update(dict.fromkeys(front, max(result.values()) + 1))
+    return {node: result.get(node, len(neighbours)) for node in neighbours}
+
+
+def _bodies(structure: Any, node: Node) -> int:
+    """How many moving bodies a constraint touches."""
+    return sum(start == node.group for start, _, _ in structure)
 
 
 def _nodes(structure: Any) -> tuple[dict[tuple[int, int], Node], dict[Any, list[Any]]]:
