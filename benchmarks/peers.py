@@ -167,6 +167,7 @@ def mjx_here(name: str, batch: int, work: int = 20_000, repeats: int = 5) -> dic
     """The same in this process, at one batch: rate, and compile time of one step [s]."""
     mechanism = mechanisms.find(name)
     model, data = mjx_start(mechanism, batch)
+    data = timing.over_devices(data, batch)
     step = jax.vmap(functools.partial(mjx_step(), model))
     _, seconds = timing.compile_seconds(step, data)
     steps = max(10, work // batch)
@@ -209,6 +210,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=256)
     options = parser.parse_args()
     if options.mjx:
+        timing.use_all_cores()
         print(json.dumps(mjx_here(options.mjx, options.batch)))
         return
     print(f"world-steps a second, {timing.cores()} cores, {timing.versions()}")

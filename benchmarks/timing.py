@@ -55,6 +55,21 @@ def cores() -> int:
     return os.cpu_count() or 1
 
 
+def use_all_cores() -> None:
+    """Makes JAX see one device a core; to be called before JAX is used."""
+    jax.config.update("jax_num_cpu_devices", cores())
+
+
+def over_devices(worlds: Any, batch: int) -> Any:
+    """A batch spread over all devices, where it can be divided among them."""
+    devices = jax.devices()
+    if batch % len(devices):
+        return worlds
+    mesh = jax.sharding.Mesh(np.asarray(devices), ("worlds",))
+    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("worlds"))
+    return jax.device_put(worlds, sharding)
+
+
 def machine() -> dict[str, Any]:
     """What a file of results says about where they were measured."""
     return {

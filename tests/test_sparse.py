@@ -168,3 +168,43 @@ def test_a_dependent_row_is_singular(name):
     )
     twice = dataclasses.replace(twice, target=jnp.ones(n + size))
     assert quick_jit(lambda: Sparse().solve(twice))().status == jc.Status.SINGULAR
+
+
+def hinge_twice(dtype):
+    """A link on two hinges at the same point: two of four rows are redundant."""
+    scene = jc.Scene(dim=2, dtype=dtype)
+    scene.add_body("link", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    for name in ("one", "two"):
+        scene.add(jc.Revolute(name, jc.WORLD, "link", point=(0.0, 0.0)))
+    return scene.build()
+
+
+@pytest.mark.parametrize("solver", [jc.Sparse, jc.Schur])
+@pytest.mark.parametrize(
+    ("dtype", "share", "bound"), [("float32", 1e-5, 1e-3), ("float64", 1e-10, 1e-8)]
+)
+def test_regularised_redundant_rows_share_the_load(solver, dtype, share, bound):
+    system, state = hinge_twice(np.dtype(dtype))
+    plain = jc.forward_dynamics(system, state, None, jc.Method(solver=solver()), 1e-3)
+    assert plain.status == jc.Status.SINGULAR
+    method = jc.Method(solver=solver(tikhonov=share))
+    found = jc.forward_dynamics(system, state, None, method, 1e-3)
+    assert found.status == jc.Status.OK
+    # the point of a rod hung at its end falls freely about the hinge: a = m g l / (I + m l²) l
+    turn = -9.81 * 0.5 / (0.1 + 0.25)
+    np.testing.assert_allclose(found.acceleration, [0.0, 0.5 * turn, turn], rtol=bound, atol=bound)
+    one, two = found.multipliers.reshape(2, 2).T
+    np.testing.assert_allclose(one, two, rtol=1e-2, atol=1e-2)
+
+
+def test_a_regularised_solution_has_a_gradient():
+    system, state = hinge_twice(np.float64)
+
+    def turn(mass):
+        changed = system.with_params({"link": {"mass": mass}})
+        method = jc.Method(solver=jc.Sparse(tikhonov=1e-10))
+        return jc.forward_dynamics(changed, state, None, method, 1e-3).acceleration[2]
+
+    # −m g l / (I + m l²) by m
+    exact = -9.81 * 0.5 * 0.1 / (0.1 + 0.25) ** 2
+    np.testing.assert_allclose(jax.grad(turn)(1.0), exact, rtol=1e-6)

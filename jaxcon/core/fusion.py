@@ -62,7 +62,8 @@ OTHERS = _names("concatenate dynamic_update_slice pad gather scan split stack un
 
 
 WHOLE, PART = 100, 24
-"""Steps in one kernel, and in each where there are more: compiling takes longer than in proportion."""
+"""Steps in one kernel, and in each of several where there are more: compiling a kernel takes longer
+than in proportion to its size."""
 
 Step = Operation | list[int]
 """An operation by itself, or the values of a stage."""
@@ -163,11 +164,7 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
         (name,) = op.outputs
         needed: set[int] = {name} if name in results else set()
         for reader in readers.get(name, ()):
-            after = reader.outputs[0]
-            if not _elementwise(reader):
-                needed.add(name)
-            else:
-                needed |= kernels[after]
+            needed |= kernels[reader.outputs[0]] if _elementwise(reader) else {name}
         if name in needed:
             ends.add(name)
         if op.name not in MOVES and (len(needed) > 1 or name in needed):
@@ -217,9 +214,21 @@ def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[
     results: list[tuple[list[Step], list[int]]] = []
     for part, own in reversed(list(zip(parts, made, strict=True))):
         results.append((part, [x for x in own if x in needed]))
-        operands = [y for x in own for y in program.makers[x].inputs]
-        needed |= set(program.leaves(known, [y for y in operands if not isinstance(y, Constant)]))
-    return [(part, wanted) for part, wanted in reversed(results) if wanted]
+        for op in {id(op): op for step in part for op in _operations(program, step)}.values():
+            needed |= set(
+                program.leaves(known, [x for x in op.inputs if not isinstance(x, Constant)])
+            )
+    return [(part, wanted) for part, wanted in reversed(results) if wanted or _acts(part)]
+
+
+def _operations(program: Program, step: Step) -> list[Operation]:
+    """The operations that make what a step computes."""
+    return [step] if isinstance(step, Operation) else [program.makers[x] for x in step]
+
+
+def _acts(part: list[Step]) -> bool:
+    """Whether it does something besides computing, such as printing."""
+    return any(isinstance(step, Operation) and step.effects for step in part)
 
 
 def _values(step: Step) -> list[int]:

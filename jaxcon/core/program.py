@@ -59,6 +59,7 @@ class Operation:
     inputs: list[Operand]
     outputs: list[int]
     inexact: bool
+    effects: bool
 
     @property
     def name(self) -> str:
@@ -145,7 +146,7 @@ class Program:
         needed = {x for x in self.outputs if not isinstance(x, Constant)}
         kept: list[Operation] = []
         for op in reversed(self.operations):
-            if not needed.isdisjoint(op.outputs):
+            if op.effects or not needed.isdisjoint(op.outputs):
                 kept.append(op)
                 needed.update(x for x in op.inputs if not isinstance(x, Constant))
         self.operations = kept[::-1]
@@ -201,8 +202,9 @@ class Program:
             return self._known[key]
         outputs = [self._new() for _ in equation.outvars]
         inexact = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
-        self.operations.append(Operation(primitive, params, args, outputs, inexact))
-        if key is not None:
+        effects = bool(equation.effects)
+        self.operations.append(Operation(primitive, params, args, outputs, inexact, effects))
+        if key is not None and not effects:
             self._known[key] = outputs
         return outputs
 
@@ -231,8 +233,10 @@ def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
 
     The compiler would find it out later, when what is stored has been decided.
     """
+    if len(equation.outvars) != 1:
+        return None
     name, aval = equation.primitive.name, equation.outvars[0].aval
-    if len(equation.outvars) == 1 and 0 in aval.shape:
+    if 0 in aval.shape:
         return [Constant(np.zeros(aval.shape, aval.dtype))]
     exponent = args[1] if name == "pow" and len(args) == 2 else None
     power = equation.params.get("y") if name == "integer_pow" else exponent

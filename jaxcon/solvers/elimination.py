@@ -291,6 +291,23 @@ def _at(x: Lane, i: int) -> Lane:
     return x[i] if isinstance(x, jax.Array) else x
 
 
+def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
+    """C + ε diag(J M⁻¹ Jᵀ), (n_c,), with the diagonal held constant."""
+    jacobian, inverse_mass, _ = matrices
+    rows: dict[int, list[Lane]] = {}
+    for block in jacobian.blocks:
+        weight = block.columns.take(inverse_mass)
+        squares = [
+            total(times(w, times(x, x)) for x, w in zip(row, weight, strict=True))
+            for row in block.value
+        ]
+        known = rows.get(block.start, [0.0] * len(squares))
+        rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
+    diagonal = jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
+    added = jnp.asarray(share).astype(diagonal.dtype)[None] * diagonal
+    return added if compliance is None else compliance + added
+
+
 def _blocks_of(plan: Plan, jacobian: Jacobian, inverse_mass: Array) -> Any:
     """The diagonal blocks of A by group, lower triangles, and its couplings, by lanes."""
     weighted = []

@@ -1,5 +1,7 @@
 """The Schur complement on the multipliers (chapter 3.2.5, method 2)."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -19,9 +21,14 @@ class Schur:
     The derivative is that of the solution, not of the factorization: dλ = A⁻¹(db − dA λ) reuses
     the factor, in forward and in reverse mode.
 
+    Attributes:
+        tikhonov: ε of a regularised system (A + ε diag A) λ = b − J M⁻¹ f, or None; see `Sparse`.
+
     References:
         Featherstone, Rigid Body Dynamics Algorithms (2008), section 8.
     """
+
+    tikhonov: Any = None
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.
@@ -31,13 +38,16 @@ class Schur:
         if not system.target.size:
             return free_motion(system)
         rank = system.target.ndim - 1
-        return native.per_world(_solve, rank)(system)
+        return native.per_world(_solve, rank)(system, self.tikhonov)
 
 
-def _solve(system: Saddle) -> Solution:
+def _solve(system: Saddle, tikhonov: Any) -> Solution:
     """Of one world."""
     j = system.jacobian.dense()
     a = delassus(system.mass, j, system.compliance)
+    if tikhonov is not None:
+        share = jnp.asarray(tikhonov).astype(a.dtype)
+        a = a + jnp.diag(jax.lax.stop_gradient(share * jnp.diagonal(a)))
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(a), symmetrize_input=False)
     free = system.mass.solve(system.force)
     multipliers = jax.lax.custom_linear_solve(
@@ -47,7 +57,8 @@ def _solve(system: Saddle) -> Solution:
         symmetric=True,
     )
     acceleration = free + system.mass.solve(j.T @ multipliers)
-    dependent = _dependent(factor, a) & jnp.all(jnp.isfinite(a))
+    rounding = 0.0 if tikhonov is not None else a.shape[0] * float(jnp.finfo(a.dtype).eps)
+    dependent = _dependent(factor, a, rounding) & jnp.all(jnp.isfinite(a))
     status = judge(acceleration, dependent | system.mass.singular)
     return Solution(acceleration, multipliers, status)
 
@@ -58,11 +69,11 @@ def delassus(mass: Mass, jacobian: Array, compliance: Array | None) -> Array:
     return a if compliance is None else a + jnp.diag(compliance)
 
 
-def _dependent(factor: Array, a: Array) -> Array:
+def _dependent(factor: Array, a: Array, rounding: float) -> Array:
     """Whether a row is, to round-off, a combination of the rows before it.
 
     The square of a Cholesky pivot over the diagonal entry is the part of a row that the earlier
     ones do not explain: 1 for an orthogonal row, round-off for a dependent one.
     """
     share = jnp.diagonal(factor) ** 2 / jnp.diagonal(a)
-    return ~jnp.all(share > a.shape[0] * jnp.finfo(a.dtype).eps)
+    return ~jnp.all(share > rounding)

@@ -9,6 +9,8 @@ proportion to its joints, and no matrix of the size of the system is ever formed
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -16,7 +18,7 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import ordering
 from jaxcon.solvers.blocks import freeze
-from jaxcon.solvers.elimination import Elimination
+from jaxcon.solvers.elimination import Elimination, regularized
 from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
 
@@ -30,6 +32,9 @@ class Sparse:
     dense, and `Schur` takes over.
 
     Attributes:
+        tikhonov: ε of a regularised system (A + ε diag A) λ = b − J M⁻¹ f, or None; gives redundant
+            rows a solution, which holds them to ε λ. 1e-6 suits float32, 1e-10 float64. The
+            derivative is that of the regularised system with diag A held.
         run: equal nodes in a row from which a scan is used instead of unrolled code.
 
     References:
@@ -37,6 +42,7 @@ class Sparse:
         Davis, Direct Methods for Sparse Linear Systems (2006), chapters 4 and 7.
     """
 
+    tikhonov: Any = None
     run: int = static(default=ordering.RUN)
 
     def solve(self, system: Saddle) -> Solution:
@@ -51,6 +57,9 @@ class Sparse:
         j, compliance = system.jacobian, system.compliance
         free = system.mass.solve(system.force)
         matrices = freeze((j, 1 / system.mass.values, compliance))
+        if self.tikhonov is not None:
+            compliance = regularized(compliance, freeze(self.tikhonov), matrices)
+            matrices = (*matrices[:2], freeze(compliance))
         elimination = Elimination(matrices, self.run, free.shape[1:])
 
         def delassus(x: Array) -> Array:
@@ -64,6 +73,7 @@ class Sparse:
             symmetric=True,
         )
         acceleration = free + system.mass.solve(j.transpose(multipliers))
-        explained = elimination.share > len(system.target) * jnp.finfo(free.dtype).eps
+        rounding = len(system.target) * jnp.finfo(free.dtype).eps
+        explained = elimination.share > (rounding if self.tikhonov is None else 0)
         dependent = (~explained & elimination.finite) | system.mass.singular
         return Solution(acceleration, multipliers, judge(acceleration, dependent))
