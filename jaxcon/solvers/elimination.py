@@ -94,10 +94,9 @@ class Elimination:
             [jnp.broadcast_to(jnp.asarray(x, self.dtype), self.batch) for x in row[: r + 1]]
             for r, row in enumerate(known)
         ]
-        last, (lower, inverse, gain, share) = jax.lax.scan(
-            _eliminate, start, (pivots, sides), reverse=step.descending
+        (last, self.share), (lower, inverse, gain) = jax.lax.scan(
+            _eliminate, (start, self.share), (pivots, sides), reverse=step.descending
         )
-        self.share = jnp.minimum(self.share, jnp.min(jnp.stack(share), axis=(0, 1)))
         full = [[last[r][c] if c <= r else 0.0 for c in range(size)] for r in range(size)]
         self._update(step.parent, step.parent, full)
         return RunFactor(step, lower, inverse, gain)
@@ -147,18 +146,19 @@ def _halve(lower: Block, side: Block) -> Block:
     return [blocks.forward(lower, row) for row in side]
 
 
-def _eliminate(update: Any, at: Any) -> Any:
+def _eliminate(carry: Any, at: Any) -> Any:
     """One node of a run: its pivot less the update, its gain, and the update of the next pivot."""
-    pivot, side = at
+    (update, share), (pivot, side) = carry, at
     size = len(pivot)
     rows = zip(pivot, update, strict=True)
     changed = [[x - u for x, u in zip(p, w, strict=False)] for p, w in rows]
     lower, inverse = blocks.ldl(changed)
-    share = [1 / (inverse[r] * pivot[r][r]) for r in range(size)]
+    for r in range(size):
+        share = jnp.minimum(share, 1 / (inverse[r] * pivot[r][r]))
     half = _halve(lower, side)
     gain = [blocks.scale(row, inverse) for row in half]
     following = [[total(map(times, half[r], gain[c])) for c in range(r + 1)] for r in range(size)]
-    return following, (lower, inverse, gain, share)
+    return (following, share), (lower, inverse, gain)
 
 
 @dataclass(frozen=True)
