@@ -136,6 +136,12 @@ def test_what_a_function_does_besides_is_done(capsys):
     assert "seen 0.3" in capsys.readouterr().out
 
 
+def test_it_can_be_left_to_the_compiler(monkeypatch):
+    monkeypatch.setenv("JAXCON_STAGES", "off")
+    left = jax.jit(fusion.settled(chain_of_shared_values)).lower(X, Y).as_text()
+    assert "inlineable" not in left
+
+
 SHARDED = """
 import jax
 jax.config.update("jax_num_cpu_devices", 2)

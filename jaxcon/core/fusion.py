@@ -9,13 +9,15 @@ stages, each a call that computes values which do not depend on each other, and 
 after it read from cache. All of it together is one kernel of one thread, so that nothing is spent
 on launching kernels and passing them between threads.
 
-The attributes are hints: a compiler that does not know them gives the same results. They are those
-of XLA 0.7 (2025) and later, `xla/service/call_inliner.cc` and `xla/service/cpu/thunk_emitter.cc`.
+The attributes by which a call says so are hints of XLA's call inliner and CPU emitter, as in jaxlib
+0.10: a compiler that does not know them gives the same results, more slowly. The environment
+variable JAXCON_STAGES=off leaves all of it to the compiler.
 """
 
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -73,6 +75,8 @@ def settled(function: Callable[..., Any]) -> Callable[..., list[Array]]:
     """The function of arrays that returns a list of them, cut into stages."""
 
     def run(*args: Array) -> list[Array]:
+        if os.environ.get("JAXCON_STAGES") == "off":
+            return function(*args)
         return Stages(jax.make_jaxpr(function)(*args))(*args)
 
     return run
