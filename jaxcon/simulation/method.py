@@ -6,7 +6,7 @@ from typing import Any
 
 from jaxcon.core.pytree import pytree
 from jaxcon.simulation.integrators import SemiImplicitEuler
-from jaxcon.solvers.schur import Schur
+from jaxcon.solvers.sparse import Sparse
 from jaxcon.stabilization.baumgarte import Baumgarte
 
 
@@ -17,12 +17,12 @@ class Method:
     Attributes:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
         stabilizer: `Baumgarte(…)` or `Unstabilized()`.
-        solver: `Schur()`, `Sparse()` or `Dense()`.
+        solver: `Sparse()`, `Schur()` or `Dense()`.
     """
 
     integrator: Any = SemiImplicitEuler()
     stabilizer: Any = Baumgarte()
-    solver: Any = Schur()
+    solver: Any = Sparse()
 
     def feedback(self, dt: Any) -> Any:
         """The stabiliser, its missing gains chosen for the integrator at this step."""
