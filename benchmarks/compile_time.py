@@ -11,8 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -49,23 +47,9 @@ def seconds_here(name: str, solver: str, batch: int = 256) -> dict[str, float]:
 
 def seconds(name: str, solver: str, limit: float) -> dict[str, float] | str:
     """The same in a fresh process, or why there is no time."""
-    command = [sys.executable, "-m", "benchmarks.compile_time", "--here", name, "--solver", solver]
+    arguments = ["benchmarks.compile_time", "--here", name, "--solver", solver]
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
-    try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=limit,
-            cwd=peers.ROOT,
-            check=True,
-            env=environment,
-        )
-    except subprocess.TimeoutExpired:
-        return f"over {limit:g} s"
-    except subprocess.CalledProcessError as error:
-        return f"fails: {(error.stderr.strip().splitlines() or ['?'])[-1]}"
-    return json.loads(done.stdout.splitlines()[-1])
+    return timing.in_process(arguments, environment, limit, "over")
 
 
 def mjx_seconds(name: str, limit: float) -> float | str:

@@ -13,11 +13,8 @@ import argparse
 import functools
 import json
 import os
-import subprocess
-import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -29,7 +26,6 @@ from benchmarks.mechanisms import Mechanism
 from benchmarks.targets import SCENES
 from benchmarks.timing import Rate
 
-ROOT = Path(__file__).parents[1]
 BATCHES = (64, 256, 1024)
 FLAGS = ("--xla_cpu_use_fusion_emitters=false", "")
 """Settings of XLA that MJX is tried with: on long chains the first is many times faster."""
@@ -142,24 +138,11 @@ def mjx(name: str, batches: tuple[int, ...] = BATCHES, limit: float = 240.0) -> 
 
 def mjx_process(name: str, batch: int, flags: str, limit: float) -> MjxRun | str:
     """One run in a process of its own, or why there is none."""
-    command = [sys.executable, "-m", "benchmarks.peers", "--mjx", name, "--batch", str(batch)]
-    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}"}
-    setting = f"batch {batch}" + (f" with {flags}" if flags else "")
-    try:
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            text=True,
-            timeout=limit,
-            cwd=ROOT,
-            check=True,
-            env=environment,
-        )
-    except subprocess.TimeoutExpired:
-        return f"{setting} does not compile and run in {limit:g} s"
-    except subprocess.CalledProcessError as error:
-        return f"{setting} fails: {(error.stderr.strip().splitlines() or ['?'])[-1]}"
-    found = json.loads(done.stdout.splitlines()[-1])
+    arguments = ["benchmarks.peers", "--mjx", name, "--batch", str(batch)]
+    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
+    found = timing.in_process(arguments, environment, limit, "does not compile and run in")
+    if isinstance(found, str):
+        return f"batch {batch}" + (f" with {flags}" if flags else "") + f" {found}"
     return MjxRun(batch, flags, Rate(**found["rate"]), found["compile"])
 
 

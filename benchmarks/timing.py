@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import platform
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+
+ROOT = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -46,6 +52,34 @@ def compile_seconds(function: Callable[..., Any], *args: Any) -> tuple[Any, floa
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
     return compiled, time.perf_counter() - start
+
+
+def in_process(
+    arguments: list[str], environment: dict[str, str], limit: float, late: str
+) -> dict[str, Any] | str:
+    """What a module prints as JSON when run in a process of its own, or why there is nothing.
+
+    Args:
+        arguments: of `python -m`.
+        environment: of the process.
+        limit: on its time [s].
+        late: what to say where it takes longer.
+    """
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=limit,
+            cwd=ROOT,
+            check=True,
+            env=environment,
+        )
+    except subprocess.TimeoutExpired:
+        return f"{late} {limit:g} s"
+    except subprocess.CalledProcessError as error:
+        return f"fails: {(error.stderr.strip().splitlines() or ['?'])[-1]}"
+    return json.loads(done.stdout.splitlines()[-1])
 
 
 def cores() -> int:

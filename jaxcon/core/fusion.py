@@ -218,10 +218,8 @@ def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[
     results: list[tuple[list[Step], list[int]]] = []
     for part, own in reversed(list(zip(parts, made, strict=True))):
         results.append((part, [x for x in own if x in needed]))
-        for op in {id(op): op for step in part for op in _operations(program, step)}.values():
-            needed |= set(
-                program.leaves(known, [x for x in op.inputs if not isinstance(x, Constant)])
-            )
+        operands = (x for step in part for op in _operations(program, step) for x in op.inputs)
+        needed |= set(program.leaves(known, [x for x in operands if not isinstance(x, Constant)]))
     return [(part, wanted) for part, wanted in reversed(results) if wanted or _acts(part)]
 
 
