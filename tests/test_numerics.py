@@ -135,11 +135,15 @@ def test_negative_numbers_have_no_root():
     assert jax.grad(numerics.safe_sqrt)(-1.0) == 0
 
 
-def test_cos_sinc_is_exact_on_both_sides_of_the_switch():
-    for s in (0.0099999, 0.0100001):
-        root = np.sqrt(s)
-        got = numerics.cos_sinc(jnp.asarray(s))
-        np.testing.assert_allclose(got, [np.cos(root), np.sin(root) / root], rtol=4e-16)
+def test_cos_sinc_is_exact_within_and_across_half_turns():
+    edges = np.array([1, 3, 5, 41]) * np.pi / 2
+    for root in (1e-9, 1e-3, 0.1, 1.5, 3.0, np.pi, 100.0, *(edges - 1e-9), *(edges + 1e-9)):
+        got, slope = jax.jvp(numerics.cos_sinc, (root**2,), (1.0,))
+        cos, sinc = np.cos(root), np.sin(root) / root
+        np.testing.assert_allclose(got, [cos, sinc], rtol=0, atol=4e-16 * (1 + root))
+        near = -1 / 6 + root**2 / 60  # of sin √s / √s
+        bent = near if root < 1e-2 else (cos - sinc) / (2 * root**2)
+        np.testing.assert_allclose(slope, [-sinc / 2, bent], rtol=0, atol=2e-14)
 
 
 def test_wrap_keeps_the_slope_everywhere():

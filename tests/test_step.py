@@ -169,4 +169,5 @@ def test_control_reaches_the_body():
     alone, _ = jc.step(built.system, jc.Method(), built.state, None, 1e-3)
     assert np.any(np.abs(pushed.v - alone.v) > 1e-4)
     nothing, _ = jc.step(built.system, jc.Method(), built.state, 0 * control, 1e-3)
-    np.testing.assert_array_equal(nothing.v, alone.v)
+    # two programs, in which the compiler contracts other products and sums
+    np.testing.assert_allclose(nothing.v, alone.v, rtol=IDENTITY, atol=1e-16)

@@ -24,8 +24,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend import core as jex
 
-from jaxcon.core.program import Constant, Operation, Program
+from jaxcon.core.program import Constant, Operand, Operation, Program, traced
 from jaxcon.core.typing import Array
 
 WORTH = 4
@@ -56,7 +57,10 @@ COSTLY = _names(
 )
 """Elementwise operations that are always worth storing."""
 
-SHIFTS = MOVES | {"concatenate", "pad"}
+SLICES = _names("dynamic_slice gather")
+"""Operations of which the first operand is in the result, and the place perhaps not."""
+
+SHIFTS = MOVES - SLICES | {"concatenate", "pad"}
 """Operations of which every operand is in the result."""
 
 OTHERS = _names("concatenate dynamic_update_slice pad gather scan split stack unstack")
@@ -77,7 +81,7 @@ def settled(function: Callable[..., Any]) -> Callable[..., list[Array]]:
     def run(*args: Array) -> list[Array]:
         if os.environ.get("JAXCON_STAGES") == "off":
             return function(*args)
-        return Stages(jax.make_jaxpr(function)(*args))(*args)
+        return Stages(traced(function, *args))(*args)
 
     return run
 
@@ -248,13 +252,19 @@ def _elementwise(op: Operation) -> bool:
     return op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY
 
 
-def _surely_read(op: Operation) -> bool:
-    """Whether no compiler can find that the result does not depend on an operand.
+def _surely_read(op: Operation, whole: bool) -> Sequence[Operand]:
+    """The operands of which no compiler can find that the results do not depend on them.
 
-    Arithmetic in floating point is such, since NaN spreads through it; a choice between two values
-    is not, since they may turn out to be the same.
+    Arithmetic in floating point depends on all of them, since NaN spreads through it; a choice
+    between two values does not, since they may turn out to be the same. Loops read what kernels in
+    their bodies read.
     """
-    return op.name in SHIFTS or (op.inexact and op.name in (ARITHMETIC | COSTLY) - {"select_n"})
+    if op.name == "scan" and whole:
+        return [x for i, x in enumerate(op.inputs) if i in op.read]
+    if op.name in SLICES:
+        return op.inputs[:1]
+    arithmetic = op.inexact and op.name in (ARITHMETIC | COSTLY) - {"select_n"}
+    return op.inputs if arithmetic or op.name in SHIFTS else []
 
 
 def _kernel(
@@ -287,7 +297,10 @@ def _read(x: Array) -> Array:
     return x != x if jnp.issubdtype(x.dtype, jnp.inexact) else x > 0  # noqa: PLR0124
 
 
-def _settled_body(closed: Any) -> Any:
-    """The body of a loop, cut into stages itself."""
+def _settled_body(closed: Any) -> tuple[Any, frozenset[int]]:
+    """The body of a loop, cut into stages itself, and which of its arguments kernels read."""
     inputs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in closed.jaxpr.invars]
-    return jax.make_jaxpr(Stages(closed))(*inputs)
+    settled = jax.make_jaxpr(Stages(closed))(*inputs)
+    barriers = [x for x in settled.jaxpr.eqns if x.primitive.name == "optimization_barrier"]
+    read = {x for barrier in barriers for x in barrier.invars if not isinstance(x, jex.Literal)}
+    return settled, frozenset(i for i, x in enumerate(settled.jaxpr.invars) if x in read)

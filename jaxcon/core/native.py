@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core import fusion
 from jaxcon.core.typing import Array, PyTree
@@ -46,6 +46,7 @@ class Native:
         self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
         self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
         self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
+        self.part = functools.lru_cache(maxsize=None)(self._part)
         self.shapes = functools.lru_cache(maxsize=64)(self._shapes)
 
     def __call__(self, *args: Array) -> list[Array]:
@@ -72,6 +73,14 @@ class Native:
                 " params= instead."
             )
         return shapes
+
+    def _part(self, wanted: tuple[bool, ...]) -> Native:
+        """Some of the results."""
+
+        def part(*args: Array) -> list[Array]:
+            return [y for y, flag in zip(self(*args), wanted, strict=True) if flag]
+
+        return Native(part, self.full)
 
     def _tangent(self, moved: tuple[bool, ...]) -> Native:
         """(x, ẋ of the moved arguments) → the tangents of the floating results."""
@@ -247,6 +256,16 @@ def _transpose(cotangents: Any, *args: Any, fun: Native) -> Any:
     return [next(found) if flag else None for flag in linear]
 
 
+def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]:
+    """Leaves out the results that nobody needs, and what is done for them alone."""
+    if not any(wanted):
+        return [False] * len(equation.invars), None
+    results = [x for x, flag in zip(equation.outvars, wanted, strict=True) if flag]
+    fun = equation.params["fun"].part(tuple(wanted))
+    kept = equation if all(wanted) else equation.replace(outvars=results, params={"fun": fun})
+    return [True] * len(equation.invars), kept
+
+
 native_p.def_impl(lambda *args, fun: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
 mlir.register_lowering(
@@ -259,4 +278,5 @@ mlir.register_lowering(
 )
 batching.primitive_batchers[native_p] = _batched
 ad.primitive_jvps[native_p] = _jvp
+partial_eval.dce_rules[native_p] = _without_unused
 ad.primitive_transposes[native_p] = _transpose

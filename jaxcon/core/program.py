@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
+from jax.interpreters import partial_eval
 
 from jaxcon.core.typing import Array
 
@@ -52,7 +53,15 @@ Operand = int | Constant
 
 @dataclass
 class Operation:
-    """One instruction on numbered values."""
+    """One instruction on numbered values.
+
+    Attributes:
+        inputs, outputs: operands and results.
+        inexact: whether the results are of floating point.
+        effects: whether it does something besides.
+        read: which operands a loop reads if its results are needed, those apart that are only
+            carried from one round to the next.
+    """
 
     primitive: Any
     params: dict[str, Any]
@@ -60,6 +69,7 @@ class Operation:
     outputs: list[int]
     inexact: bool
     effects: bool
+    read: frozenset[int] = frozenset()
 
     @property
     def name(self) -> str:
@@ -72,6 +82,13 @@ class Operation:
         return results if self.primitive.multiple_results else [results]
 
 
+def traced(function: Callable[..., Any], *args: Any) -> Any:
+    """The closed jaxpr of a function, without what no result needs."""
+    closed = jax.make_jaxpr(function)(*args)
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, True, instantiate=True)
+    return jex.ClosedJaxpr(jaxpr, closed.consts)
+
+
 class Program:
     """A function as operations in order.
 
@@ -82,8 +99,13 @@ class Program:
         makers: the operation that makes a value.
     """
 
-    def __init__(self, closed: Any, inner: Callable[[Any], Any]) -> None:
-        """Flattens a closed jaxpr; `inner` rewrites the bodies of loops."""
+    def __init__(self, closed: Any, inner: Callable[[Any], tuple[Any, frozenset[int]]]) -> None:
+        """Flattens a closed jaxpr.
+
+        Args:
+            closed: the jaxpr.
+            inner: rewrites the body of a loop, and says which of its arguments it surely reads.
+        """
         self.operations: list[Operation] = []
         self._inner = inner
         self._known: dict[Any, list[int]] = {}
@@ -124,9 +146,16 @@ class Program:
         self,
         known: Any,
         wanted: list[int],
-        through: Callable[[Operation], bool] = lambda op: True,
+        through: Callable[[Operation, bool], Sequence[Operand]] = lambda op, whole: op.inputs,
     ) -> list[int]:
-        """The known values from which others are made, as far as it is by certain operations."""
+        """The known values from which others are made.
+
+        Args:
+            known: values.
+            wanted: what is made.
+            through: (operation, whether all of its results are wanted or lead to what is wanted) →
+                the operands to follow.
+        """
         found: dict[int, None] = {}
         seen: set[int] = set()
         todo = list(reversed(wanted))
@@ -137,9 +166,16 @@ class Program:
             seen.add(x)
             if x in known:
                 found[x] = None
-            elif through(self.makers[x]):
-                todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
+            else:
+                op = self.makers[x]
+                operands = through(op, seen.issuperset(self._results(op)))
+                todo += [y for y in operands if not isinstance(y, Constant)]
         return list(found)
+
+    def _results(self, op: Operation) -> list[int]:
+        """Of an operation, without what a loop only carries from one round to the next."""
+        carried = op.outputs[: op.params["num_carry"]] if op.name == "scan" else []
+        return [x for x in op.outputs if x not in carried or x in self._used]
 
     def _drop_unused(self) -> None:
         """Leaves out operations on which no result depends."""
@@ -149,7 +185,7 @@ class Program:
             if op.effects or not needed.isdisjoint(op.outputs):
                 kept.append(op)
                 needed.update(x for x in op.inputs if not isinstance(x, Constant))
-        self.operations = kept[::-1]
+        self.operations, self._used = kept[::-1], needed
 
     def _new(self) -> int:
         self._count += 1
@@ -183,7 +219,7 @@ class Program:
             return self._inline_closed(params["jaxprs"].solve, given)
         if name == "native":
             avals = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
-            return self._inline_closed(jax.make_jaxpr(params["fun"])(*avals), args)
+            return self._inline_closed(traced(params["fun"], *avals), args)
         folded = _known_result(equation, args)
         if folded is not None:
             return folded
@@ -191,10 +227,18 @@ class Program:
             fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
             return self._inline_closed(jax.make_jaxpr(fold)(equation.invars[0].aval), args)
         if name == "scan":
-            params = params | {"jaxpr": self._inner(params["jaxpr"])}
+            body, read = self._inner(params["jaxpr"])
+            read = read if params["length"] else frozenset()
+            return self._emit(equation, params | {"jaxpr": body}, args, read)
         return self._emit(equation, params, args)
 
-    def _emit(self, equation: Any, params: Any, args: list[Operand]) -> list[Any]:
+    def _emit(
+        self,
+        equation: Any,
+        params: Any,
+        args: list[Operand],
+        read: frozenset[int] = frozenset(),
+    ) -> list[Any]:
         """Appends an operation, or finds the same one done before."""
         primitive = equation.primitive
         key = _key(primitive, params, args)
@@ -203,24 +247,27 @@ class Program:
         outputs = [self._new() for _ in equation.outvars]
         inexact = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
         effects = bool(equation.effects)
-        self.operations.append(Operation(primitive, params, args, outputs, inexact, effects))
+        self.operations.append(Operation(primitive, params, args, outputs, inexact, effects, read))
         if key is not None and not effects:
             self._known[key] = outputs
         return outputs
 
 
 def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -> Array:
-    """The reduction over the first axes: the second half onto the first, until one is left."""
+    """The reduction over the first axes: the second half onto the first, until one is left.
+
+    Of an odd number the one in the middle belongs to both halves where that changes nothing, and
+    the last one waits where it does.
+    """
     x = x.reshape((-1, *x.shape[axes:]))
+    waiting: list[Array] = []
     while len(x) > 1:
-        half, odd = divmod(len(x), 2)
-        folded = operation(x[:half], x[half : 2 * half])
-        if odd and half > 1:
-            folded = jax.lax.concatenate([folded, x[-1:]], 0)
-        elif odd:
-            folded = operation(folded, x[-1:])
-        x = folded
-    return x[0]
+        if len(x) % 2 and operation is jax.lax.add:
+            waiting.append(x[-1])
+            x = x[:-1]
+        half = (len(x) + 1) // 2
+        x = operation(x[:half], x[len(x) - half :])
+    return functools.reduce(operation, waiting, x[0])
 
 
 def _leading(axes: Any, shape: tuple[int, ...]) -> bool:

@@ -1,6 +1,7 @@
 """Small dense matrices by lanes: blocks of a sparse factorization in unrolled scalar formulas.
 
-A matrix is a list of rows of lanes.
+A matrix is a list of rows of lanes; of a symmetric one and of its factor, the rows of the lower
+triangle.
 """
 
 from __future__ import annotations
@@ -29,42 +30,39 @@ def minus(x: Lane, y: Lane) -> Lane:
     return plus(x, times(-1, y))
 
 
-def ldl(a: Block) -> tuple[Block, list[Lane]]:
-    """A = L D Lᵀ from the lower triangle of A: L strictly below the diagonal, and D⁻¹."""
-    n = len(a)
-    lower: Block = [[0.0] * n for _ in range(n)]
-    pivots: list[Lane] = []
-    inverse: list[Lane] = []
-    for j in range(n):
-        scaled = [times(lower[j][k], pivots[k]) for k in range(j)]
-        pivots.append(minus(a[j][j], total(map(times, lower[j], scaled))))
-        inverse.append(1 / pivots[j])
-        for i in range(j + 1, n):
-            rest = minus(a[i][j], total(map(times, lower[i], scaled)))
-            lower[i][j] = times(rest, inverse[j])
-    return lower, inverse
+def ldl(a: Block) -> Block:
+    """A = L D Lᵀ from the lower triangle of A: L below the diagonal, and D⁻¹ on it."""
+    factor: Block = []
+    for j, row in enumerate(a):
+        own: list[Lane] = []  # L_jk D_k, then L_jk
+        for k in range(j):
+            own.append(minus(row[k], total(map(times, factor[k][:k], own))))
+        lower = [times(x, factor[k][k]) for k, x in enumerate(own)]
+        pivot = minus(row[j], total(map(times, lower, own)))
+        factor.append([*lower, 1 / pivot])
+    return factor
 
 
-def forward(lower: Block, b: list[Lane]) -> list[Lane]:
+def forward(factor: Block, b: list[Lane]) -> list[Lane]:
     """L⁻¹ b."""
     y: list[Lane] = []
-    for row, value in zip(lower, b, strict=True):
+    for row, value in zip(factor, b, strict=True):
         y.append(minus(value, total(times(x, z) for x, z in zip(row, y, strict=False))))
     return y
 
 
-def backward(lower: Block, y: list[Lane]) -> list[Lane]:
+def backward(factor: Block, y: list[Lane]) -> list[Lane]:
     """L⁻ᵀ y."""
     n = len(y)
     x = list(y)
     for i in reversed(range(n)):
-        x[i] = minus(x[i], total(times(lower[k][i], x[k]) for k in range(i + 1, n)))
+        x[i] = minus(x[i], total(times(factor[k][i], x[k]) for k in range(i + 1, n)))
     return x
 
 
-def scale(x: list[Lane], weights: list[Lane]) -> list[Lane]:
-    """The products of components."""
-    return [times(value, w) for value, w in zip(x, weights, strict=True)]
+def scale(factor: Block, y: list[Lane]) -> list[Lane]:
+    """D⁻¹ y."""
+    return [times(value, row[-1]) for value, row in zip(y, factor, strict=True)]
 
 
 def transpose(a: Block) -> Block:
@@ -84,9 +82,8 @@ def product(a: Block, b: Block) -> Block:
 
 
 def lower_product(a: Block, b: Block) -> Block:
-    """The lower triangle of A Bᵀ, zero above it."""
-    n = len(a)
-    return [[total(map(times, a[r], b[c])) if c <= r else 0.0 for c in range(n)] for r in range(n)]
+    """The lower triangle of A Bᵀ."""
+    return [[total(map(times, row, b[c])) for c in range(r + 1)] for r, row in enumerate(a)]
 
 
 def add(a: Block, b: Block) -> Block:

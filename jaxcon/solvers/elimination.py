@@ -24,22 +24,28 @@ class Elimination:
     neighbour q, and A_qr −= H_q D H_rᵀ. Then y_p = L⁻¹ b_p and b_q −= H_q y_p on the way down, and
     on the way back x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q).
 
+    A row is a combination of the rows before it where its pivot D_r is not above `rounding` of its
+    diagonal entry A_rr, the pivot that it would have without them.
+
     Attributes:
-        share: the smallest part of a row that the rows before it do not explain, by world.
+        margin: positive, by world, where no row is such a combination: the least of D_r⁻¹ and of
+            1 − rounding A_rr D_r⁻¹, which needs no division and sees negative pivots, too.
         finite: whether A is, by world.
     """
 
-    def __init__(self, matrices: tuple[Jacobian, Array, Any], run: int, batch: Any) -> None:
+    def __init__(
+        self, matrices: tuple[Jacobian, Array, Any], run: int, batch: Any, rounding: float
+    ) -> None:
         jacobian, inverse_mass, compliance = matrices
         structure = tuple((b.start, b.shape[0], b.columns) for b in jacobian.blocks)
         self.plan = ordering.plan(structure, run)
-        self.batch, self.dtype = batch, inverse_mass.dtype
+        self.batch, self.dtype, self.rounding = batch, inverse_mass.dtype, rounding
         self.groups = {block.start: block.shape for block in jacobian.blocks}
         self.diagonal, self.couplings = _blocks_of(self.plan, jacobian, inverse_mass)
         if compliance is not None:
             self._soften(compliance)
         self.updates: dict[tuple[Node, Node], Block] = {}
-        self.share: Any = jnp.ones(self.batch, self.dtype)
+        self.margin: Any = jnp.ones(self.batch, self.dtype)
         traces = (total(block[r][r] for r in range(len(block))) for block in self.diagonal.values())
         self.finite = jnp.isfinite(total(jnp.sum(x, axis=0) for x in traces))
         self.factors = [
@@ -58,48 +64,49 @@ class Elimination:
     def _single(self, step: Single) -> SingleFactor:
         node = step.node
         pivot = [[_at(x, node.element) for x in row] for row in self.diagonal[node.group]]
-        original = [pivot[r][r] for r in range(node.size)]
-        if (node, node) in self.updates:
-            pivot = blocks.subtract(pivot, self.updates[node, node])
-        lower, inverse = blocks.ldl(pivot)
-        self._judge(original, inverse)
-        sides = [_halve(lower, self._coupling(q, node)) for q in step.later]
-        gains = [[blocks.scale(row, inverse) for row in a] for a in sides]
+        update = self.updates.get((node, node), _no_update(node))
+        factor = blocks.ldl(blocks.subtract(pivot, update))
+        self.margin = self._judge(self.margin, pivot, factor)
+        sides = [_halve(factor, self._coupling(q, node)) for q in step.later]
+        gains = [[blocks.scale(factor, row) for row in a] for a in sides]
         for i, (q, side) in enumerate(zip(step.later, sides, strict=True)):
             for r, gain in zip(step.later[:i], gains, strict=False):
                 self._update(q, r, blocks.product(side, blocks.transpose(gain)))
             self._update(q, q, blocks.lower_product(side, gains[i]))
-        return SingleFactor(step, lower, inverse, gains)
+        return SingleFactor(step, factor, gains)
 
     def _run(self, step: Run) -> RunFactor:
-        """The same along a run, in a scan that carries the update of the next pivot."""
-        size, count = step.nodes[0].size, len(step.nodes)
+        """The same along a run, carrying the update of the next pivot."""
+        first, *others = step.nodes
 
         def spread(x: Lane) -> Array:
-            return jnp.broadcast_to(jnp.asarray(x, self.dtype), (count, *self.batch))
+            return jnp.broadcast_to(jnp.asarray(x, self.dtype), (len(step.nodes), *self.batch))
 
-        pivots = [
-            [spread(take(x, step.elements)) for x in row]
-            for row in self.diagonal[step.nodes[0].group]
-        ]
-        first, *others = step.nodes
+        def eliminate(carry: Any, rows: Any, k: Array) -> Any:
+            (update, margin), (pivot, side) = carry, rows
+            factor = blocks.ldl(blocks.subtract(pivot, update))
+            half = _halve(factor, side)
+            gain = [blocks.scale(factor, row) for row in half]
+            margin = self._judge(margin, pivot, factor)
+            return (blocks.lower_product(half, gain), margin), (factor, gain)
+
+        diagonal = self.diagonal[first.group]
+        pivots = [[spread(take(x, step.elements)) for x in row] for row in diagonal]
         for node in others:
             for r, row in enumerate(self.updates.get((node, node), ())):
                 place = node.element - step.elements[0]
                 pairs = zip(pivots[r], row, strict=True)
                 pivots[r] = [replaced(x, place, blocks.minus(x[place], u)) for x, u in pairs]
         sides = [[spread(x) for x in row] for row in self._run_coupling(step)]
-        known = self.updates.get((first, first), [[0.0] * size] * size)
+        known = self.updates.get((first, first), _no_update(first))
         start = [
-            [jnp.broadcast_to(jnp.asarray(x, self.dtype), self.batch) for x in row[: r + 1]]
-            for r, row in enumerate(known)
+            [jnp.broadcast_to(jnp.asarray(x, self.dtype), self.batch) for x in row] for row in known
         ]
-        (last, self.share), (lower, inverse, gain) = jax.lax.scan(
-            _eliminate, (start, self.share), (pivots, sides), reverse=step.descending
+        (last, self.margin), factors = _along(
+            step, eliminate, (start, self.margin), (pivots, sides)
         )
-        full = [[last[r][c] if c <= r else 0.0 for c in range(size)] for r in range(size)]
-        self._update(step.parent, step.parent, full)
-        return RunFactor(step, lower, inverse, gain)
+        self._update(step.parent, step.parent, last)
+        return RunFactor(step, *factors)
 
     def _run_coupling(self, step: Run) -> Block:
         """A_(next, node) of every node of a run, ascending in its elements."""
@@ -130,9 +137,11 @@ class Elimination:
         known = self.updates.get((q, r))
         self.updates[q, r] = amount if known is None else blocks.add(known, amount)
 
-    def _judge(self, original: list[Lane], inverse: list[Lane]) -> None:
-        for x, w in zip(original, inverse, strict=True):
-            self.share = jnp.minimum(self.share, 1 / (w * x))
+    def _judge(self, margin: Lane, pivot: Block, factor: Block) -> Lane:
+        for full, left in zip(pivot, factor, strict=True):
+            rest = 1 - self.rounding * full[-1] * left[-1]
+            margin = jnp.minimum(margin, jnp.minimum(left[-1], rest))
+        return margin
 
     def _soften(self, compliance: Array) -> None:
         for start, (m, k) in self.groups.items():
@@ -141,48 +150,65 @@ class Elimination:
                 self.diagonal[start][r][r] = plus(self.diagonal[start][r][r], part)
 
 
-def _halve(lower: Block, side: Block) -> Block:
+def _no_update(node: Node) -> Block:
+    return [[0.0] * (r + 1) for r in range(node.size)]
+
+
+def _halve(factor: Block, side: Block) -> Block:
     """A_qp L⁻ᵀ."""
-    return [blocks.forward(lower, row) for row in side]
+    return [blocks.forward(factor, row) for row in side]
 
 
-def _eliminate(carry: Any, at: Any) -> Any:
-    """One node of a run: its pivot less the update, its gain, and the update of the next pivot."""
-    (update, share), (pivot, side) = carry, at
-    size = len(pivot)
-    rows = zip(pivot, update, strict=True)
-    changed = [[x - u for x, u in zip(p, w, strict=False)] for p, w in rows]
-    lower, inverse = blocks.ldl(changed)
-    for r in range(size):
-        share = jnp.minimum(share, 1 / (inverse[r] * pivot[r][r]))
-    half = _halve(lower, side)
-    gain = [blocks.scale(row, inverse) for row in half]
-    following = [[total(map(times, half[r], gain[c])) for c in range(r + 1)] for r in range(size)]
-    return (following, share), (lower, inverse, gain)
+def _along(step: Run, function: Any, carry: Any, rows: Any, down: bool = True) -> Any:
+    """The nodes of a run one after the other, each replacing its rows of arrays (node, …).
+
+    In place, so that no memory is set up for results, and what is read is read where it lies.
+
+    Args:
+        step: the run.
+        function: (carry, rows of the node, its place) → the carry for the next node, and the rows.
+        carry: for the first node.
+        rows: trees of arrays, ascending in the nodes' elements.
+        down: in the order of elimination, or against it.
+    """
+    count = len(step.nodes)
+
+    def at(k: Array, state: Any) -> Any:
+        carry, rows = state
+        i = count - 1 - k if step.descending == down else k
+        carry, new = function(carry, _row(rows, i), i)
+        put = jax.lax.dynamic_update_index_in_dim
+        return carry, jax.tree.map(lambda x, y: put(x, y, i, 0), rows, new)
+
+    return jax.lax.fori_loop(0, count, at, (carry, rows))
+
+
+def _row(tree: Any, i: Array) -> Any:
+    """Row i of arrays."""
+    return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, i, keepdims=False), tree)
 
 
 @dataclass(frozen=True)
 class SingleFactor:
-    """One eliminated node: L, D⁻¹ of its pivot, and H_q for its later neighbours."""
+    """One eliminated node: L and D⁻¹ of its pivot, and H_q for its later neighbours."""
 
     step: Single
-    lower: Block
-    inverse: list[Lane]
+    factor: Block
     gains: list[Block]
 
     def down(self, b: Vectors) -> list[Lane]:
         """y_p = L⁻¹ b_p and b_q −= H_q y_p; returns D⁻¹ y_p."""
-        y = blocks.forward(self.lower, b.get(self.step.node))
+        y = blocks.forward(self.factor, b.get(self.step.node))
         for q, gain in zip(self.step.later, self.gains, strict=True):
             b.subtract(q, blocks.apply(gain, y))
-        return blocks.scale(y, self.inverse)
+        return blocks.scale(self.factor, y)
 
     def back(self, y: list[Lane], x: Vectors) -> None:
         """x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q)."""
         for q, gain in zip(self.step.later, self.gains, strict=True):
             pull = blocks.apply(blocks.transpose(gain), x.solution(q))
             y = [blocks.minus(a, c) for a, c in zip(y, pull, strict=True)]
-        x.nodes[self.step.node] = blocks.backward(self.lower, y)
+        x.nodes[self.step.node] = blocks.backward(self.factor, y)
 
 
 @dataclass(frozen=True)
@@ -190,39 +216,33 @@ class RunFactor:
     """An eliminated run: the same with a first axis over its nodes, and one gain each."""
 
     step: Run
-    lower: Block
-    inverse: list[Lane]
+    factor: Block
     gain: Block
 
     def down(self, b: Vectors) -> list[Lane]:
-        """The same in a scan that carries H y to the next node."""
+        """The same, carrying H y to the next node."""
 
-        def eliminate(update: Any, at: Any) -> Any:
-            lower, inverse, gain, right = at
-            right = [x - u for x, u in zip(right, update, strict=True)]
-            y = blocks.forward(lower, right)
-            return blocks.apply(gain, y), blocks.scale(y, inverse)
+        def eliminate(update: Any, right: Any, k: Array) -> Any:
+            factor, gain = _row((self.factor, self.gain), k)
+            y = blocks.forward(factor, [x - u for x, u in zip(right, update, strict=True)])
+            return blocks.apply(gain, y), blocks.scale(factor, y)
 
         right, start = b.get_run(self.step)
-        at = (self.lower, self.inverse, self.gain, right)
-        last, y = jax.lax.scan(eliminate, start, at, reverse=self.step.descending)
+        last, y = _along(self.step, eliminate, start, right)
         b.subtract(self.step.parent, last)
         return y
 
     def back(self, y: list[Lane], x: Vectors) -> None:
-        """The same in a scan that carries the solution of the next node."""
+        """The same, carrying the solution of the next node."""
 
-        def substitute(following: Any, at: Any) -> Any:
-            lower, gain, own = at
+        def substitute(following: Any, own: Any, k: Array) -> Any:
+            factor, gain = _row((self.factor, self.gain), k)
             pull = blocks.apply(blocks.transpose(gain), following)
-            rest = [a - c for a, c in zip(own, pull, strict=True)]
-            solution = blocks.backward(lower, rest)
+            solution = blocks.backward(factor, [a - c for a, c in zip(own, pull, strict=True)])
             return solution, solution
 
         start, step = x.solution(self.step.parent), self.step
-        _, solution = jax.lax.scan(
-            substitute, start, (self.lower, self.gain, y), reverse=not step.descending
-        )
+        _, solution = _along(step, substitute, start, y, down=False)
         x.runs[step.nodes[0].group, step.elements[0]] = solution
 
 
@@ -316,13 +336,7 @@ def _blocks_of(plan: Plan, jacobian: Jacobian, inverse_mass: Array) -> Any:
         weight = block.columns.take(inverse_mass)
         rows = [[times(x, w) for x, w in zip(row, weight, strict=True)] for row in block.value]
         weighted.append(rows)
-        own = [
-            [
-                total(map(times, rows[r], block.value[s])) if s <= r else 0.0
-                for s in range(len(rows))
-            ]
-            for r in range(len(rows))
-        ]
+        own = blocks.lower_product(rows, block.value)
         known = diagonal.get(block.start)
         diagonal[block.start] = own if known is None else blocks.add(known, own)
     couplings = []

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.lanes import Vector, collect, plus, times, total
+from jaxcon.core.lanes import Vector, collect, plus, take, times, total
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 
@@ -30,7 +30,7 @@ class Columns:
         """The velocities by components, each lane (element,)."""
         block = jax.lax.slice_in_dim(v, self.start, self.start + self.components * self.bodies)
         lanes = block.reshape((self.components, self.bodies, *v.shape[1:]))
-        return Vector.of(lanes[:, np.asarray(self.indices)])
+        return Vector(*(take(lane, self.indices) for lane in lanes))
 
     def index(self) -> np.ndarray:
         """Column numbers, (components, elements)."""

@@ -25,11 +25,11 @@ class Diagonal:
 
     def solve(self, x: Array) -> Array:
         """M⁻¹ x, (n_v,)."""
-        return x / self.values
+        return x * (1 / self.values)
 
     def solve_columns(self, x: Array) -> Array:
         """M⁻¹ X, (n_v, k)."""
-        return x / self.values[:, None]
+        return x * (1 / self.values)[:, None]
 
     def apply(self, x: Array) -> Array:
         """M x, (n_v,)."""

@@ -60,7 +60,9 @@ class Sparse:
         if self.tikhonov is not None:
             compliance = regularized(compliance, freeze(self.tikhonov), matrices)
             matrices = (*matrices[:2], freeze(compliance))
-        elimination = Elimination(matrices, self.run, free.shape[1:])
+        rounding = len(system.target) * float(jnp.finfo(free.dtype).eps)
+        rounding = 0.0 if self.tikhonov is not None else rounding
+        elimination = Elimination(matrices, self.run, free.shape[1:], rounding)
 
         def delassus(x: Array) -> Array:
             y = j.apply(system.mass.solve(j.transpose(x)))
@@ -73,7 +75,6 @@ class Sparse:
             symmetric=True,
         )
         acceleration = free + system.mass.solve(j.transpose(multipliers))
-        rounding = len(system.target) * jnp.finfo(free.dtype).eps
-        explained = elimination.share > (rounding if self.tikhonov is None else 0)
-        dependent = (~explained & elimination.finite) | system.mass.singular
+        independent = elimination.margin > 0
+        dependent = (~independent & elimination.finite) | system.mass.singular
         return Solution(acceleration, multipliers, judge(acceleration, dependent))
