@@ -12,6 +12,7 @@ from tolerances import DIFFERENCE
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.dynamics.assembly import saddle
+from jaxcon.solvers import ordering
 from jaxcon.solvers.saddle import Diagonal, Saddle
 from jaxcon.solvers.sparse import Sparse
 
@@ -53,6 +54,23 @@ def links(n, closed):
     return scene.build()
 
 
+def with_a_global_row(n):
+    """A chain of particles, and two rows of which each touches all of them."""
+    scene, random = jc.Scene(dim=2), np.random.default_rng(7)
+    for i, place in enumerate(scatter(n)):
+        scene.add_particle(f"p{i}", mass=random.uniform(0.5, 2.0), position=place)
+        a = jc.WORLD if i == 0 else f"p{i - 1}"
+        scene.add(jc.Distance(f"{i}", a, f"p{i}", **({} if i else {"point_a": (0.0, 5.0)})))
+    bodies = tuple(f"p{i}" for i in range(n))
+
+    def centre(*args):
+        mean = sum(x.position for x in args[:-2]) / n
+        return mean - jnp.array([5.5, 0.0])
+
+    scene.add(jc.Holonomic(centre, bodies, name="centre"))
+    return scene.build()
+
+
 GRAPHS = {
     "one": lambda: particles(scatter(1), [], [0]),
     "two apart": lambda: particles(scatter(2), [], [0, 1]),
@@ -70,6 +88,7 @@ GRAPHS = {
     "truss": lambda: particles(
         scatter(8), [(i, i + 1) for i in range(7)] + [(i, i + 2) for i in range(6)], [0, 3]
     ),
+    "chain that a user's row touches everywhere": lambda: with_a_global_row(12),
     "links": lambda: links(10, False),
     "links in a loop": lambda: links(10, True),
 }
@@ -85,15 +104,55 @@ def problem(name):
     return saddle(system, state.q, rows, force, target)
 
 
+WAYS = {
+    "runs": Sparse(run=2),
+    "some": Sparse(run=4),
+    "unrolled": Sparse(run=1000),
+    "levels": Sparse(order="levels"),
+}
+
+
 @every_graph
-@pytest.mark.parametrize("run", [2, 4, 1000], ids=["runs", "some", "unrolled"])
-def test_the_solution_is_that_of_the_dense_solver(name, run):
+@pytest.mark.parametrize("way", WAYS)
+def test_the_solution_is_that_of_the_dense_solver(name, way):
     system = problem(name)
     expected = jc.Dense().solve(system)
-    got = quick_jit(lambda: Sparse(run=run).solve(system))()
+    got = quick_jit(lambda: WAYS[way].solve(system))()
     assert got.status == jc.Status.OK
     np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-8, atol=1e-8)
+
+
+def steps_of(name, **options):
+    """What is eliminated together, by size."""
+    jacobian = problem(name).jacobian
+    structure = tuple((b.start, b.shape[0], b.columns) for b in jacobian.blocks)
+    return ordering.plan(structure, **options).steps
+
+
+def test_a_row_that_touches_everything_borders_a_run():
+    run, *_ = (s for s in steps_of("chain that a user's row touches everywhere") if not is_batch(s))
+    assert len(run.nodes) >= 8
+    assert [node.size for node in run.border] == [2]
+
+
+def test_levels_of_a_chain_grow_with_its_logarithm():
+    steps = steps_of("long chain", order="levels")
+    assert all(map(is_batch, steps))
+    assert sorted(len(step.nodes) for step in steps)[-1] >= 9
+    assert len(steps) <= 7  # of 20 nodes, one of them hung otherwise
+    assert sum(len(step.nodes) for step in steps) == 20
+
+
+def is_batch(step):
+    return isinstance(step, ordering.Batch)
+
+
+def test_equal_branches_are_eliminated_at_once():
+    steps = steps_of("star")
+    assert max(len(step.nodes) for step in steps) == 1  # all touch each other at the centre
+    legs = steps_of("two chains", run=1000)
+    assert len(legs) < 16
 
 
 @pytest.mark.parametrize("name", ["long chain", "truss", "links in a loop"])

@@ -9,6 +9,7 @@ coordinate axis) stays a Python number, and products with it are never emitted.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -162,24 +163,43 @@ def perpendicular(x: Vector) -> Vector:
     return Vector(times(-1, x[1]), x[0])
 
 
+GATHERED = 16
+"""Rows from which picking them is one gather instead of as many copies."""
+
+
 def take(x: Lane, indices: tuple[int, ...]) -> Lane:
-    """x[indices] along the first axis: nothing, a slice, or a gather, as needed."""
+    """x[indices] along the first axis: nothing, a slice, copies or a gather, as needed."""
     if not isinstance(x, jax.Array):
         return x
-    first = indices[0]
-    if indices == tuple(range(first, first + len(indices))):
-        whole = len(indices) == x.shape[0]
-        return x if whole else jax.lax.slice_in_dim(x, first, first + len(indices))
-    if indices == tuple(range(first, first - len(indices), -1)):
-        last = indices[-1]
-        return jax.lax.rev(jax.lax.slice_in_dim(x, last, last + len(indices)), (0,))
+    first, n = indices[0], len(indices)
+    stride = indices[1] - first if n > 1 else 1
+    last = first + stride * (n - 1)
+    if stride and indices == tuple(range(first, last + (1 if stride > 0 else -1), stride)):
+        if n == x.shape[0] and stride == 1:
+            return x
+        low, high = min(first, last), max(first, last) + 1
+        rows = jax.lax.slice_in_dim(x, low, high, abs(stride))
+        return rows if stride > 0 else jax.lax.rev(rows, (0,))
+    if n < GATHERED:
+        return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + 1) for i in indices])
     return x[np.asarray(indices)]
 
 
-def replaced(x: Array, place: int, y: Array) -> Array:
-    """A lane (element, …) with another value for one element."""
-    parts = (x[:place], jnp.broadcast_to(y, x.shape[1:])[None], x[place + 1 :])
-    return jnp.concatenate([part for part in parts if len(part)])
+def side_by_side(rows: list[tuple[Lane, int]]) -> Lane:
+    """Rows of lanes (element, …) as one lane; a row of a number is that number."""
+    parts: list[tuple[Lane, int]] = []
+    for _, members in itertools.groupby(rows, key=lambda row: id(row[0])):
+        lanes, places = zip(*members, strict=True)
+        parts.append((take(lanes[0], places), len(places)))
+    arrays = [x for x, _ in parts if isinstance(x, jax.Array)]
+    if not arrays:
+        (number,) = {x for x, _ in parts}
+        return number
+    if len(parts) == 1:
+        return arrays[0]
+    shape = jnp.broadcast_shapes(*(x.shape[1:] for x in arrays))
+    whole = [jnp.broadcast_to(jnp.asarray(x, arrays[0].dtype), (n, *shape)) for x, n in parts]
+    return jnp.concatenate(whole)
 
 
 PIECES = 8

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import itertools
+import functools
 from dataclasses import dataclass
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.lanes import Vector, plus, replaced, take, times, total
+from jaxcon.core.lanes import Vector, plus, take, times, total
 from jaxcon.core.typing import Array, Lane
-from jaxcon.solvers import blocks, ordering
+from jaxcon.solvers import blocks
 from jaxcon.solvers.blocks import Block
 from jaxcon.solvers.jacobian import Jacobian
-from jaxcon.solvers.ordering import Node, Plan, Run, Single
+from jaxcon.solvers.ordering import Batch, Node, Plan, Run
+from jaxcon.solvers.pieces import Pieces, Vectors, less
 
 
 class Elimination:
@@ -22,7 +23,8 @@ class Elimination:
 
     Eliminating node p with pivot block A_pp = L D Lᵀ leaves H_q = A_qp L⁻ᵀ D⁻¹ for each later
     neighbour q, and A_qr −= H_q D H_rᵀ. Then y_p = L⁻¹ b_p and b_q −= H_q y_p on the way down, and
-    on the way back x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q).
+    on the way back x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q). A step does this for many nodes: for those
+    that do not wait for each other at once, along lanes, and for those of a run in a loop.
 
     A row is a combination of the rows before it where its pivot D_r is not above `rounding` of its
     diagonal entry A_rr, the pivot that it would have without them.
@@ -34,129 +36,129 @@ class Elimination:
     """
 
     def __init__(
-        self, matrices: tuple[Jacobian, Array, Any], run: int, batch: Any, rounding: float
+        self, matrices: tuple[Jacobian, Array, Any], plan: Plan, batch: Any, rounding: float
     ) -> None:
-        jacobian, inverse_mass, compliance = matrices
-        structure = tuple((b.start, b.shape[0], b.columns) for b in jacobian.blocks)
-        self.plan = ordering.plan(structure, run)
-        self.batch, self.dtype, self.rounding = batch, inverse_mass.dtype, rounding
-        self.groups = {block.start: block.shape for block in jacobian.blocks}
-        self.diagonal, self.couplings = _blocks_of(self.plan, jacobian, inverse_mass)
-        if compliance is not None:
-            self._soften(compliance)
-        self.updates: dict[tuple[Node, Node], Block] = {}
-        self.margin: Any = jnp.ones(self.batch, self.dtype)
-        traces = (total(block[r][r] for r in range(len(block))) for block in self.diagonal.values())
-        self.finite = jnp.isfinite(total(jnp.sum(x, axis=0) for x in traces))
+        self.batch, self.dtype, self.rounding = batch, matrices[1].dtype, rounding
+        self.groups = {block.start: block.shape for block in matrices[0].blocks}
+        self.entries, trace = _matrix(plan, matrices)
+        self.updates = Pieces()
+        self.margin: Any = jnp.ones(batch, self.dtype)
+        self.finite = jnp.isfinite(trace)
         self.factors = [
-            self._run(step) if isinstance(step, Run) else self._single(step)
-            for step in self.plan.steps
+            self._run(step) if isinstance(step, Run) else self._batch(step) for step in plan.steps
         ]
 
     def substitute(self, right: Array) -> Array:
         """A⁻¹ b: down the order, then back."""
-        b, x = (Vectors(self.groups, values, self.batch) for values in (right, None))
+        b, x = Vectors(), Vectors()
+        for start, (m, k) in self.groups.items():
+            rows = jax.lax.slice_in_dim(right, start, start + m * k)
+            b.put(nodes_of(start, m, k), list(Vector.of(rows.reshape((m, k, *right.shape[1:])))))
         middle = [factor.down(b) for factor in self.factors]
         for factor, y in reversed(list(zip(self.factors, middle, strict=True))):
             factor.back(y, x)
-        return x.join()
+        groups = sorted(self.groups.items())
+        return jnp.concatenate(
+            [z for start, (m, k) in groups for z in x.get(nodes_of(start, m, k))]
+        )
 
-    def _single(self, step: Single) -> SingleFactor:
-        node = step.node
-        pivot = [[_at(x, node.element) for x in row] for row in self.diagonal[node.group]]
-        update = self.updates.get((node, node), _no_update(node))
-        factor = blocks.ldl(blocks.subtract(pivot, update))
-        self.margin = self._judge(self.margin, pivot, factor)
-        sides = [_halve(factor, self._coupling(q, node)) for q in step.later]
-        gains = [[blocks.scale(factor, row) for row in a] for a in sides]
-        for i, (q, side) in enumerate(zip(step.later, sides, strict=True)):
-            for r, gain in zip(step.later[:i], gains, strict=False):
-                self._update(q, r, blocks.product(side, blocks.transpose(gain)))
-            self._update(q, q, blocks.lower_product(side, gains[i]))
-        return SingleFactor(step, factor, gains)
+    def _batch(self, step: Batch) -> BatchFactor:
+        diagonal = [(p, p) for p in step.nodes]
+        whole = self._entries(diagonal)
+        factor = blocks.ldl(less(whole, self.updates.sum(diagonal)))
+        self.margin = jnp.minimum(self.margin, jnp.min(self._margin(whole, factor), axis=0))
+        pairs = [list(zip(slot, step.nodes, strict=True)) for slot in step.slots]
+        halves = [_halve(factor, less(self._entries(x), self.updates.sum(x))) for x in pairs]
+        gains = [_gain(factor, half) for half in halves]
+        for (i, j), product in _products(halves, gains).items():
+            self.updates.add(zip(step.slots[i], step.slots[j], strict=True), product)
+        return BatchFactor(step, factor, gains)
 
     def _run(self, step: Run) -> RunFactor:
-        """The same along a run, carrying the update of the next pivot."""
-        first, *others = step.nodes
-
-        def spread(x: Lane) -> Array:
-            return jnp.broadcast_to(jnp.asarray(x, self.dtype), (len(step.nodes), *self.batch))
+        """The same along a run, carrying the updates of the next node and of the border."""
+        nodes, first, later = step.ascending, step.nodes[0], (step.parent, *step.border)
+        others = [None if p == first else p for p in nodes]
+        whole = self._entries([(p, p) for p in nodes])
+        changed = self.updates.sum((p, p) for p in others)
+        pairs = [(step.following(p), p) for p in nodes]
+        sides = [less(self._entries(pairs), self.updates.sum(pairs))]
+        for g in step.border:
+            side = self._entries([(g, p) for p in nodes])
+            sides.append(less(side, self.updates.sum((g, p) for p in others)))
 
         def eliminate(carry: Any, rows: Any, k: Array) -> Any:
-            (update, margin), (pivot, side) = carry, rows
-            factor = blocks.ldl(blocks.subtract(pivot, update))
-            half = _halve(factor, side)
-            gain = [blocks.scale(factor, row) for row in half]
-            margin = self._judge(margin, pivot, factor)
-            return (blocks.lower_product(half, gain), margin), (factor, gain)
+            (updates, margin), (pivot, sides) = carry, rows
+            factor = blocks.ldl(blocks.subtract(pivot, updates[0, 0]))
+            border = [blocks.subtract(x, updates[j, 0]) for j, x in enumerate(sides[1:], 1)]
+            halves = [_halve(factor, side) for side in (sides[0], *border)]
+            gains = [_gain(factor, half) for half in halves]
+            products = _products(halves, gains)
+            updates = {
+                key: blocks.add(updates[key], x) if key[1] else x for key, x in products.items()
+            }
+            original = pivot if changed is None else row_of(whole, k)
+            margin = jnp.minimum(margin, self._margin(original, factor))
+            return (updates, margin), (factor, gains)
 
-        diagonal = self.diagonal[first.group]
-        pivots = [[spread(take(x, step.elements)) for x in row] for row in diagonal]
-        for node in others:
-            for r, row in enumerate(self.updates.get((node, node), ())):
-                place = node.element - step.elements[0]
-                pairs = zip(pivots[r], row, strict=True)
-                pivots[r] = [replaced(x, place, blocks.minus(x[place], u)) for x, u in pairs]
-        sides = [[spread(x) for x in row] for row in self._run_coupling(step)]
-        known = self.updates.get((first, first), _no_update(first))
-        start = [
-            [jnp.broadcast_to(jnp.asarray(x, self.dtype), self.batch) for x in row] for row in known
-        ]
-        (last, self.margin), factors = _along(
-            step, eliminate, (start, self.margin), (pivots, sides)
-        )
-        self._update(step.parent, step.parent, last)
+        rows = self._spread((less(whole, changed), sides), len(nodes))
+        start = {(0, 0): self.updates.sum([(first, first)]) or _zero(first)}
+        for j, g in enumerate(step.border, 1):
+            start[j, 0] = self.updates.sum([(g, first)]) or _zero(g, first)
+            start |= {
+                (j, i): _zero(g, None if i == j else step.border[i - 1]) for i in range(1, j + 1)
+            }
+        start = jax.tree.map(lambda x: x[0], self._spread(start, 1))
+        (last, self.margin), factors = _along(step, eliminate, (start, self.margin), rows)
+        for (i, j), product in last.items():
+            self.updates.add([(later[i], later[j])], jax.tree.map(lambda x: x[None], product))
         return RunFactor(step, *factors)
 
-    def _run_coupling(self, step: Run) -> Block:
-        """A_(next, node) of every node of a run, ascending in its elements."""
-        nodes = [*step.nodes, step.parent]
-        pairs = list(itertools.pairwise(nodes))
-        pairs = pairs[::-1] if step.descending else pairs
-        found = [self.plan.entries[q, p] for p, q in pairs]
-        result: Block | None = None
-        for column in zip(*found, strict=True):
-            block = self.couplings[column[0].coupling]
-            index = tuple(entry.pair for entry in column)
-            part = [[take(x, index) for x in row] for row in block]
-            part = blocks.transpose(part) if column[0].transposed else part
-            result = part if result is None else blocks.add(result, part)
-        assert result is not None
-        return result
+    def _entries(self, pairs: list[tuple[Node, Node]]) -> Block:
+        """A_qp of several pairs before any elimination."""
+        q, p = pairs[0]
+        return self.entries.sum(pairs) or _zero(q, p)
 
-    def _coupling(self, q: Node, p: Node) -> Block:
-        """A_qp as it is when p is eliminated."""
-        result: Block = [[0.0] * p.size for _ in range(q.size)]
-        for entry in self.plan.entries.get((q, p), ()):
-            part = [[_at(x, entry.pair) for x in row] for row in self.couplings[entry.coupling]]
-            result = blocks.add(result, blocks.transpose(part) if entry.transposed else part)
-        update = self.updates.get((q, p))
-        return result if update is None else blocks.subtract(result, update)
+    def _spread(self, tree: Any, count: int) -> Any:
+        """Arrays (count, …) over the whole batch."""
+        shape = (count, *self.batch)
+        return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, self.dtype), shape), tree)
 
-    def _update(self, q: Node, r: Node, amount: Block) -> None:
-        known = self.updates.get((q, r))
-        self.updates[q, r] = amount if known is None else blocks.add(known, amount)
-
-    def _judge(self, margin: Lane, pivot: Block, factor: Block) -> Lane:
-        for full, left in zip(pivot, factor, strict=True):
-            rest = 1 - self.rounding * full[-1] * left[-1]
-            margin = jnp.minimum(margin, jnp.minimum(left[-1], rest))
-        return margin
-
-    def _soften(self, compliance: Array) -> None:
-        for start, (m, k) in self.groups.items():
-            for r in range(m):
-                part = jax.lax.slice_in_dim(compliance, start + r * k, start + (r + 1) * k)
-                self.diagonal[start][r][r] = plus(self.diagonal[start][r][r], part)
+    def _margin(self, whole: Block, factor: Block) -> Lane:
+        """Of one node or of many; see `margin`."""
+        inverse = [row[-1] for row in factor]
+        rests = [1 - self.rounding * a[-1] * x for a, x in zip(whole, inverse, strict=True)]
+        return functools.reduce(jnp.minimum, [*inverse, *rests])
 
 
-def _no_update(node: Node) -> Block:
-    return [[0.0] * (r + 1) for r in range(node.size)]
+def nodes_of(group: int, size: int, count: int) -> list[Node]:
+    """All nodes of a group."""
+    return [Node(group, element, size) for element in range(count)]
 
 
 def _halve(factor: Block, side: Block) -> Block:
     """A_qp L⁻ᵀ."""
     return [blocks.forward(factor, row) for row in side]
+
+
+def _gain(factor: Block, half: Block) -> Block:
+    """A_qp L⁻ᵀ D⁻¹."""
+    return [blocks.scale(factor, row) for row in half]
+
+
+def _products(halves: list[Block], gains: list[Block]) -> dict[tuple[int, int], Block]:
+    """H_q D H_rᵀ for the q-th and the r-th of some later neighbours, r ≤ q."""
+    return {
+        (q, r): blocks.product(half, blocks.transpose(gains[r]))
+        if r < q
+        else blocks.lower_product(half, gains[q])
+        for q, half in enumerate(halves)
+        for r in range(q + 1)
+    }
+
+
+def _zero(q: Node, p: Node | None = None) -> Block:
+    """A block of zeros; the lower triangle of one on the diagonal where p is not given."""
+    return [[0.0] * (r + 1 if p is None else p.size) for r in range(q.size)]
 
 
 def _along(step: Run, function: Any, carry: Any, rows: Any, down: bool = True) -> Any:
@@ -176,139 +178,125 @@ def _along(step: Run, function: Any, carry: Any, rows: Any, down: bool = True) -
     def at(k: Array, state: Any) -> Any:
         carry, rows = state
         i = count - 1 - k if step.descending == down else k
-        carry, new = function(carry, _row(rows, i), i)
+        carry, new = function(carry, row_of(rows, i), i)
         put = jax.lax.dynamic_update_index_in_dim
         return carry, jax.tree.map(lambda x, y: put(x, y, i, 0), rows, new)
 
     return jax.lax.fori_loop(0, count, at, (carry, rows))
 
 
-def _row(tree: Any, i: Array) -> Any:
+def row_of(tree: Any, i: Any) -> Any:
     """Row i of arrays."""
-    return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, i, keepdims=False), tree)
+
+    def row(x: Lane) -> Lane:
+        whole = isinstance(x, jax.Array)
+        return jax.lax.dynamic_index_in_dim(x, i, keepdims=False) if whole else x
+
+    return jax.tree.map(row, tree)
 
 
 @dataclass(frozen=True)
-class SingleFactor:
-    """One eliminated node: L and D⁻¹ of its pivot, and H_q for its later neighbours."""
+class BatchFactor:
+    """Eliminated nodes: L and D⁻¹ of their pivots, and H_q for each of their later neighbours."""
 
-    step: Single
+    step: Batch
     factor: Block
     gains: list[Block]
 
     def down(self, b: Vectors) -> list[Lane]:
         """y_p = L⁻¹ b_p and b_q −= H_q y_p; returns D⁻¹ y_p."""
-        y = blocks.forward(self.factor, b.get(self.step.node))
-        for q, gain in zip(self.step.later, self.gains, strict=True):
-            b.subtract(q, blocks.apply(gain, y))
+        y = blocks.forward(self.factor, b.get(self.step.nodes))
+        for slot, gain in zip(self.step.slots, self.gains, strict=True):
+            b.subtract(slot, blocks.apply(gain, y))
         return blocks.scale(self.factor, y)
 
     def back(self, y: list[Lane], x: Vectors) -> None:
         """x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q)."""
-        for q, gain in zip(self.step.later, self.gains, strict=True):
-            pull = blocks.apply(blocks.transpose(gain), x.solution(q))
+        for slot, gain in zip(self.step.slots, self.gains, strict=True):
+            pull = blocks.apply(blocks.transpose(gain), x.get(slot))
             y = [blocks.minus(a, c) for a, c in zip(y, pull, strict=True)]
-        x.nodes[self.step.node] = blocks.backward(self.factor, y)
+        x.put(self.step.nodes, blocks.backward(self.factor, y))
 
 
 @dataclass(frozen=True)
 class RunFactor:
-    """An eliminated run: the same with a first axis over its nodes, and one gain each."""
+    """An eliminated run: the same with a first axis over its nodes."""
 
     step: Run
     factor: Block
-    gain: Block
+    gains: list[Block]
 
     def down(self, b: Vectors) -> list[Lane]:
-        """The same, carrying H y to the next node."""
+        """The same, carrying H y to the next node, and its sum to the border."""
 
-        def eliminate(update: Any, right: Any, k: Array) -> Any:
-            factor, gain = _row((self.factor, self.gain), k)
-            y = blocks.forward(factor, [x - u for x, u in zip(right, update, strict=True)])
-            return blocks.apply(gain, y), blocks.scale(factor, y)
+        def eliminate(taken: Any, right: Any, k: Array) -> Any:
+            factor, gains = row_of((self.factor, self.gains), k)
+            y = blocks.forward(factor, [x - u for x, u in zip(right, taken[0], strict=True)])
+            following, *border = (blocks.apply(gain, y) for gain in gains)
+            pairs = zip(taken[1:], border, strict=True)
+            sums = [[u + x for u, x in zip(known, own, strict=True)] for known, own in pairs]
+            return [following, *sums], blocks.scale(factor, y)
 
-        right, start = b.get_run(self.step)
+        right, taken = b.split(self.step.ascending, self.step.nodes[0])
+        none = jnp.zeros_like(right[0][0])
+        start = [[x[0] for x in taken], *([none] * g.size for g in self.step.border)]
         last, y = _along(self.step, eliminate, start, right)
-        b.subtract(self.step.parent, last)
+        for q, amount in zip((self.step.parent, *self.step.border), last, strict=True):
+            b.subtract([q], [x[None] for x in amount])
         return y
 
     def back(self, y: list[Lane], x: Vectors) -> None:
         """The same, carrying the solution of the next node."""
+        border = [[z[0] for z in x.get([g])] for g in self.step.border]
 
         def substitute(following: Any, own: Any, k: Array) -> Any:
-            factor, gain = _row((self.factor, self.gain), k)
-            pull = blocks.apply(blocks.transpose(gain), following)
-            solution = blocks.backward(factor, [a - c for a, c in zip(own, pull, strict=True)])
+            factor, gains = row_of((self.factor, self.gains), k)
+            for gain, solution in zip(gains, (following, *border), strict=True):
+                pull = blocks.apply(blocks.transpose(gain), solution)
+                own = [a - c for a, c in zip(own, pull, strict=True)]
+            solution = blocks.backward(factor, own)
             return solution, solution
 
-        start, step = x.solution(self.step.parent), self.step
-        _, solution = _along(step, substitute, start, y, down=False)
-        x.runs[step.nodes[0].group, step.elements[0]] = solution
+        start = [z[0] for z in x.get([self.step.parent])]
+        _, solution = _along(self.step, substitute, start, y, down=False)
+        x.put(self.step.ascending, solution)
 
 
-class Vectors:
-    """A vector by nodes: rows of a group as lanes (element, …), read and changed node by node."""
-
-    def __init__(
-        self, shapes: dict[int, tuple[int, int]], values: Array | None, batch: Any
-    ) -> None:
-        self.shapes, self.batch = shapes, batch
-        self.groups: dict[int, list[Lane]] = {}
-        self.taken: dict[Node, list[Lane]] = {}
-        self.nodes: dict[Node, list[Lane]] = {}
-        self.runs: dict[tuple[int, int], list[Lane]] = {}
-        if values is not None:
-            for start, (m, k) in shapes.items():
-                rows = jax.lax.slice_in_dim(values, start, start + m * k)
-                self.groups[start] = list(Vector.of(rows.reshape((m, k, *values.shape[1:]))))
-
-    def get(self, node: Node) -> list[Lane]:
-        """The lanes of one node, less what was subtracted from it."""
-        own = [x[node.element] for x in self.groups[node.group]]
-        taken = self.taken.get(node, [0.0] * node.size)
-        return [blocks.minus(x, y) for x, y in zip(own, taken, strict=True)]
-
-    def solution(self, node: Node) -> list[Lane]:
-        """The lanes of one node that was solved by itself or in a run."""
-        if node in self.nodes:
-            return self.nodes[node]
-        for (group, first), lanes in self.runs.items():
-            place = node.element - first
-            if group == node.group and 0 <= place < lanes[0].shape[0]:
-                return [x[place] for x in lanes]
-        raise KeyError(node)
-
-    def subtract(self, node: Node, amount: list[Lane]) -> None:
-        """Subtracts from one node."""
-        known = self.taken.get(node, [0.0] * node.size)
-        self.taken[node] = [plus(x, y) for x, y in zip(known, amount, strict=True)]
-
-    def get_run(self, step: Run) -> tuple[list[Array], list[Array]]:
-        """The lanes of the nodes of a run, ascending, and what to subtract from the first."""
-        lanes = [take(x, step.elements) for x in self.groups[step.nodes[0].group]]
-        first, *others = step.nodes
-        for node in (node for node in others if node in self.taken):
-            place = node.element - step.elements[0]
-            pairs = zip(lanes, self.get(node), strict=True)
-            lanes = [replaced(x, place, y) for x, y in pairs]
-        taken = self.taken.get(first, [0.0] * first.size)
-        dtype = lanes[0].dtype
-        return lanes, [jnp.broadcast_to(jnp.asarray(y, dtype), self.batch) for y in taken]
-
-    def join(self) -> Array:
-        """One array (n_c, …)."""
-        parts: list[Array] = []
-        for start, (rows, _) in sorted(self.shapes.items()):
-            pieces = {
-                n.element: [x[None] for x in v] for n, v in self.nodes.items() if n.group == start
-            }
-            pieces |= {first: v for (group, first), v in self.runs.items() if group == start}
-            parts += [pieces[element][r] for r in range(rows) for element in sorted(pieces)]
-        return jnp.concatenate(parts)
+def _matrix(plan: Plan, matrices: Any) -> tuple[Pieces, Lane]:
+    """A by its blocks, of those on the diagonal the lower triangles, and its trace."""
+    jacobian, inverse_mass, compliance = matrices
+    weighted = []
+    diagonal: dict[int, Block] = {}
+    for block in jacobian.blocks:
+        weight = block.columns.take(inverse_mass)
+        rows = [[times(x, w) for x, w in zip(row, weight, strict=True)] for row in block.value]
+        weighted.append(rows)
+        own = blocks.lower_product(rows, [list(row) for row in block.value])
+        known = diagonal.get(block.start)
+        diagonal[block.start] = own if known is None else blocks.add(known, own)
+    groups = {block.start: block.shape for block in jacobian.blocks}
+    if compliance is not None:
+        _soften(diagonal, groups, compliance)
+    entries = Pieces()
+    for start, (m, k) in groups.items():
+        entries.add([(node, node) for node in nodes_of(start, m, k)], diagonal[start])
+    for coupling in plan.couplings:
+        (first, second), (x, y) = coupling.blocks, coupling.elements
+        left = [[take(lane, x) for lane in row] for row in weighted[first]]
+        right = [[take(lane, y) for lane in row] for row in jacobian.blocks[second].value]
+        block = blocks.product(left, blocks.transpose(right))
+        entries.add(coupling.pairs, block)
+        entries.add([pair[::-1] for pair in coupling.pairs], blocks.transpose(block))
+    traces = (total(row[-1] for row in block) for block in diagonal.values())
+    return entries, total(jnp.sum(x, axis=0) for x in traces)
 
 
-def _at(x: Lane, i: int) -> Lane:
-    return x[i] if isinstance(x, jax.Array) else x
+def _soften(diagonal: dict[int, Block], groups: Any, compliance: Array) -> None:
+    """Adds C."""
+    for start, (m, k) in groups.items():
+        for r in range(m):
+            part = jax.lax.slice_in_dim(compliance, start + r * k, start + (r + 1) * k)
+            diagonal[start][r][r] = plus(diagonal[start][r][r], part)
 
 
 def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
@@ -326,23 +314,3 @@ def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
     diagonal = jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
     added = jnp.asarray(share).astype(diagonal.dtype)[None] * diagonal
     return added if compliance is None else compliance + added
-
-
-def _blocks_of(plan: Plan, jacobian: Jacobian, inverse_mass: Array) -> Any:
-    """The diagonal blocks of A by group, lower triangles, and its couplings, by lanes."""
-    weighted = []
-    diagonal: dict[int, Block] = {}
-    for block in jacobian.blocks:
-        weight = block.columns.take(inverse_mass)
-        rows = [[times(x, w) for x, w in zip(row, weight, strict=True)] for row in block.value]
-        weighted.append(rows)
-        own = blocks.lower_product(rows, block.value)
-        known = diagonal.get(block.start)
-        diagonal[block.start] = own if known is None else blocks.add(known, own)
-    couplings = []
-    for coupling in plan.couplings:
-        (first, second), (x, y) = coupling.blocks, coupling.elements
-        left = [[take(lane, x) for lane in row] for row in weighted[first]]
-        right = [[take(lane, y) for lane in row] for row in jacobian.blocks[second].value]
-        couplings.append(blocks.product(left, blocks.transpose(right)))
-    return diagonal, couplings

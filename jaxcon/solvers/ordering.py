@@ -33,45 +33,55 @@ class Coupling:
     Attributes:
         blocks: positions of the two blocks in `Jacobian.blocks`.
         elements: which element of the first meets which of the second, (pairs,) each.
+        pairs: the same as nodes.
     """
 
     blocks: tuple[int, int]
     elements: tuple[tuple[int, ...], tuple[int, ...]]
+    pairs: tuple[tuple[Node, Node], ...]
 
 
 @dataclass(frozen=True)
-class Entry:
-    """Where a block of A is found: a pair of a coupling, transposed or not."""
+class Batch:
+    """Nodes of one group that do not touch each other, eliminated at once.
 
-    coupling: int
-    pair: int
-    transposed: bool
+    Attributes:
+        nodes: ascending in their elements.
+        later: of each node, its neighbours that are eliminated later, in that order; as many and of
+            the same sizes for each.
+    """
 
+    nodes: tuple[Node, ...]
+    later: tuple[tuple[Node, ...], ...]
 
-@dataclass(frozen=True)
-class Single:
-    """A node eliminated by itself, and its neighbours that are eliminated later."""
-
-    node: Node
-    later: tuple[Node, ...]
+    @property
+    def slots(self) -> list[tuple[Node, ...]]:
+        """The first later neighbours of all nodes, the second ones, and so on."""
+        return list(zip(*self.later, strict=True))
 
 
 @dataclass(frozen=True)
 class Run:
-    """Nodes of one group, each the only later neighbour of the one before; the last one excluded.
+    """Nodes of one group, each a later neighbour of the one before; the last one excluded.
 
     Attributes:
         nodes: in the order of elimination; consecutive elements, ascending or descending.
-        parent: the only later neighbour of the last of them.
+        parent: the later neighbour of the last of them.
+        border: other later neighbours, common to all of them.
     """
 
     nodes: tuple[Node, ...]
     parent: Node
+    border: tuple[Node, ...] = ()
 
     @property
-    def elements(self) -> tuple[int, ...]:
-        """Of the nodes, ascending."""
-        return tuple(sorted(node.element for node in self.nodes))
+    def ascending(self) -> list[Node]:
+        """The nodes, ascending in their elements."""
+        return list(self.nodes[::-1] if self.descending else self.nodes)
+
+    def following(self, node: Node) -> Node:
+        """The neighbour of one of the nodes that is eliminated after it."""
+        return (*self.nodes, self.parent)[self.nodes.index(node) + 1]
 
     @property
     def descending(self) -> bool:
@@ -85,38 +95,65 @@ class Plan:
 
     Attributes:
         couplings: which blocks of A to compute.
-        entries: for a pair of nodes (row, column), what to add up to their block.
         steps: the elimination, in order.
     """
 
     couplings: tuple[Coupling, ...]
-    entries: Mapping[tuple[Node, Node], tuple[Entry, ...]]
-    steps: tuple[Single | Run, ...]
+    steps: tuple[Batch | Run, ...]
 
 
 @functools.lru_cache(maxsize=256)
-def plan(structure: Any, run: int = RUN) -> Plan:
+def plan(structure: Any, run: int = RUN, order: str = "runs") -> Plan:
     """The plan for a Jacobian's structure.
 
     Args:
         structure: (first row, rows an element, columns) of each Jacobian block.
         run: least length of a run.
+        order: "runs" for the fewest operations, or "levels" for the fewest steps one after another.
     """
     nodes, touching = _nodes(structure)
     couplings = _couplings(structure, nodes, touching)
-    entries: dict[tuple[Node, Node], tuple[Entry, ...]] = {}
+    kinds: dict[tuple[Node, Node], list[tuple[int, bool]]] = {}
     neighbours: dict[Node, set[Node]] = {node: set() for node in nodes.values()}
     for c, coupling in enumerate(couplings):
-        groups = [structure[b][0] for b in coupling.blocks]
-        for i, (x, y) in enumerate(zip(*coupling.elements, strict=True)):
-            first, second = nodes[groups[0], x], nodes[groups[1], y]
+        for first, second in coupling.pairs:
             neighbours[first].add(second)
             neighbours[second].add(first)
-            for key, flip in (((first, second), False), ((second, first), True)):
-                entries[key] = (*entries.get(key, ()), Entry(c, i, flip))
-    grounded = [node for node in neighbours if _bodies(structure, node) == 1]
-    order, later = minimum_degree(neighbours, distances(neighbours, grounded))
-    return Plan(tuple(couplings), entries, tuple(_steps(order, later, entries, run)))
+            kinds.setdefault((first, second), []).append((c, False))
+            kinds.setdefault((second, first), []).append((c, True))
+    if order == "levels":
+        steps = _single(*independent_sets(neighbours))
+    else:
+        grounded = [node for node in neighbours if _bodies(structure, node) == 1]
+        found = minimum_degree(neighbours, distances(neighbours, grounded))
+        steps = _steps(*found, kinds, run)
+    return Plan(tuple(couplings), tuple(_at_once(steps)))
+
+
+def independent_sets(
+    neighbours: dict[Any, set[Any]], degree: int = 2
+) -> tuple[list[Any], dict[Any, list[Any]]]:
+    """An order in few rounds, each of nodes that do not touch each other; else `minimum_degree`.
+
+    A round takes nodes of the least degree or of at most `degree`: eliminating a node with two
+    neighbours makes these neighbours of each other, so that no degree grows. A chain of n is done
+    in log₂ n rounds (cyclic reduction).
+    """
+    graph = {node: set(around) for node, around in neighbours.items()}
+    order: list[Any] = []
+    later: dict[Any, set[Any]] = {}
+    while graph:
+        most = max(degree, min(map(len, graph.values())))
+        blocked: set[Any] = set()
+        chosen = []
+        for node in graph:
+            if node not in blocked and len(graph[node]) <= most:
+                chosen.append(node)
+                blocked |= graph[node]
+        for node in chosen:
+            later[node] = _eliminate(graph, node)
+        order += chosen
+    return order, _sorted(order, later)
 
 
 def minimum_degree(
@@ -137,14 +174,24 @@ def minimum_degree(
     near: set[Any] = set()
     while graph:
         node = min(graph, key=lambda x: (len(graph[x]), x not in near, distance[x], rank[x]))
-        around = graph.pop(node)
-        for other in around:
-            graph[other] |= around - {other}
-            graph[other].discard(node)
-        later[node], near = around, around
+        later[node] = near = _eliminate(graph, node)
         order.append(node)
+    return order, _sorted(order, later)
+
+
+def _eliminate(graph: dict[Any, set[Any]], node: Any) -> set[Any]:
+    """Takes a node out of a graph, whose neighbours become neighbours of each other."""
+    around = graph.pop(node)
+    for other in around:
+        graph[other] |= around - {other}
+        graph[other].discard(node)
+    return around
+
+
+def _sorted(order: list[Any], later: dict[Any, set[Any]]) -> dict[Any, list[Any]]:
+    """The later neighbours in the order of elimination."""
     position = {node: i for i, node in enumerate(order)}
-    return order, {node: sorted(s, key=position.__getitem__) for node, s in later.items()}
+    return {node: sorted(s, key=position.__getitem__) for node, s in later.items()}
 
 
 def distances(neighbours: dict[Any, set[Any]], start: list[Any]) -> dict[Any, int]:
@@ -184,38 +231,71 @@ def _couplings(structure: Any, nodes: Any, touching: Any) -> list[Coupling]:
     couplings = []
     for blocks, elements in pairs.items():
         first, second = zip(*sorted(elements), strict=True)
-        couplings.append(Coupling(blocks, (first, second)))
+        starts = [structure[b][0] for b in blocks]
+        ends = [[nodes[s, x] for x in e] for s, e in zip(starts, (first, second), strict=True)]
+        couplings.append(Coupling(blocks, (first, second), tuple(zip(*ends, strict=True))))
     return couplings
 
 
 def _steps(
-    order: list[Node], later: dict[Node, list[Node]], entries: Any, run: int
-) -> list[Single | Run]:
+    order: list[Node], later: dict[Node, list[Node]], kinds: Any, run: int
+) -> list[Batch | Run]:
     """The order as runs where there are long ones, and single nodes elsewhere."""
-    steps: list[Single | Run] = []
+    steps: list[Batch | Run] = []
     i = 0
     while i < len(order):
         j = i
-        while j + 1 < len(order) and _continues(order, later, entries, i, j):
+        while j + 1 < len(order) and _continues(order, later, kinds, i, j):
             j += 1
         if j - i >= run:
-            steps.append(Run(tuple(order[i:j]), order[j]))
+            steps.append(Run(tuple(order[i:j]), order[j], tuple(later[order[i]][1:])))
             i = j
         else:
-            steps.append(Single(order[i], tuple(later[order[i]])))
+            steps += _single(order[i : i + 1], later)
             i += 1
     return steps
 
 
-def _continues(order: list[Node], later: Any, entries: Any, i: int, j: int) -> bool:
+def _single(order: list[Node], later: dict[Node, list[Node]]) -> list[Batch | Run]:
+    """Nodes one by one."""
+    return [Batch((node,), (tuple(later[node]),)) for node in order]
+
+
+def _at_once(steps: list[Batch | Run]) -> list[Batch | Run]:
+    """The same elimination with equal nodes that do not wait for each other in one step.
+
+    A step waits for those that change its nodes; all that wait for equally many are a level.
+    """
+    waits: dict[Node, int] = {}
+    levels: dict[Any, list[Batch | Run]] = {}
+    for step in steps:
+        level = max(waits.get(node, 0) for node in step.nodes)
+        run = isinstance(step, Run)
+        after = [step.parent, *step.border] if run else [q for s in step.later for q in s]
+        for node in after:
+            waits[node] = max(waits.get(node, 0), level + 1)
+        alone = (step,) if run else ()
+        sizes = tuple(node.size for node in after)
+        levels.setdefault((level, step.nodes[0].group, sizes, *alone), []).append(step)
+    merged: list[Batch | Run] = []
+    for _, equal in sorted(levels.items(), key=lambda item: item[0][0]):
+        pairs = [(s.nodes[0], s.later[0]) for s in equal if isinstance(s, Batch)]
+        if pairs:
+            pairs.sort(key=lambda pair: pair[0].element)
+            nodes, later = zip(*pairs, strict=True)
+            equal = [Batch(nodes, later)]
+        merged += equal
+    return merged
+
+
+def _continues(order: list[Node], later: Any, kinds: Any, i: int, j: int) -> bool:
     """Whether a run from i to j may go on: same group, next element, same kind of block."""
     node, following = order[j], order[j + 1]
-    if later[node] != [following] or node.group != following.group:
+    if later[node] != [following, *later[order[i]][1:]] or node.group != following.group:
         return False
 
     def kind(k: int) -> Any:
-        blocks = entries.get((order[k + 1], order[k]), ())
         stride = order[k + 1].element - order[k].element
-        return stride, [(entry.coupling, entry.transposed) for entry in blocks]
+        return stride, kinds.get((order[k + 1], order[k]))
 
     return abs(following.element - node.element) == 1 and kind(j) == kind(i)

@@ -35,7 +35,9 @@ class Sparse:
         tikhonov: ε of a regularised system (A + ε diag A) λ = b − J M⁻¹ f, or None; gives redundant
             rows a solution, which holds them to ε λ. 1e-6 suits float32, 1e-10 float64. The
             derivative is that of the regularised system with diag A held.
-        run: equal nodes in a row from which a scan is used instead of unrolled code.
+        run: equal nodes in a row from which a loop is used instead of unrolled code.
+        order: "runs" for the fewest operations; "levels" for the fewest steps one after another,
+            each of many nodes, which suits GPUs; None for what suits the default device.
 
     References:
         Baraff, Linear-time dynamics using Lagrange multipliers, SIGGRAPH 1996.
@@ -44,6 +46,7 @@ class Sparse:
 
     tikhonov: Any = None
     run: int = static(default=ordering.RUN)
+    order: str | None = static(default=None)
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.
@@ -62,7 +65,9 @@ class Sparse:
             matrices = (*matrices[:2], freeze(compliance))
         rounding = len(system.target) * float(jnp.finfo(free.dtype).eps)
         rounding = 0.0 if self.tikhonov is not None else rounding
-        elimination = Elimination(matrices, self.run, free.shape[1:], rounding)
+        structure = tuple((b.start, b.shape[0], b.columns) for b in j.blocks)
+        plan = ordering.plan(structure, self.run, self.order or suits_device())
+        elimination = Elimination(matrices, plan, free.shape[1:], rounding)
 
         def delassus(x: Array) -> Array:
             y = j.apply(system.mass.solve(j.transpose(x)))
@@ -78,3 +83,8 @@ class Sparse:
         independent = elimination.margin > 0
         dependent = (~independent & elimination.finite) | system.mass.singular
         return Solution(acceleration, multipliers, judge(acceleration, dependent))
+
+
+def suits_device() -> str:
+    """The order of elimination for the default device."""
+    return "runs" if jax.default_backend() == "cpu" else "levels"
