@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.core import fusion
+from jaxcon.core.native import Native
 from jaxcon.scenes import four_bar
 
 X = np.linspace(0.3, 1.7, 24).reshape(4, 6)
@@ -71,7 +71,7 @@ FUNCTIONS = [
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.__name__)
 @pytest.mark.parametrize("constant", [False, True])
 def test_the_results_are_those_of_the_function(function, constant):
-    cut = fusion.settled(function)
+    cut = Native(function).settled
     x, y = jnp.asarray(X), jnp.asarray(Y)
     if constant:
         found = jax.jit(lambda x: cut(x, np.ones_like(Y)))(x)
@@ -84,7 +84,7 @@ def test_the_results_are_those_of_the_function(function, constant):
 
 
 def test_shared_values_are_computed_once():
-    text = jax.jit(fusion.settled(chain_of_shared_values)).lower(X, Y).compile().as_text()
+    text = jax.jit(Native(chain_of_shared_values).settled).lower(X, Y).compile().as_text()
     assert len(re.findall(r" multiply\(", text)) < 8 * 40
 
 
@@ -104,7 +104,7 @@ def unread(text):
     ids=lambda f: f.__name__,
 )
 def test_kernels_read_all_their_arguments(function):
-    cut = fusion.settled(function)
+    cut = Native(function).settled
     for run, args in ((cut, (X, Y)), (lambda x: cut(x, np.zeros_like(Y)), (X,))):
         text = jax.jit(run).lower(*args).compile().as_text()
         assert "%kernel" in text
@@ -131,14 +131,14 @@ def test_what_a_function_does_besides_is_done(capsys):
         jax.debug.callback(lambda z: print("seen", float(z)), x[0, 0])
         return [x + y]
 
-    jax.block_until_ready(jax.jit(fusion.settled(loud))(X, Y))
+    jax.block_until_ready(jax.jit(Native(loud).settled)(X, Y))
     jax.effects_barrier()
     assert "seen 0.3" in capsys.readouterr().out
 
 
 def test_it_can_be_left_to_the_compiler(monkeypatch):
     monkeypatch.setenv("JAXCON_STAGES", "off")
-    left = jax.jit(fusion.settled(chain_of_shared_values)).lower(X, Y).as_text()
+    left = jax.jit(Native(chain_of_shared_values).settled).lower(X, Y).as_text()
     assert "inlineable" not in left
 
 

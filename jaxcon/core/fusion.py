@@ -75,13 +75,13 @@ Step = Operation | list[int]
 """An operation by itself, or the values of a stage."""
 
 
-def settled(function: Callable[..., Any]) -> Callable[..., list[Array]]:
-    """The function of arrays that returns a list of them, cut into stages."""
+def settled(function: Any) -> Callable[..., list[Array]]:
+    """A native function, cut into stages."""
 
     def run(*args: Array) -> list[Array]:
         if os.environ.get("JAXCON_STAGES") == "off":
             return function(*args)
-        return Stages(traced(function, *args))(*args)
+        return Stages(traced(function, args))(*args)
 
     return run
 

@@ -19,7 +19,7 @@ checkpoint, and its derivative evaluates the function once more.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -42,12 +42,12 @@ class Native:
 
     def __init__(self, function: Callable[..., Any], full: bool = False) -> None:
         self.function, self.full = function, full
-        self.settled = fusion.settled(self.__call__)
+        self.settled = fusion.settled(self)
         self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
         self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
         self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
         self.part = functools.lru_cache(maxsize=None)(self._part)
-        self.shapes = functools.lru_cache(maxsize=64)(self._shapes)
+        self.traced = functools.lru_cache(maxsize=64)(self._traced)
 
     def __call__(self, *args: Array) -> list[Array]:
         """The function itself."""
@@ -57,22 +57,25 @@ class Native:
         """The function outside jit: compiled, unless that is switched off."""
         return self(*args) if jax.config.values["jax_disable_jit"] else self.compiled(*args)
 
-    def _shapes(self, *avals: Any) -> list[Any]:
-        """Shape and dtype of the results.
+    def shapes(self, args: Sequence[Array]) -> list[Any]:
+        """Shape and dtype of the results."""
+        return self.traced(*((x.shape, x.dtype) for x in args)).out_avals
+
+    def _traced(self, *avals: Any) -> Any:
+        """The closed jaxpr for arguments of these shapes and dtypes.
 
         Raises:
             TypeError: a user's function holds a traced value that is not among the arguments; its
                 derivative would silently be zero.
         """
-        inputs = (jax.ShapeDtypeStruct(*aval) for aval in avals)
-        closed, shapes = jax.make_jaxpr(self, return_shape=True)(*inputs)
+        closed = jax.make_jaxpr(self)(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
         if any(isinstance(x, Tracer) for x in closed.consts):
             raise TypeError(
                 "a function of the scene (a force, constraint, motion, mass or potential) closes"
                 " over a traced value, which would be invisible to vmap and grad: pass it through"
                 " params= instead."
             )
-        return shapes
+        return closed
 
     def _part(self, wanted: tuple[bool, ...]) -> Native:
         """Some of the results."""
@@ -156,7 +159,7 @@ def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
     leaves, structure = jax.tree.flatten(args)
     native, result = _native(function, structure)
     arrays = [jnp.asarray(x) for x in leaves]
-    native.shapes(*((x.shape, x.dtype) for x in arrays))
+    native.shapes(arrays)  # leaves the structure
     arrays = native_p.bind(*arrays, fun=native)
     return jax.tree.unflatten(result[0], arrays)
 
@@ -214,8 +217,7 @@ def lift(x: Array, like: Array) -> Array:
 
 
 def _abstract(*args: Any, fun: Native) -> list[Any]:
-    shapes = fun.shapes(*((x.shape, x.dtype) for x in args))
-    return [ShapedArray(y.shape, y.dtype) for y in shapes]
+    return [ShapedArray(y.shape, y.dtype) for y in fun.shapes(args)]
 
 
 def _batched(args: Any, axes: Any, *, fun: Native) -> Any:

@@ -82,9 +82,9 @@ class Operation:
         return results if self.primitive.multiple_results else [results]
 
 
-def traced(function: Callable[..., Any], *args: Any) -> Any:
-    """The closed jaxpr of a function, without what no result needs."""
-    closed = jax.make_jaxpr(function)(*args)
+def traced(function: Any, args: Sequence[Any]) -> Any:
+    """The closed jaxpr of a native function, without what no result needs."""
+    closed = function.traced(*((x.shape, x.dtype) for x in args))
     jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, True, instantiate=True)
     return jex.ClosedJaxpr(jaxpr, closed.consts)
 
@@ -218,8 +218,8 @@ class Program:
             given = [*args[first:last], *args[last + lengths.transpose_solve :]]
             return self._inline_closed(params["jaxprs"].solve, given)
         if name == "native":
-            avals = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
-            return self._inline_closed(traced(params["fun"], *avals), args)
+            avals = [x.aval for x in equation.invars]
+            return self._inline_closed(traced(params["fun"], avals), args)
         folded = _known_result(equation, args)
         if folded is not None:
             return folded
