@@ -561,3 +561,9 @@ def test_the_same_scene_may_be_built_twice():
     (first, start), (second, again) = s.build(), s.build()
     assert jax.tree.structure(first) == jax.tree.structure(second)
     np.testing.assert_array_equal(start.q, again.q)
+
+
+def test_an_unknown_order_of_elimination():
+    system, state = build(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)), dim=2)
+    with pytest.raises(ValueError, match="order must be one of .*'levels'.* got 'random'"):
+        jc.step(system, jc.Method(solver=jc.Sparse(order="random")), state, None, 1e-3)

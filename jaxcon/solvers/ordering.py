@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+ORDERS = ("runs", "levels")
 RUN = 6
 """Nodes in a row from which a scan pays more than unrolling."""
 
@@ -110,7 +111,12 @@ def plan(structure: Any, run: int = RUN, order: str = "runs") -> Plan:
         structure: (first row, rows an element, columns) of each Jacobian block.
         run: least length of a run.
         order: "runs" for the fewest operations, or "levels" for the fewest steps one after another.
+
+    Raises:
+        ValueError: another order.
     """
+    if order not in ORDERS:
+        raise ValueError(f"Sparse: order must be one of {ORDERS} or None, got {order!r}.")
     nodes, touching = _nodes(structure)
     couplings = _couplings(structure, nodes, touching)
     kinds: dict[tuple[Node, Node], list[tuple[int, bool]]] = {}

@@ -1,10 +1,11 @@
 """Block LDLᵀ of the Delassus matrix by a plan found when tracing.
 
-Three tiers. Once for each structure, on the host: the graph of A = J M⁻¹ Jᵀ, an elimination order,
-and its long runs (`ordering.plan`). Once for each state: the blocks of A and their factorization,
-blocks unrolled into scalar formulas and runs of equal blocks in a scan (`factor`). For each right
-side: one sweep down the order and one back (`substitute`). A tree of joints costs and compiles in
-proportion to its joints, and no matrix of the size of the system is ever formed.
+Three tiers. Once for each structure, on the host: the graph of A = J M⁻¹ Jᵀ and an elimination
+order, as steps that each take many nodes (`ordering.plan`). Once for each state: the blocks of A
+and their factorization, small blocks in unrolled scalar formulas, equal nodes side by side, runs of
+them in a loop (`Elimination`). For each right side: one sweep down the order and one back
+(`substitute`). A tree of joints costs and compiles in proportion to its joints, and no matrix of
+the size of the system is ever formed.
 """
 
 from __future__ import annotations
