@@ -44,6 +44,7 @@ from benchmarks import mechanisms, targets, timing
 from benchmarks.mjcf import DT
 from benchmarks.throughput import method_of
 from jaxcon.constraints.rows import linearize
+from jaxcon.core import fusion
 from jaxcon.dynamics.assembly import saddle
 from jaxcon.solvers.saddle import Saddle, Solution
 
@@ -52,6 +53,8 @@ SOLVERS: dict[str, Callable[..., Any]] = {
     "Schur": jc.Schur,
     "Sparse": jc.Sparse,
 }
+LAPACK = (jc.Dense, jc.Schur)
+"""Those that factor whole matrices; what the others do is compiled in stages, as in a step."""
 LIMIT = {"float64": 1e-12, "float32": 1e-5}
 """Of ρ₁ and ρ₂."""
 FACTOR = 10.0
@@ -154,7 +157,7 @@ def measure(name: str, dtype: str, solvers: list[str], times: list[float]) -> It
     for time, plain in zip(times, systems(name, dtype, times), strict=True):
         with jax.enable_x64(True):
             full = plain if share is None else regularized(plain, share)
-            numbers, exact = Numbers(full), on_arrays(jc.Dense().solve, doubled(full))
+            numbers, exact = Numbers(full), on_arrays(jc.Dense().solve, doubled(full), False)
         condition = numbers.condition()
         for solver in solvers:
             with jax.enable_x64(dtype == "float64"):
@@ -186,9 +189,10 @@ def judged(
 
 def solve(solver: Any, plain: Saddle, full: Saddle, share: float | None) -> Solution:
     """By a solver that regularises the plain system, or one that is given the regularised one."""
+    staged = solver not in LAPACK
     if share is None or not hasattr(solver(), "tikhonov"):
-        return on_arrays(solver().solve, full)
-    return on_arrays(solver(tikhonov=share).solve, plain)
+        return on_arrays(solver().solve, full, staged)
+    return on_arrays(solver(tikhonov=share).solve, plain, staged)
 
 
 def systems(name: str, dtype: str, times: list[float]) -> list[Saddle]:
@@ -229,18 +233,19 @@ def is_array(x: Any) -> bool:
     return isinstance(x, jax.Array)
 
 
-def on_arrays(function: Callable[[Any], Any], tree: Any) -> Any:
+def on_arrays(function: Callable[[Any], Any], tree: Any, staged: bool = True) -> Any:
     """function(tree), compiled for the arrays in it; Python numbers stay what they are."""
     leaves, structure = jax.tree.flatten(tree)
     results: list[Any] = []
 
-    def run(arrays: list[jax.Array]) -> list[jax.Array]:
+    def run(*arrays: jax.Array) -> list[jax.Array]:
         given = iter(arrays)
         merged = [next(given) if is_array(x) else x for x in leaves]
         results[:] = jax.tree.flatten(function(jax.tree.unflatten(structure, merged)))
         return [x for x in results[0] if is_array(x)]
 
-    found = iter(jax.jit(run)([x for x in leaves if is_array(x)]))
+    compiled = jax.jit(fusion.settled(run) if staged else run)
+    found = iter(compiled(*(x for x in leaves if is_array(x))))
     output = [next(found) if is_array(x) else x for x in results[0]]
     return jax.tree.unflatten(results[1], output)
 
