@@ -1,5 +1,6 @@
 """Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
 
+from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
     angular_velocity,
     energy,
@@ -66,6 +67,7 @@ __all__ = [
     "Heun",
     "Holonomic",
     "JointSpring",
+    "Memory",
     "Method",
     "Motion",
     "Pose",
@@ -92,6 +94,7 @@ __all__ = [
     "inertia",
     "init",
     "largest_stable_rate",
+    "memory",
     "orientation",
     "position",
     "quaternion",

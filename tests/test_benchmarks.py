@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import quick_jit
+from tolerances import IDENTITY
 
 import jaxcon as jc
 
@@ -18,7 +19,9 @@ from benchmarks import (  # noqa: E402
     drift,
     equivalence,
     mechanisms,
+    native_share,
     regression,
+    residuals,
     roofline,
     tables,
     targets,
@@ -126,3 +129,38 @@ def test_what_fell_is_named():
     now = {"a": {"over_mujoco": 2.0, "over_peak": 1.0}, "b": {"over_peak": 0.9}, "c": {}}
     assert regression.slower(before, now, 1.5) == ["a: over_mujoco fell from 4 to 2"]
     assert not regression.slower(before, now, 2.5)
+
+
+@pytest.mark.parametrize("dtype", residuals.LIMIT)
+@pytest.mark.parametrize("name", ["pendulum", "four-bar", "n-four-bar-2"])
+def test_every_solver_leaves_only_rounding(name, dtype, monkeypatch):
+    monkeypatch.setitem(targets.TIKHONOV, "n-four-bar-2", 1e-5)
+    rows = list(residuals.measure(name, dtype, list(residuals.SOLVERS), [0.02]))
+    assert len(rows) == len(residuals.SOLVERS)
+    assert all(row.verdict == "passes" for row in rows), "\n".join(map(str, rows))
+    assert any(row.motion > 0 for row in rows)
+
+
+def test_a_solution_of_another_system_is_seen():
+    """Of the regularised one in the place of the plain one, and one whose λ is off."""
+    (plain,) = residuals.systems("four-bar", "float64", [0.0])
+    exact = residuals.on_arrays(jc.Dense().solve, plain, False)
+    numbers, which = residuals.Numbers(plain), ("four-bar", "float64", "-", 0.0)
+    softened = residuals.solve(jc.Dense, plain, residuals.regularized(plain, 1e-6), 1e-6)
+    found = residuals.judged(numbers, softened, exact, numbers.condition(), which)
+    assert found.verdict == "fails: constraint, distance"
+    off = exact._replace(multipliers=exact.multipliers * (1 + 1e-9))
+    found = residuals.judged(numbers, off, exact, numbers.condition(), which)
+    assert found.verdict == "fails: motion, distance"
+
+
+@pytest.mark.parametrize("name", ["pendulum", "four-bar"])
+def test_steps_batched_by_hand_are_those_of_vmap(name):
+    system, state = mechanisms.find(name).build(jnp.float64)
+    method, states = jc.Method(), throughput.worlds(state, 3)
+    expected = quick_jit(native_share.plain(system, method, 20))(states)
+    found = quick_jit(native_share.by_hand(system, method, 20))(native_share.turned(states))
+    found = native_share.turned(found, last=False)
+    assert np.max(np.abs(expected.v - states.v)) > 1e-3
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(x, y, rtol=IDENTITY, atol=IDENTITY)

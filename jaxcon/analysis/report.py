@@ -8,9 +8,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxcon.analysis.memory import Memory, memory
 from jaxcon.constraints.rows import Rows, linearize
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State, check_state
+from jaxcon.simulation.method import Method
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,7 @@ class Report:
         redundant: (constraint, row in it) of each row that depends on those before it.
         condition: of J M⁻¹ Jᵀ with rows scaled to unit length, independent rows only.
         violation: ‖φ‖ and ‖φ̇‖ by constraint.
+        memory: of a world in a batch [B], where a method was given.
     """
 
     coordinates: int
@@ -35,6 +38,7 @@ class Report:
     redundant: tuple[tuple[str, int], ...]
     condition: float
     violation: dict[str, tuple[float, float]]
+    memory: Memory | None = None
 
     def __str__(self) -> str:
         lines = [
@@ -49,6 +53,8 @@ class Report:
                 f"redundant rows (each depends on rows before it): {named}; keep only independent"
                 " ones, for example close a loop with a joint or a Holonomic of fewer rows"
             )
+        if self.memory:
+            lines.append(str(self.memory))
         lines += [
             f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
             for name, (phi, rate) in self.violation.items()
@@ -56,8 +62,10 @@ class Report:
         return "\n".join(lines)
 
 
-def report(system: Any, state: State) -> Report:
-    """Degrees of freedom, rank, redundant rows by name, and violation.
+def report(
+    system: Any, state: State, method: Method | None = None, control: PyTree = None
+) -> Report:
+    """Degrees of freedom, rank, redundant rows by name, violation, and memory of a world.
 
     Rows are compared in the metric of M⁻¹, scaled to unit length; a row counts as dependent where
     the part that earlier rows do not explain is below 1e-9 (float64) or 1e-4 (float32).
@@ -65,6 +73,9 @@ def report(system: Any, state: State) -> Report:
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
         state: of one world.
+        method: by which the system is to be stepped, for `memory`, which compiles it and takes
+            seconds; None leaves that out.
+        control: for `memory`.
 
     Returns:
         A `Report`.
@@ -94,6 +105,7 @@ def report(system: Any, state: State) -> Report:
             name: (float(rows.violation[name]), float(rows.violation.rate(name)))
             for name in rows.layout.names
         },
+        memory=None if method is None else memory(system, method, state, control),
     )
 
 

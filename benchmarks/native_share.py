@@ -1,0 +1,138 @@
+"""What of the native speed plain `jit(vmap(rollout))` reaches: at least four fifths.
+
+    python -m benchmarks.native_share [--scenes chain-10 …] [--batch 512] [--dtype float32]
+        [--json FILE]
+
+The other runs the same steps by hand: worlds on the last axis from the beginning, a scan that calls
+the step on the whole batch, and no vmap anywhere. Both lie over one device a core and do the same
+numbers of steps; their repeats alternate, so that a machine that slows down slows both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcon as jc
+from benchmarks import mechanisms, targets, timing
+from benchmarks.mjcf import DT
+from benchmarks.throughput import WORK, method_of, worlds
+from benchmarks.timing import Rate
+from jaxcon.core import native
+from jaxcon.simulation.step import contained_step
+
+SHARE = 0.8
+"""Of the native rate that plain vmap is to reach."""
+
+Run = Callable[[jc.State], jc.State]
+
+
+@dataclass(frozen=True)
+class Share:
+    """Of one scene.
+
+    Attributes:
+        scene: which.
+        plain, native: world-steps a second.
+        ratios: the rate of vmap over the native one, least, median and most of the repeats.
+    """
+
+    scene: str
+    plain: Rate
+    native: Rate
+    ratios: tuple[float, float, float]
+
+    @property
+    def verdict(self) -> str:
+        """Whether vmap costs little."""
+        return "passes" if self.ratios[1] >= SHARE else "below"
+
+
+def plain(system: Any, method: jc.Method, steps: int) -> Run:
+    """Steps of a batch on the first axis, by vmap."""
+
+    def run(state: jc.State) -> jc.State:
+        return jc.rollout(system, method, state, None, DT, steps, record=lambda s, i: None)[0]
+
+    return jax.vmap(run)
+
+
+def by_hand(system: Any, method: jc.Method, steps: int) -> Run:
+    """Steps of a batch on the last axis, without vmap; what worlds share has a last axis of 1."""
+
+    def one(state: jc.State, shared: Any) -> tuple[jc.State, None]:
+        system, method, dt = shared
+        return native.call(contained_step, system, method, state, None, dt)[0], None
+
+    def run(state: jc.State) -> jc.State:
+        dt = jnp.asarray(DT, state.q.dtype)
+        shared = jax.tree.map(lambda x: jnp.asarray(x)[..., None], (system, method, dt))
+        return jax.lax.scan(lambda s, _: one(s, shared), state, None, steps)[0]
+
+    return run
+
+
+def turned(states: jc.State, last: bool = True) -> jc.State:
+    """The batch from the first axis to the last, or back."""
+    source, target = (0, -1) if last else (-1, 0)
+    return jax.jit(lambda s: jax.tree.map(lambda x: jnp.moveaxis(x, source, target), s))(states)
+
+
+def measure(name: str, batch: int, dtype: Any, work: int = WORK, repeats: int = 9) -> Share:
+    """Both rates of one scene."""
+    with jax.enable_x64(np.dtype(dtype) == np.float64):
+        system, state = mechanisms.find(name).build(dtype)
+        method = method_of(name, "Sparse")
+        steps = int(np.clip(work // batch, 10, 1000))
+        first = timing.over_devices(worlds(state, batch), batch)
+        starts = first, turned(first)
+        runs = [
+            timing.compile_seconds(make(system, method, steps), start)[0]
+            for make, start in zip((plain, by_hand), starts, strict=True)
+        ]
+        rates: tuple[list[float], list[float]] = ([], [])
+        for i in range(repeats + 1):
+            for run, start, found in zip(runs, starts, rates, strict=True):
+                rate = timing.rate(lambda r=run, s=start: r(s), batch * steps, 1)
+                found.extend([rate.median] if i else [])  # the first warms up
+    ratios = np.asarray(rates[0]) / np.asarray(rates[1])
+    spread = float(ratios.min()), float(np.median(ratios)), float(ratios.max())
+    return Share(name, *(Rate(float(np.median(x)), min(x), max(x)) for x in rates), spread)
+
+
+def main() -> None:
+    """Prints the table and writes the file."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scenes", nargs="*", default=list(targets.SCENES))
+    parser.add_argument("--batch", type=int, default=512)
+    parser.add_argument("--dtype", default="float32")
+    parser.add_argument("--work", type=int, default=WORK, help="world-steps of a repeat")
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    timing.use_all_cores()
+    print(timing.machine())
+    print("| scene | jit(vmap(rollout)) | by hand | ratio (min to max) | verdict |")
+    print("|---|---|---|---|---|")
+    rows = []
+    for name in options.scenes:
+        row = measure(name, options.batch, options.dtype, options.work, options.repeats)
+        rows.append(timing.plain(row) | {"verdict": row.verdict})
+        least, median, most = row.ratios
+        ratio = f"{median:.2f} ({least:.2f} to {most:.2f})"
+        print(f"| {name} | {row.plain} | {row.native} | {ratio} | {row.verdict} |", flush=True)
+    if options.json:
+        result = {"machine": timing.machine(), "batch": options.batch, "dtype": options.dtype}
+        options.json.write_text(json.dumps(result | {"rows": rows}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,82 @@
+"""What a world takes, against what XLA plans for batches that were not asked about."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxcon as jc
+from jaxcon import scenes as scenes_of_library
+
+CLOSE = 0.2
+"""Of a batch; the rest is what XLA decides anew for each."""
+
+
+def chain(links, dtype):
+    """Rods on hinges in space; of one, the pendulum."""
+    scene, before = jc.Scene(dtype=dtype), jc.WORLD
+    for i in range(links):
+        rod, middle, end = jc.inertia.rod(1.0, 1.0, 0.05), (i + 0.5, 0.0, 0.0), (float(i), 0.0, 0.0)
+        scene.add_body(f"link{i}", inertia=rod, position=middle)
+        scene.add(jc.Revolute(f"hinge{i}", before, f"link{i}", end, (0.0, 1.0, 0.0)))
+        before = f"link{i}"
+    return scene.build()
+
+
+SCENES = {
+    "pendulum": lambda: chain(1, jnp.float64),
+    "four-bar": scenes_of_library.four_bar,
+    "chain": lambda: chain(4, jnp.float32),
+}
+
+
+def planned(function, state, worlds):
+    """Arguments, and results with what lies between, of a batch as XLA plans it [B]."""
+    batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), state)
+    plan = jax.jit(jax.vmap(function)).lower(batch).compile().memory_analysis()
+    return plan.argument_size_in_bytes, plan.output_size_in_bytes + plan.temp_size_in_bytes
+
+
+@pytest.mark.parametrize(
+    ("name", "solver"),
+    [*((name, jc.Sparse()) for name in SCENES), ("four-bar", jc.Schur())],
+)
+def test_memory_of_other_batches_is_foretold(name, solver):
+    (system, state), method = SCENES[name](), jc.Method(solver=solver)
+    memory = jc.memory(system, method, state)
+    for worlds in (100, 2000):
+        given, other = planned(lambda s: jc.step(system, method, s, None, 2e-3), state, worlds)
+        assert given == memory.state * worlds
+        assert abs(memory.working * worlds / other - 1) < CLOSE
+        assert abs(memory.of(worlds) / (given + other) - 1) < CLOSE
+
+
+def test_a_rollout_takes_what_a_step_takes():
+    system, state = scenes_of_library.four_bar()
+    memory = jc.memory(system, jc.Method(), state)
+
+    def run(s):
+        return jc.rollout(system, jc.Method(), s, None, 2e-3, 50, record=lambda s, i: None)[0]
+
+    given, other = planned(run, state, 1000)
+    assert abs(memory.of(1000) / (given + other) - 1) < CLOSE
+
+
+def test_a_report_has_it_where_a_method_is_given():
+    system, state = chain(1, jnp.float32)
+    assert jc.report(system, state).memory is None
+    report = jc.report(system, state, jc.Method())
+    assert report.memory == jc.memory(system, jc.Method(), state)
+    assert report.memory.state == (7 + 6 + 1 + 1) * 4
+    assert "60 B of state" in str(report)
+
+
+def test_control_is_that_of_a_step():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    scene.add(jc.ExternalWrench("push", "bob"))
+    system, state = scene.build()
+    control = [1.0] * system.layout.n_u
+    assert jc.memory(system, jc.Method(), state, control).working > 0
+    with pytest.raises(ValueError, match="control must have shape"):
+        jc.memory(system, jc.Method(), state, [*control, 1.0])
