@@ -44,7 +44,7 @@ from benchmarks import mechanisms, targets, timing
 from benchmarks.mjcf import DT
 from benchmarks.throughput import method_of
 from jaxcon.constraints.rows import linearize
-from jaxcon.core import fusion
+from jaxcon.core.native import Native
 from jaxcon.dynamics.assembly import saddle
 from jaxcon.solvers.saddle import Saddle, Solution
 
@@ -244,7 +244,7 @@ def on_arrays(function: Callable[[Any], Any], tree: Any, staged: bool = True) ->
         results[:] = jax.tree.flatten(function(jax.tree.unflatten(structure, merged)))
         return [x for x in results[0] if is_array(x)]
 
-    compiled = jax.jit(fusion.settled(run) if staged else run)
+    compiled = jax.jit(Native(run).settled if staged else run)
     found = iter(compiled(*(x for x in leaves if is_array(x))))
     output = [next(found) if is_array(x) else x for x in results[0]]
     return jax.tree.unflatten(results[1], output)

@@ -122,7 +122,16 @@ def forward_dynamics(
     """
     control = check_step(system, method, state, control)
     h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
-    at = accelerate(system, method.feedback(h), method.solver, control, state.memory, h)
+    return native.call(_dynamics, system, method, state, control, h)
+
+
+def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Solution:
+    """Of worlds along trailing axes."""
+    if not hasattr(system, "layout") and state.q.ndim > 1:
+        one = native.per_world(_dynamics, state.q.ndim - 1)
+        return one(system, method, state, control, dt)
+    stabilizer = method.feedback(dt)
+    at = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
     return at(state.q, state.v, state.time)[0]
 
 
