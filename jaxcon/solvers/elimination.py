@@ -9,10 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.lanes import Vector, plus, replaced, take, times, total
+from jaxcon.core.lanes import Vector, plus, replaced, take, total
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers import blocks, ordering
 from jaxcon.solvers.blocks import Block
+from jaxcon.solvers.delassus import diagonal_blocks, softened, weighted
 from jaxcon.solvers.jacobian import Jacobian
 from jaxcon.solvers.ordering import Node, Plan, Run, Single
 
@@ -41,9 +42,11 @@ class Elimination:
         self.plan = ordering.plan(structure, run)
         self.batch, self.dtype, self.rounding = batch, inverse_mass.dtype, rounding
         self.groups = {block.start: block.shape for block in jacobian.blocks}
-        self.diagonal, self.couplings = _blocks_of(self.plan, jacobian, inverse_mass)
+        rows = weighted(jacobian, inverse_mass)
+        self.diagonal = diagonal_blocks(jacobian, rows)
+        self.couplings = _couplings(self.plan, jacobian, rows)
         if compliance is not None:
-            self._soften(compliance)
+            self.diagonal = softened(self.diagonal, self.groups, compliance)
         self.updates: dict[tuple[Node, Node], Block] = {}
         self.margin: Any = jnp.ones(self.batch, self.dtype)
         traces = (total(block[r][r] for r in range(len(block))) for block in self.diagonal.values())
@@ -142,12 +145,6 @@ class Elimination:
             rest = 1 - self.rounding * full[-1] * left[-1]
             margin = jnp.minimum(margin, jnp.minimum(left[-1], rest))
         return margin
-
-    def _soften(self, compliance: Array) -> None:
-        for start, (m, k) in self.groups.items():
-            for r in range(m):
-                part = jax.lax.slice_in_dim(compliance, start + r * k, start + (r + 1) * k)
-                self.diagonal[start][r][r] = plus(self.diagonal[start][r][r], part)
 
 
 def _no_update(node: Node) -> Block:
@@ -311,38 +308,12 @@ def _at(x: Lane, i: int) -> Lane:
     return x[i] if isinstance(x, jax.Array) else x
 
 
-def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
-    """C + ε diag(J M⁻¹ Jᵀ), (n_c,), with the diagonal held constant."""
-    jacobian, inverse_mass, _ = matrices
-    rows: dict[int, list[Lane]] = {}
-    for block in jacobian.blocks:
-        weight = block.columns.take(inverse_mass)
-        squares = [
-            total(times(w, times(x, x)) for x, w in zip(row, weight, strict=True))
-            for row in block.value
-        ]
-        known = rows.get(block.start, [0.0] * len(squares))
-        rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
-    diagonal = jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
-    added = jnp.asarray(share).astype(diagonal.dtype)[None] * diagonal
-    return added if compliance is None else compliance + added
-
-
-def _blocks_of(plan: Plan, jacobian: Jacobian, inverse_mass: Array) -> Any:
-    """The diagonal blocks of A by group, lower triangles, and its couplings, by lanes."""
-    weighted = []
-    diagonal: dict[int, Block] = {}
-    for block in jacobian.blocks:
-        weight = block.columns.take(inverse_mass)
-        rows = [[times(x, w) for x, w in zip(row, weight, strict=True)] for row in block.value]
-        weighted.append(rows)
-        own = blocks.lower_product(rows, block.value)
-        known = diagonal.get(block.start)
-        diagonal[block.start] = own if known is None else blocks.add(known, own)
+def _couplings(plan: Plan, jacobian: Jacobian, rows: list[Block]) -> list[Block]:
+    """The blocks of A off its diagonal from those of J M⁻¹, by lanes."""
     couplings = []
     for coupling in plan.couplings:
         (first, second), (x, y) = coupling.blocks, coupling.elements
-        left = [[take(lane, x) for lane in row] for row in weighted[first]]
+        left = [[take(lane, x) for lane in row] for row in rows[first]]
         right = [[take(lane, y) for lane in row] for row in jacobian.blocks[second].value]
         couplings.append(blocks.product(left, blocks.transpose(right)))
-    return diagonal, couplings
+    return couplings

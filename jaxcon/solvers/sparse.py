@@ -18,7 +18,8 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import ordering
 from jaxcon.solvers.blocks import freeze
-from jaxcon.solvers.elimination import Elimination, regularized
+from jaxcon.solvers.delassus import regularized
+from jaxcon.solvers.elimination import Elimination
 from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
 
