@@ -42,6 +42,7 @@ from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
+from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.dense import Dense
 from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse
@@ -54,6 +55,7 @@ __all__ = [
     "WORLD",
     "Baumgarte",
     "Coincident",
+    "ConjugateGradients",
     "CustomForce",
     "Dense",
     "Distance",

@@ -250,7 +250,7 @@ def test_a_healthy_world_keeps_its_gradient_through_the_guard(scene):
         np.testing.assert_allclose(jnp.sum(gradient[name]), slope, rtol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("solver", [jc.Schur(), jc.Sparse()])
+@pytest.mark.parametrize("solver", [jc.Schur(), jc.Sparse(), jc.ConjugateGradients()])
 def test_a_mass_that_is_not_positive_is_singular(solver):
     system = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.stack([1.0 + 0 * q[0], p]),

@@ -111,7 +111,11 @@ def test_kernels_read_all_their_arguments(function):
         assert not unread(text)
 
 
-@pytest.mark.parametrize("solver", [jc.Sparse(), jc.Schur()], ids=["sparse", "schur"])
+@pytest.mark.parametrize(
+    "solver",
+    [jc.Sparse(), jc.Schur(), jc.ConjugateGradients()],
+    ids=["sparse", "schur", "cg"],
+)
 def test_kernels_of_a_step_and_its_gradient_read_all_their_arguments(solver):
     system, state = four_bar()
     batch = jax.vmap(lambda q: jc.State(q, state.v, state.time, state.status, state.memory))(

@@ -22,6 +22,15 @@ SOLVERS = {"schur": jc.Schur(), "dense": jc.Dense(), "sparse": Sparse()}
 every_solver = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
 
 
+def iterative(dtype):
+    """Conjugate gradients to a few units of rounding."""
+    return {"cg": jc.ConjugateGradients(tolerance=8 * float(jnp.finfo(dtype).eps))}
+
+
+MORE = SOLVERS | iterative("float64")
+every_solver_and_iterative = pytest.mark.parametrize("solver", MORE.values(), ids=MORE)
+
+
 def problem(name, dtype="float64"):
     """The saddle system of a scene off its constraints, with a random right side."""
     built = scenes.build(name, dtype)
@@ -53,7 +62,7 @@ def test_all_solvers_leave_no_residual_and_agree(name, dtype):
     system = problem(name, dtype)
     solutions = {
         key: quick_jit(lambda solver=solver: solver.solve(system))()
-        for key, solver in SOLVERS.items()
+        for key, solver in (SOLVERS | iterative(dtype)).items()
     }
     for key, solution in solutions.items():
         assert solution.status == jc.Status.OK
@@ -90,7 +99,7 @@ FULL = SPREAD @ SPREAD.T + np.eye(4)
 FORCE, TARGET, COMPLIANCE = RANDOM.normal(size=4), RANDOM.normal(size=2), np.array([0.3, 0.0])
 
 
-@every_solver
+@every_solver_and_iterative
 @pytest.mark.parametrize("mass", [MASS, FULL], ids=["diagonal", "full"])
 @pytest.mark.parametrize("compliance", [None, COMPLIANCE], ids=["hard", "compliant"])
 def test_small_systems_against_numpy(solver, mass, compliance):
@@ -103,7 +112,7 @@ def test_small_systems_against_numpy(solver, mass, compliance):
     assert status == jc.Status.OK
 
 
-@every_solver
+@every_solver_and_iterative
 def test_no_rows_is_free_motion(solver):
     system = Saddle(
         Diagonal(jnp.asarray(MASS)), jnp.asarray(FORCE), Jacobian((), (0, 4)), jnp.zeros(0)
@@ -114,7 +123,7 @@ def test_no_rows_is_free_motion(solver):
     assert status == jc.Status.OK
 
 
-@every_solver
+@every_solver_and_iterative
 def test_derivative_by_every_number_is_that_of_the_solution(solver):
     """Forward, reverse and central differences of numpy's solution agree."""
     names = ("jacobian", "mass", "force", "target", "compliance")
@@ -153,7 +162,7 @@ def test_an_empty_row_is_singular(solver):
     assert solver.solve(small(rows, MASS, FORCE, np.ones(3))).status == jc.Status.SINGULAR
 
 
-@every_solver
+@every_solver_and_iterative
 def test_compliance_makes_dependent_rows_regular(solver):
     twice = np.concatenate([J, J[:1]])
     system = small(twice, MASS, FORCE, np.ones(3), np.full(3, 0.1))
@@ -162,7 +171,7 @@ def test_compliance_makes_dependent_rows_regular(solver):
     np.testing.assert_allclose(solution.multipliers[0], solution.multipliers[2], rtol=1e-12)
 
 
-@every_solver
+@every_solver_and_iterative
 @pytest.mark.parametrize("units", [1e-6, 1e6])
 def test_units_do_not_decide_what_is_singular(solver, units):
     rows = J * np.array([[units], [1.0]])
@@ -170,7 +179,7 @@ def test_units_do_not_decide_what_is_singular(solver, units):
     assert solver.solve(small(J, MASS * units, FORCE, TARGET)).status == jc.Status.OK
 
 
-@every_solver
+@every_solver_and_iterative
 @pytest.mark.parametrize("what", ["force", "target", "mass", "jacobian"])
 def test_a_nan_is_not_finite(solver, what):
     values = {"jacobian": J, "mass": MASS, "force": FORCE, "target": TARGET}

@@ -274,3 +274,16 @@ def test_a_regularised_solution_has_a_gradient():
     # −m g l / (I + m l²) by m
     exact = -9.81 * 0.5 * 0.1 / (0.1 + 0.25) ** 2
     np.testing.assert_allclose(jax.grad(turn)(1.0), exact, rtol=1e-6)
+
+
+def test_a_full_mass_matrix_is_regularised_too():
+    rod = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.array([[2.0, 0.5], [0.5, 1.0]]),
+        force=lambda q, v, t, u, p: jnp.array([1.0, -2.0]),
+        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q[0], 2 * q[0]]), name="twice"),),
+    )
+    state = jc.init(rod, jc.Method(), jnp.zeros(2), jnp.zeros(2))
+    method = jc.Method(solver=Sparse(tikhonov=1e-10))
+    found = jc.forward_dynamics(rod, state, None, method, 1e-3)
+    assert found.status == jc.Status.OK
+    np.testing.assert_allclose(found.acceleration, [0.0, -2.0], atol=1e-8)

@@ -16,6 +16,7 @@ from jaxcon.solvers.sparse import Sparse
 
 INTEGRATORS = {"euler": jc.SemiImplicitEuler(), "heun": jc.Heun(), "rk4": jc.RK4()}
 SOLVERS = {"schur": jc.Schur(), "dense": jc.Dense(), "sparse": Sparse()}
+SOLVERS["cg"] = jc.ConjugateGradients(tolerance=1e-14)
 DT = 1e-3
 
 
@@ -39,6 +40,7 @@ CASES = [
     ("all-3d-tree", "heun", "dense"),
     ("mixed-2d", "heun", "sparse"),
     ("mixed-3d", "euler", "dense"),
+    ("mixed-2d", "euler", "cg"),
     ("polar", "heun", "dense"),
     ("polar", "rk4", "sparse"),
     ("arm", "rk4", "schur"),
@@ -94,6 +96,7 @@ GRADIENTS = [
     ("fixed-3d-loop", "euler", "schur"),
     ("distance-2d-between", "rk4", "sparse"),
     ("mixed-2d", "euler", "sparse"),
+    ("revolute-2d-loop", "euler", "cg"),
 ]
 
 
@@ -249,6 +252,8 @@ def test_no_float64_in_a_float32_step(name, integrator, solver):
     if integrator == "euler":  # the others have the default gains
         gain = jnp.asarray(20.0, jnp.float32)
         method = dataclasses.replace(method, stabilizer=jc.Baumgarte(gain, gain))
+    solver = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), method.solver)
+    method = dataclasses.replace(method, solver=solver)
 
     def step(state, method, dt):
         return jc.step(built.system, method, state, None, dt)

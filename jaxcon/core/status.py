@@ -14,6 +14,7 @@ class Status(IntEnum):
     OK = 0
     NON_FINITE = 1
     SINGULAR = 2
+    NOT_CONVERGED = 3
 
 
 MEANING = {
@@ -22,6 +23,9 @@ MEANING = {
     Status.SINGULAR: "the constraint rows are dependent, or the mass matrix is not positive"
     " definite; `report` names redundant rows; likely (a) a closed spatial loop of revolute joints,"
     " (b) the same constraint twice, (c) a singular position of the mechanism",
+    Status.NOT_CONVERGED: "an iterative solver did not reach its tolerance; likely (a) too few"
+    " iterations, (b) a tolerance below what rounding allows, (c) redundant rows that contradict"
+    " each other, to which `tikhonov` gives a solution",
 }
 
 

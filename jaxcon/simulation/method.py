@@ -17,7 +17,7 @@ class Method:
     Attributes:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
         stabilizer: `Baumgarte(…)` or `Unstabilized()`.
-        solver: `Sparse()`, `Schur()` or `Dense()`.
+        solver: `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`.
     """
 
     integrator: Any = SemiImplicitEuler()

@@ -9,10 +9,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.lanes import Vector, plus, take, times, total
+from jaxcon.core.lanes import Vector, take, total
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers import blocks
 from jaxcon.solvers.blocks import Block
+from jaxcon.solvers.delassus import diagonal_blocks, softened, weighted
 from jaxcon.solvers.jacobian import Jacobian
 from jaxcon.solvers.ordering import Batch, Node, Plan, Run
 from jaxcon.solvers.pieces import Pieces, Vectors, less
@@ -265,52 +266,20 @@ class RunFactor:
 def _matrix(plan: Plan, matrices: Any) -> tuple[Pieces, Lane]:
     """A by its blocks, of those on the diagonal the lower triangles, and its trace."""
     jacobian, inverse_mass, compliance = matrices
-    weighted = []
-    diagonal: dict[int, Block] = {}
-    for block in jacobian.blocks:
-        weight = block.columns.take(inverse_mass)
-        rows = [[times(x, w) for x, w in zip(row, weight, strict=True)] for row in block.value]
-        weighted.append(rows)
-        own = blocks.lower_product(rows, [list(row) for row in block.value])
-        known = diagonal.get(block.start)
-        diagonal[block.start] = own if known is None else blocks.add(known, own)
+    rows = weighted(jacobian, inverse_mass)
     groups = {block.start: block.shape for block in jacobian.blocks}
+    diagonal = diagonal_blocks(jacobian, rows)
     if compliance is not None:
-        _soften(diagonal, groups, compliance)
+        diagonal = softened(diagonal, groups, compliance)
     entries = Pieces()
     for start, (m, k) in groups.items():
         entries.add([(node, node) for node in nodes_of(start, m, k)], diagonal[start])
     for coupling in plan.couplings:
         (first, second), (x, y) = coupling.blocks, coupling.elements
-        left = [[take(lane, x) for lane in row] for row in weighted[first]]
+        left = [[take(lane, x) for lane in row] for row in rows[first]]
         right = [[take(lane, y) for lane in row] for row in jacobian.blocks[second].value]
         block = blocks.product(left, blocks.transpose(right))
         entries.add(coupling.pairs, block)
         entries.add([pair[::-1] for pair in coupling.pairs], blocks.transpose(block))
     traces = (total(row[-1] for row in block) for block in diagonal.values())
     return entries, total(jnp.sum(x, axis=0) for x in traces)
-
-
-def _soften(diagonal: dict[int, Block], groups: Any, compliance: Array) -> None:
-    """Adds C."""
-    for start, (m, k) in groups.items():
-        for r in range(m):
-            part = jax.lax.slice_in_dim(compliance, start + r * k, start + (r + 1) * k)
-            diagonal[start][r][r] = plus(diagonal[start][r][r], part)
-
-
-def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
-    """C + ε diag(J M⁻¹ Jᵀ), (n_c,), with the diagonal held constant."""
-    jacobian, inverse_mass, _ = matrices
-    rows: dict[int, list[Lane]] = {}
-    for block in jacobian.blocks:
-        weight = block.columns.take(inverse_mass)
-        squares = [
-            total(times(w, times(x, x)) for x, w in zip(row, weight, strict=True))
-            for row in block.value
-        ]
-        known = rows.get(block.start, [0.0] * len(squares))
-        rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
-    diagonal = jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
-    added = jnp.asarray(share).astype(diagonal.dtype)[None] * diagonal
-    return added if compliance is None else compliance + added

@@ -19,7 +19,8 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import ordering
 from jaxcon.solvers.blocks import freeze
-from jaxcon.solvers.elimination import Elimination, regularized
+from jaxcon.solvers.delassus import regularized
+from jaxcon.solvers.elimination import Elimination
 from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
 
@@ -57,7 +58,7 @@ class Sparse:
         if not system.target.size:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
-            return Schur().solve(system)
+            return Schur(self.tikhonov).solve(system)
         j, compliance = system.jacobian, system.compliance
         free = system.mass.solve(system.force)
         matrices = freeze((j, 1 / system.mass.values, compliance))

@@ -1,0 +1,65 @@
+"""The blocks on the diagonal of A = J M⁻¹ Jᵀ + C, one for each constraint, by lanes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core.lanes import Vector, plus, times, total
+from jaxcon.core.typing import Array, Lane
+from jaxcon.solvers import blocks
+from jaxcon.solvers.blocks import Block
+from jaxcon.solvers.jacobian import Jacobian
+
+
+def weighted(jacobian: Jacobian, inverse_mass: Array) -> list[Block]:
+    """J M⁻¹, block by block."""
+    weights = [block.columns.take(inverse_mass) for block in jacobian.blocks]
+    return [
+        [[times(x, w) for x, w in zip(row, weight, strict=True)] for row in block.value]
+        for block, weight in zip(jacobian.blocks, weights, strict=True)
+    ]
+
+
+def diagonal_blocks(jacobian: Jacobian, rows: list[Block]) -> dict[int, Block]:
+    """The blocks on the diagonal of J M⁻¹ Jᵀ from those of J M⁻¹, by group, lower triangles."""
+    diagonal: dict[int, Block] = {}
+    for block, row in zip(jacobian.blocks, rows, strict=True):
+        own = blocks.lower_product(row, list(map(list, block.value)))
+        known = diagonal.get(block.start)
+        diagonal[block.start] = own if known is None else blocks.add(known, own)
+    return diagonal
+
+
+def softened(
+    diagonal: dict[int, Block], shapes: dict[int, tuple[int, int]], compliance: Array
+) -> dict[int, Block]:
+    """Diagonal blocks with C added, by the rows and elements of each group."""
+    result: dict[int, Block] = {}
+    for start, block in diagonal.items():
+        m, k = shapes[start]
+        own = jax.lax.slice_in_dim(compliance, start, start + m * k)
+        parts = Vector.of(own.reshape((m, k, *compliance.shape[1:])))
+        result[start] = [
+            [*row[:-1], plus(row[-1], part)] for row, part in zip(block, parts, strict=True)
+        ]
+    return result
+
+
+def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
+    """C + ε diag(J M⁻¹ Jᵀ), (n_c,), with the diagonal held constant."""
+    jacobian, inverse_mass, _ = matrices
+    rows: dict[int, list[Lane]] = {}
+    for block in jacobian.blocks:
+        weight = block.columns.take(inverse_mass)
+        squares = [
+            total(times(w, times(x, x)) for x, w in zip(row, weight, strict=True))
+            for row in block.value
+        ]
+        known = rows.get(block.start, [0.0] * len(squares))
+        rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
+    diagonal = jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
+    added = jnp.asarray(share).astype(diagonal.dtype)[None] * diagonal
+    return added if compliance is None else compliance + added

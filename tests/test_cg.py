@@ -1,0 +1,342 @@
+"""Conjugate gradients against dense solutions, and against what theory says of them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from test_solvers import FORCE, FULL, MASS, TARGET, J, small
+from test_sparse import GRAPHS, hinge_twice, links, problem
+from tolerances import DIFFERENCE
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
+from jaxcon.dynamics.assembly import saddle
+from jaxcon.solvers.saddle import Diagonal
+
+CG = jc.ConjugateGradients
+
+
+def assembled(system, state, seed=3):
+    """The saddle system of a scene with a random right side that is consistent: b = J x."""
+    rows = linearize(system, state.q, state.v, state.time)
+    random = np.random.default_rng(seed)
+    force, x = (jnp.asarray(random.normal(size=state.v.shape), state.v.dtype) for _ in range(2))
+    return saddle(system, state.q, rows, force, rows.jacobian.apply(x))
+
+
+def joints_in_space(n, closed, dtype=np.float64):
+    """A planar chain of links in space; closed, its joints hold it in the plane several times."""
+    scene, points = jc.Scene(dim=3, dtype=dtype), np.random.default_rng(1).normal(size=(n + 1, 2))
+    points = np.column_stack([np.arange(n + 1), points[:, 0], np.zeros(n + 1)])
+    for i in range(n):
+        a, middle = jc.WORLD if i == 0 else f"l{i - 1}", (points[i] + points[i + 1]) / 2
+        scene.add_body(f"l{i}", mass=1.0 + i % 3, inertia=(0.01, 0.1, 0.1), position=middle)
+        scene.add(jc.Revolute(f"j{i}", a, f"l{i}", point=points[i], axis=(0.0, 0.0, 1.0)))
+    if closed:
+        end = {"point": points[n], "axis": (0.0, 0.0, 1.0)}
+        scene.add(jc.Revolute("end", f"l{n - 1}", jc.WORLD, **end))
+    return scene.build()
+
+
+def matrices(system):
+    """A, its diagonal blocks P, and the right side b − J M⁻¹ f, in float64."""
+    j = np.asarray(system.jacobian.dense(), float)
+    lift = j.T / np.asarray(system.mass.values, float)[:, None]
+    a, right = j @ lift, np.asarray(system.target, float) - lift.T @ np.asarray(system.force, float)
+    p = np.zeros_like(a)
+    for block in system.jacobian.blocks:
+        m, k = block.shape
+        for i in range(k):
+            rows = np.ix_(*[block.start + i + k * np.arange(m)] * 2)
+            p[rows] = a[rows]
+    return a, p, right
+
+
+def iterates(a, p, b, count):
+    """Conjugate gradients as in the books, with P⁻¹ as a matrix."""
+    inverse = np.linalg.inv(p)
+    x, r = np.zeros_like(b), b
+    d = inverse @ r
+    for _ in range(count):
+        rho, y = r @ inverse @ r, a @ d
+        x, r = x + rho / (d @ y) * d, r - rho / (d @ y) * y
+        d = inverse @ r + (r @ inverse @ r) / rho * d
+        yield x
+
+
+def multipliers(system, iterations):
+    """λ after some iterations, as an array of the host."""
+    return np.asarray(quick_jit(CG(iterations=iterations).solve)(system).multipliers)
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_the_solution_is_that_of_the_dense_solver(name):
+    system = problem(name)
+    expected = jc.Dense().solve(system)
+    got = quick_jit(CG(tolerance=1e-14).solve)(system)
+    assert got.status == jc.Status.OK
+    np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-8, atol=1e-8)
+
+
+def test_with_compliance():
+    system = problem("links in a loop")
+    compliance = jnp.asarray(np.random.default_rng(4).uniform(0, 1, size=system.target.shape))
+    system = dataclasses.replace(system, compliance=compliance)
+    got = quick_jit(CG(tolerance=1e-14).solve)(system)
+    expected = jc.Dense().solve(system)
+    np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-9, atol=1e-9)
+
+
+def test_a_full_mass_matrix_is_left_to_schur():
+    system = small(J, FULL, FORCE, TARGET)
+    for share in (None, 0.1):
+        ours, theirs = CG(tikhonov=share).solve(system), jc.Schur(tikhonov=share).solve(system)
+        np.testing.assert_array_equal(ours.multipliers, theirs.multipliers)
+
+
+@pytest.mark.parametrize("count", [1, 3, 7])
+def test_the_iterates_are_those_of_the_books(count):
+    """With one block of the preconditioner for each joint, of two rows and of five."""
+    for built in (links(10, True), joints_in_space(6, False)):
+        system = assembled(*built)
+        *_, expected = iterates(*matrices(system), count)
+        found = multipliers(system, count)
+        np.testing.assert_allclose(found, expected, atol=1e-6 * np.max(np.abs(expected)))
+
+
+def test_every_iteration_brings_a_chain_nearer_to_the_solution():
+    """In the norm of A, that conjugate gradients make least; the residual need not fall."""
+    system = assembled(*links(10, False))
+    a, _, b = matrices(system)
+    exact = np.linalg.solve(a, b)
+    gaps = [multipliers(system, n) - exact for n in range(0, len(b) + 1, 2)]
+    errors = [np.sqrt(gap @ a @ gap) for gap in gaps]
+    assert all(after < before for before, after in zip(errors[:-1], errors[1:], strict=True))
+    assert errors[-1] < 1e-9 * errors[0]
+
+
+def test_without_the_preconditioner_it_would_take_more_iterations():
+    system = assembled(*joints_in_space(10, False))
+    a, p, b = matrices(system)
+    exact = np.linalg.solve(a, b)
+
+    def enough(preconditioner):
+        for count, x in enumerate(iterates(a, preconditioner, b, 500), start=1):
+            if np.sqrt((x - exact) @ a @ (x - exact)) < 1e-6 * np.sqrt(exact @ a @ exact):
+                return count
+        return 500
+
+    ours, plain = enough(p), enough(np.eye(len(b)))
+    assert ours < plain / 2
+    gap = multipliers(system, ours) - exact
+    assert np.sqrt(gap @ a @ gap) < 1.01e-6 * np.sqrt(exact @ a @ exact)
+
+
+REDUNDANT = {
+    "hinge twice": hinge_twice,
+    "four-bar in space": lambda dtype: joints_in_space(3, True, dtype),
+    "chain in space, held at both ends": lambda dtype: joints_in_space(8, True, dtype),
+}
+
+
+@pytest.mark.parametrize("name", REDUNDANT)
+@pytest.mark.parametrize(("dtype", "bound"), [("float64", 1e-8), ("float32", 1e-3)])
+def test_redundant_rows_that_agree_are_solved_however_many_iterations_follow(name, dtype, bound):
+    system = assembled(*REDUNDANT[name](np.dtype(dtype)))
+    a, _, b = matrices(system)
+    assert np.linalg.matrix_rank(a, tol=1e-5) < len(b)
+    exact = np.linalg.pinv(a, rcond=1e-6, hermitian=True) @ b
+    for iterations in (40, 400):
+        got = quick_jit(CG(iterations=iterations).solve)(system)
+        assert got.status == jc.Status.OK
+        assert got.multipliers.dtype == dtype
+        j, found = (np.asarray(x, float) for x in (system.jacobian.dense(), got.multipliers))
+        pull, expected = j.T @ found, j.T @ exact
+        np.testing.assert_allclose(pull, expected, atol=bound * np.max(np.abs(expected)))
+        assert np.linalg.norm(found) < 10 * np.linalg.norm(exact)
+
+
+def test_redundant_rows_have_a_gradient():
+    system, state = hinge_twice(np.float64)
+
+    def turn(mass):
+        changed = system.with_params({"link": {"mass": mass}})
+        return jc.forward_dynamics(changed, state, None, jc.Method(solver=CG()), 1e-3)
+
+    # −m g l / (I + m l²) by m
+    exact = -9.81 * 0.5 * 0.1 / (0.1 + 0.25) ** 2
+    slope = jax.grad(lambda mass: turn(mass).acceleration[2])
+    np.testing.assert_allclose(slope(1.0), exact, rtol=1e-9)
+    every = jax.grad(lambda mass: jnp.sum(turn(mass).multipliers ** 2))
+    assert jnp.isfinite(every(1.0))
+
+
+TWICE = np.concatenate([J, J[:1]])
+EMPTY = np.concatenate([J, np.zeros((1, 4))])
+
+
+@pytest.mark.parametrize("rows", [TWICE, EMPTY], ids=["twice", "empty"])
+def test_rows_without_a_solution_are_told_from_redundant_ones(rows):
+    """Of one constraint, so that a block of the preconditioner is singular."""
+    last = {id(TWICE): TARGET[0], id(EMPTY): 0.0}[id(rows)]
+    for wrong, status in ((0.0, jc.Status.OK), (1.0, jc.Status.NOT_CONVERGED)):
+        system = small(rows, MASS, FORCE, np.append(TARGET, last + wrong))
+        got = CG().solve(system)
+        assert got.status == status
+        assert jnp.all(jnp.isfinite(got.multipliers))
+
+
+def test_tikhonov_solves_rows_that_contradict_each_other():
+    system = small(TWICE, MASS, FORCE, np.append(TARGET, TARGET[0] + 0.1))
+    ours, theirs = CG(tikhonov=1e-3, tolerance=1e-13).solve(system), jc.Schur(1e-3).solve(system)
+    assert ours.status == jc.Status.OK
+    np.testing.assert_allclose(ours.multipliers, theirs.multipliers, rtol=1e-9)
+
+
+def test_the_tolerance_decides_what_has_converged_and_is_a_number():
+    system = assembled(*links(10, False))
+    solve = jax.jit(lambda x: CG(tolerance=x, iterations=12).solve(system))
+    found = [solve(x) for x in (1e-12, 0.01, 0.1)]
+    assert [int(x.status) for x in found] == [jc.Status.NOT_CONVERGED, jc.Status.OK, jc.Status.OK]
+    assert solve._cache_size() == 1
+    a, _, b = matrices(system)
+    gaps = [np.linalg.norm(a @ x.multipliers - b) for x in found]
+    assert gaps[0] < gaps[1] < gaps[2]
+    with pytest.raises(jc.SimulationError, match="NOT_CONVERGED.*iterations"):
+        jc.raise_for_status(found[0])
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [("float32", 2.5e-5), ("float64", 4e-11)])
+def test_the_default_tolerance_leaves_two_thirds_of_the_digits(dtype, bound):
+    system = assembled(*hinge_twice(np.dtype(dtype)))
+    a, p, b = matrices(system)
+    p += 1e-9 * np.eye(len(b))
+    r = b - a @ np.asarray(quick_jit(CG().solve)(system).multipliers, float)
+    assert r @ np.linalg.solve(p, r) < bound**2 * (b @ np.linalg.solve(p, b))
+
+
+def test_a_batch_is_a_loop():
+    """Of worlds that need none, few and all iterations, and of one that fails."""
+    system = assembled(*links(6, True))
+    zero, random = jnp.zeros_like(system.force), np.random.default_rng(6)
+    force = jnp.asarray(random.normal(size=system.force.shape))
+    force = jnp.stack([zero, force, 1e6 * force, zero.at[0].set(jnp.nan)])
+    target = jnp.stack([0 * system.target, *[system.target] * 3])
+    solver = CG(tolerance=jnp.asarray(1e-13))
+
+    def one(force, target):
+        return solver.solve(dataclasses.replace(system, force=force, target=target))
+
+    batch, alone = quick_jit(jax.vmap(one))(force, target), quick_jit(one)
+    ok, bad = jc.Status.OK, jc.Status.NON_FINITE
+    np.testing.assert_array_equal(batch.status, [ok, ok, ok, bad])
+    np.testing.assert_array_equal(batch.multipliers[0], 0)
+    for i in (1, 2):
+        expected = alone(force[i], target[i]).multipliers
+        np.testing.assert_allclose(batch.multipliers[i], expected, rtol=1e-10)
+
+
+def numbers(system):
+    return (system.mass.values, system.force, system.target, jnp.ones(len(system.jacobian.blocks)))
+
+
+def value(solver, system, mass, force, target, scale):
+    """A number that every result enters, by those of the system and a factor of each block."""
+    blocks = [
+        dataclasses.replace(block, value=jax.tree.map(lambda x, s=s: x * s, block.value))
+        for block, s in zip(system.jacobian.blocks, scale, strict=True)
+    ]
+    jacobian = dataclasses.replace(system.jacobian, blocks=tuple(blocks))
+    changes = {"mass": Diagonal(mass), "force": force, "target": target, "jacobian": jacobian}
+    a, multipliers, _ = solver.solve(dataclasses.replace(system, **changes))
+    return jnp.sum(jnp.sin(a)) + jnp.sum(multipliers**2)
+
+
+@pytest.mark.parametrize("name", ["tree", "links in a loop"])
+def test_derivatives_are_those_of_the_dense_solver_and_differences(name):
+    system = problem(name)
+    x = numbers(system)
+    random = np.random.default_rng(5)
+    direction = tuple(jnp.asarray(random.normal(size=leaf.shape)) for leaf in x)
+    ours, dense = (
+        quick_jit(jax.grad(lambda x, s=solver: value(s, system, *x)))(x)
+        for solver in (CG(tolerance=1e-14), jc.Dense())
+    )
+    for got, expected in zip(ours, dense, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-8)
+
+    def plain(x):
+        return value(CG(tolerance=1e-14), system, *x)
+
+    along = quick_jit(lambda x, dx: jax.jvp(plain, (x,), (dx,))[1])(x, direction)
+    ends = (jax.tree.map(lambda a, d, h=h: a + h * d, x, direction) for h in (1e-5, -1e-5))
+    ahead, behind = map(quick_jit(plain), ends)
+    reverse = sum(jnp.sum(g * d) for g, d in zip(ours, direction, strict=True))
+    np.testing.assert_allclose(reverse, along, rtol=1e-9)
+    np.testing.assert_allclose(along, (ahead - behind) / 2e-5, rtol=DIFFERENCE)
+
+
+def test_gradients_of_a_batched_rollout():
+    """Inside vmap and outside of it, as of the default solver."""
+    system, state = links(4, True)
+    states = jnp.stack([state.v, 2 * state.v, -state.v])
+
+    def final(solver, v):
+        start = dataclasses.replace(state, v=v)
+        return jnp.sum(jc.rollout(system, jc.Method(solver=solver), start, None, 1e-3, 5)[0].q ** 2)
+
+    def inside(solver):
+        return quick_jit(jax.vmap(jax.grad(lambda v: final(solver, v))))(states)
+
+    def outside(solver):
+        return quick_jit(jax.grad(lambda v: jnp.sum(jax.vmap(lambda x: final(solver, x))(v))))(
+            states
+        )
+
+    expected = inside(jc.Sparse())
+    for found in (inside(CG(tolerance=1e-14)), outside(CG(tolerance=1e-14))):
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
+
+
+def equations(jaxpr):
+    """Those of a jaxpr and of all within it."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for inner in jax.tree.leaves(list(equation.params.values())):
+            yield from equations(inner) if hasattr(inner, "eqns") else ()
+
+
+def program_of(solver, n, dtype=np.float64):
+    """How many rows a chain of n links in space has, and all equations from its rows to λ."""
+    system, state = joints_in_space(n, False, dtype)
+    trace = jax.make_jaxpr(lambda state: solver.solve(assembled(system, state)))
+    closed, solution = trace(state), jax.eval_shape(lambda: assembled(system, state).target)
+    return solution.size, list(equations(closed.jaxpr))
+
+
+def test_the_program_does_not_grow_with_the_scene():
+    (_, short), (_, long) = (program_of(CG(), n) for n in (10, 100))
+    assert len(short) == len(long)
+    assert [x.primitive.name for x in short] == [x.primitive.name for x in long]
+
+
+def test_arrays_grow_no_faster_than_the_scene():
+    def largest(solver, n):
+        n_c, program = program_of(solver, n)
+        return n_c, max(y.aval.size for x in program for y in x.outvars)
+
+    (few, small), (many, large) = (largest(CG(), n) for n in (10, 100))
+    assert many == 10 * few
+    assert large == 10 * small < 2 * many
+    assert largest(jc.Schur(), 10)[1] >= few**2
+
+
+def test_nothing_in_float32_is_float64():
+    _, program = program_of(CG(), 10, np.float32)
+    dtypes = {str(y.aval.dtype) for x in program for y in x.outvars}
+    assert "float32" in dtypes
+    assert "float64" not in dtypes
