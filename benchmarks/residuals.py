@@ -1,7 +1,7 @@
 """How well each solver solves the saddle system at states that the scenes of the benchmarks meet.
 
     python -m benchmarks.residuals [--scenes chain-10 …] [--dtypes float64,float32]
-        [--solvers Dense,Schur,Sparse] [--times 0,0.25] [--json FILE]
+        [--solvers Dense,Sparse,…] [--times 0,0.25] [--json FILE]
 
 The system is assembled once and handed to each solver as arrays, so that what is judged is the
 solution of exactly these numbers M, J, f, b, C, at double precision:
@@ -48,13 +48,20 @@ from jaxcon.core.native import Native
 from jaxcon.dynamics.assembly import saddle
 from jaxcon.solvers.saddle import Saddle, Solution
 
+
+def converged(**options: Any) -> jc.ConjugateGradients:
+    """Conjugate gradients down to rounding."""
+    precision = float(jnp.finfo(jnp.result_type(float)).eps)
+    return jc.ConjugateGradients(tolerance=10 * precision, iterations=1000, **options)
+
+
 SOLVERS: dict[str, Callable[..., Any]] = {
     "Dense": jc.Dense,
     "Schur": jc.Schur,
     "Sparse": jc.Sparse,
+    "ConjugateGradients": converged,
 }
-LAPACK = (jc.Dense, jc.Schur)
-"""Those that factor whole matrices; what the others do is compiled in stages, as in a step."""
+
 LIMIT = {"float64": 1e-12, "float32": 1e-5}
 """Of ρ₁ and ρ₂."""
 FACTOR = 10.0
@@ -157,7 +164,7 @@ def measure(name: str, dtype: str, solvers: list[str], times: list[float]) -> It
     for time, plain in zip(times, systems(name, dtype, times), strict=True):
         with jax.enable_x64(True):
             full = plain if share is None else regularized(plain, share)
-            numbers, exact = Numbers(full), on_arrays(jc.Dense().solve, doubled(full), False)
+            numbers, exact = Numbers(full), on_arrays(jc.Dense().solve, doubled(full))
         condition = numbers.condition()
         for solver in solvers:
             with jax.enable_x64(dtype == "float64"):
@@ -189,10 +196,9 @@ def judged(
 
 def solve(solver: Any, plain: Saddle, full: Saddle, share: float | None) -> Solution:
     """By a solver that regularises the plain system, or one that is given the regularised one."""
-    staged = solver not in LAPACK
     if share is None or not hasattr(solver(), "tikhonov"):
-        return on_arrays(solver().solve, full, staged)
-    return on_arrays(solver(tikhonov=share).solve, plain, staged)
+        return on_arrays(solver().solve, full)
+    return on_arrays(solver(tikhonov=share).solve, plain)
 
 
 def systems(name: str, dtype: str, times: list[float]) -> list[Saddle]:
@@ -233,7 +239,7 @@ def is_array(x: Any) -> bool:
     return isinstance(x, jax.Array)
 
 
-def on_arrays(function: Callable[[Any], Any], tree: Any, staged: bool = True) -> Any:
+def on_arrays(function: Callable[[Any], Any], tree: Any) -> Any:
     """function(tree), compiled for the arrays in it; Python numbers stay what they are."""
     leaves, structure = jax.tree.flatten(tree)
     results: list[Any] = []
@@ -244,8 +250,7 @@ def on_arrays(function: Callable[[Any], Any], tree: Any, staged: bool = True) ->
         results[:] = jax.tree.flatten(function(jax.tree.unflatten(structure, merged)))
         return [x for x in results[0] if is_array(x)]
 
-    compiled = jax.jit(Native(run).settled if staged else run)
-    found = iter(compiled(*(x for x in leaves if is_array(x))))
+    found = iter(Native(run).compiled(*(x for x in leaves if is_array(x))))
     output = [next(found) if is_array(x) else x for x in results[0]]
     return jax.tree.unflatten(results[1], output)
 
