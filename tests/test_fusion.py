@@ -6,8 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from functions import (
+    FUNCTIONS,
+    WIDE,
+    arguments_that_do_not_matter,
+    chain_of_shared_values,
+    rows_and_loops,
+)
 
 import jaxcon as jc
+from jaxcon.core import fusion
 from jaxcon.core.native import Native
 from jaxcon.scenes import four_bar
 
@@ -15,76 +23,78 @@ X = np.linspace(0.3, 1.7, 24).reshape(4, 6)
 Y = np.linspace(-1.0, 2.0, 24).reshape(4, 6)
 
 
-def chain_of_shared_values(x, y):
-    """Each value is needed twice by the next: 2⁴⁰ operations if none is stored."""
-    a, b = x, y
-    for _ in range(40):
-        a, b = 0.5 * (a * b + a), 0.5 * (a * b - b)
-    return [a, b]
-
-
-def rows_and_loops(x, y):
-    def body(carry, row):
-        turned = jnp.sin(carry) * row + jnp.cos(carry)
-        return turned * turned - 0.1 * turned, turned + row
-
-    last, rows = jax.lax.scan(body, x[0], jnp.concatenate([x, y * 2.0]))
-    return [last, rows[::-1], jnp.stack([last, x[1]])]
-
-
-def reductions(x, y):
-    return [
-        jnp.sum(x * y, axis=0),
-        jnp.max(x + y, axis=0),
-        jnp.min(x.reshape(2, 2, 6), axis=(0, 1)),
-        jnp.all(x > y, axis=0),
-        jnp.any(x[:3] > y[:3], axis=0),
-        jnp.sum(x, axis=1),
-    ]
-
-
-def arguments_that_do_not_matter(x, y):
-    same = jnp.where(y > 0, x, x)
-    return [same * 2.0, x**0 + 0.0 * x, jnp.where(True, x, y), x * jnp.ones((4, 6)) - 0.0]
-
-
-def matrices(x, y):
-    a = x @ x.T + 4 * jnp.eye(4)
-    factor = jnp.linalg.cholesky(a)
-    return [factor * 2.0 + jnp.sin(a), jnp.linalg.solve(a, y * x)]
-
-
-def results_as_they_come(x, y):
-    return [x, jnp.zeros((2, 3)), x, x + y, jnp.zeros((0, 3))]
-
-
-FUNCTIONS = [
-    chain_of_shared_values,
-    rows_and_loops,
-    reductions,
-    arguments_that_do_not_matter,
-    matrices,
-    results_as_they_come,
-]
+def staged(function):
+    """The function, cut into stages."""
+    native = Native(function)
+    return lambda *args: fusion.settled(native, args)
 
 
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.__name__)
-@pytest.mark.parametrize("constant", [False, True])
-def test_the_results_are_those_of_the_function(function, constant):
-    cut = Native(function).settled
-    x, y = jnp.asarray(X), jnp.asarray(Y)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("constant", [False, True], ids=["", "constant"])
+def test_the_results_are_those_of_the_function(function, dtype, constant):
+    x, y = jnp.asarray(X, dtype), jnp.asarray(Y, dtype)
     if constant:
-        found = jax.jit(lambda x: cut(x, np.ones_like(Y)))(x)
+        found = jax.jit(lambda x: staged(function)(x, np.ones(Y.shape, dtype)))(x)
         expected = function(x, jnp.ones_like(y))
     else:
-        found, expected = jax.jit(cut)(x, y), function(x, y)
+        found, expected = jax.jit(staged(function))(x, y), function(x, y)
+    compare(found, expected)
+
+
+@pytest.mark.parametrize("function", WIDE, ids=lambda f: f.__name__)
+def test_arrays_may_be_wide(function):
+    x, y = (jnp.asarray(np.tile(z, (1, 20_000))) for z in (X, Y))
+    compare(jax.jit(staged(function))(x, y), function(x, y))
+
+
+def compare(found, expected):
     for a, b in zip(found, expected, strict=True):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
-        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13)
+        rounding = 1e-12 if a.dtype == np.float64 else 2e-5
+        np.testing.assert_allclose(a, b, rtol=rounding, atol=rounding)
+
+
+def a_user_force(q, v, t, u, p):
+    """A delay line and a loop."""
+    joined = jnp.concatenate([q, v])
+    twice = jnp.concatenate([joined[:4], joined[:4]])
+    return jax.lax.fori_loop(0, 3, lambda i, f: f + p["k"] @ f, -jnp.sin(twice[2:6]))
+
+
+def test_a_step_with_such_functions_is_the_step_without_a_compiler():
+    system = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.ones(4),
+        force=a_user_force,
+        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q[:2] @ q[:2] - 1.0]), name="rod"),),
+        params={"k": jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)))},
+    )
+    state = jc.init(system, jc.Method(), jnp.array([0.0, 1.0, 0.2, 0.3]), jnp.ones(4) * 0.1)
+    batch = jax.tree.map(lambda x: jnp.stack([x, x, x]), state)
+    new = jax.jit(jax.vmap(lambda s: jc.step(system, jc.Method(), s, None, 1e-2)[0]))(batch)
+    with jax.disable_jit():
+        expected, _ = jc.step(system, jc.Method(), state, None, 1e-2)
+    for q, v in zip(new.q, new.v, strict=True):
+        np.testing.assert_allclose(q, expected.q, rtol=1e-12)
+        np.testing.assert_allclose(v, expected.v, rtol=1e-12)
+
+
+def test_a_loop_that_only_prints(capsys):
+    def loud(x, y):
+        def body(carry, row):
+            jax.debug.callback(lambda z: print("row", float(z)), row[0])
+            return carry, None
+
+        jax.lax.scan(body, 0, x)
+        return [x + y]
+
+    jax.block_until_ready(jax.jit(staged(loud))(X, Y))
+    jax.effects_barrier()
+    assert capsys.readouterr().out.count("row") == 4
 
 
 def test_shared_values_are_computed_once():
-    text = jax.jit(Native(chain_of_shared_values).settled).lower(X, Y).compile().as_text()
+    text = jax.jit(staged(chain_of_shared_values)).lower(X, Y).compile().as_text()
     assert len(re.findall(r" multiply\(", text)) < 8 * 40
 
 
@@ -104,7 +114,7 @@ def unread(text):
     ids=lambda f: f.__name__,
 )
 def test_kernels_read_all_their_arguments(function):
-    cut = Native(function).settled
+    cut = staged(function)
     for run, args in ((cut, (X, Y)), (lambda x: cut(x, np.zeros_like(Y)), (X,))):
         text = jax.jit(run).lower(*args).compile().as_text()
         assert "%kernel" in text
@@ -135,14 +145,14 @@ def test_what_a_function_does_besides_is_done(capsys):
         jax.debug.callback(lambda z: print("seen", float(z)), x[0, 0])
         return [x + y]
 
-    jax.block_until_ready(jax.jit(Native(loud).settled)(X, Y))
+    jax.block_until_ready(jax.jit(staged(loud))(X, Y))
     jax.effects_barrier()
     assert "seen 0.3" in capsys.readouterr().out
 
 
 def test_it_can_be_left_to_the_compiler(monkeypatch):
     monkeypatch.setenv("JAXCON_STAGES", "off")
-    left = jax.jit(Native(chain_of_shared_values).settled).lower(X, Y).as_text()
+    left = jax.jit(staged(chain_of_shared_values)).lower(X, Y).as_text()
     assert "inlineable" not in left
 
 

@@ -172,6 +172,26 @@ def test_with_compliance(name):
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["truss", "links"])
+def test_compliance_and_regularisation_are_one_problem(name):
+    system = problem(name)
+    compliance = jnp.asarray(np.random.default_rng(4).uniform(0, 1, size=system.target.shape))
+    system = dataclasses.replace(system, compliance=compliance)
+    j, w = system.jacobian.dense(), 1 / system.mass.values
+    added = 0.1 * (jnp.einsum("ri,i,ri->r", j, w, j) + compliance)
+    expected = jc.Dense().solve(dataclasses.replace(system, compliance=compliance + added))
+    for solver in (jc.Sparse, jc.Schur, jc.ConjugateGradients):
+        got = quick_jit(lambda s=solver: s(tikhonov=0.1).solve(system))()
+        np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_system_may_be_an_argument_of_a_compiled_function(way):
+    system = problem("tree")
+    got = quick_jit(WAYS[way].solve)(system)
+    np.testing.assert_allclose(got.multipliers, jc.Dense().solve(system).multipliers, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["tree", "links in a loop"])
 def test_its_gradient_is_that_of_the_dense_solver(name):
     system = problem(name)

@@ -57,11 +57,12 @@ COSTLY = _names(
 )
 """Elementwise operations that are always worth storing."""
 
-SLICES = _names("dynamic_slice gather")
-"""Operations of which the first operand is in the result, and the place perhaps not."""
+REARRANGED = _names("reshape squeeze expand_dims transpose broadcast_in_dim rev")
+"""Moves of which the whole operand is in the result."""
 
-SHIFTS = MOVES - SLICES | {"concatenate", "pad"}
-"""Operations of which every operand is in the result."""
+FOLDED = _names("select_n clamp pow")
+"""Arithmetic whose result may turn out not to depend on an operand."""
+
 
 OTHERS = _names("concatenate dynamic_update_slice pad gather scan split stack unstack")
 """Operations that end a stage and may be part of a kernel."""
@@ -75,15 +76,17 @@ Step = Operation | list[int]
 """An operation by itself, or the values of a stage."""
 
 
-def settled(function: Any) -> Callable[..., list[Array]]:
-    """A native function, cut into stages."""
+def settled(function: Any, args: Sequence[Array], rank: int = 1) -> list[Array]:
+    """The results of a native function, cut into stages.
 
-    def run(*args: Array) -> list[Array]:
-        if os.environ.get("JAXCON_STAGES") == "off":
-            return function(*args)
-        return Stages(traced(function, args))(*args)
-
-    return run
+    Args:
+        function: with `traced`, its closed jaxpr for arguments of some shapes.
+        args: its arguments.
+        rank: how many trailing axes enumerate worlds; they may be spread over devices.
+    """
+    if os.environ.get("JAXCON_STAGES") == "off":
+        return function(*args)
+    return Stages(traced(function, args), rank)(*args)
 
 
 class Stages:
@@ -94,8 +97,9 @@ class Stages:
             operation, or the values that a stage computes.
     """
 
-    def __init__(self, closed: Any) -> None:
-        self.program = Program(closed, _settled_body)
+    def __init__(self, closed: Any, rank: int) -> None:
+        self.rank = rank
+        self.program = Program(closed, functools.partial(_settled_body, rank))
         steps = _in_stages(self.program, worth_storing(self.program))
         self.parts = _with_results(self.program, _in_parts(steps))
 
@@ -105,7 +109,7 @@ class Stages:
         for steps, wanted in self.parts:
             run = functools.partial(self._run, steps)
             if all(map(_fits, steps)):
-                self._store(values, wanted, run)
+                self._store(values, wanted, run, self._read_by(steps, values, wanted))
             else:
                 run(values, wanted)
         return [self.program.evaluate(values, x) for x in self.program.outputs]
@@ -117,14 +121,17 @@ class Stages:
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
-                self._store(values, step, self._evaluate)
+                read = surely_read(self.program, values, step)
+                self._store(values, step, self._evaluate, read)
 
     def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
         for x in wanted:
             self.program.evaluate(values, x)
 
-    def _store(self, values: dict[int, Any], wanted: list[int], how: Callable[..., None]) -> None:
-        """Computes values in a kernel of their own."""
+    def _store(
+        self, values: dict[int, Any], wanted: list[int], how: Callable[..., None], sure: set[int]
+    ) -> None:
+        """Computes values in a kernel of their own, which reads some of the known ones for sure."""
         leaves = self.program.leaves(values, wanted)
 
         def compute(*given: Array) -> list[Array]:
@@ -132,10 +139,26 @@ class Stages:
             how(own, wanted)
             return [own[x] for x in wanted]
 
-        sure = set(self.program.leaves(values, wanted, _surely_read))
         doubtful = [i for i, x in enumerate(leaves) if x not in sure]
-        results = _kernel(compute, [values[x] for x in leaves], doubtful)
+        results = _kernel(compute, [values[x] for x in leaves], doubtful, self.rank)
         values.update(zip(wanted, results, strict=True))
+
+    def _read_by(self, steps: list[Step], values: dict[int, Any], wanted: list[int]) -> set[int]:
+        """The values that steps read for sure: a stage, being a kernel, reads all that it is given.
+
+        A stage is never left out if one of its results is needed.
+        """
+        known = {*values, *(x for step in steps for x in _values(step))}
+        read = set(wanted)
+        for step in reversed(steps):
+            known -= set(_values(step))
+            if isinstance(step, Operation):
+                operands, _ = _followed(self.program, step, read, False)
+                inputs = [x for x in operands if not isinstance(x, Constant)]
+                read |= surely_read(self.program, known, inputs)
+            elif not read.isdisjoint(step):
+                read.update(self.program.leaves(known, step))
+        return read
 
 
 def worth_storing(program: Program) -> set[int]:
@@ -143,7 +166,8 @@ def worth_storing(program: Program) -> set[int]:
 
     Backwards, a value becomes the result of a kernel where it is needed by two kernels after it, or
     by an operation that is no part of one. Forwards, those that turn out cheap, given what else is
-    stored, are taken back.
+    stored, are taken back. A row of an array that a loop changes in place is not cheap: a kernel
+    that read it after the change would make the compiler copy the array.
     """
     stored, ends = _needed_twice(program)
     work: dict[int, frozenset[int]] = {}
@@ -152,7 +176,9 @@ def worth_storing(program: Program) -> set[int]:
         unstored = (x for x in op.inputs if not isinstance(x, Constant) and x not in stored)
         parts = (work.get(x, frozenset()) for x in unstored)
         own = frozenset().union(*parts)
-        if op.name not in MOVES:
+        if op.name == "dynamic_slice":
+            own |= {*range(-WORTH, 0)}
+        elif op.name not in MOVES:
             own |= {name}
         cheap = len(own) < WORTH and op.name not in COSTLY
         if name in stored and name not in ends and cheap:
@@ -175,7 +201,8 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
             needed |= kernels[reader.outputs[0]] if _elementwise(reader) else {name}
         if name in needed:
             ends.add(name)
-        if op.name not in MOVES and (len(needed) > 1 or name in needed):
+        moves = op.name in MOVES and op.name != "dynamic_slice"
+        if not moves and (len(needed) > 1 or name in needed):
             stored.add(name)
             needed = {name}
         kernels[name] = set(sorted(needed)[:2])
@@ -244,31 +271,64 @@ def _values(step: Step) -> list[int]:
 
 def _fits(step: Step) -> bool:
     """Whether a kernel may contain it."""
-    return not isinstance(step, Operation) or step.name in OTHERS
+    return not isinstance(step, Operation) or (step.name in OTHERS and step.plain)
 
 
 def _elementwise(op: Operation) -> bool:
     """Whether it becomes a part of the kernels that read it."""
-    return op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY
+    return op.plain and (op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY)
 
 
-def _surely_read(op: Operation, whole: bool) -> Sequence[Operand]:
-    """The operands of which no compiler can find that the results do not depend on them.
+def surely_read(program: Program, known: Any, wanted: list[int]) -> set[int]:
+    """The known values of which no compiler can find that others do not depend on them.
 
-    Arithmetic in floating point depends on all of them, since NaN spreads through it; a choice
-    between two values does not, since they may turn out to be the same. Loops read what kernels in
-    their bodies read.
+    Arithmetic in floating point depends on its operands, since NaN spreads through it, and so do
+    arrays that are rearranged, or joined to others. Of a slice that is not said, where what is
+    sliced has been joined, since the rest may be what is read. Loops depend on what kernels in
+    their bodies read. All others, such as choices between values that may be the same, are not
+    followed.
     """
-    if op.name == "scan" and whole:
-        return [x for i, x in enumerate(op.inputs) if i in op.read]
-    if op.name in SLICES:
-        return op.inputs[:1]
-    arithmetic = op.inexact and op.name in (ARITHMETIC | COSTLY) - {"select_n"}
-    return op.inputs if arithmetic or op.name in SHIFTS else []
+    found: set[int] = set()
+    seen: set[tuple[int, bool]] = set()
+    todo = [(x, False) for x in wanted]
+    while todo:
+        x, sliced = todo.pop()
+        if (x, sliced) in seen:
+            continue
+        seen.add((x, sliced))
+        if x in known:
+            found.add(x)
+            continue
+        met = {y for y, _ in seen}
+        operands, cut = _followed(program, program.makers[x], met, sliced)
+        todo += [(y, cut) for y in operands if not isinstance(y, Constant)]
+    return found
+
+
+def _followed(
+    program: Program, op: Operation, met: set[int], sliced: bool
+) -> tuple[Sequence[Operand], bool]:
+    """The operands on which those results depend that are met, and whether they are cut.
+
+    Where a slice is met, only those on which each of its entries depends.
+    """
+    if met.isdisjoint(op.outputs):
+        return [], sliced
+    read = [x for i, x in enumerate(op.inputs) if i in op.read]
+    if op.name == "scan":
+        return (read if met.issuperset(program.needed_results(op)) else []), False
+    if op.name == "dynamic_update_slice":
+        return ([] if sliced else read), sliced
+    if op.name in ("slice", "dynamic_slice"):
+        return read or op.inputs, True
+    bounded = op.name in ("max", "min") and any(isinstance(x, Constant) for x in op.inputs)
+    arithmetic = op.inexact and op.name in (ARITHMETIC | COSTLY) - FOLDED and not bounded
+    joined = op.name == "concatenate" and not sliced
+    return (op.inputs if arithmetic or joined or op.name in REARRANGED else []), sliced
 
 
 def _kernel(
-    function: Callable[..., list[Array]], args: list[Array], doubtful: list[int]
+    function: Callable[..., list[Array]], args: list[Array], doubtful: list[int], rank: int
 ) -> list[Array]:
     """Calls a function as one kernel.
 
@@ -283,24 +343,28 @@ def _kernel(
         nonlocal count
         results = function(*args)
         count = len(results)
-        return [*results, *(_read(args[i]) for i in doubtful), jnp.zeros((), bool)]
+        return [*results, *(_read(args[i], rank) for i in doubtful), jnp.zeros((), bool)]
 
     first, *others = jax.jit(kernel)(*jax.lax.optimization_barrier(args))
-    # what is said of a result of a call is said of the call
-    return [set_xla_metadata(first, **KERNEL), *others][:count]
+    # what is said of a result of a call is said of the call; all of its results are kept
+    return jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])[:count]
 
 
-def _read(x: Array) -> Array:
-    """What no compiler can know without reading the array."""
+def _read(x: Array, rank: int) -> Array:
+    """What no compiler can know without reading the array: its first row is enough."""
+    x = x[:1] if x.ndim > max(rank, 1) else x
     if x.dtype == bool:
         return ~x
     return x != x if jnp.issubdtype(x.dtype, jnp.inexact) else x > 0  # noqa: PLR0124
 
 
-def _settled_body(closed: Any) -> tuple[Any, frozenset[int]]:
-    """The body of a loop, cut into stages itself, and which of its arguments kernels read."""
+def _settled_body(rank: int, closed: Any) -> tuple[Any, bool, frozenset[int]]:
+    """The body of a loop in stages, whether all of it fits a kernel, and what it surely reads."""
     inputs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in closed.jaxpr.invars]
-    settled = jax.make_jaxpr(Stages(closed))(*inputs)
+    stages = Stages(closed, rank)
+    settled = jax.make_jaxpr(stages)(*inputs)
+    plain = all(_fits(step) for steps, _ in stages.parts for step in steps)
     barriers = [x for x in settled.jaxpr.eqns if x.primitive.name == "optimization_barrier"]
     read = {x for barrier in barriers for x in barrier.invars if not isinstance(x, jex.Literal)}
-    return settled, frozenset(i for i, x in enumerate(settled.jaxpr.invars) if x in read)
+    places = (i for i, x in enumerate(settled.jaxpr.invars) if x in read)
+    return settled, plain, frozenset(places)

@@ -168,8 +168,11 @@ GATHERED = 16
 
 
 def take(x: Lane, indices: tuple[int, ...]) -> Lane:
-    """x[indices] along the first axis: nothing, a slice, copies or a gather, as needed."""
-    if not isinstance(x, jax.Array):
+    """x[indices] along the first axis: nothing, a slice, copies or a gather, as needed.
+
+    A number is the same for every index.
+    """
+    if not isinstance(x, jax.Array) or not x.ndim:
         return x
     first, n = indices[0], len(indices)
     stride = indices[1] - first if n > 1 else 1
@@ -191,12 +194,12 @@ def side_by_side(rows: list[tuple[Lane, int]]) -> Lane:
     for _, members in itertools.groupby(rows, key=lambda row: id(row[0])):
         lanes, places = zip(*members, strict=True)
         parts.append((take(lanes[0], places), len(places)))
+    if len(parts) == 1:
+        return parts[0][0]
     arrays = [x for x, _ in parts if isinstance(x, jax.Array)]
     if not arrays:
         (number,) = {x for x, _ in parts}
         return number
-    if len(parts) == 1:
-        return arrays[0]
     shape = jnp.broadcast_shapes(*(x.shape[1:] for x in arrays))
     whole = [jnp.broadcast_to(jnp.asarray(x, arrays[0].dtype), (n, *shape)) for x, n in parts]
     return jnp.concatenate(whole)

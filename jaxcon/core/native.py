@@ -42,8 +42,7 @@ class Native:
 
     def __init__(self, function: Callable[..., Any], full: bool = False) -> None:
         self.function, self.full = function, full
-        self.settled = fusion.settled(self)
-        self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
+        self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self, rank=0))
         self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
         self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
         self.part = functools.lru_cache(maxsize=None)(self._part)
@@ -160,7 +159,7 @@ def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
     native, result = _native(function, structure)
     arrays = [jnp.asarray(x) for x in leaves]
     native.shapes(arrays)  # leaves the structure
-    arrays = native_p.bind(*arrays, fun=native)
+    arrays = native_p.bind(*arrays, fun=native, rank=0)
     return jax.tree.unflatten(result[0], arrays)
 
 
@@ -216,11 +215,11 @@ def lift(x: Array, like: Array) -> Array:
     return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)
 
 
-def _abstract(*args: Any, fun: Native) -> list[Any]:
+def _abstract(*args: Any, fun: Native, rank: int) -> list[Any]:
     return [ShapedArray(y.shape, y.dtype) for y in fun.shapes(args)]
 
 
-def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
+def _batched(args: Any, axes: Any, *, fun: Native, rank: int) -> Any:
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
 
     def last(x: Any, axis: int | None) -> Array:
@@ -229,16 +228,16 @@ def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
             return jnp.moveaxis(x, axis, -1)
         return jnp.broadcast_to(x[..., None], (*x.shape, size)) if fun.full else x[..., None]
 
-    results = native_p.bind(*map(last, args, axes), fun=fun)
+    results = native_p.bind(*map(last, args, axes), fun=fun, rank=rank + 1)
     results = [jnp.broadcast_to(y, (*y.shape[:-1], size)) for y in results]
     return results, [y.ndim - 1 for y in results]
 
 
-def _jvp(primals: Any, tangents: Any, *, fun: Native) -> Any:
-    results = native_p.bind(*primals, fun=fun)
+def _jvp(primals: Any, tangents: Any, *, fun: Native, rank: int) -> Any:
+    results = native_p.bind(*primals, fun=fun, rank=rank)
     moved = tuple(type(x) is not ad.Zero for x in tangents)
     given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
-    moving = iter(native_p.bind(*primals, *given, fun=fun.tangent(moved)))
+    moving = iter(native_p.bind(*primals, *given, fun=fun.tangent(moved), rank=rank))
     return results, [
         next(moving)
         if jnp.issubdtype(y.dtype, jnp.inexact)
@@ -247,14 +246,14 @@ def _jvp(primals: Any, tangents: Any, *, fun: Native) -> Any:
     ]
 
 
-def _transpose(cotangents: Any, *args: Any, fun: Native) -> Any:
+def _transpose(cotangents: Any, *args: Any, fun: Native, rank: int) -> Any:
     linear = tuple(ad.is_undefined_primal(x) for x in args)
     fixed = [x for x, flag in zip(args, linear, strict=True) if not flag]
     pairs = zip(args, linear, strict=True)
     avals = tuple((x.aval.shape, x.aval.dtype) for x, flag in pairs if flag)
     cotangents = [ad.instantiate_zeros(x) for x in cotangents]
     transposed = fun.transposed(linear, avals, cotangents[0].ndim)
-    found = iter(native_p.bind(*fixed, *cotangents, fun=transposed))
+    found = iter(native_p.bind(*fixed, *cotangents, fun=transposed, rank=rank))
     return [next(found) if flag else None for flag in linear]
 
 
@@ -263,19 +262,19 @@ def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]
     if not any(wanted):
         return [False] * len(equation.invars), None
     results = [x for x, flag in zip(equation.outvars, wanted, strict=True) if flag]
-    fun = equation.params["fun"].part(tuple(wanted))
-    kept = equation if all(wanted) else equation.replace(outvars=results, params={"fun": fun})
+    params = equation.params | {"fun": equation.params["fun"].part(tuple(wanted))}
+    kept = equation if all(wanted) else equation.replace(outvars=results, params=params)
     return [True] * len(equation.invars), kept
 
 
-native_p.def_impl(lambda *args, fun: fun.eager(*args))
+native_p.def_impl(lambda *args, fun, rank: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
 mlir.register_lowering(
-    native_p, mlir.lower_fun(lambda *args, fun: fun(*args), multiple_results=True)
+    native_p, mlir.lower_fun(lambda *args, fun, rank: fun(*args), multiple_results=True)
 )
 mlir.register_lowering(
     native_p,
-    mlir.lower_fun(lambda *args, fun: fun.settled(*args), multiple_results=True),
+    mlir.lower_fun(lambda *args, fun, rank: fusion.settled(fun, args, rank), multiple_results=True),
     platform="cpu",
 )
 batching.primitive_batchers[native_p] = _batched

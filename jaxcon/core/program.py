@@ -58,9 +58,11 @@ class Operation:
     Attributes:
         inputs, outputs: operands and results.
         inexact: whether the results are of floating point.
+        plain: whether it may be part of a kernel as far as its dtypes and effects go; not so where
+            it handles random keys, or does something besides, such as printing.
         effects: whether it does something besides.
-        read: which operands a loop reads if its results are needed, those apart that are only
-            carried from one round to the next.
+        read: which operands a loop or a slice at a computed place surely reads if its results are
+            needed, those apart that a loop only carries from one round to the next.
     """
 
     primitive: Any
@@ -68,6 +70,7 @@ class Operation:
     inputs: list[Operand]
     outputs: list[int]
     inexact: bool
+    plain: bool
     effects: bool
     read: frozenset[int] = frozenset()
 
@@ -99,12 +102,15 @@ class Program:
         makers: the operation that makes a value.
     """
 
-    def __init__(self, closed: Any, inner: Callable[[Any], tuple[Any, frozenset[int]]]) -> None:
+    def __init__(
+        self, closed: Any, inner: Callable[[Any], tuple[Any, bool, frozenset[int]]]
+    ) -> None:
         """Flattens a closed jaxpr.
 
         Args:
             closed: the jaxpr.
-            inner: rewrites the body of a loop, and says which of its arguments it surely reads.
+            inner: rewrites the body of a loop, and says whether a kernel may contain all of it, and
+                which of its arguments it surely reads.
         """
         self.operations: list[Operation] = []
         self._inner = inner
@@ -142,20 +148,8 @@ class Program:
             values.update(zip(op.outputs, op(operands), strict=True))
         return values[wanted]
 
-    def leaves(
-        self,
-        known: Any,
-        wanted: list[int],
-        through: Callable[[Operation, bool], Sequence[Operand]] = lambda op, whole: op.inputs,
-    ) -> list[int]:
-        """The known values from which others are made.
-
-        Args:
-            known: values.
-            wanted: what is made.
-            through: (operation, whether all of its results are wanted or lead to what is wanted) →
-                the operands to follow.
-        """
+    def leaves(self, known: Any, wanted: list[int]) -> list[int]:
+        """The known values from which others are made."""
         found: dict[int, None] = {}
         seen: set[int] = set()
         todo = list(reversed(wanted))
@@ -167,12 +161,10 @@ class Program:
             if x in known:
                 found[x] = None
             else:
-                op = self.makers[x]
-                operands = through(op, seen.issuperset(self._results(op)))
-                todo += [y for y in operands if not isinstance(y, Constant)]
+                todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
         return list(found)
 
-    def _results(self, op: Operation) -> list[int]:
+    def needed_results(self, op: Operation) -> list[int]:
         """Of an operation, without what a loop only carries from one round to the next."""
         carried = op.outputs[: op.params["num_carry"]] if op.name == "scan" else []
         return [x for x in op.outputs if x not in carried or x in self._used]
@@ -227,17 +219,18 @@ class Program:
             fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
             return self._inline_closed(jax.make_jaxpr(fold)(equation.invars[0].aval), args)
         if name == "scan":
-            body, read = self._inner(params["jaxpr"])
+            jaxpr, plain, read = self._inner(params["jaxpr"])
             read = read if params["length"] else frozenset()
-            return self._emit(equation, params | {"jaxpr": body}, args, read)
-        return self._emit(equation, params, args)
+            return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain, read)
+        return self._emit(equation, params, args, True, _places(equation))
 
     def _emit(
         self,
         equation: Any,
         params: Any,
         args: list[Operand],
-        read: frozenset[int] = frozenset(),
+        plain: bool,
+        read: frozenset[int],
     ) -> list[Any]:
         """Appends an operation, or finds the same one done before."""
         primitive = equation.primitive
@@ -247,7 +240,11 @@ class Program:
         outputs = [self._new() for _ in equation.outvars]
         inexact = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
         effects = bool(equation.effects)
-        self.operations.append(Operation(primitive, params, args, outputs, inexact, effects, read))
+        avals = [x.aval for x in (*equation.invars, *equation.outvars)]
+        keys = any(map(_is_key, avals))
+        plain = plain and not keys and not effects
+        op = Operation(primitive, params, args, outputs, inexact, plain, effects, read)
+        self.operations.append(op)
         if key is not None and not effects:
             self._known[key] = outputs
         return outputs
@@ -275,6 +272,19 @@ def _leading(axes: Any, shape: tuple[int, ...]) -> bool:
     return tuple(axes) == tuple(range(len(axes))) and all(shape[: len(axes)])
 
 
+def _places(equation: Any) -> frozenset[int]:
+    """Which operands a slice at a computed place reads: not one whose only value is zero."""
+    shapes = [x.aval.shape for x in equation.invars]
+    if equation.primitive.name == "dynamic_slice":
+        first, sizes, own = 1, equation.params["slice_sizes"], {0}
+    elif equation.primitive.name == "dynamic_update_slice":
+        first, sizes, own = 2, shapes[1], {1} if shapes[0] == shapes[1] else {0, 1}
+    else:
+        return frozenset()
+    pairs = enumerate(zip(shapes[0], sizes, strict=True))
+    return frozenset(own | {first + axis for axis, (whole, part) in pairs if part < whole})
+
+
 def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
     """The result of an operation that does not depend on all its operands.
 
@@ -283,7 +293,7 @@ def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
     if len(equation.outvars) != 1:
         return None
     name, aval = equation.primitive.name, equation.outvars[0].aval
-    if 0 in aval.shape:
+    if 0 in aval.shape and not _is_key(aval):
         return [Constant(np.zeros(aval.shape, aval.dtype))]
     exponent = args[1] if name == "pow" and len(args) == 2 else None
     power = equation.params.get("y") if name == "integer_pow" else exponent
@@ -306,13 +316,19 @@ def _key(primitive: Any, params: Any, args: list[Operand]) -> Any:
     for x in args:
         if not isinstance(x, Constant):
             parts.append(x)
-        elif jnp.shape(x.value) == () and not jnp.issubdtype(jnp.result_type(x.value), jnp.integer):
-            parts.append((str(jnp.result_type(x.value)), repr(x.value)))
+        elif jnp.shape(x.value) == () and not _is_key(x.value):
+            value = np.asarray(x.value, jnp.result_type(x.value))
+            parts.append((str(value.dtype), value.tobytes()))
         else:
-            parts.append((type(x.value).__name__, id(x.value)))
+            parts.append((type(x.value).__name__, id(x.value)))  # kept alive by the operation
     key = (primitive, tuple(sorted(params.items(), key=lambda item: item[0])), tuple(parts))
     try:
         hash(key)
     except TypeError:
         return None
     return key
+
+
+def _is_key(x: Any) -> bool:
+    """Whether it is a random key, or another array without numbers."""
+    return jnp.issubdtype(getattr(x, "dtype", np.float32), jax.dtypes.extended)

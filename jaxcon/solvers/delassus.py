@@ -49,7 +49,7 @@ def softened(
 
 
 def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
-    """C + ε diag(J M⁻¹ Jᵀ), (n_c,), with the diagonal held constant."""
+    """C + ε diag(J M⁻¹ Jᵀ + C), (n_c,), with the diagonal held constant."""
     jacobian, inverse_mass, _ = matrices
     rows: dict[int, list[Lane]] = {}
     for block in jacobian.blocks:
@@ -61,5 +61,7 @@ def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
         known = rows.get(block.start, [0.0] * len(squares))
         rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
     diagonal = jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
-    added = jnp.asarray(share).astype(diagonal.dtype)[None] * diagonal
-    return added if compliance is None else compliance + added
+    ε = jnp.asarray(share).astype(diagonal.dtype)[None]
+    if compliance is None:
+        return ε * diagonal
+    return compliance + ε * (diagonal + jax.lax.stop_gradient(compliance))

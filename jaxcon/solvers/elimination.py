@@ -190,8 +190,8 @@ def row_of(tree: Any, i: Any) -> Any:
     """Row i of arrays."""
 
     def row(x: Lane) -> Lane:
-        whole = isinstance(x, jax.Array)
-        return jax.lax.dynamic_index_in_dim(x, i, keepdims=False) if whole else x
+        lane = isinstance(x, jax.Array) and x.ndim
+        return jax.lax.dynamic_index_in_dim(x, i, keepdims=False) if lane else x
 
     return jax.tree.map(row, tree)
 
