@@ -122,7 +122,7 @@ class Stages:
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
                 read = surely_read(self.program, values, step)
-                self._store(values, step, self._evaluate, read)
+                self._store(values, step, self._evaluate, set.union(*read))
 
     def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
         for x in wanted:
@@ -149,16 +149,19 @@ class Stages:
         A stage is never left out if one of its results is needed.
         """
         known = {*values, *(x for step in steps for x in _values(step))}
-        read = set(wanted)
+        whole, cut = set(wanted), set[int]()
         for step in reversed(steps):
             known -= set(_values(step))
             if isinstance(step, Operation):
-                operands, _ = _followed(self.program, step, read, False)
+                sliced = whole.isdisjoint(step.outputs)
+                operands, sliced = _followed(self.program, step, whole | cut, sliced)
                 inputs = [x for x in operands if not isinstance(x, Constant)]
-                read |= surely_read(self.program, known, inputs)
-            elif not read.isdisjoint(step):
-                read.update(self.program.leaves(known, step))
-        return read
+                found = surely_read(self.program, known, inputs, sliced)
+                whole |= found[0]
+                cut |= found[1]
+            elif not (whole | cut).isdisjoint(step):
+                whole.update(self.program.leaves(known, step))
+        return whole | cut
 
 
 def worth_storing(program: Program) -> set[int]:
@@ -279,8 +282,12 @@ def _elementwise(op: Operation) -> bool:
     return op.plain and (op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY)
 
 
-def surely_read(program: Program, known: Any, wanted: list[int]) -> set[int]:
+def surely_read(
+    program: Program, known: Any, wanted: list[int], sliced: bool = False
+) -> tuple[set[int], set[int]]:
     """The known values of which no compiler can find that others do not depend on them.
+
+    First those that are read as a whole, then those of which a slice is read.
 
     Arithmetic in floating point depends on its operands, since NaN spreads through it, and so do
     arrays that are rearranged, or joined to others. Of a slice that is not said, where what is
@@ -288,16 +295,16 @@ def surely_read(program: Program, known: Any, wanted: list[int]) -> set[int]:
     their bodies read. All others, such as choices between values that may be the same, are not
     followed.
     """
-    found: set[int] = set()
+    found: tuple[set[int], set[int]] = (set(), set())
     seen: set[tuple[int, bool]] = set()
-    todo = [(x, False) for x in wanted]
+    todo = [(x, sliced) for x in wanted]
     while todo:
         x, sliced = todo.pop()
         if (x, sliced) in seen:
             continue
         seen.add((x, sliced))
         if x in known:
-            found.add(x)
+            found[sliced].add(x)
             continue
         met = {y for y, _ in seen}
         operands, cut = _followed(program, program.makers[x], met, sliced)
