@@ -186,7 +186,7 @@ def worth_storing(program: Program) -> set[int]:
         cheap = len(own) < WORTH and op.name not in COSTLY
         if name in stored and name not in ends and cheap:
             stored.discard(name)
-        work[name] = own if cheap else frozenset(list(own)[:WORTH])
+        work[name] = own if cheap else frozenset(list(own)[:WORTH])  # enough to be worth it
     return stored
 
 
@@ -208,7 +208,7 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
         if not moves and (len(needed) > 1 or name in needed):
             stored.add(name)
             needed = {name}
-        kernels[name] = set(sorted(needed)[:2])
+        kernels[name] = set(sorted(needed)[:2])  # more than one is all that matters
     return stored, ends
 
 

@@ -130,6 +130,8 @@ def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Ar
     if not hasattr(system, "layout") and state.q.ndim > 1:
         one = native.per_world(_dynamics, state.q.ndim - 1)
         return one(system, method, state, control, dt)
+    args = (system, method, state, control, dt)
+    state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
     stabilizer = method.feedback(dt)
     at = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
     return at(state.q, state.v, state.time)[0]

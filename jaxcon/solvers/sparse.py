@@ -39,7 +39,8 @@ class Sparse:
             derivative is that of the regularised system with diag A held.
         run: equal nodes in a row from which a loop is used instead of unrolled code.
         order: "runs" for the fewest operations; "levels" for the fewest steps one after another,
-            each of many nodes, which suits GPUs; None for what suits the default device.
+            each of many nodes, which suits GPUs; None for what suits `jax.default_backend()`,
+            whatever the device a function is then compiled for.
 
     References:
         Baraff, Linear-time dynamics using Lagrange multipliers, SIGGRAPH 1996.
