@@ -63,6 +63,19 @@ def loops_with_branches(x, y):
     return [jax.lax.fori_loop(0, 3, body, start)]
 
 
+def loops_of_one_round(x, y):
+    def body(carry, row):
+        a, b = carry
+        return (b, jnp.sin(b) * y[0] + row), a
+
+    return [jax.lax.scan(body, (x[0], x[1]), y[:1])[1] + 1.0]
+
+
+def equal_loops(x, y):
+    u, v = (jax.lax.fori_loop(0, 3, lambda i, a: jnp.sin(a) * y + x, x) for _ in range(2))
+    return [u + v[::-1], u + jnp.sum(v, axis=0)[None]]
+
+
 def random_keys(x, y):
     def body(i, carry):
         key, a = carry
@@ -129,6 +142,8 @@ FUNCTIONS = [
     loops_with_unused_parts,
     loops_of_what_no_kernel_holds,
     loops_with_branches,
+    loops_of_one_round,
+    equal_loops,
     random_keys,
     reductions,
     arguments_that_do_not_matter,

@@ -15,7 +15,7 @@ from functions import (
 )
 
 import jaxcon as jc
-from jaxcon.core import fusion
+from jaxcon.core import fusion, native
 from jaxcon.core.native import Native
 from jaxcon.scenes import four_bar
 
@@ -53,6 +53,26 @@ def compare(found, expected):
         assert (a.shape, a.dtype) == (b.shape, b.dtype)
         rounding = 1e-12 if a.dtype == np.float64 else 2e-5
         np.testing.assert_allclose(a, b, rtol=rounding, atol=rounding)
+
+
+def test_two_arguments_may_be_the_same_array():
+    def turned(a, b):
+        return [a + b[::-1], a + jnp.sum(b, axis=0)[None]]
+
+    def run(x):
+        z = jnp.sin(x) * 1.5
+        return native.call(turned, z, z)
+
+    z = np.sin(X) * 1.5
+    compare(jax.jit(run)(X), [z + z[::-1], z + z.sum(axis=0)])
+
+
+def test_cotangents_may_be_equal():
+    def function(x):
+        return [x, jnp.broadcast_to(jnp.sum(x, axis=0), x.shape)]
+
+    found = jax.jit(jax.grad(lambda x: sum(map(jnp.sum, native.call(function, x)))))(X)
+    np.testing.assert_allclose(found, np.full(X.shape, 5.0))
 
 
 def a_user_force(q, v, t, u, p):

@@ -140,7 +140,8 @@ class Stages:
             return [own[x] for x in wanted]
 
         doubtful = [i for i, x in enumerate(leaves) if x not in sure]
-        results = _kernel(compute, [values[x] for x in leaves], doubtful, self.rank)
+        given = [values[x] for x in leaves]
+        results = _kernel(compute, given, doubtful, self.rank, how == self._evaluate)
         values.update(zip(wanted, results, strict=True))
 
     def _read_by(self, steps: list[Step], values: dict[int, Any], wanted: list[int]) -> set[int]:
@@ -335,7 +336,11 @@ def _followed(
 
 
 def _kernel(
-    function: Callable[..., list[Array]], args: list[Array], doubtful: list[int], rank: int
+    function: Callable[..., list[Array]],
+    args: list[Array],
+    doubtful: list[int],
+    rank: int,
+    stage: bool,
 ) -> list[Array]:
     """Calls a function as one kernel.
 
@@ -343,6 +348,10 @@ def _kernel(
     and those that the function may not read (`doubtful`) are read for results that nobody needs.
     For that reason, too, there is always one of these: a computation that ends in one large array
     would be split among threads, which a kernel inside a kernel cannot be.
+
+    In a stage, arguments in whose place a result would fit are results as well, so that they are
+    not overwritten before the end: two that XLA finds to be equal are one array to it, and a result
+    in the place of the first would destroy the second.
     """
     count = 0
 
@@ -350,7 +359,9 @@ def _kernel(
         nonlocal count
         results = function(*args)
         count = len(results)
-        return [*results, *(_read(args[i], rank) for i in doubtful), jnp.zeros((), bool)]
+        kinds = {(x.shape, x.dtype) for x in results} if stage else set[Any]()
+        kept = [x for x in args if (x.shape, x.dtype) in kinds]
+        return [*results, *(_read(args[i], rank) for i in doubtful), jnp.zeros((), bool), *kept]
 
     first, *others = jax.jit(kernel)(*jax.lax.optimization_barrier(args))
     # what is said of a result of a call is said of the call; all of its results are kept

@@ -220,7 +220,7 @@ class Program:
             return self._inline_closed(jax.make_jaxpr(fold)(equation.invars[0].aval), args)
         if name == "scan":
             jaxpr, plain, read = self._inner(params["jaxpr"])
-            read = read if params["length"] else frozenset()
+            read = read if params["length"] > 1 else frozenset()  # one round is no loop to XLA
             return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain, read)
         return self._emit(equation, params, args, True, _places(equation))
 
