@@ -15,7 +15,7 @@ from jaxcon.core.status import Status, first
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers import blocks
 from jaxcon.solvers.blocks import Block, freeze
-from jaxcon.solvers.delassus import diagonal_blocks, regularized, softened, weighted
+from jaxcon.solvers.delassus import Delassus, diagonal_blocks, softened, weighted
 from jaxcon.solvers.jacobian import Jacobian
 from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
@@ -68,18 +68,10 @@ class ConjugateGradients:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
             return Schur(self.tikhonov).solve(system)
-        j, compliance = system.jacobian, system.compliance
+        j, delassus = system.jacobian, Delassus(system, self.tikhonov)
         free = system.mass.solve(system.force)
-        matrices = freeze((j, 1 / system.mass.values, compliance))
-        if self.tikhonov is not None:
-            compliance = regularized(compliance, freeze(self.tikhonov), matrices)
-            matrices = (*matrices[:2], freeze(compliance))
-        preconditioner = BlockJacobi(*matrices)
+        preconditioner = BlockJacobi(*delassus.matrices)
         tolerance = freeze(self._tolerance(free.dtype))
-
-        def delassus(x: Array) -> Array:
-            y = j.apply(system.mass.solve(j.transpose(x)))
-            return y if compliance is None else y + compliance * x
 
         def iterate(a: Operator, x: Array) -> tuple[Array, Array]:
             return descend(a, preconditioner.solve, x, tolerance, self.iterations)

@@ -1,4 +1,4 @@
-"""The blocks on the diagonal of A = J M⁻¹ Jᵀ + C, one for each constraint, by lanes."""
+"""A = J M⁻¹ Jᵀ + C as an operator, and its blocks on the diagonal, one for each constraint."""
 
 from __future__ import annotations
 
@@ -10,8 +10,31 @@ import jax.numpy as jnp
 from jaxcon.core.lanes import Vector, plus, times, total
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers import blocks
-from jaxcon.solvers.blocks import Block
+from jaxcon.solvers.blocks import Block, freeze
 from jaxcon.solvers.jacobian import Jacobian
+from jaxcon.solvers.saddle import Saddle
+
+
+class Delassus:
+    """x → A x = J (M⁻¹ (Jᵀ x)) + C x of a system whose M is diagonal; C with ε diag A, if given.
+
+    Attributes:
+        matrices: J, the diagonal of M⁻¹ and C, constant under differentiation.
+    """
+
+    def __init__(self, system: Saddle, tikhonov: Any) -> None:
+        self.system, self.compliance = system, system.compliance
+        inverse_mass = 1 / system.mass.diagonal
+        self.matrices = freeze((system.jacobian, inverse_mass, system.compliance))
+        if tikhonov is not None:
+            self.compliance = regularized(self.compliance, freeze(tikhonov), self.matrices)
+            self.matrices = (*self.matrices[:2], freeze(self.compliance))
+
+    def __call__(self, x: Array) -> Array:
+        """A x, (n_c,)."""
+        j, mass = self.system.jacobian, self.system.mass
+        y = j.apply(mass.solve(j.transpose(x)))
+        return y if self.compliance is None else y + self.compliance * x
 
 
 def weighted(jacobian: Jacobian, inverse_mass: Array) -> list[Block]:

@@ -16,10 +16,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array
 from jaxcon.solvers import ordering
-from jaxcon.solvers.blocks import freeze
-from jaxcon.solvers.delassus import regularized
+from jaxcon.solvers.delassus import Delassus
 from jaxcon.solvers.elimination import Elimination
 from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
@@ -60,21 +58,13 @@ class Sparse:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
             return Schur(self.tikhonov).solve(system)
-        j, compliance = system.jacobian, system.compliance
+        j, delassus = system.jacobian, Delassus(system, self.tikhonov)
         free = system.mass.solve(system.force)
-        matrices = freeze((j, 1 / system.mass.values, compliance))
-        if self.tikhonov is not None:
-            compliance = regularized(compliance, freeze(self.tikhonov), matrices)
-            matrices = (*matrices[:2], freeze(compliance))
         rounding = len(system.target) * float(jnp.finfo(free.dtype).eps)
         rounding = 0.0 if self.tikhonov is not None else rounding
         structure = tuple((b.start, b.shape[0], b.columns) for b in j.blocks)
         plan = ordering.plan(structure, self.run, self.order or suits_device())
-        elimination = Elimination(matrices, plan, free.shape[1:], rounding)
-
-        def delassus(x: Array) -> Array:
-            y = j.apply(system.mass.solve(j.transpose(x)))
-            return y if compliance is None else y + compliance * x
+        elimination = Elimination(delassus.matrices, plan, free.shape[1:], rounding)
 
         multipliers = jax.lax.custom_linear_solve(
             delassus,
