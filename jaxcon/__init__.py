@@ -3,6 +3,8 @@
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
     angular_velocity,
+    coordinate,
+    coordinate_rate,
     energy,
     orientation,
     position,
@@ -11,6 +13,15 @@ from jaxcon.analysis.quantities import (
     wrench,
 )
 from jaxcon.analysis.report import Report, report
+from jaxcon.constraints.armature import Armature
+from jaxcon.constraints.couplings import (
+    Belt,
+    Differential,
+    Gear,
+    PolynomialCoupling,
+    Pulley,
+    RackAndPinion,
+)
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
 from jaxcon.constraints.joints import (
@@ -22,12 +33,22 @@ from jaxcon.constraints.joints import (
     Spherical,
     Universal,
 )
+from jaxcon.constraints.span import Span
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
-from jaxcon.model.forces import CustomForce, ExternalWrench, Force, JointSpring, Spring
+from jaxcon.model.actuators import (
+    AffineActuator,
+    JointDamper,
+    JointSpring,
+    Motor,
+    PositionServo,
+    VelocityServo,
+)
+from jaxcon.model.coordinates import TurnCounter
+from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
 from jaxcon.simulation.initialize import init
@@ -53,11 +74,15 @@ __version__ = "0.1.0"
 __all__ = [
     "RK4",
     "WORLD",
+    "AffineActuator",
+    "Armature",
     "Baumgarte",
+    "Belt",
     "Coincident",
     "ConjugateGradients",
     "CustomForce",
     "Dense",
+    "Differential",
     "Distance",
     "Drive",
     "Energy",
@@ -65,15 +90,22 @@ __all__ = [
     "ExternalWrench",
     "Fixed",
     "Force",
+    "Gear",
     "GeneralizedSystem",
     "Heun",
     "Holonomic",
+    "JointDamper",
     "JointSpring",
     "Memory",
     "Method",
     "Motion",
+    "Motor",
+    "PolynomialCoupling",
     "Pose",
+    "PositionServo",
     "Prismatic",
+    "Pulley",
+    "RackAndPinion",
     "Report",
     "Revolute",
     "RungeKutta",
@@ -81,16 +113,21 @@ __all__ = [
     "Schur",
     "SemiImplicitEuler",
     "SimulationError",
-    "Spherical",
+    "Span",
     "Sparse",
+    "Spherical",
     "Spring",
     "State",
     "Status",
     "StepInfo",
+    "TurnCounter",
     "Universal",
     "Unstabilized",
     "VelocityLevel",
+    "VelocityServo",
     "angular_velocity",
+    "coordinate",
+    "coordinate_rate",
     "energy",
     "forward_dynamics",
     "inertia",

@@ -110,6 +110,25 @@ def driven_prismatic(s: Site) -> list[Any]:
     return [*prismatic(s), drive(s)]
 
 
+def pulley(s: Site) -> list[Any]:
+    """A rope from a point of a through one of b and back."""
+    spans = [
+        jc.Span(name + s.suffix, s.a, s.b, start, end)
+        for name, start, end in (("there", s.point, s.other), ("back", s.other, s.other + s.axis))
+    ]
+    names = [span.name for span in spans]
+    return [*spans, jc.Pulley(s.joint[0], *names, parts=2.0)]
+
+
+def cam(s: Site) -> list[Any]:
+    """The distance of two points as a polynomial of the angle of a hinge."""
+    axis = None if s.dim == 2 else s.axis
+    hinge = jc.Revolute("hinge" + s.suffix, s.a, s.b, point=s.point, axis=axis)
+    reach = jc.Span("reach" + s.suffix, s.a, s.b, s.other, s.point + s.other)
+    shape = (0.0, 0.3, -0.2, 0.1)
+    return [hinge, reach, jc.PolynomialCoupling(s.joint[0], hinge.name, reach.name, shape)]
+
+
 def breathing(a: Any, b: Any, t: Any, p: Any) -> Any:
     """A point of b stays at a distance from the centre of a that varies in time."""
     gap = b.point(p["anchor"]) - a.position
@@ -142,6 +161,8 @@ JOINTS = {
     "fixed": Joint(fixed, ("joint", "anchor_b")),
     "driven_revolute": Joint(driven_revolute, ("drive", "params")),
     "driven_prismatic": Joint(driven_prismatic, ("drive", "params")),
+    "pulley": Joint(pulley, ("joint", "parts")),
+    "cam": Joint(cam, ("joint", "coefficients")),
     "holonomic": Joint(holonomic, ("joint", "params")),
     "velocity_level": Joint(velocity_level, ("joint", "params"), velocity_level=True),
 }

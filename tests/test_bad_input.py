@@ -272,7 +272,7 @@ MISTAKES = {
             jc.Revolute("j", "arm", "leg", point=ORIGIN, axis=Z),
             jc.JointSpring("s", "j", 1.0, damping=-1.0),
         ),
-        ["joint spring 's'", "damping", "zero or more", "-1.0"],
+        ["JointSpring 's'", "damping", "zero or more", "-1.0"],
     ),
     "force that is not a number": (
         lambda: build(jc.Force("f", "arm", (0, np.inf, 0))),

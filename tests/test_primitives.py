@@ -196,6 +196,8 @@ FREEDOM = {
     "fixed": (0, 0),
     "driven_revolute": (0, 0),
     "driven_prismatic": (0, 0),
+    "pulley": (2, 5),
+    "cam": (0, 0),
     "holonomic": (2, 5),
     "velocity_level": (2, 5),
 }

@@ -7,6 +7,7 @@ bodies. To add a joint, write a class like these and one row in `tests/scenes.py
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -141,7 +142,7 @@ class Revolute:
     point: Any
     axis: Any = None
     oriented = True
-    turns = True
+    coordinates = MappingProxyType({"angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axes, and pointers that read the angle."""
@@ -168,7 +169,7 @@ class Revolute:
         return rows + [primitives.angle_between(n, u) for u in across]
 
     @staticmethod
-    def coordinate(p: dict[str, Any], a: Any, b: Any) -> Row:
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
         """The angle of b in a about the axis, zero at assembly [rad]; over turns in the plane."""
         if "axis" not in p:
             return primitives.same_orientation(a, b, p["angle"])[0]
@@ -197,7 +198,7 @@ class Prismatic:
     axis: Any
     point: Any = None
     oriented = True
-    turns = False
+    coordinates = MappingProxyType({"travel": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in a, the orientation of b in a."""
@@ -218,7 +219,7 @@ class Prismatic:
         return rows + primitives.same_orientation(a, b, p["orientation"])
 
     @staticmethod
-    def coordinate(p: dict[str, Any], a: Any, b: Any) -> Row:
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
         """How far b has moved along the axis since assembly [m]."""
         points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
         return primitives.travel(a.direction(p["axis"]), *points)

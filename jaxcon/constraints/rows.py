@@ -22,10 +22,12 @@ class RowLayout:
     Attributes:
         entries: (name, first, rows, stride) of each.
         velocity_level: names of those that have no φ.
+        inertial: names of those that hold nothing, but resist acceleration: rotors.
     """
 
     entries: tuple[tuple[str, int, int, int], ...]
     velocity_level: tuple[str, ...] = ()
+    inertial: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -101,6 +103,7 @@ class Rows:
         jacobian: J = ∂φ̇/∂v, (n_c, n_v).
         bias: γ (n_c,).
         layout: rows by constraint.
+        compliance: the diagonal of C, (n_c,); None where it is zero.
     """
 
     residual: Array
@@ -108,6 +111,7 @@ class Rows:
     jacobian: Jacobian
     bias: Array
     layout: RowLayout = static()
+    compliance: Array | None = None
 
     @property
     def violation(self) -> Violation:
@@ -135,17 +139,30 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     for group, rows in zip(system.constraints, sets, strict=True):
         k = len(group.names)
         blocks += [Block(value, start, columns) for columns, value in rows.jacobian]
-        entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
+        if rows.value:  # a joint may be there to be read and driven only
+            entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
         start += k * len(rows.value)
     jacobian = Jacobian(tuple(blocks), (start, v.shape[0]))
     residual, rate, bias = (_flat(sets, field, v) for field in ("value", "rate", "bias"))
-    free = [n for g in system.constraints if getattr(g, "velocity_level", False) for n in g.names]
-    return Rows(residual, rate, jacobian, bias, RowLayout(tuple(entries), tuple(free)))
+    soft = any(rows.compliance is not None for rows in sets)
+    compliance = _flat(sets, "compliance", v) if soft else None
+    layout = RowLayout(tuple(entries), _those(system, "velocity_level"), _those(system, "inertial"))
+    return Rows(residual, rate, jacobian, bias, layout, compliance)
+
+
+def _those(system: Any, quality: str) -> tuple[str, ...]:
+    """The names of the constraints that are so."""
+    groups = (g for g in system.constraints if getattr(g, quality, False))
+    return tuple(name for group in groups for name in group.names)
 
 
 def _flat(sets: list[RowSet], field: str, like: Array) -> Array:
     """One array (n_c,) from lanes, row-major inside each set."""
-    lanes = [_spread(lane, rows, like) for rows in sets for lane in getattr(rows, field)]
+    lanes = [
+        _spread(lane, rows, like)
+        for rows in sets
+        for lane in getattr(rows, field) or (0.0,) * len(rows.value)
+    ]
     return jnp.concatenate(lanes) if lanes else jnp.zeros((0, *like.shape[1:]), like.dtype)
 
 

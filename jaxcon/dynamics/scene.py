@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.status import Status
 from jaxcon.dynamics import grouping
+from jaxcon.dynamics.along import no_turns
 from jaxcon.dynamics.inputs import BodyInput, resolve
 from jaxcon.geometry.pose import Pose, WorldPose
 from jaxcon.model.layout import WORLD
@@ -115,7 +117,7 @@ class Scene:
             ValueError: its name is taken.
             TypeError: it is neither a constraint nor a force.
         """
-        roles = ("attach", "function", "motion", "rows", "forces")
+        roles = ("attach", "function", "motion", "rows", "forces", "joint")
         if not hasattr(element, "name") or not any(hasattr(element, role) for role in roles):
             raise TypeError(f"Scene.add takes a joint, constraint or force, got {element!r}.")
         self._take_name(element.name)
@@ -140,13 +142,22 @@ class Scene:
         poses = {n: b.motion.pose for n, b in bodies.items()}
         poses |= {n: WorldPose(pose.position, upright) for n, pose in fixed.items()}
         gather = grouping.Gather(self.dim, self.dtype, layout, poses)
-        constraints = gather.constraints(self._elements.values())
-        forces = gather.forces(self._elements.values(), constraints)
-        offsets = {n: b.offset for n, b in bodies.items() if b.offset is not None}
+        elements = self._elements.values()
+        along = gather.along(elements)
+        constraints = gather.constraints(elements, along)
+        turns = no_turns(along.counted, self.dtype)
         system = BodySystem(
-            self.gravity, inertia, tuple(constraints), tuple(forces), offsets, fixed, layout
+            gravity=self.gravity,
+            inertia=inertia,
+            constraints=tuple(constraints),
+            forces=tuple(gather.forces(elements, along)),
+            offsets={n: b.offset for n, b in bodies.items() if b.offset is not None},
+            fixed=fixed,
+            turns=turns,
+            layout=layout,
+            counted=along.counted,
         )
-        state = self._state(layout, bodies)
+        state = dataclasses.replace(self._state(layout, bodies), turns=turns)
         for group in constraints:
             if isinstance(group, Custom):
                 check_function(group, system.snapshot(state.q, state.v, state.time))

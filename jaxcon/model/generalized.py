@@ -49,6 +49,10 @@ class GeneralizedCoordinates:
         """The system at one instant."""
         return Snapshot(dataclasses.replace(self, size=v.shape[0]), q, v, t)
 
+    def count(self, q: Array, v: Array, t: Any) -> PyTree:
+        """Nothing: the user's coordinates count their own turns."""
+        return ()
+
     def mass(self, q: Array) -> Mass:
         """M(q, θ), (n_v, n_v), or its diagonal (n_v,) where the user's function gives that."""
         m = self.mass_function(q, self.params)

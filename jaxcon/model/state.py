@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
+
+import numpy as np
 
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
@@ -18,6 +21,8 @@ class State:
         time: () [s].
         status: `Status` code of this world, (); the first failure sticks.
         memory: of the method (integrals, histories); `jc.init` makes it.
+        turns: the angles a step ago of joints whose whole turns are counted, (n,) [rad]; empty
+            where there are none.
     """
 
     q: Array
@@ -25,10 +30,11 @@ class State:
     time: Array
     status: Array
     memory: PyTree = ()
+    turns: PyTree = ()
 
 
-def check_state(system: Any, state: Any) -> None:
-    """Checks that these are a system and a state of one world of it.
+def at(system: Any, state: Any) -> Any:
+    """The system as one of its worlds remembers it, checked: see `recall`.
 
     Raises:
         TypeError: they are something else, such as a Scene that was not built.
@@ -48,6 +54,22 @@ def check_state(system: Any, state: Any) -> None:
                 f"state.{what} must have shape {shape}, got {got}; for batches and trajectories use"
                 " jax.vmap: jax.vmap(lambda s: jc.position(system, s, name))(trajectory)."
             )
+    return recall(system, state.turns)
+
+
+def recall(system: Any, turns: PyTree) -> Any:
+    """The system with the angles a step ago of the joints whose turns it counts.
+
+    Raises:
+        ValueError: there are not as many as it counts.
+    """
+    expected, got = (np.shape(x)[:1] for x in (getattr(system, "turns", ()), turns))
+    if expected != got and sum(expected + got):
+        raise ValueError(
+            f"state.turns must have shape {expected}, got {got}: this system counts the whole turns"
+            f" of {sum(expected)} joints; start from the state of Scene.build or from jc.init."
+        )
+    return dataclasses.replace(system, turns=turns) if sum(got) else system
 
 
 @pytree

@@ -47,7 +47,8 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
     memory = method.stabilizer.init(system, q, v)
-    return State(q, v, jnp.asarray(time, dtype), status, memory)
+    turns = getattr(system, "turns", ())
+    return State(q, v, jnp.asarray(time, dtype), status, memory, turns)
 
 
 def check_dtype(system: Any, dtype: Any) -> None:
