@@ -22,6 +22,17 @@ from jaxcon.constraints.joints import (
     Spherical,
     Universal,
 )
+from jaxcon.constraints.pairs import (
+    ConstantVelocity,
+    Cylindrical,
+    Parallel,
+    Planar,
+    PointOnLine,
+    PointOnPlane,
+    RevoluteSpherical,
+    Screw,
+    SphericalSpherical,
+)
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
@@ -51,12 +62,12 @@ from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
 __version__ = "0.1.0"
 
 __all__ = [
-    "RK4",
-    "WORLD",
     "Baumgarte",
     "Coincident",
     "ConjugateGradients",
+    "ConstantVelocity",
     "CustomForce",
+    "Cylindrical",
     "Dense",
     "Distance",
     "Drive",
@@ -72,17 +83,25 @@ __all__ = [
     "Memory",
     "Method",
     "Motion",
+    "Parallel",
+    "Planar",
+    "PointOnLine",
+    "PointOnPlane",
     "Pose",
     "Prismatic",
+    "RK4",
     "Report",
     "Revolute",
+    "RevoluteSpherical",
     "RungeKutta",
     "Scene",
     "Schur",
+    "Screw",
     "SemiImplicitEuler",
     "SimulationError",
-    "Spherical",
     "Sparse",
+    "Spherical",
+    "SphericalSpherical",
     "Spring",
     "State",
     "Status",
@@ -90,6 +109,7 @@ __all__ = [
     "Universal",
     "Unstabilized",
     "VelocityLevel",
+    "WORLD",
     "angular_velocity",
     "energy",
     "forward_dynamics",
