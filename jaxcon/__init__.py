@@ -62,6 +62,8 @@ from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
 __version__ = "0.1.0"
 
 __all__ = [
+    "RK4",
+    "WORLD",
     "Baumgarte",
     "Coincident",
     "ConjugateGradients",
@@ -89,7 +91,6 @@ __all__ = [
     "PointOnPlane",
     "Pose",
     "Prismatic",
-    "RK4",
     "Report",
     "Revolute",
     "RevoluteSpherical",
@@ -109,7 +110,6 @@ __all__ = [
     "Universal",
     "Unstabilized",
     "VelocityLevel",
-    "WORLD",
     "angular_velocity",
     "energy",
     "forward_dynamics",

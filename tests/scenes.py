@@ -115,6 +115,10 @@ def point_on_plane(s: Site) -> list[Any]:
     return [jc.PointOnPlane(*s.joint, axis=s.axis, point=s.point)]
 
 
+def spherical_spherical(s: Site) -> list[Any]:
+    return [jc.SphericalSpherical(*s.joint, point_a=s.point, point_b=s.other)]
+
+
 def revolute_spherical(s: Site) -> list[Any]:
     across = np.cross(s.axis, s.other - s.point)
     return [jc.RevoluteSpherical(*s.joint, hinge=s.point, ball=s.other, axis=across)]
@@ -179,6 +183,7 @@ JOINTS = {
     "constant_velocity": Joint(constant_velocity, ("joint", "anchor_b"), dims=(3,)),
     "point_on_line": Joint(point_on_line, ("joint", "anchor_b")),
     "point_on_plane": Joint(point_on_plane, ("joint", "anchor_b")),
+    "spherical_spherical": Joint(spherical_spherical, ("joint", "length"), dims=(3,)),
     "revolute_spherical": Joint(revolute_spherical, ("joint", "length"), dims=(3,)),
     "fixed": Joint(fixed, ("joint", "anchor_b")),
     "driven_revolute": Joint(driven_revolute, ("drive", "params")),

@@ -177,6 +177,7 @@ class Screw(Cylindrical):
     """
 
     lead: Any = None
+    turns = False
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """That of the sleeve, and the lead."""
@@ -232,16 +233,22 @@ class Planar(Parallel):
 class ConstantVelocity:
     """Two shafts at any angle below π that turn equally fast, in space, 4 rows.
 
-    The shafts meet, and b is turned from its place at assembly, where the shafts are in line, about
-    axes normal to the shaft of a only: with a₁, a₂ normal to the shaft in a, and b₁, b₂ those of b,
-    a₁·b₂ − a₂·b₁ = 0, which is (1 + cos β) sin τ of the bend β and the twist τ.
+    The shafts meet, and the turn from where they would be in line is about an axis normal to both:
+    a unit quaternion (w, x, y, z) with z along the shaft of a has z = 0. With a₁, a₂ normal to the
+    shaft in a, and b₁, b₂ the same directions in b when the shafts are in line,
+
+        φ = a₂·b₁ − a₁·b₂ = 4 w z = (1 + cos β) sin τ,
+
+    of the bend β and the twist τ. Turning a by α and b by α′ about their own shafts takes φ from 0
+    to 2 w² sin(α′ − α), so that α′ = α at every bend.
 
     Attributes:
         name: unique in the scene.
         body_a, body_b: names, or `WORLD`.
         point: where the shafts meet, world frame at assembly, (3,) [m].
         axis: of the shaft of a, world frame at assembly, (3,), any length but zero.
-        axis_b: of that of b; in line with `axis` unless given.
+        axis_b: of that of b, in line with `axis` unless given; both shafts turn equally fast in the
+            right-handed sense about these.
     """
 
     name: str
@@ -257,6 +264,7 @@ class ConstantVelocity:
         """The point in both frames, and the directions normal to the shafts."""
         n, u, w = triad(self, a)
         m = n if self.axis_b is None else unit(self, "axis_b", b)
+        check_bend(self, n, m)
         return anchors(self, a, b) | {
             "first_a": a.local_direction(u),
             "second_a": a.local_direction(w),
@@ -266,11 +274,11 @@ class ConstantVelocity:
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """p_b − p_a = 0, a₁·b₂ − a₂·b₁ = 0."""
+        """p_b − p_a = 0, a₂·b₁ − a₁·b₂ = 0."""
         a1, a2 = a.direction(p["first_a"]), a.direction(p["second_a"])
         b1, b2 = b.direction(p["first_b"]), b.direction(p["second_b"])
         twist = primitives.difference(
-            primitives.angle_between(a1, b2), primitives.angle_between(a2, b1)
+            primitives.angle_between(a2, b1), primitives.angle_between(a1, b2)
         )
         return [*primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"])), twist]
 
@@ -351,6 +359,19 @@ def check_normal(joint: Any, n: Array, rod: Array) -> None:
                 f"{label(joint)}: the rod must be normal to the axis of its hinge, got a cosine of"
                 f" {cosine:.6g} between them."
             )
+
+
+def check_bend(joint: Any, n: Array, m: Array) -> None:
+    """Checks, where they are concrete, that two shafts do not point at each other.
+
+    Raises:
+        ValueError: they do.
+    """
+    if checks.is_concrete((n, m)) and float(n @ m) < PERPENDICULAR - 1:
+        raise ValueError(
+            f"{label(joint)}: axis and axis_b are opposite, which leaves the bend between them"
+            " without a plane; let both point on along the shafts, from a to b."
+        )
 
 
 def bent(n: Array, m: Array, x: Array) -> Array:
