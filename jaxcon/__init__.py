@@ -31,8 +31,18 @@ from jaxcon.constraints.joints import (
     Prismatic,
     Revolute,
     Spherical,
-    Universal,
 )
+from jaxcon.constraints.pairs import (
+    Cylindrical,
+    Parallel,
+    Planar,
+    PointOnLine,
+    PointOnPlane,
+    RevoluteSpherical,
+    Screw,
+    SphericalSpherical,
+)
+from jaxcon.constraints.shafts import ConstantVelocity, Universal
 from jaxcon.constraints.span import Span
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
@@ -80,7 +90,9 @@ __all__ = [
     "Belt",
     "Coincident",
     "ConjugateGradients",
+    "ConstantVelocity",
     "CustomForce",
+    "Cylindrical",
     "Dense",
     "Differential",
     "Distance",
@@ -100,6 +112,10 @@ __all__ = [
     "Method",
     "Motion",
     "Motor",
+    "Parallel",
+    "Planar",
+    "PointOnLine",
+    "PointOnPlane",
     "PolynomialCoupling",
     "Pose",
     "PositionServo",
@@ -108,14 +124,17 @@ __all__ = [
     "RackAndPinion",
     "Report",
     "Revolute",
+    "RevoluteSpherical",
     "RungeKutta",
     "Scene",
     "Schur",
+    "Screw",
     "SemiImplicitEuler",
     "SimulationError",
     "Span",
     "Sparse",
     "Spherical",
+    "SphericalSpherical",
     "Spring",
     "State",
     "Status",

@@ -87,6 +87,43 @@ def universal(s: Site) -> list[Any]:
     return [jc.Universal(*s.joint, point=s.point, axis_a=s.axis, axis_b=across)]
 
 
+def cylindrical(s: Site) -> list[Any]:
+    return [jc.Cylindrical(*s.joint, axis=s.axis, point=s.point)]
+
+
+def screw(s: Site) -> list[Any]:
+    return [jc.Screw(*s.joint, axis=s.axis, point=s.point, lead=0.7)]
+
+
+def planar(s: Site) -> list[Any]:
+    return [jc.Planar(*s.joint, axis=s.axis, point=s.point)]
+
+
+def parallel(s: Site) -> list[Any]:
+    return [jc.Parallel(*s.joint, axis=s.axis)]
+
+
+def constant_velocity(s: Site) -> list[Any]:
+    return [jc.ConstantVelocity(*s.joint, point=s.point, axis=s.axis, axis_b=s.axis + s.other)]
+
+
+def point_on_line(s: Site) -> list[Any]:
+    return [jc.PointOnLine(*s.joint, axis=s.axis, point=s.point)]
+
+
+def point_on_plane(s: Site) -> list[Any]:
+    return [jc.PointOnPlane(*s.joint, axis=s.axis, point=s.point)]
+
+
+def spherical_spherical(s: Site) -> list[Any]:
+    return [jc.SphericalSpherical(*s.joint, point_a=s.point, point_b=s.other)]
+
+
+def revolute_spherical(s: Site) -> list[Any]:
+    across = np.cross(s.axis, s.other - s.point)
+    return [jc.RevoluteSpherical(*s.joint, hinge=s.point, ball=s.other, axis=across)]
+
+
 def fixed(s: Site) -> list[Any]:
     return [jc.Fixed(*s.joint, point=s.point)]
 
@@ -108,6 +145,16 @@ def driven_revolute(s: Site) -> list[Any]:
 
 def driven_prismatic(s: Site) -> list[Any]:
     return [*prismatic(s), drive(s)]
+
+
+def driven(make: Callable[[Site], list[Any]], coordinate: str) -> Callable[[Site], list[Any]]:
+    """A joint with one of its coordinates driven."""
+
+    def elements(s: Site) -> list[Any]:
+        one = dataclasses.replace(drive(s), coordinate=coordinate)
+        return [*make(s), one]
+
+    return elements
 
 
 def pulley(s: Site) -> list[Any]:
@@ -158,9 +205,23 @@ JOINTS = {
     "revolute": Joint(revolute, ("joint", "anchor_b")),
     "prismatic": Joint(prismatic, ("joint", "anchor_b")),
     "universal": Joint(universal, ("joint", "anchor_b"), dims=(3,)),
+    "cylindrical": Joint(cylindrical, ("joint", "anchor_b"), dims=(3,)),
+    "screw": Joint(screw, ("joint", "lead"), dims=(3,)),
+    "planar": Joint(planar, ("joint", "anchor_b"), dims=(3,)),
+    "parallel": Joint(parallel, ("joint", "axis"), dims=(3,)),
+    "constant_velocity": Joint(constant_velocity, ("joint", "anchor_b"), dims=(3,)),
+    "point_on_line": Joint(point_on_line, ("joint", "anchor_b")),
+    "point_on_plane": Joint(point_on_plane, ("joint", "anchor_b")),
+    "spherical_spherical": Joint(spherical_spherical, ("joint", "length"), dims=(3,)),
+    "revolute_spherical": Joint(revolute_spherical, ("joint", "length"), dims=(3,)),
     "fixed": Joint(fixed, ("joint", "anchor_b")),
     "driven_revolute": Joint(driven_revolute, ("drive", "params")),
     "driven_prismatic": Joint(driven_prismatic, ("drive", "params")),
+    "driven_universal_a": Joint(driven(universal, "angle_a"), ("drive", "params"), dims=(3,)),
+    "driven_universal_b": Joint(driven(universal, "angle_b"), ("drive", "params"), dims=(3,)),
+    "driven_sleeve": Joint(driven(cylindrical, "travel"), ("drive", "params"), dims=(3,)),
+    "driven_shaft": Joint(driven(cylindrical, "angle"), ("drive", "params"), dims=(3,)),
+    "driven_planar": Joint(driven(planar, "y"), ("drive", "params"), dims=(3,)),
     "pulley": Joint(pulley, ("joint", "parts")),
     "cam": Joint(cam, ("joint", "coefficients")),
     "holonomic": Joint(holonomic, ("joint", "params")),

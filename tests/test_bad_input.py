@@ -177,6 +177,24 @@ MISTAKES = {
         lambda: build(jc.Universal("j", jc.WORLD, "bob", ORIGIN, (1, 0, 0), Z)),
         ["Universal 'j'", "orientation", "'bob' is a particle"],
     ),
+    "screw joint in the plane": (
+        lambda: build(jc.Screw("j", "arm", "leg", axis=(1, 0), lead=0.1), dim=2),
+        ["Screw 'j'", "3 dimensions only"],
+    ),
+    "sleeve on a particle": (
+        lambda: build(jc.Cylindrical("j", jc.WORLD, "bob", axis=Z)),
+        ["Cylindrical 'j'", "orientation", "'bob' is a particle"],
+    ),
+    "line of a particle": (
+        lambda: build(jc.PointOnLine("j", "bob", "arm", axis=Z)),
+        ["PointOnLine 'j'", "orientation", "'bob' is a particle", "body_b"],
+    ),
+    "rod hinged to a particle": (
+        lambda: build(
+            jc.RevoluteSpherical("j", "bob", "arm", hinge=(2, 0, 0), ball=ORIGIN, axis=Z)
+        ),
+        ["RevoluteSpherical 'j'", "orientation", "'bob' is a particle", "body_b"],
+    ),
     "drive of a joint without a coordinate": (
         lambda: build(jc.Fixed("bolt", "arm", "leg"), jc.Drive("d", "bolt", scenes.wave)),
         ["Drive 'd'", "'bolt' has no coordinate"],
@@ -262,6 +280,28 @@ MISTAKES = {
     "negative distance": (
         lambda: build(jc.Distance("d", "arm", "leg", length=-2)),
         ["Distance 'd'", "length", "positive", "-2.0"],
+    ),
+    "screw without a lead": (
+        lambda: build(jc.Screw("j", "arm", "leg", axis=Z)),
+        ["Screw 'j'", "lead", "one turn"],
+    ),
+    "screw with a lead of zero": (
+        lambda: build(jc.Screw("j", "arm", "leg", axis=Z, lead=0.0)),
+        ["Screw 'j'", "lead", "0.0"],
+    ),
+    "shafts that point at each other": (
+        lambda: build(jc.ConstantVelocity("j", "arm", "leg", ORIGIN, axis=Z, axis_b=(0, 0, -1))),
+        ["ConstantVelocity 'j'", "axis and axis_b", "opposite", "from a to b"],
+    ),
+    "rod of length zero": (
+        lambda: build(jc.RevoluteSpherical("j", "arm", "leg", hinge=Z, ball=Z, axis=Z)),
+        ["RevoluteSpherical 'j'", "hinge to ball", "positive", "0.0"],
+    ),
+    "rod oblique to its hinge": (
+        lambda: build(
+            jc.RevoluteSpherical("j", "arm", "leg", hinge=ORIGIN, ball=(0, 3, 4), axis=Z)
+        ),
+        ["RevoluteSpherical 'j'", "normal to the axis", "0.8"],
     ),
     "negative stiffness": (
         lambda: build(jc.Spring("s", "arm", "leg", stiffness=-1)),

@@ -151,6 +151,52 @@ def prismatic(p, a, b):
     return [*((a.r @ u) @ gap(p, a, b) for u in normals), *turned(p, a, b)]
 
 
+def across(p, a, b):
+    """Cosines between an axis of a and the two normals of the axis in b."""
+    return [(a.r @ p["axis"]) @ (b.r @ p[side]) for side in ("first_b", "second_b")]
+
+
+def point_on_line(p, a, b):
+    normals = [p[side] for side in ("first_a", "second_a") if side in p]
+    return [(a.r @ u) @ gap(p, a, b) for u in normals]
+
+
+def point_on_plane(p, a, b):
+    return [(a.r @ p["axis"]) @ gap(p, a, b)]
+
+
+def planar(p, a, b):
+    return [*point_on_plane(p, a, b), *across(p, a, b)]
+
+
+def cylindrical(p, a, b):
+    return [*point_on_line(p, a, b), *across(p, a, b)]
+
+
+def screw(p, a, b):
+    """The nut is where its turns say, up to whole ones."""
+    pointer = b.r @ p["first_b"]
+    turns = np.arctan2((a.r @ p["second_a"]) @ pointer, (a.r @ p["first_a"]) @ pointer) / 2 / np.pi
+    left = (a.r @ p["axis"]) @ gap(p, a, b) / p["lead"] - turns
+    return [*cylindrical(p, a, b), p["lead"] * (left - np.round(left))]
+
+
+def constant_velocity(p, a, b):
+    """(1 + cos β) sin τ: the bend from the shafts, the twist left after undoing it."""
+    n, m = (
+        np.cross(x.r @ p["first" + s], x.r @ p["second" + s]) for x, s in ((a, "_a"), (b, "_b"))
+    )
+    k = np.cross(m, n)
+    cross = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
+    back = np.eye(3) + cross + cross @ cross / (1 + n @ m)  # the shortest turn from m to n
+    u, w, pointer = a.r @ p["first_a"], a.r @ p["second_a"], back @ b.r @ p["first_b"]
+    return [*gap(p, a, b), (1 + n @ m) * np.sin(np.arctan2(w @ pointer, u @ pointer))]
+
+
+def revolute_spherical(p, a, b):
+    return [*point_on_plane(p, a, b), *distance(p, a, b)]
+
+
 RESIDUALS = {
     "coincident": gap,
     "spherical": gap,
@@ -159,6 +205,15 @@ RESIDUALS = {
     "universal": universal,
     "fixed": fixed,
     "prismatic": prismatic,
+    "cylindrical": cylindrical,
+    "screw": screw,
+    "planar": planar,
+    "parallel": across,
+    "constant_velocity": constant_velocity,
+    "point_on_line": point_on_line,
+    "point_on_plane": point_on_plane,
+    "spherical_spherical": distance,
+    "revolute_spherical": revolute_spherical,
 }
 FORMULAS = [
     f"{kind}-{dim}d-{topology}"
@@ -193,9 +248,23 @@ FREEDOM = {
     "revolute": (1, 1),
     "prismatic": (1, 1),
     "universal": (None, 2),
+    "cylindrical": (None, 2),
+    "screw": (None, 1),
+    "planar": (None, 3),
+    "parallel": (None, 4),
+    "constant_velocity": (None, 2),
+    "point_on_line": (2, 4),
+    "point_on_plane": (2, 5),
+    "spherical_spherical": (None, 5),
+    "revolute_spherical": (None, 4),
     "fixed": (0, 0),
     "driven_revolute": (0, 0),
     "driven_prismatic": (0, 0),
+    "driven_universal_a": (None, 1),
+    "driven_universal_b": (None, 1),
+    "driven_sleeve": (None, 1),
+    "driven_shaft": (None, 1),
+    "driven_planar": (None, 2),
     "pulley": (2, 5),
     "cam": (0, 0),
     "holonomic": (2, 5),
@@ -227,7 +296,7 @@ def test_a_distance_of_zero_has_no_direction_and_is_finite(dim):
         assert jnp.all(jnp.isfinite(leaf))
 
 
-@pytest.mark.parametrize("kind", ["fixed", "prismatic", "driven_revolute"])
+@pytest.mark.parametrize("kind", ["fixed", "prismatic", "driven_revolute", "screw"])
 def test_derivatives_of_rows_at_the_identity_are_finite(kind):
     """Where both bodies are upright and the joint is as at assembly."""
     scene = jc.Scene()

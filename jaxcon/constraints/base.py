@@ -81,9 +81,11 @@ class Joints(Elements):
         return self.joint.coordinate(name, self.params, *self.frames(snapshot))
 
     def anchor(self, snapshot: Any, i: int) -> Array | None:
-        """The anchor of one joint on its second body, world frame, (dim,)."""
+        """The anchor of one joint on its second body, world frame, (dim,); None without a point."""
+        if "anchor_b" not in self.params:
+            return None
         one = self.select((i,))
-        point = one.frames(snapshot)[1].point(one.params.get("anchor_b"))
+        point = one.frames(snapshot)[1].point(one.params["anchor_b"])
         return jnp.stack([x.reshape(()) for x in point.position])
 
 

@@ -173,8 +173,7 @@ class Revolute:
         """The angle of b in a about the axis, zero at assembly [rad]; over turns in the plane."""
         if "axis" not in p:
             return primitives.same_orientation(a, b, p["angle"])[0]
-        first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
-        return primitives.turn(first, second, b.direction(p["first_b"]))
+        return turn_about(p, a, b)
 
 
 @dataclass(frozen=True)
@@ -225,44 +224,10 @@ class Prismatic:
         return primitives.travel(a.direction(p["axis"]), *points)
 
 
-@dataclass(frozen=True)
-class Universal:
-    """A cross (Cardan, Hooke) joint in space, 4 rows; two turns are free.
-
-    Two points meet, and an axis n_a of a stays normal to an axis n_b of b: n_a·n_b = 0.
-
-    Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: where the axes cross, world frame at assembly, (3,) [m].
-        axis_a, axis_b: of the cross in a and in b, world frame at assembly, (3,), any length but
-            zero; perpendicular.
-    """
-
-    name: str
-    body_a: str
-    body_b: str
-    point: Any
-    axis_a: Any
-    axis_b: Any
-    oriented = True
-    dims = (3,)
-
-    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, and each axis in its own."""
-        n_a, n_b = unit(self, "axis_a", a), unit(self, "axis_b", b)
-        check_perpendicular(self, n_a, n_b)
-        return anchors(self, a, b) | {
-            "axis_a": a.local_direction(n_a),
-            "axis_b": b.local_direction(n_b),
-        }
-
-    @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """p_b − p_a = 0, n_a·n_b = 0."""
-        rows = primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
-        n_a, n_b = a.direction(p["axis_a"]), b.direction(p["axis_b"])
-        return [*rows, primitives.angle_between(n_a, n_b)]
+def turn_about(p: dict[str, Any], a: Any, b: Any) -> Row:
+    """The angle of b in a about the normal of two directions of a, zero at assembly [rad]."""
+    first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
+    return primitives.turn(first, second, b.direction(p["first_b"]))
 
 
 def label(joint: Any) -> str:
@@ -304,21 +269,6 @@ def unit(joint: Any, what: str, pose: Pose) -> Array:
     axis = checks.number(label(joint), what, given, pose.position.dtype, pose.position.shape)
     checks.nonzero(label(joint), what, axis)
     return axis / numerics.norm(axis)
-
-
-def check_perpendicular(joint: Any, u: Array, w: Array) -> None:
-    """Checks two unit axes of a joint, where they are concrete.
-
-    Raises:
-        ValueError: the cosine of the angle between them is not zero.
-    """
-    if checks.is_concrete((u, w)):
-        cosine = float(jnp.dot(u, w))
-        if abs(cosine) > PERPENDICULAR:
-            raise ValueError(
-                f"{label(joint)}: axis_a and axis_b must be perpendicular, got a cosine of"
-                f" {cosine:.6g} between them."
-            )
 
 
 def relative_orientation(a: Pose, b: Pose) -> Array:

@@ -59,6 +59,12 @@ def angle_between(u: Direction, w: Direction) -> Row:
     )
 
 
+def difference(x: Row, y: Row) -> Row:
+    """φ_x − φ_y."""
+    pulls = (x.pulls[0] - y.pulls[0], x.pulls[1] - y.pulls[1])
+    return Row(x.value - y.value, x.rate - y.rate, x.bias - y.bias, pulls)
+
+
 def travel(u: Direction, p: Point, r: Point) -> Row:
     """u · (r − p): how far r lies from p along a direction of p's body."""
     d, ḋ, bias = r.position - p.position, r.velocity - p.velocity, r.bias - p.bias
