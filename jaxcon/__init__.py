@@ -11,6 +11,7 @@ from jaxcon.analysis.quantities import (
     wrench,
 )
 from jaxcon.analysis.report import Report, report
+from jaxcon.constraints.curves import PointOnCurve
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
 from jaxcon.constraints.joints import (
@@ -87,6 +88,7 @@ __all__ = [
     "Motion",
     "Parallel",
     "Planar",
+    "PointOnCurve",
     "PointOnLine",
     "PointOnPlane",
     "Pose",

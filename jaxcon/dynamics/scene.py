@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.constraints.curves import Curves
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.status import Status
@@ -139,10 +140,10 @@ class Scene:
         fixed[WORLD] = Pose(world, upright)
         poses = {n: b.motion.pose for n, b in bodies.items()}
         poses |= {n: WorldPose(pose.position, upright) for n, pose in fixed.items()}
-        gather = grouping.Gather(self.dim, self.dtype, layout, poses)
+        offsets = {n: b.offset for n, b in bodies.items() if b.offset is not None}
+        gather = grouping.Gather(self.dim, self.dtype, layout, poses, offsets | fixed)
         constraints = gather.constraints(self._elements.values())
         forces = gather.forces(self._elements.values(), constraints)
-        offsets = {n: b.offset for n, b in bodies.items() if b.offset is not None}
         system = BodySystem(
             self.gravity, inertia, tuple(constraints), tuple(forces), offsets, fixed, layout
         )
@@ -150,6 +151,8 @@ class Scene:
         for group in constraints:
             if isinstance(group, Custom):
                 check_function(group, system.snapshot(state.q, state.v, state.time))
+            if isinstance(group, Curves):
+                group.check(system.snapshot(state.q, state.v, state.time))
         return system, state
 
     def _state(self, layout: Any, bodies: Any) -> State:
