@@ -22,6 +22,7 @@ from jaxcon.constraints.couplings import (
     Pulley,
     RackAndPinion,
 )
+from jaxcon.constraints.curves import PointOnCurve
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
 from jaxcon.constraints.joints import (
@@ -114,6 +115,7 @@ __all__ = [
     "Motor",
     "Parallel",
     "Planar",
+    "PointOnCurve",
     "PointOnLine",
     "PointOnPlane",
     "PolynomialCoupling",

@@ -21,6 +21,7 @@ import numpy as np
 from compiling import quick_jit
 
 import jaxcon as jc
+from jaxcon.constraints.curves import Curves
 from jaxcon.constraints.rows import linearize
 
 
@@ -113,6 +114,20 @@ def point_on_line(s: Site) -> list[Any]:
 
 def point_on_plane(s: Site) -> list[Any]:
     return [jc.PointOnPlane(*s.joint, axis=s.axis, point=s.point)]
+
+
+def bend(x: Any, p: Any) -> Any:
+    """A parabola through a point of a, twisted out of its plane in space."""
+    y = x - p["start"]
+    rows = [y[1] + p["curvature"] * y[0] ** 2 + 0.3 * y[0] * y[1]]
+    if len(x) == 3:
+        rows.append(y[2] - 0.3 * y[0] + 0.2 * y[0] * y[1] * y[2])
+    return jnp.stack(rows)
+
+
+def point_on_curve(s: Site) -> list[Any]:
+    params = {"start": np.zeros(s.dim), "curvature": 0.7}  # the start: see start_curves
+    return [jc.PointOnCurve(*s.joint, bend, point=s.point, params=params)]
 
 
 def spherical_spherical(s: Site) -> list[Any]:
@@ -212,6 +227,7 @@ JOINTS = {
     "constant_velocity": Joint(constant_velocity, ("joint", "anchor_b"), dims=(3,)),
     "point_on_line": Joint(point_on_line, ("joint", "anchor_b")),
     "point_on_plane": Joint(point_on_plane, ("joint", "anchor_b")),
+    "point_on_curve": Joint(point_on_curve, ("joint", "params")),
     "spherical_spherical": Joint(spherical_spherical, ("joint", "length"), dims=(3,)),
     "revolute_spherical": Joint(revolute_spherical, ("joint", "length"), dims=(3,)),
     "fixed": Joint(fixed, ("joint", "anchor_b")),
@@ -265,7 +281,8 @@ def joints_scene(kinds: tuple[str, ...], dim: int, topology: str, dtype: Any) ->
         for kind in kinds
         if JOINTS[kind].velocity_level
     )
-    return finish(start_breathing(system, state), state, random, tuple(parameters), level)
+    system = start_curves(start_breathing(system, state), state)
+    return finish(system, state, random, tuple(parameters), level)
 
 
 def add_joint(scene: jc.Scene, kind: str, topology: str, suffix: str, random: Any) -> None:
@@ -299,6 +316,17 @@ def start_breathing(system: Any, state: jc.State) -> Any:
             gap = jc.position(system, state, b, group.params["anchor"])
             gap = gap - (0 if a == jc.WORLD else jc.position(system, state, a))
             changes[group.law.name] = {"params": group.params | {"square": gap @ gap}}
+    return system.with_params(changes)
+
+
+def start_curves(system: Any, state: jc.State) -> Any:
+    """The same with curves that run through their points at assembly."""
+    snapshot = system.snapshot(state.q, state.v, state.time)
+    changes = {}
+    for group in system.constraints:
+        if isinstance(group, Curves):
+            place = jnp.concatenate([row.value for row in group.place(snapshot)])
+            changes[group.names[0]] = {"params": group.given | {"start": place}}
     return system.with_params(changes)
 
 

@@ -86,6 +86,18 @@ def two_arguments(a, p):
     return a.position
 
 
+def three_arguments(x, t, p):
+    return x[1:]
+
+
+def sheet(x, p):
+    return x[:1]
+
+
+def touching(x, p):
+    return (x[:1] - p) ** 2
+
+
 def nothing(q, t, p):
     return q[:0]
 
@@ -391,6 +403,22 @@ MISTAKES = {
     ),
     "nothing moves": (lambda: jc.Scene().build(), ["no body that moves"]),
     # users' functions
+    "curve of other arguments": (
+        lambda: build(jc.PointOnCurve("c", "arm", "bob", three_arguments)),
+        ["PointOnCurve 'c'", r"curve\(x, params\) cannot be called"],
+    ),
+    "curve in space of one function": (
+        lambda: build(jc.PointOnCurve("c", "arm", "bob", sheet)),
+        ["PointOnCurve 'c'", r"\(2,\) of float64 in 3 dimensions", r"\[1\]"],
+    ),
+    "curve whose function does not cross zero": (
+        lambda: build(jc.PointOnCurve("c", jc.WORLD, "bob", touching, params=2.0), dim=2),
+        ["PointOnCurve 'c'", "rank 0, but 1", "crossed", "touched"],
+    ),
+    "curve of a particle": (
+        lambda: build(jc.PointOnCurve("c", "bob", "arm", sheet), dim=2),
+        ["PointOnCurve 'c'", "orientation", "'bob' is a particle", "body_b"],
+    ),
     "constraint that returns a matrix": (
         lambda: build(jc.Holonomic(matrix, ("arm",), name="h")),
         ["Holonomic 'h'", r"\(m,\)", r"\[3, 3\]"],

@@ -255,6 +255,7 @@ FREEDOM = {
     "constant_velocity": (None, 2),
     "point_on_line": (2, 4),
     "point_on_plane": (2, 5),
+    "point_on_curve": (2, 4),
     "spherical_spherical": (None, 5),
     "revolute_spherical": (None, 4),
     "fixed": (0, 0),

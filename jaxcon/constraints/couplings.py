@@ -285,7 +285,7 @@ class Couplings(Elements):
                 pulls[side] = pull * slope if known is None else known + pull * slope
         rate = total(slope * row.rate for slope, row in pairs)
         bias = total(slope * row.bias for slope, row in pairs) + curvature
-        row = Row(value, rate, bias, tuple(pulls))  # type: ignore[arg-type]
+        row = Row(value, rate, bias, tuple(pulls))
         return gather(snapshot, self.places, [row])
 
     def anchor(self, snapshot: Any, i: int) -> Array | None:

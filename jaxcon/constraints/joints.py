@@ -271,6 +271,21 @@ def unit(joint: Any, what: str, pose: Pose) -> Array:
     return axis / numerics.norm(axis)
 
 
+def check_perpendicular(joint: Any, u: Array, w: Array) -> None:
+    """Checks two unit axes of a joint, where they are concrete.
+
+    Raises:
+        ValueError: the cosine of the angle between them is not zero.
+    """
+    if checks.is_concrete((u, w)):
+        cosine = float(jnp.dot(u, w))
+        if abs(cosine) > PERPENDICULAR:
+            raise ValueError(
+                f"{label(joint)}: axis_a and axis_b must be perpendicular, got a cosine of"
+                f" {cosine:.6g} between them."
+            )
+
+
 def relative_orientation(a: Pose, b: Pose) -> Array:
     """θ_b − θ_a in the plane, q_a* q_b in space."""
     if a.position.shape == (2,):

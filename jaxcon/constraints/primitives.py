@@ -37,7 +37,7 @@ class Row(NamedTuple):
     value: Lane
     rate: Lane
     bias: Lane
-    pulls: tuple[Vector, Vector]
+    pulls: tuple[Vector, ...]
 
 
 def meet(p: Point, r: Point) -> list[Row]:

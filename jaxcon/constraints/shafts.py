@@ -9,7 +9,14 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxcon.constraints import primitives
-from jaxcon.constraints.joints import PERPENDICULAR, anchors, label, triad, unit
+from jaxcon.constraints.joints import (
+    PERPENDICULAR,
+    anchors,
+    check_perpendicular,
+    label,
+    triad,
+    unit,
+)
 from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
@@ -128,21 +135,6 @@ class ConstantVelocity:
             primitives.angle_between(a2, b1), primitives.angle_between(a1, b2)
         )
         return [*primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"])), twist]
-
-
-def check_perpendicular(joint: Any, u: Array, w: Array) -> None:
-    """Checks two unit axes of a joint, where they are concrete.
-
-    Raises:
-        ValueError: the cosine of the angle between them is not zero.
-    """
-    if checks.is_concrete((u, w)):
-        cosine = float(jnp.dot(u, w))
-        if abs(cosine) > PERPENDICULAR:
-            raise ValueError(
-                f"{label(joint)}: axis_a and axis_b must be perpendicular, got a cosine of"
-                f" {cosine:.6g} between them."
-            )
 
 
 def check_bend(joint: Any, n: Array, m: Array) -> None:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.base import Joints
+from jaxcon.constraints.curves import Curves, PointOnCurve
 from jaxcon.constraints.custom import CustomOnBodies, Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
 from jaxcon.core import checks
@@ -27,7 +28,7 @@ from jaxcon.model.forces import (
 from jaxcon.model.layout import WORLD, Group, Layout, Place
 from jaxcon.model.system import MassProperties
 
-SPECIAL = (Drive, Holonomic, VelocityLevel, ExternalWrench, CustomForce)
+SPECIAL = (Drive, PointOnCurve, Holonomic, VelocityLevel, ExternalWrench, CustomForce)
 """Elements that are not attached to their bodies by `attach` alone."""
 
 
@@ -64,8 +65,16 @@ def lay_out(
 class Gather:
     """Finds the bodies of elements, checks them, and puts equal ones side by side."""
 
-    def __init__(self, dim: int, dtype: Any, layout: Layout, poses: dict[str, Pose]) -> None:
-        self.dim, self.dtype, self.layout, self.poses = dim, dtype, layout, poses
+    def __init__(
+        self,
+        dim: int,
+        dtype: Any,
+        layout: Layout,
+        poses: dict[str, Pose],
+        own: dict[str, Pose],
+    ) -> None:
+        """`poses` are of the frames where elements are attached, `own` of users' frames in them."""
+        self.dim, self.dtype, self.layout, self.poses, self.own = dim, dtype, layout, poses, own
 
     def along(self, elements: Iterable[Any]) -> Along:
         """The joints, and what acts along their coordinates."""
@@ -75,8 +84,10 @@ class Gather:
     def constraints(self, elements: Iterable[Any], along: Along) -> list[Any]:
         """Joints first, then what constrains their coordinates, then the user's constraints."""
         drives = along.drives(_of(elements, Drive), self._params, _bare)
+        held = [*drives, *along.couplings(), *along.armatures()]
+        curves = self.curves(_of(elements, PointOnCurve))
         custom = self.customs(_of(elements, Holonomic, VelocityLevel))
-        return [*along.joints, *drives, *along.couplings(), *along.armatures(), *custom]
+        return [*along.joints, *held, *curves, *custom]
 
     def forces(self, elements: Iterable[Any], along: Along) -> list[Any]:
         """Force elements of every class."""
@@ -110,6 +121,20 @@ class Gather:
         for _, params, names, places in self._gather(wrenches, lambda w: w.bodies):
             starts = tuple(self.layout.control(name).start for name in names)
             result.append(ExternalWrenches(params, names, places, starts=starts))
+        return result
+
+    def curves(self, curves: list[Any]) -> list[Any]:
+        """Points on users' curves, one group each."""
+        origin = Pose(jnp.zeros(self.dim, self.dtype))
+        result = []
+        for curve in curves:
+            self._check_joint(curve)
+            names = (curve.body_a, curve.body_b)
+            own = self.own.get(curve.body_a, origin)
+            numbers = stack([curve.attach(*(self.poses[name] for name in names), own)])
+            places = tuple(self._place((name,)) for name in names)
+            given = self._params(curve)
+            result.append(Curves(numbers, (curve.name,), places, _bare(curve), given))
         return result
 
     def customs(self, constraints: list[Any]) -> list[Any]:
@@ -157,13 +182,10 @@ class Gather:
             fields = tuple((field, jax.tree.map(jnp.shape, x)) for field, x in params.items())
             groups.setdefault((type(element), sides, fields), []).append((element, params))
         result = []
-        for (cls, sides, _), members in groups.items():
+        for (cls, _, _), members in groups.items():
             names = tuple(element.name for element, _ in members)
             columns = zip(*(bodies(element) for element, _ in members), strict=True)
-            places = tuple(
-                Place(None, (), column) if side is None else self._place(column)
-                for side, column in zip(sides, columns, strict=True)
-            )
+            places = tuple(map(self._place, columns))
             result.append((cls, stack([p for _, p in members]), names, places))
         return result
 
@@ -172,7 +194,7 @@ class Gather:
 
     def _place(self, names: tuple[str, ...]) -> Place:
         if names[0] not in self.layout.bodies:
-            return Place(None, ())
+            return Place(None, (), names)
         located = [self.layout.locate(name) for name in names]
         return Place(located[0][0], tuple(index for _, index in located))
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.constraints.curves import Curves
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.status import Status
@@ -141,7 +142,8 @@ class Scene:
         fixed[WORLD] = Pose(world, upright)
         poses = {n: b.motion.pose for n, b in bodies.items()}
         poses |= {n: WorldPose(pose.position, upright) for n, pose in fixed.items()}
-        gather = grouping.Gather(self.dim, self.dtype, layout, poses)
+        offsets = {n: b.offset for n, b in bodies.items() if b.offset is not None}
+        gather = grouping.Gather(self.dim, self.dtype, layout, poses, offsets | fixed)
         elements = self._elements.values()
         along = gather.along(elements)
         constraints = gather.constraints(elements, along)
@@ -151,7 +153,7 @@ class Scene:
             inertia=inertia,
             constraints=tuple(constraints),
             forces=tuple(gather.forces(elements, along)),
-            offsets={n: b.offset for n, b in bodies.items() if b.offset is not None},
+            offsets=offsets,
             fixed=fixed,
             turns=turns,
             layout=layout,
@@ -161,6 +163,8 @@ class Scene:
         for group in constraints:
             if isinstance(group, Custom):
                 check_function(group, system.snapshot(state.q, state.v, state.time))
+            if isinstance(group, Curves):
+                group.check(system.snapshot(state.q, state.v, state.time))
         return system, state
 
     def _state(self, layout: Any, bodies: Any) -> State:
