@@ -11,6 +11,7 @@ from jaxcon.analysis.quantities import (
     wrench,
 )
 from jaxcon.analysis.report import Report, report
+from jaxcon.constraints.blades import KnifeEdge
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
 from jaxcon.constraints.joints import (
@@ -22,6 +23,7 @@ from jaxcon.constraints.joints import (
     Spherical,
     Universal,
 )
+from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphere
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
@@ -69,6 +71,7 @@ __all__ = [
     "Heun",
     "Holonomic",
     "JointSpring",
+    "KnifeEdge",
     "Memory",
     "Method",
     "Motion",
@@ -76,6 +79,9 @@ __all__ = [
     "Prismatic",
     "Report",
     "Revolute",
+    "RollingCylinder",
+    "RollingDisc",
+    "RollingSphere",
     "RungeKutta",
     "Scene",
     "Schur",

@@ -21,12 +21,14 @@ class RowSet(NamedTuple):
     Attributes:
         value, rate, bias: φ, φ̇, γ by row, lanes (element,).
         jacobian: for each body, its columns and its part of every row.
+        holonomic: by row, whether it has a φ or is one of velocities alone.
     """
 
     value: tuple[Lane, ...]
     rate: tuple[Lane, ...]
     bias: tuple[Lane, ...]
     jacobian: tuple[tuple[Columns, tuple[Vector, ...]], ...]
+    holonomic: tuple[bool, ...]
 
 
 class Constraint(Protocol):
@@ -91,4 +93,5 @@ class Joints(Elements):
             tuple(row.rate for row in rows),
             tuple(row.bias for row in rows),
             tuple(sides),
+            tuple(row.holonomic for row in rows),
         )

@@ -23,7 +23,7 @@ from jaxcon.model.state import Energy
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal
 
-POSITIVE = {"mass", "inertia", "length"}
+POSITIVE = {"mass", "inertia", "length", "radius"}
 NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
 """Fields whose values are checked where they are known."""
 
