@@ -1,5 +1,6 @@
 """Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
 
+from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
     angular_velocity,
@@ -27,6 +28,7 @@ from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphe
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
+from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, JointSpring, Spring
@@ -70,6 +72,7 @@ __all__ = [
     "GeneralizedSystem",
     "Heun",
     "Holonomic",
+    "Integrability",
     "JointSpring",
     "KnifeEdge",
     "Memory",
@@ -95,12 +98,14 @@ __all__ = [
     "StepInfo",
     "Universal",
     "Unstabilized",
+    "Vakonomic",
     "VelocityLevel",
     "angular_velocity",
     "energy",
     "forward_dynamics",
     "inertia",
     "init",
+    "integrability",
     "largest_stable_rate",
     "memory",
     "orientation",
@@ -110,6 +115,7 @@ __all__ = [
     "report",
     "rollout",
     "step",
+    "vakonomic",
     "velocity",
     "violation",
     "wrench",

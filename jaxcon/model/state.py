@@ -39,14 +39,12 @@ def check_state(system: Any, state: Any) -> None:
             f"expected a system and a State, got {type(system).__name__} and"
             f" {type(state).__name__}; `system, state = scene.build()` makes them."
         )
-    layout = getattr(system, "layout", None)
-    expected = state.v.shape if layout is None else (layout.n_v,)
-    for what, got in (("q", state.q.shape), ("v", state.v.shape)):
-        shape = (layout.n_q,) if layout is not None and what == "q" else expected
-        if got != shape or len(got) != 1:
+    sizes = system.sizes(state.q.shape[-1] if state.q.ndim else 0)
+    for what, got, size in zip("qv", (state.q.shape, state.v.shape), sizes, strict=True):
+        if got != (size,):
             raise ValueError(
-                f"state.{what} must have shape {shape}, got {got}; for batches and trajectories use"
-                " jax.vmap: jax.vmap(lambda s: jc.position(system, s, name))(trajectory)."
+                f"state.{what} must have shape ({size},), got {got}; for batches and trajectories"
+                " use jax.vmap: jax.vmap(lambda s: jc.position(system, s, name))(trajectory)."
             )
 
 

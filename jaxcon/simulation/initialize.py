@@ -34,12 +34,12 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
     chosen = [x for x in (q, v, *jax.tree.leaves(system)) if isinstance(x, jax.Array)]
     floating = (x.dtype for x in chosen if jnp.issubdtype(x.dtype, jnp.floating))
     dtype = next(floating, jnp.result_type(float))
-    layout = getattr(system, "layout", None)
-    n_q = jnp.asarray(q).shape if layout is None else (layout.n_q,)
-    if len(n_q) != 1:
-        raise ValueError(f"init: q must have shape (n_q,), got {n_q}.")
-    q = checks.number("init", "q", q, dtype, n_q)
-    v = checks.number("init", "v", v, dtype, n_q if layout is None else (layout.n_v,))
+    given = jnp.asarray(q).shape
+    if len(given) != 1:
+        raise ValueError(f"init: q must have shape (n_q,), got {given}.")
+    n_q, n_v = system.sizes(given[0])
+    q = checks.number("init", "q", q, dtype, (n_q,))
+    v = checks.number("init", "v", v, dtype, (n_v,))
     check_dtype(system, dtype)
     snapshot = system.snapshot(q, v, jnp.zeros((), dtype))
     for group in snapshot.system.constraints:

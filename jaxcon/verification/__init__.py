@@ -13,6 +13,7 @@ import jax
 import jaxcon as jc
 from jaxcon.verification import (
     andrews,
+    bicycle,
     closed_forms,
     convergence,
     departures,
@@ -21,6 +22,7 @@ from jaxcon.verification import (
     nonholonomic,
     pendulums,
     rheonomic,
+    rolling,
     rotations,
     stabilisation,
     statics,
@@ -42,6 +44,11 @@ CASES: dict[str, Callable[[], list[Check]]] = {
         nonholonomic.chaplygin_sleigh,
         nonholonomic.ball_on_turntable,
         nonholonomic.nonholonomic_particle,
+        rolling.rolling_disc,
+        rolling.rolling_coin,
+        rolling.knife_edge_incline,
+        rolling.vakonomic_knife_edge,
+        bicycle.bicycle_linear,
         closed_forms.atwood,
         closed_forms.incline,
         closed_forms.conical_pendulum,
