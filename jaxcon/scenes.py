@@ -16,6 +16,7 @@ from jaxcon.constraints.joints import Revolute
 from jaxcon.constraints.rolling import RollingDisc
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.scene import Scene
+from jaxcon.model.forces import ExternalWrench
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
@@ -112,7 +113,8 @@ References:
 def bicycle(speed: Any = 0.0, p: Any = BICYCLE, gravity: float = 9.81) -> Any:
     """An upright bicycle of four bodies on knife-edge wheels: 24 velocities, 21 rows, 3 freedoms.
 
-    The joints are "rear_axle", "front_axle", "steering", "rear_contact" and "front_contact".
+    The joints are "rear_axle", "front_axle", "steering", "rear_contact" and "front_contact"; the
+    control channel "push" is a wrench on the frame.
 
     Args:
         speed: forward, () [m/s].
@@ -148,4 +150,5 @@ def bicycle(speed: Any = 0.0, p: Any = BICYCLE, gravity: float = 9.81) -> Any:
         scene.add(Revolute(f"{end}_axle", holder, wheel, point=hub, axis=axle))
         up = (0.0, 0.0, -1.0)
         scene.add(RollingDisc(f"{end}_contact", WORLD, wheel, radius=radius, axis=axle, normal=up))
+    scene.add(ExternalWrench("push", "frame"))
     return scene.build()

@@ -49,7 +49,7 @@ EXAMPLES = {
         lambda: ball(jc.VelocityLevel(no_pivot, ("ball",), name="pivot")),
         ((2, 3, 5), 1, 0),
     ),
-    "leaning disc": (lambda: rolling("disc", axis=(0.0, 0.8, 0.6)), ((3, 5), 1, 0)),
+    "leaning disc": (lambda: rolling("disc", axis=(0.0, 0.8, 0.6)), ((3, 4, 5), 1, 0)),
     "wheel in the plane": (lambda: rolling("wheel"), ((1,), 1, 1)),
     "cylinder": (lambda: rolling("cylinder", axis=(1.0, 1.0, 0.0)), ((1,), 2, 3)),
 }

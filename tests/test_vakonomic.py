@@ -79,7 +79,7 @@ def test_rolling_in_space_keeps_energy_and_the_momenta_of_its_symmetries():
     state = jax.tree.map(lambda x: x, state)
     start = state.v - jnp.asarray(np.linalg.pinv(j) @ np.asarray(rows.rate))
     state = jc.State(state.q, start, state.time, state.status)
-    system, state = jc.vakonomic(system, state, {"roll": (0.4, -0.2)})
+    system, state = jc.vakonomic(system, state, {"roll": np.array([0.4, -0.2])})
     path = run(system, state)
     energy = jax.vmap(lambda s: jc.energy(system, s).total)(path)
     np.testing.assert_allclose(energy, jc.energy(system, state).total, rtol=1e-9)
@@ -187,7 +187,7 @@ def test_readers_and_errors():
     with pytest.raises(ValueError, match="'blad' is unknown"):
         jc.vakonomic(system, state, {"blad": 0.2})
     with pytest.raises(ValueError, match="'blade'.*\\(1,\\).*\\(2,\\)"):
-        jc.vakonomic(system, state, {"blade": (0.2, 0.1)})
+        jc.vakonomic(system, state, {"blade": np.ones(2)})
     with pytest.raises(ValueError, match=r"state.v must have shape \(4,\), got \(3,\)"):
         jc.step(wide, IDEAL, state, None, 1e-3)
     scene = jc.Scene(dim=2)

@@ -103,7 +103,8 @@ def integrability(system: Any, state: State, names: Sequence[str] | None = None)
     held = known[layout.holonomic[rows[known]]]
     allowed = np.linalg.svd(unit[known])[2][len(known) :]
     fields = _allowed(system, metric, rows[known], jnp.asarray(allowed, state.q.dtype))
-    growth, directions = _grow(fields, metric, jnp.append(state.q, state.time), allowed, tolerance)
+    x, room = jnp.append(state.q, state.time), state.v.shape[0] - len(held)
+    growth, directions = _grow(fields, metric, x, allowed, room, tolerance)
     return Integrability(chosen, state.v.shape[0], len(held), growth, directions)
 
 
@@ -152,12 +153,12 @@ def _allowed(system: Any, metric: _Metric, rows: np.ndarray, basis: Array) -> Fi
 
 
 def _grow(
-    fields: Fields, metric: _Metric, x: Array, allowed: np.ndarray, tolerance: float
+    fields: Fields, metric: _Metric, x: Array, allowed: np.ndarray, room: int, tolerance: float
 ) -> tuple[tuple[int, ...], np.ndarray]:
-    """Dimensions of the levels, and the velocities that span the last."""
+    """Dimensions of the levels, and the velocities that span the last; at most `room` of them."""
     found = list(allowed)
     growth, last = [len(found)], fields
-    while True:
+    while len(found) < room:
         brackets = _brackets(fields, last)
         first, second = (metric.of(part) for part in jax.jit(brackets)(x))
         size = 1 + np.linalg.norm(first, axis=1) + np.linalg.norm(second, axis=1)
@@ -169,20 +170,20 @@ def _grow(
                 found.append(w)
                 new.append(i)
         if not new:
-            return tuple(growth), np.array(found).reshape(-1, len(metric.out)) @ metric.out.T
+            break
         growth.append(len(found))
         last = _chosen(brackets, np.array(new))
+    return tuple(growth), np.array(found).reshape(-1, len(metric.out)) @ metric.out.T
 
 
 def _brackets(fields: Fields, others: Fields) -> Callable[[Array], tuple[Array, Array]]:
     """[X, Y] = DY X − DX Y of all pairs, as its two terms (pairs, n_q + 1)."""
 
     def terms(x: Array) -> tuple[Array, Array]:
-        def along(function: Fields, direction: Array) -> Array:
-            return jax.jvp(function, (x,), (direction,))[1]
-
-        first = jax.vmap(lambda d: along(others, d))(fields(x))
-        second = jnp.swapaxes(jax.vmap(lambda d: along(fields, d))(others(x)), 0, 1)
+        own, along_own = jax.linearize(fields, x)
+        other, along_other = jax.linearize(others, x)
+        first = jax.vmap(along_other)(own)
+        second = jnp.swapaxes(jax.vmap(along_own)(other), 0, 1)
         return first.reshape(-1, len(x)), second.reshape(-1, len(x))
 
     return terms

@@ -177,9 +177,8 @@ def vakonomic(
                 f"vakonomic: constraint '{name}' has a φ in each of its rows and takes no μ; those"
                 f" that take one are {[n for n in layout.names if _takes(layout, n)]}."
             )
-        shape = jnp.shape(given) or (len(mine),)
-        value = jnp.broadcast_to(jnp.asarray(given, μ.dtype), shape)
-        value = checks.number(f"vakonomic: '{name}'", "μ", value, μ.dtype, (len(mine),))
+        shape = np.shape(given) and (len(mine),)
+        value = checks.number(f"vakonomic: '{name}'", "μ", given, μ.dtype, shape)
         μ = μ.at[mine].set(value)
     return result, dataclasses.replace(state, v=jnp.concatenate([state.v, μ]))
 
