@@ -1,5 +1,6 @@
 """Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
 
+from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
     angular_velocity,
@@ -14,6 +15,7 @@ from jaxcon.analysis.quantities import (
 )
 from jaxcon.analysis.report import Report, report
 from jaxcon.constraints.armature import Armature
+from jaxcon.constraints.blades import KnifeEdge
 from jaxcon.constraints.couplings import (
     Belt,
     Differential,
@@ -43,11 +45,13 @@ from jaxcon.constraints.pairs import (
     Screw,
     SphericalSpherical,
 )
+from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphere
 from jaxcon.constraints.shafts import ConstantVelocity, Universal
 from jaxcon.constraints.span import Span
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
+from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.model.actuators import (
@@ -107,8 +111,10 @@ __all__ = [
     "GeneralizedSystem",
     "Heun",
     "Holonomic",
+    "Integrability",
     "JointDamper",
     "JointSpring",
+    "KnifeEdge",
     "Memory",
     "Method",
     "Motion",
@@ -127,6 +133,9 @@ __all__ = [
     "Report",
     "Revolute",
     "RevoluteSpherical",
+    "RollingCylinder",
+    "RollingDisc",
+    "RollingSphere",
     "RungeKutta",
     "Scene",
     "Schur",
@@ -144,6 +153,7 @@ __all__ = [
     "TurnCounter",
     "Universal",
     "Unstabilized",
+    "Vakonomic",
     "VelocityLevel",
     "VelocityServo",
     "angular_velocity",
@@ -153,6 +163,7 @@ __all__ = [
     "forward_dynamics",
     "inertia",
     "init",
+    "integrability",
     "largest_stable_rate",
     "memory",
     "orientation",
@@ -162,6 +173,7 @@ __all__ = [
     "report",
     "rollout",
     "step",
+    "vakonomic",
     "velocity",
     "violation",
     "wrench",

@@ -22,6 +22,7 @@ class RowSet(NamedTuple):
     Attributes:
         value, rate, bias: φ, φ̇, γ by row, lanes (element,).
         jacobian: for each body, its columns and its part of every row.
+        holonomic: by row, whether it has a φ or is one of velocities alone.
         compliance: C by row, lanes (element,); None where it is zero.
     """
 
@@ -29,6 +30,7 @@ class RowSet(NamedTuple):
     rate: tuple[Lane, ...]
     bias: tuple[Lane, ...]
     jacobian: tuple[tuple[Columns, tuple[Vector, ...]], ...]
+    holonomic: tuple[bool, ...]
     compliance: tuple[Lane, ...] | None = None
 
 
@@ -103,5 +105,6 @@ def gather(
         tuple(row.rate for row in rows),
         tuple(row.bias for row in rows),
         tuple(sides),
+        tuple(row.holonomic for row in rows),
         compliance,
     )

@@ -142,6 +142,7 @@ class Revolute:
     point: Any
     axis: Any = None
     oriented = True
+    turns = True
     coordinates = MappingProxyType({"angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
@@ -248,7 +249,11 @@ def triad(joint: Any, pose: Pose) -> list[Array]:
     Raises:
         ValueError: the axis is missing, has the wrong shape or length zero.
     """
-    n = unit(joint, "axis", pose)
+    return basis(unit(joint, "axis", pose))
+
+
+def basis(n: Array) -> list[Array]:
+    """A unit vector and the directions normal to it, right-handed: two in the plane, or three."""
     if n.shape == (2,):
         return [n, jnp.stack([-n[1], n[0]])]
     smallest = jnp.argmin(jnp.abs(n))

@@ -218,7 +218,7 @@ class Gather:
         for name in names:
             if getattr(joint, "oriented", False) and self.poses[name].orientation is None:
                 raise ValueError(f"{owner}: it needs an orientation, but '{name}' is a particle.")
-        turns = "angle" in getattr(joint, "coordinates", ())
+        turns = getattr(joint, "turns", False)
         if self.dim == 2 and turns and getattr(joint, "axis", None) is not None:
             raise ValueError(f"{owner}: in the plane the axis is the normal; give none.")
 

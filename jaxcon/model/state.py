@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
@@ -45,14 +44,12 @@ def at(system: Any, state: Any) -> Any:
             f"expected a system and a State, got {type(system).__name__} and"
             f" {type(state).__name__}; `system, state = scene.build()` makes them."
         )
-    layout = getattr(system, "layout", None)
-    expected = state.v.shape if layout is None else (layout.n_v,)
-    for what, got in (("q", state.q.shape), ("v", state.v.shape)):
-        shape = (layout.n_q,) if layout is not None and what == "q" else expected
-        if got != shape or len(got) != 1:
+    sizes = system.sizes(state.q.shape[-1] if state.q.ndim else 0)
+    for what, got, size in zip("qv", (state.q.shape, state.v.shape), sizes, strict=True):
+        if got != (size,):
             raise ValueError(
-                f"state.{what} must have shape {shape}, got {got}; for batches and trajectories use"
-                " jax.vmap: jax.vmap(lambda s: jc.position(system, s, name))(trajectory)."
+                f"state.{what} must have shape ({size},), got {got}; for batches and trajectories"
+                " use jax.vmap: jax.vmap(lambda s: jc.position(system, s, name))(trajectory)."
             )
     return recall(system, state.turns)
 
@@ -63,13 +60,13 @@ def recall(system: Any, turns: PyTree) -> Any:
     Raises:
         ValueError: there are not as many as it counts.
     """
-    expected, got = (np.shape(x)[:1] for x in (getattr(system, "turns", ()), turns))
+    expected, got = (np.shape(x)[:1] for x in (system.turns, turns))
     if expected != got and sum(expected + got):
         raise ValueError(
             f"state.turns must have shape {expected}, got {got}: this system counts the whole turns"
             f" of {sum(expected)} joints; start from the state of Scene.build or from jc.init."
         )
-    return dataclasses.replace(system, turns=turns) if sum(got) else system
+    return system.remember(turns) if sum(got) else system
 
 
 @pytree

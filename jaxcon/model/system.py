@@ -22,9 +22,9 @@ from jaxcon.model.frames import WorldFrame
 from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
 from jaxcon.solvers.jacobian import Columns
-from jaxcon.solvers.saddle import Diagonal
+from jaxcon.solvers.saddle import Diagonal, Solution
 
-POSITIVE = {"mass", "inertia", "length"}
+POSITIVE = {"mass", "inertia", "length", "radius"}
 NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
 """Fields whose values are checked where they are known."""
 
@@ -106,6 +106,10 @@ class BodySystem:
         """The system at one instant."""
         return Snapshot(self, q, v, t)
 
+    def remember(self, turns: PyTree) -> BodySystem:
+        """With other angles of a step ago."""
+        return dataclasses.replace(self, turns=turns)
+
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
         """The angles of the joints whose turns are counted, over turns: what a state remembers."""
         return count(self.counted, self.snapshot(q, v, t)) if self.counted else self.turns
@@ -151,6 +155,19 @@ class BodySystem:
     def retract(self, q: Array, step: Array) -> Array:
         """q ⊕ Δ for a finite step Δ = h v (n_v,); rotations by their exponential."""
         return self._each("retract", q, step)
+
+    def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
+        """ad*_v p (n_v,): what turning with the bodies does to a momentum p (n_v,), p × ω."""
+        pairs = [(g.kind, g.unpack(q, v)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
+        return _join([kind.coadjoint(own, momentum) for kind, own, momentum in pairs], q)
+
+    def complete(self, solution: Solution) -> Solution:
+        """The solution of the saddle system as it is."""
+        return solution
+
+    def sizes(self, n_q: int) -> tuple[int, int]:
+        """How many positions and velocities a state has."""
+        return self.layout.n_q, self.layout.n_v
 
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""
