@@ -23,6 +23,7 @@ from jaxcon.constraints.joints import (
     Universal,
 )
 from jaxcon.core.status import SimulationError, Status, raise_for_status
+from jaxcon.dynamics.assembly import Assembly, assemble
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
 from jaxcon.geometry import inertia, quaternion
@@ -53,6 +54,7 @@ __version__ = "0.1.0"
 __all__ = [
     "RK4",
     "WORLD",
+    "Assembly",
     "Baumgarte",
     "Coincident",
     "ConjugateGradients",
@@ -91,6 +93,7 @@ __all__ = [
     "Unstabilized",
     "VelocityLevel",
     "angular_velocity",
+    "assemble",
     "energy",
     "forward_dynamics",
     "inertia",
