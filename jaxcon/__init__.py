@@ -2,8 +2,11 @@
 
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
+    angular_momentum,
     angular_velocity,
+    center_of_mass,
     energy,
+    momentum,
     orientation,
     position,
     velocity,
@@ -22,6 +25,7 @@ from jaxcon.constraints.joints import (
     Spherical,
     Universal,
 )
+from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.assembly import Assembly, assemble
 from jaxcon.dynamics.generalized import GeneralizedSystem
@@ -54,6 +58,7 @@ __version__ = "0.1.0"
 __all__ = [
     "RK4",
     "WORLD",
+    "AngularMomentum",
     "Assembly",
     "Baumgarte",
     "Coincident",
@@ -71,6 +76,7 @@ __all__ = [
     "Heun",
     "Holonomic",
     "JointSpring",
+    "LinearMomentum",
     "Memory",
     "Method",
     "Motion",
@@ -92,14 +98,17 @@ __all__ = [
     "Universal",
     "Unstabilized",
     "VelocityLevel",
+    "angular_momentum",
     "angular_velocity",
     "assemble",
+    "center_of_mass",
     "energy",
     "forward_dynamics",
     "inertia",
     "init",
     "largest_stable_rate",
     "memory",
+    "momentum",
     "orientation",
     "position",
     "quaternion",

@@ -132,6 +132,12 @@ def velocity_level(s: Site) -> list[Any]:
     return [jc.VelocityLevel(skate, bodies=(s.a, s.b), name=s.joint[0], params=params)]
 
 
+def momentum(s: Site) -> list[Any]:
+    bodies = tuple(name for name in (s.a, s.b) if name != jc.WORLD)
+    value = 0.3 if s.dim == 2 else 0.1 * s.axis
+    return [jc.AngularMomentum(s.joint[0], bodies, value)]
+
+
 JOINTS = {
     "coincident": Joint(coincident, ("joint", "anchor_b")),
     "spherical": Joint(spherical, ("joint", "anchor_b"), dims=(3,)),
@@ -144,6 +150,7 @@ JOINTS = {
     "driven_prismatic": Joint(driven_prismatic, ("drive", "params")),
     "holonomic": Joint(holonomic, ("joint", "params")),
     "velocity_level": Joint(velocity_level, ("joint", "params"), velocity_level=True),
+    "momentum": Joint(momentum, ("joint", "value"), velocity_level=True),
 }
 TOPOLOGIES = ("tree", "between", "loop")
 

@@ -260,10 +260,11 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
             f"assemble: expected a system, got {type(system).__name__};"
             " `system, state = scene.build()` makes one."
         )
-    known = q if isinstance(q, State) else None
-    if known is not None:
-        q, v = known.q, known.v if v is None else v
-        time = known.time if time is None else time
+    memory = ()
+    if isinstance(q, State):
+        v = q.v if v is None else v
+        time = q.time if time is None else time
+        q, memory = q.q, q.memory
     chosen = [x.dtype for x in (*jax.tree.leaves(system), q, v) if isinstance(x, jax.Array)]
     floating = (x for x in chosen if jnp.issubdtype(x, jnp.floating))
     dtype = next(floating, jnp.result_type(float))
@@ -282,7 +283,7 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
         if isinstance(group, Custom):
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
-    return State(q, v, t, status, () if known is None else known.memory)
+    return State(q, v, t, status, memory)
 
 
 def _held(system: Any, hold: Any, n_v: int) -> tuple[int, ...]:

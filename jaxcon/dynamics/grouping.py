@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxcon.constraints.base import Joints
 from jaxcon.constraints.custom import CustomOnBodies, Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive, Drives
+from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum, Momenta
 from jaxcon.core import checks
 from jaxcon.dynamics.inputs import Resolved
 from jaxcon.geometry.pose import Pose
@@ -28,7 +29,10 @@ from jaxcon.model.forces import (
 from jaxcon.model.layout import WORLD, Group, Layout, Place
 from jaxcon.model.system import MassProperties
 
-SPECIAL = (Drive, Holonomic, VelocityLevel, JointSpring, ExternalWrench, CustomForce)
+SPECIAL = (
+    *(Drive, Holonomic, VelocityLevel, AngularMomentum, LinearMomentum),
+    *(JointSpring, ExternalWrench, CustomForce),
+)
 """Elements that are not attached to their bodies by `attach` alone."""
 
 
@@ -73,7 +77,8 @@ class Gather:
         plain = [e for e in elements if not isinstance(e, SPECIAL) and hasattr(e, "rows")]
         joints = self.joints(plain)
         drives = self.drives(_of(elements, Drive), joints)
-        return joints + drives + self.customs(_of(elements, Holonomic, VelocityLevel))
+        momenta = self.momenta(_of(elements, AngularMomentum, LinearMomentum))
+        return joints + drives + momenta + self.customs(_of(elements, Holonomic, VelocityLevel))
 
     def forces(self, elements: Iterable[Any], constraints: list[Any]) -> list[Any]:
         """Force elements of every class."""
@@ -144,6 +149,25 @@ class Gather:
             moving = [name for name in constraint.bodies if name in self.layout.bodies]
             places = tuple(self._place((name,)) for name in moving)
             result.append(CustomOnBodies(self._params(constraint), _bare(constraint), places))
+        return result
+
+    def momenta(self, momenta: list[Any]) -> list[Any]:
+        """Prescribed momenta, one group each."""
+        result = []
+        for one in momenta:
+            bodies = self.layout.bodies if one.bodies is None else one.bodies
+            one = dataclasses.replace(one, bodies=bodies)
+            self._check_user(one)
+            params = stack([one.attach(self.dim, self.dtype)])
+            places = tuple(self._place((name,)) for name in bodies)
+            for name, place in zip(bodies, places, strict=True):
+                if place.group is None:
+                    raise ValueError(
+                        f"{type(one).__name__} '{one.name}': '{name}' is fixed to the world and"
+                        " has no momentum."
+                    )
+            bare = dataclasses.replace(one, value=None)
+            result.append(Momenta(params, (one.name,), places, law=bare))
         return result
 
     def user_forces(self, forces: list[Any]) -> list[Any]:
