@@ -45,7 +45,7 @@ from benchmarks.mjcf import DT
 from benchmarks.throughput import method_of
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.native import Native
-from jaxcon.dynamics.assembly import saddle
+from jaxcon.dynamics.forward import saddle
 from jaxcon.solvers.saddle import Saddle, Solution
 
 

@@ -3,10 +3,13 @@
 from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
+    angular_momentum,
     angular_velocity,
+    center_of_mass,
     coordinate,
     coordinate_rate,
     energy,
+    momentum,
     orientation,
     position,
     velocity,
@@ -35,6 +38,7 @@ from jaxcon.constraints.joints import (
     Revolute,
     Spherical,
 )
+from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum
 from jaxcon.constraints.pairs import (
     Cylindrical,
     Parallel,
@@ -49,6 +53,7 @@ from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphe
 from jaxcon.constraints.shafts import ConstantVelocity, Universal
 from jaxcon.constraints.span import Span
 from jaxcon.core.status import SimulationError, Status, raise_for_status
+from jaxcon.dynamics.assembly import Assembly, assemble
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
 from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
@@ -90,7 +95,9 @@ __all__ = [
     "RK4",
     "WORLD",
     "AffineActuator",
+    "AngularMomentum",
     "Armature",
+    "Assembly",
     "Baumgarte",
     "Belt",
     "Coincident",
@@ -115,6 +122,7 @@ __all__ = [
     "JointDamper",
     "JointSpring",
     "KnifeEdge",
+    "LinearMomentum",
     "Memory",
     "Method",
     "Motion",
@@ -156,7 +164,10 @@ __all__ = [
     "Vakonomic",
     "VelocityLevel",
     "VelocityServo",
+    "angular_momentum",
     "angular_velocity",
+    "assemble",
+    "center_of_mass",
     "coordinate",
     "coordinate_rate",
     "energy",
@@ -166,6 +177,7 @@ __all__ = [
     "integrability",
     "largest_stable_rate",
     "memory",
+    "momentum",
     "orientation",
     "position",
     "quaternion",

@@ -233,6 +233,12 @@ def knife_edge(s: Site) -> list[Any]:
     return [jc.KnifeEdge(*s.joint, edge=s.other, normal=ice, center=s.point)]
 
 
+def momentum(s: Site) -> list[Any]:
+    bodies = tuple(name for name in (s.a, s.b) if name != jc.WORLD)
+    value = 0.3 if s.dim == 2 else 0.1 * s.axis
+    return [jc.AngularMomentum(s.joint[0], bodies, value)]
+
+
 JOINTS = {
     "coincident": Joint(coincident, ("joint", "anchor_b")),
     "spherical": Joint(spherical, ("joint", "anchor_b"), dims=(3,)),
@@ -266,6 +272,7 @@ JOINTS = {
     "knife_edge": Joint(knife_edge, ("joint", "anchor_b"), held=(0, 1)),
     "holonomic": Joint(holonomic, ("joint", "params")),
     "velocity_level": Joint(velocity_level, ("joint", "params"), held=(0, 0)),
+    "momentum": Joint(momentum, ("joint", "value"), held=(0, 0)),
 }
 TOPOLOGIES = ("tree", "between", "loop")
 

@@ -13,7 +13,7 @@ from tolerances import DIFFERENCE
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
-from jaxcon.dynamics.assembly import saddle
+from jaxcon.dynamics.forward import saddle
 from jaxcon.solvers.saddle import Diagonal
 
 CG = jc.ConjugateGradients

@@ -13,7 +13,7 @@ from tolerances import DIFFERENCE, ROUND_OFF
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.lanes import Vector
-from jaxcon.dynamics.assembly import saddle
+from jaxcon.dynamics.forward import saddle
 from jaxcon.solvers.jacobian import Block, Columns, Jacobian
 from jaxcon.solvers.saddle import Diagonal, Full, Saddle
 from jaxcon.solvers.sparse import Sparse

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation, linearize
 from jaxcon.core import checks
-from jaxcon.core.lanes import times, total
+from jaxcon.core.lanes import Vector, times, total
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Motion
 from jaxcon.model import coordinates
+from jaxcon.model.layout import Place
+from jaxcon.model.momentum import Momentum, momentum_of
 from jaxcon.model.state import Energy, State, at
 
 
@@ -72,6 +75,69 @@ def coordinate_rate(system: Any, state: State, joint: str, name: str | None = No
     return jnp.reshape(_row(system, state, joint, name).rate, ())
 
 
+def center_of_mass(
+    system: Any, state: State, bodies: Sequence[str] | None = None
+) -> tuple[Array, Array]:
+    """Position (dim,) [m] and velocity (dim,) [m/s] of a centre of mass, world frame.
+
+    Args:
+        system: a `BodySystem`.
+        state: where.
+        bodies: whose; all that move unless given.
+    """
+    found = _momentum(system, state, bodies)
+    return _point(found.position), _point(found.velocity)
+
+
+def momentum(system: Any, state: State, bodies: Sequence[str] | None = None) -> Array:
+    """Σ m ẋ of chosen bodies, all that move unless given, (dim,) [kg m/s], world frame."""
+    return _point(_momentum(system, state, bodies).linear)
+
+
+def angular_momentum(
+    system: Any, state: State, bodies: Sequence[str] | None = None, about: Any = None
+) -> Array:
+    """Σ m (x − c) × ẋ + R I ω of chosen bodies: () in the plane, (3,) in space [kg m²/s].
+
+    Args:
+        system: a `BodySystem`.
+        state: where.
+        bodies: whose; all that move unless given.
+        about: c, world point (dim,) [m]; their common centre of mass unless given.
+
+    Returns:
+        The angular momentum, world frame. About the centre of mass it does not change where no
+        outer torque acts, whatever the bodies do to each other.
+    """
+    found = _momentum(system, state, bodies)
+    own = found.angular
+    if about is not None:
+        point = checks.number(
+            "angular_momentum", "about", about, state.q.dtype, (system.layout.dim,)
+        )
+        arm = found.position - Vector.of(point).map(lambda x: x[None])
+        own = own + arm.cross(found.linear)
+    return _point(own) if isinstance(own, Vector) else own[0]
+
+
+def _momentum(system: Any, state: State, bodies: Sequence[str] | None) -> Momentum:
+    system = at(system, state)
+    if not hasattr(system, "layout"):
+        raise TypeError("momentum: a GeneralizedSystem has no bodies whose momentum could be read.")
+    names = (
+        system.layout.bodies if bodies is None else [bodies] if isinstance(bodies, str) else bodies
+    )
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"momentum: bodies must be different names, got {list(names)}.")
+    places = [Place(group, (i,)) for group, i in map(system.layout.locate, names)]
+    return momentum_of(system.snapshot(state.q, state.v, state.time), places)
+
+
+def _point(x: Vector) -> Array:
+    """A vector of lanes of one element as an array."""
+    return x.stack()[:, 0]
+
+
 def wrench(system: Any, state: State, info: Any, name: str, body: str | None = None) -> Array:
     """What a constraint does to a body: force and torque, world frame, at the anchor.
 
@@ -127,7 +193,7 @@ def _row(system: Any, state: State, joint: str, name: str | None) -> Any:
     """A coordinate of one joint with its rate."""
     system = at(system, state)
     end = coordinates.find(system.constraints, "coordinate", joint, name)
-    along = coordinates.at(getattr(system, "counted", ()), [end])
+    along = coordinates.at(system.counted, [end])
     return along.read(system.snapshot(state.q, state.v, state.time))
 
 

@@ -41,6 +41,12 @@ class RowLayout:
         return ~np.isin(np.arange(self.size), self.free)
 
     @property
+    def holding(self) -> np.ndarray:
+        """Numbers of the rows that take away a freedom: all but those of rotors."""
+        rotors = [self.rows(name) for name in self.inertial]
+        return np.setdiff1d(np.arange(self.size), np.concatenate([[], *rotors]).astype(int))
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of the constraints, in the order in which they were grouped."""
         return tuple(name for name, *_ in self.entries)

@@ -1,4 +1,4 @@
-"""Accelerations and multipliers at one state."""
+"""The saddle system of a constrained system, and its accelerations and multipliers."""
 
 from __future__ import annotations
 
@@ -6,8 +6,23 @@ from typing import Any
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core.typing import Array
-from jaxcon.dynamics.assembly import saddle
-from jaxcon.solvers.saddle import Solution
+from jaxcon.solvers.saddle import Saddle, Solution
+
+
+def saddle(system: Any, q: Array, rows: Rows, force: Array, target: Array) -> Saddle:
+    """M a = f + Jᵀλ, J a + C λ = b.
+
+    Args:
+        system: with `mass(q)`.
+        q: positions, (n_q,).
+        rows: the linearized constraints.
+        force: f, (n_v,).
+        target: b, (n_c,).
+
+    Returns:
+        What a solver takes.
+    """
+    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance)
 
 
 def accelerate(

@@ -13,6 +13,7 @@ from jaxcon.constraints.base import Joints
 from jaxcon.constraints.curves import Curves, PointOnCurve
 from jaxcon.constraints.custom import CustomOnBodies, Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
+from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum, Momenta
 from jaxcon.core import checks
 from jaxcon.dynamics.along import Along
 from jaxcon.dynamics.inputs import Resolved
@@ -28,7 +29,10 @@ from jaxcon.model.forces import (
 from jaxcon.model.layout import WORLD, Group, Layout, Place
 from jaxcon.model.system import MassProperties
 
-SPECIAL = (Drive, PointOnCurve, Holonomic, VelocityLevel, ExternalWrench, CustomForce)
+SPECIAL = (
+    *(Drive, PointOnCurve, Holonomic, VelocityLevel, AngularMomentum, LinearMomentum),
+    *(ExternalWrench, CustomForce),
+)
 """Elements that are not attached to their bodies by `attach` alone."""
 
 
@@ -86,8 +90,9 @@ class Gather:
         drives = along.drives(_of(elements, Drive), self._params, _bare)
         held = [*drives, *along.couplings(), *along.armatures()]
         curves = self.curves(_of(elements, PointOnCurve))
+        momenta = self.momenta(_of(elements, AngularMomentum, LinearMomentum))
         custom = self.customs(_of(elements, Holonomic, VelocityLevel))
-        return [*along.joints, *held, *curves, *custom]
+        return [*along.joints, *held, *curves, *momenta, *custom]
 
     def forces(self, elements: Iterable[Any], along: Along) -> list[Any]:
         """Force elements of every class."""
@@ -145,6 +150,25 @@ class Gather:
             moving = [name for name in constraint.bodies if name in self.layout.bodies]
             places = tuple(self._place((name,)) for name in moving)
             result.append(CustomOnBodies(self._params(constraint), _bare(constraint), places))
+        return result
+
+    def momenta(self, momenta: list[Any]) -> list[Any]:
+        """Prescribed momenta, one group each."""
+        result = []
+        for one in momenta:
+            bodies = self.layout.bodies if one.bodies is None else one.bodies
+            one = dataclasses.replace(one, bodies=bodies)
+            self._check_user(one)
+            params = stack([one.attach(self.dim, self.dtype)])
+            places = tuple(self._place((name,)) for name in bodies)
+            for name, place in zip(bodies, places, strict=True):
+                if place.group is None:
+                    raise ValueError(
+                        f"{type(one).__name__} '{one.name}': '{name}' is fixed to the world and"
+                        " has no momentum."
+                    )
+            bare = dataclasses.replace(one, value=None)
+            result.append(Momenta(params, (one.name,), places, law=bare))
         return result
 
     def user_forces(self, forces: list[Any]) -> list[Any]:
