@@ -97,8 +97,9 @@ class Curves(Joints):
         along = self.place(snapshot)
         x, ẋ = (Vector(*(getattr(r, f) for r in along)).stack()[:, 0] for f in ("value", "rate"))
         derivatives = native.per_world(self._derivatives, snapshot.q.ndim - 1)
-        found = derivatives(x, ẋ, self.given)
-        return self.gather(snapshot, [chain(*row, along) for row in zip(*found, strict=True)])
+        found = zip(*derivatives(x, ẋ, self.given), strict=True)
+        rows = [chain(g, rate, bend, gradient, along) for g, rate, bend, gradient in found]
+        return self.gather(snapshot, rows)
 
     def place(self, snapshot: Any) -> list[Row]:
         """x by components: the way from the origin of a to the point along each axis of a."""
@@ -157,8 +158,9 @@ def chain(g: Array, rate: Array, bend: Array, gradient: Array, along: list[Row])
     """One row of g from its derivatives and the rows of x."""
     slope = [gradient[k][None] for k in range(len(along))]
     bias = total(times(s, row.bias) for s, row in zip(slope, along, strict=True))
-    pulls = (
-        functools.reduce(operator.add, (r.pulls[i] * s for s, r in zip(slope, along, strict=True)))
-        for i in (0, 1)
-    )
-    return Row(g[None], rate[None], plus(bias, bend[None]), tuple(pulls))
+
+    def pull(side: int) -> Vector:
+        terms = (row.pulls[side] * s for s, row in zip(slope, along, strict=True))
+        return functools.reduce(operator.add, terms)
+
+    return Row(g[None], rate[None], plus(bias, bend[None]), (pull(0), pull(1)))
