@@ -1,8 +1,11 @@
 """Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
 
+from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
     angular_velocity,
+    coordinate,
+    coordinate_rate,
     energy,
     orientation,
     position,
@@ -11,6 +14,16 @@ from jaxcon.analysis.quantities import (
     wrench,
 )
 from jaxcon.analysis.report import Report, report
+from jaxcon.constraints.armature import Armature
+from jaxcon.constraints.blades import KnifeEdge
+from jaxcon.constraints.couplings import (
+    Belt,
+    Differential,
+    Gear,
+    PolynomialCoupling,
+    Pulley,
+    RackAndPinion,
+)
 from jaxcon.constraints.curves import PointOnCurve
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
@@ -21,10 +34,8 @@ from jaxcon.constraints.joints import (
     Prismatic,
     Revolute,
     Spherical,
-    Universal,
 )
 from jaxcon.constraints.pairs import (
-    ConstantVelocity,
     Cylindrical,
     Parallel,
     Planar,
@@ -34,12 +45,25 @@ from jaxcon.constraints.pairs import (
     Screw,
     SphericalSpherical,
 )
+from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphere
+from jaxcon.constraints.shafts import ConstantVelocity, Universal
+from jaxcon.constraints.span import Span
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
+from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
-from jaxcon.model.forces import CustomForce, ExternalWrench, Force, JointSpring, Spring
+from jaxcon.model.actuators import (
+    AffineActuator,
+    JointDamper,
+    JointSpring,
+    Motor,
+    PositionServo,
+    VelocityServo,
+)
+from jaxcon.model.coordinates import TurnCounter
+from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
 from jaxcon.simulation.initialize import init
@@ -65,13 +89,17 @@ __version__ = "0.1.0"
 __all__ = [
     "RK4",
     "WORLD",
+    "AffineActuator",
+    "Armature",
     "Baumgarte",
+    "Belt",
     "Coincident",
     "ConjugateGradients",
     "ConstantVelocity",
     "CustomForce",
     "Cylindrical",
     "Dense",
+    "Differential",
     "Distance",
     "Drive",
     "Energy",
@@ -79,29 +107,42 @@ __all__ = [
     "ExternalWrench",
     "Fixed",
     "Force",
+    "Gear",
     "GeneralizedSystem",
     "Heun",
     "Holonomic",
+    "Integrability",
+    "JointDamper",
     "JointSpring",
+    "KnifeEdge",
     "Memory",
     "Method",
     "Motion",
+    "Motor",
     "Parallel",
     "Planar",
     "PointOnCurve",
     "PointOnLine",
     "PointOnPlane",
+    "PolynomialCoupling",
     "Pose",
+    "PositionServo",
     "Prismatic",
+    "Pulley",
+    "RackAndPinion",
     "Report",
     "Revolute",
     "RevoluteSpherical",
+    "RollingCylinder",
+    "RollingDisc",
+    "RollingSphere",
     "RungeKutta",
     "Scene",
     "Schur",
     "Screw",
     "SemiImplicitEuler",
     "SimulationError",
+    "Span",
     "Sparse",
     "Spherical",
     "SphericalSpherical",
@@ -109,14 +150,20 @@ __all__ = [
     "State",
     "Status",
     "StepInfo",
+    "TurnCounter",
     "Universal",
     "Unstabilized",
+    "Vakonomic",
     "VelocityLevel",
+    "VelocityServo",
     "angular_velocity",
+    "coordinate",
+    "coordinate_rate",
     "energy",
     "forward_dynamics",
     "inertia",
     "init",
+    "integrability",
     "largest_stable_rate",
     "memory",
     "orientation",
@@ -126,6 +173,7 @@ __all__ = [
     "report",
     "rollout",
     "step",
+    "vakonomic",
     "velocity",
     "violation",
     "wrench",

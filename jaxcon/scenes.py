@@ -5,14 +5,18 @@ Their numbers may be traced: `jax.vmap` over lengths and masses builds a batch o
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.joints import Revolute
+from jaxcon.constraints.rolling import RollingDisc
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.scene import Scene
+from jaxcon.model.forces import ExternalWrench
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
@@ -79,3 +83,72 @@ def four_bar_poses(lengths: Array, angle: Array) -> Array:
     return jnp.stack(
         [jnp.append((p + r) / 2, jnp.arctan2(r[1] - p[1], r[0] - p[0])) for p, r in ends]
     )
+
+
+BICYCLE = {
+    "wheelbase": 1.02,
+    "trail": 0.08,
+    "tilt": math.pi / 10,
+    "rear_wheel": {"radius": 0.3, "mass": 2.0, "inertia": (0.0603, 0.12, 0.0603)},
+    "front_wheel": {"radius": 0.35, "mass": 3.0, "inertia": (0.1405, 0.28, 0.1405)},
+    "frame": {
+        "mass": 85.0,
+        "center": (0.3, 0.0, -0.9),
+        "inertia": ((9.2, 0.0, 2.4), (0.0, 11.0, 0.0), (2.4, 0.0, 2.8)),
+    },
+    "fork": {
+        "mass": 4.0,
+        "center": (0.9, 0.0, -0.7),
+        "inertia": ((0.05892, 0.0, -0.00756), (0.0, 0.06, 0.0), (-0.00756, 0.0, 0.00708)),
+    },
+}
+"""The benchmark bicycle, its rider part of the frame [m, kg, kg m²]; x forward, y right, z down.
+
+References:
+    Meijaard, Papadopoulos, Ruina, Schwab, Linearized dynamics equations for the balance and steer
+    of a bicycle, Proc. R. Soc. A 463 (2007).
+"""
+
+
+def bicycle(speed: Any = 0.0, p: Any = BICYCLE, gravity: float = 9.81) -> Any:
+    """An upright bicycle of four bodies on knife-edge wheels: 24 velocities, 21 rows, 3 freedoms.
+
+    The joints are "rear_axle", "front_axle", "steering", "rear_contact" and "front_contact"; the
+    control channel "push" is a wrench on the frame.
+
+    Args:
+        speed: forward, () [m/s].
+        p: as `BICYCLE`: the point where the steering axis meets the ground lies `trail` ahead of
+            the front contact, and the axis leans back by `tilt`.
+        gravity: () [m/s²], along z, which points down.
+
+    Returns:
+        The system, and the state at the start, rolling straight along x.
+    """
+    scene, along = Scene(gravity=(0.0, 0.0, gravity)), (speed, 0.0, 0.0)
+    steer = (math.sin(p["tilt"]), 0.0, math.cos(p["tilt"]))
+    places = {"rear": ("frame", 0.0), "front": ("fork", p["wheelbase"])}
+    for name in ("frame", "fork"):
+        part = p[name]
+        solid = {"mass": part["mass"], "inertia": np.array(part["inertia"])}
+        scene.add_body(name, position=part["center"], velocity=along, **solid)
+    for end, (_, x) in places.items():
+        wheel = p[f"{end}_wheel"]
+        scene.add_body(
+            f"{end}_wheel",
+            mass=wheel["mass"],
+            inertia=wheel["inertia"],
+            position=(x, 0.0, -wheel["radius"]),
+            velocity=along,
+            angular_velocity=(0.0, -speed / wheel["radius"], 0.0),
+        )
+    foot = (p["wheelbase"] + p["trail"], 0.0, 0.0)
+    scene.add(Revolute("steering", "frame", "fork", point=foot, axis=steer))
+    for end, (holder, x) in places.items():
+        radius, axle = p[f"{end}_wheel"]["radius"], (0.0, 1.0, 0.0)
+        hub, wheel = (x, 0.0, -radius), f"{end}_wheel"
+        scene.add(Revolute(f"{end}_axle", holder, wheel, point=hub, axis=axle))
+        up = (0.0, 0.0, -1.0)
+        scene.add(RollingDisc(f"{end}_contact", WORLD, wheel, radius=radius, axis=axle, normal=up))
+    scene.add(ExternalWrench("push", "frame"))
+    return scene.build()

@@ -53,13 +53,14 @@ class Joint:
         make: elements that make the joint, the joint itself called "joint", a drive "drive".
         parameter: element and field of a number to differentiate by.
         dims: dimensions in which it exists.
-        velocity_level: whether "joint" has no φ.
+        held: how many of the rows of "joint" have a φ, in the plane and in space; these come first.
+            All have where it is None.
     """
 
     make: Callable[[Site], list[Any]]
     parameter: tuple[str, str]
     dims: tuple[int, ...] = (2, 3)
-    velocity_level: bool = False
+    held: tuple[int, int] | None = None
 
 
 def coincident(s: Site) -> list[Any]:
@@ -162,6 +163,35 @@ def driven_prismatic(s: Site) -> list[Any]:
     return [*prismatic(s), drive(s)]
 
 
+def driven(make: Callable[[Site], list[Any]], coordinate: str) -> Callable[[Site], list[Any]]:
+    """A joint with one of its coordinates driven."""
+
+    def elements(s: Site) -> list[Any]:
+        one = dataclasses.replace(drive(s), coordinate=coordinate)
+        return [*make(s), one]
+
+    return elements
+
+
+def pulley(s: Site) -> list[Any]:
+    """A rope from a point of a through one of b and back."""
+    spans = [
+        jc.Span(name + s.suffix, s.a, s.b, start, end)
+        for name, start, end in (("there", s.point, s.other), ("back", s.other, s.other + s.axis))
+    ]
+    names = [span.name for span in spans]
+    return [*spans, jc.Pulley(s.joint[0], *names, parts=2.0)]
+
+
+def cam(s: Site) -> list[Any]:
+    """The distance of two points as a polynomial of the angle of a hinge."""
+    axis = None if s.dim == 2 else s.axis
+    hinge = jc.Revolute("hinge" + s.suffix, s.a, s.b, point=s.point, axis=axis)
+    reach = jc.Span("reach" + s.suffix, s.a, s.b, s.other, s.point + s.other)
+    shape = (0.0, 0.3, -0.2, 0.1)
+    return [hinge, reach, jc.PolynomialCoupling(s.joint[0], hinge.name, reach.name, shape)]
+
+
 def breathing(a: Any, b: Any, t: Any, p: Any) -> Any:
     """A point of b stays at a distance from the centre of a that varies in time."""
     gap = b.point(p["anchor"]) - a.position
@@ -184,6 +214,25 @@ def velocity_level(s: Site) -> list[Any]:
     return [jc.VelocityLevel(skate, bodies=(s.a, s.b), name=s.joint[0], params=params)]
 
 
+def rolling_sphere(s: Site) -> list[Any]:
+    return [jc.RollingSphere(*s.joint, radius=0.4, normal=s.axis, center=s.point)]
+
+
+def rolling_cylinder(s: Site) -> list[Any]:
+    along = np.cross(s.axis, s.other)
+    return [jc.RollingCylinder(*s.joint, radius=0.4, axis=along, normal=s.axis, center=s.point)]
+
+
+def rolling_disc(s: Site) -> list[Any]:
+    axis = None if s.dim == 2 else s.other
+    return [jc.RollingDisc(*s.joint, radius=0.4, axis=axis, normal=s.axis, center=s.point)]
+
+
+def knife_edge(s: Site) -> list[Any]:
+    ice = None if s.dim == 2 else s.axis
+    return [jc.KnifeEdge(*s.joint, edge=s.other, normal=ice, center=s.point)]
+
+
 JOINTS = {
     "coincident": Joint(coincident, ("joint", "anchor_b")),
     "spherical": Joint(spherical, ("joint", "anchor_b"), dims=(3,)),
@@ -204,8 +253,19 @@ JOINTS = {
     "fixed": Joint(fixed, ("joint", "anchor_b")),
     "driven_revolute": Joint(driven_revolute, ("drive", "params")),
     "driven_prismatic": Joint(driven_prismatic, ("drive", "params")),
+    "driven_universal_a": Joint(driven(universal, "angle_a"), ("drive", "params"), dims=(3,)),
+    "driven_universal_b": Joint(driven(universal, "angle_b"), ("drive", "params"), dims=(3,)),
+    "driven_sleeve": Joint(driven(cylindrical, "travel"), ("drive", "params"), dims=(3,)),
+    "driven_shaft": Joint(driven(cylindrical, "angle"), ("drive", "params"), dims=(3,)),
+    "driven_planar": Joint(driven(planar, "y"), ("drive", "params"), dims=(3,)),
+    "pulley": Joint(pulley, ("joint", "parts")),
+    "cam": Joint(cam, ("joint", "coefficients")),
+    "rolling_sphere": Joint(rolling_sphere, ("joint", "radius"), (3,), (1, 1)),
+    "rolling_cylinder": Joint(rolling_cylinder, ("joint", "radius"), (3,), (2, 2)),
+    "rolling_disc": Joint(rolling_disc, ("joint", "radius"), held=(1, 1)),
+    "knife_edge": Joint(knife_edge, ("joint", "anchor_b"), held=(0, 1)),
     "holonomic": Joint(holonomic, ("joint", "params")),
-    "velocity_level": Joint(velocity_level, ("joint", "params"), velocity_level=True),
+    "velocity_level": Joint(velocity_level, ("joint", "params"), held=(0, 0)),
 }
 TOPOLOGIES = ("tree", "between", "loop")
 
@@ -219,14 +279,14 @@ class Built:
         state: on the constraints, moving, at time 0.
         off: off the constraints in position and velocity, at another time.
         parameters: elements and fields to differentiate by.
-        velocity_level: names of the constraints without φ.
+        velocity_level: constraints with rows that have no φ, and how many rows before them do.
     """
 
     system: Any
     state: jc.State
     off: jc.State
     parameters: tuple[tuple[str, str], ...] = ()
-    velocity_level: tuple[str, ...] = ()
+    velocity_level: tuple[tuple[str, int], ...] = ()
 
 
 def joints_scene(kinds: tuple[str, ...], dim: int, topology: str, dtype: Any) -> Built:
@@ -241,9 +301,9 @@ def joints_scene(kinds: tuple[str, ...], dim: int, topology: str, dtype: Any) ->
         parameters += [(element + suffix, field), ("first" + suffix, "mass")]
     system, state = scene.build()
     level = tuple(
-        "joint" + ("" if len(kinds) == 1 else "_" + kind)
+        ("joint" + ("" if len(kinds) == 1 else "_" + kind), held[dim - 2])
         for kind in kinds
-        if JOINTS[kind].velocity_level
+        if (held := JOINTS[kind].held) is not None
     )
     system = start_curves(start_breathing(system, state), state)
     return finish(system, state, random, tuple(parameters), level)
@@ -337,7 +397,7 @@ def mixed_scene(dim: int, dtype: Any) -> Built:
     scene.add(jc.ExternalWrench("push", "second"))
     system, state = scene.build()
     parameters = (("rod", "length"), ("bob", "mass"), ("spring", "stiffness"))
-    return finish(system, state, random, parameters, ("skate",))
+    return finish(system, state, random, parameters, (("skate", 0),))
 
 
 def polar_mass(q: Any, p: Any) -> Any:
@@ -395,7 +455,7 @@ def arm_scene(dtype: Any) -> Built:
         params={"moment": jnp.asarray(1.3, dtype), "coupling": jnp.asarray(0.7, dtype)},
     )
     state = jc.init(system, jc.Method(), jnp.asarray([0.4, -0.9], dtype), np.zeros(2))
-    return finish(system, state, seeded("arm"), (), ("speed",))
+    return finish(system, state, seeded("arm"), (), (("speed", 0),))
 
 
 OTHERS = {

@@ -315,6 +315,46 @@ MISTAKES = {
         ),
         ["RevoluteSpherical 'j'", "normal to the axis", "0.8"],
     ),
+    "ball of radius zero": (
+        lambda: build(jc.RollingSphere("r", jc.WORLD, "arm", radius=0.0)),
+        ["RollingSphere 'r'", "radius", "positive", "0.0"],
+    ),
+    "ball that rolls in the plane": (
+        lambda: build(jc.RollingSphere("r", jc.WORLD, "arm", radius=1.0), dim=2),
+        ["RollingSphere 'r'", "3 dimensions only"],
+    ),
+    "cylinder that stands on its plane": (
+        lambda: build(jc.RollingCylinder("r", jc.WORLD, "arm", radius=1.0, axis=(0, 3, 4))),
+        ["RollingCylinder 'r'", "axis", "parallel", "0.8"],
+    ),
+    "disc that lies flat": (
+        lambda: build(jc.RollingDisc("r", jc.WORLD, "arm", radius=1.0, axis=Z)),
+        ["RollingDisc 'r'", "flat", "axis", "normal"],
+    ),
+    "disc without an axis": (
+        lambda: build(jc.RollingDisc("r", jc.WORLD, "arm", radius=1.0)),
+        ["RollingDisc 'r'", "axis", "none"],
+    ),
+    "axis of a disc in the plane": (
+        lambda: build(jc.RollingDisc("r", jc.WORLD, "arm", radius=1.0, axis=Z), dim=2),
+        ["RollingDisc 'r'", "in the plane", "axis"],
+    ),
+    "particle that rolls": (
+        lambda: build(jc.RollingDisc("r", jc.WORLD, "bob", radius=1.0, axis=Z)),
+        ["RollingDisc 'r'", "orientation", "'bob' is a particle"],
+    ),
+    "normal of length zero": (
+        lambda: build(jc.RollingSphere("r", jc.WORLD, "arm", radius=1.0, normal=ORIGIN)),
+        ["RollingSphere 'r'", "normal", "length", "0.0"],
+    ),
+    "ice in the plane": (
+        lambda: build(jc.KnifeEdge("k", jc.WORLD, "arm", edge=(1, 0), normal=(0, 1)), dim=2),
+        ["KnifeEdge 'k'", "in the plane", "normal"],
+    ),
+    "edge of another dimension": (
+        lambda: build(jc.KnifeEdge("k", jc.WORLD, "arm", edge=(1, 0))),
+        ["KnifeEdge 'k'", "edge", r"\(3,\)", r"\(2,\)"],
+    ),
     "negative stiffness": (
         lambda: build(jc.Spring("s", "arm", "leg", stiffness=-1)),
         ["spring 's'", "stiffness", "zero or more", "-1.0"],
@@ -324,7 +364,7 @@ MISTAKES = {
             jc.Revolute("j", "arm", "leg", point=ORIGIN, axis=Z),
             jc.JointSpring("s", "j", 1.0, damping=-1.0),
         ),
-        ["joint spring 's'", "damping", "zero or more", "-1.0"],
+        ["JointSpring 's'", "damping", "zero or more", "-1.0"],
     ),
     "force that is not a number": (
         lambda: build(jc.Force("f", "arm", (0, np.inf, 0))),

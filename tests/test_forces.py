@@ -238,16 +238,3 @@ def test_a_spring_at_zero_length_keeps_its_stiffness():
         return changed.energy(jnp.array([0.3, 0.4]), state.v, state.time).potential
 
     np.testing.assert_allclose(jax.grad(stored)(0.0), -5.0)
-
-
-def test_a_spring_about_a_spatial_hinge_pulls_the_shorter_way():
-    """Across θ = π the torque goes on as −k (θ − θ₀)."""
-    scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
-    scene.add_body("arm", mass=1.0, inertia=(1.0, 1.0, 1.0))
-    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0, 0, 0), axis=(0, 0, 1)))
-    scene.add(jc.JointSpring("s", "hinge", stiffness=10.0, rest=3.0))
-    system, state = scene.build()
-    for angle in (3.1, 3.2):
-        q = jnp.zeros(7).at[3:].set(jc.quaternion.from_axis_angle((0, 0, 1), angle))
-        torque = system.force(q, state.v, state.time)[5]
-        np.testing.assert_allclose(torque, -10.0 * (angle - 3.0), rtol=1e-9)

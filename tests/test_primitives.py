@@ -41,8 +41,8 @@ def level_rows(built):
     """Which rows have no φ."""
     layout = linearize(built.system, built.off.q, built.off.v, built.off.time).layout
     level = np.zeros(layout.size, bool)
-    for name in built.velocity_level:
-        level[layout.rows(name)] = True
+    for name, held in built.velocity_level:
+        level[layout.rows(name)[held:]] = True
     return level
 
 
@@ -55,6 +55,7 @@ def test_rows_are_derivatives_of_the_residual(name):
     derive = quick_jit(lambda q, v, t: by_derivation(built.system, level, q, v, t))
     expected = derive(s.q, s.v, s.time)
     layout = linearize(built.system, s.q, s.v, s.time).layout
+    np.testing.assert_array_equal(layout.holonomic, ~level)
     close = {"rtol": DERIVATIVE, "atol": DERIVATIVE}
     for constraint in layout.names:
         rows = layout.rows(constraint)
@@ -261,6 +262,17 @@ FREEDOM = {
     "fixed": (0, 0),
     "driven_revolute": (0, 0),
     "driven_prismatic": (0, 0),
+    "driven_universal_a": (None, 1),
+    "driven_universal_b": (None, 1),
+    "driven_sleeve": (None, 1),
+    "driven_shaft": (None, 1),
+    "driven_planar": (None, 2),
+    "pulley": (2, 5),
+    "cam": (0, 0),
+    "rolling_sphere": (None, 3),
+    "rolling_cylinder": (None, 1),
+    "rolling_disc": (1, 3),
+    "knife_edge": (2, 4),
     "holonomic": (2, 5),
     "velocity_level": (2, 5),
 }

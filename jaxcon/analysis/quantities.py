@@ -11,18 +11,19 @@ from jaxcon.core import checks
 from jaxcon.core.lanes import times, total
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Motion
-from jaxcon.model.state import Energy, State, check_state
+from jaxcon.model import coordinates
+from jaxcon.model.state import Energy, State, at
 
 
 def energy(system: Any, state: State) -> Energy:
     """Kinetic energy ½ vᵀMv and the potential of gravity and springs, () [J] each."""
-    check_state(system, state)
+    system = at(system, state)
     return system.energy(state.q, state.v, state.time)
 
 
 def violation(system: Any, state: State) -> Violation:
     """φ and φ̇ of a state, by constraint."""
-    check_state(system, state)
+    system = at(system, state)
     return linearize(system, state.q, state.v, state.time).violation
 
 
@@ -48,6 +49,29 @@ def angular_velocity(system: Any, state: State, body: str) -> Array:
     return _oriented(system, state, body).angular_velocity
 
 
+def coordinate(system: Any, state: State, joint: str, name: str | None = None) -> Array:
+    """A coordinate of a joint, zero at assembly, () [rad] or [m].
+
+    In space an angle lies in [−π, π] unless its turns are counted: by a spring, servo or coupling
+    on it, or a `TurnCounter`.
+
+    Args:
+        system: a `BodySystem`.
+        state: where.
+        joint: its name.
+        name: which of its coordinates; not needed where it has but one.
+
+    Raises:
+        ValueError: no such joint or coordinate.
+    """
+    return jnp.reshape(_row(system, state, joint, name).value, ())
+
+
+def coordinate_rate(system: Any, state: State, joint: str, name: str | None = None) -> Array:
+    """The rate of a coordinate of a joint, () [rad/s] or [m/s]; arguments as of `coordinate`."""
+    return jnp.reshape(_row(system, state, joint, name).rate, ())
+
+
 def wrench(system: Any, state: State, info: Any, name: str, body: str | None = None) -> Array:
     """What a constraint does to a body: force and torque, world frame, at the anchor.
 
@@ -69,7 +93,7 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
         ValueError: no such constraint, or it does not act on this body.
         TypeError: `info` has no multipliers.
     """
-    check_state(system, state)
+    system = at(system, state)
     if not hasattr(info, "multipliers"):
         raise TypeError(
             f"wrench: info must be a StepInfo or the Solution of forward_dynamics, got"
@@ -97,6 +121,14 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
     motion = system.principal_motion(owner, state.q, state.v)
     anchor = group.anchor(snapshot, index)
     return sign * _about(motion, force, motion.position if anchor is None else anchor)
+
+
+def _row(system: Any, state: State, joint: str, name: str | None) -> Any:
+    """A coordinate of one joint with its rate."""
+    system = at(system, state)
+    end = coordinates.find(system.constraints, "coordinate", joint, name)
+    along = coordinates.at(getattr(system, "counted", ()), [end])
+    return along.read(system.snapshot(state.q, state.v, state.time))
 
 
 def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str, int]:
@@ -136,7 +168,7 @@ def _local(motion: Motion, point: Any) -> Array:
 
 
 def _motion(system: Any, state: State, body: str) -> Motion:
-    check_state(system, state)
+    system = at(system, state)
     return system.motion(body, state.q, state.v)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.model.state import State, check_state
+from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method
 
 
@@ -80,9 +80,11 @@ def report(
     Returns:
         A `Report`.
     """
-    check_state(system, state)
+    system = at(system, state)
     rows, dense_j, dense_m = _linearized(system, state)
-    jacobian, mass = np.asarray(dense_j, np.float64), np.asarray(dense_m, np.float64)
+    owners = _owners(rows.layout)
+    jacobian = np.asarray(dense_j, np.float64)[list(owners)]
+    mass = np.asarray(dense_m, np.float64)
     # J M⁻¹ Jᵀ = Ĵ Ĵᵀ with Ĵ = J L⁻ᵀ and M = L Lᵀ
     scaled = np.linalg.solve(np.linalg.cholesky(mass), jacobian.T).T
     length = np.linalg.norm(scaled, axis=1, keepdims=True)
@@ -91,7 +93,6 @@ def report(
     dependent = dependent_rows(scaled, tolerance)
     kept = np.delete(scaled, dependent, axis=0)
     singular = np.linalg.svd(kept, compute_uv=False)
-    owners = _owners(rows.layout)
     rank = len(scaled) - len(dependent)
     return Report(
         coordinates=state.q.shape[0],
@@ -99,7 +100,7 @@ def report(
         rows=len(scaled),
         rank=rank,
         degrees_of_freedom=state.v.shape[0] - rank,
-        redundant=tuple(owners[i] for i in dependent),
+        redundant=tuple(list(owners.values())[i] for i in dependent),
         condition=float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
         violation={
             name: (float(rows.violation[name]), float(rows.violation.rate(name)))
@@ -132,5 +133,7 @@ def dependent_rows(rows: Array | np.ndarray, tolerance: float) -> list[int]:
 
 
 def _owners(layout: Any) -> dict[int, tuple[str, int]]:
-    """Constraint and row in it, by row number."""
-    return {int(row): (name, i) for name in layout.names for i, row in enumerate(layout.rows(name))}
+    """Constraint and row in it, by row number, of the rows that take away a freedom."""
+    holding = [name for name in layout.names if name not in layout.inertial]
+    owned = {int(row): (name, i) for name in holding for i, row in enumerate(layout.rows(name))}
+    return dict(sorted(owned.items()))

@@ -12,6 +12,7 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.geometry.pose import Pose
 from jaxcon.model.elements import Elements
+from jaxcon.model.layout import Place
 from jaxcon.solvers.jacobian import Columns
 
 
@@ -21,12 +22,16 @@ class RowSet(NamedTuple):
     Attributes:
         value, rate, bias: φ, φ̇, γ by row, lanes (element,).
         jacobian: for each body, its columns and its part of every row.
+        holonomic: by row, whether it has a φ or is one of velocities alone.
+        compliance: C by row, lanes (element,); None where it is zero.
     """
 
     value: tuple[Lane, ...]
     rate: tuple[Lane, ...]
     bias: tuple[Lane, ...]
     jacobian: tuple[tuple[Columns, tuple[Vector, ...]], ...]
+    holonomic: tuple[bool, ...]
+    compliance: tuple[Lane, ...] | None = None
 
 
 class Constraint(Protocol):
@@ -43,7 +48,11 @@ class Constraint(Protocol):
 
 
 class Joint(Protocol):
-    """How a joint is described: two bodies, numbers at assembly, and its rows."""
+    """How a joint is described: two bodies, numbers at assembly, and its rows.
+
+    A joint that can be driven and read also has `coordinates`, the unit of each by its name ("rad"
+    or "m"), and `coordinate(name, p, a, b)`, the row of one.
+    """
 
     name: str
     body_a: str
@@ -67,11 +76,11 @@ class Joints(Elements):
 
     def rows(self, snapshot: Any) -> RowSet:
         """φ, φ̇, J and γ at one instant."""
-        return self.gather(snapshot, self.joint.rows(self.params, *self.frames(snapshot)))
+        return gather(snapshot, self.places, self.joint.rows(self.params, *self.frames(snapshot)))
 
-    def coordinate(self, snapshot: Any) -> Row:
-        """The joint's angle or travel with its rate, bias and pulls."""
-        return self.joint.coordinate(self.params, *self.frames(snapshot))
+    def coordinate(self, snapshot: Any, name: str) -> Row:
+        """A coordinate of the joints, zero at assembly, with its rate, bias and pulls."""
+        return self.joint.coordinate(name, self.params, *self.frames(snapshot))
 
     def anchor(self, snapshot: Any, i: int) -> Array | None:
         """The anchor of one joint on its second body, world frame, (dim,); None without a point."""
@@ -81,16 +90,21 @@ class Joints(Elements):
         point = one.frames(snapshot)[1].point(one.params["anchor_b"])
         return jnp.stack([x.reshape(()) for x in point.position])
 
-    def gather(self, snapshot: Any, rows: list[Row]) -> RowSet:
-        """The rows as a set, without the columns of the world."""
-        sides = [
-            (snapshot.system.columns(place), tuple(row.pulls[side] for row in rows))
-            for side, place in enumerate(self.places)
-            if place.group is not None
-        ]
-        return RowSet(
-            tuple(row.value for row in rows),
-            tuple(row.rate for row in rows),
-            tuple(row.bias for row in rows),
-            tuple(sides),
-        )
+
+def gather(
+    snapshot: Any, places: tuple[Place, ...], rows: list[Row], compliance: Any = None
+) -> RowSet:
+    """Rows whose pulls act on these places as a set, without the columns of the world."""
+    sides = [
+        (snapshot.system.columns(place), tuple(row.pulls[side] for row in rows))
+        for side, place in enumerate(places)
+        if place.group is not None and rows
+    ]
+    return RowSet(
+        tuple(row.value for row in rows),
+        tuple(row.rate for row in rows),
+        tuple(row.bias for row in rows),
+        tuple(sides),
+        tuple(row.holonomic for row in rows),
+        compliance,
+    )

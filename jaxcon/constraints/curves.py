@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints import primitives
-from jaxcon.constraints.base import Joints, RowSet
+from jaxcon.constraints.base import Joints, RowSet, gather
 from jaxcon.constraints.joints import anchors, label
 from jaxcon.constraints.pairs import check_oriented
 from jaxcon.constraints.primitives import Row
@@ -98,8 +98,8 @@ class Curves(Joints):
         x, ẋ = (Vector(*(getattr(r, f) for r in along)).stack()[:, 0] for f in ("value", "rate"))
         derivatives = native.per_world(self._derivatives, snapshot.q.ndim - 1)
         found = zip(*derivatives(x, ẋ, self.given), strict=True)
-        rows = [chain(g, rate, bend, gradient, along) for g, rate, bend, gradient in found]
-        return self.gather(snapshot, rows)
+        rows = [chain(g, ġ, bend, gradient, along) for g, ġ, bend, gradient in found]
+        return gather(snapshot, self.places, rows)
 
     def place(self, snapshot: Any) -> list[Row]:
         """x by components: the way from the origin of a to the point along each axis of a."""

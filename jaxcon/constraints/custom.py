@@ -98,11 +98,6 @@ class Custom:
         """Of the constraint."""
         return (self.law.name,)
 
-    @property
-    def velocity_level(self) -> bool:
-        """Whether it has no φ."""
-        return isinstance(self.law, VelocityLevel)
-
     def get(self, i: int) -> dict[str, Any]:
         """The user's parameters."""
         return {"params": self.params}
@@ -124,7 +119,9 @@ class Custom:
             (snapshot.system.columns(place), tuple(_lanes(row) for row in block))
             for place, block in zip(self.places, jacobian, strict=True)
         ]
-        return RowSet(tuple(_lanes(value)), tuple(_lanes(rate)), tuple(_lanes(bias)), tuple(blocks))
+        value, rate, bias = (tuple(_lanes(x)) for x in (value, rate, bias))
+        holonomic = (isinstance(self.law, Holonomic),) * len(rate)
+        return RowSet(value, rate, bias, tuple(blocks), holonomic)
 
     def problem(self, snapshot: Any) -> tuple[Any, Any, Any, Any]:
         """q and v as lists, q̇ = N(q) v, and the function as call(q, v, t)."""

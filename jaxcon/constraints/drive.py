@@ -10,10 +10,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.constraints.base import RowSet
-from jaxcon.core import native, numerics
+from jaxcon.constraints.base import RowSet, gather
+from jaxcon.core import native
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.model.coordinates import JointCoordinate
 from jaxcon.model.layout import Place
 
 
@@ -30,12 +31,15 @@ class Drive:
         joint: name of the driven joint.
         motion: `motion(t, params)` → θ* (); pure and hashable, twice differentiable in t.
         params: any pytree of arrays.
+        coordinate: which of the joint's; not needed where it has but one.
     """
 
     name: str
     joint: str
     motion: Callable[..., Array]
     params: PyTree = None
+    coordinate: str | None = None
+    counts = False
 
 
 @pytree
@@ -44,8 +48,7 @@ class Drives:
 
     params: PyTree
     law: Drive = static()
-    group: int = static()
-    index: int = static()
+    along: JointCoordinate = static()
     places: tuple[Place, ...] = static()
 
     @property
@@ -64,18 +67,12 @@ class Drives:
 
     def rows(self, snapshot: Any) -> RowSet:
         """φ = θ − θ*(t), φ̇ = θ̇ − θ̇*, γ = γ_θ − θ̈*, by two nested derivatives of the motion."""
-        joint = snapshot.system.constraints[self.group].select((self.index,))
-        row = joint.coordinate(snapshot)
+        row = self.along.read(snapshot)
         motion = native.per_world(self._motion, snapshot.q.ndim - 1)
         target, rate, bias = (x[None] for x in motion(snapshot.t, self.params))
-        error = row.value - target
-        error = (
-            error
-            if snapshot.system.layout.dim == 2 or not joint.joint.turns
-            else numerics.wrap(error)
-        )
+        error = self.along.difference(snapshot, row, target)
         row = row._replace(value=error, rate=row.rate - rate, bias=row.bias - bias)
-        return joint.gather(snapshot, [row])
+        return gather(snapshot, self.places, [row])
 
     def check(self, dtype: Any) -> None:
         """Calls the motion once, abstractly.
@@ -92,7 +89,8 @@ class Drives:
 
     def anchor(self, snapshot: Any, i: int) -> Array | None:
         """The anchor of the driven joint."""
-        return snapshot.system.constraints[self.group].anchor(snapshot, self.index)
+        (joint,) = self.along.joints
+        return snapshot.system.constraints[self.along.group].anchor(snapshot, joint)
 
     def _motion(self, t: Any, params: PyTree) -> tuple[Array, Array, Array]:
         """θ*, θ̇*, θ̈*."""

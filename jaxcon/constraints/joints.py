@@ -7,6 +7,7 @@ bodies. To add a joint, write a class like these and one row in `tests/scenes.py
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -142,6 +143,7 @@ class Revolute:
     axis: Any = None
     oriented = True
     turns = True
+    coordinates = MappingProxyType({"angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axes, and pointers that read the angle."""
@@ -168,12 +170,11 @@ class Revolute:
         return rows + [primitives.angle_between(n, u) for u in across]
 
     @staticmethod
-    def coordinate(p: dict[str, Any], a: Any, b: Any) -> Row:
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
         """The angle of b in a about the axis, zero at assembly [rad]; over turns in the plane."""
         if "axis" not in p:
             return primitives.same_orientation(a, b, p["angle"])[0]
-        first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
-        return primitives.turn(first, second, b.direction(p["first_b"]))
+        return turn_about(p, a, b)
 
 
 @dataclass(frozen=True)
@@ -197,7 +198,7 @@ class Prismatic:
     axis: Any
     point: Any = None
     oriented = True
-    turns = False
+    coordinates = MappingProxyType({"travel": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in a, the orientation of b in a."""
@@ -218,50 +219,16 @@ class Prismatic:
         return rows + primitives.same_orientation(a, b, p["orientation"])
 
     @staticmethod
-    def coordinate(p: dict[str, Any], a: Any, b: Any) -> Row:
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
         """How far b has moved along the axis since assembly [m]."""
         points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
         return primitives.travel(a.direction(p["axis"]), *points)
 
 
-@dataclass(frozen=True)
-class Universal:
-    """A cross (Cardan, Hooke) joint in space, 4 rows; two turns are free.
-
-    Two points meet, and an axis n_a of a stays normal to an axis n_b of b: n_a·n_b = 0.
-
-    Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: where the axes cross, world frame at assembly, (3,) [m].
-        axis_a, axis_b: of the cross in a and in b, world frame at assembly, (3,), any length but
-            zero; perpendicular.
-    """
-
-    name: str
-    body_a: str
-    body_b: str
-    point: Any
-    axis_a: Any
-    axis_b: Any
-    oriented = True
-    dims = (3,)
-
-    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, and each axis in its own."""
-        n_a, n_b = unit(self, "axis_a", a), unit(self, "axis_b", b)
-        check_perpendicular(self, n_a, n_b)
-        return anchors(self, a, b) | {
-            "axis_a": a.local_direction(n_a),
-            "axis_b": b.local_direction(n_b),
-        }
-
-    @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """p_b − p_a = 0, n_a·n_b = 0."""
-        rows = primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
-        n_a, n_b = a.direction(p["axis_a"]), b.direction(p["axis_b"])
-        return [*rows, primitives.angle_between(n_a, n_b)]
+def turn_about(p: dict[str, Any], a: Any, b: Any) -> Row:
+    """The angle of b in a about the normal of two directions of a, zero at assembly [rad]."""
+    first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
+    return primitives.turn(first, second, b.direction(p["first_b"]))
 
 
 def label(joint: Any) -> str:
@@ -282,7 +249,11 @@ def triad(joint: Any, pose: Pose) -> list[Array]:
     Raises:
         ValueError: the axis is missing, has the wrong shape or length zero.
     """
-    n = unit(joint, "axis", pose)
+    return basis(unit(joint, "axis", pose))
+
+
+def basis(n: Array) -> list[Array]:
+    """A unit vector and the directions normal to it, right-handed: two in the plane, or three."""
     if n.shape == (2,):
         return [n, jnp.stack([-n[1], n[0]])]
     smallest = jnp.argmin(jnp.abs(n))

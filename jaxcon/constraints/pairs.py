@@ -7,6 +7,7 @@ assembly and kept in the frames of the two bodies.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jaxcon.constraints.joints import (
     anchors,
     label,
     triad,
+    turn_about,
     unit,
 )
 from jaxcon.constraints.primitives import Row
@@ -47,7 +49,7 @@ class PointOnLine:
     body_b: str
     axis: Any
     point: Any = None
-    turns = False
+    coordinates = MappingProxyType({"travel": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in a."""
@@ -84,7 +86,6 @@ class PointOnPlane:
     body_b: str
     axis: Any
     point: Any = None
-    turns = False
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, and the normal in a."""
@@ -147,6 +148,7 @@ class Cylindrical(Parallel):
     """
 
     point: Any = None
+    coordinates = MappingProxyType({"travel": "m", "angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in both."""
@@ -158,6 +160,11 @@ class Cylindrical(Parallel):
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """u·(p_b − p_a) = 0 for u normal to the axis, n·b₁ = n·b₂ = 0."""
         return PointOnLine.rows(p, a, b) + Parallel.rows(p, a, b)
+
+    @staticmethod
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
+        """How far b has moved along the axis [m] and turned about it [rad] since assembly."""
+        return turn_about(p, a, b) if name == "angle" else Prismatic.coordinate(name, p, a, b)
 
 
 @dataclass(frozen=True)
@@ -177,7 +184,6 @@ class Screw(Cylindrical):
     """
 
     lead: Any = None
-    turns = False
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """That of the sleeve, and the lead."""
@@ -190,9 +196,7 @@ class Screw(Cylindrical):
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """Those of the sleeve, and s − lead θ/2π = 0."""
-        s = Prismatic.coordinate(p, a, b)
-        first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
-        θ = primitives.turn(first, second, b.direction(p["first_b"]))
+        s, θ = Prismatic.coordinate("travel", p, a, b), turn_about(p, a, b)
         rise = p["lead"] / (2 * jnp.pi)
         thread = Row(
             rise * numerics.wrap(s.value / rise - θ.value),
@@ -201,8 +205,6 @@ class Screw(Cylindrical):
             (s.pulls[0] - θ.pulls[0] * rise, s.pulls[1] - θ.pulls[1] * rise),
         )
         return [*Cylindrical.rows(p, a, b), thread]
-
-    coordinate = Prismatic.coordinate
 
 
 @dataclass(frozen=True)
@@ -218,69 +220,26 @@ class Planar(Parallel):
     """
 
     point: Any = None
+    coordinates = MappingProxyType({"x": "m", "y": "m", "angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, the normal in a, and the directions of the plane in b."""
-        return anchors(self, a, b) | Parallel.attach(self, a, b)
+        """The point in both frames, the normal in a, and the directions of the plane in both."""
+        _, u, w = triad(self, a)
+        own = {"first_a": a.local_direction(u), "second_a": a.local_direction(w)}
+        return anchors(self, a, b) | Parallel.attach(self, a, b) | own
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """n·(p_b − p_a) = 0, n·b₁ = n·b₂ = 0."""
         return PointOnPlane.rows(p, a, b) + Parallel.rows(p, a, b)
 
-
-@dataclass(frozen=True)
-class ConstantVelocity:
-    """Two shafts at any angle below π that turn equally fast, in space, 4 rows.
-
-    The shafts meet, and the turn from where they would be in line is about an axis normal to both:
-    a unit quaternion (w, x, y, z) with z along the shaft of a has z = 0. With a₁, a₂ normal to the
-    shaft in a, and b₁, b₂ the same directions in b when the shafts are in line,
-
-        φ = a₂·b₁ − a₁·b₂ = 4 w z = (1 + cos β) sin τ,
-
-    of the bend β and the twist τ. Turning a by α and b by α′ about their own shafts takes φ from 0
-    to 2 w² sin(α′ − α), so that α′ = α at every bend.
-
-    Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: where the shafts meet, world frame at assembly, (3,) [m].
-        axis: of the shaft of a, world frame at assembly, (3,), any length but zero.
-        axis_b: of that of b, in line with `axis` unless given; both shafts turn equally fast in the
-            right-handed sense about these.
-    """
-
-    name: str
-    body_a: str
-    body_b: str
-    point: Any
-    axis: Any
-    axis_b: Any = None
-    oriented = True
-    dims = (3,)
-
-    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, and the directions normal to the shafts."""
-        n, u, w = triad(self, a)
-        m = n if self.axis_b is None else unit(self, "axis_b", b)
-        check_bend(self, n, m)
-        return anchors(self, a, b) | {
-            "first_a": a.local_direction(u),
-            "second_a": a.local_direction(w),
-            "first_b": b.local_direction(bent(n, m, u)),
-            "second_b": b.local_direction(bent(n, m, w)),
-        }
-
     @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """p_b − p_a = 0, a₂·b₁ − a₁·b₂ = 0."""
-        a1, a2 = a.direction(p["first_a"]), a.direction(p["second_a"])
-        b1, b2 = b.direction(p["first_b"]), b.direction(p["second_b"])
-        twist = primitives.difference(
-            primitives.angle_between(a2, b1), primitives.angle_between(a1, b2)
-        )
-        return [*primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"])), twist]
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
+        """How far b has moved along two directions of the plane [m] and turned in it [rad]."""
+        if name == "angle":
+            return turn_about(p, a, b)
+        along = a.direction(p["first_a" if name == "x" else "second_a"])
+        return primitives.travel(along, a.point(p["anchor_a"]), b.point(p["anchor_b"]))
 
 
 @dataclass(frozen=True)
@@ -359,26 +318,3 @@ def check_normal(joint: Any, n: Array, rod: Array) -> None:
                 f"{label(joint)}: the rod must be normal to the axis of its hinge, got a cosine of"
                 f" {cosine:.6g} between them."
             )
-
-
-def check_bend(joint: Any, n: Array, m: Array) -> None:
-    """Checks, where they are concrete, that two shafts do not point at each other.
-
-    Raises:
-        ValueError: they do.
-    """
-    if checks.is_concrete((n, m)) and float(n @ m) < PERPENDICULAR - 1:
-        raise ValueError(
-            f"{label(joint)}: axis and axis_b are opposite, which leaves the bend between them"
-            " without a plane; let both point on along the shafts, from a to b."
-        )
-
-
-def bent(n: Array, m: Array, x: Array) -> Array:
-    """x after the shortest turn from the unit vector n to the unit vector m; m ≠ −n.
-
-    R x = x + k × x + k × (k × x)/(1 + n·m) with k = n × m.
-    """
-    k = jnp.cross(n, m)
-    across = jnp.cross(k, x)
-    return x + across + jnp.cross(k, across) / (1 + n @ m)

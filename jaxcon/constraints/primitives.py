@@ -32,12 +32,14 @@ class Row(NamedTuple):
     Attributes:
         value, rate, bias: φ, φ̇, γ, lanes (element,).
         pulls: ∂φ̇/∂v on each body.
+        holonomic: whether there is a φ; without one the row is ψ(q, v, t) = 0, value zero, rate ψ.
     """
 
     value: Lane
     rate: Lane
     bias: Lane
-    pulls: tuple[Vector, Vector]
+    pulls: tuple[Vector, ...]
+    holonomic: bool = True
 
 
 def meet(p: Point, r: Point) -> list[Row]:

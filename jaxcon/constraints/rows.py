@@ -21,11 +21,24 @@ class RowLayout:
 
     Attributes:
         entries: (name, first, rows, stride) of each.
-        velocity_level: names of those that have no φ.
+        free: numbers of the rows that have no φ, in ascending order; a position projection leaves
+            them out. Rolling has both kinds in one constraint.
+        inertial: names of those that hold nothing, but resist acceleration: rotors.
     """
 
     entries: tuple[tuple[str, int, int, int], ...]
-    velocity_level: tuple[str, ...] = ()
+    free: tuple[int, ...] = ()
+    inertial: tuple[str, ...] = ()
+
+    @property
+    def velocity_level(self) -> tuple[str, ...]:
+        """Names of the constraints of which no row has a φ."""
+        return tuple(name for name in self.names if not np.any(self.holonomic[self.rows(name)]))
+
+    @property
+    def holonomic(self) -> np.ndarray:
+        """Whether each row has a φ, (n_c,)."""
+        return ~np.isin(np.arange(self.size), self.free)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -76,7 +89,7 @@ class Violation:
         return jnp.max(jnp.abs(self.velocity), axis=-1, initial=0)
 
     def __getitem__(self, name: str) -> Array:
-        """‖φ‖ of a constraint, or ‖ψ‖ of a velocity-level one, ()."""
+        """‖φ‖ of a constraint, over the rows that have a φ; ‖ψ‖ where none has, ()."""
         if name in self.layout.velocity_level:
             return self.rate(name)
         return _norm(self.position[..., self.layout.rows(name)])
@@ -101,6 +114,7 @@ class Rows:
         jacobian: J = ∂φ̇/∂v, (n_c, n_v).
         bias: γ (n_c,).
         layout: rows by constraint.
+        compliance: the diagonal of C, (n_c,); None where it is zero.
     """
 
     residual: Array
@@ -108,6 +122,7 @@ class Rows:
     jacobian: Jacobian
     bias: Array
     layout: RowLayout = static()
+    compliance: Array | None = None
 
     @property
     def violation(self) -> Violation:
@@ -131,21 +146,37 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     sets = [group.rows(snapshot) for group in system.constraints]
     blocks: list[Block] = []
     entries: list[tuple[str, int, int, int]] = []
+    free: list[int] = []
     start = 0
     for group, rows in zip(system.constraints, sets, strict=True):
         k = len(group.names)
         blocks += [Block(value, start, columns) for columns, value in rows.jacobian]
-        entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
+        if rows.value:  # a joint may be there to be read and driven only
+            entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
+        free += [
+            start + k * r + i
+            for r, known in enumerate(rows.holonomic)
+            if not known
+            for i in range(k)
+        ]
         start += k * len(rows.value)
     jacobian = Jacobian(tuple(blocks), (start, v.shape[0]))
     residual, rate, bias = (_flat(sets, field, v) for field in ("value", "rate", "bias"))
-    free = [n for g in system.constraints if getattr(g, "velocity_level", False) for n in g.names]
-    return Rows(residual, rate, jacobian, bias, RowLayout(tuple(entries), tuple(free)))
+    soft = any(rows.compliance is not None for rows in sets)
+    compliance = _flat(sets, "compliance", v) if soft else None
+    rotors = (g for g in system.constraints if getattr(g, "inertial", False))
+    inertial = tuple(name for group in rotors for name in group.names)
+    layout = RowLayout(tuple(entries), tuple(free), inertial)
+    return Rows(residual, rate, jacobian, bias, layout, compliance)
 
 
 def _flat(sets: list[RowSet], field: str, like: Array) -> Array:
     """One array (n_c,) from lanes, row-major inside each set."""
-    lanes = [_spread(lane, rows, like) for rows in sets for lane in getattr(rows, field)]
+    lanes = [
+        _spread(lane, rows, like)
+        for rows in sets
+        for lane in getattr(rows, field) or (0.0,) * len(rows.value)
+    ]
     return jnp.concatenate(lanes) if lanes else jnp.zeros((0, *like.shape[1:]), like.dtype)
 
 

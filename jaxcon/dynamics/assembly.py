@@ -10,7 +10,7 @@ from jaxcon.solvers.saddle import Saddle
 
 
 def saddle(system: Any, q: Array, rows: Rows, force: Array, target: Array) -> Saddle:
-    """M a = f + Jᵀλ, J a = b.
+    """M a = f + Jᵀλ, J a + C λ = b.
 
     Args:
         system: with `mass(q)`.
@@ -22,4 +22,4 @@ def saddle(system: Any, q: Array, rows: Rows, force: Array, target: Array) -> Sa
     Returns:
         What a solver takes.
     """
-    return Saddle(system.mass(q), force, rows.jacobian, target)
+    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance)

@@ -18,6 +18,7 @@ def accelerate(
     def at(q: Array, v: Array, t: Any) -> tuple[Solution, Rows]:
         rows = linearize(system, q, v, t)
         target = stabilizer.target(rows, memory, dt)
-        return solver.solve(saddle(system, q, rows, system.force(q, v, t, control), target)), rows
+        force = system.force(q, v, t, control)
+        return system.complete(solver.solve(saddle(system, q, rows, force, target))), rows
 
     return at

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 from jaxcon.constraints.base import Joints
 from jaxcon.constraints.curves import Curves, PointOnCurve
 from jaxcon.constraints.custom import CustomOnBodies, Holonomic, VelocityLevel
-from jaxcon.constraints.drive import Drive, Drives
+from jaxcon.constraints.drive import Drive
 from jaxcon.core import checks
+from jaxcon.dynamics.along import Along
 from jaxcon.dynamics.inputs import Resolved
 from jaxcon.geometry.pose import Pose
 from jaxcon.model.elements import stack
@@ -23,13 +24,11 @@ from jaxcon.model.forces import (
     ExternalWrench,
     ExternalWrenches,
     ForceElements,
-    JointSpring,
-    JointSprings,
 )
 from jaxcon.model.layout import WORLD, Group, Layout, Place
 from jaxcon.model.system import MassProperties
 
-SPECIAL = (Drive, PointOnCurve, Holonomic, VelocityLevel, JointSpring, ExternalWrench, CustomForce)
+SPECIAL = (Drive, PointOnCurve, Holonomic, VelocityLevel, ExternalWrench, CustomForce)
 """Elements that are not attached to their bodies by `attach` alone."""
 
 
@@ -54,8 +53,8 @@ def lay_out(
         if isinstance(element, ExternalWrench) and element.body in bodies:
             kind = bodies[element.body].kind
             width = 0 if kind is None else kind.n_v
-        elif isinstance(element, CustomForce):
-            width = element.controls
+        elif not isinstance(element, ExternalWrench):
+            width = getattr(element, "controls", 0)
         if width:
             controls.append((element.name, u, u + width))
             u += width
@@ -77,20 +76,25 @@ class Gather:
         """`poses` are of the frames where elements are attached, `own` of users' frames in them."""
         self.dim, self.dtype, self.layout, self.poses, self.own = dim, dtype, layout, poses, own
 
-    def constraints(self, elements: Iterable[Any]) -> list[Any]:
-        """Joints first, then the motions prescribed to them, curves and the user's constraints."""
+    def along(self, elements: Iterable[Any]) -> Along:
+        """The joints, and what acts along their coordinates."""
         plain = [e for e in elements if not isinstance(e, SPECIAL) and hasattr(e, "rows")]
-        joints = self.joints(plain)
-        drives = self.drives(_of(elements, Drive), joints)
-        curves = self.curves(_of(elements, PointOnCurve))
-        return joints + drives + curves + self.customs(_of(elements, Holonomic, VelocityLevel))
+        return Along(self.joints(plain), elements, self.layout, self.dtype)
 
-    def forces(self, elements: Iterable[Any], constraints: list[Any]) -> list[Any]:
+    def constraints(self, elements: Iterable[Any], along: Along) -> list[Any]:
+        """Joints first, then what constrains their coordinates, then the user's constraints."""
+        drives = along.drives(_of(elements, Drive), self._params, _bare)
+        held = [*drives, *along.couplings(), *along.armatures()]
+        curves = self.curves(_of(elements, PointOnCurve))
+        custom = self.customs(_of(elements, Holonomic, VelocityLevel))
+        return [*along.joints, *held, *curves, *custom]
+
+    def forces(self, elements: Iterable[Any], along: Along) -> list[Any]:
         """Force elements of every class."""
         plain = [e for e in elements if not isinstance(e, SPECIAL) and hasattr(e, "forces")]
         return [
             *self.simple_forces(plain),
-            *self.joint_springs(_of(elements, JointSpring), constraints),
+            *along.forces(),
             *self.wrenches(_of(elements, ExternalWrench)),
             *self.user_forces(_of(elements, CustomForce)),
         ]
@@ -119,18 +123,6 @@ class Gather:
             result.append(ExternalWrenches(params, names, places, starts=starts))
         return result
 
-    def drives(self, drives: list[Any], joints: list[Any]) -> list[Any]:
-        """Prescribed motions, one group each."""
-        result = []
-        for drive in drives:
-            group, index = self._find_joint(drive, joints)
-            params = self._params(drive)
-            places = joints[group].select((index,)).places
-            drives_one = Drives(params, _bare(drive), group, index, places)
-            drives_one.check(self.dtype)
-            result.append(drives_one)
-        return result
-
     def curves(self, curves: list[Any]) -> list[Any]:
         """Points on users' curves, one group each."""
         origin = Pose(jnp.zeros(self.dim, self.dtype))
@@ -143,21 +135,6 @@ class Gather:
             places = tuple(self._place((name,)) for name in names)
             bare = dataclasses.replace(curve, point=None, params=None)
             result.append(Curves(numbers, (curve.name,), places, bare, self._params(curve)))
-        return result
-
-    def joint_springs(self, springs: list[Any], joints: list[Any]) -> list[Any]:
-        """Springs about joint coordinates, by the group of their joints."""
-        found: dict[int, list[tuple[Any, int]]] = {}
-        for spring in springs:
-            group, index = self._find_joint(spring, joints)
-            found.setdefault(group, []).append((spring, index))
-        result = []
-        for group, members in found.items():
-            params = stack([spring.attach(self.dtype) for spring, _ in members])
-            names = tuple(spring.name for spring, _ in members)
-            indices = tuple(index for _, index in members)
-            places = joints[group].select(indices).places
-            result.append(JointSprings(params, names, places, group=group, joints=indices))
         return result
 
     def customs(self, constraints: list[Any]) -> list[Any]:
@@ -202,7 +179,7 @@ class Gather:
             names = bodies(element)
             params = element.attach(*(self.poses[name] for name in names))
             sides = tuple(self._group(name) for name in names)
-            fields = tuple(params)
+            fields = tuple((field, jax.tree.map(jnp.shape, x)) for field, x in params.items())
             groups.setdefault((type(element), sides, fields), []).append((element, params))
         result = []
         for (cls, _, _), members in groups.items():
@@ -241,7 +218,8 @@ class Gather:
         for name in names:
             if getattr(joint, "oriented", False) and self.poses[name].orientation is None:
                 raise ValueError(f"{owner}: it needs an orientation, but '{name}' is a particle.")
-        if self.dim == 2 and getattr(joint, "axis", None) is not None and joint.turns:
+        turns = getattr(joint, "turns", False)
+        if self.dim == 2 and turns and getattr(joint, "axis", None) is not None:
             raise ValueError(f"{owner}: in the plane the axis is the normal; give none.")
 
     def _check_user(self, element: Any) -> None:
@@ -249,16 +227,6 @@ class Gather:
         if not isinstance(element.bodies, tuple) or not element.bodies:
             raise ValueError(f"{owner}: bodies must be a tuple of names, got {element.bodies!r}.")
         self._check_bodies(element, element.bodies)
-
-    def _find_joint(self, element: Any, joints: list[Any]) -> tuple[int, int]:
-        owner = f"{type(element).__name__} '{element.name}'"
-        for group, candidates in enumerate(joints):
-            if element.joint in candidates.names:
-                if not hasattr(getattr(candidates, "joint", None), "coordinate"):
-                    raise ValueError(f"{owner}: '{element.joint}' has no coordinate.")
-                return group, candidates.names.index(element.joint)
-        known = [name for group in joints for name in group.names]
-        raise ValueError(f"{owner}: joint '{element.joint}' is unknown; known are {known}.")
 
 
 def _of(elements: Iterable[Any], *classes: type) -> list[Any]:

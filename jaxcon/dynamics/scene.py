@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.status import Status
 from jaxcon.dynamics import grouping
+from jaxcon.dynamics.along import no_turns
 from jaxcon.dynamics.inputs import BodyInput, resolve
 from jaxcon.geometry.pose import Pose, WorldPose
 from jaxcon.model.layout import WORLD
@@ -116,7 +118,7 @@ class Scene:
             ValueError: its name is taken.
             TypeError: it is neither a constraint nor a force.
         """
-        roles = ("attach", "function", "motion", "rows", "forces")
+        roles = ("attach", "function", "motion", "rows", "forces", "joint")
         if not hasattr(element, "name") or not any(hasattr(element, role) for role in roles):
             raise TypeError(f"Scene.add takes a joint, constraint or force, got {element!r}.")
         self._take_name(element.name)
@@ -142,12 +144,22 @@ class Scene:
         poses |= {n: WorldPose(pose.position, upright) for n, pose in fixed.items()}
         offsets = {n: b.offset for n, b in bodies.items() if b.offset is not None}
         gather = grouping.Gather(self.dim, self.dtype, layout, poses, offsets | fixed)
-        constraints = gather.constraints(self._elements.values())
-        forces = gather.forces(self._elements.values(), constraints)
+        elements = self._elements.values()
+        along = gather.along(elements)
+        constraints = gather.constraints(elements, along)
+        turns = no_turns(along.counted, self.dtype)
         system = BodySystem(
-            self.gravity, inertia, tuple(constraints), tuple(forces), offsets, fixed, layout
+            gravity=self.gravity,
+            inertia=inertia,
+            constraints=tuple(constraints),
+            forces=tuple(gather.forces(elements, along)),
+            offsets=offsets,
+            fixed=fixed,
+            turns=turns,
+            layout=layout,
+            counted=along.counted,
         )
-        state = self._state(layout, bodies)
+        state = dataclasses.replace(self._state(layout, bodies), turns=turns)
         for group in constraints:
             if isinstance(group, Custom):
                 check_function(group, system.snapshot(state.q, state.v, state.time))

@@ -54,6 +54,10 @@ class Particle:
         """None."""
         return zeros(self.n_v)
 
+    def coadjoint(self, v: Vector, p: Vector) -> Vector:
+        """None: these velocities are rates of coordinates."""
+        return v.map(jnp.zeros_like)
+
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
         return Motion(q, None, v, None)
@@ -141,6 +145,11 @@ class SpatialRigid(Particle):
         i1, i2, i3 = Vector.of(moments)
         x, y, z = v[3:]
         return Vector(*zeros(3), (i2 - i3) * y * z, (i3 - i1) * z * x, (i1 - i2) * x * y)
+
+    def coadjoint(self, v: Vector, p: Vector) -> Vector:
+        """p × ω of an angular momentum p in the body frame; with p = Iω the gyroscopic torque."""
+        none = (jnp.zeros_like(x) for x in v[:3])
+        return Vector(*none, *Vector(*p[3:]).cross(Vector(*v[3:])))
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""

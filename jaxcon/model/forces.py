@@ -151,67 +151,6 @@ class Force:
 
 
 @dataclass(frozen=True)
-class JointSpring:
-    """A spring and damper about a joint's coordinate θ: force −k (θ − θ₀) − c θ̇.
-
-    θ is the angle of a revolute joint [rad] or the travel of a prismatic one [m], from assembly. In
-    space θ − θ₀ is taken modulo whole turns, in [−π, π]: the spring pulls the shorter way round.
-
-    Attributes:
-        name: unique in the scene.
-        joint: name of the joint.
-        stiffness: k [N m/rad] or [N/m].
-        damping: c [N m s/rad] or [N s/m].
-        rest: θ₀ [rad] or [m].
-    """
-
-    name: str
-    joint: str
-    stiffness: Any
-    damping: Any = 0.0
-    rest: Any = 0.0
-
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """The numbers of the element."""
-        owner = f"joint spring '{self.name}'"
-        params = {
-            "stiffness": checks.number(owner, "stiffness", self.stiffness, dtype),
-            "damping": checks.number(owner, "damping", self.damping, dtype),
-            "rest": checks.number(owner, "rest", self.rest, dtype),
-        }
-        for field in ("stiffness", "damping"):
-            checks.positive(owner, field, params[field], strictly=False)
-        return params
-
-
-@pytree
-class JointSprings(Elements):
-    """Springs about the coordinates of joints of one group."""
-
-    group: int = static(default=0)
-    joints: tuple[int, ...] = static(default=())
-
-    def pulls(self, snapshot: Any, control: Any) -> Pulls:
-        """The generalized forces on the bodies of each side."""
-        coordinate, stretch = self._stretch(snapshot)
-        force = -self.params["stiffness"] * stretch - self.params["damping"] * coordinate.rate
-        return [(p, pull * force) for p, pull in zip(self.places, coordinate.pulls, strict=True)]
-
-    def potential(self, snapshot: Any) -> Iterable[Lane]:
-        """½ k (θ − θ₀)²."""
-        stretch = self._stretch(snapshot)[1]
-        return (self.params["stiffness"] * stretch**2 / 2,)
-
-    def _stretch(self, snapshot: Any) -> tuple[Any, Lane]:
-        """The joint's coordinate, and how far it is from rest."""
-        joints = snapshot.system.constraints[self.group].select(self.joints)
-        coordinate = joints.coordinate(snapshot)
-        stretch = coordinate.value - self.params["rest"]
-        spatial_angle = snapshot.system.layout.dim == 3 and joints.joint.turns
-        return coordinate, numerics.wrap(stretch) if spatial_angle else stretch
-
-
-@dataclass(frozen=True)
 class ExternalWrench:
     """A wrench on a body as control: (F, τ) in the world frame, at a point of the body.
 

@@ -104,8 +104,17 @@ class WorldFrame:
         """No turning."""
         return 0.0 if self.dim == 2 else zeros(3)
 
+    @property
+    def spin(self) -> Vector:
+        """No turning (in space)."""
+        return zeros(3)
+
     def turn(self, torque: Any) -> Vector:
         """The world takes up no torque."""
+        return Vector()
+
+    def torque(self, n: Vector) -> Vector:
+        """The world takes up no torque (in space)."""
         return Vector()
 
 
@@ -200,3 +209,7 @@ class SpatialFrame(Frame):
     def turn(self, torque: Vector) -> Vector:
         """The generalized force of a torque in the body frame [N m]."""
         return Vector(*zeros(3), *torque)
+
+    def torque(self, n: Vector) -> Vector:
+        """The generalized force of a torque in the world frame [N m], the gradient of n·Rω."""
+        return self.turn(self.rotation.T @ n)

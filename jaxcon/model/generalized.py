@@ -14,7 +14,7 @@ from jaxcon.model.layout import Place
 from jaxcon.model.state import Energy
 from jaxcon.model.system import Snapshot
 from jaxcon.solvers.jacobian import Columns
-from jaxcon.solvers.saddle import Diagonal, Full, Mass
+from jaxcon.solvers.saddle import Diagonal, Full, Mass, Solution
 
 WHOLE = Place(0, (0,))
 """All coordinates at once, as the one element of one group."""
@@ -49,6 +49,15 @@ class GeneralizedCoordinates:
         """The system at one instant."""
         return Snapshot(dataclasses.replace(self, size=v.shape[0]), q, v, t)
 
+    @property
+    def turns(self) -> PyTree:
+        """None are counted: the user's coordinates count their own."""
+        return ()
+
+    def count(self, q: Array, v: Array, t: Any) -> PyTree:
+        """Nothing."""
+        return ()
+
     def mass(self, q: Array) -> Mass:
         """M(q, θ), (n_v, n_v), or its diagonal (n_v,) where the user's function gives that."""
         m = self.mass_function(q, self.params)
@@ -73,6 +82,18 @@ class GeneralizedCoordinates:
     def retract(self, q: Array, step: Array) -> Array:
         """q + Δ."""
         return q + step
+
+    def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
+        """None: v is q̇."""
+        return jnp.zeros_like(v)
+
+    def complete(self, solution: Solution) -> Solution:
+        """The solution of the saddle system as it is."""
+        return solution
+
+    def sizes(self, n_q: int) -> tuple[int, int]:
+        """How many positions and velocities a state has, where there are n_q positions."""
+        return n_q, n_q
 
     def normalize(self, q: Array) -> Array:
         """q as it is."""

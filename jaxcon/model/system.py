@@ -13,17 +13,18 @@ import jax.numpy as jnp
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.typing import Array, Lane, PyTree
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.model.bodies import rest
+from jaxcon.model.coordinates import JointCoordinate, count
 from jaxcon.model.elements import element_at, replace_at
 from jaxcon.model.frames import WorldFrame
 from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
 from jaxcon.solvers.jacobian import Columns
-from jaxcon.solvers.saddle import Diagonal
+from jaxcon.solvers.saddle import Diagonal, Solution
 
-POSITIVE = {"mass", "inertia", "length"}
+POSITIVE = {"mass", "inertia", "length", "radius"}
 NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
 """Fields whose values are checked where they are known."""
 
@@ -81,7 +82,9 @@ class BodySystem:
         offsets: by name, the body's own frame as given by the user, in its principal frame; only
             for bodies where they differ.
         fixed: by name, the pose of each frame that is fixed to the world.
+        turns: the angles a step ago of joints whose whole turns are counted, (n,) [rad].
         layout: names and indices.
+        counted: which these are.
     """
 
     gravity: Array
@@ -90,7 +93,9 @@ class BodySystem:
     forces: tuple[Any, ...]
     offsets: dict[str, Pose]
     fixed: dict[str, Pose]
+    turns: Any
     layout: Layout = static()
+    counted: tuple[JointCoordinate, ...] = static(default=())
 
     @property
     def n_v(self) -> int:
@@ -100,6 +105,14 @@ class BodySystem:
     def snapshot(self, q: Array, v: Array, t: Any) -> Snapshot:
         """The system at one instant."""
         return Snapshot(self, q, v, t)
+
+    def remember(self, turns: PyTree) -> BodySystem:
+        """With other angles of a step ago."""
+        return dataclasses.replace(self, turns=turns)
+
+    def count(self, q: Array, v: Array, t: Any) -> PyTree:
+        """The angles of the joints whose turns are counted, over turns: what a state remembers."""
+        return count(self.counted, self.snapshot(q, v, t)) if self.counted else self.turns
 
     def mass(self, q: Array) -> Diagonal:
         """M: constant and diagonal, since frames lie at centres of mass along principal axes."""
@@ -143,6 +156,19 @@ class BodySystem:
         """q ⊕ Δ for a finite step Δ = h v (n_v,); rotations by their exponential."""
         return self._each("retract", q, step)
 
+    def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
+        """ad*_v p (n_v,): what turning with the bodies does to a momentum p (n_v,), p × ω."""
+        pairs = [(g.kind, g.unpack(q, v)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
+        return _join([kind.coadjoint(own, momentum) for kind, own, momentum in pairs], q)
+
+    def complete(self, solution: Solution) -> Solution:
+        """The solution of the saddle system as it is."""
+        return solution
+
+    def sizes(self, n_q: int) -> tuple[int, int]:
+        """How many positions and velocities a state has."""
+        return self.layout.n_q, self.layout.n_v
+
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""
         if all(g.kind.n_q == g.kind.n_v for g in self.layout.groups):
@@ -185,7 +211,10 @@ class BodySystem:
             height = frame.position.dot(Vector.of(self.gravity))
             potential = potential - jnp.sum(properties.mass * height)
         stored = total(jnp.sum(x) for f in self.forces for x in f.potential(snapshot))
-        return Energy(jnp.sum(self.mass(q).values * v * v) / 2, potential + stored)
+        rotors = (c for c in self.constraints if hasattr(c, "kinetic"))
+        kinetic = jnp.sum(self.mass(q).values * v * v) / 2
+        kinetic = kinetic + total(jnp.sum(c.kinetic(snapshot)) for c in rotors)
+        return Energy(kinetic, potential + stored)
 
     @property
     def params(self) -> dict[str, Any]:

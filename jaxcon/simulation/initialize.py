@@ -34,12 +34,10 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
     chosen = [x for x in (q, v, *jax.tree.leaves(system)) if isinstance(x, jax.Array)]
     floating = (x.dtype for x in chosen if jnp.issubdtype(x.dtype, jnp.floating))
     dtype = next(floating, jnp.result_type(float))
-    layout = getattr(system, "layout", None)
-    n_q = jnp.asarray(q).shape if layout is None else (layout.n_q,)
-    if len(n_q) != 1:
-        raise ValueError(f"init: q must have shape (n_q,), got {n_q}.")
-    q = checks.number("init", "q", q, dtype, n_q)
-    v = checks.number("init", "v", v, dtype, n_q if layout is None else (layout.n_v,))
+    given = jnp.asarray(q).shape
+    n_q, n_v = system.sizes(given[-1] if given else 1)
+    q = checks.number("init", "q", q, dtype, (n_q,))
+    v = checks.number("init", "v", v, dtype, (n_v,))
     check_dtype(system, dtype)
     snapshot = system.snapshot(q, v, jnp.zeros((), dtype))
     for group in snapshot.system.constraints:
@@ -47,7 +45,7 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
     memory = method.stabilizer.init(system, q, v)
-    return State(q, v, jnp.asarray(time, dtype), status, memory)
+    return State(q, v, jnp.asarray(time, dtype), status, memory, system.turns)
 
 
 def check_dtype(system: Any, dtype: Any) -> None:

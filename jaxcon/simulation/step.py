@@ -15,7 +15,7 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import accelerate
-from jaxcon.model.state import State, check_state
+from jaxcon.model.state import State, at, recall
 from jaxcon.simulation.initialize import check_dtype
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.recovery import contain, keep
@@ -87,9 +87,11 @@ def contained_step(
 
 def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
     stabilizer = method.feedback(dt)
-    at = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
-    new, solution, rows = method.integrator.advance(at, system, state, dt)
+    system = recall(system, state.turns)
+    acceleration = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
+    new, solution, rows = method.integrator.advance(acceleration, system, state, dt)
     new = stabilizer.correct(system, method.solver, new, dt)
+    new = dataclasses.replace(new, turns=system.count(state.q, state.v, state.time))
     code = status.first(state.status, judge(new, solution))
     healthy = code == Status.OK
     info = StepInfo(solution.acceleration, solution.multipliers, rows.violation, code)
@@ -133,8 +135,9 @@ def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Ar
     args = (system, method, state, control, dt)
     state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
     stabilizer = method.feedback(dt)
-    at = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
-    return at(state.q, state.v, state.time)[0]
+    system = recall(system, state.turns)
+    acceleration = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
+    return acceleration(state.q, state.v, state.time)[0]
 
 
 def check_step(system: Any, method: Method, state: State, control: PyTree) -> PyTree:
@@ -143,7 +146,7 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
     Raises:
         ValueError: wrong shapes, mixed dtypes, or memory of another method.
     """
-    check_state(system, state)
+    at(system, state)
     method.check()
     layout = getattr(system, "layout", None)
     if layout is not None:

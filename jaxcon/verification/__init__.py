@@ -13,6 +13,7 @@ import jax
 import jaxcon as jc
 from jaxcon.verification import (
     andrews,
+    bicycle,
     closed_forms,
     convergence,
     departures,
@@ -22,6 +23,7 @@ from jaxcon.verification import (
     nonholonomic,
     pendulums,
     rheonomic,
+    rolling,
     rotations,
     single_joints,
     stabilisation,
@@ -44,6 +46,11 @@ CASES: dict[str, Callable[[], list[Check]]] = {
         nonholonomic.chaplygin_sleigh,
         nonholonomic.ball_on_turntable,
         nonholonomic.nonholonomic_particle,
+        rolling.rolling_disc,
+        rolling.rolling_coin,
+        rolling.knife_edge_incline,
+        rolling.vakonomic_knife_edge,
+        bicycle.bicycle_linear,
         closed_forms.atwood,
         closed_forms.incline,
         closed_forms.conical_pendulum,

@@ -1,0 +1,200 @@
+"""The variational equations of rows of velocities, beside the physical ones (chapter 3.8.2).
+
+The physical (d'Alembert) equations let the forces of ψ = A v + b = 0 do no virtual work. The
+variational ones ask that ∫ L + μ·ψ dt be stationary, as if the rows belonged to the Lagrangian, and
+so give the motion the momentum p = Aᵀμ besides its own. With q̇ = N(q) v, Hamel's equations are
+
+    M a = f + J_hᵀλ − Aᵀμ̇ + Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v p,       A a = −γ,
+
+where d/dt follows the motion and ad*_v p is p_ω × ω on every body in space and nothing elsewhere.
+It is the physical saddle system with one more force, the curvature dθ(·, v) of the form θ = μ·A
+(and what depends on time), and μ̇ = −λ. That force vanishes for every μ where ψ is the rate of a φ:
+then both motions are the same. Rows that have a φ stay physical.
+
+References:
+    Arnold, Kozlov, Neishtadt, Mathematical Aspects of Classical and Celestial Mechanics (2006),
+    section 1.4.
+    Bloch, Nonholonomic Mechanics and Control (2003), sections 1.3 and 5.2.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.rows import RowLayout, linearize
+from jaxcon.core import checks
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array
+from jaxcon.geometry.pose import Motion
+from jaxcon.model.state import Energy, State, at
+from jaxcon.solvers.saddle import Diagonal, Full, Mass, Solution
+
+
+@pytree
+class Vakonomic:
+    """A system under the variational equations; `vakonomic` makes one.
+
+    Its velocities are (v, μ), the μ of every row without a φ behind those of the system; positions
+    are the system's. It is stepped, batched and differentiated like any other system.
+
+    Attributes:
+        system: the physical one, a `BodySystem` or `GeneralizedSystem`.
+        layout_of_rows: of the constraints.
+    """
+
+    system: Any
+    layout_of_rows: RowLayout = static()
+
+    @property
+    def free(self) -> np.ndarray:
+        """Numbers of the rows that have a μ."""
+        return np.asarray(self.layout_of_rows.free)
+
+    def physical(self, state: State) -> State:
+        """A state of the physical system: without μ."""
+        return dataclasses.replace(state, v=state.v[: state.v.shape[0] - len(self.free)])
+
+    def multipliers(self, state: State, name: str) -> Array:
+        """μ of a constraint, by those of its rows that have no φ."""
+        mine = np.isin(self.free, self.layout_of_rows.rows(name))
+        return state.v[state.v.shape[0] - len(self.free) :][mine]
+
+    @property
+    def constraints(self) -> tuple[Any, ...]:
+        """Those of the system."""
+        return self.system.constraints
+
+    @property
+    def params(self) -> Any:
+        """Those of the system."""
+        return self.system.params
+
+    def with_params(self, changes: Any) -> Vakonomic:
+        """With other parameters of the system."""
+        return dataclasses.replace(self, system=self.system.with_params(changes))
+
+    @property
+    def turns(self) -> Any:
+        """The angles that the system counts."""
+        return self.system.turns
+
+    def remember(self, turns: Any) -> Vakonomic:
+        """With other angles of a step ago."""
+        return dataclasses.replace(self, system=self.system.remember(turns))
+
+    def count(self, q: Array, v: Array, t: Any) -> Any:
+        """The angles that the system counts."""
+        return self.system.count(q, self._split(v)[0], t)
+
+    def sizes(self, n_q: int) -> tuple[int, int]:
+        """How many positions and velocities a state has, μ among them."""
+        positions, velocities = self.system.sizes(n_q)
+        return positions, velocities + len(self.free)
+
+    def snapshot(self, q: Array, v: Array, t: Any) -> Any:
+        """The system at one instant."""
+        return self.system.snapshot(q, self._split(v)[0], t)
+
+    def mass(self, q: Array) -> Mass:
+        """M, and 1 for each μ, which no row touches."""
+        mass, more = self.system.mass(q), jnp.ones(len(self.free), q.dtype)
+        if isinstance(mass, Diagonal):
+            return Diagonal(jnp.concatenate([mass.values, more]))
+        return Full(jax.scipy.linalg.block_diag(mass.values, jnp.diag(more)))
+
+    def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
+        """f and the force of the curvature; nothing on μ."""
+        v, μ = self._split(v)
+        f = self.system.force(q, v, t, control)
+        return jnp.concatenate([f + self.curvature(q, v, t, μ), jnp.zeros_like(μ)])
+
+    def curvature(self, q: Array, v: Array, t: Any, μ: Array) -> Array:
+        """Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v Aᵀμ, (n_v,)."""
+        system, every = self.system, jnp.zeros(self.layout_of_rows.size, q.dtype)
+        every = every.at[self.free].set(μ)
+
+        def momentum(q: Array, t: Any) -> Array:
+            return linearize(system, q, v, t).jacobian.transpose(every)
+
+        along = (system.kinematics(q, v), jnp.ones_like(t))
+        p, ṗ = jax.jvp(momentum, (q, t), along)
+        slope = jax.grad(lambda q: linearize(system, q, v, t).rate @ every)(q)
+        (pull,) = jax.vjp(lambda w: system.kinematics(q, w), v)[1](slope)
+        return pull - ṗ + system.coadjoint(q, v, p)
+
+    def complete(self, solution: Solution) -> Solution:
+        """μ̇ = −λ beside the accelerations."""
+        a, _ = self._split(solution.acceleration)
+        rates = -solution.multipliers[self.free]
+        return solution._replace(acceleration=jnp.concatenate([a, rates]))
+
+    def kinematics(self, q: Array, v: Array) -> Array:
+        """q̇ (n_q,)."""
+        return self.system.kinematics(q, self._split(v)[0])
+
+    def retract(self, q: Array, step: Array) -> Array:
+        """q ⊕ Δ."""
+        return self.system.retract(q, self._split(step)[0])
+
+    def normalize(self, q: Array) -> Array:
+        """q with its quaternions brought back to unit length."""
+        return self.system.normalize(q)
+
+    def energy(self, q: Array, v: Array, t: Any) -> Energy:
+        """That of the system [J]; μ, whose rows are homogeneous in v, adds none."""
+        return self.system.energy(q, self._split(v)[0], t)
+
+    def motion(self, name: str, q: Array, v: Array) -> Motion:
+        """The motion of a body in the frame in which the user gave it."""
+        return self.system.motion(name, q, self._split(v)[0])
+
+    def _split(self, v: Array) -> tuple[Array, Array]:
+        n = v.shape[0] - len(self.free)
+        return v[:n], v[n:]
+
+
+def vakonomic(
+    system: Any, state: State, multipliers: Mapping[str, Any] | None = None
+) -> tuple[Vakonomic, State]:
+    """The variational equations in place of the physical ones, for all rows without a φ.
+
+    They are the equations of optimal control, where rows say which motions are possible and not
+    which force keeps to them; a wheel or a skate obeys the physical ones. A motion needs μ at the
+    start besides q and v.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: at the start.
+        multipliers: μ by constraint name, () or (rows without a φ,); zero for the others.
+
+    Returns:
+        The variational system, and its state.
+
+    Raises:
+        ValueError: an unknown name, one whose rows all have a φ, or a wrong shape.
+    """
+    layout = jax.eval_shape(linearize, at(system, state), state.q, state.v, state.time).layout
+    result = Vakonomic(system, layout)
+    μ = jnp.zeros(len(result.free), state.v.dtype)
+    for name, given in (multipliers or {}).items():
+        mine = np.flatnonzero(np.isin(result.free, layout.rows(name)))
+        if not len(mine):
+            raise ValueError(
+                f"vakonomic: constraint '{name}' has a φ in each of its rows and takes no μ; those"
+                f" that take one are {[n for n in layout.names if _takes(layout, n)]}."
+            )
+        shape = np.shape(given) and (len(mine),)
+        value = checks.number(f"vakonomic: '{name}'", "μ", given, μ.dtype, shape)
+        μ = μ.at[mine].set(value)
+    return result, dataclasses.replace(state, v=jnp.concatenate([state.v, μ]))
+
+
+def _takes(layout: RowLayout, name: str) -> bool:
+    """Whether a constraint has a row without a φ."""
+    return not np.all(layout.holonomic[layout.rows(name)])

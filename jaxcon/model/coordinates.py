@@ -1,0 +1,116 @@
+"""The coordinates of joints: angles and travels that springs, motors, gears and drives act on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.core import numerics
+from jaxcon.core.lanes import take
+from jaxcon.core.typing import Array
+
+
+@dataclass(frozen=True)
+class JointCoordinate:
+    """One coordinate of several joints of one group.
+
+    In space an angle is seen modulo whole turns only. Where an element needs more, the state holds
+    the angle of a step ago, θ₀, and the one now is that nearest to it: θ = θ₀ + wrap(θ_seen − θ₀).
+    Its derivative is that of θ_seen, whatever θ₀ is.
+
+    Attributes:
+        group: of the joints, in the constraints of the system.
+        joints: their indices in the group, one for each element.
+        name: "angle", "travel", …
+        counters: where the state holds each of them; empty where turns are not counted.
+    """
+
+    group: int
+    joints: tuple[int, ...]
+    name: str
+    counters: tuple[int, ...] = ()
+
+    def read(self, snapshot: Any) -> Any:
+        """Value, rate, bias and pulls by element, the value over turns where they are counted."""
+        group = snapshot.system.constraints[self.group]
+        row = group.select(self.joints).coordinate(snapshot, self.name)
+        if not self.counters:
+            return row
+        before = take(snapshot.system.turns, self.counters)
+        return row._replace(value=before + numerics.wrap(row.value - before))
+
+    def difference(self, snapshot: Any, row: Any, reference: Any) -> Any:
+        """value − reference, in [−π, π] where the value is an angle seen modulo whole turns."""
+        error = row.value - reference
+        joint = snapshot.system.constraints[self.group].joint
+        wraps = not self.counters and turns_over(joint, self.name, snapshot.system.layout.dim)
+        return numerics.wrap(error) if wraps else error
+
+
+End = tuple[int, int, str]
+"""A coordinate of one joint: its group, its index there, and the coordinate's name."""
+
+
+def find(groups: Sequence[Any], owner: str, joint: str, name: str | None) -> End:
+    """A coordinate of a joint by name.
+
+    Raises:
+        ValueError: no joint has this name, or it has no such coordinate, or several.
+    """
+    joints = {g: group for g, group in enumerate(groups) if hasattr(group, "joint")}
+    for g, group in joints.items():
+        if joint in group.names:
+            known = list(getattr(group.joint, "coordinates", ()))
+            if not known:
+                raise ValueError(f"{owner}: '{joint}' has no coordinate.")
+            chosen = known[0] if name is None and len(known) == 1 else name
+            if chosen not in known:
+                raise ValueError(
+                    f"{owner}: the coordinates of '{joint}' are {known}; say which, got {name!r}."
+                )
+            return g, group.names.index(joint), chosen
+    names = [name for group in joints.values() for name in group.names]
+    raise ValueError(f"{owner}: joint '{joint}' is unknown; known are {names}.")
+
+
+def at(counted: tuple[JointCoordinate, ...], ends: Iterable[End]) -> JointCoordinate:
+    """The same coordinate of several joints of one group, with the counters of its turns."""
+    groups, joints, names = zip(*ends, strict=True)
+    known = [c for c in counted if (c.group, c.name) == (groups[0], names[0])]
+    counters = {j: n for c in known for j, n in zip(c.joints, c.counters, strict=True)}
+    own = tuple(counters[j] for j in joints if j in counters)
+    return JointCoordinate(groups[0], joints, names[0], own if len(own) == len(joints) else ())
+
+
+def turns_over(joint: Any, name: str, dim: int) -> bool:
+    """Whether a coordinate is seen modulo whole turns; in the plane angles are coordinates."""
+    return dim == 3 and joint.coordinates[name] == "rad"
+
+
+def count(counted: tuple[JointCoordinate, ...], snapshot: Any) -> Array:
+    """The angles whose turns are counted, (n,) [rad]."""
+    lanes = [coordinate.read(snapshot).value for coordinate in counted]
+    batch = jnp.broadcast_shapes(*(x.shape[1:] for x in lanes))
+    return jnp.concatenate([jnp.broadcast_to(x, (x.shape[0], *batch)) for x in lanes])
+
+
+@dataclass(frozen=True)
+class TurnCounter:
+    """Counts the whole turns of a joint's angle, for `coordinate` to read.
+
+    Springs, servos and couplings count by themselves what they act on, and in the plane angles are
+    coordinates, which need no counting.
+
+    Attributes:
+        name: unique in the scene.
+        joint: name of the joint.
+        coordinate: which of the joint's; not needed where it has but one.
+    """
+
+    name: str
+    joint: str
+    coordinate: str | None = None
+    counts = True
