@@ -158,8 +158,9 @@ def chain(g: Array, rate: Array, bend: Array, gradient: Array, along: list[Row])
     """One row of g from its derivatives and the rows of x."""
     slope = [gradient[k][None] for k in range(len(along))]
     bias = total(times(s, row.bias) for s, row in zip(slope, along, strict=True))
-    pulls = (
-        functools.reduce(operator.add, (r.pulls[i] * s for s, r in zip(slope, along, strict=True)))
-        for i in (0, 1)
-    )
-    return Row(g[None], rate[None], plus(bias, bend[None]), tuple(pulls))
+
+    def pull(side: int) -> Vector:
+        terms = (row.pulls[side] * s for s, row in zip(slope, along, strict=True))
+        return functools.reduce(operator.add, terms)
+
+    return Row(g[None], rate[None], plus(bias, bend[None]), (pull(0), pull(1)))

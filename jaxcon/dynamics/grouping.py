@@ -138,8 +138,8 @@ class Gather:
             own = self.own.get(curve.body_a, origin)
             numbers = stack([curve.attach(*(self.poses[name] for name in names), own)])
             places = tuple(self._place((name,)) for name in names)
-            given = self._params(curve)
-            result.append(Curves(numbers, (curve.name,), places, _bare(curve), given))
+            bare = dataclasses.replace(curve, point=None, params=None)
+            result.append(Curves(numbers, (curve.name,), places, bare, self._params(curve)))
         return result
 
     def customs(self, constraints: list[Any]) -> list[Any]:

@@ -1,0 +1,183 @@
+"""No joint prefers a frame: turned scenes move alike, axes have no length or sign, no row is idle.
+
+The directions normal to an axis are chosen by where it points in the world, so a turned scene has
+other ones in its bodies.
+"""
+
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from compiling import quick_jit
+from tolerances import DERIVATIVE
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
+
+LEFT_OUT = ("holonomic", "velocity_level", "driven_planar")
+"""Functions of the tests themselves, and the coordinate y, whose direction is a chosen one."""
+
+TURN = np.array([0.3, -0.7, 0.5, 0.4]) / np.linalg.norm([0.3, -0.7, 0.5, 0.4])
+ANGLE = 0.8
+
+
+def rotation(dim):
+    """A turn of the whole scene."""
+    if dim == 3:
+        return np.asarray(jc.quaternion.matrix(jnp.asarray(TURN)))
+    c, s = np.cos(ANGLE), np.sin(ANGLE)
+    return np.array([[c, -s], [s, c]])
+
+
+@dataclasses.dataclass(frozen=True)
+class Variant:
+    """How a scene differs from the one that it is compared with."""
+
+    turned: bool = False
+    stretch: float = 1.0
+    """A factor of every axis."""
+
+
+def turn_of(dim, variant):
+    return rotation(dim) if variant.turned else np.eye(dim)
+
+
+def kinds_in(dim):
+    return [k for k, joint in scenes.JOINTS.items() if dim in joint.dims and k not in LEFT_OUT]
+
+
+def pair(scene, kind, variant):
+    """The two bodies of a joint, at random places, and the joint."""
+    dim, random = scene.dim, scenes.seeded(kind, scene.dim, "frames")
+    r = turn_of(dim, variant)
+    for body, near in (("first", (0.1, -0.1)), ("second", (1.5, 0.5))):
+        place = {"position": r @ scenes.near(near, random, dim)}
+        if dim == 2:
+            place["angle"] = random.normal() + ANGLE * variant.turned
+        else:
+            start = jnp.asarray(random.normal(size=4))
+            turned = jc.quaternion.multiply(jnp.asarray(TURN), start)
+            place["quaternion"] = turned if variant.turned else start
+        inertia = 0.8 if dim == 2 else (0.8, 1.1, 1.5)
+        scene.add_body(f"{body}_{kind}", mass=1.3, inertia=inertia, **place)
+    point, other = (r @ scenes.near(x, random, dim) for x in ((0.8, 0.4), (1.2, 1.1)))
+    axis = r @ random.normal(size=dim)
+    site = scenes.Site(f"first_{kind}", f"second_{kind}", dim, point, axis, other, "_" + kind)
+    elements = scenes.JOINTS[kind].make(site)
+    # of drives and cams the axis says in which sense they turn
+    sense = kind == "cam" or any(isinstance(element, jc.Drive) for element in elements)
+    stretch = abs(variant.stretch) if sense else variant.stretch
+    for element in elements:
+        given = [f for f in ("axis", "axis_a", "axis_b") if getattr(element, f, None) is not None]
+        longer = {f: stretch * getattr(element, f) for f in given}
+        scene.add(dataclasses.replace(element, **longer))
+
+
+@functools.cache
+def build(dim, variant):
+    """Every joint between two bodies of its own."""
+    gravity = turn_of(dim, variant) @ np.array((0.3, 1.0, -9.81)[-dim:])
+    scene = jc.Scene(dim=dim, gravity=gravity)
+    for kind in kinds_in(dim):
+        pair(scene, kind, variant)
+    system, state = scene.build()
+    return scenes.start_curves(system, state), state
+
+
+@quick_jit
+def equations(system, q, v, t):
+    """φ, φ̇, J, γ, M and f. One trace for all variants."""
+    rows = linearize(system, q, v, t)
+    forces = system.mass(q).dense(), system.force(q, v, t)
+    return rows.residual, rows.rate, rows.jacobian.dense(), rows.bias, *forces
+
+
+move = quick_jit(lambda system, q, step: system.retract(q, step))
+
+
+@functools.cache
+def moments(dim):
+    """Two moving states that the joints allow: at assembly, and far from there."""
+    system, state = build(dim, Variant())
+    random = scenes.seeded(dim, "moments")
+    far = move(system, state.q, jnp.asarray(0.3 * random.normal(size=state.v.shape)))
+    found = []
+    for q, t in ((state.q, 0.0), (far, 0.3)):
+        for _ in range(8):  # of Newton's method, by the shortest way
+            residual, _, jacobian, *_ = equations(system, q, state.v, t)
+            q = move(system, q, -jnp.linalg.pinv(jacobian) @ residual)
+        v = jnp.asarray(random.normal(size=state.v.shape))
+        residual, rate, jacobian, *_ = equations(system, q, v, t)
+        assert jnp.max(jnp.abs(residual)) < 1e-12
+        found.append((q, v - jnp.linalg.pinv(jacobian) @ rate, t))
+    return found
+
+
+def turn(system, q, v):
+    """A state of the scene as it is after the turn."""
+    dim = system.layout.dim
+    r = rotation(dim)
+    for name in system.layout.bodies:
+        i, j = system.layout.q(name), system.layout.v(name)[:dim]
+        place, way = q[i[:dim]], q[i[dim:]]
+        way = way + ANGLE if dim == 2 else jc.quaternion.multiply(jnp.asarray(TURN), way)
+        q = q.at[i].set(jnp.concatenate([r @ place, way]))
+        v = v.at[j].set(r @ v[j])
+    return q, v
+
+
+@functools.cache
+def solved(dim, variant):
+    """By joint and moment: a and Jᵀλ of its two bodies, (2, d), and the joint's own J."""
+    system, state = build(dim, variant)
+    rows = linearize(system, state.q, state.v, state.time).layout
+    result = {}
+    for when, (q, v, t) in zip(("at assembly", "elsewhere"), moments(dim), strict=True):
+        q, v = turn(system, q, v) if variant.turned else (q, v)
+        parts = [np.asarray(x) for x in equations(system, q, v, t)]
+        residual, rate, jacobian, bias, mass, force = parts
+        assert max(np.max(np.abs(residual)), np.max(np.abs(rate))) < 1e-10, when
+        saddle = np.block([[mass, -jacobian.T], [jacobian, np.zeros((len(bias),) * 2)]])
+        a, multipliers = np.split(np.linalg.solve(saddle, np.append(force, -bias)), [len(force)])
+        for kind in kinds_in(dim):
+            own = [system.layout.v(f"{body}_{kind}") for body in ("first", "second")]
+            names = [n for n in (f"joint_{kind}", f"drive_{kind}") if n in rows.names]
+            here = np.concatenate([rows.rows(n) for n in names])
+            pull = jacobian[here].T @ multipliers[here]
+            motion = tuple(np.stack([x[i] for i in own]) for x in (a, pull))
+            result[kind, when] = (*motion, jacobian[np.ix_(here, np.concatenate(own))])
+    return result
+
+
+VARIANTS = {
+    "turned": Variant(turned=True),
+    "stretched": Variant(stretch=2.5),
+    "reversed": Variant(stretch=-0.4),
+    "both": Variant(turned=True, stretch=-0.4),
+}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_joints_prefer_no_frame_and_no_axis(dim, variant):
+    """Accelerations and forces turn with the scene; those about the axes of bodies stay."""
+    r = turn_of(dim, VARIANTS[variant])
+    expected, found = solved(dim, Variant()), solved(dim, VARIANTS[variant])
+    for key, (*motion, _) in expected.items():
+        for got, want in zip(found[key], motion, strict=False):
+            turned = np.concatenate([want[:, :dim] @ r.T, want[:, dim:]], axis=1)
+            np.testing.assert_allclose(
+                got, turned, rtol=DERIVATIVE, atol=DERIVATIVE, err_msg=str(key)
+            )
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_no_row_of_a_joint_depends_on_the_others(dim):
+    """Where the joint was assembled and elsewhere; the row of its drive included."""
+    for key, (_, _, jacobian) in solved(dim, Variant()).items():
+        sizes = np.linalg.svd(jacobian, compute_uv=False)
+        assert len(sizes) == len(jacobian), key
+        assert sizes[-1] > 0.02 * sizes[0], key
