@@ -33,6 +33,15 @@ def no_pivot(body, t, p):
     return (body.direction(body.angular_velocity))[2:]
 
 
+def railed():
+    """On a rail, where the blade adds nothing."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("skate", mass=60.0, inertia=2.0)
+    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.5)))
+    scene.add(jc.Prismatic("rail", jc.WORLD, "skate", axis=(1.0, 0.5)))
+    return scene
+
+
 def rolling(kind, **given):
     scene = jc.Scene(dim=2 if kind == "wheel" else 3)
     inertia = 0.3 if kind == "wheel" else (0.1, 0.2, 0.25)
@@ -44,6 +53,7 @@ def rolling(kind, **given):
 
 EXAMPLES = {
     "skate": (sleigh, ((2, 3), 0, 0)),
+    "skate on a rail": (railed, ((1,), 2, 0)),
     "ball": (ball, ((3, 5), 1, 0)),
     "ball that does not pivot": (
         lambda: ball(jc.VelocityLevel(no_pivot, ("ball",), name="pivot")),

@@ -1,9 +1,12 @@
 """The variational equations: what they conserve, when they are the physical ones, and errors."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
@@ -21,7 +24,7 @@ def skate():
 
 
 def run(system, state, dt=1e-3, steps=500, every=100):
-    return jax.jit(lambda s: jc.rollout(system, IDEAL, s, None, dt, steps, every=every)[1])(state)
+    return quick_jit(lambda s: jc.rollout(system, IDEAL, s, None, dt, steps, every=every)[1])(state)
 
 
 def test_skate_keeps_energy_and_momentum_of_the_augmented_lagrangian():
@@ -75,25 +78,20 @@ def test_rolling_in_space_keeps_energy_and_the_momenta_of_its_symmetries():
     scene.add(jc.RollingDisc("roll", jc.WORLD, "disc", radius=0.5, axis=axis))
     system, state = scene.build()
     rows = linearize(system, state.q, state.v, state.time)
-    j = np.asarray(rows.jacobian.dense())
-    state = jax.tree.map(lambda x: x, state)
-    start = state.v - jnp.asarray(np.linalg.pinv(j) @ np.asarray(rows.rate))
-    state = jc.State(state.q, start, state.time, state.status)
+    slip = np.linalg.pinv(np.asarray(rows.jacobian.dense())) @ np.asarray(rows.rate)
+    state = dataclasses.replace(state, v=state.v - slip)
     system, state = jc.vakonomic(system, state, {"roll": np.array([0.4, -0.2])})
-    path = run(system, state)
-    energy = jax.vmap(lambda s: jc.energy(system, s).total)(path)
-    np.testing.assert_allclose(energy, jc.energy(system, state).total, rtol=1e-9)
 
-    def shift(s):
-        """∂(L + μ·ψ)/∂ẋ, ∂/∂ẏ."""
+    def kept(s):
+        """Energy, ∂(L + μ·ψ)/∂ẋ and ∂/∂ẏ."""
         rows = linearize(system.system, s.q, s.v[:6], s.time)
         μ = jnp.zeros(3).at[system.free].set(system.multipliers(s, "roll"))
-        return (2.0 * s.v[:6] + rows.jacobian.transpose(μ))[:2]
+        shift = 2.0 * s.v[:6] + rows.jacobian.transpose(μ)
+        return jnp.append(jc.energy(system, s).total, shift[:2])
 
-    expected = np.tile(shift(state), (5, 1))
-    np.testing.assert_allclose(jax.vmap(shift)(path), expected, atol=1e-9)
-    moved = np.asarray(path.v)[:, 6:] - np.asarray(state.v)[6:]
-    assert np.max(np.abs(moved)) > 1e-2
+    path = run(system, state)
+    assert np.max(np.abs(path.v[-1, 6:] - state.v[6:])) > 1e-2
+    np.testing.assert_allclose(jax.vmap(kept)(path), np.tile(kept(state), (5, 1)), atol=1e-8)
 
 
 def radius_rate(q, v, t, p):
@@ -158,12 +156,12 @@ def test_batches_and_gradients():
         changed = system.with_params({"skate": {"mass": mass}})
         return jc.rollout(changed, IDEAL, start, None, 1e-2, 20)[0].q[1]
 
-    one = jax.jit(end)
+    one = quick_jit(end)
     masses = jnp.asarray([1.0, 1.3, 2.0])
-    batch = jax.jit(jax.vmap(end, (None, 0)))(0.2, masses)
+    batch = quick_jit(jax.vmap(end, (None, 0)))(0.2, masses)
     np.testing.assert_allclose(batch, [one(0.2, m) for m in masses], rtol=1e-12)
     h = 1e-5
-    slopes = jax.jit(jax.grad(end, (0, 1)))(0.2, 1.3)
+    slopes = quick_jit(jax.grad(end, (0, 1)))(0.2, 1.3)
     by_μ = (one(0.2 + h, 1.3) - one(0.2 - h, 1.3)) / (2 * h)
     by_mass = (one(0.2, 1.3 + h) - one(0.2, 1.3 - h)) / (2 * h)
     np.testing.assert_allclose(slopes, [by_μ, by_mass], rtol=1e-6)

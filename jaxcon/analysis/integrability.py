@@ -94,7 +94,8 @@ def integrability(system: Any, state: State, names: Sequence[str] | None = None)
     chosen = holding if names is None else tuple(names)
     if not chosen:
         raise ValueError("integrability: there is no constraint whose rows could be looked at.")
-    rows = np.sort(np.concatenate([layout.rows(name) for name in chosen]))
+    rows = np.concatenate([layout.rows(name) for name in chosen])
+    rows = rows[np.argsort(~layout.holonomic[rows], kind="stable")]  # those with a φ first
     metric = _Metric(system, state)
     jacobian = np.asarray(_rows(system, state.q, state.time, rows)[0]) @ metric.out
     tolerance = 1e-9 if state.q.dtype == np.float64 else 1e-4

@@ -45,16 +45,16 @@ class Vakonomic:
 
     Attributes:
         system: the physical one, a `BodySystem` or `GeneralizedSystem`.
-        layout_of_rows: of the constraints.
+        rows: which rows belong to which constraint, and which have no φ.
     """
 
     system: Any
-    layout_of_rows: RowLayout = static()
+    rows: RowLayout = static()
 
     @property
     def free(self) -> np.ndarray:
         """Numbers of the rows that have a μ."""
-        return np.asarray(self.layout_of_rows.free)
+        return np.asarray(self.rows.free)
 
     def physical(self, state: State) -> State:
         """A state of the physical system: without μ."""
@@ -62,7 +62,7 @@ class Vakonomic:
 
     def multipliers(self, state: State, name: str) -> Array:
         """μ of a constraint, by those of its rows that have no φ."""
-        mine = np.isin(self.free, self.layout_of_rows.rows(name))
+        mine = np.isin(self.free, self.rows.rows(name))
         return state.v[state.v.shape[0] - len(self.free) :][mine]
 
     @property
@@ -116,7 +116,7 @@ class Vakonomic:
 
     def curvature(self, q: Array, v: Array, t: Any, μ: Array) -> Array:
         """Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v Aᵀμ, (n_v,)."""
-        system, every = self.system, jnp.zeros(self.layout_of_rows.size, q.dtype)
+        system, every = self.system, jnp.zeros(self.rows.size, q.dtype)
         every = every.at[self.free].set(μ)
 
         def momentum(q: Array, t: Any) -> Array:

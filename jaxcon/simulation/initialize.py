@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
@@ -34,8 +35,7 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
     chosen = [x for x in (q, v, *jax.tree.leaves(system)) if isinstance(x, jax.Array)]
     floating = (x.dtype for x in chosen if jnp.issubdtype(x.dtype, jnp.floating))
     dtype = next(floating, jnp.result_type(float))
-    given = jnp.asarray(q).shape
-    n_q, n_v = system.sizes(given[-1] if given else 1)
+    n_q, n_v = system.sizes(np.shape(q)[-1] if np.ndim(q) else 0)
     q = checks.number("init", "q", q, dtype, (n_q,))
     v = checks.number("init", "v", v, dtype, (n_v,))
     check_dtype(system, dtype)
