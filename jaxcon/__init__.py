@@ -28,10 +28,12 @@ from jaxcon.constraints.joints import (
 from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.assembly import Assembly, assemble
+from jaxcon.dynamics.chains import Chain, hanging, rod, rope
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.model.elastic import Bending, Flexure
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, JointSpring, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
@@ -61,6 +63,8 @@ __all__ = [
     "AngularMomentum",
     "Assembly",
     "Baumgarte",
+    "Bending",
+    "Chain",
     "Coincident",
     "ConjugateGradients",
     "CustomForce",
@@ -71,6 +75,7 @@ __all__ = [
     "ExplicitEuler",
     "ExternalWrench",
     "Fixed",
+    "Flexure",
     "Force",
     "GeneralizedSystem",
     "Heun",
@@ -104,6 +109,7 @@ __all__ = [
     "center_of_mass",
     "energy",
     "forward_dynamics",
+    "hanging",
     "inertia",
     "init",
     "largest_stable_rate",
@@ -114,7 +120,9 @@ __all__ = [
     "quaternion",
     "raise_for_status",
     "report",
+    "rod",
     "rollout",
+    "rope",
     "step",
     "velocity",
     "violation",

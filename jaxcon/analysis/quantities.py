@@ -172,7 +172,7 @@ def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str
         for p in group.places
     ]
     sides = list(getattr(getattr(group, "law", None), "bodies", sides))
-    moving = [side for side in sides if side in system.layout.bodies]
+    moving = [side for side in sides if side in system.layout.places]
     target = sides[-1] if body is None else body
     if target in moving:
         return target, 1

@@ -116,9 +116,9 @@ class Gather:
 
     def drives(self, drives: list[Any], joints: list[Any]) -> list[Any]:
         """Prescribed motions, one group each."""
-        result = []
+        result, where = [], _places(joints)
         for drive in drives:
-            group, index = self._find_joint(drive, joints)
+            group, index = self._find_joint(drive, joints, where)
             params = self._params(drive)
             places = joints[group].select((index,)).places
             drives_one = Drives(params, _bare(drive), group, index, places)
@@ -129,8 +129,9 @@ class Gather:
     def joint_springs(self, springs: list[Any], joints: list[Any]) -> list[Any]:
         """Springs about joint coordinates, by the group of their joints."""
         found: dict[int, list[tuple[Any, int]]] = {}
+        where = _places(joints)
         for spring in springs:
-            group, index = self._find_joint(spring, joints)
+            group, index = self._find_joint(spring, joints, where)
             found.setdefault(group, []).append((spring, index))
         result = []
         for group, members in found.items():
@@ -146,7 +147,7 @@ class Gather:
         result = []
         for constraint in constraints:
             self._check_user(constraint)
-            moving = [name for name in constraint.bodies if name in self.layout.bodies]
+            moving = [name for name in constraint.bodies if name in self.layout.places]
             places = tuple(self._place((name,)) for name in moving)
             result.append(CustomOnBodies(self._params(constraint), _bare(constraint), places))
         return result
@@ -216,10 +217,10 @@ class Gather:
         return result
 
     def _group(self, name: str) -> int | None:
-        return self.layout.locate(name)[0] if name in self.layout.bodies else None
+        return self.layout.locate(name)[0] if name in self.layout.places else None
 
     def _place(self, names: tuple[str, ...]) -> Place:
-        if names[0] not in self.layout.bodies:
+        if names[0] not in self.layout.places:
             return Place(None, ())
         located = [self.layout.locate(name) for name in names]
         return Place(located[0][0], tuple(index for _, index in located))
@@ -232,7 +233,7 @@ class Gather:
                 raise ValueError(f"{owner}: body '{name}' is unknown; known are {known}.")
         if len(set(names)) < len(names):
             raise ValueError(f"{owner}: it joins body '{names[0]}' to itself.")
-        if not any(name in self.layout.bodies for name in names):
+        if not any(name in self.layout.places for name in names):
             raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")
 
     def _check_joint(self, joint: Any) -> None:
@@ -253,15 +254,19 @@ class Gather:
             raise ValueError(f"{owner}: bodies must be a tuple of names, got {element.bodies!r}.")
         self._check_bodies(element, element.bodies)
 
-    def _find_joint(self, element: Any, joints: list[Any]) -> tuple[int, int]:
+    def _find_joint(self, element: Any, joints: list[Any], where: Any) -> tuple[int, int]:
         owner = f"{type(element).__name__} '{element.name}'"
-        for group, candidates in enumerate(joints):
-            if element.joint in candidates.names:
-                if not hasattr(getattr(candidates, "joint", None), "coordinate"):
-                    raise ValueError(f"{owner}: '{element.joint}' has no coordinate.")
-                return group, candidates.names.index(element.joint)
-        known = [name for group in joints for name in group.names]
-        raise ValueError(f"{owner}: joint '{element.joint}' is unknown; known are {known}.")
+        if element.joint not in where:
+            raise ValueError(f"{owner}: joint '{element.joint}' is unknown; known are {[*where]}.")
+        group, index = where[element.joint]
+        if not hasattr(getattr(joints[group], "joint", None), "coordinate"):
+            raise ValueError(f"{owner}: '{element.joint}' has no coordinate.")
+        return group, index
+
+
+def _places(joints: list[Any]) -> dict[str, tuple[int, int]]:
+    """Group and index of each joint, by name."""
+    return {name: (g, i) for g, group in enumerate(joints) for i, name in enumerate(group.names)}
 
 
 def _of(elements: Iterable[Any], *classes: type) -> list[Any]:

@@ -25,6 +25,7 @@ from jaxcon.verification import (
     rotations,
     stabilisation,
     statics,
+    suspended,
 )
 from jaxcon.verification.case import Check
 
@@ -57,6 +58,7 @@ CASES: dict[str, Callable[[], list[Check]]] = {
         statics.tension,
         statics.power,
         statics.balance,
+        suspended.hanging_chain,
         stabilisation.feedback_in_time,
         stabilisation.feedback_in_steps,
         stabilisation.feedback_limits,
