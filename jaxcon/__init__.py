@@ -54,6 +54,7 @@ from jaxcon.constraints.shafts import ConstantVelocity, Universal
 from jaxcon.constraints.span import Span
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.assembly import Assembly, assemble
+from jaxcon.dynamics.chains import Chain, hanging, rod, rope
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
 from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
@@ -68,6 +69,7 @@ from jaxcon.model.actuators import (
     VelocityServo,
 )
 from jaxcon.model.coordinates import TurnCounter
+from jaxcon.model.elastic import Bending, Flexure
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
@@ -100,6 +102,8 @@ __all__ = [
     "Assembly",
     "Baumgarte",
     "Belt",
+    "Bending",
+    "Chain",
     "Coincident",
     "ConjugateGradients",
     "ConstantVelocity",
@@ -113,6 +117,7 @@ __all__ = [
     "ExplicitEuler",
     "ExternalWrench",
     "Fixed",
+    "Flexure",
     "Force",
     "Gear",
     "GeneralizedSystem",
@@ -172,6 +177,7 @@ __all__ = [
     "coordinate_rate",
     "energy",
     "forward_dynamics",
+    "hanging",
     "inertia",
     "init",
     "integrability",
@@ -183,7 +189,9 @@ __all__ = [
     "quaternion",
     "raise_for_status",
     "report",
+    "rod",
     "rollout",
+    "rope",
     "step",
     "vakonomic",
     "velocity",

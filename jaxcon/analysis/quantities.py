@@ -192,8 +192,9 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
 def _row(system: Any, state: State, joint: str, name: str | None) -> Any:
     """A coordinate of one joint with its rate."""
     system = at(system, state)
-    end = coordinates.find(system.constraints, "coordinate", joint, name)
-    along = coordinates.at(system.counted, [end])
+    where = coordinates.directory(system.constraints)
+    end = coordinates.find(system.constraints, where, "coordinate", joint, name)
+    along = coordinates.at(coordinates.numbered(system.counted), [end])
     return along.read(system.snapshot(state.q, state.v, state.time))
 
 
@@ -204,7 +205,7 @@ def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str
         for p in group.places
     ]
     sides = list(getattr(getattr(group, "law", None), "bodies", sides))
-    moving = [side for side in sides if side in system.layout.bodies]
+    moving = [side for side in sides if side in system.layout.places]
     target = sides[-1] if body is None else body
     if target in moving:
         return target, 1

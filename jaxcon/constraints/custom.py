@@ -150,7 +150,7 @@ class CustomOnBodies(Custom):
     def problem(self, snapshot: Any) -> tuple[Any, Any, Any, Any]:
         """q and v of the bodies that move, q̇ = N(q) v, and the function as call(q, v, t)."""
         layout = snapshot.system.layout
-        moving = [name for name in self.law.bodies if name in layout.bodies]
+        moving = [name for name in self.law.bodies if name in layout.places]
         kinds = [layout.groups[layout.locate(name)[0]].kind for name in moving]
 
         def kinematics(q: Any, v: Any) -> Any:

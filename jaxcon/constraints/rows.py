@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -57,10 +58,14 @@ class RowLayout:
         Raises:
             ValueError: no constraint has this name.
         """
-        for entry, first, count, stride in self.entries:
-            if entry == name:
-                return first + stride * np.arange(count)
-        raise ValueError(f"constraint '{name}' is unknown; known are {list(self.names)}.")
+        if name not in self._places:
+            raise ValueError(f"constraint '{name}' is unknown; known are {list(self.names)}.")
+        first, count, stride = self._places[name]
+        return first + stride * np.arange(count)
+
+    @cached_property
+    def _places(self) -> dict[str, list[int]]:
+        return {name: place for name, *place in self.entries}
 
     @property
     def size(self) -> int:

@@ -12,7 +12,15 @@ from jaxcon.constraints.base import Joints
 from jaxcon.constraints.couplings import Couplings
 from jaxcon.constraints.drive import Drives
 from jaxcon.model.actuators import JointForces, label
-from jaxcon.model.coordinates import End, JointCoordinate, at, find, turns_over
+from jaxcon.model.coordinates import (
+    End,
+    JointCoordinate,
+    at,
+    directory,
+    find,
+    numbered,
+    turns_over,
+)
 from jaxcon.model.elements import stack
 from jaxcon.model.layout import Layout, Place
 
@@ -32,7 +40,9 @@ class Along:
     ) -> None:
         self.joints, self.layout, self.dtype = joints, layout, dtype
         self.elements = [e for e in elements if hasattr(e, "joint") or hasattr(e, "along")]
+        self.where = directory(joints)
         self.counted = self._count()
+        self.counters = numbered(self.counted)
 
     def forces(self) -> list[JointForces]:
         """Springs, dampers, motors and servos."""
@@ -65,7 +75,7 @@ class Along:
         result = []
         for drive in drives:
             (end,) = self._ends(drive)
-            along = at(self.counted, [end])
+            along = at(self.counters, [end])
             places, _ = self._places(((end,),))
             one = Drives(params(drive), bare(drive), along, places)
             one.check(self.dtype)
@@ -84,7 +94,7 @@ class Along:
         for (cls, *_), members in groups.items():
             names = tuple(element.name for element, _, _ in members)
             columns = tuple(zip(*(ends for _, ends, _ in members), strict=True))
-            along = tuple(at(self.counted, column) for column in columns)
+            along = tuple(at(self.counters, column) for column in columns)
             places, sides = self._places(columns)
             yield cls, stack([p for *_, p in members]), names, along, places, sides
 
@@ -112,7 +122,7 @@ class Along:
     def _pattern(self, ends: tuple[End, ...]) -> tuple[int, ...]:
         """Which of the bodies of an element are the same one, and what its angles count."""
         bodies = [body for end in ends for body in self._bodies(end)]
-        counts = [len(at(self.counted, [end]).counters) for end in ends]
+        counts = [len(at(self.counters, [end]).counters) for end in ends]
         return (*(bodies.index(body) for body in bodies), *counts)
 
     def _places(
@@ -131,8 +141,10 @@ class Along:
     def _ends(self, element: Any) -> tuple[End, ...]:
         """The coordinates that an element acts on."""
         if hasattr(element, "along"):
-            return tuple(find(self.joints, label(element), *end) for end in element.along)
-        return (find(self.joints, label(element), element.joint, element.coordinate),)
+            return tuple(
+                find(self.joints, self.where, label(element), *end) for end in element.along
+            )
+        return (find(self.joints, self.where, label(element), element.joint, element.coordinate),)
 
 
 def _width(cls: type) -> int:

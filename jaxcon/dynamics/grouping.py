@@ -147,7 +147,7 @@ class Gather:
         result = []
         for constraint in constraints:
             self._check_user(constraint)
-            moving = [name for name in constraint.bodies if name in self.layout.bodies]
+            moving = [name for name in constraint.bodies if name in self.layout.places]
             places = tuple(self._place((name,)) for name in moving)
             result.append(CustomOnBodies(self._params(constraint), _bare(constraint), places))
         return result
@@ -214,10 +214,10 @@ class Gather:
         return result
 
     def _group(self, name: str) -> int | None:
-        return self.layout.locate(name)[0] if name in self.layout.bodies else None
+        return self.layout.locate(name)[0] if name in self.layout.places else None
 
     def _place(self, names: tuple[str, ...]) -> Place:
-        if names[0] not in self.layout.bodies:
+        if names[0] not in self.layout.places:
             return Place(None, (), names)
         located = [self.layout.locate(name) for name in names]
         return Place(located[0][0], tuple(index for _, index in located))
@@ -230,7 +230,7 @@ class Gather:
                 raise ValueError(f"{owner}: body '{name}' is unknown; known are {known}.")
         if len(set(names)) < len(names):
             raise ValueError(f"{owner}: it joins body '{names[0]}' to itself.")
-        if not any(name in self.layout.bodies for name in names):
+        if not any(name in self.layout.places for name in names):
             raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")
 
     def _check_joint(self, joint: Any) -> None:

@@ -16,6 +16,7 @@ from jaxcon.dynamics import grouping
 from jaxcon.dynamics.along import no_turns
 from jaxcon.dynamics.inputs import BodyInput, resolve
 from jaxcon.geometry.pose import Pose, WorldPose
+from jaxcon.model.elements import side_by_side
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
@@ -171,8 +172,8 @@ class Scene:
         q, v = [], []
         for group in layout.groups:
             pairs = [group.kind.coordinates(bodies[name].motion) for name in group.names]
-            q.append(jnp.stack([x for x, _ in pairs], axis=-1).ravel())
-            v.append(jnp.stack([y for _, y in pairs], axis=-1).ravel())
+            q.append(side_by_side([x for x, _ in pairs]).ravel())
+            v.append(side_by_side([y for _, y in pairs]).ravel())
         if not q:
             raise ValueError("Scene: there is no body that moves; add one with add_body.")
         status = jnp.asarray(Status.OK, jnp.int32)

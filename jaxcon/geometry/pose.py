@@ -43,7 +43,7 @@ class Pose:
 
     def direction(self, local: Array) -> Array:
         """R u: a direction of the body in the world frame."""
-        return self.rotation @ local
+        return local if self.orientation is None else self.rotation @ local
 
     def local_point(self, world: Array) -> Array:
         """Rᵀ (p − x): a world point in the body frame."""
@@ -51,7 +51,7 @@ class Pose:
 
     def local_direction(self, world: Array) -> Array:
         """Rᵀ n: a world direction in the body frame."""
-        return self.rotation.T @ world
+        return world if self.orientation is None else self.rotation.T @ world
 
 
 @pytree

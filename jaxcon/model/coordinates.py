@@ -54,34 +54,46 @@ End = tuple[int, int, str]
 """A coordinate of one joint: its group, its index there, and the coordinate's name."""
 
 
-def find(groups: Sequence[Any], owner: str, joint: str, name: str | None) -> End:
-    """A coordinate of a joint by name.
+def directory(groups: Sequence[Any]) -> dict[str, tuple[int, int]]:
+    """Group and index of each joint, by name."""
+    joints = ((g, group) for g, group in enumerate(groups) if hasattr(group, "joint"))
+    return {name: (g, i) for g, group in joints for i, name in enumerate(group.names)}
+
+
+def find(groups: Sequence[Any], where: Any, owner: str, joint: str, name: str | None) -> End:
+    """A coordinate of a joint by name; `where` is the directory of the groups.
 
     Raises:
         ValueError: no joint has this name, or it has no such coordinate, or several.
     """
-    joints = {g: group for g, group in enumerate(groups) if hasattr(group, "joint")}
-    for g, group in joints.items():
-        if joint in group.names:
-            known = list(getattr(group.joint, "coordinates", ()))
-            if not known:
-                raise ValueError(f"{owner}: '{joint}' has no coordinate.")
-            chosen = known[0] if name is None and len(known) == 1 else name
-            if chosen not in known:
-                raise ValueError(
-                    f"{owner}: the coordinates of '{joint}' are {known}; say which, got {name!r}."
-                )
-            return g, group.names.index(joint), chosen
-    names = [name for group in joints.values() for name in group.names]
-    raise ValueError(f"{owner}: joint '{joint}' is unknown; known are {names}.")
+    if joint not in where:
+        raise ValueError(f"{owner}: joint '{joint}' is unknown; known are {[*where]}.")
+    group, index = where[joint]
+    known = list(getattr(groups[group].joint, "coordinates", ()))
+    if not known:
+        raise ValueError(f"{owner}: '{joint}' has no coordinate.")
+    chosen = known[0] if name is None and len(known) == 1 else name
+    if chosen not in known:
+        raise ValueError(
+            f"{owner}: the coordinates of '{joint}' are {known}; say which, got {name!r}."
+        )
+    return group, index, chosen
 
 
-def at(counted: tuple[JointCoordinate, ...], ends: Iterable[End]) -> JointCoordinate:
+Counters = dict[tuple[int, str], dict[int, int]]
+"""By group and coordinate: where the state holds the turns of each joint."""
+
+
+def numbered(counted: tuple[JointCoordinate, ...]) -> Counters:
+    """The same by joint."""
+    return {(c.group, c.name): dict(zip(c.joints, c.counters, strict=True)) for c in counted}
+
+
+def at(counters: Counters, ends: Iterable[End]) -> JointCoordinate:
     """The same coordinate of several joints of one group, with the counters of its turns."""
     groups, joints, names = zip(*ends, strict=True)
-    known = [c for c in counted if (c.group, c.name) == (groups[0], names[0])]
-    counters = {j: n for c in known for j, n in zip(c.joints, c.counters, strict=True)}
-    own = tuple(counters[j] for j in joints if j in counters)
+    known = counters.get((groups[0], names[0]), {})
+    own = tuple(known[j] for j in joints if j in known)
     return JointCoordinate(groups[0], joints, names[0], own if len(own) == len(joints) else ())
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -68,8 +68,15 @@ class Elements:
 
 def stack(elements: list[dict[str, Any]]) -> dict[str, Any]:
     """The numbers of elements side by side: arrays (), (n,) become lanes, Vectors of lanes."""
-    stacked = jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *elements)
+    stacked = jax.tree.map(lambda *x: side_by_side(x), *elements)
     return jax.tree.map(lambda x: x if x.ndim == 1 else Vector.of(x), stacked)
+
+
+def side_by_side(arrays: Sequence[Array]) -> Array:
+    """Arrays along a new last axis; on the host where they are known, since they may be many."""
+    if checks.is_concrete(arrays):
+        return jnp.asarray(np.stack([np.asarray(x) for x in arrays], axis=-1))
+    return jnp.stack(arrays, axis=-1)
 
 
 def element_at(x: Any, i: int) -> Array:

@@ -7,6 +7,7 @@ and so on, so that reshaping a slice of q to (component, body) moves nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -100,7 +101,12 @@ class Layout:
     @property
     def bodies(self) -> tuple[str, ...]:
         """Names of the bodies with coordinates."""
-        return tuple(name for group in self.groups for name in group.names)
+        return tuple(self.places)
+
+    @cached_property
+    def places(self) -> dict[str, tuple[int, int]]:
+        """Group and index of each body with coordinates, by name."""
+        return {n: (g, i) for g, group in enumerate(self.groups) for i, n in enumerate(group.names)}
 
     def locate(self, name: str) -> tuple[int, int]:
         """Group and index of a body.
@@ -108,9 +114,8 @@ class Layout:
         Raises:
             ValueError: no body has this name, or it has no coordinates.
         """
-        for i, group in enumerate(self.groups):
-            if name in group.names:
-                return i, group.names.index(name)
+        if name in self.places:
+            return self.places[name]
         reason = "is fixed to the world" if name in (WORLD, *self.fixed) else "is unknown"
         raise ValueError(f"body '{name}' {reason}; the bodies that move are {list(self.bodies)}.")
 

@@ -81,7 +81,7 @@ class Elimination:
         others = [None if p == first else p for p in nodes]
         whole = self._entries([(p, p) for p in nodes])
         changed = self.updates.sum((p, p) for p in others)
-        pairs = [(step.following(p), p) for p in nodes]
+        pairs = step.pairs
         sides = [less(self._entries(pairs), self.updates.sum(pairs))]
         for g in step.border:
             side = self._entries([(g, p) for p in nodes])

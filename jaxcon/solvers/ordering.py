@@ -9,6 +9,7 @@ joints of two bodies each has none.
 from __future__ import annotations
 
 import functools
+import heapq
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -80,9 +81,11 @@ class Run:
         """The nodes, ascending in their elements."""
         return list(self.nodes[::-1] if self.descending else self.nodes)
 
-    def following(self, node: Node) -> Node:
-        """The neighbour of one of the nodes that is eliminated after it."""
-        return (*self.nodes, self.parent)[self.nodes.index(node) + 1]
+    @property
+    def pairs(self) -> list[tuple[Node, Node]]:
+        """For each node, ascending, the neighbour that is eliminated after it, and itself."""
+        pairs = list(zip((*self.nodes[1:], self.parent), self.nodes, strict=True))
+        return pairs[::-1] if self.descending else pairs
 
     @property
     def descending(self) -> bool:
@@ -178,10 +181,21 @@ def minimum_degree(
     order: list[Any] = []
     later: dict[Any, set[Any]] = {}
     near: set[Any] = set()
+
+    def key(node: Any) -> tuple[int, bool, int, int]:
+        return len(graph[node]), node not in near, distance[node], rank[node]
+
+    # the least of all, by a heap in which degrees that have changed stand twice, and of the near
+    heap = [(len(graph[node]), distance[node], rank[node], node) for node in graph]
+    heapq.heapify(heap)
     while graph:
-        node = min(graph, key=lambda x: (len(graph[x]), x not in near, distance[x], rank[x]))
+        while heap[0][3] not in graph or heap[0][0] != len(graph[heap[0][3]]):
+            heapq.heappop(heap)
+        node = min((heap[0][3], *near), key=key)
         later[node] = near = _eliminate(graph, node)
         order.append(node)
+        for other in near:
+            heapq.heappush(heap, (len(graph[other]), distance[other], rank[other], other))
     return order, _sorted(order, later)
 
 
@@ -203,10 +217,11 @@ def _sorted(order: list[Any], later: dict[Any, set[Any]]) -> dict[Any, list[Any]
 def distances(neighbours: dict[Any, set[Any]], start: list[Any]) -> dict[Any, int]:
     """How many nodes away each is from the nearest of some; all of them where there is none."""
     result = dict.fromkeys(start, 0)
-    front = start
+    front, away = start, 0
     while front:
+        away += 1
         front = [other for node in front for other in neighbours[node] if other not in result]
-        result.update(dict.fromkeys(front, max(result.values()) + 1))
+        result.update(dict.fromkeys(front, away))
     return {node: result.get(node, len(neighbours)) for node in neighbours}
 
 

@@ -29,6 +29,7 @@ from jaxcon.verification import (
     single_joints,
     stabilisation,
     statics,
+    suspended,
 )
 from jaxcon.verification.case import Check
 
@@ -69,6 +70,7 @@ CASES: dict[str, Callable[[], list[Check]]] = {
         statics.tension,
         statics.power,
         statics.balance,
+        suspended.hanging_chain,
         stabilisation.feedback_in_time,
         stabilisation.feedback_in_steps,
         stabilisation.feedback_limits,

@@ -1,0 +1,173 @@
+"""Force elements of slender bodies: bending of a chain of points, bending and twist of links."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.core import checks, numerics
+from jaxcon.core.lanes import Vector, axes, times, total
+from jaxcon.core.typing import Array, Lane
+from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import own_point
+
+
+@dataclass(frozen=True)
+class Bending:
+    """Bending of an inextensible chain at a point between two others: E = ½ (B/s) ‖t₂ − t₁‖².
+
+    t₁ = (r_b − r_a)/s₁ and t₂ = (r_c − r_b)/s₂ are tangents by the distances s₁, s₂ at assembly,
+    and s their mean: the sum over a chain tends to ½ ∫ B κ² ds. The forces are linear in positions.
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b, body_c: names, or `WORLD`; the chain runs from a through b to c.
+        stiffness: B = E I [N m²].
+        point_a, point_b, point_c: world points at assembly, (dim,) [m]; centres of mass unless
+            given.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    body_c: str
+    stiffness: Any
+    point_a: Any = None
+    point_b: Any = None
+    point_c: Any = None
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The names of the bodies it acts on."""
+        return (self.body_a, self.body_b, self.body_c)
+
+    def attach(self, a: Pose, b: Pose, c: Pose) -> dict[str, Array]:
+        """The points in the frames of the bodies, and the distances between them."""
+        owner = f"Bending '{self.name}'"
+        first, middle, last = (
+            own_point(self, what, getattr(self, what), pose)
+            for what, pose in (("point_a", a), ("point_b", b), ("point_c", c))
+        )
+        checks.nonzero(owner, "point_b − point_a", middle - first)
+        checks.nonzero(owner, "point_c − point_b", last - middle)
+        stiffness = checks.number(owner, "stiffness", self.stiffness, a.position.dtype)
+        checks.positive(owner, "stiffness", stiffness, strictly=False)
+        return {
+            "anchor_a": a.local_point(first),
+            "anchor_b": b.local_point(middle),
+            "anchor_c": c.local_point(last),
+            "before": numerics.norm(middle - first),
+            "after": numerics.norm(last - middle),
+            "stiffness": stiffness,
+        }
+
+    @staticmethod
+    def forces(p: dict[str, Any], a: Any, b: Any, c: Any) -> tuple[Vector, ...]:
+        """With g = (B/s)(t₂ − t₁): −g/s₁ at a, g (1/s₁ + 1/s₂) at b, −g/s₂ at c."""
+        points, bend = _bend(p, a, b, c)
+        g = bend * (2 * p["stiffness"] / (p["before"] + p["after"]))
+        on_a, on_c = g * (-1 / p["before"]), g * (-1 / p["after"])
+        on_b = -(on_a + on_c)
+        return tuple(x.pull(f) for x, f in zip(points, (on_a, on_b, on_c), strict=True))
+
+    @staticmethod
+    def potential(p: dict[str, Any], a: Any, b: Any, c: Any) -> Lane:
+        """½ (B/s) ‖t₂ − t₁‖²."""
+        bend = _bend(p, a, b, c)[1]
+        return p["stiffness"] / (p["before"] + p["after"]) * bend.dot(bend)
+
+
+def _bend(p: dict[str, Any], a: Any, b: Any, c: Any) -> tuple[tuple[Any, ...], Vector]:
+    """The three points, and t₂ − t₁."""
+    points = a.point(p["anchor_a"]), b.point(p["anchor_b"]), c.point(p["anchor_c"])
+    first, middle, last = (x.position for x in points)
+    return points, (last - middle) * (1 / p["after"]) - (middle - first) * (1 / p["before"])
+
+
+@dataclass(frozen=True)
+class Flexure:
+    """A joint that resists bending and twist between rigid bodies: E = Σ κᵢ (1 − aᵢ·bᵢ).
+
+    aᵢ are the principal axes of the first body, x along its length, and bᵢ the directions of the
+    second one that agree with them when relaxed. For small turns θ about these axes E is
+    ½ k_t θ_x² + ½ k_b (θ_y² + θ_z²) with κ_x = k_b − k_t/2 and κ_y = κ_z = k_t/2; it is smooth at
+    every turn. In the plane E = k_b (1 − cos θ).
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names of bodies, or `WORLD`.
+        bending: k_b, B/s for links of length s [N m/rad].
+        twisting: k_t ≤ 2 k_b, in space [N m/rad].
+        straight: whether it is relaxed where the principal axes of both agree; otherwise where it
+            is at assembly.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    bending: Any
+    twisting: Any = 0.0
+    straight: bool = False
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """The names of the bodies it acts on."""
+        return (self.body_a, self.body_b)
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """The stiffnesses, and the relaxed directions in the second body."""
+        owner, dtype = f"Flexure '{self.name}'", a.position.dtype
+        for name, pose in zip(self.bodies, (a, b), strict=True):
+            if pose.orientation is None:
+                raise ValueError(f"{owner}: '{name}' is a particle: it has no orientation.")
+        bending = checks.number(owner, "bending", self.bending, dtype)
+        twisting = checks.number(owner, "twisting", self.twisting, dtype)
+        for what, x in (("bending", bending), ("twisting", twisting)):
+            checks.positive(owner, what, x, strictly=False)
+        dim = a.position.shape[0]
+        if checks.is_concrete((bending, twisting)) and float(twisting) > 2 * float(bending):
+            raise ValueError(
+                f"{owner}: twisting must be at most twice bending, got {float(twisting):g} and"
+                f" {float(bending):g}: beyond that the straight joint is unstable at large turns."
+            )
+        params = {"bending": bending}
+        if dim == 3:
+            params["twisting"] = twisting
+        if not self.straight:
+            own = jnp.eye(dim, dtype=dtype)[: 1 if dim == 2 else 3]
+            params |= {f"relaxed_{i}": b.local_direction(a.direction(x)) for i, x in enumerate(own)}
+        return params
+
+    @staticmethod
+    def forces(p: dict[str, Any], a: Any, b: Any) -> tuple[Vector, Vector]:
+        """κᵢ ∂(aᵢ·bᵢ) on each body."""
+        pulls = [
+            (u.pull(w.position) * k, w.pull(u.position) * k) for u, w, k in _directors(p, a, b)
+        ]
+        first, second = (_sum(side) for side in zip(*pulls, strict=True))
+        return first, second
+
+    @staticmethod
+    def potential(p: dict[str, Any], a: Any, b: Any) -> Lane:
+        """Σ κᵢ (1 − aᵢ·bᵢ)."""
+        return total(k * (1 - u.position.dot(w.position)) for u, w, k in _directors(p, a, b))
+
+
+def _sum(vectors: tuple[Vector, ...]) -> Vector:
+    """The sum of vectors."""
+    return Vector(*(total(lanes) for lanes in zip(*vectors, strict=True)))
+
+
+def _directors(p: dict[str, Any], a: Any, b: Any) -> list[tuple[Any, Any, Lane]]:
+    """aᵢ, bᵢ and κᵢ."""
+    if "twisting" not in p:
+        shares, own = [p["bending"]], axes(2)[:1]
+    else:
+        half = times(0.5, p["twisting"])
+        shares, own = [p["bending"] - half, half, half], axes(3)
+    return [
+        (a.direction(e), b.direction(p.get(f"relaxed_{i}", e)), k)
+        for i, (e, k) in enumerate(zip(own, shares, strict=True))
+    ]

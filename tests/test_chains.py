@@ -1,0 +1,206 @@
+"""Ropes and rods: their shape, the energy of bending, what holds them, and how they scale."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from tolerances import IDENTITY
+
+import jaxcon as jc
+from jaxcon.solvers import ordering
+
+
+def circle(links, radius, dim=2):
+    """Points on half a circle."""
+    angles = np.linspace(0, np.pi, links + 1)
+    points = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.pad(points, ((0, 0), (0, dim - 2)))
+
+
+def helix(links):
+    s = np.linspace(0, 4, links + 1)
+    return np.column_stack([np.cos(s), np.sin(s), 0.3 * s])
+
+
+def test_a_rope_keeps_its_mass_and_its_lengths():
+    scene = jc.Scene(dim=3)
+    points = helix(12)
+    chain = jc.rope(scene, "rope", points, 2.4, start=None)
+    system, state = scene.build()
+    assert chain.bodies == tuple(f"rope.{i}" for i in range(13))
+    assert len(chain.joints) == 12
+    masses = np.array([system.params[name]["mass"] for name in chain.bodies])
+    np.testing.assert_allclose(masses.sum(), 2.4, rtol=IDENTITY)
+    np.testing.assert_allclose(masses[0], 0.1, rtol=IDENTITY)
+    assert jc.violation(system, state).worst < 1e-15
+    places = [jc.position(system, state, name) for name in chain.bodies]
+    np.testing.assert_allclose(places, points, atol=1e-15)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_bending_energy_of_an_arc(dim):
+    """E = ½ (B/s) (2 sin δ/2)² at each joint, for ropes and, with stiffness B/s, for rods."""
+    n, radius, stiffness = 20, 1.5, 0.7
+    points, δ = circle(n, radius, dim), np.pi / n
+    s = 2 * radius * np.sin(δ / 2)
+    expected = (n - 1) * stiffness / s * 2 * np.sin(δ / 2) ** 2
+    for build, options in ((jc.rope, {}), (jc.rod, {"radius": 0.02, "twisting": 0.5})):
+        scene = jc.Scene(dim=dim, gravity=np.zeros(dim))
+        options = {} if dim == 2 else options
+        build(scene, "c", points, 1.0, end=jc.WORLD, bending=stiffness, **options)
+        system, state = scene.build()
+        np.testing.assert_allclose(jc.energy(system, state).potential, expected, rtol=1e-10)
+        assert jc.violation(system, state).worst < 1e-14
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("straight", [True, False])
+def test_forces_are_those_of_the_energy(dim, straight):
+    scene = jc.Scene(dim=dim, gravity=np.zeros(dim))
+    points = helix(4)[:, :dim]
+    twist = {} if dim == 2 else {"radius": 0.05, "twisting": 0.8}
+    jc.rod(scene, "rod", points, 1.0, bending=1.3, straight=straight, **twist)
+    jc.rope(scene, "rope", points + 1.0, 1.0, bending=0.9)
+    system, state = scene.build()
+    if not straight:
+        slack = system.with_params({f"rope.bend{i}": {"stiffness": 0.0} for i in (1, 2, 3)})
+        np.testing.assert_allclose(slack.force(state.q, 0 * state.v, 0.0), 0, atol=1e-14)
+    step = jnp.asarray(0.3 * np.random.default_rng(0).normal(size=state.v.shape))
+    q, rest = system.retract(state.q, step), jnp.zeros_like(state.v)
+
+    def potential(step):
+        return system.energy(system.retract(q, step), rest, 0.0).potential
+
+    expected = -quick_jit(jax.grad(potential))(rest)
+    np.testing.assert_allclose(system.force(q, rest, 0.0), expected, atol=1e-12)
+
+
+def test_small_turns_meet_the_stiffnesses():
+    """½ k_t θ² about the axis of the rod and ½ k_b θ² across it."""
+    scene = jc.Scene(dim=3, gravity=np.zeros(3))
+    for name in ("a", "b"):
+        scene.add_body(name, mass=1.0, inertia=(1.0, 1.0, 1.0))
+    scene.add(jc.Flexure("f", "a", "b", bending=2.0, twisting=3.0))
+    system, state = scene.build()
+    turns = system.layout.v("b")[3:]
+
+    def potential(θ):
+        step = jnp.zeros_like(state.v).at[turns].set(θ)
+        return system.energy(system.retract(state.q, step), state.v, 0.0).potential
+
+    np.testing.assert_allclose(
+        quick_jit(jax.hessian(potential))(jnp.zeros(3)), np.diag([3.0, 2.0, 2.0]), atol=1e-12
+    )
+
+
+def test_a_hanging_chain_in_space_and_at_unequal_heights_rests():
+    start, end, gravity = (0.0, 0.0, 1.0), (1.0, 0.5, 0.7), (0.0, 0.0, -9.81)
+    scene = jc.Scene(dim=3, gravity=gravity)
+    jc.rope(scene, "rope", jc.hanging(start, end, 2.0, 30, gravity), 1.5, end=jc.WORLD)
+    system, state = scene.build()
+    info = jc.forward_dynamics(system, state, None, jc.Method(), 1e-3)
+    np.testing.assert_allclose(info.acceleration, 0, atol=1e-8)
+    assert np.all(info.multipliers < 0)
+
+
+def test_the_derivative_by_the_points():
+    """A rope of traced points: each length follows."""
+
+    def lengths(points):
+        scene = jc.Scene(dim=2)
+        jc.rope(scene, "rope", points, 1.0)
+        system, _ = scene.build()
+        return jnp.stack([system.params[f"rope.link{i}"]["length"] for i in range(3)])
+
+    slope = jax.jacfwd(lengths)(jnp.asarray([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (3.0, 1.0)]))
+    np.testing.assert_allclose(slope[2, 3], (1.0, 0.0), atol=IDENTITY)
+
+
+def test_the_plan_of_a_long_chain_is_one_run():
+    """The program does not grow with the chain, and neither planning nor names are quadratic."""
+    sizes = {}
+    for n in (50, 2000):
+        scene = jc.Scene(dim=2)
+        jc.rope(scene, "rope", np.column_stack([np.linspace(0, 1, n + 1)] * 2), 1.0, end=jc.WORLD)
+        system, state = scene.build()
+        step = jax.make_jaxpr(lambda s, system=system: jc.step(system, jc.Method(), s, None, 1e-3))
+        sizes[n] = str(step(state)).count("\n")
+    assert sizes[2000] < 1.2 * sizes[50]
+
+
+def test_the_heap_finds_what_a_search_finds():
+    random = np.random.default_rng(0)
+    for n in (1, 7, 30):
+        graph = {i: set() for i in range(n)}
+        for i, j in random.integers(0, n, (2 * n, 2)):
+            if i != j:
+                graph[int(i)].add(int(j))
+                graph[int(j)].add(int(i))
+        distance = {i: int(random.integers(0, 4)) for i in graph}
+        assert ordering.minimum_degree(graph, distance)[0] == searched(graph, distance)
+
+
+def searched(neighbours, distance):
+    """The order by a search among all at every step."""
+    graph, order, near = {k: set(v) for k, v in neighbours.items()}, [], set()
+    while graph:
+        node = min(graph, key=lambda x: (len(graph[x]), x not in near, distance[x], x))
+        near = graph.pop(node)
+        for other in near:
+            graph[other] = (graph[other] | near) - {other, node}
+        order.append(node)
+    return order
+
+
+SPAN = np.linspace((0.0, 0.0), (1.0, 0.0), 4)
+MISTAKES = {
+    "shape": (lambda s: jc.rope(s, "r", np.ones((4, 3)), 1.0), r"\(links \+ 1, 2\).*\(4, 3\)"),
+    "one link": (lambda s: jc.rope(s, "r", SPAN[:2], 1.0), "2 links or more"),
+    "twice": (lambda s: jc.rod(s, "r", SPAN[[0, 1, 1, 2]], 1.0), "points 1 and 2 must be apart"),
+    "nan": (lambda s: jc.rope(s, "r", SPAN * np.nan, 1.0), "apart and finite"),
+    "mass": (lambda s: jc.rope(s, "r", SPAN, -1.0), "mass must be positive"),
+    "unknown end": (lambda s: jc.rope(s, "r", SPAN, 1.0, end="hook"), "'hook' is unknown"),
+    "stiffness": (lambda s: jc.rope(s, "r", SPAN, 1.0, bending=-1.0), "stiffness must be zero or"),
+    "twist": (
+        lambda s: s.add(jc.Flexure("f", "p", jc.WORLD, 1.0)),
+        "'p' is a particle: it has no orientation",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named(mistake):
+    call, words = MISTAKES[mistake]
+    scene = jc.Scene(dim=2)
+    scene.add_particle("p", mass=1.0, position=(5.0, 0.0))
+
+    def build():
+        call(scene)
+        return scene.build()
+
+    with pytest.raises(ValueError, match=words):
+        build()
+
+
+def test_a_rod_in_space_needs_a_radius_and_a_bounded_twist():
+    scene = jc.Scene(dim=3)
+    with pytest.raises(ValueError, match="a radius is needed"):
+        jc.rod(scene, "r", helix(3), 1.0)
+    jc.rod(scene, "r", helix(3), 1.0, radius=0.1, bending=1.0, twisting=3.0)
+    with pytest.raises(ValueError, match="twisting must be at most twice bending"):
+        scene.build()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (((0, 0), (1, 0), 0.9, 5), "does not reach over 1 m"),
+        (((0, 0), (0, 1), 2.0, 5), "above one another"),
+        (((0, 0), (1, 0), 2.0, 1), "links must be an integer of 2 or more"),
+        (((0, 0), (1, 0, 0), 2.0, 5), "must be points"),
+    ],
+)
+def test_a_chain_that_cannot_hang_is_refused(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        jc.hanging(*arguments)
