@@ -44,6 +44,9 @@ MOVES = _names(
 )
 """Operations that compute nothing: kernels read through them."""
 
+MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice")
+"""Those of which an entry of the result may be another entry of the operand."""
+
 ARITHMETIC = _names(
     "add sub mul neg abs sign square integer_pow max min and or not xor eq ne lt le gt ge"
     " is_finite floor ceil round select_n add_any clamp nextafter"
@@ -97,11 +100,10 @@ class Stages:
         """The results."""
         values: dict[int, Any] = dict(zip(self.program.inputs, args, strict=True))
         for steps, wanted in self.parts:
-            run = functools.partial(self._run, steps)
             if all(map(_fits, steps)):
-                self._store(values, wanted, run, _kernel)
+                self._store(values, wanted, functools.partial(self._run, steps), _kernel)
             else:
-                run(values, wanted)
+                self._run(steps, values, wanted)
         return [self.program.evaluate(values, x) for x in self.program.outputs]
 
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
@@ -111,7 +113,8 @@ class Stages:
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
-                self._store(values, step, self._evaluate, _stage)
+                call = _stage_with_arguments if self._may_overwrite(values, step) else _stage
+                self._store(values, step, self._evaluate, call)
 
     def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
         for x in wanted:
@@ -125,7 +128,7 @@ class Stages:
         call: Callable[..., list[Array]],
     ) -> None:
         """Computes values from known ones in a call of their own."""
-        leaves = self.program.leaves(values, wanted)
+        leaves, _ = self.program.between(values, wanted)
 
         def compute(*given: Array) -> list[Array]:
             own: dict[int, Any] = dict(zip(leaves, given, strict=True))
@@ -134,6 +137,13 @@ class Stages:
 
         results = call(compute, [values[x] for x in leaves])
         values.update(zip(wanted, results, strict=True))
+
+    def _may_overwrite(self, known: Any, wanted: list[int]) -> bool:
+        """Whether something is moved in whose place a result of a stage would fit."""
+        sizes = {self.program.sizes[x] for x in wanted}
+        operations = self.program.between(known, wanted)[1]
+        moved = (x for op in operations if op.name in MOVED for x in op.inputs)
+        return any(self.program.sizes[x] in sizes for x in moved if not isinstance(x, Constant))
 
 
 def worth_storing(program: Program) -> set[int]:
@@ -220,12 +230,14 @@ def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[
     """The parts, each with those of its values that parts after it or the results need."""
     made = [[x for step in part for x in _values(step)] for part in parts]
     known = {*program.inputs, *(x for part in made for x in part)}
-    needed = set(program.leaves(known, [x for x in program.outputs if not isinstance(x, Constant)]))
+    outputs = [x for x in program.outputs if not isinstance(x, Constant)]
+    needed = set(program.between(known, outputs)[0])
     results: list[tuple[list[Step], list[int]]] = []
     for part, own in reversed(list(zip(parts, made, strict=True))):
         results.append((part, [x for x in own if x in needed]))
         operands = (x for step in part for op in _operations(program, step) for x in op.inputs)
-        needed |= set(program.leaves(known, [x for x in operands if not isinstance(x, Constant)]))
+        read = [x for x in operands if not isinstance(x, Constant)]
+        needed |= set(program.between(known, read)[0])
     return [(part, wanted) for part, wanted in reversed(results) if wanted or _acts(part)]
 
 
@@ -257,42 +269,53 @@ def _elementwise(op: Operation) -> bool:
 def _kernel(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
     """Calls a function as one kernel.
 
-    XLA knows the buffers of a kernel by the operands of its instructions, and stops at an argument
-    that is none of them, as one may turn out to be. So the arguments pass through a call that does
-    nothing.
+    XLA knows the buffers of a kernel by the operands of its instructions, and fails at an argument
+    that is none, because it is a constant or because what was made of it turned out not to matter.
+    The barrier hides constants, and all arguments go through a call that does nothing.
     """
 
     def kernel(*args: Array) -> list[Array]:
-        return function(*_uninlined(lambda *args: list(args), args)[:-1])
+        return function(*_uninlined(arguments, args))
 
-    return _uninlined(kernel, args)[:-1]
+    def arguments(*args: Array) -> list[Array]:
+        return list(args)
+
+    return _uninlined(kernel, jax.lax.optimization_barrier(args))
 
 
 def _stage(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
-    """Calls a function as a stage within a kernel.
+    """Calls a function as a stage of a kernel."""
 
-    Its arguments are results as well, so that they are not overwritten before the end: two that XLA
-    finds to be equal are one array to it, and a result in the place of the first would destroy the
-    second.
+    def stage(*args: Array) -> list[Array]:
+        return function(*args)
+
+    return _uninlined(stage, args)
+
+
+def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
+    """Calls a function as a stage that writes no result over an argument, as it returns them.
+
+    Two arguments that XLA finds to be equal are one array to it. It takes a result to fit in the
+    place of the one where it is read entry by entry, and forgets that the other is moved.
     """
-    results = _uninlined(lambda *args: [*function(*args), *args], args)
-    return results[: -1 - len(args)]
+    results = _stage(lambda *args: [*function(*args), *args], args)
+    return results[: len(results) - len(args)]
 
 
 def _uninlined(function: Callable[..., list[Array]], args: Sequence[Array]) -> list[Array]:
-    """The results of a call that XLA does not inline, and a number that nobody needs.
+    """The results of a call that XLA does not inline.
 
-    The number keeps XLA from splitting the call among threads, as it does where the last thing that
-    is computed is one large array: a call inside a kernel cannot be. The barriers hide which of the
-    arguments are constants, and keep results that are not used.
+    It has one result more, which the barrier keeps although nobody needs it: a call that ends in
+    one large array would be split among threads, which a call inside a kernel cannot be.
     """
 
-    def called(*args: Array) -> list[Array]:
+    @functools.wraps(function)
+    def call(*args: Array) -> list[Array]:
         return [*function(*args), jnp.zeros((), bool)]
 
-    first, *others = jax.jit(called)(*jax.lax.optimization_barrier(args))
+    first, *others = jax.jit(call)(*args)
     # what is said of a result of a call is said of the call
-    return jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])
+    return jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])[:-1]
 
 
 def _settled_body(closed: Any) -> tuple[Any, bool]:

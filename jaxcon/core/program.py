@@ -95,6 +95,7 @@ class Program:
         inputs: numbers of the arguments.
         outputs: of the results.
         makers: the operation that makes a value.
+        sizes: how many entries a value has.
     """
 
     def __init__(self, closed: Any, inner: Callable[[Any], tuple[Any, bool]]) -> None:
@@ -107,8 +108,8 @@ class Program:
         self.operations: list[Operation] = []
         self._inner = inner
         self._known: dict[Any, list[int]] = {}
-        self._count = 0
-        self.inputs = [self._new() for _ in closed.jaxpr.invars]
+        self.sizes: dict[int, int] = {}
+        self.inputs = [self._new(x) for x in closed.jaxpr.invars]
         self.outputs = self._inline_closed(closed, list(self.inputs))
         self.makers = {name: op for op in self.operations for name in op.outputs}
         self._drop_unused()
@@ -140,9 +141,10 @@ class Program:
             values.update(zip(op.outputs, op(operands), strict=True))
         return values[wanted]
 
-    def leaves(self, known: Any, wanted: list[int]) -> list[int]:
-        """The known values from which others are made."""
-        found: dict[int, None] = {}
+    def between(self, known: Any, wanted: list[int]) -> tuple[list[int], list[Operation]]:
+        """The known values of which others are made, and the operations that do it."""
+        leaves: list[int] = []
+        operations: list[Operation] = []
         seen: set[int] = set()
         todo = list(reversed(wanted))
         while todo:
@@ -151,10 +153,11 @@ class Program:
                 continue
             seen.add(x)
             if x in known:
-                found[x] = None
+                leaves.append(x)
             else:
+                operations.append(self.makers[x])
                 todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
-        return list(found)
+        return leaves, operations
 
     def _drop_unused(self) -> None:
         """Leaves out operations on which no result depends."""
@@ -166,9 +169,10 @@ class Program:
                 needed.update(x for x in op.inputs if not isinstance(x, Constant))
         self.operations = kept[::-1]
 
-    def _new(self) -> int:
-        self._count += 1
-        return self._count
+    def _new(self, variable: Any) -> int:
+        name = len(self.sizes)
+        self.sizes[name] = variable.aval.size
+        return name
 
     def _inline_closed(self, jaxpr: Any, args: list[Operand]) -> list[Operand]:
         """Appends the operations of a jaxpr; returns its results."""
@@ -216,7 +220,7 @@ class Program:
         key = _key(primitive, params, args)
         if key is not None and key in self._known:
             return self._known[key]
-        outputs = [self._new() for _ in equation.outvars]
+        outputs = [self._new(x) for x in equation.outvars]
         effects = bool(equation.effects)
         avals = [x.aval for x in (*equation.invars, *equation.outvars)]
         keys = any(map(_is_key, avals))
