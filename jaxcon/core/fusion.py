@@ -275,12 +275,12 @@ def _kernel(function: Callable[..., list[Array]], args: list[Array]) -> list[Arr
     """
 
     def kernel(*args: Array) -> list[Array]:
-        return function(*_uninlined(arguments, args))
+        return function(*uninlined(arguments, args))
 
     def arguments(*args: Array) -> list[Array]:
         return list(args)
 
-    return _uninlined(kernel, jax.lax.optimization_barrier(args))
+    return uninlined(kernel, jax.lax.optimization_barrier(args))
 
 
 def _stage(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
@@ -289,7 +289,7 @@ def _stage(function: Callable[..., list[Array]], args: list[Array]) -> list[Arra
     def stage(*args: Array) -> list[Array]:
         return function(*args)
 
-    return _uninlined(stage, args)
+    return uninlined(stage, args)
 
 
 def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
@@ -302,7 +302,7 @@ def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array
     return results[: len(results) - len(args)]
 
 
-def _uninlined(function: Callable[..., list[Array]], args: Sequence[Array]) -> list[Array]:
+def uninlined(function: Callable[..., list[Array]], args: Sequence[Array]) -> list[Array]:
     """The results of a call that XLA does not inline.
 
     It has one result more, which the barrier keeps although nobody needs it: a call that ends in

@@ -272,7 +272,13 @@ def _in_stages(*args: Array, fun: Native, rank: int) -> list[Array]:
     time of compiling them and makes the vectorized code no faster.
     """
     lanes = [jnp.expand_dims(x, -1) for x in args]
-    return [jnp.squeeze(y, -1) for y in fusion.settled(fun, lanes)]
+    # were it inlined, XLA would copy the results to move the batch to the front
+    return fusion.uninlined(squeezed, fusion.settled(fun, lanes))
+
+
+def squeezed(*lanes: Array) -> list[Array]:
+    """Arrays without their last axis, which is of one."""
+    return [jnp.squeeze(x, -1) for x in lanes]
 
 
 def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]:
