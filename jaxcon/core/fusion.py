@@ -24,9 +24,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend import core as jex
 
-from jaxcon.core.program import Constant, Operand, Operation, Program, traced
+from jaxcon.core.program import Constant, Operation, Program, traced
 from jaxcon.core.typing import Array
 
 WORTH = 4
@@ -45,6 +44,9 @@ MOVES = _names(
 )
 """Operations that compute nothing: kernels read through them."""
 
+MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice")
+"""Those of which an entry of the result may be another entry of the operand."""
+
 ARITHMETIC = _names(
     "add sub mul neg abs sign square integer_pow max min and or not xor eq ne lt le gt ge"
     " is_finite floor ceil round select_n add_any clamp nextafter"
@@ -56,13 +58,6 @@ COSTLY = _names(
     " logistic exp2 sinh cosh asinh acosh atanh"
 )
 """Elementwise operations that are always worth storing."""
-
-REARRANGED = _names("reshape squeeze expand_dims transpose broadcast_in_dim rev")
-"""Moves of which the whole operand is in the result."""
-
-FOLDED = _names("select_n clamp pow")
-"""Arithmetic whose result may turn out not to depend on an operand."""
-
 
 OTHERS = _names("concatenate dynamic_update_slice pad gather scan split stack unstack")
 """Operations that end a stage and may be part of a kernel."""
@@ -76,17 +71,16 @@ Step = Operation | list[int]
 """An operation by itself, or the values of a stage."""
 
 
-def settled(function: Any, args: Sequence[Array], rank: int = 1) -> list[Array]:
+def settled(function: Any, args: Sequence[Array]) -> list[Array]:
     """The results of a native function, cut into stages.
 
     Args:
         function: with `traced`, its closed jaxpr for arguments of some shapes.
         args: its arguments.
-        rank: how many trailing axes enumerate worlds; they may be spread over devices.
     """
     if os.environ.get("JAXCON_STAGES") == "off":
         return function(*args)
-    return Stages(traced(function, args), rank)(*args)
+    return Stages(traced(function, args))(*args)
 
 
 class Stages:
@@ -97,9 +91,8 @@ class Stages:
             operation, or the values that a stage computes.
     """
 
-    def __init__(self, closed: Any, rank: int) -> None:
-        self.rank = rank
-        self.program = Program(closed, functools.partial(_settled_body, rank))
+    def __init__(self, closed: Any) -> None:
+        self.program = Program(closed, _settled_body)
         steps = _in_stages(self.program, worth_storing(self.program))
         self.parts = _with_results(self.program, _in_parts(steps))
 
@@ -107,11 +100,10 @@ class Stages:
         """The results."""
         values: dict[int, Any] = dict(zip(self.program.inputs, args, strict=True))
         for steps, wanted in self.parts:
-            run = functools.partial(self._run, steps)
             if all(map(_fits, steps)):
-                self._store(values, wanted, run, self._read_by(steps, values, wanted))
+                self._store(values, wanted, functools.partial(self._run, steps), _kernel)
             else:
-                run(values, wanted)
+                self._run(steps, values, wanted)
         return [self.program.evaluate(values, x) for x in self.program.outputs]
 
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
@@ -121,48 +113,37 @@ class Stages:
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
-                read = surely_read(self.program, values, step)
-                self._store(values, step, self._evaluate, set.union(*read))
+                call = _stage_with_arguments if self._may_overwrite(values, step) else _stage
+                self._store(values, step, self._evaluate, call)
 
     def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
         for x in wanted:
             self.program.evaluate(values, x)
 
     def _store(
-        self, values: dict[int, Any], wanted: list[int], how: Callable[..., None], sure: set[int]
+        self,
+        values: dict[int, Any],
+        wanted: list[int],
+        how: Callable[..., None],
+        call: Callable[..., list[Array]],
     ) -> None:
-        """Computes values in a kernel of their own, which reads some of the known ones for sure."""
-        leaves = self.program.leaves(values, wanted)
+        """Computes values from known ones in a call of their own."""
+        leaves, _ = self.program.between(values, wanted)
 
         def compute(*given: Array) -> list[Array]:
             own: dict[int, Any] = dict(zip(leaves, given, strict=True))
             how(own, wanted)
             return [own[x] for x in wanted]
 
-        doubtful = [i for i, x in enumerate(leaves) if x not in sure]
-        given = [values[x] for x in leaves]
-        results = _kernel(compute, given, doubtful, self.rank, how == self._evaluate)
+        results = call(compute, [values[x] for x in leaves])
         values.update(zip(wanted, results, strict=True))
 
-    def _read_by(self, steps: list[Step], values: dict[int, Any], wanted: list[int]) -> set[int]:
-        """The values that steps read for sure: a stage, being a kernel, reads all that it is given.
-
-        A stage is never left out if one of its results is needed.
-        """
-        known = {*values, *(x for step in steps for x in _values(step))}
-        whole, cut = set(wanted), set[int]()
-        for step in reversed(steps):
-            known -= set(_values(step))
-            if isinstance(step, Operation):
-                sliced = whole.isdisjoint(step.outputs)
-                operands, sliced = _followed(self.program, step, whole | cut, sliced)
-                inputs = [x for x in operands if not isinstance(x, Constant)]
-                found = surely_read(self.program, known, inputs, sliced)
-                whole |= found[0]
-                cut |= found[1]
-            elif not (whole | cut).isdisjoint(step):
-                whole.update(self.program.leaves(known, step))
-        return whole | cut
+    def _may_overwrite(self, known: Any, wanted: list[int]) -> bool:
+        """Whether something is moved in whose place a result of a stage would fit."""
+        sizes = {self.program.sizes[x] for x in wanted}
+        operations = self.program.between(known, wanted)[1]
+        moved = (x for op in operations if op.name in MOVED for x in op.inputs)
+        return any(self.program.sizes[x] in sizes for x in moved if not isinstance(x, Constant))
 
 
 def worth_storing(program: Program) -> set[int]:
@@ -249,12 +230,14 @@ def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[
     """The parts, each with those of its values that parts after it or the results need."""
     made = [[x for step in part for x in _values(step)] for part in parts]
     known = {*program.inputs, *(x for part in made for x in part)}
-    needed = set(program.leaves(known, [x for x in program.outputs if not isinstance(x, Constant)]))
+    outputs = [x for x in program.outputs if not isinstance(x, Constant)]
+    needed = set(program.between(known, outputs)[0])
     results: list[tuple[list[Step], list[int]]] = []
     for part, own in reversed(list(zip(parts, made, strict=True))):
         results.append((part, [x for x in own if x in needed]))
         operands = (x for step in part for op in _operations(program, step) for x in op.inputs)
-        needed |= set(program.leaves(known, [x for x in operands if not isinstance(x, Constant)]))
+        read = [x for x in operands if not isinstance(x, Constant)]
+        needed |= set(program.between(known, read)[0])
     return [(part, wanted) for part, wanted in reversed(results) if wanted or _acts(part)]
 
 
@@ -283,106 +266,61 @@ def _elementwise(op: Operation) -> bool:
     return op.plain and (op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY)
 
 
-def surely_read(
-    program: Program, known: Any, wanted: list[int], sliced: bool = False
-) -> tuple[set[int], set[int]]:
-    """The known values of which no compiler can find that others do not depend on them.
-
-    First those that are read as a whole, then those of which a slice is read.
-
-    Arithmetic in floating point depends on its operands, since NaN spreads through it, and so do
-    arrays that are rearranged, or joined to others. Of a slice that is not said, where what is
-    sliced has been joined, since the rest may be what is read. Loops depend on what kernels in
-    their bodies read. All others, such as choices between values that may be the same, are not
-    followed.
-    """
-    found: tuple[set[int], set[int]] = (set(), set())
-    seen: set[tuple[int, bool]] = set()
-    todo = [(x, sliced) for x in wanted]
-    while todo:
-        x, sliced = todo.pop()
-        if (x, sliced) in seen:
-            continue
-        seen.add((x, sliced))
-        if x in known:
-            found[sliced].add(x)
-            continue
-        met = {y for y, _ in seen}
-        operands, cut = _followed(program, program.makers[x], met, sliced)
-        todo += [(y, cut) for y in operands if not isinstance(y, Constant)]
-    return found
-
-
-def _followed(
-    program: Program, op: Operation, met: set[int], sliced: bool
-) -> tuple[Sequence[Operand], bool]:
-    """The operands on which those results depend that are met, and whether they are cut.
-
-    Where a slice is met, only those on which each of its entries depends.
-    """
-    if met.isdisjoint(op.outputs):
-        return [], sliced
-    read = [x for i, x in enumerate(op.inputs) if i in op.read]
-    if op.name == "scan":
-        return (read if met.issuperset(program.needed_results(op)) else []), False
-    if op.name == "dynamic_update_slice":
-        return ([] if sliced else read), sliced
-    if op.name in ("slice", "dynamic_slice"):
-        return read or op.inputs, True
-    bounded = op.name in ("max", "min") and any(isinstance(x, Constant) for x in op.inputs)
-    arithmetic = op.inexact and op.name in (ARITHMETIC | COSTLY) - FOLDED and not bounded
-    joined = op.name == "concatenate" and not sliced
-    return (op.inputs if arithmetic or joined or op.name in REARRANGED else []), sliced
-
-
-def _kernel(
-    function: Callable[..., list[Array]],
-    args: list[Array],
-    doubtful: list[int],
-    rank: int,
-    stage: bool,
-) -> list[Array]:
+def _kernel(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
     """Calls a function as one kernel.
 
-    XLA's kernels must read all of their arguments. The barrier hides which of them are constants,
-    and those that the function may not read (`doubtful`) are read for results that nobody needs.
-    For that reason, too, there is always one of these: a computation that ends in one large array
-    would be split among threads, which a kernel inside a kernel cannot be.
-
-    In a stage, arguments in whose place a result would fit are results as well, so that they are
-    not overwritten before the end: two that XLA finds to be equal are one array to it, and a result
-    in the place of the first would destroy the second.
+    XLA knows the buffers of a kernel by the operands of its instructions, and fails at an argument
+    that is none, because it is a constant or because what was made of it turned out not to matter.
+    The barrier hides constants, and all arguments go through a call that does nothing.
     """
-    count = 0
 
     def kernel(*args: Array) -> list[Array]:
-        nonlocal count
-        results = function(*args)
-        count = len(results)
-        kinds = {(x.shape, x.dtype) for x in results} if stage else set[Any]()
-        kept = [x for x in args if (x.shape, x.dtype) in kinds]
-        return [*results, *(_read(args[i], rank) for i in doubtful), jnp.zeros((), bool), *kept]
+        return function(*uninlined(arguments, args))
 
-    first, *others = jax.jit(kernel)(*jax.lax.optimization_barrier(args))
-    # what is said of a result of a call is said of the call; all of its results are kept
-    return jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])[:count]
+    def arguments(*args: Array) -> list[Array]:
+        return list(args)
+
+    return uninlined(kernel, jax.lax.optimization_barrier(args))
 
 
-def _read(x: Array, rank: int) -> Array:
-    """What no compiler can know without reading the array: its first row is enough."""
-    x = x[:1] if x.ndim > max(rank, 1) else x
-    if x.dtype == bool:
-        return ~x
-    return x != x if jnp.issubdtype(x.dtype, jnp.inexact) else x > 0  # noqa: PLR0124
+def _stage(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
+    """Calls a function as a stage of a kernel."""
+
+    def stage(*args: Array) -> list[Array]:
+        return function(*args)
+
+    return uninlined(stage, args)
 
 
-def _settled_body(rank: int, closed: Any) -> tuple[Any, bool, frozenset[int]]:
-    """The body of a loop in stages, whether all of it fits a kernel, and what it surely reads."""
+def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
+    """Calls a function as a stage that writes no result over an argument, as it returns them.
+
+    Two arguments that XLA finds to be equal are one array to it. It takes a result to fit in the
+    place of the one where it is read entry by entry, and forgets that the other is moved.
+    """
+    results = _stage(lambda *args: [*function(*args), *args], args)
+    return results[: len(results) - len(args)]
+
+
+def uninlined(function: Callable[..., list[Array]], args: Sequence[Array]) -> list[Array]:
+    """The results of a call that XLA does not inline.
+
+    It has one result more, which the barrier keeps although nobody needs it: a call that ends in
+    one large array would be split among threads, which a call inside a kernel cannot be.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Array) -> list[Array]:
+        return [*function(*args), jnp.zeros((), bool)]
+
+    first, *others = jax.jit(call)(*args)
+    # what is said of a result of a call is said of the call
+    return jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])[:-1]
+
+
+def _settled_body(closed: Any) -> tuple[Any, bool]:
+    """The body of a loop in stages, and whether all of it fits a kernel."""
     inputs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in closed.jaxpr.invars]
-    stages = Stages(closed, rank)
-    settled = jax.make_jaxpr(stages)(*inputs)
+    stages = Stages(closed)
     plain = all(_fits(step) for steps, _ in stages.parts for step in steps)
-    barriers = [x for x in settled.jaxpr.eqns if x.primitive.name == "optimization_barrier"]
-    read = {x for barrier in barriers for x in barrier.invars if not isinstance(x, jex.Literal)}
-    places = (i for i, x in enumerate(settled.jaxpr.invars) if x in read)
-    return settled, plain, frozenset(places)
+    return jax.make_jaxpr(stages)(*inputs), plain

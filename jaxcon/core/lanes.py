@@ -66,6 +66,12 @@ class Vector:
             return cls(*(jax.lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0])))
         return cls(*x)
 
+    @classmethod
+    def of_rows(cls, x: Array, start: int, components: int, elements: int) -> Vector:
+        """From rows of an array: those of all elements for each component, from `start` on."""
+        places = (start + i * elements for i in range(components))
+        return cls(*(jax.lax.slice_in_dim(x, i, i + elements) for i in places))
+
     def stack(self) -> Array:
         """The array with the components along the first axis."""
         shape = jnp.broadcast_shapes(*(jnp.shape(c) for c in self))

@@ -57,22 +57,17 @@ class Operation:
 
     Attributes:
         inputs, outputs: operands and results.
-        inexact: whether the results are of floating point.
         plain: whether it may be part of a kernel as far as its dtypes and effects go; not so where
             it handles random keys, or does something besides, such as printing.
         effects: whether it does something besides.
-        read: which operands a loop or a slice at a computed place surely reads if its results are
-            needed, those apart that a loop only carries from one round to the next.
     """
 
     primitive: Any
     params: dict[str, Any]
     inputs: list[Operand]
     outputs: list[int]
-    inexact: bool
     plain: bool
     effects: bool
-    read: frozenset[int] = frozenset()
 
     @property
     def name(self) -> str:
@@ -100,23 +95,21 @@ class Program:
         inputs: numbers of the arguments.
         outputs: of the results.
         makers: the operation that makes a value.
+        sizes: how many entries a value has.
     """
 
-    def __init__(
-        self, closed: Any, inner: Callable[[Any], tuple[Any, bool, frozenset[int]]]
-    ) -> None:
+    def __init__(self, closed: Any, inner: Callable[[Any], tuple[Any, bool]]) -> None:
         """Flattens a closed jaxpr.
 
         Args:
             closed: the jaxpr.
-            inner: rewrites the body of a loop, and says whether a kernel may contain all of it, and
-                which of its arguments it surely reads.
+            inner: rewrites the body of a loop, and says whether a kernel may contain all of it.
         """
         self.operations: list[Operation] = []
         self._inner = inner
         self._known: dict[Any, list[int]] = {}
-        self._count = 0
-        self.inputs = [self._new() for _ in closed.jaxpr.invars]
+        self.sizes: dict[int, int] = {}
+        self.inputs = [self._new(x) for x in closed.jaxpr.invars]
         self.outputs = self._inline_closed(closed, list(self.inputs))
         self.makers = {name: op for op in self.operations for name in op.outputs}
         self._drop_unused()
@@ -148,9 +141,10 @@ class Program:
             values.update(zip(op.outputs, op(operands), strict=True))
         return values[wanted]
 
-    def leaves(self, known: Any, wanted: list[int]) -> list[int]:
-        """The known values from which others are made."""
-        found: dict[int, None] = {}
+    def between(self, known: Any, wanted: list[int]) -> tuple[list[int], list[Operation]]:
+        """The known values of which others are made, and the operations that do it."""
+        leaves: list[int] = []
+        operations: list[Operation] = []
         seen: set[int] = set()
         todo = list(reversed(wanted))
         while todo:
@@ -159,15 +153,11 @@ class Program:
                 continue
             seen.add(x)
             if x in known:
-                found[x] = None
+                leaves.append(x)
             else:
+                operations.append(self.makers[x])
                 todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
-        return list(found)
-
-    def needed_results(self, op: Operation) -> list[int]:
-        """Of an operation, without what a loop only carries from one round to the next."""
-        carried = op.outputs[: op.params["num_carry"]] if op.name == "scan" else []
-        return [x for x in op.outputs if x not in carried or x in self._used]
+        return leaves, operations
 
     def _drop_unused(self) -> None:
         """Leaves out operations on which no result depends."""
@@ -177,11 +167,12 @@ class Program:
             if op.effects or not needed.isdisjoint(op.outputs):
                 kept.append(op)
                 needed.update(x for x in op.inputs if not isinstance(x, Constant))
-        self.operations, self._used = kept[::-1], needed
+        self.operations = kept[::-1]
 
-    def _new(self) -> int:
-        self._count += 1
-        return self._count
+    def _new(self, variable: Any) -> int:
+        name = len(self.sizes)
+        self.sizes[name] = variable.aval.size
+        return name
 
     def _inline_closed(self, jaxpr: Any, args: list[Operand]) -> list[Operand]:
         """Appends the operations of a jaxpr; returns its results."""
@@ -219,31 +210,22 @@ class Program:
             fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
             return self._inline_closed(jax.make_jaxpr(fold)(equation.invars[0].aval), args)
         if name == "scan":
-            jaxpr, plain, read = self._inner(params["jaxpr"])
-            read = read if params["length"] > 1 else frozenset()  # one round is no loop to XLA
-            return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain, read)
-        return self._emit(equation, params, args, True, _places(equation))
+            jaxpr, plain = self._inner(params["jaxpr"])
+            return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain)
+        return self._emit(equation, params, args, True)
 
-    def _emit(
-        self,
-        equation: Any,
-        params: Any,
-        args: list[Operand],
-        plain: bool,
-        read: frozenset[int],
-    ) -> list[Any]:
+    def _emit(self, equation: Any, params: Any, args: list[Operand], plain: bool) -> list[Any]:
         """Appends an operation, or finds the same one done before."""
         primitive = equation.primitive
         key = _key(primitive, params, args)
         if key is not None and key in self._known:
             return self._known[key]
-        outputs = [self._new() for _ in equation.outvars]
-        inexact = all(jnp.issubdtype(x.aval.dtype, jnp.inexact) for x in equation.outvars)
+        outputs = [self._new(x) for x in equation.outvars]
         effects = bool(equation.effects)
         avals = [x.aval for x in (*equation.invars, *equation.outvars)]
         keys = any(map(_is_key, avals))
         plain = plain and not keys and not effects
-        op = Operation(primitive, params, args, outputs, inexact, plain, effects, read)
+        op = Operation(primitive, params, args, outputs, plain, effects)
         self.operations.append(op)
         if key is not None and not effects:
             self._known[key] = outputs
@@ -270,19 +252,6 @@ def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -
 def _leading(axes: Any, shape: tuple[int, ...]) -> bool:
     """Whether these are the first axes, none of them empty."""
     return tuple(axes) == tuple(range(len(axes))) and all(shape[: len(axes)])
-
-
-def _places(equation: Any) -> frozenset[int]:
-    """Which operands a slice at a computed place reads: not one whose only value is zero."""
-    shapes = [x.aval.shape for x in equation.invars]
-    if equation.primitive.name == "dynamic_slice":
-        first, sizes, own = 1, equation.params["slice_sizes"], {0}
-    elif equation.primitive.name == "dynamic_update_slice":
-        first, sizes, own = 2, shapes[1], {1} if shapes[0] == shapes[1] else {0, 1}
-    else:
-        return frozenset()
-    pairs = enumerate(zip(shapes[0], sizes, strict=True))
-    return frozenset(own | {first + axis for axis, (whole, part) in pairs if part < whole})
 
 
 def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:

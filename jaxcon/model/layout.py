@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-import jax
 import numpy as np
 
 from jaxcon.core.lanes import Vector, take
@@ -38,14 +37,9 @@ class Group:
     def unpack(self, q: Array, v: Array) -> tuple[Vector, Vector]:
         """The group's coordinates and velocities by components, each lane (body, …)."""
         return (
-            _block(q, self.q, self.kind.n_q, len(self.names)),
-            _block(v, self.v, self.kind.n_v, len(self.names)),
+            Vector.of_rows(q, self.q, self.kind.n_q, len(self.names)),
+            Vector.of_rows(v, self.v, self.kind.n_v, len(self.names)),
         )
-
-
-def _block(x: Array, start: int, components: int, bodies: int) -> Vector:
-    lanes = jax.lax.slice_in_dim(x, start, start + components * bodies)
-    return Vector.of(lanes.reshape((components, bodies, *x.shape[1:])))
 
 
 @dataclass(frozen=True)

@@ -151,8 +151,8 @@ class BlockJacobi:
         parts: list[Array] = []
         for start, factor in self.factors.items():
             m, k = self.shapes[start]
-            own = jax.lax.slice_in_dim(r, start, start + m * k).reshape((m, k, *r.shape[1:]))
-            y = blocks.scale(factor, blocks.forward(factor, list(Vector.of(own))))
+            own = Vector.of_rows(r, start, m, k)
+            y = blocks.scale(factor, blocks.forward(factor, list(own)))
             parts += blocks.backward(factor, y)
         return jnp.concatenate(parts)
 

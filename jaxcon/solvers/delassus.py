@@ -63,8 +63,7 @@ def softened(
     result: dict[int, Block] = {}
     for start, block in diagonal.items():
         m, k = shapes[start]
-        own = jax.lax.slice_in_dim(compliance, start, start + m * k)
-        parts = Vector.of(own.reshape((m, k, *compliance.shape[1:])))
+        parts = Vector.of_rows(compliance, start, m, k)
         result[start] = [
             [*row[:-1], plus(row[-1], part)] for row, part in zip(block, parts, strict=True)
         ]

@@ -53,8 +53,7 @@ class Elimination:
         """A⁻¹ b: down the order, then back."""
         b, x = Vectors(), Vectors()
         for start, (m, k) in self.groups.items():
-            rows = jax.lax.slice_in_dim(right, start, start + m * k)
-            b.put(nodes_of(start, m, k), list(Vector.of(rows.reshape((m, k, *right.shape[1:])))))
+            b.put(nodes_of(start, m, k), list(Vector.of_rows(right, start, m, k)))
         middle = [factor.down(b) for factor in self.factors]
         for factor, y in reversed(list(zip(self.factors, middle, strict=True))):
             factor.back(y, x)

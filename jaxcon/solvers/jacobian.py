@@ -28,9 +28,8 @@ class Columns:
 
     def take(self, v: Array) -> Vector:
         """The velocities by components, each lane (element,)."""
-        block = jax.lax.slice_in_dim(v, self.start, self.start + self.components * self.bodies)
-        lanes = block.reshape((self.components, self.bodies, *v.shape[1:]))
-        return Vector(*(take(lane, self.indices) for lane in lanes))
+        lanes = Vector.of_rows(v, self.start, self.components, self.bodies)
+        return lanes.map(lambda lane: take(lane, self.indices))
 
     def index(self) -> np.ndarray:
         """Column numbers, (components, elements)."""
@@ -80,8 +79,7 @@ class Jacobian:
         terms: dict[int, tuple[Columns, list[Any]]] = {}
         for block in self.blocks:
             m, k = block.shape
-            part = jax.lax.slice_in_dim(multipliers, block.start, block.start + m * k)
-            force = Vector.of(part.reshape((m, k, *multipliers.shape[1:])))
+            force = Vector.of_rows(multipliers, block.start, m, k)
             columns = block.columns
             _, known = terms.setdefault(
                 columns.start, (columns, [[] for _ in range(columns.components)])
