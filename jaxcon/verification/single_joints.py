@@ -106,7 +106,7 @@ def reaction(
     """Force and torque on the ground, the torque about the joint's place there."""
     wrench = jc.wrench(system, state, solution, f"{name} joint", jc.WORLD)
     anchor = jc.position(system, state, name, system.params[f"{name} joint"]["anchor_b"])
-    arm = anchor - jnp.asarray(ground)
+    arm = anchor - jnp.asarray(ground, anchor.dtype)
     return {"Rforce": wrench[:3], "Rtorque": wrench[3:] + jnp.cross(arm, wrench[:3])}
 
 
