@@ -198,6 +198,7 @@ FREEDOM = {
     "driven_prismatic": (0, 0),
     "holonomic": (2, 5),
     "velocity_level": (2, 5),
+    "momentum": (2, 3),
 }
 
 
