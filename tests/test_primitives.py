@@ -275,6 +275,7 @@ FREEDOM = {
     "knife_edge": (2, 4),
     "holonomic": (2, 5),
     "velocity_level": (2, 5),
+    "momentum": (2, 3),
 }
 
 
