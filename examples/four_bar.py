@@ -37,7 +37,7 @@ def build() -> tuple:
     scene.add(jc.Revolute("c", "coupler", "rocker", point=C))
     scene.add(jc.Revolute("d", "rocker", jc.WORLD, point=D))
     scene.add(jc.Spring("spring", jc.WORLD, "crank", stiffness=40.0, point_a=(-0.5, 0), point_b=B))
-    scene.add(jc.JointSpring("friction", "d", stiffness=0.0, damping=0.05))
+    scene.add(jc.JointDamper("friction", "d", damping=0.05))
     return scene.build()
 
 
