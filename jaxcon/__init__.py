@@ -14,6 +14,7 @@ from jaxcon.analysis.quantities import (
 )
 from jaxcon.analysis.report import Report, report
 from jaxcon.constraints.armature import Armature
+from jaxcon.constraints.compound import Compound
 from jaxcon.constraints.couplings import (
     Belt,
     Differential,
@@ -34,6 +35,7 @@ from jaxcon.constraints.joints import (
     Universal,
 )
 from jaxcon.constraints.span import Span
+from jaxcon.constraints.twist import Twist
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
@@ -79,6 +81,7 @@ __all__ = [
     "Baumgarte",
     "Belt",
     "Coincident",
+    "Compound",
     "ConjugateGradients",
     "CustomForce",
     "Dense",
@@ -121,6 +124,7 @@ __all__ = [
     "Status",
     "StepInfo",
     "TurnCounter",
+    "Twist",
     "Universal",
     "Unstabilized",
     "VelocityLevel",

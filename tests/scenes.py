@@ -129,6 +129,33 @@ def cam(s: Site) -> list[Any]:
     return [hinge, reach, jc.PolynomialCoupling(s.joint[0], hinge.name, reach.name, shape)]
 
 
+def telescope(s: Site) -> list[Any]:
+    """Two slides and two hinges, none perpendicular to another, with three of them prescribed."""
+    axes = np.array([s.axis, s.other + s.axis, np.cross(s.axis, s.other)]) + 0.3
+    name, a, b = s.joint
+    arm = jc.Compound(name, a, b, s.point, slides=(*axes[:2],), hinges=(*axes[1:],))
+    shape = (0.0, 0.3, -0.2, 0.1)
+    cams = [
+        jc.PolynomialCoupling(cam + s.suffix, name, name, shape, *coordinates)
+        for cam, *coordinates in (("cam", "angle_1", "travel_2"), ("rise", "travel_1", "angle_2"))
+    ]
+    return [arm, *cams]
+
+
+def gimbal(s: Site) -> list[Any]:
+    """A slide and three oblique hinges, each turned by the next."""
+    axes = np.array([s.axis, np.cross(s.axis, s.other), s.other])
+    name, a, b = s.joint
+    arm = jc.Compound(name, a, b, s.point, slides=(s.other,), hinges=(*(axes + 0.2),))
+    shape = (0.0, 0.3, -0.2, 0.1)
+    turns = ("angle_1", "angle_2"), ("angle_2", "angle_3")
+    cams = [
+        jc.PolynomialCoupling(cam + s.suffix, name, name, shape, *pair)
+        for cam, pair in zip(("outer", "inner"), turns, strict=True)
+    ]
+    return [arm, *cams]
+
+
 def breathing(a: Any, b: Any, t: Any, p: Any) -> Any:
     """A point of b stays at a distance from the centre of a that varies in time."""
     gap = b.point(p["anchor"]) - a.position
@@ -163,6 +190,8 @@ JOINTS = {
     "driven_prismatic": Joint(driven_prismatic, ("drive", "params")),
     "pulley": Joint(pulley, ("joint", "parts")),
     "cam": Joint(cam, ("joint", "coefficients")),
+    "telescope": Joint(telescope, ("joint", "anchor_b"), dims=(3,)),
+    "gimbal": Joint(gimbal, ("joint", "anchor_b"), dims=(3,)),
     "holonomic": Joint(holonomic, ("joint", "params")),
     "velocity_level": Joint(velocity_level, ("joint", "params"), velocity_level=True),
 }

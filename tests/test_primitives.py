@@ -198,6 +198,8 @@ FREEDOM = {
     "driven_prismatic": (0, 0),
     "pulley": (2, 5),
     "cam": (0, 0),
+    "telescope": (None, 2),
+    "gimbal": (None, 2),
     "holonomic": (2, 5),
     "velocity_level": (2, 5),
 }
@@ -227,7 +229,7 @@ def test_a_distance_of_zero_has_no_direction_and_is_finite(dim):
         assert jnp.all(jnp.isfinite(leaf))
 
 
-@pytest.mark.parametrize("kind", ["fixed", "prismatic", "driven_revolute"])
+@pytest.mark.parametrize("kind", ["fixed", "prismatic", "driven_revolute", "telescope", "gimbal"])
 def test_derivatives_of_rows_at_the_identity_are_finite(kind):
     """Where both bodies are upright and the joint is as at assembly."""
     scene = jc.Scene()

@@ -130,9 +130,26 @@ class Along:
 
     def _ends(self, element: Any) -> tuple[End, ...]:
         """The coordinates that an element acts on."""
-        if hasattr(element, "along"):
-            return tuple(find(self.joints, label(element), *end) for end in element.along)
-        return (find(self.joints, label(element), element.joint, element.coordinate),)
+        if not hasattr(element, "along"):
+            ends = (find(self.joints, label(element), element.joint, element.coordinate),)
+        else:
+            ends = tuple(find(self.joints, label(element), *end) for end in element.along)
+        if hasattr(element, "along") or hasattr(element, "motion"):
+            self._check_integrable(element, ends)
+        return ends
+
+    def _check_integrable(self, element: Any, ends: tuple[End, ...]) -> None:
+        """Checks that a coordinate to be prescribed or coupled is the integral of its rate.
+
+        Raises:
+            ValueError: it is a component of a rotation vector.
+        """
+        for group, index, name in ends:
+            if self.joints[group].joint.coordinates[name] == "rotation":
+                raise ValueError(
+                    f"{label(element)}: the {name} of '{self.joints[group].names[index]}' is not"
+                    " the integral of its rate; couple or drive the angle of a hinge."
+                )
 
 
 def _width(cls: type) -> int:

@@ -104,6 +104,15 @@ class WorldFrame:
         """No turning."""
         return 0.0 if self.dim == 2 else zeros(3)
 
+    @property
+    def spin(self) -> Vector:
+        """No turning (in space)."""
+        return zeros(3)
+
+    def moment(self, torque: Vector) -> Vector:
+        """The world takes up no torque."""
+        return Vector()
+
     def turn(self, torque: Any) -> Vector:
         """The world takes up no torque."""
         return Vector()
@@ -200,3 +209,7 @@ class SpatialFrame(Frame):
     def turn(self, torque: Vector) -> Vector:
         """The generalized force of a torque in the body frame [N m]."""
         return Vector(*zeros(3), *torque)
+
+    def moment(self, torque: Vector) -> Vector:
+        """The generalized force of a torque in the world frame [N m]."""
+        return self.turn(self.rotation.T @ torque)
