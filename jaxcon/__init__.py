@@ -41,6 +41,7 @@ from jaxcon.dynamics.generalized import GeneralizedSystem
 from jaxcon.dynamics.scene import Scene
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.io.mjcf import Keyframe, MujocoModel, from_mjcf
 from jaxcon.model.actuators import (
     AffineActuator,
     JointDamper,
@@ -99,10 +100,12 @@ __all__ = [
     "Holonomic",
     "JointDamper",
     "JointSpring",
+    "Keyframe",
     "Memory",
     "Method",
     "Motion",
     "Motor",
+    "MujocoModel",
     "PolynomialCoupling",
     "Pose",
     "PositionServo",
@@ -134,6 +137,7 @@ __all__ = [
     "coordinate_rate",
     "energy",
     "forward_dynamics",
+    "from_mjcf",
     "inertia",
     "init",
     "largest_stable_rate",
