@@ -105,7 +105,9 @@ def solid(compiled: Compiled, link: Link, dtype: Any) -> inertia.Inertia:
     return inertia.from_tensor(masses.sum(), symmetric, center)
 
 
-def offset(compiled: Compiled, links: tuple[Link, ...], link: Link) -> tuple[np.ndarray, np.ndarray]:
+def offset(
+    compiled: Compiled, links: tuple[Link, ...], link: Link
+) -> tuple[np.ndarray, np.ndarray]:
     """Position (3,) and orientation (4,) of a link before its joints, in its parent's frame."""
     m = compiled.model
     top = 0 if link.parent < 0 else links[link.parent].body

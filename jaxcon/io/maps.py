@@ -112,7 +112,10 @@ class Tree:
                 pose.position,
                 pose.orientation,
                 slope.position,
-                2 * quaternion.multiply(quaternion.conjugate(pose.orientation), slope.orientation)[1:],
+                2
+                * quaternion.multiply(quaternion.conjugate(pose.orientation), slope.orientation)[
+                    1:
+                ],
             )
             for pose, slope in zip(poses, slopes, strict=True)
         ]
@@ -161,7 +164,9 @@ class Tree:
             qvel = qvel.at[jnp.asarray([s.v for s in scalars])].set(row.rate)
         return qpos, qvel
 
-    def _relative(self, i: int, joint: LinkJoint, above: Motion, own: Motion) -> tuple[Array, Array]:
+    def _relative(
+        self, i: int, joint: LinkJoint, above: Motion, own: Motion
+    ) -> tuple[Array, Array]:
         """Coordinates and velocities of a ball or free joint."""
         if joint.kind == "free":
             x = jnp.concatenate([own.position, own.orientation])

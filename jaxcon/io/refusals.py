@@ -56,7 +56,9 @@ def friction(compiled: Compiled) -> list[str]:
     if compiled.disabled("frictionloss", "constraint"):
         return []
     m = compiled.model
-    return sorted({compiled.name("joint", m.dof_jntid[i]) for i in np.flatnonzero(m.dof_frictionloss)})
+    return sorted(
+        {compiled.name("joint", m.dof_jntid[i]) for i in np.flatnonzero(m.dof_frictionloss)}
+    )
 
 
 def tendons(compiled: Compiled) -> list[str]:
@@ -118,7 +120,9 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
     for kind, field, what in ZERO:
         for name in _named(compiled, kind, getattr(m, field, ())):
             yield f"{what} of {kind} '{name}'"
-    for i in np.flatnonzero(np.any(np.reshape(getattr(m, "dof_dampingpoly", 0.0), (-1, 1)), axis=1)):
+    for i in np.flatnonzero(
+        np.any(np.reshape(getattr(m, "dof_dampingpoly", 0.0), (-1, 1)), axis=1)
+    ):
         yield f"polynomial damping of degree of freedom {i}"
     if compiled.disabled("actuation") and m.nu:
         yield "the flag actuation='disable' of a model with actuators"
