@@ -151,9 +151,8 @@ def test_rotors_on_three_twists_add_to_the_moments():
 def test_equal_springs_on_three_twists_pull_along_the_rotation_vector():
     system, state = ball(*(jc.JointSpring(f"s{i}", f"twist{i}", 2.0, 0.1) for i in range(3)))
     turn, spin = jnp.asarray([0.7, -1.3, 0.4]), jnp.asarray([0.2, 0.1, -0.3])
-    q = jnp.concatenate(
-        [jnp.zeros(3), jc.quaternion.multiply(state.q[3:], jc.quaternion.exp(turn))]
-    )
+    turned = jc.quaternion.multiply(state.q[3:], jc.quaternion.exp(turn))
+    q = jnp.concatenate([jnp.zeros(3), turned])
     s = dataclasses.replace(state, q=q, v=jnp.concatenate([jnp.zeros(3), spin]))
     moments = jnp.asarray(MOMENTS)
     torque = -2.0 * turn - 0.1 * spin - jnp.cross(spin, moments * spin)

@@ -1,17 +1,21 @@
 """Models of MuJoCo against MuJoCo itself: accelerations at random states, maps, what is refused."""
 
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from compiling import quick_jit
 
+import jaxcon as jc
+
 mujoco = pytest.importorskip("mujoco")
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
+from benchmarks import mjcf_agreement as agreement  # noqa: E402
 
-import jaxcon as jc  # noqa: E402
-
-DENSE = jc.Method(stabilizer=jc.Unstabilized(), solver=jc.Dense())
 AGREE = 1e-9
 """Accelerations, relative to the largest one of the state."""
 BODY = '<inertial pos="0.1 0.02 -0.2" mass="1.3" fullinertia="0.06 0.05 0.04 0.01 0.005 -0.004"/>'
@@ -25,93 +29,35 @@ def model(bodies, rest="", options=""):
     )
 
 
-def random_states(m, n, seed=0):
-    """qpos within half a radian or metre of the reference, any ball and free orientation."""
-    random = np.random.default_rng(seed)
-    qpos = m.qpos0 + random.uniform(-0.5, 0.5, (n, m.nq))
-    for kind, q in zip(m.jnt_type, m.jnt_qposadr, strict=True):
-        if kind in (0, 1):
-            first = q if kind else q + 3
-            turn = random.normal(size=(n, 4))
-            qpos[:, first : first + 4] = turn / np.linalg.norm(turn, axis=1, keepdims=True)
-    return qpos, random.normal(size=(n, m.nv)), random.uniform(-2, 2, (n, m.nu))
-
-
-def agreement(text, n=20, **options):
-    """The largest relative difference of qacc, and what comes back of qpos and qvel."""
-    m = text if isinstance(text, mujoco.MjModel) else mujoco.MjModel.from_xml_string(text)
-    read = jc.from_mjcf(m, **options)
-    qpos, qvel, ctrl = random_states(m, n)
-    data, expected = mujoco.MjData(m), np.zeros((n, m.nv))
-    for i in range(n):
-        data.qpos[:], data.qvel[:], data.ctrl[:] = qpos[i], qvel[i], ctrl[i]
-        mujoco.mj_forward(m, data)
-        expected[i] = data.qacc
-
-    def accelerate(qpos, qvel, ctrl):
-        state = read.state(qpos, qvel)
-        solution = jc.forward_dynamics(read.system, state, ctrl, DENSE, 1e-3)
-        return read.qacc(state, solution.acceleration), read.qpos(state), read.qvel(state)
-
-    got, q, v = quick_jit(jax.vmap(accelerate))(qpos, qvel, ctrl)
-    np.testing.assert_allclose(q, qpos, atol=1e-12)
-    np.testing.assert_allclose(v, qvel, atol=1e-12)
-    error = np.abs(got - expected).max(1) / np.abs(expected).max(1)
-    assert error.max() < AGREE, (error.max(), got[0], expected[0])
-    return read
-
-
-HINGES = '<joint name="j{0}" axis="{1}" pos="0.1 0.2 0.3" ref="0.2" {2}/>'
+HINGES = '<joint name="j{0}{{0}}" axis="{1}" pos="0.1 0.2 0.3" ref="0.2" {2}/>'
 SPRUNG = 'stiffness="{}" springref="0.3" damping="0.4" armature="0.05"'
-TREES = {
+SLIDES = '<joint type="slide" axis="1 0.3 0" stiffness="7" ref="0.1"/>'
+SLIDES += '<joint type="slide" axis="0 1 0.2" damping="0.2" armature="0.1"/>'
+AXES = ("1 0 0", "0 1 0", "0 0 1")
+JOINTS = {
     "two hinges": HINGES.format(1, "1 0.2 0.1", SPRUNG.format(3))
     + HINGES.format(2, "0.1 0.3 1", SPRUNG.format(5)),
     "three hinges": HINGES.format(1, "1 0.2 0.1", SPRUNG.format(3))
     + HINGES.format(2, "0.1 0.3 1", SPRUNG.format(5))
     + HINGES.format(3, "0.1 1 0.3", SPRUNG.format(2)),
-    "slides and hinges": '<joint type="slide" axis="1 0.3 0" ref="0.1" stiffness="7"/>'
-    '<joint type="slide" axis="0 1 0.2" armature="0.3"/>'
+    "slides and hinges": SLIDES
     + HINGES.format(1, "1 0.2 0.1", "")
     + HINGES.format(2, "0.1 0.3 1", SPRUNG.format(2)),
     "hinges, then slides": HINGES.format(1, "1 0.2 0.1", SPRUNG.format(3))
     + HINGES.format(2, "0.1 0.3 1", "")
-    + '<joint type="slide" axis="1 0.3 0" stiffness="7"/>'
-    + '<joint type="slide" axis="0 1 0.2" damping="0.2" armature="0.1"/>',
-    "six freedoms": "".join(
-        f'<joint type="slide" axis="{a}"/>' for a in ("1 0 0", "0 1 0", "0 0 1")
-    )
-    + "".join(HINGES.format(i, a, "") for i, a in enumerate(("1 0 0", "0 1 0", "0 0 1"))),
-    "ball": '<joint name="j1" type="ball" pos="0.1 0 0.2" stiffness="2" damping="0.3"'
-    ' armature="0.1"/>',
+    + SLIDES,
+    "six freedoms": "".join(f'<joint type="slide" axis="{a}"/>' for a in AXES)
+    + "".join(HINGES.format(i, a, "") for i, a in enumerate(AXES)),
+    "ball": '<joint type="ball" pos="0.1 0 0.2" stiffness="2" damping="0.3" armature="0.1"/>',
     "a slide and a ball": '<joint type="slide" axis="1 0.3 0" damping="2"/>'
     '<joint type="ball" pos="0.1 0 0.2" damping="0.3"/>',
 }
-
-
-@pytest.mark.parametrize("joints", TREES.values(), ids=list(TREES))
-def test_bodies_with_several_joints(joints):
-    """Below a body that moves, with a second one welded to it at an angle."""
-    welded = f'<body pos="0.1 0.2 0" euler="0.3 0.2 0.1">{SMALL}</body>'
-    inner = f'<body pos="0.2 0.1 0.3" euler="0.5 0.1 -0.4">{joints}{BODY}{welded}</body>'
-    agreement(model(f'<body><joint axis="0 1 0"/>{SMALL}{inner}</body>'))
-
-
-def test_free_bodies():
-    """One with springs, damping and a rotor along its six freedoms, and one without."""
-    loaded = '<joint type="free" damping="0.2" stiffness="1.5" armature="0.1"/>'
-    agreement(
-        model(
-            f'<body pos="1 2 3" euler="0.3 0.2 0.1">{loaded}{BODY}</body>'
-            f"<body><freejoint/>{SMALL}<body><joint/>{BODY}</body></body>"
-        )
-    )
-
-
 ARM = (
     f'<body name="arm"><joint name="turn" axis="0 1 0" ref="0.3"/>{BODY}'
-    f'<body name="tip" pos="0 0 1"><joint name="out" type="slide" axis="1 0 0"/>{SMALL}</body></body>'
+    '<body name="tip" pos="0 0 1"><joint name="out" type="slide" axis="1 0 0"/>'
+    f"{SMALL}</body></body>"
 )
-ACTUATORS = """
+ON_ARM = """
 <motor joint="turn" gear="3" ctrllimited="true" ctrlrange="-1 0.5"/>
 <position joint="turn" kp="4" kv="0.5" gear="2" forcelimited="true" forcerange="-3 2"/>
 <velocity joint="out" kv="3"/>
@@ -119,33 +65,60 @@ ACTUATORS = """
   biasprm="0.1 -0.5 -0.3" gear="1.5"/>
 <general joint="out" gainprm="3" forcelimited="true" forcerange="-2 2"/>
 """
+FLOATING = (
+    f'<body euler="0.2 0.3 0.4"><freejoint name="free"/>{BODY}'
+    f'<body euler="0.1 0.5 0.2"><joint name="ball" type="ball"/>{SMALL}</body></body>'
+)
+ON_FLOATING = """
+<motor joint="ball" gear="1 2 3"/>
+<motor jointinparent="ball" gear="1 -2 0.5"/>
+<position joint="ball" gear="0 2 1" kp="2" kv="0.3"/>
+<motor joint="free" gear="1 2 3 0 0 0"/>
+<motor joint="free" gear="0 0 0 1 2 3"/>
+<motor jointinparent="free" gear="0 0 0 1 -2 0.5"/>
+"""
+LOADED = (
+    '<body pos="1 2 3" euler="0.3 0.2 0.1">'
+    f'<joint type="free" damping="0.2" stiffness="1.5" armature="0.1"/>{BODY}</body>'
+)
 
 
-def test_actuators_on_hinges_and_slides():
-    read = agreement(model(ARM, f"<actuator>{ACTUATORS}</actuator>"))
-    assert read.system.layout.n_u == 5
+def tree(name):
+    """Joints between a body that moves and one with another welded to it at an angle."""
+    joints = JOINTS[name].replace("{0}", name)
+    welded = f'<body pos="0.1 0.2 0" euler="0.3 0.2 0.1">{SMALL}</body>'
+    inner = f'<body pos="0.2 0.1 0.3" euler="0.5 0.1 -0.4">{joints}{BODY}{welded}</body>'
+    return f'<body><joint axis="0 1 0"/>{SMALL}{inner}</body>'
 
 
-def test_actuators_on_ball_and_free_joints():
-    bodies = (
-        f'<body euler="0.2 0.3 0.4"><freejoint name="free"/>{BODY}'
-        f'<body euler="0.1 0.5 0.2"><joint name="ball" type="ball"/>{SMALL}</body></body>'
-    )
-    actuators = """
-    <motor joint="ball" gear="1 2 3"/>
-    <motor jointinparent="ball" gear="1 -2 0.5"/>
-    <position joint="ball" gear="0 2 1" kp="2" kv="0.3"/>
-    <motor joint="free" gear="1 2 3 0 0 0"/>
-    <motor joint="free" gear="0 0 0 1 2 3"/>
-    <motor jointinparent="free" gear="0 0 0 1 -2 0.5"/>
-    """
-    agreement(model(bodies, f"<actuator>{actuators}</actuator>"))
+TREES = {name: tree(name) for name in JOINTS}
+TREES |= {"arm and actuators": ARM, "floating and actuators": FLOATING, "loaded": LOADED}
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_accelerations_and_coordinates_are_those_of_mujoco(name):
+    actuators = {"arm and actuators": ON_ARM, "floating and actuators": ON_FLOATING}.get(name, "")
+    m = mujoco.MjModel.from_xml_string(model(TREES[name], f"<actuator>{actuators}</actuator>"))
+    read = jc.from_mjcf(m)
+    states = agreement.random_states(m, 4)
+    expected = agreement.mujoco_accelerations(m, states)
+    for qpos, qvel, ctrl, qacc in zip(*states, expected, strict=True):
+        state = read.state(qpos, qvel)
+        solution = jc.forward_dynamics(read.system, state, ctrl, agreement.EXACT, 1e-3)
+        got = np.asarray(read.qacc(state, solution.acceleration))
+        assert agreement.relative(got[None], qacc[None]) < AGREE
+        np.testing.assert_allclose(read.qpos(state), qpos, atol=1e-12)
+        np.testing.assert_allclose(read.qvel(state), qvel, atol=1e-12)
 
 
 def test_flags_of_the_options_are_obeyed():
     flags = "".join(f'{f}="disable" ' for f in ("gravity", "spring", "damper", "clampctrl"))
-    text = model(ARM, f"<actuator>{ACTUATORS}</actuator>")
-    agreement(text.replace("<option />", f"<option><flag {flags}/></option>"))
+    text = model(TREES["two hinges"] + ARM, f"<actuator>{ON_ARM}</actuator>")
+    system, _ = jc.from_mjcf(text.replace("<option />", f"<option><flag {flags}/></option>"))
+    np.testing.assert_array_equal(system.params["gravity"], 0)
+    fields = [set(numbers) for numbers in system.params.values() if isinstance(numbers, dict)]
+    assert not any({"stiffness", "damping", "control_range"} & own for own in fields)
+    assert any("inertia" in own and "mass" not in own for own in fields)  # rotors stay
 
 
 def test_positions_count_turns_where_that_is_asked_for():
@@ -160,7 +133,8 @@ def test_positions_count_turns_where_that_is_asked_for():
 
 def test_names_are_those_of_the_model():
     """In MuJoCo a body, its joint and its motor may have one name."""
-    bodies = f'<body name="arm"><joint name="arm"/>{BODY}<body><joint type="slide"/>{SMALL}</body></body>'
+    inner = f'<body><joint type="slide"/>{SMALL}</body>'
+    bodies = f'<body name="arm"><joint name="arm"/>{BODY}{inner}</body>'
     actuator = '<actuator><motor name="arm" joint="arm"/></actuator>'
     read = jc.from_mjcf(model(bodies, actuator))
     assert read.system.layout.bodies == ("arm", "body 2")
@@ -184,14 +158,11 @@ def test_keyframes_are_states_and_controls():
         read.keyframe("straight")
 
 
-def test_a_model_unpacks_and_runs_in_both_precisions():
-    for dtype in (jnp.float32, jnp.float64):
-        system, state = jc.from_mjcf(model(ARM), dtype=dtype)
-        final, _ = quick_jit(lambda system, s: jc.rollout(system, jc.Method(), s, None, 2e-3, 10))(
-            system, state
-        )
-        jc.raise_for_status(final)
-        assert final.q.dtype == dtype
+def test_a_model_unpacks_and_runs_in_single_precision():
+    system, state = jc.from_mjcf(model(ARM), dtype=jnp.float32)
+    final, _ = quick_jit(lambda s: jc.step(system, jc.Method(), s, None, 2e-3))(state)
+    jc.raise_for_status(final)
+    assert {x.dtype for x in jax.tree.leaves(system)} == {jnp.dtype("float32")}
 
 
 def test_the_map_to_states_is_differentiable():
@@ -220,9 +191,14 @@ URDF = """
 
 
 def test_urdf():
-    read = agreement(URDF)
+    """A fixed joint makes one body of two: 2 kg at 0.2 m and 0.5 kg at 0.4 m along z."""
+    read = jc.from_mjcf(URDF)
     assert dict(read.joints) == {"shoulder": ("shoulder", "angle")}
-    np.testing.assert_allclose(read.system.params["upper"]["mass"], 2.5)
+    upper = read.system.params["upper"]
+    np.testing.assert_allclose(upper["mass"], 2.5)
+    across = 0.1 + 0.2 + 2 * 0.01 + 2 * (2 * 0.04**2 + 0.5 * 0.16**2)
+    np.testing.assert_allclose(jnp.sum(upper["inertia"]), 0.15 + 0.01 + across, rtol=1e-9)
+    np.testing.assert_allclose(read.qvel(read.state([0.3], [2.0])), [2.0], rtol=1e-12)
 
 
 SITES = '<site name="{}" pos="0.1 0.2 0.3" euler="0.4 0.1 0.2"/>'
@@ -246,7 +222,7 @@ def test_equalities_are_violated_as_much_as_in_mujoco(equality):
     """At random states: the gap of the points as MuJoCo sees it, and the sine of half the turn."""
     m = mujoco.MjModel.from_xml_string(model(WELDED, f"<equality>{equality}</equality>"))
     read, data = jc.from_mjcf(m), mujoco.MjData(m)
-    qpos, qvel, _ = random_states(m, 3)
+    qpos, qvel, _ = agreement.random_states(m, 3)
     for i in range(3):
         data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
         mujoco.mj_forward(m, data)
@@ -323,8 +299,9 @@ UNSUPPORTED = {
         HINGE.format("", '<site name="s"/>'), '<actuator><motor name="m" site="s"/></actuator>'
     ),
     "dyntype 'filter'": acting('<general joint="turn" dyntype="filter" dynprm="1"/>'),
-    "gaintype 'muscle'": acting('<muscle joint="turn" lengthrange="0 1"/>').replace(
-        "muscle ", 'general gaintype="muscle" '
+    "biastype 'muscle'": acting(
+        '<general joint="turn" biastype="muscle" biasprm="0.75 1.05 1 200 0.5 1.6 1.5 1.3 1.2"'
+        ' lengthrange="0 1"/>'
     ),
     "actuatorfrcrange of joint 'j'": model(HINGE.format('actuatorfrcrange="-1 1"', "")),
     "equality 'e' is of type 'tendon'": model(
@@ -336,10 +313,9 @@ UNSUPPORTED = {
         f'<body><freejoint name="f"/>{BODY}</body>',
         '<actuator><motor joint="f" gear="1 0 0 0 1 0"/></actuator>',
     ),
-    "'j' and 'k'|'j', 'k'\\] of body 'b' pass each other": model(
-        HINGE.format('axis="1 0 0"', '<joint name="k" axis="0 1 0" pos="0 0 1"/>')
-        .replace(BODY + "<joint", "<joint")
-        .replace("</body>", BODY + "</body>")
+    "'j', 'k'\\] of body 'b' pass each other": model(
+        f'<body name="b"><joint name="j" axis="1 0 0"/>'
+        f'<joint name="k" axis="0 1 0" pos="0 0 1"/>{BODY}</body>'
     ),
     "gimbal lock": model(
         '<body><joint axis="0 0 1"/><joint axis="1 0 0"/><joint axis="0 0 1"/>' + BODY + "</body>"

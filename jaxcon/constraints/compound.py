@@ -153,7 +153,7 @@ class Compound:
         if len(slides) == 1:
             across = normals(slides[0])
         elif len(slides) == 2:
-            n = jnp.cross(*slides)
+            n = jnp.cross(slides[0], slides[1])
             across = [n / jnp.sqrt(jnp.dot(n, n))]
         x, y, z = *slides, *across
         volume = jnp.dot(x, jnp.cross(y, z))

@@ -46,12 +46,12 @@ def join(compiled: Compiled, link: Link, names: Names) -> Joined:
     Raises:
         NotImplementedError: the freedoms of the link are none that one joint has.
     """
-    if [j.kind for j in link.joints] == ["free"]:
+    joint, *more = link.joints
+    if joint.kind == "free":
         return Joined([], {})
     ends = (link.above, link.name)
-    if len(link.joints) > 1:
+    if more:
         return _compound(compiled, link, ends, names)
-    (joint,) = link.joints
     name = names.take(compiled.name("joint", joint.id), "joint")
     point, axis = compiled.data.xanchor[joint.id], compiled.data.xaxis[joint.id]
     if joint.kind == "ball":

@@ -107,18 +107,7 @@ class Tree:
     def motions(self, qpos: Array, qvel: Array) -> list[Motion]:
         """Of the frame of every link; ω = 2 q* ⊗ q̇."""
         poses, slopes = jax.jvp(self.poses, (qpos,), (self.rates(qpos, qvel),))
-        return [
-            Motion(
-                pose.position,
-                pose.orientation,
-                slope.position,
-                2
-                * quaternion.multiply(quaternion.conjugate(pose.orientation), slope.orientation)[
-                    1:
-                ],
-            )
-            for pose, slope in zip(poses, slopes, strict=True)
-        ]
+        return [_motion(*pair) for pair in zip(poses, slopes, strict=True)]
 
     def flat(self, system: Any, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """q and v of the system."""
@@ -186,6 +175,12 @@ class Tree:
         for members in found.values():
             scalars, ends = zip(*members, strict=True)
             yield list(scalars), list(ends)
+
+
+def _motion(pose: Pose, slope: Pose) -> Motion:
+    """From a pose and its derivative in time."""
+    spin = quaternion.multiply(quaternion.conjugate(pose.orientation), slope.orientation)
+    return Motion(pose.position, pose.orientation, slope.position, 2 * spin[1:])
 
 
 def _inverse(offset: Pose | None) -> Pose | None:

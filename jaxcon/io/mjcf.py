@@ -121,8 +121,8 @@ def from_mjcf(
     Bodies without a joint become part of their parent. Several joints of one body become one
     `Compound`. Springs, dampers, rotors (armature), actuators and keyframes are those of the model;
     equality constraints hold as joints do, not softly by `solref` and `solimp`. Integrator and
-    step are the user's, `timestep` is the model's. What has no effect on the motion (sites, cameras,
-    sensors) is left out; what has one and is not supported is refused by name.
+    step are the user's, `timestep` is the model's. What has no effect on the motion (sites,
+    cameras, sensors) is left out; what has one and is not supported is refused by name.
 
     Args:
         source: path of a file, its text, or a `mujoco.MjModel`.

@@ -56,9 +56,8 @@ def friction(compiled: Compiled) -> list[str]:
     if compiled.disabled("frictionloss", "constraint"):
         return []
     m = compiled.model
-    return sorted(
-        {compiled.name("joint", m.dof_jntid[i]) for i in np.flatnonzero(m.dof_frictionloss)}
-    )
+    rubbing = np.unique(m.dof_jntid[m.dof_frictionloss > 0])
+    return [compiled.name("joint", int(i)) for i in rubbing]
 
 
 def tendons(compiled: Compiled) -> list[str]:
@@ -91,16 +90,17 @@ IGNORABLE: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
 """What may be left out where the user says so: what it is, and what has it."""
 
 
-def refuse(compiled: Compiled, ignore: Iterable[str]) -> None:
+def refuse(compiled: Compiled, ignore: tuple[str, ...]) -> None:
     """Checks that everything that has an effect is simulated, but for what the user gives up.
 
     Raises:
         ValueError: `ignore` has an unknown entry.
         NotImplementedError: the model has what is not supported.
     """
-    if isinstance(ignore, str) or (unknown := set(ignore) - set(IGNORABLE)):
-        got = ignore if isinstance(ignore, str) else sorted(unknown)
-        raise ValueError(f"from_mjcf: ignore must be names out of {list(IGNORABLE)}, got {got!r}.")
+    if isinstance(ignore, str) or set(ignore) - set(IGNORABLE):
+        raise ValueError(
+            f"from_mjcf: ignore must be names out of {list(IGNORABLE)}, got {ignore!r}."
+        )
     for key, (what, found) in IGNORABLE.items():
         if key not in ignore and (names := found(compiled)):
             raise NotImplementedError(
@@ -120,10 +120,8 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
     for kind, field, what in ZERO:
         for name in _named(compiled, kind, getattr(m, field, ())):
             yield f"{what} of {kind} '{name}'"
-    for i in np.flatnonzero(
-        np.any(np.reshape(getattr(m, "dof_dampingpoly", 0.0), (-1, 1)), axis=1)
-    ):
-        yield f"polynomial damping of degree of freedom {i}"
+    if np.any(getattr(m, "dof_dampingpoly", 0.0)):
+        yield "polynomial damping of joints"
     if compiled.disabled("actuation") and m.nu:
         yield "the flag actuation='disable' of a model with actuators"
     if m.opt.disableactuator:
