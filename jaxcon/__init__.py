@@ -19,6 +19,7 @@ from jaxcon.analysis.quantities import (
 from jaxcon.analysis.report import Report, report
 from jaxcon.constraints.armature import Armature
 from jaxcon.constraints.blades import KnifeEdge
+from jaxcon.constraints.compound import Compound
 from jaxcon.constraints.couplings import (
     Belt,
     Differential,
@@ -52,6 +53,7 @@ from jaxcon.constraints.pairs import (
 from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphere
 from jaxcon.constraints.shafts import ConstantVelocity, Universal
 from jaxcon.constraints.span import Span
+from jaxcon.constraints.twist import Twist
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.assembly import Assembly, assemble
 from jaxcon.dynamics.chains import Chain, hanging, rod, rope
@@ -60,6 +62,7 @@ from jaxcon.dynamics.scene import Scene
 from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.io.mjcf import Keyframe, MujocoModel, from_mjcf
 from jaxcon.model.actuators import (
     AffineActuator,
     JointDamper,
@@ -105,6 +108,7 @@ __all__ = [
     "Bending",
     "Chain",
     "Coincident",
+    "Compound",
     "ConjugateGradients",
     "ConstantVelocity",
     "CustomForce",
@@ -126,12 +130,14 @@ __all__ = [
     "Integrability",
     "JointDamper",
     "JointSpring",
+    "Keyframe",
     "KnifeEdge",
     "LinearMomentum",
     "Memory",
     "Method",
     "Motion",
     "Motor",
+    "MujocoModel",
     "Parallel",
     "Planar",
     "PointOnCurve",
@@ -164,6 +170,7 @@ __all__ = [
     "Status",
     "StepInfo",
     "TurnCounter",
+    "Twist",
     "Universal",
     "Unstabilized",
     "Vakonomic",
@@ -177,6 +184,7 @@ __all__ = [
     "coordinate_rate",
     "energy",
     "forward_dynamics",
+    "from_mjcf",
     "hanging",
     "inertia",
     "init",

@@ -192,6 +192,33 @@ def cam(s: Site) -> list[Any]:
     return [hinge, reach, jc.PolynomialCoupling(s.joint[0], hinge.name, reach.name, shape)]
 
 
+def telescope(s: Site) -> list[Any]:
+    """Two slides and two hinges, none perpendicular to another, with three of them prescribed."""
+    axes = np.array([s.axis, s.other + s.axis, np.cross(s.axis, s.other)]) + 0.3
+    name, a, b = s.joint
+    arm = jc.Compound(name, a, b, s.point, slides=(*axes[:2],), hinges=(*axes[1:],))
+    shape = (0.0, 0.3, -0.2, 0.1)
+    cams = [
+        jc.PolynomialCoupling(cam + s.suffix, name, name, shape, *coordinates)
+        for cam, *coordinates in (("cam", "angle_1", "travel_2"), ("rise", "travel_1", "angle_2"))
+    ]
+    return [arm, *cams]
+
+
+def gimbal(s: Site) -> list[Any]:
+    """A slide and three oblique hinges, each turned by the next."""
+    axes = np.array([s.axis, np.cross(s.axis, s.other), s.other])
+    name, a, b = s.joint
+    arm = jc.Compound(name, a, b, s.point, slides=(s.other,), hinges=(*(axes + 0.2),))
+    shape = (0.0, 0.3, -0.2, 0.1)
+    turns = ("angle_1", "angle_2"), ("angle_2", "angle_3")
+    cams = [
+        jc.PolynomialCoupling(cam + s.suffix, name, name, shape, *pair)
+        for cam, pair in zip(("outer", "inner"), turns, strict=True)
+    ]
+    return [arm, *cams]
+
+
 def breathing(a: Any, b: Any, t: Any, p: Any) -> Any:
     """A point of b stays at a distance from the centre of a that varies in time."""
     gap = b.point(p["anchor"]) - a.position
@@ -270,6 +297,8 @@ JOINTS = {
     "rolling_cylinder": Joint(rolling_cylinder, ("joint", "radius"), (3,), (2, 2)),
     "rolling_disc": Joint(rolling_disc, ("joint", "radius"), held=(1, 1)),
     "knife_edge": Joint(knife_edge, ("joint", "anchor_b"), held=(0, 1)),
+    "telescope": Joint(telescope, ("joint", "anchor_b"), dims=(3,)),
+    "gimbal": Joint(gimbal, ("joint", "anchor_b"), dims=(3,)),
     "holonomic": Joint(holonomic, ("joint", "params")),
     "velocity_level": Joint(velocity_level, ("joint", "params"), held=(0, 0)),
     "momentum": Joint(momentum, ("joint", "value"), held=(0, 0)),

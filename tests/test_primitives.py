@@ -273,6 +273,8 @@ FREEDOM = {
     "rolling_cylinder": (None, 1),
     "rolling_disc": (1, 3),
     "knife_edge": (2, 4),
+    "telescope": (None, 2),
+    "gimbal": (None, 2),
     "holonomic": (2, 5),
     "velocity_level": (2, 5),
     "momentum": (2, 3),
@@ -303,7 +305,9 @@ def test_a_distance_of_zero_has_no_direction_and_is_finite(dim):
         assert jnp.all(jnp.isfinite(leaf))
 
 
-@pytest.mark.parametrize("kind", ["fixed", "prismatic", "driven_revolute", "screw"])
+@pytest.mark.parametrize(
+    "kind", ["fixed", "prismatic", "driven_revolute", "screw", "telescope", "gimbal"]
+)
 def test_derivatives_of_rows_at_the_identity_are_finite(kind):
     """Where both bodies are upright and the joint is as at assembly."""
     scene = jc.Scene()

@@ -50,8 +50,10 @@ class Constraint(Protocol):
 class Joint(Protocol):
     """How a joint is described: two bodies, numbers at assembly, and its rows.
 
-    A joint that can be driven and read also has `coordinates`, the unit of each by its name ("rad"
-    or "m"), and `coordinate(name, p, a, b)`, the row of one.
+    A joint that can be driven and read also has `coordinates`, the unit of each by its name ("rad",
+    counted over turns, "m", or "rotation" where the rate is the derivative of no coordinate), and
+    `coordinate(name, p, a, b)`, the row of one. Joints of one class that move in different ways
+    also have `kind`, a hashable value which then stands for the class.
     """
 
     name: str

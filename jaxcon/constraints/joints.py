@@ -254,12 +254,17 @@ def triad(joint: Any, pose: Pose) -> list[Array]:
 
 def basis(n: Array) -> list[Array]:
     """A unit vector and the directions normal to it, right-handed: two in the plane, or three."""
+    return [n, *normals(n)]
+
+
+def normals(n: Array) -> list[Array]:
+    """The directions normal to a unit vector (dim,) that make it a right-handed frame."""
     if n.shape == (2,):
-        return [n, jnp.stack([-n[1], n[0]])]
+        return [jnp.stack([-n[1], n[0]])]
     smallest = jnp.argmin(jnp.abs(n))
     across = jnp.cross(n, jnp.eye(3, dtype=n.dtype)[smallest])
     u = across / numerics.norm(across)
-    return [n, u, jnp.cross(n, u)]
+    return [u, jnp.cross(n, u)]
 
 
 def unit(joint: Any, what: str, pose: Pose) -> Array:
@@ -271,6 +276,15 @@ def unit(joint: Any, what: str, pose: Pose) -> Array:
     given = getattr(joint, what)
     if given is None:
         raise ValueError(f"{label(joint)}: in space an {what} (3,) is needed, got none.")
+    return unit_vector(joint, what, given, pose)
+
+
+def unit_vector(joint: Any, what: str, given: Any, pose: Pose) -> Array:
+    """A vector (dim,) that a user gave to a joint, at length one.
+
+    Raises:
+        ValueError: it has the wrong shape or length zero.
+    """
     axis = checks.number(label(joint), what, given, pose.position.dtype, pose.position.shape)
     checks.nonzero(label(joint), what, axis)
     return axis / numerics.norm(axis)

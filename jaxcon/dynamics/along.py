@@ -140,11 +140,24 @@ class Along:
 
     def _ends(self, element: Any) -> tuple[End, ...]:
         """The coordinates that an element acts on."""
-        if hasattr(element, "along"):
-            return tuple(
-                find(self.joints, self.where, label(element), *end) for end in element.along
-            )
-        return (find(self.joints, self.where, label(element), element.joint, element.coordinate),)
+        own = element.along if hasattr(element, "along") else ((element.joint, element.coordinate),)
+        ends = tuple(find(self.joints, self.where, label(element), *end) for end in own)
+        if hasattr(element, "along") or hasattr(element, "motion"):
+            self._check_integrable(element, ends)
+        return ends
+
+    def _check_integrable(self, element: Any, ends: tuple[End, ...]) -> None:
+        """Checks that a coordinate to be prescribed or coupled is the integral of its rate.
+
+        Raises:
+            ValueError: it is a component of a rotation vector.
+        """
+        for group, index, name in ends:
+            if self.joints[group].joint.coordinates[name] == "rotation":
+                raise ValueError(
+                    f"{label(element)}: the {name} of '{self.joints[group].names[index]}' is not"
+                    " the integral of its rate; couple or drive the angle of a hinge."
+                )
 
 
 def _width(cls: type) -> int:

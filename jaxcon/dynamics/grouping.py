@@ -204,7 +204,7 @@ class Gather:
             params = element.attach(*(self.poses[name] for name in names))
             sides = tuple(self._group(name) for name in names)
             fields = tuple((field, jax.tree.map(jnp.shape, x)) for field, x in params.items())
-            groups.setdefault((type(element), sides, fields), []).append((element, params))
+            groups.setdefault((_kind(element), sides, fields), []).append((element, params))
         result = []
         for (cls, _, _), members in groups.items():
             names = tuple(element.name for element, _ in members)
@@ -251,6 +251,11 @@ class Gather:
         if not isinstance(element.bodies, tuple) or not element.bodies:
             raise ValueError(f"{owner}: bodies must be a tuple of names, got {element.bodies!r}.")
         self._check_bodies(element, element.bodies)
+
+
+def _kind(element: Any) -> Any:
+    """What elements of one group share: a class, or what the element says."""
+    return getattr(element, "kind", type(element))
 
 
 def _of(elements: Iterable[Any], *classes: type) -> list[Any]:

@@ -1,5 +1,8 @@
 """The whole saddle matrix, factored as it is (chapter 3.2.5, method 1): the reference."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -40,14 +43,27 @@ def _solve(system: Saddle) -> Solution:
     solution = scale * jax.lax.custom_linear_solve(
         lambda x: matrix @ x,
         right,
-        lambda _, x: jax.scipy.linalg.lu_solve(factor, x),
-        lambda _, x: jax.scipy.linalg.lu_solve(factor, x, trans=1),
+        lambda multiply, x: _refined(multiply, factor, 0, x),
+        lambda multiply, x: _refined(multiply, factor, 1, x),
     )
     pivots = jnp.abs(jnp.diagonal(factor[0]))
     singular = ~jnp.all(pivots > matrix.shape[0] * jnp.finfo(matrix.dtype).eps)
     n = system.force.shape[0]
     status = judge(solution, singular & jnp.all(jnp.isfinite(matrix)))
     return Solution(solution[:n], solution[n:], status)
+
+
+def _refined(multiply: Callable[[Array], Array], factor: Any, trans: int, right: Array) -> Array:
+    """The solution after one step of refinement.
+
+    Of the two it is the one whose error is small in each entry beside its own size, so that a light
+    body that moves with a heavy rotor has the right acceleration.
+
+    References:
+        Skeel, Iterative refinement implies numerical stability for Gaussian elimination (1980).
+    """
+    x = jax.scipy.linalg.lu_solve(factor, right, trans=trans)
+    return x + jax.scipy.linalg.lu_solve(factor, right - multiply(x), trans=trans)
 
 
 def saddle_matrix(system: Saddle, jacobian: Array) -> Array:

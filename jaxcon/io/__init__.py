@@ -1,0 +1,1 @@
+"""Floor 7: models of other programs."""

@@ -1,0 +1,122 @@
+"""Actuators of MuJoCo's on joints, each one control channel, in the order of its controls."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxcon.io.compiled import Compiled, Names
+from jaxcon.io.joints import Coordinate, pushing, turning
+from jaxcon.io.links import Link, LinkJoint
+from jaxcon.model.actuators import AffineActuator, Motor
+
+LAWS = (
+    ("trntype", "mjtTrn", ("joint", "jointinparent")),
+    ("dyntype", "mjtDyn", ("none",)),
+    ("gaintype", "mjtGain", ("fixed", "affine")),
+    ("biastype", "mjtBias", ("none", "affine")),
+)
+"""What is supported of transmission, dynamics, gain and bias."""
+
+
+def actuators(
+    compiled: Compiled,
+    links: tuple[Link, ...],
+    coordinates: dict[int, Coordinate],
+    names: Names,
+) -> Iterator[Any]:
+    """The elements of all actuators.
+
+    Raises:
+        NotImplementedError: one of them is of a kind that is not supported.
+    """
+    joints = {joint.id: (link, joint) for link in links for joint in link.joints}
+    for i in range(compiled.model.nu):
+        _check(compiled, i)
+        link, joint = joints[int(compiled.model.actuator_trnid[i, 0])]
+        name = names.take(compiled.name("actuator", i), "actuator")
+        if joint.id in coordinates:
+            gear = float(compiled.model.actuator_gear[i, 0])
+            reference = float(compiled.model.qpos0[joint.q])
+            yield _law(compiled, i, name, coordinates[joint.id], gear, reference)
+        else:
+            element, at, gear = _vector(compiled, i, link, joint, name, names)
+            yield element
+            yield _law(compiled, i, name, at, gear, 0.0, measured=joint.kind == "ball")
+
+
+def _check(compiled: Compiled, i: int) -> None:
+    """Checks that an actuator is of a supported kind.
+
+    Raises:
+        NotImplementedError: it is not.
+    """
+    m = compiled.model
+    for field, enum, known in LAWS:
+        found = compiled.choice(enum, getattr(m, f"actuator_{field}")[i])
+        if found not in known:
+            raise NotImplementedError(
+                f"from_mjcf: actuator '{compiled.name('actuator', i)}' has the {field} '{found}';"
+                f" supported are {list(known)}."
+            )
+
+
+def _law(
+    compiled: Compiled,
+    i: int,
+    name: str,
+    at: Coordinate,
+    gear: float,
+    reference: float,
+    measured: bool = True,
+) -> Any:
+    """The actuator along a coordinate θ = qpos − reference, whose length is g qpos.
+
+    (g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇ with l = g θ + g reference; where the length is not
+    measured, it counts as zero.
+    """
+    m = compiled.model
+    gain, bias = m.actuator_gainprm[i, :3].copy(), m.actuator_biasprm[i, :3].copy()
+    gain[1:] *= compiled.choice("mjtGain", m.actuator_gaintype[i]) == "affine"
+    bias *= compiled.choice("mjtBias", m.actuator_biastype[i]) == "affine"
+    for law in (gain, bias):
+        law[0] += law[1] * gear * reference
+        law[1] *= measured
+    obeyed = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl")
+    control = m.actuator_ctrlrange[i] if obeyed else None
+    force = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
+    if not gain[1:].any() and not bias.any() and force is None:
+        return Motor(name, at.joint, gear * gain[0], control, at.name)
+    return AffineActuator(name, at.joint, gain, bias, gear, control, force, at.name)
+
+
+def _vector(
+    compiled: Compiled, i: int, link: Link, joint: LinkJoint, name: str, names: Names
+) -> tuple[Any, Coordinate, float]:
+    """A joint without rows along the gear of a ball or free joint, its coordinate, and ‖gear‖.
+
+    Raises:
+        NotImplementedError: the gear has both a force and a torque.
+    """
+    gear = compiled.model.actuator_gear[i]
+    force, torque = (gear[:3], gear[3:]) if joint.kind == "free" else (np.zeros(3), gear[:3])
+    if force.any() and torque.any():
+        raise NotImplementedError(
+            f"from_mjcf: actuator '{compiled.name('actuator', i)}' has a gear with a force and a"
+            f" torque, {gear.tolist()}; give each an actuator of its own."
+        )
+    axis = force if force.any() else torque
+    size = float(np.linalg.norm(axis))
+    axis = axis / size if size else np.array([1.0, 0.0, 0.0])
+    if force.any():
+        axes = np.linalg.svd(axis[None])[2]
+        axes[0] = axis
+        push = pushing(compiled, link, axes, names.take(f"{name} push", "push"))
+        return push, Coordinate(push.name, "travel_1"), size
+    in_parent = compiled.choice("mjtTrn", compiled.model.actuator_trntype[i]) == "jointinparent"
+    frame = compiled.data.xmat[link.body].reshape(3, 3)
+    world = axis if in_parent and joint.kind == "free" else frame @ axis
+    twist = turning(link, world, names.take(f"{name} twist", "twist"), backward=in_parent)
+    return twist, Coordinate(twist.name, "twist"), -size if in_parent else size

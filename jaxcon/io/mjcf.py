@@ -1,0 +1,213 @@
+"""Models that are already written down: MJCF and URDF, read by MuJoCo's own compiler."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core import checks
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array
+from jaxcon.dynamics.scene import Scene
+from jaxcon.io.actuators import actuators
+from jaxcon.io.compiled import Compiled, Names
+from jaxcon.io.equalities import equalities
+from jaxcon.io.joints import Coordinate, join, passive
+from jaxcon.io.links import Link, find_links, offset, solid
+from jaxcon.io.maps import Node, Scalar, Tree
+from jaxcon.io.refusals import refuse
+from jaxcon.model.state import State
+from jaxcon.model.system import BodySystem
+
+
+@pytree
+class Keyframe:
+    """A state that a model names, and the controls that go with it."""
+
+    state: State
+    control: Array
+
+
+@pytree
+class MujocoModel:
+    """A model of MuJoCo as a system, with maps to and from MuJoCo's coordinates.
+
+    `system, state = model` unpacks what a `Scene` builds. The control array is MuJoCo's ctrl.
+
+    Attributes:
+        system: its links are named as the bodies, its joints and actuators as MuJoCo's, with their
+            kind after the name where a body or joint has it already.
+        start: the state at MuJoCo's reference pose, at rest.
+        timestep: of the model's options, () [s].
+        tree: the links and their joints.
+        keys: time, qpos, qvel and ctrl of each keyframe.
+        joints: by MuJoCo's name of each hinge and slide, the joint and coordinate of the system.
+        keyframes: names of the keyframes; "key 0" and so on where they have none.
+    """
+
+    system: BodySystem
+    start: State
+    timestep: Array
+    tree: Tree
+    keys: tuple[dict[str, Array], ...]
+    joints: tuple[tuple[str, Coordinate], ...] = static()
+    keyframes: tuple[str, ...] = static()
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.system, self.start))
+
+    def state(self, qpos: Any, qvel: Any, time: Any = 0.0) -> State:
+        """The state at MuJoCo's coordinates; pure: jit, vmap and differentiate it.
+
+        Args:
+            qpos: (nq,), quaternions of any length but zero; angles may hold whole turns.
+            qvel: (nv,).
+            time: () [s].
+
+        Raises:
+            ValueError: a wrong shape or dtype.
+        """
+        dtype = self.start.q.dtype
+        qpos = checks.number("state", "qpos", qpos, dtype, self.tree.reference.shape)
+        qvel = checks.number("state", "qvel", qvel, dtype, (self.tree.size,))
+        q, v = self.tree.flat(self.system, qpos, qvel)
+        turns = self.tree.turns_of(self.system, qpos)
+        time = checks.number("state", "time", time, dtype)
+        return dataclasses.replace(self.start, q=q, v=v, time=time, turns=turns)
+
+    def qpos(self, state: State) -> Array:
+        """MuJoCo's positions of a state, (nq,).
+
+        An angle lies within half a turn of its reference unless whole turns are counted: by a
+        spring, servo or coupling, or everywhere by `from_mjcf(…, count_turns=True)`.
+        """
+        return self.tree.read(self.system, state)[0]
+
+    def qvel(self, state: State) -> Array:
+        """MuJoCo's velocities of a state, (nv,)."""
+        return self.tree.read(self.system, state)[1]
+
+    def qacc(self, state: State, acceleration: Array) -> Array:
+        """MuJoCo's accelerations, (nv,): the rate of qvel where the bodies have this a (n_v,)."""
+
+        def qvel(q: Array, v: Array) -> Array:
+            return self.qvel(dataclasses.replace(state, q=q, v=v))
+
+        slopes = self.system.kinematics(state.q, state.v), acceleration
+        return jax.jvp(qvel, (state.q, state.v), slopes)[1]
+
+    def keyframe(self, name: str) -> Keyframe:
+        """A keyframe by name.
+
+        Raises:
+            ValueError: there is none of this name.
+        """
+        if name not in self.keyframes:
+            raise ValueError(f"keyframe '{name}' is unknown; known are {list(self.keyframes)}.")
+        key = self.keys[self.keyframes.index(name)]
+        return Keyframe(self.state(key["qpos"], key["qvel"], key["time"]), key["ctrl"])
+
+
+def from_mjcf(
+    source: Any, ignore: tuple[str, ...] = (), count_turns: bool = False, dtype: Any = None
+) -> MujocoModel:
+    """A system from an MJCF or URDF model, compiled by MuJoCo: `pip install 'jaxcon[mujoco]'`.
+
+    Bodies without a joint become part of their parent. Several joints of one body become one
+    `Compound`. Springs, dampers, rotors (armature), actuators and keyframes are those of the model;
+    equality constraints hold as joints do, not softly by `solref` and `solimp`. Integrator and
+    step are the user's, `timestep` is the model's. What has no effect on the motion (sites,
+    cameras, sensors) is left out; what has one and is not supported is refused by name.
+
+    Args:
+        source: path of a file, its text, or a `mujoco.MjModel`.
+        ignore: what to leave out although it has an effect, out of "contact", "limit", "friction",
+            "tendon", "fluid" and "gravcomp".
+        count_turns: whether every hinge counts its whole turns, so that `qpos` gives them.
+        dtype: of every number; JAX's default float unless given.
+
+    Returns:
+        The model; `system, state = jc.from_mjcf(path)` is enough to simulate it.
+
+    Raises:
+        ImportError: MuJoCo is not installed.
+        FileNotFoundError: there is no such file.
+        ValueError: MuJoCo cannot compile it, or nothing in it moves.
+        NotImplementedError: it has what is not supported; the message names it.
+    """
+    compiled = Compiled(source)
+    refuse(compiled, ignore)
+    names = Names()
+    links = find_links(compiled, names)
+    scene = Scene(gravity=_gravity(compiled), dtype=dtype)
+    for link in links:
+        frame = compiled.data.xpos[link.body], compiled.data.xquat[link.body]
+        body = solid(compiled, link, scene.dtype)
+        scene.add_body(link.name, inertia=body, position=frame[0], quaternion=frame[1])
+    found = _add_elements(scene, compiled, links, names, count_turns)
+    system, state = scene.build()
+    m, cast = compiled.model, lambda x: jnp.asarray(x, scene.dtype)
+    keys = [
+        {"time": m.key_time[i], "qpos": m.key_qpos[i], "qvel": m.key_qvel[i], "ctrl": m.key_ctrl[i]}
+        for i in range(m.nkey)
+    ]
+    return MujocoModel(
+        system,
+        state,
+        cast(m.opt.timestep),
+        _tree(compiled, links, found, cast),
+        jax.tree.map(cast, tuple(keys)),
+        tuple((compiled.name("joint", i), at) for i, at in sorted(found.items())),
+        tuple(compiled.name("key", i) for i in range(m.nkey)),
+    )
+
+
+def _gravity(compiled: Compiled) -> np.ndarray:
+    """Of the options [m/s²]."""
+    return compiled.model.opt.gravity * (not compiled.disabled("gravity"))
+
+
+def _add_elements(
+    scene: Scene, compiled: Compiled, links: tuple[Link, ...], names: Names, count: bool
+) -> dict[int, Coordinate]:
+    """Adds everything between the links; returns the coordinate of each hinge and slide."""
+    found: dict[int, Coordinate] = {}
+    for link in links:
+        joined = join(compiled, link, names)
+        found |= joined.coordinates
+        for element in joined.elements:
+            scene.add(element)
+    for element in equalities(compiled, links, found, names):
+        scene.add(element)
+    for element in actuators(compiled, links, found, names):
+        scene.add(element)
+    for link in links:
+        for joint in link.joints:
+            for element in passive(compiled, link, joint, found.get(joint.id), names, count):
+                scene.add(element)
+    return found
+
+
+def _tree(
+    compiled: Compiled, links: tuple[Link, ...], found: dict[int, Coordinate], cast: Any
+) -> Tree:
+    """The links and joints as what maps coordinates."""
+    m = compiled.model
+    offsets = [offset(compiled, links, link) for link in links]
+    joints = {joint.id: joint for link in links for joint in link.joints}
+    scalars = [Scalar(joints[i].q, joints[i].v, at) for i, at in sorted(found.items())]
+    return Tree(
+        cast(np.array([x for x, _ in offsets])),
+        cast(np.array([turn for _, turn in offsets])),
+        cast(m.jnt_pos),
+        cast(m.jnt_axis),
+        cast(m.qpos0),
+        nodes=tuple(Node(link.name, link.parent, link.joints) for link in links),
+        scalars=tuple(scalars),
+        size=m.nv,
+    )

@@ -1,0 +1,370 @@
+"""Models of MuJoCo against MuJoCo itself: accelerations at random states, maps, what is refused."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+
+import jaxcon as jc
+
+mujoco = pytest.importorskip("mujoco")
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import mjcf_agreement as agreement  # noqa: E402
+
+AGREE = 1e-9
+"""Accelerations, relative to the largest one of the state."""
+BODY = '<inertial pos="0.1 0.02 -0.2" mass="1.3" fullinertia="0.06 0.05 0.04 0.01 0.005 -0.004"/>'
+SMALL = '<inertial pos="0 0.1 0" quat="1 0.3 0 0.2" mass="0.7" diaginertia="0.02 0.03 0.025"/>'
+
+
+def model(bodies, rest="", options=""):
+    return (
+        f'<mujoco><compiler angle="radian"/><option {options}/>'
+        f"<worldbody>{bodies}</worldbody>{rest}</mujoco>"
+    )
+
+
+HINGES = '<joint name="j{0}{{0}}" axis="{1}" pos="0.1 0.2 0.3" ref="0.2" {2}/>'
+SPRUNG = 'stiffness="{}" springref="0.3" damping="0.4" armature="0.05"'
+SLIDES = '<joint type="slide" axis="1 0.3 0" stiffness="7" ref="0.1"/>'
+SLIDES += '<joint type="slide" axis="0 1 0.2" damping="0.2" armature="0.1"/>'
+AXES = ("1 0 0", "0 1 0", "0 0 1")
+JOINTS = {
+    "two hinges": HINGES.format(1, "1 0.2 0.1", SPRUNG.format(3))
+    + HINGES.format(2, "0.1 0.3 1", SPRUNG.format(5)),
+    "three hinges": HINGES.format(1, "1 0.2 0.1", SPRUNG.format(3))
+    + HINGES.format(2, "0.1 0.3 1", SPRUNG.format(5))
+    + HINGES.format(3, "0.1 1 0.3", SPRUNG.format(2)),
+    "slides and hinges": SLIDES
+    + HINGES.format(1, "1 0.2 0.1", "")
+    + HINGES.format(2, "0.1 0.3 1", SPRUNG.format(2)),
+    "hinges, then slides": HINGES.format(1, "1 0.2 0.1", SPRUNG.format(3))
+    + HINGES.format(2, "0.1 0.3 1", "")
+    + SLIDES,
+    "six freedoms": "".join(f'<joint type="slide" axis="{a}"/>' for a in AXES)
+    + "".join(HINGES.format(i, a, "") for i, a in enumerate(AXES)),
+    "ball": '<joint type="ball" pos="0.1 0 0.2" stiffness="2" damping="0.3" armature="0.1"/>',
+    "a slide and a ball": '<joint type="slide" axis="1 0.3 0" damping="2"/>'
+    '<joint type="ball" pos="0.1 0 0.2" damping="0.3"/>',
+}
+ARM = (
+    f'<body name="arm"><joint name="turn" axis="0 1 0" ref="0.3"/>{BODY}'
+    '<body name="tip" pos="0 0 1"><joint name="out" type="slide" axis="1 0 0"/>'
+    f"{SMALL}</body></body>"
+)
+ON_ARM = """
+<motor joint="turn" gear="3" ctrllimited="true" ctrlrange="-1 0.5"/>
+<position joint="turn" kp="4" kv="0.5" gear="2" forcelimited="true" forcerange="-3 2"/>
+<velocity joint="out" kv="3"/>
+<general joint="turn" gaintype="affine" gainprm="1 0.3 0.2" biastype="affine"
+  biasprm="0.1 -0.5 -0.3" gear="1.5"/>
+<general joint="out" gainprm="3" forcelimited="true" forcerange="-2 2"/>
+"""
+FLOATING = (
+    f'<body euler="0.2 0.3 0.4"><freejoint name="free"/>{BODY}'
+    f'<body euler="0.1 0.5 0.2"><joint name="ball" type="ball"/>{SMALL}</body></body>'
+)
+ON_FLOATING = """
+<motor joint="ball" gear="1 2 3"/>
+<motor jointinparent="ball" gear="1 -2 0.5"/>
+<position joint="ball" gear="0 2 1" kp="2" kv="0.3"/>
+<motor joint="free" gear="1 2 3 0 0 0"/>
+<motor joint="free" gear="0 0 0 1 2 3"/>
+<motor jointinparent="free" gear="0 0 0 1 -2 0.5"/>
+"""
+LOADED = (
+    '<body pos="1 2 3" euler="0.3 0.2 0.1">'
+    f'<joint type="free" damping="0.2" stiffness="1.5" armature="0.1"/>{BODY}</body>'
+)
+
+
+def tree(name):
+    """Joints between a body that moves and one with another welded to it at an angle."""
+    joints = JOINTS[name].replace("{0}", name)
+    welded = f'<body pos="0.1 0.2 0" euler="0.3 0.2 0.1">{SMALL}</body>'
+    inner = f'<body pos="0.2 0.1 0.3" euler="0.5 0.1 -0.4">{joints}{BODY}{welded}</body>'
+    return f'<body><joint axis="0 1 0"/>{SMALL}{inner}</body>'
+
+
+TREES = {name: tree(name) for name in JOINTS}
+TREES |= {"arm and actuators": ARM, "floating and actuators": FLOATING, "loaded": LOADED}
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_accelerations_and_coordinates_are_those_of_mujoco(name):
+    actuators = {"arm and actuators": ON_ARM, "floating and actuators": ON_FLOATING}.get(name, "")
+    m = mujoco.MjModel.from_xml_string(model(TREES[name], f"<actuator>{actuators}</actuator>"))
+    read = jc.from_mjcf(m)
+    states = agreement.random_states(m, 4)
+    expected = agreement.mujoco_accelerations(m, states)
+    for qpos, qvel, ctrl, qacc in zip(*states, expected, strict=True):
+        state = read.state(qpos, qvel)
+        solution = jc.forward_dynamics(read.system, state, ctrl, agreement.EXACT, 1e-3)
+        got = np.asarray(read.qacc(state, solution.acceleration))
+        assert agreement.relative(got[None], qacc[None]) < AGREE
+        np.testing.assert_allclose(read.qpos(state), qpos, atol=1e-12)
+        np.testing.assert_allclose(read.qvel(state), qvel, atol=1e-12)
+
+
+def test_flags_of_the_options_are_obeyed():
+    flags = "".join(f'{f}="disable" ' for f in ("gravity", "spring", "damper", "clampctrl"))
+    text = model(TREES["two hinges"] + ARM, f"<actuator>{ON_ARM}</actuator>")
+    system, _ = jc.from_mjcf(text.replace("<option />", f"<option><flag {flags}/></option>"))
+    np.testing.assert_array_equal(system.params["gravity"], 0)
+    fields = [set(numbers) for numbers in system.params.values() if isinstance(numbers, dict)]
+    assert not any({"stiffness", "damping", "control_range"} & own for own in fields)
+    assert any("inertia" in own and "mass" not in own for own in fields)  # rotors stay
+
+
+def test_positions_count_turns_where_that_is_asked_for():
+    counting = jc.from_mjcf(model(ARM), count_turns=True)
+    qpos = jnp.asarray([20.0, 0.1])
+    state = counting.state(qpos, jnp.zeros(2))
+    np.testing.assert_allclose(counting.qpos(state), qpos, rtol=1e-12)
+    plain = jc.from_mjcf(model(ARM))
+    seen = plain.qpos(plain.state(qpos, jnp.zeros(2)))
+    np.testing.assert_allclose(seen, [20.0 - 6 * np.pi, 0.1], rtol=1e-12)
+
+
+def test_names_are_those_of_the_model():
+    """In MuJoCo a body, its joint and its motor may have one name."""
+    inner = f'<body><joint type="slide"/>{SMALL}</body>'
+    bodies = f'<body name="arm"><joint name="arm"/>{BODY}{inner}</body>'
+    actuator = '<actuator><motor name="arm" joint="arm"/></actuator>'
+    read = jc.from_mjcf(model(bodies, actuator))
+    assert read.system.layout.bodies == ("arm", "body 2")
+    assert dict(read.joints) == {"arm": ("arm joint", "angle"), "joint 1": ("joint 1", "travel")}
+    assert [name for name, *_ in read.system.layout.controls] == ["arm actuator"]
+
+
+def test_keyframes_are_states_and_controls():
+    keys = '<key name="bent" time="2" qpos="0.5 0.1" qvel="1 2" ctrl="3"/><key qpos="0.1 0.2"/>'
+    read = jc.from_mjcf(
+        model(ARM, f'<actuator><motor joint="turn"/></actuator><keyframe>{keys}</keyframe>')
+    )
+    assert read.keyframes == ("bent", "key 1")
+    state, control = jax.tree.leaves(read.keyframe("bent").state), read.keyframe("bent").control
+    assert all(jnp.all(jnp.isfinite(x)) for x in state)
+    np.testing.assert_allclose(control, [3.0])
+    np.testing.assert_allclose(read.qpos(read.keyframe("bent").state), [0.5, 0.1])
+    np.testing.assert_allclose(read.qvel(read.keyframe("bent").state), [1.0, 2.0])
+    np.testing.assert_allclose(read.keyframe("bent").state.time, 2.0)
+    with pytest.raises(ValueError, match="'straight' is unknown.*'bent', 'key 1'"):
+        read.keyframe("straight")
+
+
+def test_a_model_unpacks_and_runs_in_single_precision():
+    system, state = jc.from_mjcf(model(ARM), dtype=jnp.float32)
+    final, _ = quick_jit(lambda s: jc.step(system, jc.Method(), s, None, 2e-3))(state)
+    jc.raise_for_status(final)
+    assert {x.dtype for x in jax.tree.leaves(system)} == {jnp.dtype("float32")}
+
+
+def test_the_map_to_states_is_differentiable():
+    """dq/dqpos along qvel is q̇ = N(q) v."""
+    read = jc.from_mjcf(model(ARM))
+    qpos, qvel = jnp.asarray([0.4, 0.2]), jnp.asarray([0.7, -0.3])
+    slope = jax.jvp(lambda x: read.state(x, qvel).q, (qpos,), (qvel,))[1]
+    state = read.state(qpos, qvel)
+    np.testing.assert_allclose(slope, read.system.kinematics(state.q, state.v), atol=1e-12)
+
+
+URDF = """
+<robot name="arm">
+  <link name="base"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0"
+    iyz="0"/></inertial></link>
+  <link name="upper"><inertial><origin xyz="0 0 0.2"/><mass value="2"/><inertia ixx="0.1" iyy="0.2"
+    izz="0.15" ixy="0.01" ixz="0" iyz="0"/></inertial></link>
+  <link name="hand"><inertial><mass value="0.5"/><inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0"
+    ixz="0" iyz="0"/></inertial></link>
+  <joint name="shoulder" type="continuous"><parent link="base"/><child link="upper"/>
+    <origin xyz="0 0 1" rpy="0.1 0.2 0.3"/><axis xyz="0 1 0"/><dynamics damping="0.3"/></joint>
+  <joint name="grip" type="fixed"><parent link="upper"/><child link="hand"/>
+    <origin xyz="0 0 0.4"/></joint>
+</robot>
+"""
+
+
+def test_urdf():
+    """A fixed joint makes one body of two: 2 kg at 0.2 m and 0.5 kg at 0.4 m along z."""
+    read = jc.from_mjcf(URDF)
+    assert dict(read.joints) == {"shoulder": ("shoulder", "angle")}
+    upper = read.system.params["upper"]
+    np.testing.assert_allclose(upper["mass"], 2.5)
+    across = 0.1 + 0.2 + 2 * 0.01 + 2 * (2 * 0.04**2 + 0.5 * 0.16**2)
+    np.testing.assert_allclose(jnp.sum(upper["inertia"]), 0.15 + 0.01 + across, rtol=1e-9)
+    np.testing.assert_allclose(read.qvel(read.state([0.3], [2.0])), [2.0], rtol=1e-12)
+
+
+SITES = '<site name="{}" pos="0.1 0.2 0.3" euler="0.4 0.1 0.2"/>'
+WELDED = (
+    f'<body name="a"><freejoint/>{BODY}{SITES.format("s")}</body>'
+    f'<body name="b" pos="1 0 0" euler="0.1 0 0.3"><freejoint/>{SMALL}{SITES.format("t")}</body>'
+)
+EQUALITIES = {
+    "connect": '<connect name="e" body1="a" body2="b" anchor="0.1 0.2 0.3"/>',
+    "connect to the world": '<connect name="e" body1="a" anchor="0.1 0.2 0.3"/>',
+    "connect sites": '<connect name="e" site1="s" site2="t"/>',
+    "weld": '<weld name="e" body1="a" body2="b"/>',
+    "weld in a pose": '<weld name="e" body1="a" body2="b" relpose="0.3 0.1 0.2 0.5 0.5 0.5 0.5"'
+    ' anchor="0.1 0 0.2"/>',
+    "weld sites": '<weld name="e" site1="s" site2="t"/>',
+}
+
+
+@pytest.mark.parametrize("equality", EQUALITIES.values(), ids=list(EQUALITIES))
+def test_equalities_are_violated_as_much_as_in_mujoco(equality):
+    """At random states: the gap of the points as MuJoCo sees it, and the sine of half the turn."""
+    m = mujoco.MjModel.from_xml_string(model(WELDED, f"<equality>{equality}</equality>"))
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    qpos, qvel, _ = agreement.random_states(m, 3)
+    for i in range(3):
+        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+        mujoco.mj_forward(m, data)
+        found = jc.violation(read.system, read.state(qpos[i], qvel[i]))
+        expected = data.efc_pos.copy()  # of a weld: its turns in a frame of its own
+        rows = np.array(found.position)
+        pairs = [(rows[:3], expected[:3])]
+        if len(rows) == 6:
+            pairs.append((rows[3:], 2 * expected[3:]))
+        for x, y in pairs:
+            np.testing.assert_allclose(np.linalg.norm(x), np.linalg.norm(y), rtol=1e-9)
+
+
+def test_coupled_joints():
+    """A cubic of one coordinate, against MuJoCo's residual, and a joint held where it is."""
+    equality = (
+        '<joint name="cam" joint1="out" joint2="turn" polycoef="0.1 0.2 0.3 -0.4 0.5"/>'
+        '<joint name="lock" joint1="turn" polycoef="0.2 0 0 0 0"/>'
+    )
+    m = mujoco.MjModel.from_xml_string(model(ARM, f"<equality>{equality}</equality>"))
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    data.qpos[:] = [0.7, 0.4]
+    mujoco.mj_forward(m, data)
+    found = jc.violation(read.system, read.state(data.qpos, data.qvel))
+    expected = {"cam": data.efc_pos[0], "lock": data.efc_pos[1]}
+    for name, x in expected.items():
+        np.testing.assert_allclose(found[name], abs(x), rtol=1e-12)
+
+
+def test_equalities_that_are_not_active_are_left_out():
+    equality = '<connect name="e" body1="a" body2="b" anchor="0 0 0" active="false"/>'
+    system, _ = jc.from_mjcf(model(WELDED, f"<equality>{equality}</equality>"))
+    assert not system.constraints
+
+
+GEOM = '<geom name="{}" size="0.1"/>'
+HINGE = f'<body name="b"><joint name="j" {{}}/>{BODY}{{}}</body>'
+REFUSED = {
+    "contact": (
+        model(HINGE.format("", GEOM.format("g")) + GEOM.format("floor")),
+        "g' and 'floor|floor and g",
+    ),
+    "limit": (model(HINGE.format('range="0 1"', "")), "limits of 'j'"),
+    "friction": (model(HINGE.format('frictionloss="1"', "")), "frictionloss of 'j'"),
+    "fluid": (model(HINGE.format("", ""), options='density="1.2"'), "option 'density'"),
+    "tendon": (
+        model(
+            HINGE.format("", ""),
+            '<tendon><fixed name="t" stiffness="1"><joint joint="j" coef="1"/></fixed></tendon>',
+        ),
+        "tendons 't'",
+    ),
+    "gravcomp": (model(f'<body name="b" gravcomp="1"><joint/>{BODY}</body>'), "gravcomp of 'b'"),
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_what_is_left_out_must_be_asked_for(key):
+    text, match = REFUSED[key]
+    with pytest.raises(NotImplementedError, match=match):
+        jc.from_mjcf(text)
+    with pytest.raises(NotImplementedError, match=f"ignore=\\('{key}',\\)"):
+        jc.from_mjcf(text)
+    jc.from_mjcf(text, ignore=(key,))
+
+
+def acting(actuator):
+    return model(ARM, f"<actuator>{actuator}</actuator>")
+
+
+UNSUPPORTED = {
+    "mocap body": model(f'<body mocap="true"/>{HINGE.format("", "")}'),
+    "trntype 'site'": model(
+        HINGE.format("", '<site name="s"/>'), '<actuator><motor name="m" site="s"/></actuator>'
+    ),
+    "dyntype 'filter'": acting('<general joint="turn" dyntype="filter" dynprm="1"/>'),
+    "biastype 'muscle'": acting(
+        '<general joint="turn" biastype="muscle" biasprm="0.75 1.05 1 200 0.5 1.6 1.5 1.3 1.2"'
+        ' lengthrange="0 1"/>'
+    ),
+    "actuatorfrcrange of joint 'j'": model(HINGE.format('actuatorfrcrange="-1 1"', "")),
+    "equality 'e' is of type 'tendon'": model(
+        HINGE.format("", ""),
+        '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'
+        '<equality><tendon name="e" tendon1="t"/></equality>',
+    ),
+    "gear with a force and a torque": model(
+        f'<body><freejoint name="f"/>{BODY}</body>',
+        '<actuator><motor joint="f" gear="1 0 0 0 1 0"/></actuator>',
+    ),
+    "'j', 'k'\\] of body 'b' pass each other": model(
+        f'<body name="b"><joint name="j" axis="1 0 0"/>'
+        f'<joint name="k" axis="0 1 0" pos="0 0 1"/>{BODY}</body>'
+    ),
+    "gimbal lock": model(
+        '<body><joint axis="0 0 1"/><joint axis="1 0 0"/><joint axis="0 0 1"/>' + BODY + "</body>"
+    ),
+    "in this order": model(
+        '<body><joint type="slide" axis="1 0 0"/><joint/><joint type="slide" axis="0 1 0"/>'
+        + BODY
+        + "</body>"
+    ),
+    "actuation='disable'": acting('<motor joint="turn"/>').replace(
+        "<option />", '<option><flag actuation="disable"/></option>'
+    ),
+}
+
+
+@pytest.mark.parametrize("match", UNSUPPORTED)
+def test_what_is_not_supported_is_named(match):
+    with pytest.raises(NotImplementedError, match=match):
+        jc.from_mjcf(UNSUPPORTED[match])
+
+
+@pytest.mark.parametrize(
+    ("source", "error", "match"),
+    [
+        ("nowhere.xml", FileNotFoundError, "no file 'nowhere.xml'.*begins with '<'"),
+        ("<mujoco><worldbody>", ValueError, "MuJoCo cannot compile this text"),
+        ("<mujoco><worldbody><body><joint/></body></worldbody></mujoco>", ValueError, "mass"),
+        ("<mujoco/>", ValueError, "no body that moves"),
+        (3, TypeError, "path of a file.*got int"),
+    ],
+)
+def test_what_is_no_model_is_refused(source, error, match):
+    with pytest.raises(error, match=match):
+        jc.from_mjcf(source)
+
+
+@pytest.mark.parametrize("ignore", ["contact", ("contacts",)])
+def test_what_to_ignore_is_checked(ignore):
+    with pytest.raises(ValueError, match="ignore must be names out of.*'contact'"):
+        jc.from_mjcf(model(ARM), ignore=ignore)
+
+
+def test_without_mujoco_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
+    with pytest.raises(ImportError, match="pip install 'jaxcon\\[mujoco\\]'"):
+        jc.from_mjcf(model(ARM))
+
+
+def test_a_state_of_the_wrong_shape_is_refused():
+    read = jc.from_mjcf(model(ARM))
+    with pytest.raises(ValueError, match="qpos must have shape \\(2,\\), got \\(3,\\)"):
+        read.state(np.zeros(3), np.zeros(2))
