@@ -233,7 +233,7 @@ def test_a_cylinder_between_two_points(dim):
 def test_the_coordinates_of_joints_with_several():
     """Of bodies turned and moved by hand from where they were assembled."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
-    names = ("cross", "sleeve", "nut", "puck")
+    names = ("cross", "sleeve", "nut", "puck", "mast", "ball", "bead")
     for name in names:
         scene.add_body(name, mass=1.0, inertia=(1.0, 1.0, 1.0))
     x, z = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -241,13 +241,18 @@ def test_the_coordinates_of_joints_with_several():
     scene.add(jc.Cylindrical("c", jc.WORLD, "sleeve", axis=z))
     scene.add(jc.Screw("s", jc.WORLD, "nut", axis=z, lead=np.pi))
     scene.add(jc.Planar("p", jc.WORLD, "puck", axis=z))
+    scene.add(jc.Parallel("m", jc.WORLD, "mast", axis=z))
+    scene.add(jc.RevoluteSpherical("r", jc.WORLD, "ball", (0, 0, 0), (1, 0, 0), axis=z))
+    scene.add(jc.PointOnPlane("b", jc.WORLD, "bead", axis=z))
     system, state = scene.build()
     about_x, about_y = (
         jc.quaternion.from_axis_angle(axis, angle) for axis, angle in ((x, 0.4), ((0, 1, 0), -0.7))
     )
     q = state.q.at[system.layout.q("cross")[3:]].set(jc.quaternion.multiply(about_x, about_y))
     turn = jc.quaternion.from_axis_angle(z, 1.2)
-    for name, place in (("sleeve", (0, 0, 0.3)), ("nut", (0, 0, 0.6)), ("puck", (0.1, 0.2, 0))):
+    places = {"sleeve": (0, 0, 0.3), "nut": (0, 0, 0.6), "puck": (0.1, 0.2, 0)}
+    places |= {"mast": (1, 2, 3), "ball": (0, 0, 0), "bead": (0.3, 0.1, 0)}
+    for name, place in places.items():
         q = q.at[system.layout.q(name)].set(jnp.concatenate([jnp.asarray(place, float), turn]))
     moved = dataclasses.replace(state, q=q)
     assert jc.violation(system, moved).worst < 1e-14
@@ -259,11 +264,14 @@ def test_the_coordinates_of_joints_with_several():
         ("s", "travel"): 0.6,
         ("s", "angle"): 1.2,
         ("p", "angle"): 1.2,
+        ("m", "angle"): 1.2,
+        ("r", "angle"): 1.2,
     }
     for (joint, name), value in expected.items():
         got = jc.coordinate(system, moved, joint, name)
         np.testing.assert_allclose(got, value, rtol=IDENTITY, err_msg=f"{joint} {name}")
-    both = [jc.coordinate(system, moved, "p", name) for name in ("x", "y")]
-    np.testing.assert_allclose(np.hypot(*both), np.hypot(0.1, 0.2), rtol=IDENTITY)
+    for joint, place in (("p", (0.1, 0.2)), ("b", (0.3, 0.1))):
+        both = [jc.coordinate(system, moved, joint, name) for name in ("x", "y")]
+        np.testing.assert_allclose(np.hypot(*both), np.hypot(*place), rtol=IDENTITY)
     with pytest.raises(ValueError, match="'travel', 'angle'.*say which"):
         jc.coordinate(system, moved, "c")

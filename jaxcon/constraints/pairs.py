@@ -86,17 +86,30 @@ class PointOnPlane:
     body_b: str
     axis: Any
     point: Any = None
+    coordinates = MappingProxyType({"x": "m", "y": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, and the normal in a."""
         check_oriented(self, a)
-        return anchors(self, a, b) | {"axis": a.local_direction(unit(self, "axis", a))}
+        n, *sides = triad(self, a)
+        own = zip(("first_a", "second_a"), sides, strict=False)
+        directions = {side: a.local_direction(u) for side, u in own}
+        return anchors(self, a, b) | {"axis": a.local_direction(n)} | directions
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """n·(p_b − p_a) = 0."""
         points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
         return [primitives.travel(a.direction(p["axis"]), *points)]
+
+    @staticmethod
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
+        """How far b has moved along two directions of the plane; in the plane there is only x."""
+        side = {"x": "first_a", "y": "second_a"}[name]
+        if side not in p:
+            raise ValueError("PointOnPlane: in the plane its one coordinate is x, got y.")
+        points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
+        return primitives.travel(a.direction(p[side]), *points)
 
 
 @dataclass(frozen=True)
@@ -115,12 +128,15 @@ class Parallel:
     axis: Any
     oriented = True
     dims = (3,)
+    coordinates = MappingProxyType({"angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The axis in a, and the directions normal to it in b."""
+        """The axis in a, and the directions normal to it in both."""
         n, u, w = triad(self, a)
         return {
             "axis": a.local_direction(n),
+            "first_a": a.local_direction(u),
+            "second_a": a.local_direction(w),
             "first_b": b.local_direction(u),
             "second_b": b.local_direction(w),
         }
@@ -131,6 +147,11 @@ class Parallel:
         n = a.direction(p["axis"])
         across = (b.direction(p["first_b"]), b.direction(p["second_b"]))
         return [primitives.angle_between(n, u) for u in across]
+
+    @staticmethod
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
+        """The angle of b in a about the axis, zero at assembly [rad]."""
+        return turn_about(p, a, b)
 
 
 @dataclass(frozen=True)
@@ -152,9 +173,7 @@ class Cylindrical(Parallel):
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in both."""
-        _, u, w = triad(self, a)
-        own = {"first_a": a.local_direction(u), "second_a": a.local_direction(w)}
-        return anchors(self, a, b) | Parallel.attach(self, a, b) | own
+        return anchors(self, a, b) | Parallel.attach(self, a, b)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
@@ -224,9 +243,7 @@ class Planar(Parallel):
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the normal in a, and the directions of the plane in both."""
-        _, u, w = triad(self, a)
-        own = {"first_a": a.local_direction(u), "second_a": a.local_direction(w)}
-        return anchors(self, a, b) | Parallel.attach(self, a, b) | own
+        return anchors(self, a, b) | Parallel.attach(self, a, b)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
@@ -238,8 +255,7 @@ class Planar(Parallel):
         """How far b has moved along two directions of the plane [m] and turned in it [rad]."""
         if name == "angle":
             return turn_about(p, a, b)
-        along = a.direction(p["first_a" if name == "x" else "second_a"])
-        return primitives.travel(along, a.point(p["anchor_a"]), b.point(p["anchor_b"]))
+        return PointOnPlane.coordinate(name, p, a, b)
 
 
 @dataclass(frozen=True)
@@ -270,19 +286,23 @@ class RevoluteSpherical:
     ball: Any
     axis: Any
     dims = (3,)
+    coordinates = MappingProxyType({"angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The ends in their frames, the axis in a, and the length."""
+        """The ends in their frames, the axis and the rod in a, and the length."""
         check_oriented(self, a)
         n = unit(self, "axis", a)
         hinge, ball = own_point(self, "hinge", self.hinge, a), own_point(self, "ball", self.ball, b)
         length = numerics.norm(ball - hinge)
         checks.positive(label(self), "the distance from hinge to ball", length)
-        check_normal(self, n, (ball - hinge) / length)
+        rod = (ball - hinge) / length
+        check_normal(self, n, rod)
         return {
             "anchor_a": a.local_point(hinge),
             "anchor_b": b.local_point(ball),
             "axis": a.local_direction(n),
+            "first_a": a.local_direction(rod),
+            "second_a": a.local_direction(jnp.cross(n, rod)),
             "length": length,
         }
 
@@ -290,6 +310,13 @@ class RevoluteSpherical:
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """n·(p_b − p_a) = 0, ‖p_b − p_a‖ − l = 0."""
         return PointOnPlane.rows(p, a, b) + Distance.rows(p, a, b)
+
+    @staticmethod
+    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
+        """The angle of the rod about its hinge, zero at assembly [rad]."""
+        points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
+        sides = (a.direction(p[side]) for side in ("first_a", "second_a"))
+        return primitives.bearing(*(primitives.travel(u, *points) for u in sides))
 
 
 def check_oriented(joint: Any, a: Pose) -> None:

@@ -133,12 +133,16 @@ def _rate(e: Vector, ω_a: Vector, ω_b: Vector) -> Vector:
 
 
 def turn(first: Direction, second: Direction, pointer: Direction) -> Row:
-    """The angle of a pointer of b in the plane of two directions of a: atan2(s, c) in [−π, π].
+    """The angle of a pointer of b in the plane of two directions of a, in [−π, π]."""
+    return bearing(angle_between(first, pointer), angle_between(second, pointer))
 
-    With s = second·pointer and c = first·pointer, θ̇ = (c ṡ − s ċ)/(c² + s²), and its own rate
-    without a is (c s̈ − s c̈)/(c² + s²) − 2 θ̇ (c ċ + s ṡ)/(c² + s²).
+
+def bearing(c: Row, s: Row) -> Row:
+    """θ = atan2(s, c) of two rows, in [−π, π].
+
+    θ̇ = (c ṡ − s ċ)/(c² + s²), and its own rate without a is
+    (c s̈ − s c̈)/(c² + s²) − 2 θ̇ (c ċ + s ṡ)/(c² + s²).
     """
-    c, s = angle_between(first, pointer), angle_between(second, pointer)
     weight = numerics.safe_divide(1.0, c.value * c.value + s.value * s.value)
     along, across = c.value * weight, s.value * weight
     rate = along * s.rate - across * c.rate
