@@ -198,7 +198,8 @@ def solve(solver: Any, plain: Saddle, full: Saddle, share: float | None) -> Solu
     """By a solver that regularises the plain system, or one that is given the regularised one."""
     if share is None or not hasattr(solver(), "tikhonov"):
         return on_arrays(solver().solve, full)
-    return on_arrays(solver(tikhonov=share).solve, plain)
+    given = solver(tikhonov=jnp.asarray(share, plain.force.dtype))
+    return on_arrays(lambda pair: pair[0].solve(pair[1]), (given, plain))
 
 
 def systems(name: str, dtype: str, times: list[float]) -> list[Saddle]:
@@ -210,9 +211,10 @@ def systems(name: str, dtype: str, times: list[float]) -> list[Saddle]:
         def run(state: jc.State, steps: int) -> jc.State:
             return jc.rollout(system, method, state, None, DT, steps, record=lambda s, i: None)[0]
 
-        def at(state: jc.State) -> Saddle:
+        def at(given: Any) -> Saddle:
+            system, state, dt = given  # numbers of the system, too, get the axes of the batch
             rows = linearize(system, state.q, state.v, state.time)
-            target = method.feedback(DT).target(rows, state.memory, DT)
+            target = method.feedback(dt).target(rows, state.memory, dt)
             force = system.force(state.q, state.v, state.time)
             return saddle(system, state.q, rows, force, target)
 
@@ -220,7 +222,8 @@ def systems(name: str, dtype: str, times: list[float]) -> list[Saddle]:
         states = [go(start, round(time / DT)) for time in times]
         for state in states:
             jc.raise_for_status(state)
-        return [on_arrays(at, state) for state in states]
+        dt = jnp.asarray(DT, np.dtype(dtype))
+        return [on_arrays(at, (system, state, dt)) for state in states]
 
 
 def regularized(system: Saddle, share: float) -> Saddle:
