@@ -65,16 +65,19 @@ class MujocoModel:
         """The state at MuJoCo's coordinates; pure: jit, vmap and differentiate it.
 
         Args:
-            qpos: (nq,), quaternions of any length but zero; angles may hold whole turns.
+            qpos: (nq,), quaternions of any length but zero; angles may hold whole turns. Of three
+                hinges of one body the middle one must stay between gimbal locks; where qpos is
+                traced, that is not checked, and other angles of the same pose are read back.
             qvel: (nv,).
             time: () [s].
 
         Raises:
-            ValueError: a wrong shape or dtype.
+            ValueError: a wrong shape or dtype, or a middle hinge beyond gimbal lock.
         """
         dtype = self.start.q.dtype
         qpos = checks.number("state", "qpos", qpos, dtype, self.tree.reference.shape)
         qvel = checks.number("state", "qvel", qvel, dtype, (self.tree.size,))
+        self.tree.check(qpos)
         q, v = self.tree.flat(self.system, qpos, qvel)
         turns = self.tree.turns_of(self.system, qpos)
         time = checks.number("state", "time", time, dtype)
