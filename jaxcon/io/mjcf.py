@@ -21,6 +21,7 @@ from jaxcon.io.joints import Coordinate, join, passive
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Scalar, Tree
 from jaxcon.io.refusals import refuse
+from jaxcon.model.coordinates import TurnCounter
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
 
@@ -191,8 +192,12 @@ def _add_elements(
         scene.add(element)
     for link in links:
         for joint in link.joints:
-            for element in passive(compiled, link, joint, found.get(joint.id), names, count):
+            at = found.get(joint.id)
+            for element in passive(compiled, link, joint, at, names):
                 scene.add(element)
+            if count and at is not None and joint.kind == "hinge":
+                own = compiled.name("joint", joint.id)
+                scene.add(TurnCounter(names.take(f"{own} turns", "turns"), *at))
     return found
 
 
