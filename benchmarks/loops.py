@@ -106,7 +106,7 @@ def delta() -> str:
             closing += connect("platform", name, wrist - platform + shift)
         axis = f'<joint name="arm{i}" axis="{numbers(across)}" armature="0.02"/>'
         bodies += rod(f"arm{i}", shoulder, elbow, axis, rods)
-        motors += f'<position joint="arm{i}" kp="60" kv="3"/>'
+        motors += f'<position joint="arm{i}" kp="60" kv="0.3"/>'
     free = '<freejoint/><geom type="cylinder" size="0.1 0.01"/>'
     return document(
         bodies + f'<body name="platform" pos="{numbers(platform)}">{free}</body>', closing, motors

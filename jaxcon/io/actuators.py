@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,23 @@ from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
 from jaxcon.io.links import Link, LinkJoint
 from jaxcon.model.actuators import AffineActuator, Motor
+
+
+class Transmission(NamedTuple):
+    """How an actuator acts on a coordinate θ = qpos − reference.
+
+    Attributes:
+        at: the coordinate.
+        gear: g.
+        reference: qpos at assembly.
+        measured: whether the length g qpos counts; that of a free joint is zero.
+    """
+
+    at: Coordinate
+    gear: float
+    reference: float = 0.0
+    measured: bool = True
+
 
 LAWS = (
     ("trntype", "mjtTrn", ("joint", "jointinparent")),
@@ -32,19 +49,19 @@ def actuators(
     Raises:
         NotImplementedError: one of them is of a kind that is not supported.
     """
+    m = compiled.model
     joints = {joint.id: (link, joint) for link in links for joint in link.joints}
-    for i in range(compiled.model.nu):
+    for i in range(m.nu):
         _check(compiled, i)
-        link, joint = joints[int(compiled.model.actuator_trnid[i, 0])]
+        link, joint = joints[int(m.actuator_trnid[i, 0])]
         name = names.take(compiled.name("actuator", i), "actuator")
         if joint.id in coordinates:
-            gear = float(compiled.model.actuator_gear[i, 0])
-            reference = float(compiled.model.qpos0[joint.q])
-            yield _law(compiled, i, name, coordinates[joint.id], gear, reference)
+            gear, reference = float(m.actuator_gear[i, 0]), float(m.qpos0[joint.q])
+            transmission = Transmission(coordinates[joint.id], gear, reference)
         else:
-            element, at, gear = _vector(compiled, i, link, joint, name, names)
+            element, transmission = _vector(compiled, i, link, joint, names)
             yield element
-            yield _law(compiled, i, name, at, gear, 0.0, measured=joint.kind == "ball")
+        yield _law(compiled, i, name, transmission)
 
 
 def _check(compiled: Compiled, i: int) -> None:
@@ -63,20 +80,9 @@ def _check(compiled: Compiled, i: int) -> None:
             )
 
 
-def _law(
-    compiled: Compiled,
-    i: int,
-    name: str,
-    at: Coordinate,
-    gear: float,
-    reference: float,
-    measured: bool = True,
-) -> Any:
-    """The actuator along a coordinate θ = qpos − reference, whose length is g qpos.
-
-    (g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇ with l = g θ + g reference; where the length is not
-    measured, it counts as zero.
-    """
+def _law(compiled: Compiled, i: int, name: str, transmission: Transmission) -> Any:
+    """(g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇ with the length l = g θ + g reference."""
+    at, gear, reference, measured = transmission
     m = compiled.model
     gain, bias = m.actuator_gainprm[i, :3].copy(), m.actuator_biasprm[i, :3].copy()
     gain[1:] *= compiled.choice("mjtGain", m.actuator_gaintype[i]) == "affine"
@@ -93,18 +99,18 @@ def _law(
 
 
 def _vector(
-    compiled: Compiled, i: int, link: Link, joint: LinkJoint, name: str, names: Names
-) -> tuple[Any, Coordinate, float]:
-    """A joint without rows along the gear of a ball or free joint, its coordinate, and ‖gear‖.
+    compiled: Compiled, i: int, link: Link, joint: LinkJoint, names: Names
+) -> tuple[Any, Transmission]:
+    """A joint without rows along the gear of a ball or free joint, and ‖gear‖ along it.
 
     Raises:
         NotImplementedError: the gear has both a force and a torque.
     """
-    gear = compiled.model.actuator_gear[i]
+    own, gear = compiled.name("actuator", i), compiled.model.actuator_gear[i]
     force, torque = (gear[:3], gear[3:]) if joint.kind == "free" else (np.zeros(3), gear[:3])
     if force.any() and torque.any():
         raise NotImplementedError(
-            f"from_mjcf: actuator '{compiled.name('actuator', i)}' has a gear with a force and a"
+            f"from_mjcf: actuator '{own}' has a gear with a force and a"
             f" torque, {gear.tolist()}; give each an actuator of its own."
         )
     axis = force if force.any() else torque
@@ -113,10 +119,11 @@ def _vector(
     if force.any():
         axes = np.linalg.svd(axis[None])[2]
         axes[0] = axis
-        push = pushing(compiled, link, axes, names.take(f"{name} push", "push"))
-        return push, Coordinate(push.name, "travel_1"), size
+        push = pushing(compiled, link, axes, names.take(f"{own} push", "push"))
+        return push, Transmission(Coordinate(push.name, "travel_1"), size, measured=False)
     in_parent = compiled.choice("mjtTrn", compiled.model.actuator_trntype[i]) == "jointinparent"
     frame = compiled.data.xmat[link.body].reshape(3, 3)
     world = axis if in_parent and joint.kind == "free" else frame @ axis
-    twist = turning(link, world, names.take(f"{name} twist", "twist"), backward=in_parent)
-    return twist, Coordinate(twist.name, "twist"), -size if in_parent else size
+    twist = turning(link, world, names.take(f"{own} twist", "twist"), backward=in_parent)
+    at, sign = Coordinate(twist.name, "twist"), -1 if in_parent else 1
+    return twist, Transmission(at, sign * size, measured=joint.kind == "ball")

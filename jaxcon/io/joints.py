@@ -14,7 +14,6 @@ from jaxcon.constraints.twist import Twist
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.links import Link, LinkJoint
 from jaxcon.model.actuators import JointDamper, JointSpring
-from jaxcon.model.coordinates import TurnCounter
 from jaxcon.model.layout import WORLD
 
 MEETING = 1e-9
@@ -66,28 +65,28 @@ def join(compiled: Compiled, link: Link, names: Names) -> Joined:
 def _compound(compiled: Compiled, link: Link, ends: tuple[str, str], names: Names) -> Joined:
     """Slides, then hinges or a ball; hinges, then slides, is the same seen from the other body."""
     kinds = [j.kind for j in link.joints]
-    turning = [j for j in link.joints if j.kind != "slide"]
+    turns = [j for j in link.joints if j.kind != "slide"]
     slides = [j for j in link.joints if j.kind == "slide"]
-    forward, backward = list(link.joints) == slides + turning, list(link.joints) == turning + slides
+    forward, backward = list(link.joints) == slides + turns, list(link.joints) == turns + slides
     balls = kinds.count("ball")
-    if not (forward or backward) or (balls and (balls > 1 or len(turning) > 1 or not forward)):
+    if not (forward or backward) or (balls and (balls > 1 or len(turns) > 1 or not forward)):
         raise NotImplementedError(
             f"from_mjcf: body '{link.name}' has the joints {kinds} in this order; one body may have"
             " slides and then hinges or a ball, or hinges and then slides."
         )
     sign = 1 if forward else -1
-    slides, turning = slides[::sign], turning[::sign]
-    slide_axes, hinge_axes = (_axes(compiled, link, js, sign) for js in (slides, turning))
+    slides, turns = slides[::sign], turns[::sign]
+    slide_axes, hinge_axes = (_axes(compiled, link, js, sign) for js in (slides, turns))
     joint = Compound(
         names.take(f"{link.name} joint", "joint"),
         *ends[::sign],
-        point=_meeting_point(compiled, link, turning),
+        point=_meeting_point(compiled, link, turns),
         slides=slide_axes,
         hinges=() if balls else hinge_axes,
         ball=bool(balls),
     )
     found = [(s, f"travel_{i}") for i, s in enumerate(slides, 1)]
-    found += [(h, f"angle_{i}") for i, h in enumerate(turning, 1) if not balls]
+    found += [(h, f"angle_{i}") for i, h in enumerate(turns, 1) if not balls]
     return Joined([joint], {j.id: Coordinate(joint.name, name) for j, name in found})
 
 
@@ -135,14 +134,9 @@ def _meeting_point(compiled: Compiled, link: Link, joints: list[LinkJoint]) -> n
 
 
 def passive(
-    compiled: Compiled,
-    link: Link,
-    joint: LinkJoint,
-    coordinate: Coordinate | None,
-    names: Names,
-    count: bool,
+    compiled: Compiled, link: Link, joint: LinkJoint, at: Coordinate | None, names: Names
 ) -> Iterator[Any]:
-    """The spring, damper, rotor and, where asked for, turn counter of one of MuJoCo's joints."""
+    """The spring, damper and rotor of one of MuJoCo's joints, along its coordinate or freedoms."""
     m = compiled.model
     own = compiled.name("joint", joint.id)
     numbers = {
@@ -150,16 +144,14 @@ def passive(
         "damping": 0.0 if compiled.disabled("damper", "passive") else m.dof_damping[joint.v],
         "armature": m.dof_armature[joint.v],
     }
-    if coordinate is not None:
+    if at is not None:
         rest = m.qpos_spring[joint.q] - m.qpos0[joint.q]
-        yield from _along(own, coordinate, numbers, rest, names)
-        if count and joint.kind == "hinge":
-            yield TurnCounter(names.take(f"{own} turns", "turns"), *coordinate)
+        yield from _along(own, at, numbers, rest, names)
     elif any(numbers.values()):
         elements, coordinates = _freedoms(compiled, link, joint, names)
         yield from elements
-        for at in coordinates:
-            yield from _along(f"{own} {at.name}", at, numbers, 0.0, names)
+        for freedom in coordinates:
+            yield from _along(f"{own} {freedom.name}", freedom, numbers, 0.0, names)
 
 
 def _along(

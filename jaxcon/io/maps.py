@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.geometry import quaternion
@@ -88,6 +89,30 @@ class Tree:
         turned = Pose(pose.position, quaternion.multiply(pose.orientation, own))
         anchor = pose.point(point)
         return Pose(anchor - turned.direction(point), turned.orientation)
+
+    def check(self, qpos: Array) -> None:
+        """Checks three hinges of one link, where qpos is concrete.
+
+        n₁·(n₂ × n₃) changes its sign with the middle angle where the axes fall into a plane.
+
+        Raises:
+            ValueError: their middle angle lies beyond gimbal lock, as seen from the reference.
+        """
+        if not checks.is_concrete((qpos, self.axes)):
+            return
+        for node in self.nodes:
+            hinges = [joint for joint in node.joints if joint.kind == "hinge"]
+            if len(hinges) == 3:
+                first, middle, last = (self.axes[joint.id] for joint in hinges)
+                q = hinges[1].q
+                turn = quaternion.exp(middle * (qpos[q] - self.reference[q]))
+                across = jnp.cross(first, middle)
+                if across @ last * (across @ quaternion.rotate(turn, last)) <= 0:
+                    raise ValueError(
+                        f"state: qpos[{q}] = {float(qpos[q]):.6g} turns the middle one of the three"
+                        f" hinges of '{node.name}' beyond gimbal lock, where other angles, within"
+                        " it, stand for the same pose."
+                    )
 
     def rates(self, qpos: Array, qvel: Array) -> Array:
         """q̇pos, (nq,): qvel, with the quaternions of ball and free joints by ½ q ⊗ ω."""

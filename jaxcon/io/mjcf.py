@@ -21,6 +21,7 @@ from jaxcon.io.joints import Coordinate, join, passive
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Scalar, Tree
 from jaxcon.io.refusals import refuse
+from jaxcon.model.coordinates import TurnCounter
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
 
@@ -65,16 +66,19 @@ class MujocoModel:
         """The state at MuJoCo's coordinates; pure: jit, vmap and differentiate it.
 
         Args:
-            qpos: (nq,), quaternions of any length but zero; angles may hold whole turns.
+            qpos: (nq,), quaternions of any length but zero; angles may hold whole turns. Of three
+                hinges of one body the middle one must stay between gimbal locks; where qpos is
+                traced, that is not checked, and other angles of the same pose are read back.
             qvel: (nv,).
             time: () [s].
 
         Raises:
-            ValueError: a wrong shape or dtype.
+            ValueError: a wrong shape or dtype, or a middle hinge beyond gimbal lock.
         """
         dtype = self.start.q.dtype
         qpos = checks.number("state", "qpos", qpos, dtype, self.tree.reference.shape)
         qvel = checks.number("state", "qvel", qvel, dtype, (self.tree.size,))
+        self.tree.check(qpos)
         q, v = self.tree.flat(self.system, qpos, qvel)
         turns = self.tree.turns_of(self.system, qpos)
         time = checks.number("state", "time", time, dtype)
@@ -188,8 +192,12 @@ def _add_elements(
         scene.add(element)
     for link in links:
         for joint in link.joints:
-            for element in passive(compiled, link, joint, found.get(joint.id), names, count):
+            at = found.get(joint.id)
+            for element in passive(compiled, link, joint, at, names):
                 scene.add(element)
+            if count and at is not None and joint.kind == "hinge":
+                own = compiled.name("joint", joint.id)
+                scene.add(TurnCounter(names.take(f"{own} turns", "turns"), *at))
     return found
 
 

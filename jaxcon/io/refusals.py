@@ -17,7 +17,6 @@ ZERO = (
     ("actuator", "actuator_dampingpoly", "polynomial damping"),
     ("actuator", "actuator_armature", "armature"),
     ("actuator", "actuator_delay", "a delay"),
-    ("actuator", "actuator_actlimited", "an activation range"),
 )
 """Arrays of MuJoCo's model that must be zero: of what, which, and what they mean."""
 
@@ -45,25 +44,27 @@ def contacts(compiled: Compiled) -> list[str]:
 
 
 def limits(compiled: Compiled) -> list[str]:
-    """Joints that have a range."""
+    """Joints and tendons that have a range."""
     if compiled.disabled("limit", "constraint"):
         return []
-    return _named(compiled, "joint", compiled.model.jnt_limited)
+    m = compiled.model
+    return _named(compiled, "joint", m.jnt_limited) + _named(compiled, "tendon", m.tendon_limited)
 
 
 def friction(compiled: Compiled) -> list[str]:
-    """Joints with dry friction."""
+    """Joints and tendons with dry friction."""
     if compiled.disabled("frictionloss", "constraint"):
         return []
     m = compiled.model
     rubbing = np.unique(m.dof_jntid[m.dof_frictionloss > 0])
-    return [compiled.name("joint", int(i)) for i in rubbing]
+    joints = [compiled.name("joint", int(i)) for i in rubbing]
+    return joints + _named(compiled, "tendon", m.tendon_frictionloss)
 
 
 def tendons(compiled: Compiled) -> list[str]:
-    """Tendons that pull, resist or stop; those which are only measured have no effect."""
+    """Tendons that pull or resist; those which are only measured have no effect."""
     m = compiled.model
-    fields = ("stiffness", "damping", "frictionloss", "limited", "armature")
+    fields = ("stiffness", "damping", "armature")
     arrays = [np.asarray(getattr(m, f"tendon_{f}", np.zeros(m.ntendon))) != 0 for f in fields]
     return _named(compiled, "tendon", np.any(arrays, axis=0))
 
