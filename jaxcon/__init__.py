@@ -10,6 +10,7 @@ from jaxcon.analysis.quantities import (
     coordinate_rate,
     energy,
     momentum,
+    multipliers,
     orientation,
     position,
     velocity,
@@ -90,6 +91,7 @@ from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.dense import Dense
+from jaxcon.solvers.saddle import Solution
 from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse
 from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
@@ -161,6 +163,7 @@ __all__ = [
     "Screw",
     "SemiImplicitEuler",
     "SimulationError",
+    "Solution",
     "Span",
     "Sparse",
     "Spherical",
@@ -192,6 +195,7 @@ __all__ = [
     "largest_stable_rate",
     "memory",
     "momentum",
+    "multipliers",
     "orientation",
     "position",
     "quaternion",

@@ -229,8 +229,8 @@ MISTAKES = {
         ["particle 'bob'", "mass", "nan"],
     ),
     "infinite mass": (lambda: particle(mass=np.inf), ["particle 'bob'", "mass", "finite", "inf"]),
-    "no mass": (lambda: particle(mass=None), ["particle 'bob'", "mass", "None"]),
-    "body without mass": (lambda: body(mass=None), ["body 'arm'", "mass", "None"]),
+    "no mass": (lambda: particle(mass=None), ["particle 'bob'", "mass", "inertia that brings it"]),
+    "body without mass": (lambda: body(mass=None), ["body 'arm'", "mass", "inertia that brings it"]),
     "inertia of zero": (
         lambda: body(inertia=(1, 1, 0)),
         ["body 'arm'", "inertia", "positive", "0.0"],
@@ -675,3 +675,14 @@ def test_an_unknown_order_of_elimination():
     system, state = build(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)), dim=2)
     with pytest.raises(ValueError, match="order must be one of .*'levels'.* got 'random'"):
         jc.step(system, jc.Method(solver=jc.Sparse(order="random")), state, None, 1e-3)
+
+
+@pytest.mark.parametrize("method", [jc.RK4(), jc.Method])
+def test_what_is_no_method_is_named(method):
+    system, state = build()
+    for act in (
+        lambda: jc.step(system, method, state, None, 1e-3),
+        lambda: jc.rollout(system, method, state, None, 1e-3, 2),
+    ):
+        with pytest.raises(TypeError, match="jc.Method.*got (RungeKutta|Method)"):
+            act()

@@ -189,3 +189,16 @@ def test_gears_of_one_kind_share_their_code():
     (a, b, c, _), _ = accelerations(system, state, 5.0)
     np.testing.assert_allclose([b, c], [2 * a, 4 * a], rtol=1e-9)
     np.testing.assert_allclose(a, 5.0 / (0.7 + 4 * 0.2 + 16 * 0.4), rtol=IDENTITY * 1e3)
+
+
+def test_the_multiplier_is_read_by_name():
+    system, state = shafts(2, jc.Gear("coupling", "a_hinge", "b_hinge", ratio=-3.0))
+    control = jnp.asarray([5.0, 0.0, 0.0])
+    solution = jc.forward_dynamics(system, state, control, FREE, 1e-3)
+    torque = jc.multipliers(system, state, solution, "coupling")
+    np.testing.assert_allclose(torque, [-1.2], rtol=1e-9)
+
+
+def test_a_coordinate_is_not_coupled_with_itself():
+    with pytest.raises(ValueError, match="Gear 'g'.*with itself.*a_hinge"):
+        shafts(2, jc.Gear("g", "a_hinge", "a_hinge", 2.0))

@@ -155,3 +155,21 @@ def test_float32():
     scene.add_body("skate", mass=60.0, inertia=2.0)
     scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.5)))
     assert growth(scene) == ((2, 3), 0, 0)
+
+
+def martinet(q, v, t, p):
+    return (v[2] - q[0] ** 2 * v[1])[None]
+
+
+def test_brackets_that_vanish_at_one_configuration_lead_further_around_it():
+    """Martinet's form: [X, Y] = 2x ∂z vanishes at x = 0, and [X, [X, Y]] = 2 ∂z does not."""
+    system = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.ones(3),
+        force=lambda q, v, t, u, p: jnp.zeros(3),
+        constraints=(jc.VelocityLevel(martinet, name="martinet"),),
+    )
+    found = jc.integrability(system, jc.init(system, jc.Method(), jnp.zeros(3), jnp.zeros(3)))
+    assert (found.growth, found.around) == ((2,), (2, 3))
+    assert not found.integrable
+    assert found.hidden == 0
+    assert "2 dimensions here, 2 → 3 around" in str(found)

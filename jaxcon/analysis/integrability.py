@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -31,6 +32,9 @@ class Integrability:
             brackets, with the brackets of those, and so on until nothing is added.
         directions: velocities (n_last, n_v): the allowed ones, of unit length in the metric of M,
             then the brackets that added one, in the order of growth.
+        around: the growth at a configuration nearby, where that at this one is not all there is. A
+            bracket may vanish at single configurations and lead further around them; relations
+            between positions are those that are left there.
     """
 
     names: tuple[str, ...]
@@ -38,20 +42,23 @@ class Integrability:
     held: int
     growth: tuple[int, ...]
     directions: np.ndarray
+    around: tuple[int, ...]
 
     @property
     def integrable(self) -> bool:
         """Whether brackets of allowed motions are allowed motions (Frobenius)."""
-        return len(self.growth) == 1
+        return len(self.around) == 1
 
     @property
     def hidden(self) -> int:
         """How many relations between positions follow from the rows that have no φ."""
-        return self.velocities - self.held - self.growth[-1]
+        return self.velocities - self.held - self.around[-1]
 
     def __str__(self) -> str:
         level = self.velocities - self.held - self.growth[0]
-        steps = " → ".join(map(str, self.growth))
+        steps = " → ".join(map(str, self.growth)) + " dimensions"
+        if self.around != self.growth:
+            steps += f" here, {' → '.join(map(str, self.around))} around"
         verdict = "not integrable: the rows of velocities hide no relation between positions"
         if self.hidden:
             verdict = f"not integrable, but {self.hidden} relations between positions follow"
@@ -60,7 +67,7 @@ class Integrability:
         return (
             f"{', '.join(self.names)}: {self.held} independent rows of positions and {level} of"
             f" velocities leave {self.growth[0]} of {self.velocities} velocities\n"
-            f"allowed motions and their brackets: {steps} dimensions\n{verdict}"
+            f"allowed motions and their brackets: {steps}\n{verdict}"
         )
 
 
@@ -71,8 +78,9 @@ def integrability(system: Any, state: State, names: Sequence[str] | None = None)
     A v = −b on (q, t). They come from relations between q and t exactly where brackets
     [X, Y] = DY X − DX Y lead to no new direction. Each level takes the brackets of the allowed
     fields with what the last one added. Brackets are taken on q itself, where q̇ = N(q) v, so that
-    no structure constants are needed. The numbers belong to this configuration: at exceptional ones
-    growth may be slower than around them.
+    no structure constants are needed. Where they do not fill all there is, growth is looked at
+    nearby as well, since at exceptional configurations it may be slower than around them. For
+    mechanisms of up to some tens of velocities: derivatives are nested as deep as growth goes.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
@@ -91,23 +99,41 @@ def integrability(system: Any, state: State, names: Sequence[str] | None = None)
     system = at(system, state)
     layout = jax.eval_shape(linearize, system, state.q, state.v, state.time).layout
     holding = tuple(name for name in layout.names if name not in layout.inertial)
-    chosen = holding if names is None else tuple(names)
+    chosen = holding if names is None else (names,) if isinstance(names, str) else tuple(names)
     if not chosen:
         raise ValueError("integrability: there is no constraint whose rows could be looked at.")
     rows = np.concatenate([layout.rows(name) for name in chosen])
     rows = rows[np.argsort(~layout.holonomic[rows], kind="stable")]  # those with a φ first
+    held, growth, directions = _growth(system, state, rows, layout.holonomic[rows])
+    around = growth
+    if growth[-1] < state.v.shape[0] - held:
+        _, found, _ = _growth(system, _nearby(system, state), rows, layout.holonomic[rows])
+        around = max(growth, found, key=lambda levels: levels[-1])
+    return Integrability(chosen, state.v.shape[0], held, growth, directions, around)
+
+
+def _nearby(system: Any, state: State) -> State:
+    """A generic configuration in the neighbourhood, and time; off the constraints."""
+    step = 0.1 * np.random.default_rng(0).normal(size=state.v.shape)
+    q = system.retract(state.q, jnp.asarray(step, state.q.dtype))
+    return dataclasses.replace(state, q=q, time=state.time + 0.1)
+
+
+def _growth(
+    system: Any, state: State, rows: np.ndarray, holonomic: np.ndarray
+) -> tuple[int, tuple[int, ...], np.ndarray]:
+    """Independent rows that have a φ, growth, and the velocities that span its last level."""
     metric = _Metric(system, state)
     jacobian = np.asarray(_rows(system, state.q, state.time, rows)[0]) @ metric.out
     tolerance = 1e-9 if state.q.dtype == np.float64 else 1e-4
     unit = jacobian / np.maximum(np.linalg.norm(jacobian, axis=1, keepdims=True), 1e-300)
     dependent = dependent_rows(unit, tolerance)
     known = np.delete(np.arange(len(rows)), dependent)
-    held = known[layout.holonomic[rows[known]]]
+    held = int(np.sum(holonomic[known]))
     allowed = np.linalg.svd(unit[known])[2][len(known) :]
     fields = _allowed(system, metric, rows[known], jnp.asarray(allowed, state.q.dtype))
-    x, room = jnp.append(state.q, state.time), state.v.shape[0] - len(held)
-    growth, directions = _grow(fields, metric, x, allowed, room, tolerance)
-    return Integrability(chosen, state.v.shape[0], len(held), growth, directions)
+    x, room = jnp.append(state.q, state.time), state.v.shape[0] - held
+    return held, *_grow(fields, metric, x, allowed, room, tolerance)
 
 
 class _Metric:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation, linearize
@@ -187,6 +188,22 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
     motion = system.principal_motion(owner, state.q, state.v)
     anchor = group.anchor(snapshot, index)
     return sign * _about(motion, force, motion.position if anchor is None else anchor)
+
+
+def multipliers(system: Any, state: State, info: Any, name: str) -> Array:
+    """λ of a constraint by its rows, (rows,): what its docstring says of its sign and unit.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: where; the state from which the step of `info` started.
+        info: a `StepInfo` or `Solution`.
+        name: of the constraint.
+
+    Raises:
+        ValueError: no such constraint.
+    """
+    layout = jax.eval_shape(linearize, at(system, state), state.q, state.v, state.time).layout
+    return info.multipliers[layout.rows(name)]
 
 
 def _row(system: Any, state: State, joint: str, name: str | None) -> Any:

@@ -51,7 +51,8 @@ class Report:
             named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
             lines.append(
                 f"redundant rows (each depends on rows before it): {named}; keep only independent"
-                " ones, for example close a loop with a joint or a Holonomic of fewer rows"
+                " ones, for example close a loop with a joint or a Holonomic of fewer rows, or give"
+                " the solver a little tikhonov"
             )
         if self.memory:
             lines.append(str(self.memory))

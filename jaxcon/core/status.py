@@ -22,7 +22,8 @@ MEANING = {
     " for the fastest motion, (b) a NaN in the control or parameters, (c) an unstable gain",
     Status.SINGULAR: "the constraint rows are dependent, or the mass matrix is not positive"
     " definite; `report` names redundant rows; likely (a) a closed spatial loop of revolute joints,"
-    " (b) the same constraint twice, (c) a singular position of the mechanism",
+    " (b) the same constraint twice, (c) a singular position of the mechanism; rows that agree are"
+    " solved by `Sparse(tikhonov=…)`",
     Status.NOT_CONVERGED: "an iterative solver did not reach its tolerance; likely (a) too few"
     " iterations, (b) a tolerance below what rounding allows, (c) redundant rows that contradict"
     " each other, to which `tikhonov` gives a solution",

@@ -142,6 +142,8 @@ class Along:
         """The coordinates that an element acts on."""
         own = element.along if hasattr(element, "along") else ((element.joint, element.coordinate),)
         ends = tuple(find(self.joints, self.where, label(element), *end) for end in own)
+        if len(set(ends)) < len(ends):
+            raise ValueError(f"{label(element)}: it couples a coordinate with itself: {own}.")
         if hasattr(element, "along") or hasattr(element, "motion"):
             self._check_integrable(element, ends)
         return ends

@@ -241,7 +241,10 @@ class Gather:
             raise ValueError(f"{owner}: this joint exists in {joint.dims[0]} dimensions only.")
         for name in names:
             if getattr(joint, "oriented", False) and self.poses[name].orientation is None:
-                raise ValueError(f"{owner}: it needs an orientation, but '{name}' is a particle.")
+                raise ValueError(
+                    f"{owner}: it needs an orientation, but '{name}' is a particle; a Coincident"
+                    " joins a particle to a body."
+                )
         turns = getattr(joint, "turns", False)
         if self.dim == 2 and turns and getattr(joint, "axis", None) is not None:
             raise ValueError(f"{owner}: in the plane the axis is the normal; give none.")

@@ -129,6 +129,11 @@ def _solid(body: BodyInput, dim: int, dtype: Any) -> solids.Inertia:
 
 
 def _mass(body: BodyInput, mass: Any, dtype: Any) -> Array:
+    if mass is None:
+        raise ValueError(
+            f"{_label(body)}: a mass is needed; mass=, or of a body an inertia that brings it, such"
+            " as jc.inertia.box(mass, size)."
+        )
     value = checks.number(_label(body), "mass", mass, dtype)
     checks.positive(_label(body), "mass", value)
     return value

@@ -71,7 +71,9 @@ def find(groups: Sequence[Any], where: Any, owner: str, joint: str, name: str | 
     group, index = where[joint]
     known = list(getattr(groups[group].joint, "coordinates", ()))
     if not known:
-        raise ValueError(f"{owner}: '{joint}' has no coordinate.")
+        raise ValueError(
+            f"{owner}: '{joint}' has no coordinate; a Span measures a distance, a Twist a turn."
+        )
     chosen = known[0] if name is None and len(known) == 1 else name
     if chosen not in known:
         raise ValueError(

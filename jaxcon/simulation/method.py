@@ -44,3 +44,18 @@ class Method:
                     f"Method: {part} must be a value such as"
                     f" {type(getattr(Method(), part)).__name__}(), got {value!r}."
                 )
+
+
+def check_method(method: Any) -> None:
+    """Checks a method and its parts.
+
+    Raises:
+        TypeError: it is something else, or one of its parts is.
+    """
+    if not isinstance(method, Method):
+        got = method.__name__ if isinstance(method, type) else type(method).__name__
+        raise TypeError(
+            f"the method must be a value such as jc.Method(jc.RK4()), got {got}; the arguments of"
+            " step and rollout are (system, method, state, …)."
+        )
+    method.check()

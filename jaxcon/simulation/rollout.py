@@ -14,7 +14,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxcon.core.status import Status
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
-from jaxcon.simulation.method import Method
+from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain, stop_failed
 from jaxcon.simulation.stability import warn_if_unstable
 from jaxcon.simulation.step import StepInfo, step_quietly
@@ -64,6 +64,7 @@ def rollout(
         raise ValueError(f"rollout: every={every} must divide steps={steps}.")
     policy = controls if callable(controls) else None
     inputs = None if policy else _split(controls, steps, every)
+    check_method(method)
     warn_if_unstable(method, dt)
 
     def one(carry: tuple[State, Any], control: PyTree) -> tuple[tuple[State, StepInfo], None]:

@@ -17,7 +17,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import accelerate
 from jaxcon.model.state import State, at, recall
 from jaxcon.simulation.initialize import check_dtype
-from jaxcon.simulation.method import Method
+from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain, keep
 from jaxcon.simulation.stability import warn_if_unstable
 from jaxcon.solvers.saddle import Solution
@@ -59,6 +59,7 @@ def step(
     Raises:
         ValueError: shapes or dtypes disagree (at trace time).
     """
+    check_method(method)
     warn_if_unstable(method, dt)  # as given: under jit an array made of it would be traced
     return step_quietly(system, method, state, control, dt)
 
@@ -147,7 +148,7 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
         ValueError: wrong shapes, mixed dtypes, or memory of another method.
     """
     at(system, state)
-    method.check()
+    check_method(method)
     layout = getattr(system, "layout", None)
     if layout is not None:
         if control is not None and not isinstance(control, jax.Array):
