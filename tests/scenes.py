@@ -303,6 +303,11 @@ JOINTS = {
     "velocity_level": Joint(velocity_level, ("joint", "params"), held=(0, 0)),
     "momentum": Joint(momentum, ("joint", "value"), held=(0, 0)),
 }
+CORE = (
+    *("coincident", "distance", "revolute", "prismatic", "universal", "fixed"),
+    *("driven_revolute", "pulley", "rolling_disc", "gimbal", "holonomic", "velocity_level"),
+)
+"""Joints of every kind of row, for tests in which compiling all of them would take minutes."""
 TOPOLOGIES = ("tree", "between", "loop")
 
 
@@ -521,8 +526,9 @@ def build(name: str, dtype: str = "float64") -> Built:
         return OTHERS[name](jnp.dtype(dtype))
     kind, dim, topology = name.split("-")
     kinds = (kind,)
-    if kind == "all":
-        kinds = tuple(key for key, joint in JOINTS.items() if int(dim[0]) in joint.dims)
+    if kind in ("all", "core"):
+        chosen = JOINTS if kind == "all" else CORE
+        kinds = tuple(key for key in chosen if int(dim[0]) in JOINTS[key].dims)
     return joints_scene(kinds, int(dim[0]), topology, jnp.dtype(dtype))
 
 

@@ -229,8 +229,8 @@ MISTAKES = {
         ["particle 'bob'", "mass", "nan"],
     ),
     "infinite mass": (lambda: particle(mass=np.inf), ["particle 'bob'", "mass", "finite", "inf"]),
-    "no mass": (lambda: particle(mass=None), ["particle 'bob'", "mass", "inertia that brings it"]),
-    "body without mass": (lambda: body(mass=None), ["body 'arm'", "mass", "inertia that brings it"]),
+    "no mass": (lambda: particle(mass=None), ["particle 'bob'", "mass", "inertia that"]),
+    "body without mass": (lambda: body(mass=None), ["body 'arm'", "mass", "inertia that"]),
     "inertia of zero": (
         lambda: body(inertia=(1, 1, 0)),
         ["body 'arm'", "inertia", "positive", "0.0"],
