@@ -275,3 +275,32 @@ def test_the_coordinates_of_joints_with_several():
         np.testing.assert_allclose(np.hypot(*both), np.hypot(*place), rtol=IDENTITY)
     with pytest.raises(ValueError, match="'travel', 'angle'.*say which"):
         jc.coordinate(system, moved, "c")
+
+
+def test_a_drive_is_compared_modulo_turns_whatever_counts():
+    """Turned by whole turns beforehand, a counted and driven wheel is where it should be."""
+
+    def turning(t, p):
+        return 2 * jnp.pi * t
+
+    elements = jc.Drive("drive", "hub", turning), jc.TurnCounter("count", "hub")
+    system, state = wheel(3, *elements, angular_velocity=(0.0, 0.0, 2 * np.pi))
+    start = jc.init(system, jc.Method(), state.q, state.v, time=1.0)
+    assert jc.violation(system, start)["drive"] < 1e-12
+
+
+def test_turns_may_be_given_at_the_start():
+    system, state = wheel(3, jc.TurnCounter("count", "hub"))
+    angle = 4 * np.pi + 0.3
+    q = turned(system, state, 0.3).q
+    start = jc.init(system, jc.Method(), q, state.v, turns=jnp.asarray([angle - 1.0]))
+    np.testing.assert_allclose(jc.coordinate(system, start, "hub"), angle, rtol=IDENTITY)
+    with pytest.raises(ValueError, match="turns.*\\(1,\\).*\\(2,\\)"):
+        jc.init(system, jc.Method(), q, state.v, turns=jnp.zeros(2))
+
+
+def test_a_counter_of_a_travel_is_refused():
+    with pytest.raises(
+        ValueError, match="TurnCounter 'count': the travel of 'rail' makes no turns"
+    ):
+        slide(3, jc.TurnCounter("count", "rail"))

@@ -204,3 +204,9 @@ def test_a_rod_in_space_needs_a_radius_and_a_bounded_twist():
 def test_a_chain_that_cannot_hang_is_refused(arguments, words):
     with pytest.raises(ValueError, match=words):
         jc.hanging(*arguments)
+
+
+@pytest.mark.parametrize(("end", "links"), [((0.3, 0.5), 2), ((0.2, 0.0), 3)])
+def test_links_too_long_for_their_gap_cannot_hang(end, links):
+    with pytest.raises(ValueError, match="without a link under pressure.*shorter"):
+        jc.hanging((0.0, 0.0), end, 1.2, links)

@@ -170,7 +170,10 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
     group = next((g for g in system.constraints if name in g.names), None)
     if group is None:
         known = [n for g in system.constraints for n in g.names]
-        raise ValueError(f"constraint '{name}' is unknown; known are {known}.")
+        raise ValueError(
+            f"constraint '{name}' is unknown; known are {known}. What acts as a force is read where"
+            " it comes from: a motor's is its control."
+        )
     index = group.names.index(name)
     layout = linearize(system, state.q, state.v, state.time).layout
     multipliers = info.multipliers[layout.rows(name)]

@@ -8,10 +8,10 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxcon.constraints import primitives
-from jaxcon.constraints.joints import label, unit
+from jaxcon.constraints.joints import PERPENDICULAR, label, unit
 from jaxcon.constraints.primitives import Row
 from jaxcon.constraints.surfaces import Plane, normal, surface
-from jaxcon.core import numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
@@ -49,7 +49,13 @@ class KnifeEdge:
         """The plane in a, the point and the edge in b."""
         e, center = unit(self, "edge", b), own_point(self, "center", self.center, b)
         if a.position.shape == (3,):
-            axes = surface(normal(self, a), a)
+            n = normal(self, a)
+            if checks.is_concrete((e, n)) and float(numerics.norm(jnp.cross(e, n))) < PERPENDICULAR:
+                raise ValueError(
+                    f"{label(self)}: its edge {e.tolist()} must not be the normal of the ice"
+                    f" {n.tolist()}, across which a blade points nowhere."
+                )
+            axes = surface(n, a)
         elif self.normal is None:
             axes = {
                 "first_a": jnp.eye(2, dtype=e.dtype)[0],

@@ -199,6 +199,11 @@ class Differential:
     @property
     def along(self) -> tuple[tuple[str, str | None], ...]:
         """The joints and coordinates that are coupled."""
+        if len(self.coordinates) != 3:
+            raise ValueError(
+                f"{label(self)}: coordinates must be three, of left, right and carrier, got"
+                f" {self.coordinates!r}."
+            )
         return tuple(zip((self.left, self.right, self.carrier), self.coordinates, strict=True))
 
     def attach(self, dtype: Any) -> dict[str, Array]:
@@ -218,7 +223,8 @@ class PolynomialCoupling:
     Attributes:
         name: unique in the scene.
         joint_a, joint_b: names of the joints.
-        coefficients: (c₀, c₁, …), at least two; c₀ is θ_b at assembly, where both are zero.
+        coefficients: (c₀, c₁, …), at least two. Both coordinates are zero where the scene is built,
+            so c₀ ≠ 0 is violated there; `assemble` brings the joints to where it holds.
         coordinate_a, coordinate_b: which of the joints'; not needed where they have but one.
     """
 

@@ -22,7 +22,7 @@ from jaxcon.model.layout import Place
 class Drive:
     """A joint's coordinate follows a given motion: θ = θ*(t), one row.
 
-    θ is the angle of a revolute joint [rad] or the travel of a prismatic one [m], zero at assembly.
+    θ is a coordinate of the joint, an angle [rad] or a travel [m], zero at assembly.
     λ is the torque or force that the drive applies. In space angles are compared modulo whole
     turns, so a crank may be driven round and round.
 

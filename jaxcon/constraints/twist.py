@@ -22,7 +22,8 @@ class Twist:
     at most half a turn. The rate is the derivative of no function of the orientation where turns
     about several axes add up, so motors, springs, dampers and rotors may act on it, such as those
     of a ball joint, and motions may not be prescribed or coupled. Equal springs on three
-    perpendicular axes have the torque −k φ.
+    perpendicular axes have the torque −k φ and the energy ½ k ‖φ‖²; a spring on one axis alone is
+    not conservative, and its part of `energy` is only nominal.
 
     Attributes:
         name: unique in the scene.

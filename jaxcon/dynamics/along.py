@@ -15,6 +15,7 @@ from jaxcon.model.actuators import JointForces, label
 from jaxcon.model.coordinates import (
     End,
     JointCoordinate,
+    TurnCounter,
     at,
     directory,
     find,
@@ -104,6 +105,10 @@ class Along:
         for element in self.elements:
             for group, index, name in self._ends(element):
                 turns = turns_over(self.joints[group].joint, name, self.layout.dim)
+                if isinstance(element, TurnCounter) and not turns and self.layout.dim == 3:
+                    raise ValueError(
+                        f"{label(element)}: the {name} of '{element.joint}' makes no turns."
+                    )
                 if turns and getattr(element, "counts", True):
                     wanted.setdefault((group, name), set()).add(index)
         counted, start = [], 0

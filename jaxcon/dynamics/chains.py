@@ -76,6 +76,13 @@ def hanging(start: Any, end: Any, length: float, links: int, gravity: Any = None
     along = _tensions(np.array([reach, rise]), length / links, links)
     steps = length / links * along / np.linalg.norm(along, axis=1, keepdims=True)
     way = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+    missed = np.linalg.norm(way[-1] - (reach, rise))
+    if missed > 1e-9 * length:
+        raise ValueError(
+            f"hanging: {links} links of {length / links:g} m cannot hang in a gap of {reach:g} m by"
+            f" {abs(rise):g} m without a link under pressure; take more and shorter links, or give"
+            " the points yourself."
+        )
     return a + way[:, :1] * (level / reach) + way[:, 1:] * up
 
 

@@ -228,7 +228,8 @@ class Gather:
             if name not in self.poses:
                 known = [WORLD, *self.layout.bodies, *self.layout.fixed]
                 raise ValueError(f"{owner}: body '{name}' is unknown; known are {known}.")
-        if len(set(names)) < len(names):
+        moving = [name for name in names if name in self.layout.places]
+        if len(set(moving)) < len(moving) or len(names) == 2 and names[0] == names[1]:
             raise ValueError(f"{owner}: it joins body '{names[0]}' to itself.")
         if not any(name in self.layout.places for name in names):
             raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")

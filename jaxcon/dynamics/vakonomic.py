@@ -84,6 +84,11 @@ class Vakonomic:
         """The angles that the system counts."""
         return self.system.turns
 
+    @property
+    def counted(self) -> Any:
+        """Which these are."""
+        return self.system.counted
+
     def remember(self, turns: Any) -> Vakonomic:
         """With other angles of a step ago."""
         return dataclasses.replace(self, system=self.system.remember(turns))

@@ -219,6 +219,8 @@ class AffineActuator:
     def attach(self, dtype: Any) -> dict[str, Array]:
         """The numbers of the element."""
         laws = {f: checks.number(label(self), f, getattr(self, f), dtype, (3,)) for f in LAWS}
+        for field, value in laws.items():
+            checks.finite(label(self), field, value)
         limits = ranges(self, dtype, "control_range", "force_range")
         return laws | numbers(self, dtype, "gear") | limits
 

@@ -43,10 +43,10 @@ class JointCoordinate:
         return row._replace(value=before + numerics.wrap(row.value - before))
 
     def difference(self, snapshot: Any, row: Any, reference: Any) -> Any:
-        """value − reference, in [−π, π] where the value is an angle seen modulo whole turns."""
+        """value − reference, in [−π, π] where a joint's angle is seen modulo whole turns."""
         error = row.value - reference
         joint = snapshot.system.constraints[self.group].joint
-        wraps = not self.counters and turns_over(joint, self.name, snapshot.system.layout.dim)
+        wraps = turns_over(joint, self.name, snapshot.system.layout.dim)
         return numerics.wrap(error) if wraps else error
 
 

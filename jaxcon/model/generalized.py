@@ -54,6 +54,15 @@ class GeneralizedCoordinates:
         """None are counted: the user's coordinates count their own."""
         return ()
 
+    @property
+    def counted(self) -> tuple[Any, ...]:
+        """None."""
+        return ()
+
+    def remember(self, turns: PyTree) -> GeneralizedCoordinates:
+        """Itself."""
+        return self
+
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
         """Nothing."""
         return ()

@@ -64,7 +64,8 @@ def recall(system: Any, turns: PyTree) -> Any:
     if expected != got and sum(expected + got):
         raise ValueError(
             f"state.turns must have shape {expected}, got {got}: this system counts the whole turns"
-            f" of {sum(expected)} joints; start from the state of Scene.build or from jc.init."
+            f" of {sum(expected)} joints; go on from a state that counts them, with"
+            " dataclasses.replace, or start with jc.init."
         )
     return system.remember(turns) if sum(got) else system
 

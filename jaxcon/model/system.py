@@ -24,7 +24,7 @@ from jaxcon.model.state import Energy
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal, Solution
 
-POSITIVE = {"mass", "inertia", "length", "radius"}
+POSITIVE = {"mass", "inertia", "length"}
 NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
 """Fields whose values are checked where they are known."""
 

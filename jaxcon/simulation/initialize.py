@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -11,11 +12,11 @@ import numpy as np
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.status import Status
-from jaxcon.model.state import State
+from jaxcon.model.state import State, recall
 from jaxcon.simulation.method import Method
 
 
-def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
+def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: Any = None) -> State:
     """A state at q and v with the memory of the method.
 
     Args:
@@ -24,6 +25,8 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
         q: positions, (n_q,).
         v: velocities, (n_v,).
         time: () [s].
+        turns: as of a `State`, for systems that count turns; unless given, every angle counted is
+            taken to lie within half a turn of where it was at assembly.
 
     Returns:
         The state; nothing is projected.
@@ -45,7 +48,11 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0) -> State:
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
     memory = method.stabilizer.init(system, q, v)
-    return State(q, v, jnp.asarray(time, dtype), status, memory, system.turns)
+    start = State(q, v, jnp.asarray(time, dtype), status, memory, system.turns)
+    if turns is None:
+        return start
+    recall(system, turns)
+    return dataclasses.replace(start, turns=jnp.asarray(turns, dtype))
 
 
 def check_dtype(system: Any, dtype: Any) -> None:
