@@ -194,7 +194,7 @@ def cam(s: Site) -> list[Any]:
 
 def telescope(s: Site) -> list[Any]:
     """Two slides and two hinges, none perpendicular to another, with three of them prescribed."""
-    axes = np.array([s.axis, s.other + s.axis, np.cross(s.axis, s.other)]) + 0.3
+    axes = np.array([s.axis, s.other + s.axis, np.cross(s.axis, s.other) + 0.3 * s.axis])
     name, a, b = s.joint
     arm = jc.Compound(name, a, b, s.point, slides=(*axes[:2],), hinges=(*axes[1:],))
     shape = (0.0, 0.3, -0.2, 0.1)
@@ -207,9 +207,9 @@ def telescope(s: Site) -> list[Any]:
 
 def gimbal(s: Site) -> list[Any]:
     """A slide and three oblique hinges, each turned by the next."""
-    axes = np.array([s.axis, np.cross(s.axis, s.other), s.other])
+    axes = np.array([s.axis, np.cross(s.axis, s.other) + 0.2 * s.axis, s.other])
     name, a, b = s.joint
-    arm = jc.Compound(name, a, b, s.point, slides=(s.other,), hinges=(*(axes + 0.2),))
+    arm = jc.Compound(name, a, b, s.point, slides=(s.other,), hinges=(*axes,))
     shape = (0.0, 0.3, -0.2, 0.1)
     turns = ("angle_1", "angle_2"), ("angle_2", "angle_3")
     cams = [
