@@ -155,15 +155,9 @@ def drive(s: Site) -> Any:
     return jc.Drive("drive" + s.suffix, s.joint[0], wave, params=WAVE)
 
 
-def driven_revolute(s: Site) -> list[Any]:
-    return [*revolute(s), drive(s)]
-
-
-def driven_prismatic(s: Site) -> list[Any]:
-    return [*prismatic(s), drive(s)]
-
-
-def driven(make: Callable[[Site], list[Any]], coordinate: str) -> Callable[[Site], list[Any]]:
+def driven(
+    make: Callable[[Site], list[Any]], coordinate: str | None = None
+) -> Callable[[Site], list[Any]]:
     """A joint with one of its coordinates driven."""
 
     def elements(s: Site) -> list[Any]:
@@ -284,8 +278,8 @@ JOINTS = {
     "spherical_spherical": Joint(spherical_spherical, ("joint", "length"), dims=(3,)),
     "revolute_spherical": Joint(revolute_spherical, ("joint", "length"), dims=(3,)),
     "fixed": Joint(fixed, ("joint", "anchor_b")),
-    "driven_revolute": Joint(driven_revolute, ("drive", "params")),
-    "driven_prismatic": Joint(driven_prismatic, ("drive", "params")),
+    "driven_revolute": Joint(driven(revolute), ("drive", "params")),
+    "driven_prismatic": Joint(driven(prismatic), ("drive", "params")),
     "driven_universal_a": Joint(driven(universal, "angle_a"), ("drive", "params"), dims=(3,)),
     "driven_universal_b": Joint(driven(universal, "angle_b"), ("drive", "params"), dims=(3,)),
     "driven_sleeve": Joint(driven(cylindrical, "travel"), ("drive", "params"), dims=(3,)),

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.report import dependent_rows
-from jaxcon.constraints.rows import linearize
+from jaxcon.constraints.rows import layout_of, linearize
 from jaxcon.core.typing import Array
 from jaxcon.model.state import State, at
 
@@ -97,7 +97,7 @@ def integrability(system: Any, state: State, names: Sequence[str] | None = None)
         Bloch, Nonholonomic Mechanics and Control (2003), sections 2.8 and 4.3.
     """
     system = at(system, state)
-    layout = jax.eval_shape(linearize, system, state.q, state.v, state.time).layout
+    layout = layout_of(system, state.q, state.v, state.time)
     holding = tuple(name for name in layout.names if name not in layout.inertial)
     chosen = holding if names is None else (names,) if isinstance(names, str) else tuple(names)
     if not chosen:

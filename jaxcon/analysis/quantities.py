@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
-from jaxcon.constraints.rows import Violation, linearize
+from jaxcon.constraints.rows import Violation, layout_of, linearize
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector, times, total
 from jaxcon.core.typing import Array
@@ -175,8 +174,7 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
             " it comes from: a motor's is its control."
         )
     index = group.names.index(name)
-    layout = linearize(system, state.q, state.v, state.time).layout
-    multipliers = info.multipliers[layout.rows(name)]
+    λ = multipliers(system, state, info, name)
     owner, sign = _acts_on(system, group, index, body)
     columns, block = next(
         (c, rows)
@@ -184,7 +182,7 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
         if c.start + c.indices[index] == system.layout.v(owner)[0]
     )
     lanes = [
-        total(times(row[c], x) for row, x in zip(block, multipliers, strict=True))
+        total(times(row[c], x) for row, x in zip(block, λ, strict=True))
         for c in range(columns.components)
     ]
     force = jnp.stack([jnp.broadcast_to(x, (len(columns.indices),))[index] for x in lanes])
@@ -205,7 +203,7 @@ def multipliers(system: Any, state: State, info: Any, name: str) -> Array:
     Raises:
         ValueError: no such constraint.
     """
-    layout = jax.eval_shape(linearize, at(system, state), state.q, state.v, state.time).layout
+    layout = layout_of(at(system, state), state.q, state.v, state.time)
     return info.multipliers[layout.rows(name)]
 
 

@@ -9,9 +9,8 @@ from jaxcon.constraints.base import RowSet, gather
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
-from jaxcon.model.actuators import label
 from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.elements import Elements
+from jaxcon.model.elements import Elements, label
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxcon.constraints import primitives
-from jaxcon.constraints.joints import PERPENDICULAR, label, unit
+from jaxcon.constraints.joints import PERPENDICULAR, unit
 from jaxcon.constraints.primitives import Row
 from jaxcon.constraints.surfaces import Plane, normal, surface
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import own_point
+from jaxcon.model.elements import label, own_point
 
 
 @dataclass(frozen=True)

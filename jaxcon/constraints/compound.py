@@ -11,7 +11,6 @@ import numpy as np
 from jaxcon.constraints import gimbal, primitives
 from jaxcon.constraints.joints import (
     anchors,
-    label,
     normals,
     relative_orientation,
     unit_vector,
@@ -20,6 +19,7 @@ from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import label
 
 DEPENDENT = 1e-6
 """The volume that unit axes span below which they count as dependent."""

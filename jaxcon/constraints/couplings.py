@@ -21,9 +21,9 @@ from jaxcon.core import checks
 from jaxcon.core.lanes import total
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
-from jaxcon.model.actuators import label, numbers
+from jaxcon.model.actuators import numbers
 from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.elements import Elements
+from jaxcon.model.elements import Elements, label
 
 
 class Relation(NamedTuple):
@@ -40,8 +40,22 @@ class Relation(NamedTuple):
     curvature: Lane = 0.0
 
 
+class Pair:
+    """A coupling of one coordinate each of two joints."""
+
+    joint_a: str
+    joint_b: str
+    coordinate_a: str | None
+    coordinate_b: str | None
+
+    @property
+    def along(self) -> tuple[tuple[str, str | None], ...]:
+        """The joints and coordinates that are coupled."""
+        return ((self.joint_a, self.coordinate_a), (self.joint_b, self.coordinate_b))
+
+
 @dataclass(frozen=True)
-class Gear:
+class Gear(Pair):
     """A pair of gears, or any fixed ratio: θ_b = r θ_a; λ is the torque on b.
 
     Meshing outer gears turn against each other: r < 0. The angles are those of the hinges, each of
@@ -61,11 +75,6 @@ class Gear:
     coordinate_a: str | None = None
     coordinate_b: str | None = None
 
-    @property
-    def along(self) -> tuple[tuple[str, str | None], ...]:
-        """The joints and coordinates that are coupled."""
-        return ((self.joint_a, self.coordinate_a), (self.joint_b, self.coordinate_b))
-
     def attach(self, dtype: Any) -> dict[str, Array]:
         """The ratio."""
         return nonzero(self, dtype, "ratio")
@@ -73,7 +82,7 @@ class Gear:
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
         """θ_b − r θ_a."""
-        return Relation(b.value - p["ratio"] * a.value, (-p["ratio"], 1.0))
+        return in_ratio(p["ratio"], a, b)
 
 
 @dataclass(frozen=True)
@@ -107,11 +116,11 @@ class RackAndPinion:
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
         """s − r θ."""
-        return Relation(b.value - p["radius"] * a.value, (-p["radius"], 1.0))
+        return in_ratio(p["radius"], a, b)
 
 
 @dataclass(frozen=True)
-class Belt:
+class Belt(Pair):
     """A belt that does not slip round two pulleys: r_b θ_b = r_a θ_a; λ is the pull on b [N].
 
     Attributes:
@@ -128,11 +137,6 @@ class Belt:
     radius_b: Any
     coordinate_a: str | None = None
     coordinate_b: str | None = None
-
-    @property
-    def along(self) -> tuple[tuple[str, str | None], ...]:
-        """The joints and coordinates that are coupled."""
-        return ((self.joint_a, self.coordinate_a), (self.joint_b, self.coordinate_b))
 
     def attach(self, dtype: Any) -> dict[str, Array]:
         """The radii."""
@@ -217,7 +221,7 @@ class Differential:
 
 
 @dataclass(frozen=True)
-class PolynomialCoupling:
+class PolynomialCoupling(Pair):
     """One coordinate as a polynomial of another, θ_b = Σ cₖ θ_aᵏ: cams, and fits of anything else.
 
     Attributes:
@@ -235,11 +239,6 @@ class PolynomialCoupling:
     coordinate_a: str | None = None
     coordinate_b: str | None = None
 
-    @property
-    def along(self) -> tuple[tuple[str, str | None], ...]:
-        """The joints and coordinates that are coupled."""
-        return ((self.joint_a, self.coordinate_a), (self.joint_b, self.coordinate_b))
-
     def attach(self, dtype: Any) -> dict[str, Array]:
         """The coefficients.
 
@@ -251,9 +250,7 @@ class PolynomialCoupling:
             raise ValueError(
                 f"{label(self)}: coefficients must be (c0, c1, …), at least two, got shape {shape}."
             )
-        given = checks.number(label(self), "coefficients", self.coefficients, dtype, shape)
-        checks.finite(label(self), "coefficients", given)
-        return {"coefficients": given}
+        return numbers(self, dtype, "coefficients", shape=shape)
 
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
@@ -297,6 +294,11 @@ class Couplings(Elements):
     def anchor(self, snapshot: Any, i: int) -> Array | None:
         """None: a coupling acts on several joints."""
         return None
+
+
+def in_ratio(ratio: Lane, a: Row, b: Row) -> Relation:
+    """b − r a."""
+    return Relation(b.value - ratio * a.value, (-ratio, 1.0))
 
 
 def nonzero(element: Any, dtype: Any, *fields: str) -> dict[str, Array]:

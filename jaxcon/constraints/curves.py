@@ -28,7 +28,7 @@ import numpy as np
 
 from jaxcon.constraints import primitives
 from jaxcon.constraints.base import Joints, RowSet, gather
-from jaxcon.constraints.joints import anchors, label
+from jaxcon.constraints.joints import anchors
 from jaxcon.constraints.pairs import check_oriented
 from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks, native
@@ -36,6 +36,7 @@ from jaxcon.core.lanes import Vector, plus, times, total
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import label
 
 AXES = ("axis_x", "axis_y", "axis_z")
 

@@ -18,7 +18,7 @@ from jaxcon.core import checks, numerics
 from jaxcon.core.typing import Array
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import own_point
+from jaxcon.model.elements import label, own_point
 
 PERPENDICULAR = 1e-6
 """The cosine up to which two axes count as perpendicular; in float32 rounding alone is 1e-7."""
@@ -150,14 +150,7 @@ class Revolute:
         points = anchors(self, a, b)
         if a.position.shape == (2,):
             return points | {"angle": b.orientation - a.orientation}
-        n, u, w = triad(self, a)
-        return points | {
-            "axis": a.local_direction(n),
-            "first_a": a.local_direction(u),
-            "second_a": a.local_direction(w),
-            "first_b": b.local_direction(u),
-            "second_b": b.local_direction(w),
-        }
+        return points | axes_in_both(self, a, b)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
@@ -165,9 +158,7 @@ class Revolute:
         rows = primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
         if "axis" not in p:
             return rows
-        n = a.direction(p["axis"])
-        across = (b.direction(p["first_b"]), b.direction(p["second_b"]))
-        return rows + [primitives.angle_between(n, u) for u in across]
+        return rows + parallel(p, a, b)
 
     @staticmethod
     def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
@@ -202,21 +193,13 @@ class Prismatic:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in a, the orientation of b in a."""
-        axis, *normals = triad(self, a)
-        params = anchors(self, a, b) | {
-            "axis": a.local_direction(axis),
-            "first_a": a.local_direction(normals[0]),
-            "orientation": relative_orientation(a, b),
-        }
-        return params if len(normals) == 1 else params | {"second_a": a.local_direction(normals[1])}
+        turn = {"orientation": relative_orientation(a, b)}
+        return anchors(self, a, b) | axes_in(self, a) | turn
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """u·(p_b − p_a) = 0 for u normal to the axis, and the orientations agree."""
-        points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
-        normals = [p[side] for side in ("first_a", "second_a") if side in p]
-        rows = [primitives.travel(a.direction(u), *points) for u in normals]
-        return rows + primitives.same_orientation(a, b, p["orientation"])
+        return on_axis(p, a, b) + primitives.same_orientation(a, b, p["orientation"])
 
     @staticmethod
     def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
@@ -225,15 +208,42 @@ class Prismatic:
         return primitives.travel(a.direction(p["axis"]), *points)
 
 
+def axes_in(joint: Any, a: Pose) -> dict[str, Array]:
+    """The axis of a joint and the directions normal to it, in the frame of a."""
+    directions = zip(("axis", "first_a", "second_a"), triad(joint, a), strict=False)
+    return {side: a.local_direction(u) for side, u in directions}
+
+
+def axes_in_both(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
+    """The axis of a joint in space in the frame of a, and the directions normal to it in both."""
+    n, u, w = triad(joint, a)
+    return {
+        "axis": a.local_direction(n),
+        "first_a": a.local_direction(u),
+        "second_a": a.local_direction(w),
+        "first_b": b.local_direction(u),
+        "second_b": b.local_direction(w),
+    }
+
+
+def on_axis(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+    """u·(p_b − p_a) = 0 for u normal to the axis."""
+    points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
+    normals = [p[side] for side in ("first_a", "second_a") if side in p]
+    return [primitives.travel(a.direction(u), *points) for u in normals]
+
+
+def parallel(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+    """n·b₁ = n·b₂ = 0."""
+    n = a.direction(p["axis"])
+    across = (b.direction(p["first_b"]), b.direction(p["second_b"]))
+    return [primitives.angle_between(n, u) for u in across]
+
+
 def turn_about(p: dict[str, Any], a: Any, b: Any) -> Row:
     """The angle of b in a about the normal of two directions of a, zero at assembly [rad]."""
     first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
     return primitives.turn(first, second, b.direction(p["first_b"]))
-
-
-def label(joint: Any) -> str:
-    """What errors call a joint: its class and name."""
-    return f"{type(joint).__name__} '{joint.name}'"
 
 
 def anchors(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:

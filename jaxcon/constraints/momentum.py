@@ -13,7 +13,7 @@ from jaxcon.core import checks
 from jaxcon.core.lanes import Vector, axes, plus, total
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
-from jaxcon.model.elements import Elements
+from jaxcon.model.elements import Elements, label
 from jaxcon.model.layout import Place
 from jaxcon.model.momentum import Part, momentum_of, parts_of, torque_bias, torque_pulls
 
@@ -133,7 +133,7 @@ def _element(x: Any, k: int) -> Any:
 
 
 def _number(element: Any, shape: tuple[int, ...], dtype: Any) -> Array:
-    owner = f"{type(element).__name__} '{element.name}'"
+    owner = label(element)
     value = jnp.zeros(shape, dtype) if element.value is None else element.value
     value = checks.number(owner, "value", value, dtype, shape)
     checks.finite(owner, "value", value)

@@ -18,8 +18,10 @@ from jaxcon.constraints.joints import (
     Distance,
     Prismatic,
     anchors,
-    label,
-    triad,
+    axes_in,
+    axes_in_both,
+    on_axis,
+    parallel,
     turn_about,
     unit,
 )
@@ -27,7 +29,7 @@ from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks, numerics
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import own_point
+from jaxcon.model.elements import label, own_point
 
 
 @dataclass(frozen=True)
@@ -54,17 +56,12 @@ class PointOnLine:
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, the axis and its normals in a."""
         check_oriented(self, a)
-        axis, *normals = triad(self, a)
-        sides = zip(("first_a", "second_a"), normals, strict=False)
-        directions = {side: a.local_direction(u) for side, u in sides}
-        return anchors(self, a, b) | {"axis": a.local_direction(axis)} | directions
+        return anchors(self, a, b) | axes_in(self, a)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """u·(p_b − p_a) = 0 for u normal to the axis."""
-        points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
-        normals = [p[side] for side in ("first_a", "second_a") if side in p]
-        return [primitives.travel(a.direction(u), *points) for u in normals]
+        return on_axis(p, a, b)
 
     coordinate = Prismatic.coordinate
 
@@ -91,10 +88,7 @@ class PointOnPlane:
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The point in both frames, and the normal in a."""
         check_oriented(self, a)
-        n, *sides = triad(self, a)
-        own = zip(("first_a", "second_a"), sides, strict=False)
-        directions = {side: a.local_direction(u) for side, u in own}
-        return anchors(self, a, b) | {"axis": a.local_direction(n)} | directions
+        return anchors(self, a, b) | axes_in(self, a)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
@@ -132,21 +126,12 @@ class Parallel:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The axis in a, and the directions normal to it in both."""
-        n, u, w = triad(self, a)
-        return {
-            "axis": a.local_direction(n),
-            "first_a": a.local_direction(u),
-            "second_a": a.local_direction(w),
-            "first_b": b.local_direction(u),
-            "second_b": b.local_direction(w),
-        }
+        return axes_in_both(self, a, b)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """n·b₁ = n·b₂ = 0."""
-        n = a.direction(p["axis"])
-        across = (b.direction(p["first_b"]), b.direction(p["second_b"]))
-        return [primitives.angle_between(n, u) for u in across]
+        return parallel(p, a, b)
 
     @staticmethod
     def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
@@ -178,7 +163,7 @@ class Cylindrical(Parallel):
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """u·(p_b − p_a) = 0 for u normal to the axis, n·b₁ = n·b₂ = 0."""
-        return PointOnLine.rows(p, a, b) + Parallel.rows(p, a, b)
+        return on_axis(p, a, b) + parallel(p, a, b)
 
     @staticmethod
     def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
@@ -248,7 +233,7 @@ class Planar(Parallel):
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
         """n·(p_b − p_a) = 0, n·b₁ = n·b₂ = 0."""
-        return PointOnPlane.rows(p, a, b) + Parallel.rows(p, a, b)
+        return PointOnPlane.rows(p, a, b) + parallel(p, a, b)
 
     @staticmethod
     def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:

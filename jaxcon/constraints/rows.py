@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -179,6 +180,11 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     inertial = tuple(name for group in rotors for name in group.names)
     layout = RowLayout(tuple(entries), tuple(free), inertial)
     return Rows(residual, rate, jacobian, bias, layout, compliance)
+
+
+def layout_of(system: Any, q: Array, v: Array, t: Any) -> RowLayout:
+    """Which rows belong to which constraint, without computing them."""
+    return jax.eval_shape(linearize, system, q, v, t).layout
 
 
 def _flat(sets: list[RowSet], field: str, like: Array) -> Array:

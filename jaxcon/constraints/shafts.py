@@ -13,7 +13,6 @@ from jaxcon.constraints.joints import (
     PERPENDICULAR,
     anchors,
     check_perpendicular,
-    label,
     triad,
     unit,
 )
@@ -21,6 +20,7 @@ from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
+from jaxcon.model.elements import label
 
 
 @dataclass(frozen=True)

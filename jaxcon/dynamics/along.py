@@ -11,7 +11,7 @@ from jaxcon.constraints.armature import Armature, Armatures
 from jaxcon.constraints.base import Joints
 from jaxcon.constraints.couplings import Couplings
 from jaxcon.constraints.drive import Drives
-from jaxcon.model.actuators import JointForces, label
+from jaxcon.model.actuators import JointForces
 from jaxcon.model.coordinates import (
     End,
     JointCoordinate,
@@ -22,7 +22,7 @@ from jaxcon.model.coordinates import (
     numbered,
     turns_over,
 )
-from jaxcon.model.elements import stack
+from jaxcon.model.elements import label, stack
 from jaxcon.model.layout import Layout, Place
 
 

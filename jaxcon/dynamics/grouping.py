@@ -18,7 +18,7 @@ from jaxcon.core import checks
 from jaxcon.dynamics.along import Along
 from jaxcon.dynamics.inputs import Resolved
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import stack
+from jaxcon.model.elements import label, stack
 from jaxcon.model.forces import (
     CustomForce,
     CustomForces,
@@ -223,7 +223,7 @@ class Gather:
         return Place(located[0][0], tuple(index for _, index in located))
 
     def _check_bodies(self, element: Any, names: tuple[str, ...]) -> None:
-        owner = f"{type(element).__name__} '{element.name}'"
+        owner = label(element)
         for name in names:
             if name not in self.poses:
                 known = [WORLD, *self.layout.bodies, *self.layout.fixed]
@@ -235,7 +235,7 @@ class Gather:
             raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")
 
     def _check_joint(self, joint: Any) -> None:
-        owner = f"{type(joint).__name__} '{joint.name}'"
+        owner = label(joint)
         names = (joint.body_a, joint.body_b)
         self._check_bodies(joint, names)
         if self.dim not in getattr(joint, "dims", (2, 3)):
@@ -251,7 +251,7 @@ class Gather:
             raise ValueError(f"{owner}: in the plane the axis is the normal; give none.")
 
     def _check_user(self, element: Any) -> None:
-        owner = f"{type(element).__name__} '{element.name}'"
+        owner = label(element)
         if not isinstance(element.bodies, tuple) or not element.bodies:
             raise ValueError(f"{owner}: bodies must be a tuple of names, got {element.bodies!r}.")
         self._check_bodies(element, element.bodies)

@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.constraints.rows import RowLayout, linearize
+from jaxcon.constraints.rows import RowLayout, layout_of, linearize
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
@@ -184,7 +184,7 @@ def vakonomic(
     Raises:
         ValueError: an unknown name, one whose rows all have a φ, or a wrong shape.
     """
-    layout = jax.eval_shape(linearize, at(system, state), state.q, state.v, state.time).layout
+    layout = layout_of(at(system, state), state.q, state.v, state.time)
     result = Vakonomic(system, layout)
     μ = jnp.zeros(len(result.free), state.v.dtype)
     for name, given in (multipliers or {}).items():

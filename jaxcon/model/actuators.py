@@ -17,7 +17,7 @@ from jaxcon.core.lanes import Vector, take
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.elements import Elements
+from jaxcon.model.elements import Elements, label
 from jaxcon.model.forces import Pulls
 
 
@@ -218,9 +218,7 @@ class AffineActuator:
 
     def attach(self, dtype: Any) -> dict[str, Array]:
         """The numbers of the element."""
-        laws = {f: checks.number(label(self), f, getattr(self, f), dtype, (3,)) for f in LAWS}
-        for field, value in laws.items():
-            checks.finite(label(self), field, value)
+        laws = numbers(self, dtype, "gain", "bias", shape=(3,))
         limits = ranges(self, dtype, "control_range", "force_range")
         return laws | numbers(self, dtype, "gear") | limits
 
@@ -229,9 +227,6 @@ class AffineActuator:
         """(g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇."""
         at = Vector(1.0, value, rate)
         return p["gain"].dot(at) * u + p["bias"].dot(at)
-
-
-LAWS = ("gain", "bias")
 
 
 @pytree
@@ -268,11 +263,14 @@ def clip(p: dict[str, Any], field: str, x: Lane) -> Lane:
     return jnp.clip(x, lowest, highest)
 
 
-def numbers(element: Any, dtype: Any, *fields: str) -> dict[str, Array]:
-    """Fields of an element as finite numbers ()."""
-    params = {f: checks.number(label(element), f, getattr(element, f), dtype) for f in fields}
+def numbers(
+    element: Any, dtype: Any, *fields: str, shape: tuple[int, ...] = ()
+) -> dict[str, Array]:
+    """Fields of an element as finite numbers of one shape."""
+    owner = label(element)
+    params = {f: checks.number(owner, f, getattr(element, f), dtype, shape) for f in fields}
     for field, value in params.items():
-        checks.finite(label(element), field, value)
+        checks.finite(owner, field, value)
     return params
 
 
@@ -301,8 +299,3 @@ def ranges(element: Any, dtype: Any, *fields: str) -> dict[str, Array]:
                 f"{label(element)}: {field} must be (lowest, highest), got {x.tolist()}."
             )
     return result
-
-
-def label(element: Any) -> str:
-    """What errors call an element: its class and name."""
-    return f"{type(element).__name__} '{element.name}'"

@@ -97,6 +97,11 @@ def replace_at(owner: str, x: Any, i: int, value: Any) -> Any:
     return Vector(*(lane.at[i].set(component) for lane, component in pairs))
 
 
+def label(element: Any) -> str:
+    """What errors call an element: its class and name."""
+    return f"{type(element).__name__} '{element.name}'"
+
+
 def own_point(element: Any, what: str, point: Any, pose: Pose) -> Array:
     """A world point that is to be attached to a body: its position unless given.
 
@@ -105,7 +110,7 @@ def own_point(element: Any, what: str, point: Any, pose: Pose) -> Array:
     """
     if point is None:
         return pose.position
-    owner = f"{type(element).__name__} '{element.name}'"
+    owner = label(element)
     point = checks.number(owner, what, point, pose.position.dtype, pose.position.shape)
     checks.finite(owner, what, point)
     known = pose.orientation is None and checks.is_concrete((point, pose.position))
