@@ -91,6 +91,7 @@ from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.dense import Dense
+from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Solution
 from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse
@@ -151,6 +152,7 @@ __all__ = [
     "Prismatic",
     "Pulley",
     "RackAndPinion",
+    "RankSafe",
     "Report",
     "Revolute",
     "RevoluteSpherical",

@@ -51,7 +51,6 @@ class Armatures(Elements):
     """Rotors along one coordinate of joints of one group."""
 
     along: JointCoordinate = static(default=None)  # type: ignore[assignment]
-    inertial = True
 
     def rows(self, snapshot: Any) -> RowSet:
         """J a + λ/I = −γ; there is no φ, and no feedback."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,7 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.armature import Armatures
 from jaxcon.constraints.base import RowSet
+from jaxcon.constraints.drive import Drives
+from jaxcon.constraints.redundancy import has_loops
 from jaxcon.core import numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
@@ -26,11 +30,13 @@ class RowLayout:
         free: numbers of the rows that have no φ, in ascending order; a position projection leaves
             them out. Rolling has both kinds in one constraint.
         inertial: names of those that hold nothing, but resist acceleration: rotors.
+        loops: whether rows may depend on each other, as those of closed loops do.
     """
 
     entries: tuple[tuple[str, int, int, int], ...]
     free: tuple[int, ...] = ()
     inertial: tuple[str, ...] = ()
+    loops: bool = False
 
     @property
     def velocity_level(self) -> tuple[str, ...]:
@@ -141,6 +147,16 @@ class Rows:
         """φ and φ̇ by constraint."""
         return Violation(self.residual, self.rate, self.layout)
 
+    def only(self, kept: np.ndarray) -> Rows:
+        """The same rows, of which those that are not kept, (n_c,), say λ = b and act on nothing."""
+        if kept.all():
+            return self
+        open_ = jnp.asarray(~kept, self.bias.dtype).reshape(-1, *(1,) * (self.bias.ndim - 1))
+        known = 0.0 if self.compliance is None else self.compliance * (1 - open_)
+        compliance = jnp.broadcast_to(known + open_, self.bias.shape)
+        jacobian = self.jacobian.only(kept)
+        return dataclasses.replace(self, jacobian=jacobian, compliance=compliance)
+
 
 def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     """φ, φ̇, J and γ of every constraint at one instant.
@@ -176,9 +192,11 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     residual, rate, bias = (_flat(sets, field, v) for field in ("value", "rate", "bias"))
     soft = any(rows.compliance is not None for rows in sets)
     compliance = _flat(sets, "compliance", v) if soft else None
-    rotors = (g for g in system.constraints if getattr(g, "inertial", False))
+    rotors = (g for g in system.constraints if isinstance(g, Armatures))
     inertial = tuple(name for group in rotors for name in group.names)
-    layout = RowLayout(tuple(entries), tuple(free), inertial)
+    holding = zip(system.constraints, sets, strict=True)
+    loops = has_loops(rows for group, rows in holding if not isinstance(group, Armatures | Drives))
+    layout = RowLayout(tuple(entries), tuple(free), inertial, loops)
     return Rows(residual, rate, jacobian, bias, layout, compliance)
 
 

@@ -9,12 +9,14 @@ from jaxcon.core.typing import Array
 
 
 class Status(IntEnum):
-    """The first failure of a world; 0 is healthy."""
+    """0 is healthy; below `CONFLICT` a world has failed and stops, from there on it goes on."""
 
     OK = 0
     NON_FINITE = 1
     SINGULAR = 2
     NOT_CONVERGED = 3
+    CONFLICT = 16
+    RECOVERED = 17
 
 
 MEANING = {
@@ -23,10 +25,13 @@ MEANING = {
     Status.SINGULAR: "the constraint rows are dependent, or the mass matrix is not positive"
     " definite; `report` names redundant rows; likely (a) a closed spatial loop of revolute joints,"
     " (b) the same constraint twice, (c) a singular position of the mechanism; rows that agree are"
-    " solved by `Sparse(tikhonov=…)`",
-    Status.NOT_CONVERGED: "an iterative solver did not reach its tolerance; likely (a) too few"
-    " iterations, (b) a tolerance below what rounding allows, (c) redundant rows that contradict"
-    " each other, to which `tikhonov` gives a solution",
+    " solved by `RankSafe()`, the solver of a `Method` that names none",
+    Status.NOT_CONVERGED: "an iteration did not reach its tolerance; likely (a) too few iterations,"
+    " (b) a tolerance below what rounding allows, (c) a start too far off the constraints,"
+    " (d) redundant rows that contradict each other",
+    Status.CONFLICT: "constraints contradict each other; the world goes on by least squares;"
+    " `report` names them",
+    Status.RECOVERED: "a step failed and was repaired; the world goes on",
 }
 
 
@@ -34,28 +39,32 @@ class SimulationError(RuntimeError):
     """A world failed; the message names which and why."""
 
 
+def failed(code: Array) -> Array:
+    """Whether a world has failed, by its code: it keeps its last finite state."""
+    return (code != Status.OK) & (code < Status.CONFLICT)
+
+
 def first(earlier: Array, later: Array) -> Array:
-    """The earlier code unless it is OK: the first failure sticks."""
-    return jnp.where(earlier == Status.OK, later, earlier)
+    """The earlier code unless it is OK, or only a note and the later one a failure."""
+    return jnp.where(failed(later) & ~failed(earlier) | (earlier == Status.OK), later, earlier)
 
 
 def raise_for_status(result: object) -> None:
-    """Raises where a world failed. For use outside jit.
+    """Raises where a world failed or has contradicting constraints. For use outside jit.
 
     Args:
         result: a State, StepInfo or Solution, of one world or a batch.
 
     Raises:
-        SimulationError: some `status` is not OK; the message names world, code and likely causes.
+        SimulationError: some `status` is neither OK nor RECOVERED; the message names world, code
+            and likely causes.
     """
     status = np.asarray(getattr(result, "status", result))
-    failed = np.argwhere(np.atleast_1d(status) != Status.OK)
-    if failed.size:
-        code = Status(int(np.atleast_1d(status)[tuple(failed[0])]))
-        where = "" if status.ndim == 0 else f" in {len(failed)} of {status.size} worlds"
-        index = "" if status.ndim == 0 else f", first in world {tuple(map(int, failed[0]))}"
+    bad = np.argwhere(~np.isin(np.atleast_1d(status), (Status.OK, Status.RECOVERED)))
+    if bad.size:
+        code = Status(int(np.atleast_1d(status)[tuple(bad[0])]))
+        where = "" if status.ndim == 0 else f" in {len(bad)} of {status.size} worlds"
+        index = "" if status.ndim == 0 else f", first in world {tuple(map(int, bad[0]))}"
         times = getattr(result, "time", None)
-        when = (
-            "" if times is None else f", at t = {float(np.atleast_1d(times)[tuple(failed[0])]):g} s"
-        )
+        when = "" if times is None else f", at t = {float(np.atleast_1d(times)[tuple(bad[0])]):g} s"
         raise SimulationError(f"{code.name}{where}{index}{when}: {MEANING[code]}.")

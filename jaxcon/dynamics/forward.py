@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from jaxcon.constraints.rows import Rows, linearize
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, PyTree
 from jaxcon.solvers.saddle import Saddle, Solution
 
 
@@ -22,18 +23,35 @@ def saddle(system: Any, q: Array, rows: Rows, force: Array, target: Array) -> Sa
     Returns:
         What a solver takes.
     """
-    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance)
+    loops = rows.layout.loops
+    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance, loops)
 
 
-def accelerate(
-    system: Any, stabilizer: Any, solver: Any, control: Any, memory: Any, dt: Any
-) -> Any:
-    """The function (q, v, t) → (solution, rows) that integrators call."""
+@dataclass(frozen=True)
+class Dynamics:
+    """What an integrator sees of a system under control and feedback, during one step.
 
-    def at(q: Array, v: Array, t: Any) -> tuple[Solution, Rows]:
-        rows = linearize(system, q, v, t)
-        target = stabilizer.target(rows, memory, dt)
-        force = system.force(q, v, t, control)
-        return system.complete(solver.solve(saddle(system, q, rows, force, target))), rows
+    Attributes:
+        system: as remembered by the state.
+        stabilizer: with all its gains.
+        solver: of the saddle system.
+        control: u.
+        memory: of the stabiliser.
+        dt: h, () [s].
+    """
 
-    return at
+    system: Any
+    stabilizer: Any
+    solver: Any
+    control: PyTree
+    memory: PyTree
+    dt: Any
+
+    def __call__(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows]:
+        """a and λ at (q, v, t), and the rows there."""
+        rows = linearize(self.system, q, v, t)
+        law = self.stabilizer.impose(rows, self.memory, self.dt)
+        force = self.system.force(q, v, t, self.control)
+        force = force if law.force is None else force + law.force
+        problem = saddle(self.system, q, law.rows, force, law.target)
+        return self.system.complete(self.solver.solve(problem)), rows

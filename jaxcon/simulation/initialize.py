@@ -47,7 +47,7 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
         if isinstance(group, Custom):
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
-    memory = method.stabilizer.init(system, q, v)
+    memory = method.init(system, q, v)
     start = State(q, v, jnp.asarray(time, dtype), status, memory, system.turns)
     if turns is None:
         return start

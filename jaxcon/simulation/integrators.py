@@ -1,37 +1,65 @@
-"""How a step advances q and v. An integrator sees the system through `accelerate` alone.
+"""How a step advances q and v by accelerations alone.
 
-`accelerate(q, v, t)` returns the solution of the saddle system there and its rows. Each integrator
+`dynamics(q, v, t)` returns the solution of the saddle system there and its rows. Each integrator
 also says how it transforms a constraint error under feedback, which decides which gains are stable.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import operator
-from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.rows import Rows
 from jaxcon.core import status
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
+from jaxcon.solvers.saddle import Solution
 
-Accelerate = Callable[[Any, Any, Any], Any]
+
+class Advanced(NamedTuple):
+    """Where a step leads, and what was seen at its start.
+
+    Attributes:
+        point: q (n_q,), v (n_v,) and the time reached, () [s].
+        solution: a and λ.
+        rows: the constraints.
+        memory: of the integrator.
+    """
+
+    point: tuple[Array, Array, Any]
+    solution: Solution
+    rows: Rows
+    memory: PyTree = ()
+
+
+class Explicit:
+    """An integrator that needs accelerations only; admits every stabiliser."""
+
+    def init(self, system: Any, q: Array, v: Array) -> PyTree:
+        """No memory."""
+        return ()
+
+    def refuses(self, system: Any, stabilizer: Any) -> str | None:
+        """Why it does not work with a system or stabiliser; None where it does."""
+        return None
 
 
 @pytree
-class SemiImplicitEuler:
+class SemiImplicitEuler(Explicit):
     """v⁺ = v + h a(q, v), q⁺ = q ⊕ h v⁺: first order, one solve, symplectic without constraints."""
 
-    def advance(self, accelerate: Accelerate, system: Any, state: State, dt: Any) -> Any:
-        """The state one step later, and the solution and rows at its start."""
-        solution, rows = accelerate(state.q, state.v, state.time)
+    def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
+        """One step."""
+        solution, rows = dynamics(state.q, state.v, state.time)
         v = state.v + dt[None] * solution.acceleration
-        q = system.retract(state.q, dt[None] * v)
-        return dataclasses.replace(state, q=q, v=v, time=state.time + dt), solution, rows
+        q = dynamics.system.retract(state.q, dt[None] * v)
+        return Advanced((q, v, state.time + dt), solution, rows)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.
@@ -58,7 +86,7 @@ class SemiImplicitEuler:
 
 
 @pytree
-class RungeKutta:
+class RungeKutta(Explicit):
     """An explicit Runge–Kutta method by its tableau.
 
     Stages move q along q̇ = N(q) v and bring quaternions back to unit length. The vector field so
@@ -90,22 +118,22 @@ class RungeKutta:
         if abs(sum(self.b) - 1) > 1e-9:
             raise ValueError(f"RungeKutta: the weights b must add up to 1, got {sum(self.b)}.")
 
-    def advance(self, accelerate: Accelerate, system: Any, state: State, dt: Any) -> Any:
-        """The state one step later, and the solution and rows at its start."""
+    def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
+        """One step."""
         q, v, t, h = state.q, state.v, state.time, dt[None]
-        stages = [accelerate(q, v, t)]
+        system, stages = dynamics.system, [dynamics(state.q, state.v, state.time)]
         slopes = [(system.kinematics(q, v), stages[0][0].acceleration)]
         for weights in self.a:
             dq, dv = combine(weights, slopes)
             q_i, v_i = system.normalize(q + h * dq), v + h * dv
-            stages.append(accelerate(q_i, v_i, t + dt * sum(weights)))
+            stages.append(dynamics(q_i, v_i, t + dt * sum(weights)))
             slopes.append((system.kinematics(q_i, v_i), stages[-1][0].acceleration))
         dq, dv = combine(self.b, slopes)
         solution, rows = stages[0]
         for stage, _ in stages[1:]:
             solution = solution._replace(status=status.first(solution.status, stage.status))
         q, v = system.normalize(q + h * dq), v + h * dv
-        return dataclasses.replace(state, q=q, v=v, time=t + dt), solution, rows
+        return Advanced((q, v, t + dt), solution, rows)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = β = 10 /s, and less where h is so large that 0.4/h is below it."""

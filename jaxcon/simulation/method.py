@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
+
+import jax
 
 from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import PyTree
 from jaxcon.simulation.integrators import SemiImplicitEuler
-from jaxcon.solvers.sparse import Sparse
+from jaxcon.solvers.proximal import RankSafe
 from jaxcon.stabilization.baumgarte import Baumgarte
+
+
+class Memory(NamedTuple):
+    """What a state remembers for its method, by part; each () where there is nothing."""
+
+    integrator: PyTree = ()
+    stabilizer: PyTree = ()
 
 
 @pytree
@@ -17,16 +27,32 @@ class Method:
     Attributes:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
         stabilizer: `Baumgarte(…)` or `Unstabilized()`.
-        solver: `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`.
+        solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
+            want independent rows.
     """
 
     integrator: Any = SemiImplicitEuler()
     stabilizer: Any = Baumgarte()
-    solver: Any = Sparse()
+    solver: Any = RankSafe()
+
+    def init(self, system: Any, q: Any, v: Any) -> PyTree:
+        """What a state remembers for the method: a `Memory`, or () where there is nothing."""
+        memory = Memory(self.integrator.init(system, q, v), self.stabilizer.init(system, q, v))
+        return memory if jax.tree.leaves(memory) else ()
 
     def feedback(self, dt: Any) -> Any:
         """The stabiliser, its missing gains chosen for the integrator at this step."""
         return self.stabilizer.resolve(self.integrator.default_gains(dt))
+
+    def check_system(self, system: Any) -> None:
+        """Checks that the integrator works with the stabiliser and the system.
+
+        Raises:
+            ValueError: it does not; the message says why.
+        """
+        reason = self.integrator.refuses(system, self.stabilizer)
+        if reason:
+            raise ValueError(f"{type(self.integrator).__name__}: {reason}.")
 
     def check(self) -> None:
         """Checks that each part is a value of its kind.

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core.native import lift, spread
-from jaxcon.core.status import Status
+from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
 
 
@@ -46,7 +46,7 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
         # a tangent shared by worlds must be masked in each of them
         full, moved = spread(floats, batch), spread(tangents[0], batch)
         output, pushforward = jax.linearize(lambda x: call(x, others), full)
-        healthy = output[1] == Status.OK
+        healthy = ~failed(output[1])
         return output, _mask(healthy, pushforward(_mask(healthy, moved)))
 
     floats = [x for x, flag in zip(arrays, inexact, strict=True) if flag]
@@ -61,7 +61,7 @@ def keep(healthy: Array, new: PyTree, old: PyTree) -> PyTree:
 
 def stop_failed(status: Array, tree: PyTree) -> PyTree:
     """The same values, without a gradient where the world failed."""
-    healthy = status == Status.OK
+    healthy = ~failed(status)
     return keep(healthy, tree, jax.lax.stop_gradient(tree))
 
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.errors import TracerIntegerConversionError
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
-from jaxcon.core.status import Status
+from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.method import Method, check_method
@@ -92,7 +92,7 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
         # what the policy closes over, traced or not, as arguments whose tangents can be masked
         function = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))
         control = jax.tree.unflatten(structure, function(*jax.tree.leaves(state)))
-        good = state.status == Status.OK
+        good = ~failed(state.status)
         for x in jax.tree.leaves(control):
             good &= jnp.all(jnp.isfinite(x))
         return control, jnp.where(good, Status.OK, Status.NON_FINITE)

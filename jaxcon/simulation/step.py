@@ -14,10 +14,10 @@ from jaxcon.core import checks, native, status
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.dynamics.forward import accelerate
+from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State, at, recall
 from jaxcon.simulation.initialize import check_dtype
-from jaxcon.simulation.method import Method, check_method
+from jaxcon.simulation.method import Memory, Method, check_method
 from jaxcon.simulation.recovery import contain, keep
 from jaxcon.simulation.stability import warn_if_unstable
 from jaxcon.solvers.saddle import Solution
@@ -89,12 +89,18 @@ def contained_step(
 def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
     stabilizer = method.feedback(dt)
     system = recall(system, state.turns)
-    acceleration = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
-    new, solution, rows = method.integrator.advance(acceleration, system, state, dt)
-    new = stabilizer.correct(system, method.solver, new, dt)
-    new = dataclasses.replace(new, turns=system.count(state.q, state.v, state.time))
-    code = status.first(state.status, judge(new, solution))
-    healthy = code == Status.OK
+    memory = Memory(*state.memory)
+    dynamics = Dynamics(system, stabilizer, method.solver, control, memory.stabilizer, dt)
+    advanced = method.integrator.advance(dynamics, state, memory.integrator, dt)
+    (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
+    new = dataclasses.replace(state, q=q, v=v, time=time)
+    own = stabilizer.advance(rows, memory.stabilizer, dt)
+    new, corrected = stabilizer.correct(system, method.solver, new, own, dt)
+    turns = system.count(state.q, state.v, state.time)
+    kept = Memory(advanced.memory, own) if state.memory else ()
+    new = dataclasses.replace(new, turns=turns, memory=kept)
+    code = status.first(state.status, status.first(judge(new, solution), corrected))
+    healthy = ~status.failed(code)
     info = StepInfo(solution.acceleration, solution.multipliers, rows.violation, code)
     info = keep(healthy, info, jax.tree.map(jnp.zeros_like, info))
     new = dataclasses.replace(keep(healthy, new, state), status=code)
@@ -137,8 +143,9 @@ def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Ar
     state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
     stabilizer = method.feedback(dt)
     system = recall(system, state.turns)
-    acceleration = accelerate(system, stabilizer, method.solver, control, state.memory, dt)
-    return acceleration(state.q, state.v, state.time)[0]
+    memory = Memory(*state.memory).stabilizer
+    dynamics = Dynamics(system, stabilizer, method.solver, control, memory, dt)
+    return dynamics(state.q, state.v, state.time)[0]
 
 
 def check_step(system: Any, method: Method, state: State, control: PyTree) -> PyTree:
@@ -166,7 +173,8 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
         if jnp.issubdtype(got, jnp.floating) and got != state.q.dtype:
             raise ValueError(f"step: control is {got}, but the state is {state.q.dtype}.")
     check_dtype(system, state.q.dtype)
-    memory = method.stabilizer.init(system, state.q, state.v)
+    method.check_system(system)
+    memory = method.init(system, state.q, state.v)
     if jax.tree.structure(memory) != jax.tree.structure(state.memory):
         raise ValueError("step: the state has the memory of another method; start with jc.init.")
     return control

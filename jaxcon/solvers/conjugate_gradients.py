@@ -17,7 +17,7 @@ from jaxcon.solvers import blocks
 from jaxcon.solvers.blocks import Block, freeze
 from jaxcon.solvers.delassus import Delassus, diagonal_blocks, softened, weighted
 from jaxcon.solvers.jacobian import Jacobian
-from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
+from jaxcon.solvers.saddle import Diagonal, Factored, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
 
 Operator = Callable[[Array], Array]
@@ -64,26 +64,32 @@ class ConjugateGradients:
         The status is NOT_CONVERGED where the residual is above the tolerance, and SINGULAR where M
         is not positive definite.
         """
+        return self.factor(system)(system.force, system.target)
+
+    def factor(self, system: Saddle) -> Factored:
+        """The solution as a function of f and b."""
         if not system.target.size:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
-            return Schur(self.tikhonov).solve(system)
+            return Schur(self.tikhonov).factor(system)
         j, delassus = system.jacobian, Delassus(system, self.tikhonov)
-        free = system.mass.solve(system.force)
         preconditioner = BlockJacobi(*delassus.matrices)
-        tolerance = freeze(self._tolerance(free.dtype))
+        tolerance = freeze(self._tolerance(system.force.dtype))
 
         def iterate(a: Operator, x: Array) -> tuple[Array, Array]:
             return descend(a, preconditioner.solve, x, tolerance, self.iterations)
 
-        right = system.target - j.apply(free)
-        multipliers, open_ = jax.lax.custom_linear_solve(
-            delassus, right, iterate, symmetric=True, has_aux=True
-        )
-        acceleration = free + system.mass.solve(j.transpose(multipliers))
-        status = judge(acceleration, system.mass.singular)
-        late = jnp.where(open_, Status.NOT_CONVERGED, Status.OK).astype(status.dtype)
-        return Solution(acceleration, multipliers, first(status, late))
+        def solve(force: Array, target: Array) -> Solution:
+            free = system.mass.solve(force)
+            multipliers, open_ = jax.lax.custom_linear_solve(
+                delassus, target - j.apply(free), iterate, symmetric=True, has_aux=True
+            )
+            acceleration = free + system.mass.solve(j.transpose(multipliers))
+            status = judge(acceleration, system.mass.singular)
+            late = jnp.where(open_, Status.NOT_CONVERGED, Status.OK).astype(status.dtype)
+            return Solution(acceleration, multipliers, first(status, late))
+
+        return solve
 
     def _tolerance(self, dtype: Any) -> Array:
         given = self.tolerance

@@ -72,7 +72,15 @@ def softened(
 
 def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
     """C + ε diag(J M⁻¹ Jᵀ + C), (n_c,), with the diagonal held constant."""
-    jacobian, inverse_mass, _ = matrices
+    own = diagonal(*matrices[:2])
+    ε = jnp.asarray(share).astype(own.dtype)[None]
+    if compliance is None:
+        return ε * own
+    return compliance + ε * (own + jax.lax.stop_gradient(compliance))
+
+
+def diagonal(jacobian: Jacobian, inverse_mass: Array) -> Array:
+    """diag(J M⁻¹ Jᵀ), (n_c,)."""
     rows: dict[int, list[Lane]] = {}
     for block in jacobian.blocks:
         weight = block.columns.take(inverse_mass)
@@ -82,8 +90,4 @@ def regularized(compliance: Array | None, share: Any, matrices: Any) -> Array:
         ]
         known = rows.get(block.start, [0.0] * len(squares))
         rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
-    diagonal = jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
-    ε = jnp.asarray(share).astype(diagonal.dtype)[None]
-    if compliance is None:
-        return ε * diagonal
-    return compliance + ε * (diagonal + jax.lax.stop_gradient(compliance))
+    return jnp.concatenate([x for start in sorted(rows) for x in rows[start]])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
-from jaxcon.solvers.saddle import Saddle, Solution, free_motion, judge
+from jaxcon.solvers.saddle import Factored, Saddle, Solution, free_motion, judge
 
 
 @pytree
@@ -27,30 +27,49 @@ class Dense:
         The status is SINGULAR where K is singular to working precision. A mass matrix that is
         not definite goes unnoticed where K is regular.
         """
+        return self.factor(system)(system.force, system.target)
+
+    def factor(self, system: Saddle) -> Factored:
+        """The solution as a function of f and b."""
         if not system.target.size:
             return free_motion(system)
         rank = system.target.ndim - 1
-        return native.per_world(_solve, rank)(system)
+        known = native.per_world(_factor, rank)(system)
+        return lambda force, target: native.per_world(_solve, rank)(known, force, target)
 
 
-def _solve(system: Saddle) -> Solution:
+@pytree
+class Whole:
+    """S K S = P L U, of one world."""
+
+    scale: Array
+    matrix: Array
+    factor: tuple[Array, Array]
+    singular: Array
+
+
+def _factor(system: Saddle) -> Whole:
     """Of one world."""
     j = system.jacobian.dense()
     scale = jax.lax.stop_gradient(_scale(system, j))
     matrix = saddle_matrix(system, j) * scale[None] * scale[:, None]
     factor = jax.scipy.linalg.lu_factor(jax.lax.stop_gradient(matrix))
-    right = jnp.concatenate([system.force, system.target]) * scale
-    solution = scale * jax.lax.custom_linear_solve(
-        lambda x: matrix @ x,
-        right,
-        lambda multiply, x: _refined(multiply, factor, 0, x),
-        lambda multiply, x: _refined(multiply, factor, 1, x),
-    )
     pivots = jnp.abs(jnp.diagonal(factor[0]))
     singular = ~jnp.all(pivots > matrix.shape[0] * jnp.finfo(matrix.dtype).eps)
-    n = system.force.shape[0]
-    status = judge(solution, singular & jnp.all(jnp.isfinite(matrix)))
-    return Solution(solution[:n], solution[n:], status)
+    return Whole(scale, matrix, factor, singular & jnp.all(jnp.isfinite(matrix)))
+
+
+def _solve(known: Whole, force: Array, target: Array) -> Solution:
+    """Of one world."""
+    right = jnp.concatenate([force, target]) * known.scale
+    solution = known.scale * jax.lax.custom_linear_solve(
+        lambda x: known.matrix @ x,
+        right,
+        lambda multiply, x: _refined(multiply, known.factor, 0, x),
+        lambda multiply, x: _refined(multiply, known.factor, 1, x),
+    )
+    n = force.shape[0]
+    return Solution(solution[:n], solution[n:], judge(solution, known.singular))
 
 
 def _refined(multiply: Callable[[Array], Array], factor: Any, trans: int, right: Array) -> Array:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -100,6 +102,18 @@ class Jacobian:
         lanes.append(jnp.zeros((self.shape[1] - free, *multipliers.shape[1:]), multipliers.dtype))
         return jnp.concatenate([x for x in lanes if x.shape[0]])
 
+    def only(self, kept: np.ndarray) -> Jacobian:
+        """J with rows of zeros where they are not kept, (n_c,)."""
+
+        def block(old: Block) -> Block:
+            m, k = old.shape
+            choice = kept[old.start : old.start + m * k].reshape(m, k)
+            rows = zip(old.value, choice, strict=True)
+            value = tuple(row.map(partial(_chosen, own)) for row, own in rows)
+            return dataclasses.replace(old, value=value)
+
+        return dataclasses.replace(self, blocks=tuple(map(block, self.blocks)))
+
     def dense(self) -> Array:
         """J as one array (n_c, n_v): one concatenation and one gather by a fixed index."""
         entries: list[Array] = []
@@ -118,6 +132,15 @@ class Jacobian:
         dtype = jnp.result_type(*entries) if entries else jnp.result_type(float)
         flat = [x.astype(dtype) for x in entries]
         return jnp.concatenate([*flat, jnp.zeros(1, dtype)])[index]
+
+
+def _chosen(kept: np.ndarray, lane: Lane) -> Lane:
+    """A lane (element, …) with zeros where an element is not kept."""
+    if kept.all():
+        return lane
+    if not kept.any():
+        return 0.0
+    return jnp.where(kept.reshape(-1, *(1,) * (lane.ndim - 1)), lane, 0)
 
 
 def _join(rows: dict[int, list[Lane]], n_rows: int, like: Array) -> Array:

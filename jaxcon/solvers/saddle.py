@@ -6,12 +6,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.pytree import pytree
+from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
 from jaxcon.solvers.jacobian import Jacobian
@@ -108,6 +109,8 @@ class Saddle:
         jacobian: J, (n_c, n_v).
         target: b, (n_c,).
         compliance: the diagonal of C, (n_c,); None where it is zero.
+        loops: whether rows may depend on each other by structure, as those of closed loops do and
+            those of a tree of joints do not.
     """
 
     mass: Mass
@@ -115,6 +118,7 @@ class Saddle:
     jacobian: Jacobian
     target: Array
     compliance: Array | None = None
+    loops: bool = static(default=True)
 
 
 class Solution(NamedTuple):
@@ -131,6 +135,10 @@ class Solution(NamedTuple):
     status: Array
 
 
+Factored = Callable[[Array, Array], Solution]
+"""The solution for other f and b with the same M, J and C."""
+
+
 class Solver(Protocol):
     """What every solver answers."""
 
@@ -138,12 +146,20 @@ class Solver(Protocol):
         """The acceleration and the multipliers of a saddle system."""
         ...
 
+    def factor(self, system: Saddle) -> Factored:
+        """The solution as a function of f and b; those of the system are not used."""
+        ...
 
-def free_motion(system: Saddle) -> Solution:
+
+def free_motion(system: Saddle) -> Factored:
     """a = M⁻¹ f, where there is no constraint."""
-    acceleration = system.mass.solve(system.force)
-    status = judge(acceleration, system.mass.singular)
-    return Solution(acceleration, jnp.zeros_like(system.target), status)
+
+    def solve(force: Array, target: Array) -> Solution:
+        acceleration = system.mass.solve(force)
+        status = judge(acceleration, system.mass.singular)
+        return Solution(acceleration, jnp.zeros_like(target), status)
+
+    return solve
 
 
 def judge(x: Array, singular: Any = None) -> Array:

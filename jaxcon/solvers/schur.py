@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
-from jaxcon.solvers.saddle import Mass, Saddle, Solution, free_motion, judge
+from jaxcon.solvers.saddle import Factored, Mass, Saddle, Solution, free_motion, judge
 
 
 @pytree
@@ -35,13 +35,29 @@ class Schur:
 
         The status is SINGULAR where A or M is not positive definite to working precision.
         """
+        return self.factor(system)(system.force, system.target)
+
+    def factor(self, system: Saddle) -> Factored:
+        """The solution as a function of f and b."""
         if not system.target.size:
             return free_motion(system)
         rank = system.target.ndim - 1
-        return native.per_world(_solve, rank)(system, self.tikhonov)
+        known = native.per_world(_factor, rank)(system, self.tikhonov)
+        return lambda force, target: native.per_world(_solve, rank)(known, force, target)
 
 
-def _solve(system: Saddle, tikhonov: Any) -> Solution:
+@pytree
+class Complement:
+    """A = L Lᵀ and what else a solution needs, of one world."""
+
+    mass: Mass
+    jacobian: Array
+    delassus: Array
+    factor: Array
+    singular: Array
+
+
+def _factor(system: Saddle, tikhonov: Any) -> Complement:
     """Of one world."""
     j = system.jacobian.dense()
     a = delassus(system.mass, j, system.compliance)
@@ -49,18 +65,22 @@ def _solve(system: Saddle, tikhonov: Any) -> Solution:
         share = jnp.asarray(tikhonov).astype(a.dtype)
         a = a + jnp.diag(jax.lax.stop_gradient(share * jnp.diagonal(a)))
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(a), symmetrize_input=False)
-    free = system.mass.solve(system.force)
-    multipliers = jax.lax.custom_linear_solve(
-        lambda x: a @ x,
-        system.target - j @ free,
-        lambda _, x: jax.scipy.linalg.cho_solve((factor, True), x),
-        symmetric=True,
-    )
-    acceleration = free + system.mass.solve(j.T @ multipliers)
     rounding = 0.0 if tikhonov is not None else a.shape[0] * float(jnp.finfo(a.dtype).eps)
     dependent = _dependent(factor, a, rounding) & jnp.all(jnp.isfinite(a))
-    status = judge(acceleration, dependent | system.mass.singular)
-    return Solution(acceleration, multipliers, status)
+    return Complement(system.mass, j, a, factor, dependent | system.mass.singular)
+
+
+def _solve(known: Complement, force: Array, target: Array) -> Solution:
+    """Of one world."""
+    j, free = known.jacobian, known.mass.solve(force)
+    multipliers = jax.lax.custom_linear_solve(
+        lambda x: known.delassus @ x,
+        target - j @ free,
+        lambda _, x: jax.scipy.linalg.cho_solve((known.factor, True), x),
+        symmetric=True,
+    )
+    acceleration = free + known.mass.solve(j.T @ multipliers)
+    return Solution(acceleration, multipliers, judge(acceleration, known.singular))
 
 
 def delassus(mass: Mass, jacobian: Array, compliance: Array | None) -> Array:

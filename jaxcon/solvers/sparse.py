@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array
 from jaxcon.solvers import ordering
 from jaxcon.solvers.delassus import Delassus
 from jaxcon.solvers.elimination import Elimination
-from jaxcon.solvers.saddle import Diagonal, Saddle, Solution, free_motion, judge
+from jaxcon.solvers.saddle import Diagonal, Factored, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
 
 
@@ -54,28 +55,35 @@ class Sparse:
 
         The status is SINGULAR where a row is, to working precision, a combination of others.
         """
+        return self.factor(system)(system.force, system.target)
+
+    def factor(self, system: Saddle) -> Factored:
+        """The solution as a function of f and b."""
         if not system.target.size:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
-            return Schur(self.tikhonov).solve(system)
+            return Schur(self.tikhonov).factor(system)
         j, delassus = system.jacobian, Delassus(system, self.tikhonov)
-        free = system.mass.solve(system.force)
-        rounding = len(system.target) * float(jnp.finfo(free.dtype).eps)
+        rounding = len(system.target) * float(jnp.finfo(system.force.dtype).eps)
         rounding = 0.0 if self.tikhonov is not None else rounding
         structure = tuple((b.start, b.shape[0], b.columns) for b in j.blocks)
         plan = ordering.plan(structure, self.run, self.order or suits_device())
-        elimination = Elimination(delassus.matrices, plan, free.shape[1:], rounding)
-
-        multipliers = jax.lax.custom_linear_solve(
-            delassus,
-            system.target - j.apply(free),
-            lambda _, x: elimination.substitute(x),
-            symmetric=True,
-        )
-        acceleration = free + system.mass.solve(j.transpose(multipliers))
+        elimination = Elimination(delassus.matrices, plan, system.force.shape[1:], rounding)
         independent = elimination.margin > 0
         dependent = (~independent & elimination.finite) | system.mass.singular
-        return Solution(acceleration, multipliers, judge(acceleration, dependent))
+
+        def solve(force: Array, target: Array) -> Solution:
+            free = system.mass.solve(force)
+            multipliers = jax.lax.custom_linear_solve(
+                delassus,
+                target - j.apply(free),
+                lambda _, x: elimination.substitute(x),
+                symmetric=True,
+            )
+            acceleration = free + system.mass.solve(j.transpose(multipliers))
+            return Solution(acceleration, multipliers, judge(acceleration, dependent))
+
+        return solve
 
 
 def suits_device() -> str:

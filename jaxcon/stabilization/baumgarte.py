@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,21 @@ import jax.numpy as jnp
 from jaxcon.constraints.rows import RowLayout, Rows
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.model.state import State
+
+
+class Law(NamedTuple):
+    """What a stabiliser asks of the rows at one instant: J a + C λ = b.
+
+    Attributes:
+        rows: with J and C.
+        target: b, (n_c,).
+        force: what is added to f, (n_v,); None where nothing is.
+    """
+
+    rows: Rows
+    target: Array
+    force: Array | None = None
 
 
 @pytree
@@ -30,9 +45,17 @@ class Unstabilized:
         """b (n_c,)."""
         return -rows.bias
 
-    def correct(self, system: Any, solver: Any, state: Any, dt: Any) -> Any:
-        """The state as it is."""
-        return state
+    def impose(self, rows: Rows, memory: PyTree, dt: Any) -> Law:
+        """The rows as they are, with their target."""
+        return Law(rows, self.target(rows, memory, dt))
+
+    def advance(self, rows: Rows, memory: PyTree, dt: Any) -> PyTree:
+        """The memory after a step that started with these rows."""
+        return memory
+
+    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
+        """The state after a step, corrected, and a status of its own: here as it is."""
+        return state, jnp.zeros_like(state.status)
 
 
 @pytree

@@ -1,0 +1,145 @@
+"""Solutions of dependent rows by proximal iteration (chapter 3.5.4)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core import native
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.status import Status, first
+from jaxcon.core.typing import Array
+from jaxcon.solvers.delassus import diagonal
+from jaxcon.solvers.saddle import Diagonal, Factored, Saddle, Solution
+from jaxcon.solvers.schur import delassus
+from jaxcon.solvers.sparse import Sparse
+
+
+@pytree
+class RankSafe:
+    """Solves J a + C λ = b also where rows depend on each other, by proximal iteration.
+
+    (A + ε W) λ⁺ = r + ε W λ from λ = 0, with r = b − J M⁻¹ f and W = max(diag A, w² max diag A):
+    what an eigenvalue σ of A scaled by W lacks after k rounds is (ε / (σ + ε))ᵏ of its part. Rows
+    that are independent feel no regularization, dependent ones that agree get the acceleration of
+    the independent ones and, of all λ, the one of least norm in the scaled rows, and singular
+    positions are passed with finite λ. Rows that contradict each other are met by least squares,
+    and say so: `Status.CONFLICT`. The gradient is that of the iteration as it is, with W held; all
+    rounds share one factorization. A scene without closed loops is solved directly.
+
+    Attributes:
+        solver: `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`.
+        share: ε; if None, 1e-9 in float64 and 1e-5 in float32.
+        rounds: k.
+        scaling: w, the least length of a row beside the longest one.
+        conflict: the part of b that least squares may leave before it is called a conflict.
+        always: also where the structure has no loops, for rows that depend on each other by their
+            numbers alone.
+
+    References:
+        Carpentier, Budhiraja and Mansard, Proximal and sparse resolution of constrained dynamic
+            equations, Robotics: Science and Systems (2021).
+        Parikh and Boyd, Proximal algorithms (2014), section 4.1.
+    """
+
+    solver: Any = Sparse()
+    share: Any = None
+    scaling: Any = 1e-6
+    conflict: Any = 1e-2
+    rounds: int = static(default=3)
+    always: bool = static(default=False)
+
+    def solve(self, system: Saddle) -> Solution:
+        """The acceleration (n_v,), multipliers (n_c,) and status."""
+        return self.factor(system)(system.force, system.target)
+
+    def factor(self, system: Saddle) -> Factored:
+        """The solution as a function of f and b."""
+        if not system.target.size or not (system.loops or self.always):
+            return self.solver.factor(system)
+        weight = self._share(system.target.dtype) * scaled(system, self.scaling)
+        solve = proximal(self.solver, system, weight, self.rounds)
+
+        def judged(force: Array, target: Array) -> Solution:
+            solution = solve(force, target, jnp.zeros_like(target))
+            bound = jnp.asarray(self.conflict, target.dtype)
+            code = jnp.where(
+                contradicts(system, weight, target, solution, bound), Status.CONFLICT, Status.OK
+            )
+            status = first(solution.status, code.astype(jnp.int32))
+            return solution._replace(status=status)
+
+        return judged
+
+    def _share(self, dtype: Any) -> Any:
+        """ε, a number or one by world (1, …)."""
+        if self.share is None:
+            return 1e-9 if jnp.finfo(dtype).bits == 64 else 1e-5
+        return jnp.asarray(self.share, dtype)[None]
+
+
+def proximal(solver: Any, system: Saddle, weight: Array, rounds: int) -> Any:
+    """The function (f, b, λ₀) → solution after some rounds of (A + W) λ⁺ = r + W λ.
+
+    Each is a saddle system whose compliance is C + W and whose target is b + W λ. It is also the
+    method of multipliers for constraints held by springs of stiffness 1/W.
+
+    Args:
+        solver: with `factor`.
+        system: M, J and C.
+        weight: W, (n_c,).
+        rounds: how many.
+    """
+    compliance = weight if system.compliance is None else system.compliance + weight
+    solve = solver.factor(
+        Saddle(system.mass, system.force, system.jacobian, system.target, compliance)
+    )
+
+    def iterate(force: Array, target: Array, multipliers: Array) -> Solution:
+        batch = jnp.broadcast_shapes(force.shape[1:], target.shape[1:], weight.shape[1:])
+        start = jnp.broadcast_to(multipliers, (len(target), *batch))
+        if rounds == 1:
+            return solve(force, target + weight * start)
+
+        def once(known: Solution, _: Any) -> tuple[Solution, None]:
+            return solve(force, target + weight * known.multipliers), None
+
+        code = jnp.zeros(batch, jnp.int32)
+        unknown = Solution(jnp.zeros((len(force), *batch), force.dtype), start, code)
+        return jax.lax.scan(once, unknown, None, length=rounds)[0]
+
+    return iterate
+
+
+def scaled(system: Saddle, floor: Any) -> Array:
+    """W = max(diag A, w² max diag A), (n_c,), constant under differentiation."""
+    if isinstance(system.mass, Diagonal):
+        own = diagonal(system.jacobian, 1 / system.mass.diagonal)
+    else:
+        own = native.per_world(_diagonal, system.target.ndim - 1)(system)
+    if system.compliance is not None:
+        own = own + system.compliance
+    least = jnp.asarray(floor, own.dtype) ** 2 * jnp.max(own, axis=0)
+    return jax.lax.stop_gradient(jnp.maximum(own, least[None]))
+
+
+def _diagonal(system: Saddle) -> Array:
+    return jnp.diagonal(delassus(system.mass, system.jacobian.dense(), None))
+
+
+def contradicts(
+    system: Saddle, weight: Array, target: Array, solution: Solution, bound: Array
+) -> Array:
+    """Whether a row is left open by more than a share of what the rows ask for, by world.
+
+    Rows are compared in lengths of √W: b − J a − C λ against b and J a.
+    """
+    moved = system.jacobian.apply(solution.acceleration)
+    if system.compliance is not None:
+        moved = moved + system.compliance * solution.multipliers
+    length = jnp.sqrt(weight)
+    left = jnp.max(jnp.abs(target - moved) / length, axis=0)
+    size = jnp.max((jnp.abs(target) + jnp.abs(moved)) / length, axis=0)
+    return left > bound * size
