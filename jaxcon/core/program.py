@@ -212,6 +212,9 @@ class Program:
         if name == "scan":
             jaxpr, plain = self._inner(params["jaxpr"])
             return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain)
+        if name == "cond":
+            branches = tuple(self._inner(branch)[0] for branch in params["branches"])
+            return self._emit(equation, params | {"branches": branches}, args, False)
         return self._emit(equation, params, args, True)
 
     def _emit(self, equation: Any, params: Any, args: list[Operand], plain: bool) -> list[Any]:

@@ -10,7 +10,9 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.solvers.saddle import Saddle, Solution
 
 
-def saddle(system: Any, q: Array, rows: Rows, force: Array, target: Array) -> Saddle:
+def saddle(
+    system: Any, q: Array, rows: Rows, force: Array, target: Array, noise: Any = None
+) -> Saddle:
     """M a = f + Jᵀλ, J a + C λ = b.
 
     Args:
@@ -19,12 +21,13 @@ def saddle(system: Any, q: Array, rows: Rows, force: Array, target: Array) -> Sa
         rows: the linearized constraints.
         force: f, (n_v,).
         target: b, (n_c,).
+        noise: what b may be off by rounding; see `Saddle`.
 
     Returns:
         What a solver takes.
     """
     loops = rows.layout.loops
-    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance, loops)
+    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance, noise, loops)
 
 
 @dataclass(frozen=True)
@@ -53,5 +56,5 @@ class Dynamics:
         law = self.stabilizer.impose(rows, self.memory, self.dt)
         force = self.system.force(q, v, t, self.control)
         force = force if law.force is None else force + law.force
-        problem = saddle(self.system, q, law.rows, force, law.target)
+        problem = saddle(self.system, q, law.rows, force, law.target, law.noise)
         return self.system.complete(self.solver.solve(problem)), rows

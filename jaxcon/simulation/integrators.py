@@ -10,6 +10,7 @@ import functools
 import operator
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -121,19 +122,28 @@ class RungeKutta(Explicit):
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
         q, v, t, h = state.q, state.v, state.time, dt[None]
-        system, stages = dynamics.system, [dynamics(state.q, state.v, state.time)]
-        slopes = [(system.kinematics(q, v), stages[0][0].acceleration)]
-        for weights in self.a:
-            dq, dv = combine(weights, slopes)
+        system, (solution, rows) = dynamics.system, dynamics(state.q, state.v, state.time)
+        first = system.kinematics(q, v), solution.acceleration
+
+        def stage(carry: Any, row: tuple[Array, Array]) -> tuple[Any, None]:
+            (slopes, code), (weights, i) = carry, row
+            dq, dv = (combine(weights, x) for x in slopes)
             q_i, v_i = system.normalize(q + h * dq), v + h * dv
-            stages.append(dynamics(q_i, v_i, t + dt * sum(weights)))
-            slopes.append((system.kinematics(q_i, v_i), stages[-1][0].acceleration))
-        dq, dv = combine(self.b, slopes)
-        solution, rows = stages[0]
-        for stage, _ in stages[1:]:
-            solution = solution._replace(status=status.first(solution.status, stage.status))
+            found, _ = dynamics(q_i, v_i, t + dt * jnp.sum(weights))
+            own = system.kinematics(q_i, v_i), found.acceleration
+            put = jax.lax.dynamic_update_index_in_dim
+            slopes = tuple(put(x, y, i, 0) for x, y in zip(slopes, own, strict=True))
+            return (slopes, status.first(code, found.status)), None
+
+        slopes = tuple(jnp.zeros((len(self.b), *x.shape), x.dtype).at[0].set(x) for x in first)
+        table = np.zeros((len(self.a), len(self.b)))
+        for i, weights in enumerate(self.a):
+            table[i, : i + 1] = weights
+        inputs = jnp.asarray(table, q.dtype), jnp.arange(1, len(self.b))
+        (slopes, code), _ = jax.lax.scan(stage, (slopes, solution.status), inputs)
+        dq, dv = (combine(self.b, x) for x in slopes)
         q, v = system.normalize(q + h * dq), v + h * dv
-        return Advanced((q, v, t + dt), solution, rows)
+        return Advanced((q, v, t + dt), solution._replace(status=code), rows)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = β = 10 /s, and less where h is so large that 0.4/h is below it."""
@@ -169,9 +179,6 @@ def RK4() -> RungeKutta:  # noqa: N802
     return RungeKutta(((0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
 
 
-def combine(weights: tuple[float, ...], slopes: list[Any]) -> tuple[Any, Any]:
-    """Σ wᵢ (q̇ᵢ, aᵢ), without the terms of weight zero."""
-    used = [(w, slope) for w, slope in zip(weights, slopes, strict=True) if w]
-    used = used or [(0.0, slopes[0])]
-    dq = functools.reduce(operator.add, (w * slope[0] for w, slope in used))
-    return dq, functools.reduce(operator.add, (w * slope[1] for w, slope in used))
+def combine(weights: Any, slopes: Array) -> Array:
+    """Σ wᵢ kᵢ of slopes (stage, n)."""
+    return functools.reduce(operator.add, (w * k for w, k in zip(weights, slopes, strict=True)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxcon.core.lanes import plus, times, total
 from jaxcon.core.typing import Lane
@@ -30,8 +31,11 @@ def minus(x: Lane, y: Lane) -> Lane:
     return plus(x, times(-1, y))
 
 
-def ldl(a: Block) -> Block:
-    """A = L D Lᵀ from the lower triangle of A: L below the diagonal, and D⁻¹ on it."""
+def ldl(a: Block, least: list[Lane] | None = None) -> Block:
+    """A = L D Lᵀ from the lower triangle of A: L below the diagonal, and D⁻¹ on it.
+
+    A row whose pivot is not above the least one, if given, is left out: its D⁻¹ is 0.
+    """
     factor: Block = []
     for j, row in enumerate(a):
         own: list[Lane] = []  # L_jk D_k, then L_jk
@@ -39,8 +43,14 @@ def ldl(a: Block) -> Block:
             own.append(minus(row[k], total(map(times, factor[k][:k], own))))
         lower = [times(x, factor[k][k]) for k, x in enumerate(own)]
         pivot = minus(row[j], total(map(times, lower, own)))
-        factor.append([*lower, 1 / pivot])
+        factor.append([*lower, 1 / pivot if least is None else _inverse(pivot, least[j])])
     return factor
+
+
+def _inverse(pivot: Lane, least: Lane) -> Lane:
+    """1 / d where d is above the least pivot, else 0."""
+    above = pivot > least
+    return jnp.where(above, 1 / jnp.where(above, pivot, 1), 0)
 
 
 def forward(factor: Block, b: list[Lane]) -> list[Lane]:

@@ -28,7 +28,7 @@ class Elimination:
     that do not wait for each other at once, along lanes, and for those of a run in a loop.
 
     A row is a combination of the rows before it where its pivot D_r is not above `rounding` of its
-    diagonal entry A_rr, the pivot that it would have without them.
+    diagonal entry A_rr, the pivot that it would have without them. Such rows may be left out.
 
     Attributes:
         margin: positive, by world, where no row is such a combination: the least of D_r⁻¹ and of
@@ -37,9 +37,15 @@ class Elimination:
     """
 
     def __init__(
-        self, matrices: tuple[Jacobian, Array, Any], plan: Plan, batch: Any, rounding: float
+        self,
+        matrices: tuple[Jacobian, Array, Any],
+        plan: Plan,
+        batch: Any,
+        rounding: float,
+        leaves_out: bool = False,
     ) -> None:
-        self.batch, self.dtype, self.rounding = batch, matrices[1].dtype, rounding
+        self.batch, self.dtype = batch, matrices[1].dtype
+        self.rounding, self.leaves_out = rounding, leaves_out
         self.groups = {block.start: block.shape for block in matrices[0].blocks}
         self.entries, trace = _matrix(plan, matrices)
         self.updates = Pieces()
@@ -65,7 +71,7 @@ class Elimination:
     def _batch(self, step: Batch) -> BatchFactor:
         diagonal = [(p, p) for p in step.nodes]
         whole = self._entries(diagonal)
-        factor = blocks.ldl(less(whole, self.updates.sum(diagonal)))
+        factor = blocks.ldl(less(whole, self.updates.sum(diagonal)), self._least(whole))
         self.margin = jnp.minimum(self.margin, jnp.min(self._margin(whole, factor), axis=0))
         pairs = [list(zip(slot, step.nodes, strict=True)) for slot in step.slots]
         halves = [_halve(factor, less(self._entries(x), self.updates.sum(x))) for x in pairs]
@@ -88,7 +94,8 @@ class Elimination:
 
         def eliminate(carry: Any, rows: Any, k: Array) -> Any:
             (updates, margin), (pivot, sides) = carry, rows
-            factor = blocks.ldl(blocks.subtract(pivot, updates[0, 0]))
+            original = pivot if changed is None else row_of(whole, k)
+            factor = blocks.ldl(blocks.subtract(pivot, updates[0, 0]), self._least(original))
             border = [blocks.subtract(x, updates[j, 0]) for j, x in enumerate(sides[1:], 1)]
             halves = [_halve(factor, side) for side in (sides[0], *border)]
             gains = [_gain(factor, half) for half in halves]
@@ -96,7 +103,6 @@ class Elimination:
             updates = {
                 key: blocks.add(updates[key], x) if key[1] else x for key, x in products.items()
             }
-            original = pivot if changed is None else row_of(whole, k)
             margin = jnp.minimum(margin, self._margin(original, factor))
             return (updates, margin), (factor, gains)
 
@@ -122,6 +128,10 @@ class Elimination:
         """Arrays (count, …) over the whole batch."""
         shape = (count, *self.batch)
         return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, self.dtype), shape), tree)
+
+    def _least(self, whole: Block) -> list[Lane] | None:
+        """The pivots above which rows are kept."""
+        return [self.rounding * a[-1] for a in whole] if self.leaves_out else None
 
     def _margin(self, whole: Block, factor: Block) -> Lane:
         """Of one node or of many; see `margin`."""

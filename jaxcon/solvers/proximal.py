@@ -59,19 +59,47 @@ class RankSafe:
         """The solution as a function of f and b."""
         if not system.target.size or not (system.loops or self.always):
             return self.solver.factor(system)
+        if not isinstance(self.solver, Sparse) or not isinstance(system.mass, Diagonal):
+            return self._iterated(system)
+        margin = float(jnp.finfo(system.target.dtype).eps) ** (3 / 8)
+        direct, independent = self.solver.checked(system, margin, leaves_out=True)
+
+        def solve(force: Array, target: Array) -> Solution:
+            known = direct(force, target)
+
+            def rescued() -> Solution:
+                return keep(independent, known, self._iterated(system)(force, target))
+
+            return jax.lax.cond(jnp.all(independent), lambda: known, rescued)
+
+        return solve
+
+    def _iterated(self, system: Saddle) -> Factored:
+        """The solution by proximal iteration, as a function of f and b.
+
+        It is done twice: what the first one leaves of b is taken out of it for the second, which
+        otherwise would bring 1/ε of it into λ.
+        """
         weight = self._share(system.target.dtype) * scaled(system, self.scaling)
-        solve = proximal(self.solver, system, weight, self.rounds)
+        iterate = proximal(self.solver, system, weight, self.rounds)
+        length = jnp.sqrt(weight)
 
-        def judged(force: Array, target: Array) -> Solution:
-            solution = solve(force, target, jnp.zeros_like(target))
-            bound = jnp.asarray(self.conflict, target.dtype)
-            code = jnp.where(
-                contradicts(system, weight, target, solution, bound), Status.CONFLICT, Status.OK
-            )
-            status = first(solution.status, code.astype(jnp.int32))
-            return solution._replace(status=status)
+        def solve(force: Array, target: Array) -> Solution:
+            def twice(right: Array, _: Any) -> Any:
+                solution = iterate(force, right, jnp.zeros_like(right))
+                left, size = remainder(system, right, solution, length)
+                return right - left, (solution, size)
 
-        return judged
+            met, found = jax.lax.scan(twice, target, None, length=2)
+            solution, size = jax.tree.map(lambda x: x[1], found)
+            left = target - met
+            allowed = jnp.asarray(self.conflict, target.dtype) * size * length
+            allowed = allowed if system.noise is None else allowed + system.noise
+            conflict = jnp.any(jnp.abs(left) > allowed, axis=0)
+            code = jnp.where(conflict, Status.CONFLICT, Status.OK).astype(jnp.int32)
+            return solution._replace(status=first(solution.status, code))
+
+        return solve
 
     def _share(self, dtype: Any) -> Any:
         """ε, a number or one by world (1, …)."""
@@ -129,17 +157,17 @@ def _diagonal(system: Saddle) -> Array:
     return jnp.diagonal(delassus(system.mass, system.jacobian.dense(), None))
 
 
-def contradicts(
-    system: Saddle, weight: Array, target: Array, solution: Solution, bound: Array
-) -> Array:
-    """Whether a row is left open by more than a share of what the rows ask for, by world.
+def keep(chosen: Array, x: Solution, y: Solution) -> Solution:
+    """One solution in the chosen worlds, another in the others."""
+    return jax.tree.map(lambda a, b: jnp.where(native.lift(chosen, a), a, b), x, y)
 
-    Rows are compared in lengths of √W: b − J a − C λ against b and J a.
-    """
+
+def remainder(
+    system: Saddle, target: Array, solution: Solution, length: Array
+) -> tuple[Array, Array]:
+    """b − J a − C λ (n_c,), and by world how large b and J a are in rows of these lengths."""
     moved = system.jacobian.apply(solution.acceleration)
     if system.compliance is not None:
         moved = moved + system.compliance * solution.multipliers
-    length = jnp.sqrt(weight)
-    left = jnp.max(jnp.abs(target - moved) / length, axis=0)
     size = jnp.max((jnp.abs(target) + jnp.abs(moved)) / length, axis=0)
-    return left > bound * size
+    return target - moved, size

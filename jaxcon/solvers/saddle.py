@@ -109,6 +109,7 @@ class Saddle:
         jacobian: J, (n_c, n_v).
         target: b, (n_c,).
         compliance: the diagonal of C, (n_c,); None where it is zero.
+        noise: what b may be off by rounding, a number or (n_c,); None where that is not known.
         loops: whether rows may depend on each other by structure, as those of closed loops do and
             those of a tree of joints do not.
     """
@@ -118,6 +119,7 @@ class Saddle:
     jacobian: Jacobian
     target: Array
     compliance: Array | None = None
+    noise: Any = None
     loops: bool = static(default=True)
 
 

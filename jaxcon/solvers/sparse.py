@@ -63,14 +63,29 @@ class Sparse:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
             return Schur(self.tikhonov).factor(system)
-        j, delassus = system.jacobian, Delassus(system, self.tikhonov)
         rounding = len(system.target) * float(jnp.finfo(system.force.dtype).eps)
-        rounding = 0.0 if self.tikhonov is not None else rounding
+        return self.checked(system, 0.0 if self.tikhonov is not None else rounding)[0]
+
+    def checked(
+        self, system: Saddle, share: float, leaves_out: bool = False
+    ) -> tuple[Factored, Array]:
+        """The solution as a function of f and b, and whether all rows are independent.
+
+        Args:
+            system: M, diagonal, J and C.
+            share: of the diagonal entry of a row, what other rows must leave of it.
+            leaves_out: whether other rows are solved without those that are not; if not, the status
+                is SINGULAR.
+        """
+        j, delassus = system.jacobian, Delassus(system, self.tikhonov)
         structure = tuple((b.start, b.shape[0], b.columns) for b in j.blocks)
         plan = ordering.plan(structure, self.run, self.order or suits_device())
-        elimination = Elimination(delassus.matrices, plan, system.force.shape[1:], rounding)
+        batch = system.force.shape[1:]
+        elimination = Elimination(delassus.matrices, plan, batch, share, leaves_out)
         independent = elimination.margin > 0
-        dependent = (~independent & elimination.finite) | system.mass.singular
+        dependent = system.mass.singular
+        if not leaves_out:
+            dependent = dependent | (~independent & elimination.finite)
 
         def solve(force: Array, target: Array) -> Solution:
             free = system.mass.solve(force)
@@ -83,7 +98,7 @@ class Sparse:
             acceleration = free + system.mass.solve(j.transpose(multipliers))
             return Solution(acceleration, multipliers, judge(acceleration, dependent))
 
-        return solve
+        return solve, independent
 
 
 def suits_device() -> str:

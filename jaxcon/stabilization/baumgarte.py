@@ -22,11 +22,13 @@ class Law(NamedTuple):
         rows: with J and C.
         target: b, (n_c,).
         force: what is added to f, (n_v,); None where nothing is.
+        noise: what b may be off by rounding, a number or (n_c,); None where that is not known.
     """
 
     rows: Rows
     target: Array
     force: Array | None = None
+    noise: Any = None
 
 
 @pytree
@@ -104,6 +106,12 @@ class Baumgarte(Unstabilized):
         alpha = fallback[0] if self.alpha is None else self.alpha
         beta = fallback[1] if self.beta is None else self.beta
         return dataclasses.replace(self, alpha=alpha, beta=beta, fallback=fallback)
+
+    def impose(self, rows: Rows, memory: PyTree, dt: Any) -> Law:
+        """The rows as they are; b has the rounding of φ, some ε of a metre, times β²."""
+        beta = by_row(self.beta, self.fallback[1], rows)
+        noise = 64 * float(jnp.finfo(rows.bias.dtype).eps) * beta * beta
+        return Law(rows, self.target(rows, memory, dt), noise=noise)
 
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
         """b (n_c,)."""
