@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxcon.constraints.armature import Armatures
 from jaxcon.constraints.base import RowSet
+from jaxcon.constraints.custom import Custom
 from jaxcon.constraints.drive import Drives
 from jaxcon.constraints.redundancy import has_loops
 from jaxcon.core import numerics
@@ -30,7 +31,8 @@ class RowLayout:
         free: numbers of the rows that have no φ, in ascending order; a position projection leaves
             them out. Rolling has both kinds in one constraint.
         inertial: names of those that hold nothing, but resist acceleration: rotors.
-        loops: whether rows may depend on each other, as those of closed loops do.
+        loops: whether rows may depend on each other, as those of closed loops do, and several of a
+            user's function.
     """
 
     entries: tuple[tuple[str, int, int, int], ...]
@@ -194,8 +196,9 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     compliance = _flat(sets, "compliance", v) if soft else None
     rotors = (g for g in system.constraints if isinstance(g, Armatures))
     inertial = tuple(name for group in rotors for name in group.names)
-    holding = zip(system.constraints, sets, strict=True)
-    loops = has_loops(rows for group, rows in holding if not isinstance(group, Armatures | Drives))
+    pairs = list(zip(system.constraints, sets, strict=True))
+    loops = has_loops(rows for group, rows in pairs if not isinstance(group, Armatures | Drives))
+    loops |= any(isinstance(group, Custom) and len(rows.value) > 1 for group, rows in pairs)
     layout = RowLayout(tuple(entries), tuple(free), inertial, loops)
     return Rows(residual, rate, jacobian, bias, layout, compliance)
 

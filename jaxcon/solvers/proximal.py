@@ -93,7 +93,7 @@ class RankSafe:
             met, found = jax.lax.scan(twice, target, None, length=2)
             solution, size = jax.tree.map(lambda x: x[1], found)
             left = target - met
-            allowed = jnp.asarray(self.conflict, target.dtype) * size * length
+            allowed = (jnp.asarray(self.conflict, target.dtype) * size)[None] * length
             allowed = allowed if system.noise is None else allowed + system.noise
             conflict = jnp.any(jnp.abs(left) > allowed, axis=0)
             code = jnp.where(conflict, Status.CONFLICT, Status.OK).astype(jnp.int32)

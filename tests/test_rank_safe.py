@@ -1,0 +1,256 @@
+"""Rows that depend on each other: the motion of the independent ones, and λ of least norm."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
+from jaxcon.core.status import Status
+from jaxcon.dynamics.forward import saddle
+from jaxcon.verification import singular
+from tests.tolerances import DIFFERENCE
+
+GENTLE = jc.Method(stabilizer=jc.Baumgarte.critical(10.0))
+ACCURACY = {jnp.float64: 1e-9, jnp.float32: 1e-4}
+"""Of accelerations, relative to the largest."""
+SHARED = 1e-5
+"""Of multipliers of dependent rows."""
+
+
+def cast(built, dtype):
+    return jax.tree.map(lambda x: x.astype(dtype) if x.dtype == jnp.float64 else x, built)
+
+
+def door(hinges):
+    scene = jc.Scene(dim=3)
+    solid = jc.inertia.box(20.0, (0.8, 0.04, 2.0))
+    scene.add_body(
+        "door",
+        inertia=solid,
+        position=(0.4, 0.0, 1.0),
+        velocity=(0.0, 0.4, 0.0),
+        angular_velocity=(0.0, 0.0, 1.0),
+    )
+    for i in range(hinges):
+        point = (0.0, 0.0, 0.2 + 0.8 * i)
+        scene.add(jc.Revolute(f"hinge{i}", jc.WORLD, "door", point=point, axis=(0.0, 0.0, 1.0)))
+    scene.add(jc.JointSpring("closer", "hinge0", stiffness=30.0, damping=1.0))
+    return scene.build()
+
+
+def table(legs):
+    scene = jc.Scene(dim=3)
+    scene.add_body("table", inertia=jc.inertia.box(30.0, (1.2, 0.8, 0.05)), position=(0, 0, 0.7))
+    for i, (x, y) in enumerate([(0.5, 0.3), (-0.5, 0.3), (0.5, -0.3), (-0.5, -0.3)][:legs]):
+        foot = (x, y, 0.0)
+        scene.add(jc.PointOnPlane(f"leg{i}", jc.WORLD, "table", axis=(0.0, 0.0, 1.0), point=foot))
+    scene.add(jc.Force("push", "table", force=(7.0, 3.0, 0.0), point=(0.3, 0.1, 0.7)))
+    return scene.build()
+
+
+def parallelogram(bars):
+    """A coupler on two or three parallel bars, off its singular positions."""
+    scene = jc.Scene(dim=2)
+    angle = 1.1
+    half = 0.5 * np.array([np.cos(angle), np.sin(angle)])
+    spin = 2.0
+    turn = spin * np.array([-half[1], half[0]])
+    solid = {"mass": 1.0, "inertia": 0.1}
+    middle = (1.0 + 2 * half[0], 2 * half[1])
+    scene.add_body("coupler", **solid, position=middle, velocity=2 * turn)
+    for i in range(bars):
+        foot = np.array([float(i), 0.0]) if i < 2 else np.array([2.0, 0.0])
+        scene.add_body(
+            f"bar{i}",
+            **solid,
+            position=foot + half,
+            angle=angle,
+            velocity=turn,
+            angular_velocity=spin,
+        )
+        scene.add(jc.Revolute(f"foot{i}", jc.WORLD, f"bar{i}", point=foot))
+        scene.add(jc.Revolute(f"head{i}", f"bar{i}", "coupler", point=foot + 2 * half))
+    return scene.build()
+
+
+def repeated(times):
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=2.0, position=(0.6, -0.8), velocity=(0.8, 0.6))
+    for i in range(times):
+        scene.add(jc.Distance(f"rod{i}", jc.WORLD, "bob"))
+    return scene.build()
+
+
+@pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
+@pytest.mark.parametrize(
+    ("plain", "redundant"),
+    [(door(1), door(2)), (door(1), door(3)), (table(3), table(4)), (repeated(1), repeated(5))],
+    ids=["two hinges", "three hinges", "four legs", "five times"],
+)
+def test_accelerations_are_those_of_the_independent_rows(plain, redundant, dtype):
+    dynamics = jax.jit(lambda system, state: jc.forward_dynamics(system, state, None, GENTLE, 1e-3))
+    expected = dynamics(*cast(plain, dtype))
+    system, state = cast(redundant, dtype)
+    got = dynamics(system, state)
+    bound = ACCURACY[dtype] * np.max(np.abs(expected.acceleration))
+    np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=0, atol=bound)
+    assert got.status == Status.OK
+    assert jc.forward_dynamics(system, state, None, GENTLE, 1e-3).acceleration.dtype == dtype
+    strict = dataclasses.replace(GENTLE, solver=jc.Sparse())
+    assert jc.forward_dynamics(system, state, None, strict, 1e-3).status == Status.SINGULAR
+
+
+@pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
+def test_a_redundant_link_leaves_the_motion_of_a_parallelogram(dtype):
+    """The third bar is a body of its own, so the comparison is with minimal coordinates.
+
+    With all bars at the angle θ, E = ½ I θ̇² + W sin θ with I = n (¼ + i) m + M and
+    W = (n/2 m + M) g, all lengths 1.
+    """
+    system, state = cast(parallelogram(3), dtype)
+    a = jc.forward_dynamics(system, state, None, GENTLE, 1e-3).acceleration
+    inertia, weight = 3 * (0.25 + 0.1) + 1.0, (1.5 + 1.0) * 9.81
+    expected = -weight * np.cos(1.1) / inertia
+    got = a[system.layout.v("bar1")][2]
+    np.testing.assert_allclose(got, expected, rtol=ACCURACY[dtype])
+
+
+def test_multipliers_are_of_least_norm_in_the_scaled_rows():
+    """λ = D^−½ (D^−½ A D^−½)⁺ D^−½ r, by singular values.
+
+    How dependent rows share a force is known to rounding over ε = 1e-9 of the iteration.
+    """
+    for system, state in (door(2), repeated(5), table(4)):
+        rows = linearize(system, state.q, state.v, state.time)
+        force = system.force(state.q, state.v, state.time)
+        j, weights = rows.jacobian.dense(), 1 / system.mass(state.q).diagonal
+        a = (j * weights[None]) @ j.T
+        scale = 1 / np.sqrt(np.diagonal(a))
+        right = -rows.bias - j @ (weights * force)
+        inverse = np.linalg.pinv(scale[:, None] * a * scale[None], rcond=1e-10, hermitian=True)
+        expected = scale * (inverse @ (scale * right))
+        problem = saddle(system, state.q, rows, force, -rows.bias)
+        for solver in (jc.RankSafe(), jc.RankSafe(jc.Schur()), jc.RankSafe(jc.Dense())):
+            got = solver.solve(problem).multipliers
+            np.testing.assert_allclose(got, expected, atol=SHARED * np.max(np.abs(expected)))
+
+
+def test_independent_rows_feel_nothing():
+    system, state = parallelogram(2)
+    solvers = (jc.Dense(), jc.RankSafe(), jc.RankSafe(jc.Schur(), always=True))
+    methods = [dataclasses.replace(GENTLE, solver=solver) for solver in solvers]
+    exact, *others = (jc.forward_dynamics(system, state, None, m, 1e-3) for m in methods)
+    for got in others:
+        np.testing.assert_allclose(got.acceleration, exact.acceleration, rtol=0, atol=1e-10)
+        np.testing.assert_allclose(got.multipliers, exact.multipliers, rtol=0, atol=1e-10)
+
+
+def test_a_tree_is_solved_directly():
+    system, state = door(1)
+
+    def step(solver):
+        method = dataclasses.replace(GENTLE, solver=solver)
+        return str(jax.make_jaxpr(lambda s: jc.step(system, method, s, None, 1e-3))(state))
+
+    count = {name: step(solver).count("\n") for name, solver in SOLVERS.items()}
+    assert count["default"] == count["strict"]
+
+
+SOLVERS = {"default": jc.RankSafe(), "strict": jc.Sparse()}
+
+
+def two_lengths(first, second):
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.05, 0.0))
+    scene.add(jc.Distance("short", jc.WORLD, "bob", length=first))
+    scene.add(jc.Distance("long", jc.WORLD, "bob", length=second))
+    return scene.build()
+
+
+@pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
+def test_contradicting_rows_are_met_by_least_squares(dtype):
+    """The bob swings on the mean of the two lengths, and the world says that they disagree."""
+    system, state = cast(two_lengths(1.0, 1.1), dtype)
+    method = jc.Method(stabilizer=jc.Baumgarte.critical(50.0))
+    run = jax.jit(lambda s: jc.rollout(system, method, s, None, jnp.asarray(1e-3, dtype), 500))
+    final, path = run(state)
+    assert final.status == Status.CONFLICT
+    length = np.linalg.norm(path.q, axis=1)
+    np.testing.assert_allclose(length, 1.05, rtol=0, atol=2e-3)
+    with pytest.raises(jc.SimulationError, match="contradict"):
+        jc.raise_for_status(final)
+    agreeing, start = cast(two_lengths(1.05, 1.05), dtype)
+    assert jc.step(agreeing, method, start, None, jnp.asarray(1e-3, dtype))[1].status == Status.OK
+
+
+def test_a_singular_world_leaves_the_others_as_they_are():
+    """Of three parallelograms one has its rods in line."""
+    system, state = singular.bars(2)
+    angles = jnp.array([0.9, 0.0, 2.5])
+    method = jc.Method(jc.SemiImplicitEuler(), jc.Baumgarte.critical(20.0))
+
+    def turned(angle):
+        q = state.q
+        for i in range(3):
+            place = system.layout.q(f"rod{i}")
+            x = jnp.stack([i + 0.5 * jnp.cos(angle), 0.5 * jnp.sin(angle), angle])
+            q = q.at[place].set(x)
+        for i in range(2):
+            x = jnp.stack([i + 0.5 + jnp.cos(angle), jnp.sin(angle), 0.0 * angle])
+            q = q.at[system.layout.q(f"bar{i}")].set(x)
+        return dataclasses.replace(state, q=q, v=jnp.zeros_like(state.v))
+
+    def accelerate(angle):
+        return jc.forward_dynamics(system, turned(angle), None, method, 1e-3)
+
+    together = jax.jit(jax.vmap(accelerate))(angles)
+    assert np.all(np.asarray(together.status) == Status.OK)
+    inertia, weight = 3 * (0.25 + 1 / 12) + 2.0, (1.5 + 2.0) * 9.81
+    rods = np.stack([np.asarray(a)[system.layout.v("rod1")] for a in together.acceleration])
+    expected = -weight * np.cos(np.asarray(angles)) / inertia
+    np.testing.assert_allclose(rods[[0, 2], 2], expected[[0, 2]], rtol=1e-9)
+    alone = jax.jit(accelerate)(angles[0])
+    np.testing.assert_allclose(together.acceleration[0], alone.acceleration, rtol=1e-10, atol=1e-10)
+
+
+def test_the_derivative_is_that_of_the_independent_rows():
+    """By the stiffness of a closer, through a rollout of a door on one and on two hinges."""
+
+    def angle(stiffness, built):
+        system, state = built
+        system = system.with_params({"closer": {"stiffness": stiffness}})
+        final, _ = jc.rollout(system, GENTLE, state, None, 1e-3, 200, record=lambda s, i: None)
+        return jc.coordinate(system, final, "hinge0")
+
+    for built in (door(1), door(2)):
+        value = jax.jit(lambda k, b=built: angle(k, b))
+        slopes = [jax.jit(d(lambda k, b=built: angle(k, b)))(30.0) for d in (jax.grad, jax.jacfwd)]
+        difference = (value(30.01) - value(29.99)) / 0.02
+        np.testing.assert_allclose(slopes, [difference] * 2, rtol=DIFFERENCE)
+
+
+def test_rows_of_generalized_coordinates():
+    def twice(q, t, p):
+        return jnp.stack([q @ q - 1.0, 3.0 * (q @ q - 1.0)])
+
+    def once(q, t, p):
+        return jnp.stack([q @ q - 1.0])
+
+    found = []
+    for function in (once, twice):
+        system = jc.GeneralizedSystem(
+            mass=lambda q, p: jnp.eye(2) * 2.0,
+            force=lambda q, v, t, u, p: jnp.stack([0.0 * q[0], -9.81 * 2.0]),
+            constraints=(jc.Holonomic(function),),
+        )
+        state = jc.init(system, GENTLE, jnp.array([0.6, -0.8]), jnp.array([0.8, 0.6]))
+        found.append(jc.forward_dynamics(system, state, None, GENTLE, 1e-3))
+    assert all(x.status == Status.OK for x in found)
+    np.testing.assert_allclose(found[1].acceleration, found[0].acceleration, rtol=1e-9)
+    lengths = np.array([1.0, 3.0])
+    weights = found[1].multipliers @ lengths
+    np.testing.assert_allclose(weights, found[0].multipliers[0], rtol=1e-8)
