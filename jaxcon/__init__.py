@@ -91,6 +91,7 @@ from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.dense import Dense
+from jaxcon.solvers.priority import Lexicographic, Priority
 from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Solution
 from jaxcon.solvers.schur import Schur
@@ -135,6 +136,7 @@ __all__ = [
     "JointSpring",
     "Keyframe",
     "KnifeEdge",
+    "Lexicographic",
     "LinearMomentum",
     "Memory",
     "Method",
@@ -149,6 +151,7 @@ __all__ = [
     "PolynomialCoupling",
     "Pose",
     "PositionServo",
+    "Priority",
     "Prismatic",
     "Pulley",
     "RackAndPinion",

@@ -23,8 +23,9 @@ def saddle(system: Any, q: Array, rows: Rows, force: Array, target: Array) -> Sa
     Returns:
         What a solver takes.
     """
-    loops = rows.layout.loops
-    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance, loops)
+    layout = rows.layout
+    mass, loops = system.mass(q), layout.loops
+    return Saddle(mass, force, rows.jacobian, target, rows.compliance, loops, layout)
 
 
 @dataclass(frozen=True)

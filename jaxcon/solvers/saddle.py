@@ -111,6 +111,8 @@ class Saddle:
         compliance: the diagonal of C, (n_c,); None where it is zero.
         loops: whether rows may depend on each other by structure, as those of closed loops do and
             those of a tree of joints do not.
+        layout: which rows belong to which constraint, with `names` and `rows(name)`, for solvers
+            that treat them differently; None where rows have no names.
     """
 
     mass: Mass
@@ -119,6 +121,7 @@ class Saddle:
     target: Array
     compliance: Array | None = None
     loops: bool = static(default=True)
+    layout: Any = static(default=None)
 
 
 class Solution(NamedTuple):
