@@ -175,7 +175,7 @@ def test_dependent_rows_that_agree_move_as_without_levels():
 
 
 def test_what_levels_are_refused():
-    with pytest.raises(ValueError, match="'rod' must be 0 to 3, got 4"):
+    with pytest.raises(ValueError, match="'rod' must be 0, 1, 2 or 3, got 4"):
         jc.Priority({"rod": 4})
     with pytest.raises(ValueError, match=r"no constraint 'rood\*'; there are \['hold'"):
         jc.Priority({"rood*": 1}).solve(problem()[0])

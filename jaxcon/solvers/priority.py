@@ -109,7 +109,7 @@ class Lexicographic:
             ValueError: a pattern matches no constraint, or rows have no names.
         """
         layout: Any = system.layout
-        names = () if layout is None else layout.names
+        names = getattr(layout, "names", ())
         for pattern, _ in self.levels:
             if not any(fnmatchcase(name, pattern) for name in names):
                 raise ValueError(
