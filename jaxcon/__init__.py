@@ -86,6 +86,7 @@ from jaxcon.simulation.integrators import (
     SemiImplicitEuler,
 )
 from jaxcon.simulation.method import Method
+from jaxcon.simulation.repair import Recovery
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
@@ -156,6 +157,7 @@ __all__ = [
     "Pulley",
     "RackAndPinion",
     "RankSafe",
+    "Recovery",
     "Report",
     "Revolute",
     "RevoluteSpherical",
