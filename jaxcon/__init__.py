@@ -1,5 +1,7 @@
 """Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
 
+from jaxcon.analysis.diagnosis import Diagnosis, diagnose
+from jaxcon.analysis.failures import Failure, Finding, find_first_failure
 from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
@@ -119,12 +121,15 @@ __all__ = [
     "CustomForce",
     "Cylindrical",
     "Dense",
+    "Diagnosis",
     "Differential",
     "Distance",
     "Drive",
     "Energy",
     "ExplicitEuler",
     "ExternalWrench",
+    "Failure",
+    "Finding",
     "Fixed",
     "Flexure",
     "Force",
@@ -192,7 +197,9 @@ __all__ = [
     "center_of_mass",
     "coordinate",
     "coordinate_rate",
+    "diagnose",
     "energy",
+    "find_first_failure",
     "forward_dynamics",
     "from_mjcf",
     "hanging",

@@ -99,7 +99,7 @@ def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array)
 
 def _attempt(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
     """(new state, info) and the status of this step alone."""
-    dynamics = _dynamics_at(system, method, state, control, dt)
+    dynamics = dynamics_at(system, method, state, control, dt)
     system, memory = dynamics.system, Memory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, dt)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
@@ -127,7 +127,7 @@ def _settle(state: State, attempt: Any) -> Any:
     return (new, dataclasses.replace(info, status=jnp.where(healthy, own, code))), code
 
 
-def _dynamics_at(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Dynamics:
+def dynamics_at(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Dynamics:
     """What an integrator sees of the system during a step from this state."""
     stabilizer, memory = method.feedback(dt), Memory(*state.memory)
     if method.recovery is not None:
@@ -170,7 +170,7 @@ def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Ar
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
     state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
-    dynamics = _dynamics_at(system, method, state, control, dt)
+    dynamics = dynamics_at(system, method, state, control, dt)
     return dynamics(state.q, state.v, state.time)[0]
 
 
