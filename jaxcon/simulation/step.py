@@ -83,18 +83,22 @@ def contained_step(
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
     whole = native.spread(state, native.batch_of(args, state.q.ndim - 1))
-    return contain(_step, (system, method, whole, control, dt))[0]
+    args = (system, method, whole, control, dt)
+    if method.recovery is None:
+        return contain(_step, args)[0]
+    # one after the other: what is taken back must leave no derivative either
+    return contain(_repair, (system, method, whole, contain(_attempt, args), dt))[0]
 
 
 def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
     """(new state, info) and the status of the world."""
-    args = (system, method, state, control, dt)
-    if method.recovery is None:
-        return _settle(state, _attempt(*args))
-    # what is taken back must leave no derivative
-    attempt = contain(_attempt, args)
-    known = recall(system, state.turns)
-    return _settle(state, method.recovery.repair(known, method.solver, state, attempt, dt))
+    return _settle(state, _attempt(system, method, state, control, dt))
+
+
+def _repair(system: Any, method: Method, state: State, attempt: Any, dt: Array) -> Any:
+    """The same of an attempt that the method repairs where it failed."""
+    system = recall(system, state.turns)
+    return _settle(state, method.recovery.repair(system, method.solver, state, attempt, dt))
 
 
 def _attempt(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
