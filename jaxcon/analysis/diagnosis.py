@@ -125,7 +125,7 @@ def diagnose(
 def _simulate(
     system: Any, method: Method, state: State, controls: Any, dt: Any, steps: int, every: int = 1
 ) -> tuple[State, np.ndarray]:
-    """The end, and φ after each step, (steps, n_c)."""
+    """The end, and φ at the start and after each recorded step, (steps / every + 1, n_c)."""
     policy = controls if callable(controls) else None
     arrays = None if policy else controls
     end, path = _run(policy, steps, every, system, method, state, arrays, dt)
@@ -136,11 +136,12 @@ def _simulate(
 def _run(policy: Any, steps: int, every: int, *args: Any) -> tuple[State, Array]:
     system, method, state, controls, dt = args
 
-    def record(state: State, _: Any) -> Array:
+    def record(state: State, _: Any = None) -> Array:
         return linearize(at(system, state), state.q, state.v, state.time).residual
 
     controls = policy or controls
-    return rollout(system, method, state, controls, dt, steps, record=record, every=every)
+    end, path = rollout(system, method, state, controls, dt, steps, record=record, every=every)
+    return end, jnp.concatenate([record(state)[None], path])
 
 
 def _largest(path: np.ndarray) -> float:

@@ -49,9 +49,10 @@ class Recovery:
     step fails again, or the state itself is beyond the limit, the state is also projected to the
     nearest valid configuration. After `retries` failures in a row the failure sticks.
 
-    What acted is in the status of each step, as a note: ROLLED_BACK, PROJECTED, or RELAXED where a
-    step was taken with r < 1. Everything is decided world by world without a branch; the derivative
-    of a step that was rolled back is that of the state before it.
+    What acted is in `info.status` of each step, as a note: ROLLED_BACK, PROJECTED, or RELAXED where
+    the step was taken with r < 1; the state remembers the first note. A world decides by itself and
+    the others do not notice. The derivative of a step that was rolled back is that of what was done
+    instead.
 
     Attributes:
         limit: of max |φ| over rows [m, rad]; None for none.
