@@ -14,6 +14,7 @@ import jaxcon as jc
 from jaxcon.constraints.rows import RowLayout, linearize
 from jaxcon.core.lanes import Vector
 from jaxcon.dynamics.forward import saddle
+from jaxcon.scenes import CRANK_ROCKER, four_bar
 from jaxcon.solvers.jacobian import Block, Columns, Jacobian
 from jaxcon.solvers.saddle import Diagonal, Full, Saddle
 
@@ -125,24 +126,46 @@ def test_the_gradient_holds_where_rank_is_lost():
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize("name", ["polar", "arm"])
+@pytest.mark.parametrize("name", ["polar", "four-bar"])
 def test_where_all_agree_levels_change_nothing(name, dtype):
-    """Against the whole matrix; the arm has rotors."""
-    built = scenes.build(name, dtype)
-    s = built.off
-    rows = linearize(built.system, s.q, s.v, s.time)
+    """Against the whole matrix: a full M, and a closed loop of which each hinge has its level."""
+    if name == "polar":
+        built = scenes.build(name, dtype)
+        solved, s = built.system, built.off
+    else:
+        solved, s = four_bar(jnp.asarray(CRANK_ROCKER, dtype), jnp.asarray((0.3, 0.9, 0.7), dtype))
     random = scenes.seeded(name, "priority")
     force = jnp.asarray(random.normal(size=s.v.shape), dtype)
-    target = jnp.asarray(random.normal(size=rows.bias.shape), dtype)
-    system = saddle(built.system, s.q, rows, force, target)
-    levels = {n: i % 4 for i, n in enumerate(rows.layout.names)}
-    expected = jc.Dense().solve(system)
-    found = quick_jit(lambda: jc.Priority(levels, cutoff=1e-13).solve(system))()
+
+    @quick_jit
+    def both():
+        rows = linearize(solved, s.q, s.v, s.time)
+        target = jnp.asarray(random.normal(size=rows.bias.shape), dtype)
+        system = saddle(solved, s.q, rows, force, target)
+        levels = {name: i % 4 for i, name in enumerate(rows.layout.names)}
+        return jc.Priority(levels).solve(system), jc.Dense().solve(system)
+
+    found, expected = both()
     assert found.status == jc.Status.OK
     for got, reference in zip(found[:2], expected[:2], strict=True):
-        size = float(jnp.max(jnp.abs(reference)))
-        bound = 1e4 * ROUND_OFF[np.dtype(dtype)]
-        np.testing.assert_allclose(got, reference, atol=bound * size)
+        assert got.dtype == dtype
+        bound = 1e2 * ROUND_OFF[np.dtype(dtype)] * float(jnp.max(jnp.abs(reference)))
+        np.testing.assert_allclose(got, reference, atol=bound)
+
+
+def test_rows_with_a_compliance_are_met_as_such():
+    """J a + C λ = b is J a + √C z = b, with velocities z of unit mass on which no force acts."""
+    c = np.array([0.0, 0.3, 0.2, 0.0, 0.5])
+    system, _ = problem()
+    a, λ, status = jc.Priority(LEVELS).solve(dataclasses.replace(system, compliance=jnp.asarray(c)))
+    mass = np.block([[MASS, np.zeros((5, 5))], [np.zeros((5, 5)), np.eye(5)]])
+    wider = np.hstack([J, np.diag(np.sqrt(c))])
+    force = np.concatenate([FORCE, np.zeros(5)])
+    expected = by_null_spaces(wider, mass, force, TARGET, BY_LEVEL)
+    np.testing.assert_allclose(a, expected[:5], rtol=1e-10)
+    np.testing.assert_allclose(np.sqrt(c) * λ, expected[5:], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(J @ a + c * λ, TARGET, rtol=1e-10)
+    assert status == jc.Status.OK
 
 
 def test_a_world_of_a_batch_goes_on_with_what_its_levels_leave():
@@ -163,6 +186,20 @@ def test_a_world_of_a_batch_goes_on_with_what_its_levels_leave():
     assert left["rod"] < 1e-10
     assert left["other"] > 1e-2
     assert final.status == jc.Status.OK
+
+
+def test_a_row_of_zeros_leaves_solution_and_gradient_finite():
+    j = J.copy()
+    j[0] = j[3] = 0
+
+    def value(j, target):
+        a, λ, _ = jc.Priority(LEVELS).solve(problem(j, target=target)[0])
+        return jnp.sum(a**2) + jnp.sum(λ**2)
+
+    slopes = quick_jit(jax.grad(value, (0, 1)))(jnp.asarray(j), jnp.asarray(TARGET))
+    for slope in slopes:
+        assert np.all(np.isfinite(slope))
+        np.testing.assert_array_equal(slope[jnp.array([0, 3])], 0)
 
 
 def test_dependent_rows_that_agree_move_as_without_levels():

@@ -37,7 +37,7 @@ class Method:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
         stabilizer: `Baumgarte(…)` or `Unstabilized()`.
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
-            want independent rows.
+            want independent rows; `Priority(levels)` meets them level by level.
         recovery: `Recovery(…)`, which repairs steps that fail; None, and a world that fails stops.
     """
 
