@@ -161,6 +161,19 @@ def test_violation_is_told_apart_by_its_source():
     assert 1e-8 < coarse.sources["round-off"] < 1e-6
 
 
+def test_what_hardly_any_motion_changes_is_a_matter_of_rank():
+    """Two nearly parallel rods, 5 cm apart in what they ask: half of that each."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
+    scene.add(jc.Distance("near", jc.WORLD, "bob", length=1.05, point_a=(0.0, 1e-3)))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Unstabilized())
+    found = jc.diagnose(system, method, state, None, 1e-6, 2)
+    assert found.sources["rank"] == pytest.approx(0.025, rel=1e-3)
+    assert found.sources["conflict"] == 0
+
+
 def test_contradicting_constraints_are_named_with_what_is_left():
     """Two rods of lengths 1 and 1.2 to one point: 0.1 each, by symmetry."""
     scene = jc.Scene(dim=2)

@@ -59,8 +59,8 @@ class Recovery:
         shrink: of r at a failure.
         growth: of r after a success.
         damping: share of v that a world loses when it rolls back.
-        projector: a stabiliser whose `correct` finds the nearest valid configuration; None for one
-            linearised step of position and velocity in the metric of M.
+        projector: a stabiliser without memory whose `correct` finds the nearest valid configuration;
+            None for one linearised step of position and velocity in the metric of M.
         retries: how many failures in a row are repaired.
     """
 
@@ -124,7 +124,7 @@ class Recovery:
         code = jnp.where(again, note, first(code, relaxed))
         new = keep(~again, new, back)
         memory = new.memory._replace(recovery=self._remember(known, bad))
-        info = keep(~again, info, zeros_like(info))
+        info = keep(~again, info, jax.tree.map(jnp.zeros_like, info))
         return (dataclasses.replace(new, memory=memory), info), code
 
     def _remember(self, known: Repairs, bad: Array) -> Repairs:
@@ -194,11 +194,6 @@ class Linearized(Unstabilized):
         return new, first(code, later)
 
 
-def zeros_like(tree: PyTree) -> PyTree:
-    """The same tree, all zeros."""
-    return jax.tree.map(jnp.zeros_like, tree)
-
-
 def _project(*args: Any) -> tuple[State, Array]:
     """The state corrected; where it is not used its derivative, which may be infinite, is none."""
     return contain(_correct, args)
@@ -208,7 +203,7 @@ def _correct(
     projector: Any, system: Any, solver: Any, state: State, wanted: Array, dt: Any
 ) -> tuple[State, Array]:
     """The state corrected where that is wanted, and a failure where it is not or does not help."""
-    new, code = projector.correct(system, solver, state, state.memory.stabilizer, dt)
+    new, code = projector.correct(system, solver, state, (), dt)
     finite = jnp.all(jnp.isfinite(new.q), axis=0) & jnp.all(jnp.isfinite(new.v), axis=0)
     code = first(code, jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32))
     return new, jnp.where(wanted, code, UNWANTED).astype(jnp.int32)
