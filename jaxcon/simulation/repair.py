@@ -59,8 +59,8 @@ class Recovery:
         shrink: of r at a failure.
         growth: of r after a success.
         damping: share of v that a world loses when it rolls back.
-        projector: a stabiliser without memory whose `correct` finds the nearest valid configuration;
-            None for one linearised step of position and velocity in the metric of M.
+        projector: a stabiliser without memory, whose `correct` finds the nearest valid
+            configuration; None for one linearised step of q and v in the metric of M.
         retries: how many failures in a row are repaired.
     """
 
@@ -189,9 +189,7 @@ class Linearized(Unstabilized):
         q = system.retract(state.q, step)
         rows = linearize(system, q, state.v, state.time)
         step, _, later = solver.solve(saddle(system, q, rows, rest, -rows.rate))
-        turns = system.count(q, state.v + step, state.time)
-        new = dataclasses.replace(state, q=q, v=state.v + step, turns=turns)
-        return new, first(code, later)
+        return dataclasses.replace(state, q=q, v=state.v + step), first(code, later)
 
 
 def _project(*args: Any) -> tuple[State, Array]:
