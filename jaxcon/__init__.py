@@ -1,7 +1,8 @@
 """Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
 
 from jaxcon.analysis.diagnosis import Diagnosis, diagnose
-from jaxcon.analysis.failures import Failure, Finding, find_first_failure
+from jaxcon.analysis.failures import Failure, find_first_failure
+from jaxcon.analysis.findings import Finding
 from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
