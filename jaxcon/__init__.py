@@ -1,5 +1,8 @@
 """Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
 
+from jaxcon.analysis.diagnosis import Diagnosis, diagnose
+from jaxcon.analysis.failures import Failure, find_first_failure
+from jaxcon.analysis.findings import Finding
 from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
@@ -86,11 +89,13 @@ from jaxcon.simulation.integrators import (
     SemiImplicitEuler,
 )
 from jaxcon.simulation.method import Method
+from jaxcon.simulation.repair import Recovery
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.dense import Dense
+from jaxcon.solvers.priority import Lexicographic, Priority
 from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Solution
 from jaxcon.solvers.schur import Schur
@@ -117,12 +122,15 @@ __all__ = [
     "CustomForce",
     "Cylindrical",
     "Dense",
+    "Diagnosis",
     "Differential",
     "Distance",
     "Drive",
     "Energy",
     "ExplicitEuler",
     "ExternalWrench",
+    "Failure",
+    "Finding",
     "Fixed",
     "Flexure",
     "Force",
@@ -135,6 +143,7 @@ __all__ = [
     "JointSpring",
     "Keyframe",
     "KnifeEdge",
+    "Lexicographic",
     "LinearMomentum",
     "Memory",
     "Method",
@@ -149,10 +158,12 @@ __all__ = [
     "PolynomialCoupling",
     "Pose",
     "PositionServo",
+    "Priority",
     "Prismatic",
     "Pulley",
     "RackAndPinion",
     "RankSafe",
+    "Recovery",
     "Report",
     "Revolute",
     "RevoluteSpherical",
@@ -187,7 +198,9 @@ __all__ = [
     "center_of_mass",
     "coordinate",
     "coordinate_rate",
+    "diagnose",
     "energy",
+    "find_first_failure",
     "forward_dynamics",
     "from_mjcf",
     "hanging",

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 import numpy as np
 
 from jaxcon.analysis.memory import Memory, memory
-from jaxcon.constraints.rows import Rows, linearize
+from jaxcon.constraints.rows import RowLayout, Rows, linearize
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method
+
+SHARE = 1e-2
+"""Of the largest entry, from which a part that least squares leave is called a conflict."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,9 @@ class Report:
         rank: number of independent rows.
         degrees_of_freedom: n_v − rank.
         redundant: (constraint, row in it) of each row that depends on those before it.
+        conflicts: by constraint, what least squares leave of φ, φ̇ and γ: the part that no
+            displacement, velocity or acceleration can take away, because rows contradict each
+            other; only of constraints where there is such a part.
         condition: of J M⁻¹ Jᵀ with rows scaled to unit length, independent rows only.
         violation: ‖φ‖ and ‖φ̇‖ by constraint.
         memory: of a world in a batch [B], where a method was given.
@@ -39,6 +45,7 @@ class Report:
     condition: float
     violation: dict[str, tuple[float, float]]
     memory: Memory | None = None
+    conflicts: dict[str, tuple[float, float, float]] = field(default_factory=dict)
 
     def __str__(self) -> str:
         lines = [
@@ -54,6 +61,15 @@ class Report:
                 " ones, for example close a loop with a joint or a Holonomic of fewer rows, or give"
                 " the solver a little tikhonov"
             )
+        if self.conflicts:
+            lines.append(
+                "contradicting constraints, and what no motion can take away of them; keep those"
+                " that agree, or rank them by jc.Priority"
+            )
+            lines += [
+                f"  {name}: {phi:.2e} of φ, {rate:.2e} of φ̇, {bias:.2e} of φ̈"
+                for name, (phi, rate, bias) in self.conflicts.items()
+            ]
         if self.memory:
             lines.append(str(self.memory))
         lines += [
@@ -66,7 +82,7 @@ class Report:
 def report(
     system: Any, state: State, method: Method | None = None, control: PyTree = None
 ) -> Report:
-    """Degrees of freedom, rank, redundant rows by name, violation, and memory of a world.
+    """Degrees of freedom, rank, redundant and contradicting rows by name, violation, and memory.
 
     Rows are compared in the metric of M⁻¹, scaled to unit length; a row counts as dependent where
     the part that earlier rows do not explain is below 1e-9 (float64) or 1e-4 (float32).
@@ -82,37 +98,81 @@ def report(
         A `Report`.
     """
     system = at(system, state)
-    rows, dense_j, dense_m = _linearized(system, state)
-    owners = _owners(rows.layout)
-    jacobian = np.asarray(dense_j, np.float64)[list(owners)]
-    mass = np.asarray(dense_m, np.float64)
-    # J M⁻¹ Jᵀ = Ĵ Ĵᵀ with Ĵ = J L⁻ᵀ and M = L Lᵀ
-    scaled = np.linalg.solve(np.linalg.cholesky(mass), jacobian.T).T
-    length = np.linalg.norm(scaled, axis=1, keepdims=True)
-    scaled = scaled / np.where(length > 0, length, 1)
-    tolerance = 1e-9 if state.q.dtype == np.float64 else 1e-4
-    dependent = dependent_rows(scaled, tolerance)
-    kept = np.delete(scaled, dependent, axis=0)
-    singular = np.linalg.svd(kept, compute_uv=False)
-    rank = len(scaled) - len(dependent)
+    rows, dense_j, dense_m = linearized(system, state)
+    unit = UnitRows(rows.layout, dense_j, dense_m)
+    dependent = dependent_rows(unit.values, unit.tolerance)
+    singular = np.linalg.svd(np.delete(unit.values, dependent, axis=0), compute_uv=False)
+    rank = len(unit.values) - len(dependent)
+    left = [unit.contradicting(x) for x in (rows.residual, rows.rate, rows.bias)]
     return Report(
         coordinates=state.q.shape[0],
         velocities=state.v.shape[0],
-        rows=len(scaled),
+        rows=len(unit.values),
         rank=rank,
         degrees_of_freedom=state.v.shape[0] - rank,
-        redundant=tuple(list(owners.values())[i] for i in dependent),
+        redundant=tuple(unit.owners[i] for i in dependent),
         condition=float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
         violation={
             name: (float(rows.violation[name]), float(rows.violation.rate(name)))
             for name in rows.layout.names
         },
         memory=None if method is None else memory(system, method, state, control),
+        conflicts={
+            name: (left[0].get(name, 0.0), left[1].get(name, 0.0), left[2].get(name, 0.0))
+            for name in rows.layout.names
+            if any(name in part for part in left)
+        },
     )
 
 
+class UnitRows:
+    """Rows that take away a freedom, in the metric of M⁻¹ and scaled to unit length.
+
+    J M⁻¹ Jᵀ = Ĵ Ĵᵀ with Ĵ = J L⁻ᵀ and M = L Lᵀ; each row of Ĵ is divided by its length.
+
+    Attributes:
+        owners: (constraint, row in it) of each.
+        values: (rows, n_v).
+        length: of each before it was scaled.
+        tolerance: below which a length counts as zero.
+    """
+
+    def __init__(self, layout: RowLayout, jacobian: Array, mass: Array) -> None:
+        owners = _owners(layout)
+        self.numbers, self.owners = list(owners), list(owners.values())
+        self.tolerance = 1e-9 if jacobian.dtype == np.float64 else 1e-4
+        j = np.asarray(jacobian, np.float64)[self.numbers]
+        factor = np.linalg.cholesky(np.asarray(mass, np.float64))
+        scaled = np.linalg.solve(factor, j.T).T
+        length = np.linalg.norm(scaled, axis=1)
+        self.length = np.where(length > 0, length, 1)
+        self.values = scaled / self.length[:, None]
+
+    def within(self, x: Array, low: float, high: float) -> np.ndarray:
+        """The part of an array by rows (n_c,) in directions with singular values in (low, high].
+
+        These are combinations of rows; −1 … 0 are those that no motion changes.
+        """
+        own = np.asarray(x, np.float64)[self.numbers] / self.length
+        u, s, _ = np.linalg.svd(self.values)
+        s = np.append(s, np.zeros(len(u) - len(s)))
+        chosen = u[:, (low < s) & (s <= high)]
+        return self.length * (chosen @ (chosen.T @ own))
+
+    def contradicting(self, x: Array) -> dict[str, float]:
+        """The norm of what least squares leave of an array by rows (n_c,), by constraint."""
+        left = self.within(x, -1.0, self.tolerance) / self.length
+        size = np.max(np.abs(np.asarray(x)[self.numbers] / self.length), initial=0)
+        bound = max(SHARE * size, self.tolerance)
+        found: dict[str, float] = {}
+        for (name, _), part, length in zip(self.owners, left, self.length, strict=True):
+            if abs(part) > bound:
+                found[name] = float(np.hypot(found.get(name, 0.0), part * length))
+        return found
+
+
 @jax.jit
-def _linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
+def linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
     """The rows with J and M as arrays."""
     rows = linearize(system, state.q, state.v, state.time)
     return rows, rows.jacobian.dense(), system.mass(state.q).dense()

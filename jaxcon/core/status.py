@@ -15,8 +15,15 @@ class Status(IntEnum):
     NON_FINITE = 1
     SINGULAR = 2
     NOT_CONVERGED = 3
+    VIOLATED = 4
     CONFLICT = 16
-    RECOVERED = 17
+    ROLLED_BACK = 17
+    PROJECTED = 18
+    RELAXED = 19
+
+
+REPAIRS = (Status.ROLLED_BACK, Status.PROJECTED, Status.RELAXED)
+"""Notes of a `Recovery`: what acted."""
 
 
 MEANING = {
@@ -31,7 +38,13 @@ MEANING = {
     " (d) redundant rows that contradict each other",
     Status.CONFLICT: "constraints contradict each other; the world goes on by least squares;"
     " `report` names them",
-    Status.RECOVERED: "a step failed and was repaired; the world goes on",
+    Status.VIOLATED: "constraints are off by more than the limit of the method's Recovery, which"
+    " tried again as often as it may; likely (a) a step too large, (b) an unstable gain,"
+    " (c) constraints that contradict each other",
+    Status.ROLLED_BACK: "a step failed: the world went back to the state before it",
+    Status.PROJECTED: "steps failed: the world went back to the valid configuration nearest to the"
+    " state before them",
+    Status.RELAXED: "a step was taken with weaker feedback, after one that failed",
 }
 
 
@@ -56,11 +69,11 @@ def raise_for_status(result: object) -> None:
         result: a State, StepInfo or Solution, of one world or a batch.
 
     Raises:
-        SimulationError: some `status` is neither OK nor RECOVERED; the message names world, code
-            and likely causes.
+        SimulationError: some `status` is neither OK nor that of a repair; the message names world,
+            code and likely causes.
     """
     status = np.asarray(getattr(result, "status", result))
-    bad = np.argwhere(~np.isin(np.atleast_1d(status), (Status.OK, Status.RECOVERED)))
+    bad = np.argwhere(~np.isin(np.atleast_1d(status), (Status.OK, *REPAIRS)))
     if bad.size:
         code = Status(int(np.atleast_1d(status)[tuple(bad[0])]))
         where = "" if status.ndim == 0 else f" in {len(bad)} of {status.size} worlds"

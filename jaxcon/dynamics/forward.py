@@ -26,8 +26,9 @@ def saddle(
     Returns:
         What a solver takes.
     """
-    loops = rows.layout.loops
-    return Saddle(system.mass(q), force, rows.jacobian, target, rows.compliance, noise, loops)
+    mass, layout = system.mass(q), rows.layout
+    compliance, loops = rows.compliance, rows.layout.loops
+    return Saddle(mass, force, rows.jacobian, target, compliance, noise, loops, layout)
 
 
 @dataclass(frozen=True)

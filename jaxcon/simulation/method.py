@@ -12,12 +12,21 @@ from jaxcon.simulation.integrators import SemiImplicitEuler
 from jaxcon.solvers.proximal import RankSafe
 from jaxcon.stabilization.baumgarte import Baumgarte
 
+PARTS = (
+    ("integrator", "advance", "SemiImplicitEuler()"),
+    ("stabilizer", "target", "Baumgarte()"),
+    ("solver", "solve", "RankSafe()"),
+    ("recovery", "repair", "Recovery()"),
+)
+"""What a method consists of: the field, what its value can do, and an example."""
+
 
 class Memory(NamedTuple):
     """What a state remembers for its method, by part; each () where there is nothing."""
 
     integrator: PyTree = ()
     stabilizer: PyTree = ()
+    recovery: PyTree = ()
 
 
 @pytree
@@ -28,16 +37,20 @@ class Method:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
         stabilizer: `Baumgarte(…)` or `Unstabilized()`.
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
-            want independent rows.
+            want independent rows; `Priority(levels)` meets them level by level.
+        recovery: `Recovery(…)`, which repairs steps that fail; None, and a world that fails stops.
     """
 
     integrator: Any = SemiImplicitEuler()
     stabilizer: Any = Baumgarte()
     solver: Any = RankSafe()
+    recovery: Any = None
 
     def init(self, system: Any, q: Any, v: Any) -> PyTree:
         """What a state remembers for the method: a `Memory`, or () where there is nothing."""
-        memory = Memory(self.integrator.init(system, q, v), self.stabilizer.init(system, q, v))
+        repairs = () if self.recovery is None else self.recovery.init(system, q, v)
+        own = self.integrator.init(system, q, v), self.stabilizer.init(system, q, v)
+        memory = Memory(*own, repairs)
         return memory if jax.tree.leaves(memory) else ()
 
     def feedback(self, dt: Any) -> Any:
@@ -62,14 +75,13 @@ class Method:
         """
         if hasattr(self.integrator, "check") and not isinstance(self.integrator, type):
             self.integrator.check()
-        parts = {"integrator": "advance", "stabilizer": "target", "solver": "solve"}
-        for part, verb in parts.items():
+        if hasattr(self.recovery, "check") and not isinstance(self.recovery, type):
+            self.recovery.check()
+        for part, verb, example in PARTS:
             value = getattr(self, part)
-            if isinstance(value, type) or not hasattr(value, verb):
-                raise TypeError(
-                    f"Method: {part} must be a value such as"
-                    f" {type(getattr(Method(), part)).__name__}(), got {value!r}."
-                )
+            absent = part == "recovery" and value is None
+            if not absent and (isinstance(value, type) or not hasattr(value, verb)):
+                raise TypeError(f"Method: {part} must be a value such as {example}, got {value!r}.")
 
 
 def check_method(method: Any) -> None:

@@ -31,7 +31,7 @@ class StepInfo:
         acceleration: a, (n_v,).
         multipliers: λ, (n_c,).
         violation: φ and φ̇ by constraint.
-        status: of the world after the step, ().
+        status: what became of this step, or what stopped the world before, ().
     """
 
     acceleration: Array
@@ -83,28 +83,61 @@ def contained_step(
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
     whole = native.spread(state, native.batch_of(args, state.q.ndim - 1))
-    return contain(_step, (system, method, whole, control, dt))[0]
+    args = (system, method, whole, control, dt)
+    if method.recovery is None:
+        return contain(_step, args)[0]
+    # one after the other: what is taken back must leave no derivative either
+    return contain(_repair, (system, method, whole, contain(_attempt, args), dt))[0]
 
 
 def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
-    stabilizer = method.feedback(dt)
+    """(new state, info) and the status of the world."""
+    return _settle(state, _attempt(system, method, state, control, dt))
+
+
+def _repair(system: Any, method: Method, state: State, attempt: Any, dt: Array) -> Any:
+    """The same of an attempt that the method repairs where it failed."""
     system = recall(system, state.turns)
-    memory = Memory(*state.memory)
-    dynamics = Dynamics(system, stabilizer, method.solver, control, memory.stabilizer, dt)
+    return _settle(state, method.recovery.repair(system, method.solver, state, attempt, dt))
+
+
+def _attempt(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
+    """(new state, info) and the status of this step alone."""
+    dynamics = dynamics_at(system, method, state, control, dt)
+    system, memory = dynamics.system, Memory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, dt)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
     new = dataclasses.replace(state, q=q, v=v, time=time)
+    stabilizer = method.feedback(dt)
     own = stabilizer.advance(rows, memory.stabilizer, dt)
     new, corrected = stabilizer.correct(system, method.solver, new, own, dt)
     turns = system.count(state.q, state.v, state.time)
-    kept = Memory(advanced.memory, own) if state.memory else ()
+    kept = Memory(advanced.memory, own, memory.recovery) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
-    code = status.first(state.status, status.first(judge(new, solution), corrected))
-    healthy = ~status.failed(code)
+    code = status.first(judge(new, solution), corrected)
+    if method.recovery is not None:
+        code = status.first(code, method.recovery.judge(system, new))
     info = StepInfo(solution.acceleration, solution.multipliers, rows.violation, code)
+    return (new, info), code
+
+
+def _settle(state: State, attempt: Any) -> Any:
+    """The outcome of a step where the world is healthy, and the state before it where it failed."""
+    (new, info), own = attempt
+    code = status.first(state.status, own)
+    healthy = ~status.failed(code)
     info = keep(healthy, info, jax.tree.map(jnp.zeros_like, info))
     new = dataclasses.replace(keep(healthy, new, state), status=code)
-    return (new, dataclasses.replace(info, status=code)), code
+    return (new, dataclasses.replace(info, status=jnp.where(healthy, own, code))), code
+
+
+def dynamics_at(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Dynamics:
+    """What an integrator sees of the system during a step from this state."""
+    stabilizer, memory = method.feedback(dt), Memory(*state.memory)
+    if method.recovery is not None:
+        stabilizer = method.recovery.relax(stabilizer, memory.recovery)
+    system = recall(system, state.turns)
+    return Dynamics(system, stabilizer, method.solver, control, memory.stabilizer, dt)
 
 
 def judge(state: State, solution: Solution) -> Array:
@@ -141,10 +174,7 @@ def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Ar
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
     state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
-    stabilizer = method.feedback(dt)
-    system = recall(system, state.turns)
-    memory = Memory(*state.memory).stabilizer
-    dynamics = Dynamics(system, stabilizer, method.solver, control, memory, dt)
+    dynamics = dynamics_at(system, method, state, control, dt)
     return dynamics(state.q, state.v, state.time)[0]
 
 

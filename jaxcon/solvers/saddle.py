@@ -112,6 +112,8 @@ class Saddle:
         noise: what b may be off by rounding, a number or (n_c,); None where that is not known.
         loops: whether rows may depend on each other by structure, as those of closed loops do and
             those of a tree of joints do not.
+        layout: which rows belong to which constraint, with `names` and `rows(name)`, for solvers
+            that treat them differently; None where rows have no names.
     """
 
     mass: Mass
@@ -121,6 +123,7 @@ class Saddle:
     compliance: Array | None = None
     noise: Any = None
     loops: bool = static(default=True)
+    layout: Any = static(default=None)
 
 
 class Solution(NamedTuple):

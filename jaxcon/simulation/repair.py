@@ -1,0 +1,214 @@
+"""Repair of steps that failed: roll back, project, relax (chapter 3.5.4)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.rows import Rows, linearize
+from jaxcon.core import checks
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.status import Status, failed, first
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics.forward import saddle
+from jaxcon.model.state import State
+from jaxcon.simulation.recovery import contain, keep
+from jaxcon.stabilization.baumgarte import Law, Unstabilized
+
+UNWANTED = Status.NOT_CONVERGED
+"""Of a projection that nobody asked for."""
+
+
+class Repairs(NamedTuple):
+    """What a world remembers of its repairs.
+
+    Attributes:
+        relaxation: r, by which the rates of feedback are multiplied, ().
+        failures: how many steps in a row have failed, ().
+    """
+
+    relaxation: Array
+    failures: Array
+
+
+@pytree
+class Recovery:
+    """What a world does when a step fails, by itself: it rolls back, projects, and relaxes.
+
+    A step has failed where its status says so, or where it ends with max |φ| above the limit. The
+    world then keeps the state before it, the last valid one, and its time: the step is tried again
+    by the next call, with the control of that call, and with weaker feedback,
+
+        α → r α,  β → r β,    r ← shrink · r at a failure,  r ← min(1, growth · r) after a success.
+
+    That is done by what the feedback sees, φ → r² φ and φ̇ → r φ̇, and so works with any. Where the
+    step fails again, or the state itself is beyond the limit, the state is also projected to the
+    nearest valid configuration. After `retries` failures in a row the failure sticks.
+
+    What acted is in `info.status` of each step, as a note: ROLLED_BACK, PROJECTED, or RELAXED where
+    the step was taken with r < 1; the state remembers the first note. A world decides by itself and
+    the others do not notice. The derivative of a step that was rolled back is that of what was done
+    instead.
+
+    Attributes:
+        limit: of max |φ| over rows [m, rad]; None for none.
+        shrink: of r at a failure.
+        growth: of r after a success.
+        damping: share of v that a world loses when it rolls back.
+        projector: a stabiliser without memory, whose `correct` finds the nearest valid
+            configuration; None for one linearised step of q and v in the metric of M.
+        retries: how many failures in a row are repaired.
+    """
+
+    limit: Any = None
+    shrink: Any = 0.5
+    growth: Any = 1.05
+    damping: Any = 0.0
+    projector: Any = None
+    retries: int = static(default=10)
+
+    def check(self) -> None:
+        """Checks its numbers.
+
+        Raises:
+            ValueError: one is out of range.
+            TypeError: the projector is no stabiliser.
+        """
+        for name, low, high in (("shrink", 0, 1), ("growth", 1, np.inf), ("damping", 0, 1)):
+            value = getattr(self, name)
+            if checks.is_concrete(value) and np.any(np.clip(value, low, high) != value):
+                raise ValueError(f"Recovery: {name} must be from {low} to {high}, got {value}.")
+        if self.limit is not None:
+            checks.positive("Recovery", "limit", self.limit)
+        if self.projector is not None and not hasattr(self.projector, "correct"):
+            raise TypeError(f"Recovery: projector must be a stabiliser, got {self.projector!r}.")
+
+    def init(self, system: Any, q: Array, v: Array) -> Repairs:
+        """Full gains, and no failure yet."""
+        return Repairs(jnp.ones((), jnp.result_type(q)), jnp.zeros((), jnp.int32))
+
+    def relax(self, stabilizer: Any, memory: Repairs) -> Relaxed:
+        """The stabiliser with its feedback made weaker."""
+        return Relaxed(stabilizer, memory.relaxation)
+
+    def judge(self, system: Any, state: State) -> Array:
+        """VIOLATED where a state is beyond the limit, ()."""
+        if self.limit is None:
+            return jnp.zeros_like(state.status)
+        rows = linearize(system, state.q, state.v, state.time)
+        return jnp.where(self._beyond(rows), Status.VIOLATED, Status.OK).astype(jnp.int32)
+
+    def repair(self, system: Any, solver: Any, state: State, attempt: Any, dt: Any) -> Any:
+        """The outcome of a step, repaired where it failed.
+
+        Args:
+            system: as remembered by the state.
+            solver: of the method.
+            state: before the step; its memory has a part `recovery`.
+            attempt: ((new state, info), status of the step).
+            dt: h, () [s].
+
+        Returns:
+            The same kind of tuple.
+        """
+        (new, info), code = attempt
+        known = state.memory.recovery
+        bad = failed(code)
+        again = bad & (known.failures < self.retries)
+        back, note = self._back(system, solver, state, again, dt)
+        relaxed = jnp.where(known.relaxation < 1, Status.RELAXED, Status.OK).astype(jnp.int32)
+        code = jnp.where(again, note, first(code, relaxed))
+        new = keep(~again, new, back)
+        memory = new.memory._replace(recovery=self._remember(known, bad))
+        info = keep(~again, info, jax.tree.map(jnp.zeros_like, info))
+        return (dataclasses.replace(new, memory=memory), info), code
+
+    def _remember(self, known: Repairs, bad: Array) -> Repairs:
+        r = known.relaxation
+        shrink, growth = (jnp.asarray(x, r.dtype) for x in (self.shrink, self.growth))
+        relaxation = jnp.where(bad, shrink * r, jnp.minimum(1, growth * r))
+        failures = jnp.where(bad, known.failures + 1, 0).astype(jnp.int32)
+        return Repairs(relaxation, failures)
+
+    def _back(self, system: Any, solver: Any, state: State, again: Array, dt: Any) -> Any:
+        """The state before a step, damped and projected where that is called for, and a note."""
+        share = 1 - jnp.asarray(self.damping, state.v.dtype)
+        back = dataclasses.replace(state, v=share[None] * state.v)
+        wanted = again & (state.memory.recovery.failures > 0)
+        if self.limit is not None:
+            wanted |= again & failed(self.judge(system, state))
+        args = (self.projector or Linearized(), system, solver, back, wanted, dt)
+        # most steps of most batches need none
+        projected, code = jax.lax.cond(jnp.any(wanted), _project, _leave, *args)
+        done = ~failed(code)
+        note = jnp.where(done, Status.PROJECTED, Status.ROLLED_BACK).astype(jnp.int32)
+        return keep(done, projected, back), note
+
+    def _beyond(self, rows: Rows) -> Array:
+        limit = jnp.asarray(self.limit, rows.residual.dtype)
+        return jnp.max(jnp.abs(rows.residual), axis=0, initial=0) > limit
+
+
+@pytree
+class Relaxed:
+    """A stabiliser with all its rates multiplied by r: it sees r² φ and r φ̇."""
+
+    stabilizer: Any
+    factor: Array
+
+    def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
+        """b (n_c,)."""
+        return self.stabilizer.target(self._weak(rows), memory, dt)
+
+    def impose(self, rows: Rows, memory: PyTree, dt: Any) -> Law:
+        """The law of the stabiliser for what it sees."""
+        return self.stabilizer.impose(self._weak(rows), memory, dt)
+
+    def _weak(self, rows: Rows) -> Rows:
+        r = self.factor[None]
+        return dataclasses.replace(rows, residual=r * r * rows.residual, rate=r * rows.rate)
+
+
+@pytree
+class Linearized(Unstabilized):
+    """q ⊕ M⁻¹Jᵀμ with J M⁻¹Jᵀ μ = −φ, then v + M⁻¹Jᵀν with J M⁻¹Jᵀ ν = −φ̇ there: one step."""
+
+    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
+        """The state nearer to the constraints, and the status of the two solves."""
+        rows = linearize(system, state.q, state.v, state.time)
+        kept = rows.layout.holonomic
+        for name in rows.layout.inertial:  # rotors resist a displacement, too
+            kept[rows.layout.rows(name)] = True
+        rest = jnp.zeros_like(state.v)
+        problem = saddle(system, state.q, rows.only(kept), rest, -rows.residual)
+        step, _, code = solver.solve(problem)
+        q = system.retract(state.q, step)
+        rows = linearize(system, q, state.v, state.time)
+        step, _, later = solver.solve(saddle(system, q, rows, rest, -rows.rate))
+        return dataclasses.replace(state, q=q, v=state.v + step), first(code, later)
+
+
+def _project(*args: Any) -> tuple[State, Array]:
+    """The state corrected; where it is not used its derivative, which may be infinite, is none."""
+    return contain(_correct, args)
+
+
+def _correct(
+    projector: Any, system: Any, solver: Any, state: State, wanted: Array, dt: Any
+) -> tuple[State, Array]:
+    """The state corrected where that is wanted, and a failure where it is not or does not help."""
+    new, code = projector.correct(system, solver, state, (), dt)
+    finite = jnp.all(jnp.isfinite(new.q), axis=0) & jnp.all(jnp.isfinite(new.v), axis=0)
+    code = first(code, jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32))
+    return new, jnp.where(wanted, code, UNWANTED).astype(jnp.int32)
+
+
+def _leave(
+    projector: Any, system: Any, solver: Any, state: State, wanted: Array, dt: Any
+) -> tuple[State, Array]:
+    """The state as it is, not corrected."""
+    return state, jnp.full_like(state.status, UNWANTED)

@@ -1,0 +1,247 @@
+"""Constraints by priority: lower levels act in the null space of higher ones (chapter 3.5.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core import native, numerics
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.status import Status, first
+from jaxcon.core.typing import Array
+from jaxcon.solvers.saddle import Factored, Mass, Saddle, Solution, free_motion, judge
+from jaxcon.solvers.schur import delassus
+
+LEVELS = range(4)
+"""0 is met first."""
+
+
+def Priority(  # noqa: N802
+    levels: Mapping[str, int], cutoff: Any = None, conflict: Any = 1e-2
+) -> Lexicographic:
+    """A solver that meets constraints level by level: see `Lexicographic`.
+
+    Args:
+        levels: from names of constraints, or shell patterns such as "leg_*", to a level from 0, the
+            highest, to 3; where several match a name, the last one counts. Others have level 0.
+        cutoff: as of `Lexicographic`.
+        conflict: as of `Lexicographic`.
+
+    Raises:
+        ValueError: a level is not 0, 1, 2 or 3.
+    """
+    for name, level in levels.items():
+        if level not in LEVELS:
+            raise ValueError(
+                f"Priority: the level of '{name}' must be 0, 1, 2 or 3, got {level!r}."
+            )
+    return Lexicographic(cutoff, conflict, tuple((str(n), int(k)) for n, k in levels.items()))
+
+
+@pytree
+class Lexicographic:
+    """Solves M a = f + Jᵀλ with J a + C λ = b met level by level; `Priority` makes one.
+
+    Of all accelerations that meet level 0, by least squares where its rows contradict each other,
+    those that meet level 1 as well as is then possible, and so on; of what is left the one nearest
+    to M⁻¹f in the metric of M (Gauss). A lower level never disturbs a higher one: it acts in the
+    null space N of those above it, taken in the metric of M,
+
+        a ← a + N (J_k N)⁺ (b_k − J_k a),    N ← N − N (J_k N)⁺ J_k.
+
+    This is block elimination of A = J M⁻¹ Jᵀ + C, level after level, with the pseudo-inverse of
+    each pivot block S_k = J_k N M⁻¹ J_kᵀ + C_k, and is done so: M a = f + Jᵀλ then holds to
+    rounding, and λ of each level is the one of least norm. Rows are compared in units of their own
+    length √A_ii. Dense, for mechanisms of up to some hundreds of rows.
+
+    Rows with a compliance, as those of rotors and soft constraints, can always be met. The status
+    is CONFLICT where the rows of one level contradict each other; a level that cannot be met
+    because of those above it is what priorities are for, and no conflict. `report` names both.
+
+    The gradient is that of the solution where no row changes between dependent and independent; an
+    eigenvalue that counts as zero is held at zero, so that it is finite everywhere.
+
+    Attributes:
+        cutoff: eigenvalues of S_k, its rows scaled, that count as zero; if None, 1e-9 in float64
+            and 1e-5 in float32.
+        conflict: the part of b that a level may leave open on its own before it is a conflict.
+        levels: (pattern, level) of constraints.
+
+    References:
+        Siciliano and Slotine, A general framework for managing multiple tasks in highly redundant
+            robotic systems, ICAR 1991.
+        Khatib, A unified approach for motion and force control of robot manipulators (1987).
+        Escande, Mansard and Wieber, Hierarchical quadratic programming, Int. J. Robotics Research
+            33 (2014).
+    """
+
+    cutoff: Any = None
+    conflict: Any = 1e-2
+    levels: tuple[tuple[str, int], ...] = static(default=())
+
+    def solve(self, system: Saddle) -> Solution:
+        """The acceleration (n_v,), multipliers (n_c,) and status."""
+        return self.factor(system)(system.force, system.target)
+
+    def factor(self, system: Saddle) -> Factored:
+        """The solution as a function of f and b."""
+        if not system.target.size:
+            return free_motion(system)
+        parts = self._parts(system)
+        rank, dtype = system.target.ndim - 1, system.target.dtype
+        usual = 1e-9 if jnp.finfo(dtype).bits == 64 else 1e-5
+        cutoff = jnp.full((1,) * rank, usual) if self.cutoff is None else self.cutoff
+        cutoff, conflict = (jnp.asarray(x, dtype) for x in (cutoff, self.conflict))
+        known = native.per_world(partial(_factor, parts), rank)(system, cutoff)
+        solve = native.per_world(partial(_solve, parts), rank)
+        return lambda force, target: solve(known, force, target, conflict)
+
+    def _parts(self, system: Saddle) -> tuple[np.ndarray, ...]:
+        """The numbers of the rows of each level, highest first.
+
+        Raises:
+            ValueError: a pattern matches no constraint, or rows have no names.
+        """
+        layout: Any = system.layout
+        names = getattr(layout, "names", ())
+        for pattern, _ in self.levels:
+            if not any(fnmatchcase(name, pattern) for name in names):
+                raise ValueError(
+                    f"Priority: there is no constraint '{pattern}'; there are {list(names)}."
+                )
+        level = np.zeros(system.jacobian.shape[0], int)
+        for name in names:
+            chosen = [k for pattern, k in self.levels if fnmatchcase(name, pattern)]
+            if chosen:
+                level[layout.rows(name)] = chosen[-1]
+        parts = (np.flatnonzero(level == k) for k in LEVELS)
+        return tuple(part for part in parts if part.size)
+
+
+class Pivot(NamedTuple):
+    """One level of the elimination.
+
+    Attributes:
+        inverse: S⁺.
+        coupling: S⁺ times the block beside S, of the levels below.
+        own: A A⁺ of the level alone: the projector on what its rows can be given together.
+    """
+
+    inverse: Array
+    coupling: Array
+    own: Array
+
+
+class Eliminated(NamedTuple):
+    """A scaled saddle system of one world, level by level.
+
+    Attributes:
+        mass: M.
+        jacobian: J with rows in the order of levels, (n_c, n_v).
+        delassus: A with rows scaled to A_ii = 1, (n_c, n_c).
+        scale: 1/√A_ii, (n_c,).
+        pivots: of the levels.
+    """
+
+    mass: Mass
+    jacobian: Array
+    delassus: Array
+    scale: Array
+    pivots: tuple[Pivot, ...]
+
+
+def _factor(parts: tuple[np.ndarray, ...], system: Saddle, cutoff: Array) -> Eliminated:
+    """Of one world."""
+    order = np.concatenate(parts)
+    j = system.jacobian.dense()[order]
+    compliance = None if system.compliance is None else system.compliance[order]
+    a = delassus(system.mass, j, compliance)
+    scale = numerics.safe_divide(1.0, numerics.safe_sqrt(jnp.diagonal(a)))
+    a = a * scale[None] * scale[:, None]
+    pivots, left, start = [], a, 0
+    for part in parts:
+        n = part.size
+        inverse = pseudoinverse(left[:n, :n], cutoff)
+        coupling = inverse @ left[:n, n:]
+        alone = jax.lax.stop_gradient(a[start : start + n, start : start + n])
+        own = inverse if start == 0 else pseudoinverse(alone, cutoff)
+        pivots.append(Pivot(inverse, coupling, alone @ own))
+        left = left[n:, n:] - left[n:, :n] @ coupling
+        start += n
+    return Eliminated(system.mass, j, a, scale, tuple(pivots))
+
+
+def _solve(
+    parts: tuple[np.ndarray, ...], known: Eliminated, force: Array, target: Array, conflict: Array
+) -> Solution:
+    """Of one world."""
+    order = np.concatenate(parts)
+    back = np.argsort(order)
+    free = known.mass.solve(force)
+    asked, moved = known.scale * target[order], known.scale * (known.jacobian @ free)
+    right = asked - moved
+    λ = _substitute(known.pivots, right)
+    λ = known.scale * (λ + _substitute(known.pivots, right - known.delassus @ λ))
+    acceleration = free + known.mass.solve(known.jacobian.T @ λ)
+    code = judge(acceleration, known.mass.singular)
+    size = jnp.abs(asked) + jnp.abs(moved)
+    contradicting = jnp.where(
+        _contradicts(known.pivots, right, size, conflict), Status.CONFLICT, Status.OK
+    )
+    return Solution(acceleration, λ[back], first(code, contradicting.astype(jnp.int32)))
+
+
+def _substitute(pivots: tuple[Pivot, ...], right: Array) -> Array:
+    """λ of A λ = r level by level: down with what each asks for, and back up with its price."""
+    asked = []
+    for pivot in pivots:
+        n = pivot.inverse.shape[0]
+        asked.append(pivot.inverse @ right[:n])
+        right = right[n:] - pivot.coupling.T @ right[:n]
+    λ = right
+    for pivot, own in zip(reversed(pivots), reversed(asked), strict=True):
+        λ = jnp.concatenate([own - pivot.coupling @ λ, λ])
+    return λ
+
+
+def _contradicts(pivots: tuple[Pivot, ...], right: Array, size: Array, bound: Array) -> Array:
+    """Whether some level alone leaves open more than a share of what it asks for."""
+    found, start = jnp.zeros((), bool), 0
+    for pivot in pivots:
+        rows = slice(start, start + pivot.inverse.shape[0])
+        left = right[rows] - pivot.own @ right[rows]
+        found |= jnp.max(jnp.abs(left)) > bound * jnp.max(size[rows])
+        start = rows.stop
+    return found
+
+
+@jax.custom_jvp
+def pseudoinverse(matrix: Array, cutoff: Array) -> Array:
+    """A⁺ (n, n) of a symmetric A ≥ 0, eigenvalues up to a cutoff taken as zero.
+
+    Its derivative is that at constant rank, and goes through no eigenvector:
+    dA⁺ = −A⁺ dA A⁺ + A⁺² dA (1 − A A⁺) + (1 − A⁺ A) dA A⁺².
+
+    References:
+        Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares
+            problems whose variables separate, SIAM J. Numerical Analysis 10 (1973).
+    """
+    values, vectors = jnp.linalg.eigh(matrix)
+    kept = values > cutoff
+    inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)
+    return (vectors * inverse[None]) @ vectors.T
+
+
+@pseudoinverse.defjvp
+def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+    (matrix, cutoff), (change, _) = primals, tangents
+    p = pseudoinverse(matrix, cutoff)
+    open_ = jnp.eye(len(p), dtype=p.dtype) - p @ matrix
+    spread = open_ @ (change @ (p @ p))
+    return p, spread + spread.T - p @ change @ p

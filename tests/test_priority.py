@@ -1,0 +1,221 @@
+"""Levels of constraints against null-space projections by numpy, and against solvers without."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from compiling import quick_jit
+from tolerances import DIFFERENCE, ROUND_OFF
+
+import jaxcon as jc
+from jaxcon.constraints.rows import RowLayout, linearize
+from jaxcon.core.lanes import Vector
+from jaxcon.dynamics.forward import saddle
+from jaxcon.scenes import CRANK_ROCKER, four_bar
+from jaxcon.solvers.jacobian import Block, Columns, Jacobian
+from jaxcon.solvers.saddle import Diagonal, Full, Saddle
+
+RANDOM = np.random.default_rng(3)
+NAMES = ("hold", "reach", "reach_far", "rest")
+LEVELS = {"reach*": 1, "rest": 2}
+J = RANDOM.normal(size=(5, 5))
+J[2] = 0.7 * J[0] - 0.2 * J[1]  # "reach" asks for what "hold" has decided
+J[4] = J[3] + J[1]  # "rest" as well, with "reach_far"
+ROWS = {"hold": [0, 1], "reach": [2], "reach_far": [3], "rest": [4]}
+SPREAD = RANDOM.normal(size=(5, 5))
+MASS = SPREAD @ SPREAD.T + np.eye(5)
+FORCE, TARGET = RANDOM.normal(size=5), RANDOM.normal(size=5)
+BY_LEVEL = ([0, 1], [2, 3], [4])
+
+
+def problem(j=J, mass=MASS, force=FORCE, target=TARGET, order=NAMES):
+    """A saddle system whose rows have names; `order` is that of its constraints."""
+    rows = np.concatenate([ROWS[name] for name in order])
+    starts = np.cumsum([0, *(len(ROWS[name]) for name in order)])
+    entries = tuple(
+        (name, int(start), len(ROWS[name]), 1) for name, start in zip(order, starts, strict=False)
+    )
+    j, mass, force, target = (jnp.asarray(x) for x in (j, mass, force, target))
+    value = tuple(Vector(*(x[None] for x in row)) for row in j[rows])
+    jacobian = Jacobian((Block(value, 0, Columns(0, 5, 1, (0,))),), (5, 5))
+    mass = Diagonal(mass) if mass.ndim == 1 else Full(mass)
+    return Saddle(mass, force, jacobian, target[rows], layout=RowLayout(entries)), rows
+
+
+def by_null_spaces(j, mass, force, target, levels):
+    """a of the lexicographic problem by projections on null spaces, rows of length 1."""
+    root = np.linalg.cholesky(mass)
+    b = np.linalg.solve(root, j.T).T
+    length = np.linalg.norm(b, axis=1)
+    b, target = b / length[:, None], target / length
+    y, null = np.linalg.solve(root, force), np.eye(len(force))
+    for rows in levels:
+        length = np.linalg.norm(b[rows] @ null, 2)
+        inverse = np.linalg.pinv(b[rows] @ null, rcond=1e-6 / max(length, 1e-6))
+        y = y + inverse @ (target[rows] - b[rows] @ y)
+        null = null - inverse @ b[rows] @ null
+    return np.linalg.solve(root.T, y)
+
+
+@pytest.mark.parametrize("mass", [MASS, np.diag(np.diag(MASS))], ids=["full", "diagonal"])
+def test_levels_that_contradict_each_other(mass):
+    given = np.diag(mass) if np.count_nonzero(mass) == 5 else mass
+    system, _ = problem(mass=given)
+    a, λ, status = jc.Priority(LEVELS).solve(system)
+    expected = by_null_spaces(J, mass, FORCE, TARGET, BY_LEVEL)
+    np.testing.assert_allclose(a, expected, rtol=1e-10)
+    np.testing.assert_allclose(J[:2] @ a, TARGET[:2], rtol=1e-12)
+    np.testing.assert_allclose(J[3] @ a, TARGET[3], rtol=1e-12)
+    assert abs(J[2] @ a - TARGET[2]) > 0.1
+    np.testing.assert_allclose(mass @ a, FORCE + J.T @ λ, atol=1e-12)
+    np.testing.assert_allclose(λ[jnp.array([2, 4])], 0, atol=1e-12)  # they can change nothing
+    assert status == jc.Status.OK
+
+
+def test_one_level_that_contradicts_itself_is_met_by_least_squares_and_says_so():
+    j = J.copy()
+    j[1] = 2 * j[0]
+    system, _ = problem(j)
+    a, _, status = jc.Priority(LEVELS).solve(system)
+    expected = by_null_spaces(j, MASS, FORCE, TARGET, BY_LEVEL)
+    np.testing.assert_allclose(a, expected, rtol=1e-10)
+    assert status == jc.Status.CONFLICT
+    agreeing = TARGET.copy()
+    agreeing[1] = 2 * agreeing[0]
+    system, _ = problem(j, target=agreeing)
+    assert jc.Priority(LEVELS).solve(system).status == jc.Status.OK
+
+
+def test_order_within_a_level_does_not_matter():
+    reference = jc.Priority(LEVELS).solve(problem()[0])
+    for order in (NAMES[::-1], ("reach_far", "rest", "hold", "reach")):
+        system, rows = problem(order=order)
+        a, λ, _ = jc.Priority(LEVELS).solve(system)
+        np.testing.assert_allclose(a, reference.acceleration, rtol=1e-12)
+        np.testing.assert_allclose(λ, reference.multipliers[rows], rtol=1e-11, atol=1e-12)
+
+
+def test_the_gradient_holds_where_rank_is_lost():
+    """Against differences of numpy's projections; dependent rows stay so along the way."""
+    weight = np.arange(1.0, 6.0)
+    direction = [RANDOM.normal(size=x.shape) for x in (J, MASS, FORCE, TARGET)]
+    direction[1] = direction[1] + direction[1].T
+
+    def moved(s, array):
+        j, mass, force, target = (
+            array(x) + s * array(dx)
+            for x, dx in zip((J, MASS, FORCE, TARGET), direction, strict=True)
+        )
+        free = np.eye(5)
+        free[2], free[4] = [0.7, -0.2, 0, 0, 0], [0, 1.0, 0, 1.0, 0]
+        return array(free) @ j, mass, force, target
+
+    def ours(s):
+        solution = jc.Priority(LEVELS).solve(problem(*moved(s, jnp.asarray))[0])
+        return jnp.asarray(weight) @ solution.acceleration
+
+    ahead, behind = (
+        weight @ by_null_spaces(*moved(s, np.asarray), BY_LEVEL) for s in (1e-5, -1e-5)
+    )
+    _, forward = quick_jit(lambda: jax.jvp(ours, (0.0,), (1.0,)))()
+    reverse = quick_jit(jax.grad(ours))(0.0)
+    np.testing.assert_allclose([forward, reverse], (ahead - behind) / 2e-5, rtol=DIFFERENCE)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("name", ["polar", "four-bar"])
+def test_where_all_agree_levels_change_nothing(name, dtype):
+    """Against the whole matrix: a full M, and a closed loop of which each hinge has its level."""
+    if name == "polar":
+        built = scenes.build(name, dtype)
+        solved, s = built.system, built.off
+    else:
+        solved, s = four_bar(jnp.asarray(CRANK_ROCKER, dtype), jnp.asarray((0.3, 0.9, 0.7), dtype))
+    random = scenes.seeded(name, "priority")
+    force = jnp.asarray(random.normal(size=s.v.shape), dtype)
+
+    @quick_jit
+    def both():
+        rows = linearize(solved, s.q, s.v, s.time)
+        target = jnp.asarray(random.normal(size=rows.bias.shape), dtype)
+        system = saddle(solved, s.q, rows, force, target)
+        levels = {name: i % 4 for i, name in enumerate(rows.layout.names)}
+        return jc.Priority(levels).solve(system), jc.Dense().solve(system)
+
+    found, expected = both()
+    assert found.status == jc.Status.OK
+    for got, reference in zip(found[:2], expected[:2], strict=True):
+        assert got.dtype == dtype
+        bound = 1e2 * ROUND_OFF[np.dtype(dtype)] * float(jnp.max(jnp.abs(reference)))
+        np.testing.assert_allclose(got, reference, atol=bound)
+
+
+def test_rows_with_a_compliance_are_met_as_such():
+    """J a + C λ = b is J a + √C z = b, with velocities z of unit mass on which no force acts."""
+    c = np.array([0.0, 0.3, 0.2, 0.0, 0.5])
+    system, _ = problem()
+    a, λ, status = jc.Priority(LEVELS).solve(dataclasses.replace(system, compliance=jnp.asarray(c)))
+    mass = np.block([[MASS, np.zeros((5, 5))], [np.zeros((5, 5)), np.eye(5)]])
+    wider = np.hstack([J, np.diag(np.sqrt(c))])
+    force = np.concatenate([FORCE, np.zeros(5)])
+    expected = by_null_spaces(wider, mass, force, TARGET, BY_LEVEL)
+    np.testing.assert_allclose(a, expected[:5], rtol=1e-10)
+    np.testing.assert_allclose(np.sqrt(c) * λ, expected[5:], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(J @ a + c * λ, TARGET, rtol=1e-10)
+    assert status == jc.Status.OK
+
+
+def test_a_world_of_a_batch_goes_on_with_what_its_levels_leave():
+    """A slider on a rail at one end of two rods of fixed length, which cannot both be kept."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("slider", mass=1.0, inertia=1.0, position=(1.0, 0.0))
+    scene.add(jc.Prismatic("rail", jc.WORLD, "slider", axis=(1.0, 0.0)))
+    scene.add(jc.Distance("rod", jc.WORLD, "slider", length=1.5, point_a=(0.0, 0.8)))
+    scene.add(jc.Distance("other", jc.WORLD, "slider", length=1.2, point_a=(2.0, 0.5)))
+    system, state = scene.build()
+    method = jc.Method(solver=jc.Priority({"rod": 1, "other": 2}))
+    final, info = jax.jit(jax.vmap(lambda s: jc.rollout(system, method, s, None, 1e-3, 400)))(
+        jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    )
+    final = jax.tree.map(lambda x: x[1], final)
+    left = jc.violation(system, final)
+    assert left["rail"] < 1e-10
+    assert left["rod"] < 1e-10
+    assert left["other"] > 1e-2
+    assert final.status == jc.Status.OK
+
+
+def test_a_row_of_zeros_leaves_solution_and_gradient_finite():
+    j = J.copy()
+    j[0] = j[3] = 0
+
+    def value(j, target):
+        a, λ, _ = jc.Priority(LEVELS).solve(problem(j, target=target)[0])
+        return jnp.sum(a**2) + jnp.sum(λ**2)
+
+    slopes = quick_jit(jax.grad(value, (0, 1)))(jnp.asarray(j), jnp.asarray(TARGET))
+    for slope in slopes:
+        assert np.all(np.isfinite(slope))
+        np.testing.assert_array_equal(slope[jnp.array([0, 3])], 0)
+
+
+def test_dependent_rows_that_agree_move_as_without_levels():
+    system, _ = problem(target=J @ TARGET)
+    expected = jc.RankSafe(always=True).solve(system)
+    found = jc.Priority(LEVELS).solve(system)
+    np.testing.assert_allclose(found.acceleration, expected.acceleration, rtol=1e-7)
+    np.testing.assert_allclose(J @ found.acceleration, J @ TARGET, rtol=1e-12)
+    assert found.status == jc.Status.OK
+
+
+def test_what_levels_are_refused():
+    with pytest.raises(ValueError, match="'rod' must be 0, 1, 2 or 3, got 4"):
+        jc.Priority({"rod": 4})
+    with pytest.raises(ValueError, match=r"no constraint 'rood\*'; there are \['hold'"):
+        jc.Priority({"rood*": 1}).solve(problem()[0])
+    unnamed = dataclasses.replace(problem()[0], layout=None)
+    with pytest.raises(ValueError, match="no constraint 'rest'"):
+        jc.Priority({"rest": 1}).solve(unnamed)
