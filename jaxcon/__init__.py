@@ -86,6 +86,7 @@ from jaxcon.simulation.integrators import (
     SemiImplicitEuler,
 )
 from jaxcon.simulation.method import Method
+from jaxcon.simulation.response import frequency_response
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
@@ -95,17 +96,25 @@ from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Solution
 from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse
+from jaxcon.stabilization.adaptive import AdaptiveBaumgarte, SlidingWindowBaumgarte
 from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
+from jaxcon.stabilization.hybrid import Hybrid
+from jaxcon.stabilization.multipliers import AugmentedLagrangian
+from jaxcon.stabilization.penalty import Penalty
+from jaxcon.stabilization.pid import PID
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "PID",
     "RK4",
     "WORLD",
+    "AdaptiveBaumgarte",
     "AffineActuator",
     "AngularMomentum",
     "Armature",
     "Assembly",
+    "AugmentedLagrangian",
     "Baumgarte",
     "Belt",
     "Bending",
@@ -130,6 +139,7 @@ __all__ = [
     "GeneralizedSystem",
     "Heun",
     "Holonomic",
+    "Hybrid",
     "Integrability",
     "JointDamper",
     "JointSpring",
@@ -143,6 +153,7 @@ __all__ = [
     "MujocoModel",
     "Parallel",
     "Planar",
+    "Penalty",
     "PointOnCurve",
     "PointOnLine",
     "PointOnPlane",
@@ -166,6 +177,7 @@ __all__ = [
     "SemiImplicitEuler",
     "SimulationError",
     "Solution",
+    "SlidingWindowBaumgarte",
     "Span",
     "Sparse",
     "Spherical",
@@ -189,6 +201,7 @@ __all__ = [
     "coordinate_rate",
     "energy",
     "forward_dynamics",
+    "frequency_response",
     "from_mjcf",
     "hanging",
     "inertia",
