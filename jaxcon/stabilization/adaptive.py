@@ -87,13 +87,13 @@ class History(NamedTuple):
 class SlidingWindowBaumgarte(Unstabilized):
     """β = rate eᵘ and α = (ζ + (1 − ζ) o) β, where u follows the last steps (exercise 5).
 
-    u⁺ = u + η (τ (1 − o) − o), from the window of the last φ of each row, where
+    u⁺ = u + η (max(τ, 0) (1 − o) − o − r u), from the window of the last φ of each row, where
 
         τ = (E₂ − E₁)/(E₁ + E₂ + δ²)      trend: E₁, E₂ the mean φ² of its halves, the newer last
         o = 1 − ‖Σ (φ, δ)‖ / Σ ‖(φ, δ)‖   oscillation: 0 for one sign, 1 for as much of each
 
-    A violation that grows raises β, one that decays lets it go back, and one that oscillates lowers
-    it and brings α up to β. Both are smooth for δ > 0 and nothing happens where φ is far below δ.
+    A violation that grows raises β, one that oscillates lowers it and brings α up to β, and under
+    any other β goes back to the rate. τ and o are smooth for δ > 0, and 0 where φ is far below δ.
     ζ ≤ α/β ≤ 1 always, β stays within `reach` of the rate, and below `margin` times the largest β
     at which the integrator is stable at h for every such ratio. Nothing is adapted until the window
     is full; rows of velocities, without φ, keep their gains.
@@ -103,6 +103,7 @@ class SlidingWindowBaumgarte(Unstabilized):
             integrator, and no more than a quarter of the limit.
         damping_ratio: ζ, from ½ to 1.
         speed: η, by how much ln β may change in a step.
+        recovery: r, the share of u that is forgotten, in units of η.
         reach: β stays between rate/reach and rate·reach.
         noise: δ, what counts as no violation [unit of φ].
         margin: the share of the limit that is used, below 1.
@@ -114,6 +115,7 @@ class SlidingWindowBaumgarte(Unstabilized):
     rate: Any = None
     damping_ratio: Any = 0.7
     speed: Any = 0.1
+    recovery: Any = 0.1
     reach: Any = 10.0
     noise: Any = 1e-9
     margin: Any = 0.9
@@ -128,7 +130,7 @@ class SlidingWindowBaumgarte(Unstabilized):
             ValueError: one is out of its range.
         """
         owner = "SlidingWindowBaumgarte"
-        check_gains(owner, rate=self.rate, speed=self.speed)
+        check_gains(owner, rate=self.rate, speed=self.speed, recovery=self.recovery)
         check_gains(owner, strictly=True, noise=self.noise, limit=self.limit)
         check_between(owner, "damping_ratio", self.damping_ratio, LEAST_RATIO, 1)
         check_between(owner, "margin", self.margin, 0, 1)
@@ -183,9 +185,10 @@ class SlidingWindowBaumgarte(Unstabilized):
         trend, oscillation = judge(residuals, jnp.asarray(self.noise, dtype)[None])
         rate, bound = self._bounds(rows)
         reach = jnp.log(jnp.asarray(self.reach, dtype))[None]
-        change = jnp.asarray(self.speed, dtype)[None] * (trend * (1 - oscillation) - oscillation)
+        back = jnp.asarray(self.recovery, dtype)[None] * memory.raised
+        pull = jnp.maximum(trend, 0) * (1 - oscillation) - oscillation - back
         top = jnp.maximum(jnp.minimum(reach, jnp.log(bound / rate)), -reach)
-        raised = jnp.clip(memory.raised + change, -reach, top)
+        raised = jnp.clip(memory.raised + jnp.asarray(self.speed, dtype)[None] * pull, -reach, top)
         full = (seen >= self.window)[None] & column(rows.layout.holonomic, rows)
         return History(
             residuals,
