@@ -146,19 +146,19 @@ def unstable_spring(
     with jax.ensure_compile_time_eval():
         rows = linearize(recall(system, state.turns), state.q, state.v, state.time)
         rows = dataclasses.replace(rows, mass=system.mass(state.q))
-        own, (k, d) = felt(rows), penalty.constants(rows)
         soft = penalty.soft(rows.layout)
-        pairs = np.stack([np.broadcast_to(x, soft.shape) for x in (d * own / 2, k * own)])
+        numbers = (felt(rows), *penalty.constants(rows))
+        own, k, d = (np.broadcast_to(np.asarray(x), soft.shape) for x in numbers)
     if not soft.any():
         return None
-    stiffest = int(np.argmax(np.where(soft, pairs[1] + pairs[0] ** 2, -1.0)))
-    alpha, square = (float(x) for x in pairs[:, stiffest])
-    if integrator.growth(alpha, square**0.5, h) <= 1 + SLOW:
+    worst = int(np.argmax(np.where(soft, k * own + (d * own / 2) ** 2, -1.0)))
+    m, stiffness, damping = 1 / own[worst], k[worst], d[worst]
+    rate = float(np.sqrt(stiffness / m))
+    if integrator.growth(float(damping / m / 2), rate, h) <= 1 + SLOW:
         return None
-    name = next(n for n in rows.layout.names if stiffest in rows.layout.rows(n))
-    m = 1 / float(own[stiffest])
+    name = next(n for n in rows.layout.names if worst in rows.layout.rows(n))
     return (
-        f"Penalty: the explicit spring of '{name}', {square * m:.6g} N/m on {m:.6g} kg, is unstable"
+        f"Penalty: the explicit spring of '{name}', {stiffness:.6g} N/m on {m:.6g} kg, is unstable"
         f" at dt={h:.6g} with {type(integrator).__name__}; semi-implicit Euler without damping is"
         f" stable below 4 m/h² = {4 * m / h**2:.6g}. Take implicit=True, or a smaller step."
     )

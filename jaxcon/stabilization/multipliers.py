@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Rows, layout_of
 from jaxcon.core.pytree import pytree, static
@@ -16,7 +17,7 @@ from jaxcon.model.state import State
 from jaxcon.solvers.proximal import RankSafe, proximal, scaled
 from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
-from jaxcon.stabilization.gains import check_gains
+from jaxcon.stabilization.gains import check_gains, column
 
 
 class Held(NamedTuple):
@@ -36,7 +37,7 @@ class AugmentedLagrangian(Unstabilized):
     rows depend on each other or a mechanism passes a singular position, and stiffness bounds how
     stiff it is; rounds share one factorization. Each step starts from the λ of the last one, which
     is near, so that one or two rounds do. b is that of the feedback. The derivative is that of the
-    rounds as they are, with W held.
+    rounds as they are, with W held. Rotors, which hold nothing, are solved as they are.
 
     Attributes:
         stiffness: in units of the mass that a row feels, 1/A_ii.
@@ -89,13 +90,15 @@ class AugmentedLagrangian(Unstabilized):
     def impose(self, rows: Rows, memory: Held, dt: Any) -> Law:
         """The law of the feedback, solved in rounds."""
         law = self.feedback.impose(rows, memory.feedback, dt)
-        return law._replace(solve=partial(self._rounds, memory.multipliers))
+        return law._replace(solve=partial(self._rounds, rows, memory.multipliers))
 
-    def _rounds(self, start: Array, solver: Any, system: Saddle) -> Solution:
+    def _rounds(self, rows: Rows, start: Array, solver: Any, system: Saddle) -> Solution:
         if not system.target.size:
             return solver.solve(system)
         solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
+        holding = np.isin(np.arange(rows.layout.size), rows.layout.holding)
         weight = scaled(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
+        weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
         return rounds(system.force, system.target, start)
 
