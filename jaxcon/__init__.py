@@ -90,6 +90,7 @@ from jaxcon.simulation.integrators import (
 )
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.repair import Recovery
+from jaxcon.simulation.response import frequency_response
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
@@ -100,17 +101,25 @@ from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Solution
 from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse
+from jaxcon.stabilization.adaptive import AdaptiveBaumgarte, SlidingWindowBaumgarte
 from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
+from jaxcon.stabilization.hybrid import Hybrid
+from jaxcon.stabilization.multipliers import AugmentedLagrangian
+from jaxcon.stabilization.penalty import Penalty
+from jaxcon.stabilization.pid import PID
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "PID",
     "RK4",
     "WORLD",
+    "AdaptiveBaumgarte",
     "AffineActuator",
     "AngularMomentum",
     "Armature",
     "Assembly",
+    "AugmentedLagrangian",
     "Baumgarte",
     "Belt",
     "Bending",
@@ -138,6 +147,7 @@ __all__ = [
     "GeneralizedSystem",
     "Heun",
     "Holonomic",
+    "Hybrid",
     "Integrability",
     "JointDamper",
     "JointSpring",
@@ -152,6 +162,7 @@ __all__ = [
     "MujocoModel",
     "Parallel",
     "Planar",
+    "Penalty",
     "PointOnCurve",
     "PointOnLine",
     "PointOnPlane",
@@ -177,6 +188,7 @@ __all__ = [
     "SemiImplicitEuler",
     "SimulationError",
     "Solution",
+    "SlidingWindowBaumgarte",
     "Span",
     "Sparse",
     "Spherical",
@@ -202,6 +214,7 @@ __all__ = [
     "energy",
     "find_first_failure",
     "forward_dynamics",
+    "frequency_response",
     "from_mjcf",
     "hanging",
     "inertia",

@@ -42,6 +42,16 @@ def test_products_by_hand(small):
     np.testing.assert_allclose(small.transpose(jnp.asarray(multipliers)), EXPECTED.T @ multipliers)
 
 
+@pytest.mark.parametrize("open_", [(), (0,), (0, 1), (1, 3), (2, 3, 4), (0, 1, 2, 3, 4)])
+def test_rows_that_are_not_kept_are_zero(small, open_):
+    kept = ~np.isin(np.arange(5), open_)
+    only = small.only(kept, jnp.zeros(5))
+    expected = EXPECTED * kept[:, None]
+    np.testing.assert_array_equal(only.dense(), expected)
+    v = np.arange(1.0, 8.0)
+    np.testing.assert_allclose(only.apply(jnp.asarray(v)), expected @ v)
+
+
 def test_blocks_on_the_same_rows_add():
     a = Block((Vector(jnp.asarray([2.0])),), 0, Columns(0, 1, 2, (0,)))
     b = Block((Vector(jnp.asarray([3.0])),), 0, Columns(0, 1, 2, (1,)))

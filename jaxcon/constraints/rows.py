@@ -20,6 +20,7 @@ from jaxcon.core import numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers.jacobian import Block, Jacobian
+from jaxcon.solvers.saddle import Mass
 
 
 @dataclass(frozen=True)
@@ -135,6 +136,7 @@ class Rows:
         bias: γ (n_c,).
         layout: rows by constraint.
         compliance: the diagonal of C, (n_c,); None where it is zero.
+        mass: M, where a step tells it to those who weigh rows.
     """
 
     residual: Array
@@ -143,6 +145,7 @@ class Rows:
     bias: Array
     layout: RowLayout = static()
     compliance: Array | None = None
+    mass: Mass | None = None
 
     @property
     def violation(self) -> Violation:
@@ -156,7 +159,7 @@ class Rows:
         open_ = jnp.asarray(~kept, self.bias.dtype).reshape(-1, *(1,) * (self.bias.ndim - 1))
         known = 0.0 if self.compliance is None else self.compliance * (1 - open_)
         compliance = jnp.broadcast_to(known + open_, self.bias.shape)
-        jacobian = self.jacobian.only(kept)
+        jacobian = self.jacobian.only(kept, self.bias)
         return dataclasses.replace(self, jacobian=jacobian, compliance=compliance)
 
 

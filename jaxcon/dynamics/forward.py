@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,9 +27,9 @@ def saddle(
     Returns:
         What a solver takes.
     """
-    mass, layout = system.mass(q), rows.layout
-    compliance, loops = rows.compliance, rows.layout.loops
-    return Saddle(mass, force, rows.jacobian, target, compliance, noise, loops, layout)
+    mass = system.mass(q) if rows.mass is None else rows.mass
+    compliance, layout = rows.compliance, rows.layout
+    return Saddle(mass, force, rows.jacobian, target, compliance, noise, layout.loops, layout)
 
 
 @dataclass(frozen=True)
@@ -53,9 +54,10 @@ class Dynamics:
 
     def __call__(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows]:
         """a and λ at (q, v, t), and the rows there."""
-        rows = linearize(self.system, q, v, t)
+        rows = dataclasses.replace(linearize(self.system, q, v, t), mass=self.system.mass(q))
         law = self.stabilizer.impose(rows, self.memory, self.dt)
         force = self.system.force(q, v, t, self.control)
         force = force if law.force is None else force + law.force
         problem = saddle(self.system, q, law.rows, force, law.target, law.noise)
-        return self.system.complete(self.solver.solve(problem)), rows
+        own = self.solver.solve(problem) if law.solve is None else law.solve(self.solver, problem)
+        return self.system.complete(own), rows

@@ -39,6 +39,9 @@ class Advanced(NamedTuple):
     memory: PyTree = ()
 
 
+Pair = tuple[Any, Any]
+
+
 class Explicit:
     """An integrator that needs accelerations only; admits every stabiliser."""
 
@@ -84,6 +87,12 @@ class SemiImplicitEuler(Explicit):
         half = 1 - dt * alpha - (dt * beta) ** 2 / 2  # of the trace; the determinant is 1 − 2hα
         root = np.emath.sqrt(half**2 - (1 - 2 * dt * alpha))
         return float(max(abs(half + root), abs(half - root)))
+
+    def error_map(self, alpha: Any, beta: Any, dt: Any) -> tuple[Pair, Pair, Pair]:
+        """What a step makes of φ = 1, of φ̇ = 1, and of an acceleration 1 held over it: (φ, φ̇)."""
+        rates = (-dt * beta * beta, 1 - 2 * dt * alpha, dt)
+        places = (1 + dt * rates[0], dt * rates[1], dt * rates[2])
+        return tuple(zip(places, rates, strict=True))  # type: ignore[return-value]
 
 
 @pytree
@@ -155,9 +164,31 @@ class RungeKutta(Explicit):
         root = np.emath.sqrt(alpha**2 - beta**2)
         return float(max(abs(self.amplify(dt * (sign * root - alpha))) for sign in (1, -1)))
 
-    def amplify(self, z: complex) -> complex:
-        """R(z), what a step makes of y = 1 under ẏ = z y with h = 1."""
-        slopes: list[complex] = []
+    def error_map(self, alpha: Any, beta: Any, dt: Any) -> tuple[Pair, Pair, Pair]:
+        """What a step makes of φ = 1, of φ̇ = 1, and of an acceleration 1 held over it: (φ, φ̇).
+
+        With x = (φ, φ̇), ẋ = A x + B w and w held, x⁺ = R(hA) x + h Q(hA) B w, where
+        R(z) = 1 + z Q(z) is the stability polynomial.
+        """
+
+        def times(x: Pair) -> Pair:
+            return dt * x[1], -dt * (beta * beta * x[0] + 2 * alpha * x[1])
+
+        def polynomial(coefficients: list[float], x: Pair) -> Pair:
+            y = (0.0 * x[0], 0.0 * x[1])
+            for c in reversed(coefficients):
+                moved = times(y)
+                y = (c * x[0] + moved[0], c * x[1] + moved[1])
+            return y
+
+        powers = [float(c) for c in np.asarray(self.amplify(np.poly1d([1.0, 0.0])))[::-1]]
+        zero = 0.0 * (alpha + beta + dt)
+        columns = [polynomial(powers, x) for x in ((1 + zero, zero), (zero, 1 + zero))]
+        return columns[0], columns[1], polynomial(powers[1:], (zero, dt + zero))
+
+    def amplify(self, z: Any) -> Any:
+        """R(z), what a step makes of y = 1 under ẏ = z y with h = 1; z may be a polynomial."""
+        slopes: list[Any] = []
         for weights in ((), *self.a):
             stage = 1 + sum(w * k for w, k in zip(weights, slopes, strict=True))
             slopes.append(z * stage)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +10,7 @@ import jax
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import PyTree
 from jaxcon.simulation.integrators import SemiImplicitEuler
+from jaxcon.simulation.stability import stable_rate
 from jaxcon.solvers.proximal import RankSafe
 from jaxcon.stabilization.baumgarte import Baumgarte
 
@@ -35,7 +37,7 @@ class Method:
 
     Attributes:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
-        stabilizer: `Baumgarte(…)` or `Unstabilized()`.
+        stabilizer: `Baumgarte(…)`, `PID(…)`, `Penalty(…)`, …, or `Unstabilized()`.
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
             want independent rows; `Priority(levels)` meets them level by level.
         recovery: `Recovery(…)`, which repairs steps that fail; None, and a world that fails stops.
@@ -55,7 +57,8 @@ class Method:
 
     def feedback(self, dt: Any) -> Any:
         """The stabiliser, its missing gains chosen for the integrator at this step."""
-        return self.stabilizer.resolve(self.integrator.default_gains(dt))
+        stabilizer = self.stabilizer.resolve(self.integrator.default_gains(dt))
+        return stabilizer.bounded(functools.partial(stable_rate, self.integrator, dt))
 
     def check_system(self, system: Any) -> None:
         """Checks that the integrator works with the stabiliser and the system.
@@ -82,6 +85,8 @@ class Method:
             absent = part == "recovery" and value is None
             if not absent and (isinstance(value, type) or not hasattr(value, verb)):
                 raise TypeError(f"Method: {part} must be a value such as {example}, got {value!r}.")
+        if hasattr(self.stabilizer, "check"):
+            self.stabilizer.check()
 
 
 def check_method(method: Any) -> None:

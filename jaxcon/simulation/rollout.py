@@ -65,7 +65,7 @@ def rollout(
     policy = controls if callable(controls) else None
     inputs = None if policy else _split(controls, steps, every)
     check_method(method)
-    warn_if_unstable(method, dt)
+    warn_if_unstable(method, dt, system, state)
 
     def one(carry: tuple[State, Any], control: PyTree) -> tuple[tuple[State, StepInfo], None]:
         state, _ = carry

@@ -60,7 +60,9 @@ def step(
         ValueError: shapes or dtypes disagree (at trace time).
     """
     check_method(method)
-    warn_if_unstable(method, dt)  # as given: under jit an array made of it would be traced
+    warn_if_unstable(
+        method, dt, system, state
+    )  # as given: under jit an array made of it would be traced
     return step_quietly(system, method, state, control, dt)
 
 
@@ -109,7 +111,7 @@ def _attempt(system: Any, method: Method, state: State, control: PyTree, dt: Arr
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
     new = dataclasses.replace(state, q=q, v=v, time=time)
     stabilizer = method.feedback(dt)
-    own = stabilizer.advance(rows, memory.stabilizer, dt)
+    own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
     new, corrected = stabilizer.correct(system, method.solver, new, own, dt)
     turns = system.count(state.q, state.v, state.time)
     kept = Memory(advanced.memory, own, memory.recovery) if state.memory else ()

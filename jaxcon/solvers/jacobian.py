@@ -102,14 +102,14 @@ class Jacobian:
         lanes.append(jnp.zeros((self.shape[1] - free, *multipliers.shape[1:]), multipliers.dtype))
         return jnp.concatenate([x for x in lanes if x.shape[0]])
 
-    def only(self, kept: np.ndarray) -> Jacobian:
-        """J with rows of zeros where they are not kept, (n_c,)."""
+    def only(self, kept: np.ndarray, like: Array) -> Jacobian:
+        """J with rows of zeros where they are not kept, (n_c,); `like` has the axes of a lane."""
 
         def block(old: Block) -> Block:
             m, k = old.shape
             choice = kept[old.start : old.start + m * k].reshape(m, k)
             rows = zip(old.value, choice, strict=True)
-            value = tuple(row.map(partial(_chosen, own)) for row, own in rows)
+            value = tuple(row.map(partial(_chosen, own, like)) for row, own in rows)
             return dataclasses.replace(old, value=value)
 
         return dataclasses.replace(self, blocks=tuple(map(block, self.blocks)))
@@ -134,13 +134,14 @@ class Jacobian:
         return jnp.concatenate([*flat, jnp.zeros(1, dtype)])[index]
 
 
-def _chosen(kept: np.ndarray, lane: Lane) -> Lane:
+def _chosen(kept: np.ndarray, like: Array, lane: Lane) -> Lane:
     """A lane (element, …) with zeros where an element is not kept."""
-    if kept.all():
+    if kept.all() or (not isinstance(lane, jax.Array) and lane == 0):
         return lane
-    if not kept.any():
-        return 0.0
-    return jnp.where(kept.reshape(-1, *(1,) * (lane.ndim - 1)), lane, 0)
+    choice = kept.reshape(-1, *(1,) * (like.ndim - 1))
+    if isinstance(lane, jax.Array):
+        return jnp.where(choice, lane, 0) if kept.any() else jnp.zeros_like(lane)
+    return jnp.asarray(np.where(choice, lane, 0.0), like.dtype)
 
 
 def _join(rows: dict[int, list[Lane]], n_rows: int, like: Array) -> Array:

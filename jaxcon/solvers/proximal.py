@@ -12,7 +12,8 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, first
 from jaxcon.core.typing import Array
 from jaxcon.solvers.delassus import diagonal
-from jaxcon.solvers.saddle import Diagonal, Factored, Saddle, Solution
+from jaxcon.solvers.jacobian import Jacobian
+from jaxcon.solvers.saddle import Diagonal, Factored, Mass, Saddle, Solution
 from jaxcon.solvers.schur import delassus
 from jaxcon.solvers.sparse import Sparse
 
@@ -143,18 +144,28 @@ def proximal(solver: Any, system: Saddle, weight: Array, rounds: int) -> Any:
 
 def scaled(system: Saddle, floor: Any) -> Array:
     """W = max(diag A, w² max diag A), (n_c,), constant under differentiation."""
-    if isinstance(system.mass, Diagonal):
-        own = diagonal(system.jacobian, 1 / system.mass.diagonal)
-    else:
-        own = native.per_world(_diagonal, system.target.ndim - 1)(system)
+    own = own_diagonal(system.mass, system.jacobian, system.target.ndim - 1)
     if system.compliance is not None:
         own = own + system.compliance
     least = jnp.asarray(floor, own.dtype) ** 2 * jnp.max(own, axis=0)
     return jax.lax.stop_gradient(jnp.maximum(own, least[None]))
 
 
-def _diagonal(system: Saddle) -> Array:
-    return jnp.diagonal(delassus(system.mass, system.jacobian.dense(), None))
+def own_diagonal(mass: Mass, jacobian: Jacobian, worlds: int) -> Array:
+    """diag(J M⁻¹ Jᵀ), (n_c,): one over the mass that each row feels.
+
+    Args:
+        mass: M.
+        jacobian: J.
+        worlds: how many trailing axes enumerate worlds.
+    """
+    if isinstance(mass, Diagonal):
+        return diagonal(jacobian, 1 / mass.diagonal)
+    return native.per_world(_diagonal, worlds)(mass, jacobian)
+
+
+def _diagonal(mass: Mass, jacobian: Jacobian) -> Array:
+    return jnp.diagonal(delassus(mass, jacobian.dense(), None))
 
 
 def keep(chosen: Array, x: Solution, y: Solution) -> Solution:

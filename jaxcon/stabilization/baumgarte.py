@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxcon.constraints.rows import RowLayout, Rows
+from jaxcon.constraints.rows import Rows
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
+from jaxcon.solvers.saddle import Saddle, Solution
+from jaxcon.stabilization.gains import by_row
 
 
 class Law(NamedTuple):
@@ -23,12 +25,14 @@ class Law(NamedTuple):
         target: b, (n_c,).
         force: what is added to f, (n_v,); None where nothing is.
         noise: what b may be off by rounding, a number or (n_c,); None where that is not known.
+        solve: (solver, saddle) → solution, where the solver's own is not what is meant.
     """
 
     rows: Rows
     target: Array
     force: Array | None = None
     noise: Any = None
+    solve: Callable[[Any, Saddle], Solution] | None = None
 
 
 @pytree
@@ -43,6 +47,10 @@ class Unstabilized:
         """Itself: there is nothing to choose."""
         return self
 
+    def bounded(self, stable_rate: Callable[[float], Any]) -> Unstabilized:
+        """Itself; one that changes its gains asks here up to which β it may, by least α/β."""
+        return self
+
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
         """b (n_c,)."""
         return -rows.bias
@@ -53,6 +61,10 @@ class Unstabilized:
 
     def advance(self, rows: Rows, memory: PyTree, dt: Any) -> PyTree:
         """The memory after a step that started with these rows."""
+        return memory
+
+    def remember(self, memory: PyTree, solution: Solution) -> PyTree:
+        """The same after what was solved at the start of the step."""
         return memory
 
     def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
@@ -66,7 +78,7 @@ class Baumgarte(Unstabilized):
 
     Velocity-level rows have φ = 0 and decay as ψ̇ = −2α ψ. Every gain is a leaf. It is a number,
     an array by row (n_c,), or a mapping from constraint names to numbers, with the default for the
-    others.
+    others; a shell pattern such as "leg*" names a group of constraints.
 
     The default is what suits the integrator at the step used: gains in proportion to 1/h for
     semi-implicit Euler, and bounded independently of h for Runge–Kutta methods, whose stages
@@ -118,39 +130,3 @@ class Baumgarte(Unstabilized):
         alpha = by_row(self.alpha, self.fallback[0], rows)
         beta = by_row(self.beta, self.fallback[1], rows)
         return -rows.bias - 2 * alpha * rows.rate - beta * beta * rows.residual
-
-
-def by_row(gain: Any, fallback: Any, rows: Rows) -> Array:
-    """A gain as a number () or an array by row (n_c,).
-
-    Raises:
-        ValueError: an unknown constraint name, or an array of another size.
-    """
-    dtype = rows.bias.dtype
-    if isinstance(gain, Mapping):
-        return _from_names(gain, fallback, rows.layout, dtype)
-    gain = jnp.asarray(gain, dtype)
-    worlds = rows.bias.ndim - 1
-    if gain.ndim == worlds:
-        return gain[None]
-    if gain.ndim != worlds + 1 or gain.shape[0] != rows.bias.shape[0]:
-        raise ValueError(
-            f"Baumgarte: a gain must be a number, an array {rows.bias.shape[:1]} by row, or a"
-            f" mapping by constraint name; got shape {gain.shape[: gain.ndim - worlds]}."
-        )
-    return gain
-
-
-def _from_names(gain: Mapping[str, Any], fallback: Any, layout: RowLayout, dtype: Any) -> Array:
-    unknown = set(gain) - set(layout.names)
-    if unknown:
-        raise ValueError(
-            f"Baumgarte: there is no constraint {sorted(unknown)}; there are {list(layout.names)}."
-        )
-    values = {name: jnp.asarray(value, dtype) for name, value in gain.items()}
-    fallback = jnp.asarray(fallback, dtype)
-    batch = jnp.broadcast_shapes(fallback.shape, *(x.shape for x in values.values()))
-    result = jnp.broadcast_to(fallback, (layout.size, *batch))
-    for name, value in values.items():
-        result = result.at[layout.rows(name)].set(value[None])
-    return result

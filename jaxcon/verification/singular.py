@@ -24,7 +24,7 @@ def bars(loops: int) -> tuple[Any, jc.State]:
     the linkage could leave the branch on which it is.
     """
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
-    solid = {"mass": 1.0, "inertia": 1 / 12}
+    solid: dict[str, Any] = {"mass": 1.0, "inertia": 1 / 12}
     for i in range(loops + 1):
         place, speed = (float(i), 0.5), (0.5, 0.0)
         scene.add_body(

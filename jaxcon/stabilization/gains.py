@@ -1,0 +1,140 @@
+"""Gains by constraint, by group of constraints and by row, and violations by constraint."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from fnmatch import fnmatchcase
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.rows import RowLayout, Rows
+from jaxcon.core import checks
+from jaxcon.core.lanes import Vector
+from jaxcon.core.typing import Array
+
+
+def by_row(gain: Any, fallback: Any, rows: Rows, owner: str = "Baumgarte") -> Array:
+    """A gain as an array by row, (n_c,), or (1,) where all rows share it.
+
+    Args:
+        gain: a number, an array by row, or a mapping from names of constraints, or from shell
+            patterns such as "leg*" that name a group of them, to numbers.
+        fallback: of the constraints that a mapping leaves out.
+        rows: the constraints.
+        owner: whose gain it is, for errors.
+
+    Raises:
+        ValueError: an unknown name, a pattern that names nothing, two patterns for one constraint,
+            or an array of another size.
+    """
+    dtype = rows.bias.dtype
+    if isinstance(gain, Mapping):
+        return _from_names(gain, jnp.asarray(fallback, dtype), rows, owner)
+    gain = jnp.asarray(gain, dtype)
+    worlds = rows.bias.ndim - 1
+    if gain.ndim == worlds:
+        return gain[None]
+    if gain.ndim != worlds + 1 or gain.shape[0] != rows.bias.shape[0]:
+        raise ValueError(
+            f"{owner}: a gain must be a number, an array {rows.bias.shape[:1]} by row, or a"
+            f" mapping by constraint name; got shape {gain.shape[: gain.ndim - worlds]}."
+        )
+    return gain
+
+
+def _from_names(gain: Mapping[str, Any], fallback: Array, rows: Rows, owner: str) -> Array:
+    layout, result = rows.layout, fallback[None]
+    for key, names in keyed(gain, layout.names, owner).items():
+        chosen = column(rows_of(layout, names), rows)
+        result = jnp.where(chosen, jnp.asarray(gain[key], rows.bias.dtype)[None], result)
+    return result
+
+
+def keyed(keys: Iterable[str], names: tuple[str, ...], owner: str) -> dict[str, list[str]]:
+    """The names of constraints that each key stands for; a name itself outranks patterns.
+
+    Raises:
+        ValueError: a key stands for nothing, or two patterns for one constraint.
+    """
+    keys = sorted(keys)
+    unknown = [key for key in keys if not any(stands_for(key, name) for name in names)]
+    if unknown:
+        raise ValueError(f"{owner}: there is no constraint {unknown}; there are {list(names)}.")
+    found = {
+        key: [x for x in names if x == key or (x not in keys and stands_for(key, x))]
+        for key in keys
+    }
+    for name in names:
+        several = [key for key, own in found.items() if name in own]
+        if len(several) > 1:
+            raise ValueError(
+                f"{owner}: constraint '{name}' has a gain by each of the patterns {several}; name"
+                " it itself, which outranks patterns."
+            )
+    return found
+
+
+def stands_for(key: str, name: str) -> bool:
+    """Whether a key is a constraint's name, or a pattern of it."""
+    return key == name or fnmatchcase(name, key)
+
+
+def rows_of(layout: RowLayout, names: Iterable[str]) -> np.ndarray:
+    """Whether each row belongs to one of the constraints, (n_c,)."""
+    chosen = np.zeros(layout.size, bool)
+    for name in names:
+        chosen[layout.rows(name)] = True
+    return chosen
+
+
+def named(gain: Any, layout: RowLayout, owner: str) -> np.ndarray:
+    """Whether a gain is given for each row, (n_c,): by all but a mapping for those that hold."""
+    if not isinstance(gain, Mapping):
+        return np.isin(np.arange(layout.size), layout.holding)
+    names = keyed(gain, layout.names, owner).values()
+    return rows_of(layout, (name for own in names for name in own))
+
+
+def column(mask: np.ndarray, rows: Rows) -> np.ndarray:
+    """A choice of rows, (n_c,), with the trailing axes of the worlds."""
+    return mask.reshape(-1, *(1,) * (rows.bias.ndim - 1))
+
+
+def squares(x: Array, layout: RowLayout) -> Array:
+    """‖x‖² of the constraint to which a row belongs, by row, (n_c,); smooth where x = 0."""
+    lanes: list[Array] = []
+    place = 0
+    while place < len(layout.entries):
+        _, first, rows, elements = layout.entries[place]
+        own = Vector.of_rows(x, first, rows, elements)
+        lanes += [own.dot(own)] * rows
+        place += elements
+    return jnp.concatenate(lanes) if lanes else x
+
+
+def check_gains(owner: str, strictly: bool = False, **gains: Any) -> None:
+    """Checks that gains are zero or more (or positive) and finite, as far as they are known.
+
+    Raises:
+        ValueError: one is not, or is not a number.
+    """
+    for what, gain in gains.items():
+        for name, value in gain.items() if isinstance(gain, Mapping) else [("", gain)]:
+            which = f"{what} of '{name}'" if name else what
+            if isinstance(value, str | type):
+                raise ValueError(f"{owner}: {which} must be numbers, got {value!r}.")
+            if value is not None:
+                checks.positive(owner, which, value, strictly)
+
+
+def check_between(owner: str, what: str, value: Any, low: float, high: float) -> None:
+    """Checks that a number, or each of a mapping, lies between two, as far as it is known.
+
+    Raises:
+        ValueError: one does not.
+    """
+    for x in value.values() if isinstance(value, Mapping) else [value]:
+        if checks.is_concrete(x) and not np.all((np.asarray(x) >= low) & (np.asarray(x) <= high)):
+            raise ValueError(f"{owner}: {what} must lie between {low} and {high}, got {x}.")

@@ -1,0 +1,116 @@
+"""Constraints held by the method of multipliers (chapter 3.5.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.rows import Rows, layout_of
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.model.state import State
+from jaxcon.solvers.proximal import RankSafe, proximal, scaled
+from jaxcon.solvers.saddle import Saddle, Solution
+from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
+from jaxcon.stabilization.gains import check_gains, column
+
+
+class Held(NamedTuple):
+    """What the method of multipliers remembers: λ of the last step (n_c,), and the feedback's."""
+
+    multipliers: Array
+    feedback: PyTree
+
+
+@pytree
+class AugmentedLagrangian(Unstabilized):
+    """λ⁺ = λ + (b − J a)/W: springs whose rest point gives way until the rows hold.
+
+    Rounds of (A + W) λ⁺ = r + W λ with W = A_ii/stiffness, from the λ of the last step. An
+    eigenvalue σ of A, in units of A_ii, leaves 1/(1 + σ·stiffness) of the error of λ after each
+    round: a soft system with the multipliers of a hard one. Every round is solvable, also where
+    rows depend on each other or a mechanism passes a singular position, and stiffness bounds how
+    stiff it is; rounds share one factorization. Each step starts from the λ of the last one, which
+    is near, so that one or two rounds do. b is that of the feedback. The derivative is that of the
+    rounds as they are, with W held. Rotors, which hold nothing, are solved as they are.
+
+    Attributes:
+        stiffness: in units of the mass that a row feels, 1/A_ii.
+        feedback: stabiliser that says what b is.
+        iterations: rounds a step.
+
+    References:
+        Hestenes, Multiplier and gradient methods, Journal of Optimization Theory and Applications
+            (1969).
+        Bayo, García de Jalón and Serna, A modified Lagrangian formulation for the dynamic analysis
+            of constrained mechanical systems, Computer Methods in Applied Mechanics and Engineering
+            (1988).
+    """
+
+    stiffness: Any = 100.0
+    feedback: Any = Baumgarte()
+    iterations: int = static(default=2)
+
+    def check(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: the stiffness is not positive, or there is no round.
+        """
+        check_gains("AugmentedLagrangian", strictly=True, stiffness=self.stiffness)
+        if not isinstance(self.iterations, int) or self.iterations < 1:
+            raise ValueError(
+                f"AugmentedLagrangian: iterations must be 1 or more, got {self.iterations!r}."
+            )
+        if hasattr(self.feedback, "check"):
+            self.feedback.check()
+
+    def init(self, system: Any, q: Array, v: Array) -> Held:
+        """λ = 0."""
+        layout = layout_of(system, q, v, jnp.zeros((), q.dtype))
+        return Held(jnp.zeros(layout.size, q.dtype), self.feedback.init(system, q, v))
+
+    def resolve(self, gains: tuple[Any, Any]) -> AugmentedLagrangian:
+        """The same, the gains of the feedback resolved."""
+        return dataclasses.replace(self, feedback=self.feedback.resolve(gains))
+
+    def bounded(self, stable_rate: Callable[[float], Any]) -> AugmentedLagrangian:
+        """The same, the gains of the feedback bounded."""
+        return dataclasses.replace(self, feedback=self.feedback.bounded(stable_rate))
+
+    def target(self, rows: Rows, memory: Held, dt: Any) -> Array:
+        """b (n_c,) of the feedback."""
+        return self.feedback.target(rows, memory.feedback, dt)
+
+    def impose(self, rows: Rows, memory: Held, dt: Any) -> Law:
+        """The law of the feedback, solved in rounds."""
+        law = self.feedback.impose(rows, memory.feedback, dt)
+        return law._replace(solve=partial(self._rounds, rows, memory.multipliers))
+
+    def _rounds(self, rows: Rows, start: Array, solver: Any, system: Saddle) -> Solution:
+        if not system.target.size:
+            return solver.solve(system)
+        solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
+        holding = np.isin(np.arange(rows.layout.size), rows.layout.holding)
+        weight = scaled(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
+        weight = jnp.where(column(holding, rows), weight, 0)
+        rounds = proximal(solver, system, weight, self.iterations)
+        return rounds(system.force, system.target, start)
+
+    def advance(self, rows: Rows, memory: Held, dt: Any) -> Held:
+        """With the memory of the feedback after the step."""
+        return memory._replace(feedback=self.feedback.advance(rows, memory.feedback, dt))
+
+    def remember(self, memory: Held, solution: Solution) -> Held:
+        """With the λ of the step."""
+        own = self.feedback.remember(memory.feedback, solution)
+        return Held(solution.multipliers, own)
+
+    def correct(self, system: Any, solver: Any, state: State, memory: Held, dt: Any) -> Any:
+        """As the feedback does."""
+        return self.feedback.correct(system, solver, state, memory.feedback, dt)

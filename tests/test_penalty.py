@@ -1,0 +1,384 @@
+"""Springs, multipliers and mixtures in place of hard rows."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from compiling import quick_jit
+from tolerances import DIFFERENCE, IDENTITY
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
+from jaxcon.core.pytree import pytree
+from jaxcon.scenes import four_bar
+
+H = 0.01
+MASS = 2.0
+
+
+def along_x(p, t, _):
+    return p.position[:1]
+
+
+def oscillator():
+    """A particle whose constraint x = 0 is to be a spring; nothing acts along y."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("a", mass=MASS, position=(0.1, 0.0))
+    scene.add(jc.Holonomic(along_x, ("a",), name="spring"))
+    return scene.build()
+
+
+def pendulum(dtype="float64", rod=True):
+    """A link on a hinge, and a bob on a rod at its end."""
+    scene = jc.Scene(dim=2, dtype=dtype)
+    inertia, place = 1 / 12, (0.5, 0.0)
+    scene.add_body("arm", mass=1.0, inertia=inertia, position=place, angular_velocity=0.4)
+    scene.add_particle("bob", mass=0.5, position=(2.0, 0.0), velocity=(0.0, 0.2))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
+    if rod:
+        scene.add(jc.Distance("rod", "arm", "bob", point_a=(1.0, 0.0)))
+    return scene.build()
+
+
+def rolled(built, method, steps, dt=H):
+    """The last state, and the x of every state."""
+    system, state = built
+    start = jc.init(system, method, state.q, state.v)
+    return jc.rollout(system, method, start, None, dt, steps, record=lambda s, _: s.q[0])
+
+
+def test_a_penalty_has_the_frequency_of_a_spring():
+    """√(k/m), and λ is the force of the spring (exercise 4)."""
+    k = 50.0
+    ω = np.sqrt(k / MASS)
+    dt = 2 * np.pi / ω / 200
+    method = jc.Method(jc.RK4(), jc.Penalty(k, implicit=False))
+    built = oscillator()
+    _, path = quick_jit(lambda: rolled(built, method, 600, dt))()
+    expected = 0.1 * np.cos(ω * dt * np.arange(1, 601))
+    np.testing.assert_allclose(path, expected, atol=0.1 * 600 * (ω * dt) ** 5 / 120)
+    solution = jc.forward_dynamics(*built, None, method, dt)
+    np.testing.assert_allclose(solution.multipliers, [-0.1 * k], rtol=IDENTITY)
+    np.testing.assert_allclose(solution.acceleration, [-0.1 * k / MASS, 0.0], rtol=IDENTITY)
+
+
+def test_an_explicit_spring_is_stable_below_four_masses_by_the_square_of_the_step():
+    limit = 4 * MASS / H**2
+
+    @quick_jit
+    @jax.vmap
+    def largest(share):
+        method = jc.Method(stabilizer=jc.Penalty(share * limit, implicit=False))
+        return jnp.max(jnp.abs(rolled(oscillator(), method, 3000)[1]))
+
+    below, above = largest(jnp.asarray([0.999, 1.001]))
+    assert below < 4.0  # of 0.1; the orbit is a long ellipse there
+    assert not above < 1e10
+
+
+@pytest.mark.parametrize(("share", "warned"), [(0.999, False), (1.001, True)])
+def test_beyond_it_a_warning_says_so(share, warned, recwarn):
+    system, state = oscillator()
+    method = jc.Method(stabilizer=jc.Penalty({"spr*": share * 4 * MASS / H**2}, implicit=False))
+    jax.jit(lambda: jc.step(system, method, state, None, H)).trace()
+    text = [str(warning.message) for warning in recwarn]
+    assert len(text) == warned
+    assert all("explicit spring of 'spring'" in x and "80000" in x for x in text)
+
+
+@pytest.fixture(scope="module")
+def implicit():
+    """The last states under a stiffness and damping, one world each, and the hard one."""
+    built = pendulum()
+
+    @quick_jit
+    @jax.vmap
+    def soft(k, d):
+        return rolled(built, jc.Method(stabilizer=jc.Penalty(k, d)), 300)
+
+    hard = quick_jit(lambda: rolled(built, jc.Method(), 300))()
+    return soft, hard
+
+
+def test_an_implicit_spring_of_any_stiffness_is_stable_and_in_the_limit_hard(implicit):
+    soft, (hard, _) = implicit
+    k = 10.0 ** np.arange(0, 13, 2)
+    final, path = soft(jnp.asarray(k), jnp.zeros(len(k)))
+    assert np.all(np.asarray(final.status) == jc.Status.OK)
+    assert np.max(np.abs(path)) < 30  # a bob on the weakest one falls ½ g t² = 44 m, mostly along y
+    gap = np.max(np.abs(np.asarray(final.q) - np.asarray(hard.q)), axis=-1)
+    assert gap[-1] < 1e-8
+    np.testing.assert_allclose(gap[4] / gap[5], 100, rtol=0.01)  # 1e8 and 1e10: of first order
+
+
+def test_no_stiffness_is_no_constraint(implicit):
+    soft, _ = implicit
+    zero = jnp.zeros(1)
+    final, _ = soft(zero, zero)
+    # λ stands for the force, and gravity acts on each alone: y⁺ = y + h v⁺ with v⁺ = v − h g
+    fall = -9.81 * H**2 * 300 * 301 / 2
+    arm, bob = (np.asarray(final.q[0])[pendulum()[0].layout.v(name)] for name in ("arm", "bob"))
+    np.testing.assert_allclose(arm, [0.5, fall, 0.4 * 3.0], atol=1e-9)
+    np.testing.assert_allclose(bob, [2.0, fall + 0.2 * 3.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_the_gradient_where_there_is_no_spring_is_that_of_the_spring(which):
+    built = pendulum()
+
+    def value(k, d):
+        final, _ = rolled(built, jc.Method(stabilizer=jc.Penalty(k, d)), 20)
+        return jnp.sum(final.q * jnp.arange(1.0, 6.0))
+
+    zero = jnp.zeros(())
+    slope = quick_jit(jax.grad(value, which))(zero, zero)
+    run = quick_jit(value)
+    step = 1e-2  # a spring that pushes is refused, so to one side only
+    args = [[(i * step if j == which else 0.0) for j in (0, 1)] for i in range(5)]
+    at = [float(run(*map(jnp.asarray, x))) for x in args]
+    expected = np.dot([-25, 48, -36, 16, -3], at) / (12 * step)
+    assert abs(expected) > 1e-3
+    assert float(slope) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_time_and_a_damping_ratio_stand_for_the_mass_of_the_row():
+    built = oscillator()
+    for implicit in (True, False):
+        by_time = jc.Penalty.from_time({"spring": 0.2}, 0.3, implicit=implicit)
+        k, d = MASS / 0.2**2, 2 * 0.3 * MASS / 0.2
+        known = jc.Penalty({"spring": k}, {"spring": d}, implicit=implicit)
+        ends = [
+            quick_jit(lambda x=x: rolled(built, jc.Method(stabilizer=x), 50))()
+            for x in (by_time, known)
+        ]
+        np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("implicit", [True, False])
+def test_what_is_not_named_stays_hard(implicit):
+    system, state = built = pendulum()
+    soft = jc.Penalty({"r*": 1e3}, {"rod": 5.0}, implicit=implicit, others=jc.PID(integral=10.0))
+    method = jc.Method(stabilizer=soft)
+    final, _ = quick_jit(lambda: rolled(built, method, 200))()
+    violation = jc.violation(system, final)
+    assert violation["hinge"] < 2e-3
+    assert violation["rod"] > 2e-3
+    solution = jc.forward_dynamics(system, final, None, method, H)
+    rows = linearize(system, final.q, final.v, final.time)
+    own = rows.layout.rows("rod")
+    if not implicit:
+        expected = -1e3 * rows.residual - 5.0 * rows.rate
+        np.testing.assert_allclose(solution.multipliers[own], expected[own], rtol=1e-9)
+    # the motion is that of the forces reported
+    force = system.force(final.q, final.v, final.time, None)
+    force = force + rows.jacobian.transpose(solution.multipliers)
+    np.testing.assert_allclose(system.mass(final.q).apply(solution.acceleration), force, atol=1e-9)
+    assert state.memory == ()
+
+
+def test_rotors_and_rows_of_velocities():
+    scene = jc.Scene(dim=2)
+    scene.add_body("arm", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
+    scene.add(jc.Armature("rotor", "hinge", 0.3))
+    scene.add(jc.KnifeEdge("edge", jc.WORLD, "arm", edge=(1.0, 0.0), center=(0.5, 0.0)))
+    system, state = scene.build()
+    rows = linearize(system, state.q, state.v, state.time)
+    penalty = jc.Penalty(1e4)
+    soft = penalty.soft(rows.layout)
+    assert not soft[rows.layout.rows("rotor")].any()
+    assert soft[rows.layout.rows("hinge")].all()
+    stiffness, _ = penalty.constants(rows)
+    np.testing.assert_array_equal(stiffness != 0, rows.layout.holonomic)
+    for law in (penalty, jc.Penalty(1e4, 1.0, implicit=False), jc.AugmentedLagrangian()):
+        method = jc.Method(stabilizer=law)
+        start = jc.init(system, method, state.q, state.v)
+        a, λ, _ = jc.forward_dynamics(system, start, None, method, H)
+        turning = rows.jacobian.apply(a)[rows.layout.rows("rotor")]
+        np.testing.assert_allclose(λ[rows.layout.rows("rotor")], -0.3 * turning, rtol=1e-9)
+
+
+def test_multipliers_come_nearer_by_the_stiffness_in_each_round():
+    """With one row, λ after k rounds from 0 lacks (1 + stiffness)⁻ᵏ of the hard one."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.5, position=(0.6, -0.8), velocity=(0.8, 0.6))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    hard = jc.forward_dynamics(system, state, None, jc.Method(), H).multipliers
+    for rounds in (1, 3):
+        method = jc.Method(stabilizer=jc.AugmentedLagrangian(9.0, iterations=rounds))
+        start = jc.init(system, method, state.q, state.v)
+        λ = jc.forward_dynamics(system, start, None, method, H).multipliers
+        np.testing.assert_allclose(λ, hard * (1 - 10.0**-rounds), rtol=1e-12)
+        new, info = jc.step(system, method, start, None, H)
+        np.testing.assert_allclose(new.memory.stabilizer.multipliers, info.multipliers)
+
+
+def test_multipliers_hold_a_closed_loop():
+    built = four_bar()
+    ends = []
+    for law in (jc.Baumgarte(), jc.AugmentedLagrangian(100.0, iterations=2)):
+        final, _ = quick_jit(lambda law=law: rolled(built, jc.Method(stabilizer=law), 400, 1e-3))()
+        assert final.status == jc.Status.OK
+        assert jc.violation(built[0], final).worst < 1e-4
+        ends.append(final.q)
+    np.testing.assert_allclose(*ends, atol=1e-4)
+
+
+@pytree
+class Homing(jc.Unstabilized):
+    """A correction that takes the particle to the origin, at rest."""
+
+    def correct(self, system, solver, state, memory, dt):
+        code = jnp.zeros_like(state.status)
+        return dataclasses.replace(state, q=0 * state.q, v=0 * state.v), code
+
+
+def mixture(**changes: Any):
+    parts = {"small": jc.Penalty(1e3, 10.0), "middle": jc.Baumgarte(5.0, 6.0)}
+    return jc.Hybrid(**parts, soft_below=1e-3, **changes)
+
+
+def test_a_mixture_is_each_of_its_laws_where_the_violation_is_its_own():
+    system, state = oscillator()
+    own = {"small": jc.Penalty(1e3, 10.0), "middle": jc.Baumgarte(5.0, 6.0), "all": mixture()}
+
+    def acceleration(law, x):
+        at = dataclasses.replace(state, q=jnp.stack([x, 0.0 * x]))
+        method = jc.Method(stabilizer=law)
+        return jc.forward_dynamics(system, at, None, method, H).acceleration[0]
+
+    for x, name, rtol in ((1e-5, "small", 1e-6), (1.0, "middle", 1e-6)):
+        both = [acceleration(own[key], jnp.asarray(x)) for key in (name, "all")]
+        np.testing.assert_allclose(*both, rtol=rtol)
+    # where φ = soft_below half of each: (1/m + C/2) λ = ½ b₁ + ½ b₂
+    s, x = H * (10.0 + H * 1e3), 1e-3
+    λ = -(1e3 * x / s + 36 * x) / 2 / (1 / MASS + 0.5 / s)
+    got = acceleration(own["all"], jnp.asarray(x))
+    np.testing.assert_allclose(got, λ / MASS, rtol=1e-9)
+    slope = quick_jit(jax.vmap(jax.grad(lambda x: acceleration(own["all"], x))))
+    ends = jnp.asarray([0.0, 1e-3, 3e-3])
+    numbers = [
+        (acceleration(own["all"], x + 1e-8) - acceleration(own["all"], x - 1e-8)) / 2e-8
+        for x in ends
+    ]
+    np.testing.assert_allclose(slope(ends), numbers, rtol=1e-5)
+
+
+def test_a_mixture_projects_by_the_share_of_the_violation():
+    system, state = oscillator()
+    law = mixture(large=Homing(), project_above=0.05)
+    for x, share in ((0.05, 0.5), (5.0, 1.0), (5e-4, 0.0)):
+        at = dataclasses.replace(state, q=jnp.asarray([x, 0.3]), v=jnp.asarray([2.0, 1.0]))
+        new, _ = law.correct(system, jc.RankSafe(), at, (), jnp.asarray(H))
+        np.testing.assert_allclose(new.q, (1 - share) * at.q, atol=1e-7)
+        np.testing.assert_allclose(new.v, (1 - share) * at.v, atol=1e-7)
+
+
+STABILIZERS = {
+    "implicit": (jc.Penalty, {"stiffness": 3e3, "damping": 7.0}),
+    "explicit": (lambda **x: jc.Penalty(**x, implicit=False), {"stiffness": 3e3, "damping": 7.0}),
+    "time": (jc.Penalty.from_time, {"time": 0.03, "damping_ratio": 0.4}),
+    "multipliers": (jc.AugmentedLagrangian, {"stiffness": 20.0}),
+    "hybrid": (
+        lambda stiffness, beta: jc.Hybrid(
+            jc.Penalty(stiffness, 5.0), jc.PID(beta**2, 2 * beta), Homing(), 1e-3, 3.0
+        ),
+        {"stiffness": 3e3, "beta": 15.0},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STABILIZERS)
+def test_gradients_are_differences_and_worlds_are_a_loop(name):
+    kind, numbers = STABILIZERS[name]
+    built = pendulum()
+
+    def value(x):
+        final, _ = rolled(built, jc.Method(stabilizer=kind(**x)), 30)
+        return jnp.sum(final.q**3) + jnp.sum(final.v)
+
+    x = {key: jnp.asarray(number) for key, number in numbers.items()}
+    run, gradient = quick_jit(value), quick_jit(jax.grad(value))(x)
+    scale = max(abs(float(gradient[key] * x[key])) for key in x)
+    for key in x:
+        at = [float(run(x | {key: x[key] * (1 + s * 1e-3)})) for s in (2, 1, -1, -2)]
+        slope = (8 * (at[1] - at[2]) - (at[0] - at[3])) / 12e-3
+        assert abs(float(gradient[key] * x[key]) - slope) < DIFFERENCE * scale, key
+    worlds = {key: jnp.stack([number, 1.05 * number]) for key, number in x.items()}
+    one_by_one = [run({key: number[i] for key, number in worlds.items()}) for i in (0, 1)]
+    got = quick_jit(jax.vmap(value))(worlds)
+    np.testing.assert_allclose(got, jnp.stack(one_by_one), rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["implicit", "explicit", "time", "multipliers"])
+def test_a_float32_world_stays_float32(name):
+    kind, numbers = STABILIZERS[name]
+    system, state = pendulum("float32")
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), numbers)
+    law = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), kind(**single))
+    solver = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), jc.RankSafe())
+    method = jc.Method(stabilizer=law, solver=solver)
+    start = jc.init(system, method, state.q, state.v)
+
+    def after(s, method, dt):
+        return jc.rollout(system, method, s, None, dt, 200)[0]
+
+    args = (start, method, jnp.asarray(H / 2, jnp.float32))
+    assert "f64" not in str(jax.make_jaxpr(after)(*args))
+    final = quick_jit(after)(*args)
+    assert final.status == jc.Status.OK
+    assert jc.violation(system, final).worst < 0.1
+
+
+@pytest.mark.parametrize("name", ["arm", "polar"])
+def test_generalized_coordinates(name):
+    """Worlds of a system with its own mass matrix, soft by time and by multipliers."""
+    built = scenes.build(name)
+    for law in (jc.Penalty.from_time(0.05), jc.AugmentedLagrangian()):
+        method = jc.Method(stabilizer=law)
+        start = jc.init(built.system, method, built.off.q, built.off.v)
+
+        def step(s, m=method):
+            return jc.step(built.system, m, s, None, 1e-3)[0].q
+
+        other = dataclasses.replace(start, v=2 * start.v)
+        batch = jax.tree.map(lambda *x: jnp.stack(x), other, start)
+        got = quick_jit(jax.vmap(step))(batch)[1]
+        np.testing.assert_allclose(got, quick_jit(step)(start), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("stabilizer", "words"),
+    [
+        (jc.Penalty(), ["Penalty", "stiffness", "time"]),
+        (jc.Penalty(-1.0), ["Penalty", "stiffness", "zero or more", "-1"]),
+        (jc.Penalty({"spring": -1.0}), ["stiffness of 'spring'"]),
+        (jc.Penalty(1.0, -2.0), ["damping", "-2"]),
+        (jc.Penalty.from_time(0.0), ["time", "positive"]),
+        (jc.Penalty({"sprong*": 1.0}), ["Penalty", r"sprong\*", "spring"]),
+        (jc.Penalty({"spring": 1.0}, {"sp": 1.0}), ["Penalty", r"\['sp'\]"]),
+        (jc.Penalty(jnp.ones(4)), ["Penalty", r"\(1,\)", r"\(4,\)"]),
+        (jc.AugmentedLagrangian(0.0), ["AugmentedLagrangian", "stiffness", "positive"]),
+        (jc.AugmentedLagrangian(iterations=0), ["iterations must be 1 or more"]),
+        (jc.Hybrid(jc.Penalty(1.0, implicit=False)), ["Hybrid", "implicit"]),
+        (jc.Hybrid(jc.Penalty(-1.0)), ["Penalty", "stiffness"]),
+        (jc.Hybrid(jc.Penalty(1.0), sharpness=0), ["Hybrid", "sharpness"]),
+    ],
+)
+def test_bad_numbers_are_refused(stabilizer, words):
+    system, state = oscillator()
+    method = jc.Method(stabilizer=stabilizer)
+    with pytest.raises(ValueError, match=".*".join(words)):
+        jax.eval_shape(lambda s: jc.step(system, method, s, None, H), state)
+
+
+def test_damping_for_what_is_hard_is_refused():
+    system, state = pendulum()
+    method = jc.Method(stabilizer=jc.Penalty({"rod": 1.0}, {"hinge": 1.0}))
+    with pytest.raises(ValueError, match="damping is given for .*hinge.*only .*rod.* soft"):
+        jax.eval_shape(lambda s: jc.step(system, method, s, None, H), state)
