@@ -286,6 +286,22 @@ def test_gradients_are_differences_and_worlds_are_a_loop(name):
     np.testing.assert_allclose(got, jnp.stack(one_by_one), rtol=IDENTITY)
 
 
+def test_groups_of_constraints_are_batched_and_differentiated():
+    """With a limit for one constraint only."""
+
+    def value(x):
+        law = jc.PID(90.0, {"leg_*": 19.0}, {"leg_*": x}, {"leg_x": 0.5}, fallback=(1.0, 1.0))
+        final, _ = rolled(gap_scene(), jc.Method(stabilizer=law), 30)
+        return jnp.sum(final.q * jnp.asarray([1.0, 2.0]))
+
+    x = jnp.asarray([40.0, 60.0])
+    run, slopes = quick_jit(value), quick_jit(jax.vmap(jax.grad(value)))(x)
+    for i in (0, 1):
+        at = [float(run(x[i] * (1 + s * 1e-4))) for s in (2, 1, -1, -2)]
+        slope = (8 * (at[1] - at[2]) - (at[0] - at[3])) / (12e-4 * float(x[i]))
+        np.testing.assert_allclose(slopes[i], slope, rtol=DIFFERENCE)
+
+
 @pytest.mark.parametrize("name", STABILIZERS)
 def test_a_float32_world_stays_float32(name):
     kind, numbers = STABILIZERS[name]

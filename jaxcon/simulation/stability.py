@@ -169,7 +169,7 @@ def _sets(alpha: Any, beta: Any, integral: Any) -> list[tuple[str, float, float,
     gains = (alpha, beta, integral)
     named = [set(x) for x in gains if isinstance(x, Mapping)]
     if named:
-        if not all(isinstance(x, Mapping) for x in gains[:2]):
+        if any(np.ndim(x) for x in gains if not isinstance(x, Mapping)):
             return []
         values = [x if isinstance(x, Mapping) else dict.fromkeys(named[0], x) for x in gains]
         names = sorted(set.intersection(*map(set, values)))

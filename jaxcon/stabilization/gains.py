@@ -45,7 +45,8 @@ def by_row(gain: Any, fallback: Any, rows: Rows, owner: str = "Baumgarte") -> Ar
 
 
 def _from_names(gain: Mapping[str, Any], fallback: Array, rows: Rows, owner: str) -> Array:
-    layout, result = rows.layout, fallback[None]
+    layout, worlds = rows.layout, rows.bias.ndim - 1
+    result = fallback.reshape(1, *(fallback.shape or (1,) * worlds))
     for key, names in keyed(gain, layout.names, owner).items():
         chosen = column(rows_of(layout, names), rows)
         result = jnp.where(chosen, jnp.asarray(gain[key], rows.bias.dtype)[None], result)

@@ -94,7 +94,8 @@ class PID(Unstabilized):
         if self.limit is None:
             return sum_
         gain = by_row(self.integral, 0.0, rows, "PID")
-        limit = by_row(self.limit, jnp.inf, rows, "PID")
+        # not ∞, of which the derivative of limit/K_i would be NaN
+        limit = by_row(self.limit, float(jnp.finfo(gain.dtype).max) ** 0.5, rows, "PID")
         used = gain > 0
         bound = jnp.where(used, limit / jnp.where(used, gain, 1), jnp.inf)
         return jnp.clip(sum_, -bound, bound)
