@@ -86,6 +86,7 @@ from jaxcon.simulation.integrators import (
     SemiImplicitEuler,
 )
 from jaxcon.simulation.method import Method
+from jaxcon.simulation.rattle import RATTLE
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import largest_stable_rate
 from jaxcon.simulation.step import StepInfo, forward_dynamics, step
@@ -96,10 +97,12 @@ from jaxcon.solvers.saddle import Solution
 from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse
 from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
+from jaxcon.stabilization.projection import Projection, Tolerance
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "RATTLE",
     "RK4",
     "WORLD",
     "AffineActuator",
@@ -150,6 +153,7 @@ __all__ = [
     "Pose",
     "PositionServo",
     "Prismatic",
+    "Projection",
     "Pulley",
     "RackAndPinion",
     "RankSafe",
@@ -174,6 +178,7 @@ __all__ = [
     "State",
     "Status",
     "StepInfo",
+    "Tolerance",
     "TurnCounter",
     "Twist",
     "Universal",
