@@ -90,4 +90,11 @@ def diagonal(jacobian: Jacobian, inverse_mass: Array) -> Array:
         ]
         known = rows.get(block.start, [0.0] * len(squares))
         rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
-    return jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
+    batch = inverse_mass.shape[1:]
+    counts = {block.start: block.shape[1] for block in jacobian.blocks}
+    parts = [
+        jnp.broadcast_to(jnp.asarray(x, inverse_mass.dtype), (counts[start], *batch))
+        for start in sorted(rows)
+        for x in rows[start]  # a row that was left out is the number 0
+    ]
+    return jnp.concatenate(parts)
