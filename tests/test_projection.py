@@ -11,6 +11,8 @@ from tolerances import DIFFERENCE, IDENTITY
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
+from jaxcon.core import status
+from jaxcon.geometry import quaternion
 from jaxcon.scenes import four_bar
 
 PROJECTION = jc.Projection()
@@ -51,21 +53,18 @@ def dumbbell(masses=(1.0, 3.0)):
     return scene.build()
 
 
-def arm(turn=STANDING, shift=HERE, order=(0, 1, 2), dtype=None):
-    """An arm of two links in space on a door with two hinges, turned and shifted as a whole."""
+def arm(turn=STANDING, shift=HERE, hinges=1, dtype=None):
+    """A link in space on a door with one or two hinges, turned and shifted as a whole."""
     scene = jc.Scene(gravity=tuple(turn @ (0.0, 0.0, -9.81)), dtype=dtype)
-    attitude = np.asarray(jc.quaternion.from_matrix(jnp.asarray(turn)))
+    attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turn)))
     solid = {"mass": 2.0, "inertia": (0.1, 0.2, 0.15), "quaternion": attitude}
     for i, name in enumerate(("door", "link")):
         scene.add_body(name, position=turn @ (0.5 + i, 0.0, 0.2 * i) + shift, **solid)
     axis = turn @ (0.0, 0.0, 1.0)
-    joints = [
-        jc.Revolute("low", jc.WORLD, "door", point=shift, axis=axis),
-        jc.Revolute("high", jc.WORLD, "door", point=turn @ (0.0, 0.0, 0.8) + shift, axis=axis),
-        jc.Spherical("elbow", "door", "link", point=turn @ (1.0, 0.0, 0.1) + shift),
-    ]
-    for i in order:
-        scene.add(joints[i])
+    for i in range(hinges):
+        hinge = turn @ (0.0, 0.0, 0.8 * i) + shift
+        scene.add(jc.Revolute(f"hinge{i}", jc.WORLD, "door", point=hinge, axis=axis))
+    scene.add(jc.Spherical("elbow", "door", "link", point=turn @ (1.0, 0.0, 0.1) + shift))
     return scene.build()
 
 
@@ -90,16 +89,18 @@ def test_a_dumbbell_by_hand(metric, shares):
     np.testing.assert_allclose(new.v, [a, 1.0 - b, 2.0, 5.0], atol=IDENTITY)
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float64, 1e-12), (jnp.float32, 2e-6)])
-@pytest.mark.parametrize("metric", ["mass", "euclidean"])
+@pytest.mark.parametrize(
+    ("metric", "dtype", "bound"),
+    [("mass", jnp.float64, 1e-12), ("euclidean", jnp.float32, 2e-6)],
+)
 def test_a_door_with_two_hinges_is_projected_to_rounding(metric, dtype, bound):
     """Redundant rows, an error of a tenth of the scene's size."""
-    system, state = arm(dtype=dtype)
+    system, state = arm(hinges=2, dtype=dtype)
     new = projecting(system, jc.Projection(metric=metric))(system, moved(state, 0.1, 1, 1.0))
     left = jc.violation(system, new)
-    assert int(new.status) == jc.Status.OK
+    assert not status.failed(new.status)
     assert float(left.worst) < bound
-    assert float(left.worst_rate) < 5 * bound  # speeds are up to 5
+    assert float(left.worst_rate) < bound
 
 
 def test_the_point_solves_its_equations():
@@ -117,15 +118,13 @@ def test_the_point_solves_its_equations():
 
 
 def test_symmetries_are_kept():
-    """Exercise 3: a turned and shifted scene, its joints in another order, is projected alike."""
-    from jaxcon.geometry import quaternion
-
+    """Exercise 3: a turned and shifted scene is projected alike."""
     system, state = arm()
-    start = moved(state, 0.05, 3, 0.5)
-    new = projecting(system)(system, start)
+    start, project = moved(state, 0.05, 3, 0.5), projecting(system)
+    new = project(system, start)
     turn = np.asarray(quaternion.matrix(quaternion.exp(jnp.array([0.4, -0.7, 1.1]))))
     shift = np.array([0.3, -0.2, 0.5])
-    other, standing = arm(turn, shift, order=(2, 1, 0))
+    other, standing = arm(turn, shift)
     p = quaternion.from_matrix(jnp.asarray(turn))
 
     def placed(s):
@@ -136,11 +135,30 @@ def test_symmetries_are_kept():
         return np.concatenate([x.ravel(), q.ravel()]), np.append(turn @ np.asarray(u), s.v[6:])
 
     q, v = placed(start)
-    other_new = projecting(other)(
-        other, dataclasses.replace(standing, q=jnp.asarray(q), v=jnp.asarray(v))
-    )
+    placed_start = dataclasses.replace(standing, q=jnp.asarray(q), v=jnp.asarray(v))
+    other_new = project(other, placed_start)
     for got, expected in zip((other_new.q, other_new.v), placed(new), strict=True):
         np.testing.assert_allclose(got, expected, atol=IDENTITY)
+
+
+def triangle(order):
+    """Three particles held by rods, listed in some order."""
+    scene = jc.Scene(dim=2)
+    for i, place in enumerate([(0.0, 0.0), (1.0, 0.0), (0.3, 0.8)]):
+        scene.add_particle(f"p{i}", mass=1.0 + i, position=place)
+    rods = [jc.Distance(f"rod{i}", f"p{i}", f"p{(i + 1) % 3}") for i in range(3)]
+    for i in order:
+        scene.add([*rods, jc.Distance("top", jc.WORLD, "p2", point_a=(0.3, 2.0))][i])
+    return scene.build()
+
+
+def test_the_order_in_which_constraints_are_listed_does_not_matter():
+    ends = []
+    for order in ((0, 1, 2, 3), (3, 1, 0, 2)):
+        system, state = triangle(order)
+        new = projecting(system)(system, moved(state, 0.05, 7, 1.0))
+        ends.append(np.concatenate([new.q, new.v]))
+    np.testing.assert_allclose(*ends, atol=IDENTITY)
 
 
 def test_rows_of_velocities_are_part_of_the_second_projection_only():
