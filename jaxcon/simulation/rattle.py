@@ -37,7 +37,8 @@ class RATTLE:
     whole turn a step.
 
     V and λ are found together by iterations that share one factorization of [M, −Jᵀ; J, 0] at q;
-    each reduces the error in proportion to h. Where forces depend on velocities, F⁺ = F(q⁺, v⁺) is
+    each multiplies the error by about half of the angle by which bodies turn in a step, so that ten
+    are enough up to a fifth of a radian. Where forces depend on velocities, F⁺ = F(q⁺, v⁺) is
     found by fixed-point rounds, each of which reduces the error in proportion to h ∂F/∂v. Worlds in
     which either is not done are NOT_CONVERGED. Derivatives are those of the equations, whatever was
     done to solve them.
