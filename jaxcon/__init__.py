@@ -89,6 +89,7 @@ from jaxcon.simulation.integrators import (
     SemiImplicitEuler,
 )
 from jaxcon.simulation.method import Method
+from jaxcon.simulation.rattle import RATTLE
 from jaxcon.simulation.repair import Recovery
 from jaxcon.simulation.response import frequency_response
 from jaxcon.simulation.rollout import rollout
@@ -107,11 +108,13 @@ from jaxcon.stabilization.hybrid import Hybrid
 from jaxcon.stabilization.multipliers import AugmentedLagrangian
 from jaxcon.stabilization.penalty import Penalty
 from jaxcon.stabilization.pid import PID
+from jaxcon.stabilization.projection import Projection, Tolerance
 
 __version__ = "0.1.0"
 
 __all__ = [
     "PID",
+    "RATTLE",
     "RK4",
     "WORLD",
     "AdaptiveBaumgarte",
@@ -171,6 +174,7 @@ __all__ = [
     "PositionServo",
     "Priority",
     "Prismatic",
+    "Projection",
     "Pulley",
     "RackAndPinion",
     "RankSafe",
@@ -197,6 +201,7 @@ __all__ = [
     "State",
     "Status",
     "StepInfo",
+    "Tolerance",
     "TurnCounter",
     "Twist",
     "Universal",

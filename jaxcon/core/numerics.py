@@ -4,6 +4,7 @@ Each takes the safe branch of the input before the singular operation (the "doub
 `where` after it would still multiply an infinite derivative by zero.
 """
 
+import math
 from typing import Any
 
 import jax.numpy as jnp
@@ -68,3 +69,22 @@ def cos_sinc(square: Lane) -> tuple[Array, Array]:
         cos = 1 - s * cos * (1 / (2 * k * (2 * k - 1)))
         sinc = 1 - s * sinc * (1 / (2 * k * (2 * k + 1)))
     return sign * cos, jnp.where(near, sinc, sign * sinc * rest / root)
+
+
+BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798)
+"""|B₂|, |B₄|, … of (x/2) cot(x/2) = 1 − Σ |B₂ₙ| x²ⁿ / (2n)!; exact to the last place for x < 1."""
+
+
+def inverse_exponential(square: Lane) -> Array:
+    """c(s) = (1 − (√s/2) cot(√s/2)) / s as a smooth function of 0 ≤ s < (2π)², 1/12 at s = 0.
+
+    The coefficient of dexp⁻¹_φ = 1 − ½ φ× + c(φ·φ) φ×φ× of the rotation group.
+    """
+    near = square < 1
+    s = jnp.where(near, square, 1)
+    series = jnp.zeros_like(s)
+    for k in range(len(BERNOULLI), 0, -1):
+        series = series * s + BERNOULLI[k - 1] / math.factorial(2 * k)
+    far = jnp.where(near, 1, square)
+    cos, sinc = cos_sinc(far / 4)
+    return jnp.where(near, series, (1 - safe_divide(cos, sinc)) / far)

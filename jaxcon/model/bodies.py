@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector, zeros
 from jaxcon.core.typing import Array
 from jaxcon.geometry import quaternion
@@ -57,6 +58,10 @@ class Particle:
     def coadjoint(self, v: Vector, p: Vector) -> Vector:
         """None: these velocities are rates of coordinates."""
         return v.map(jnp.zeros_like)
+
+    def carry(self, step: Vector, p: Vector) -> Vector:
+        """p: these velocities are rates of coordinates."""
+        return p
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
@@ -150,6 +155,17 @@ class SpatialRigid(Particle):
         """p × ω of an angular momentum p in the body frame; with p = Iω the gyroscopic torque."""
         none = (jnp.zeros_like(x) for x in v[:3])
         return Vector(*none, *Vector(*p[3:]).cross(Vector(*v[3:])))
+
+    def carry(self, step: Vector, p: Vector) -> Vector:
+        """(dexp⁻¹_φ)ᵀ p = p + ½ φ × p + c φ × (φ × p) of an angular momentum in the body frame.
+
+        References:
+            Iserles, Munthe-Kaas, Nørsett, Zanna, Lie-group methods, Acta Numerica 9 (2000).
+        """
+        φ, p_φ = Vector(*step[3:]), Vector(*p[3:])
+        across = φ.cross(p_φ)
+        turned = p_φ + across * 0.5 + φ.cross(across) * numerics.inverse_exponential(φ.dot(φ))
+        return Vector(*p[:3], *turned)
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""

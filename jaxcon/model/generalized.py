@@ -84,6 +84,14 @@ class GeneralizedCoordinates:
             raise ValueError(f"GeneralizedSystem: force must return {q.shape}, got {f.shape}.")
         return f
 
+    def applied(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
+        """f, (n_v,)."""
+        return self.force(q, v, t, control)
+
+    def carry(self, q: Array, step: Array, p: Array) -> Array:
+        """p: v is q̇."""
+        return p
+
     def kinematics(self, q: Array, v: Array) -> Array:
         """q̇ = v."""
         return v

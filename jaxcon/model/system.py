@@ -121,9 +121,20 @@ class BodySystem:
 
     def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f (n_v,): gravity, gyroscopic force −ω × Iω, force elements and control."""
+        groups = zip(self.layout.groups, self.inertia, strict=True)
+        gyroscopic = [g.kind.gyroscopic(g.unpack(q, v)[1], p.moments) for g, p in groups]
+        return self._forces(q, v, t, control, gyroscopic)
+
+    def applied(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
+        """f without the gyroscopic force, (n_v,); reads v only where a force element does."""
+        none = [zeros(g.kind.n_v) for g in self.layout.groups]
+        return self._forces(q, v, t, control, none)
+
+    def _forces(self, q: Array, v: Array, t: Any, control: Any, gyroscopic: list[Vector]) -> Array:
+        """Gravity, force elements and control, with gyroscopic forces by group."""
         snapshot = self.snapshot(q, v, t)
         groups = self.layout.groups
-        own = [self._own_force(i, q, v) for i in range(len(groups))]
+        own = [self._own_force(i, q, v, gyroscopic[i]) for i in range(len(groups))]
         terms = [
             [[(tuple(range(len(g.names))), x)] for x in f] for g, f in zip(groups, own, strict=True)
         ]
@@ -138,14 +149,13 @@ class BodySystem:
         )
         return _join(list(forces), q)
 
-    def _own_force(self, group: int, q: Array, v: Array) -> Vector:
+    def _own_force(self, group: int, q: Array, v: Array, gyroscopic: Vector) -> Vector:
         """Gravity and gyroscopic force on the bodies of a group."""
         layout, properties = self.layout.groups[group], self.inertia[group]
         _, velocity = layout.unpack(q, v)
         weight = [properties.mass * g[None] for g in Vector.of(self.gravity)]
         rest = zeros(layout.kind.n_v - self.layout.dim)
         spread = jnp.zeros_like(velocity[0])
-        gyroscopic = layout.kind.gyroscopic(velocity, properties.moments)
         return (Vector(*weight, *rest) + gyroscopic).map(lambda x: spread + x)
 
     def kinematics(self, q: Array, v: Array) -> Array:
@@ -160,6 +170,14 @@ class BodySystem:
         """ad*_v p (n_v,): what turning with the bodies does to a momentum p (n_v,), p × ω."""
         pairs = [(g.kind, g.unpack(q, v)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
         return _join([kind.coadjoint(own, momentum) for kind, own, momentum in pairs], q)
+
+    def carry(self, q: Array, step: Array, p: Array) -> Array:
+        """(dexp⁻¹_Δ)ᵀ p (n_v,): a momentum along a step Δ = h v, as seen from where it begins.
+
+        With −Δ it is as seen from where it ends. Where velocities are rates of coordinates it is p.
+        """
+        pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
+        return _join([kind.carry(own, momentum) for kind, own, momentum in pairs], q)
 
     def complete(self, solution: Solution) -> Solution:
         """The solution of the saddle system as it is."""

@@ -11,7 +11,7 @@ from jaxcon.core.lanes import Vector, plus, times, total
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers import blocks
 from jaxcon.solvers.blocks import Block, freeze
-from jaxcon.solvers.jacobian import Jacobian
+from jaxcon.solvers.jacobian import Jacobian, join
 from jaxcon.solvers.saddle import Saddle
 
 
@@ -90,4 +90,5 @@ def diagonal(jacobian: Jacobian, inverse_mass: Array) -> Array:
         ]
         known = rows.get(block.start, [0.0] * len(squares))
         rows[block.start] = [plus(a, b) for a, b in zip(known, squares, strict=True)]
-    return jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
+    counts = {block.start: block.shape[1] for block in jacobian.blocks}
+    return join(rows, counts, inverse_mass)

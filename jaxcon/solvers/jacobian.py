@@ -69,12 +69,15 @@ class Jacobian:
     def apply(self, v: Array) -> Array:
         """J v, (n_c,)."""
         rows: dict[int, list[Lane]] = {}
+        if not self.blocks:
+            return jnp.zeros((self.shape[0], *v.shape[1:]), v.dtype)
         for block in self.blocks:
             moved = block.columns.take(v)
             values = [row.dot(moved) for row in block.value]
             known = rows.get(block.start, [0.0] * len(values))
             rows[block.start] = [plus(a, b) for a, b in zip(known, values, strict=True)]
-        return _join(rows, self.shape[0], v)
+        counts = {block.start: block.shape[1] for block in self.blocks}
+        return join(rows, counts, v)
 
     def transpose(self, multipliers: Array) -> Array:
         """Jᵀ λ, (n_v,)."""
@@ -144,7 +147,12 @@ def _chosen(kept: np.ndarray, like: Array, lane: Lane) -> Lane:
     return jnp.asarray(np.where(choice, lane, 0.0), like.dtype)
 
 
-def _join(rows: dict[int, list[Lane]], n_rows: int, like: Array) -> Array:
-    if not rows:
-        return jnp.zeros((n_rows, *like.shape[1:]), like.dtype)
-    return jnp.concatenate([x for start in sorted(rows) for x in rows[start]])
+def join(rows: dict[int, list[Lane]], counts: dict[int, int], like: Array) -> Array:
+    """One array (n_c,) of the lanes (element,) of rows, by where each block starts.
+
+    A lane may be the number 0, as where rows are left out.
+    """
+    lanes = [(x, counts[start]) for start in sorted(rows) for x in rows[start]]
+    shape = jnp.broadcast_shapes(like.shape[1:], *(jnp.shape(x)[1:] for x, _ in lanes))
+    parts = [jnp.broadcast_to(jnp.asarray(x, like.dtype), (k, *shape)) for x, k in lanes]
+    return jnp.concatenate(parts)

@@ -1,0 +1,228 @@
+"""RATTLE: a variational integrator of second order with constraints (chapter 3.7.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints.rows import RowLayout, Rows, linearize
+from jaxcon.core import numerics, status
+from jaxcon.core.dependence import depends
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.status import Status
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics.forward import Dynamics, saddle
+from jaxcon.model.state import State
+from jaxcon.simulation.integrators import Advanced
+from jaxcon.solvers import roots
+from jaxcon.solvers.saddle import Factored, Solution
+from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
+
+
+@pytree
+class RATTLE:
+    """Kicks by half of the forces, a drift on the constraints, and half of the forces there.
+
+    With V the velocity between the two ends, p_φ± = (dexp⁻¹_{±hV})ᵀ M V and F applied forces,
+
+        p₊(V) = M v + (h/2) (F + Jᵀλ),   q⁺ = q ⊕ h V,   φ(q⁺, t + h) = 0,
+        M v⁺ = p₋(V) + (h/2) (F⁺ + J⁺ᵀλ⁺),   J⁺ v⁺ + ∂φ⁺/∂t = 0.
+
+    (dexp⁻¹_{hΩ})ᵀ IΩ = IΩ + (h/2) Ω × IΩ + c h² Ω × (Ω × IΩ), and M V for all that does not turn
+    in space: the map from (q, v) to (q⁺, v⁺) is that of a discrete Lagrangian. So it is symplectic,
+    reversible and of second order, its energy stays bounded, momenta belonging to symmetries are
+    kept to rounding, and so are both levels of the constraints. A body may turn by less than one
+    whole turn a step.
+
+    V and λ are found together by iterations that share one factorization of [M, −Jᵀ; J, 0] at q;
+    each multiplies the error by about half of the angle by which bodies turn in a step, so that ten
+    are enough up to a fifth of a radian. Where forces depend on velocities, F⁺ = F(q⁺, v⁺) is
+    found by fixed-point rounds, each of which reduces the error in proportion to h ∂F/∂v. Worlds in
+    which either is not done are NOT_CONVERGED. Derivatives are those of the equations, whatever was
+    done to solve them.
+
+    λ in the solution is that of the kick at the start, and a = (v⁺ − v)/h.
+
+    Attributes:
+        iterations: for V and λ.
+        rounds: for F⁺; none are spent where no force depends on velocities.
+
+    References:
+        Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52 (1983).
+        Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), section VII.1.4.
+        Marsden, West, Discrete mechanics and variational integrators, Acta Numerica 10 (2001).
+    """
+
+    iterations: int = static(default=10)
+    rounds: int = static(default=5)
+
+    def init(self, system: Any, q: Array, v: Array) -> PyTree:
+        """No memory."""
+        return ()
+
+    def refuses(self, system: Any, stabilizer: Any) -> str | None:
+        """Feedback and projection: the step keeps both levels of the constraints itself."""
+        plain = type(stabilizer) is Unstabilized
+        default = type(stabilizer) is Baumgarte and stabilizer.alpha is stabilizer.beta is None
+        if plain or default:
+            return None
+        return (
+            "it keeps positions and velocities on the constraints itself, and a stabilizer would"
+            f" undo what it conserves, so that {type(stabilizer).__name__} with gains of its own"
+            " has no place beside it; leave the stabilizer out, or take RK4() with it"
+        )
+
+    def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
+        """One step."""
+        system, q, v, h = dynamics.system, state.q, state.v, dt[None]
+        rows = linearize(system, q, v, state.time)
+        _check_rows(rows.layout)
+        if depends(system.mass, q):
+            raise ValueError(
+                "RATTLE: the mass matrix depends on q, and the kinetic energy must not; take RK4()"
+                " with Projection(), or coordinates in which the mass is constant."
+            )
+        kick = h / 2 * system.applied(q, v, state.time, dynamics.control)
+        drift = _Drift(dynamics, state, rows, system.mass(q).apply(v) + kick, dt)
+        start = jnp.concatenate([v, jnp.zeros_like(rows.rate)])
+        between, moved = roots.implicit(
+            drift.residual, start, drift.iterate(self.iterations), *drift.inverses(self.iterations)
+        )
+        middle, pull = between[: len(v)], between[len(v) :]
+        end, code = self._arrive(dynamics, state, middle, dt)
+        code = status.first(drift.solve(*_no_load(rows, v)).status, code)
+        code = status.first(_failures(code), _late(moved, middle))
+        q = system.retract(q, h * middle)
+        acceleration = numerics.safe_divide(end - v, h)
+        solution = Solution(acceleration, numerics.safe_divide(2 * pull, h), code)
+        return Advanced((q, end, state.time + dt), solution, rows)
+
+    def _arrive(
+        self, dynamics: Dynamics, state: State, middle: Array, dt: Any
+    ) -> tuple[Array, Array]:
+        """v⁺ from V, and a status."""
+        system, h, time = dynamics.system, dt[None], state.time + dt
+        q = system.retract(state.q, h * middle)
+        momentum = system.carry(q, -h * middle, system.mass(q).apply(middle))
+        rows = linearize(system, q, middle, time)
+        target = rows.jacobian.apply(middle) - rows.rate  # −∂φ/∂t
+        solve = dynamics.solver.factor(saddle(system, q, rows, momentum, target))
+
+        def force(v: Array) -> Array:
+            return h / 2 * system.applied(q, v, time, dynamics.control)
+
+        def kicked(v: Array) -> Solution:
+            return solve(momentum + force(v), target)
+
+        first = kicked(middle)
+        if not depends(force, middle):
+            return first.acceleration, _failures(first.status)
+
+        def iterate(_: Any, v: Array) -> tuple[Array, Array]:
+            def once(_: Any, known: tuple[Array, Array]) -> tuple[Array, Array]:
+                new = kicked(known[0]).acceleration
+                return new, new - known[0]
+
+            return jax.lax.fori_loop(0, self.rounds, once, (v, jnp.zeros_like(v)))
+
+        def residual(v: Array) -> Array:
+            return v - kicked(v).acceleration
+
+        v, moved = roots.implicit(residual, first.acceleration, iterate, self.rounds)
+        return v, status.first(_failures(first.status), _late(moved, v))
+
+    def default_gains(self, dt: Any) -> tuple[Any, Any]:
+        """None: there is nothing to feed back."""
+        return 0.0 * dt, 0.0 * dt
+
+    def growth(self, alpha: float, beta: float, dt: float) -> float:
+        """0: there is no feedback that could be unstable."""
+        return 0.0
+
+
+class _Drift:
+    """p₊(V) − Jᵀ Λ = p and φ(q ⊕ h V, t + h)/h = 0 for z = (V, Λ), Λ = (h/2) λ."""
+
+    def __init__(
+        self, dynamics: Dynamics, state: State, rows: Rows, momentum: Array, dt: Any
+    ) -> None:
+        self.system, self.q, self.rows, self.momentum = dynamics.system, state.q, rows, momentum
+        self.h, self.time = dt[None], state.time + dt
+        problem = saddle(self.system, self.q, rows, momentum, rows.rate)
+        self.solve: Factored = dynamics.solver.factor(problem)
+
+    def residual(self, z: Array) -> Array:
+        """What both equations leave, (n_v + n_c,)."""
+        n = len(self.momentum)
+        v, pull = z[:n], z[n:]
+        step, system = self.h * v, self.system
+        momentum = system.carry(self.q, step, system.mass(self.q).apply(v))
+        moved = system.retract(self.q, step)
+        φ = linearize(system, moved, jnp.zeros_like(v), self.time).residual
+        balance = momentum - self.rows.jacobian.transpose(pull) - self.momentum
+        return jnp.concatenate([balance, numerics.safe_divide(φ, self.h)])
+
+    def iterate(self, iterations: int) -> Any:
+        """Quasi-Newton from a start: z, and by how much V changed at last."""
+        inverse, n = self.inverses(0)[1], len(self.momentum)
+
+        def iterate(function: Any, z: Array) -> tuple[Array, Array]:
+            def once(_: Any, known: tuple[Array, Array]) -> tuple[Array, Array]:
+                down = inverse(function(known[0]))
+                return known[0] - down, down[:n]
+
+            return jax.lax.fori_loop(0, iterations, once, (z, jnp.zeros_like(z[:n])))
+
+        return iterate
+
+    def inverses(self, rounds: int) -> tuple[int, Any, Any]:
+        """The rounds, y → K⁻¹ y and y → K⁻ᵀ y with K = [M, −Jᵀ; J, 0] and Kᵀ = D K D, D = ±1."""
+        n = len(self.momentum)
+
+        def inverse(y: Array) -> Array:
+            return jnp.concatenate(self.solve(y[:n], y[n:])[:2])
+
+        def transposed(y: Array) -> Array:
+            x, pull, _ = self.solve(y[:n], -y[n:])
+            return jnp.concatenate([x, -pull])
+
+        return rounds, inverse, transposed
+
+
+def _no_load(rows: Rows, v: Array) -> tuple[Array, Array]:
+    """f = 0 and b = 0."""
+    return jnp.zeros_like(v), jnp.zeros_like(rows.rate)
+
+
+def _failures(code: Array) -> Array:
+    """The code of a failure; notes are left out: rounding of dependent rows looks like conflict."""
+    return jnp.where(status.failed(code), code, Status.OK).astype(code.dtype)
+
+
+def _late(moved: Array, v: Array) -> Array:
+    """NOT_CONVERGED where v still changed at last."""
+    eps = float(jnp.finfo(v.dtype).eps)
+    size = 1 + jnp.max(jnp.abs(v), axis=0)
+    late = jnp.max(jnp.abs(moved), axis=0) > eps ** (2 / 3) * size
+    return jnp.where(late, Status.NOT_CONVERGED, Status.OK).astype(jnp.int32)
+
+
+def _check_rows(layout: RowLayout) -> None:
+    """Checks that every row is a hard one of positions.
+
+    Raises:
+        ValueError: names the constraints of which some rows are not.
+    """
+    free = [n for n in layout.names if not layout.holonomic[layout.rows(n)].all()]
+    if free:
+        raise ValueError(
+            f"RATTLE: {free} hold velocities and no positions, for which there is no discrete"
+            " Lagrangian; take RK4() with Projection(), or SemiImplicitEuler()."
+        )
+    if layout.inertial:
+        raise ValueError(
+            f"RATTLE: the rotors {list(layout.inertial)} are inertia in rows, which the drift does"
+            " not know; take RK4() with Projection(), or add the inertia to a body."
+        )

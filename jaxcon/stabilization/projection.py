@@ -1,0 +1,292 @@
+"""Projection onto the constraints after a step (chapter 3.4)."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.rows import RowLayout, Rows, linearize
+from jaxcon.core import checks, numerics, status
+from jaxcon.core.native import lift
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.status import Status
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics.forward import saddle
+from jaxcon.model.state import State
+from jaxcon.solvers import roots
+from jaxcon.solvers.roots import Operator
+from jaxcon.solvers.saddle import Diagonal, Saddle
+from jaxcon.stabilization.baumgarte import Unstabilized
+
+METRICS = ("mass", "euclidean")
+
+
+@pytree
+class Tolerance:
+    """ε = ε₀ (1 + α ‖v‖ + β ‖F‖): what |φ| may be, more where the motion is fast or forces large.
+
+    ‖·‖ is the Euclidean norm over all entries of v and of the applied force F, control left out.
+
+    Attributes:
+        base: ε₀, in the units of φ.
+        speed: α; None leaves the term out.
+        force: β; None leaves the term out.
+    """
+
+    base: Any
+    speed: Any = None
+    force: Any = None
+
+    def at(self, system: Any, state: State) -> Array:
+        """ε by world, ()."""
+        scale = jnp.ones_like(state.q[0])
+        if self.speed is not None:
+            scale = scale + _number(self.speed, state) * numerics.norm(state.v)
+        if self.force is not None:
+            force = system.force(state.q, state.v, state.time)
+            scale = scale + _number(self.force, state) * numerics.norm(force)
+        return _number(self.base, state) * scale
+
+
+class Bounds(NamedTuple):
+    """max |φ| at which a world stays as it is, and from which on it has not converged, ()."""
+
+    stays: Array
+    fails: Array
+
+
+@pytree
+class Projection(Unstabilized):
+    """Takes q and then v to the constraints after each step; within a step b = −γ.
+
+    Positions first: q = q* ⊕ d with d = W⁻¹ J(q*)ᵀ μ and φ(q, t) = 0, W the metric. The directions
+    are those at q*, so that one factorization of J W⁻¹ Jᵀ serves all iterations and the root does
+    not depend on how it was found; it differs from the nearest point in the metric of W by O(‖d‖²)
+    along the surface. Then velocities at that q: v = v* + W⁻¹ Jᵀ μ with J v + ∂φ/∂t = 0, the
+    smallest change in the metric. Doing it in the other order would leave J v = −J d/h.
+
+    Rows of velocities alone are part of the second projection only. Rotors are inertia of the mass
+    metric. The derivative is that of the root, in every world, and not of the iterations.
+
+    Attributes:
+        metric: W, "mass" for M with rotors, or "euclidean" for 1 [m, rad], in which heavy bodies
+            move as much as light ones.
+        iterations: of quasi-Newton d ← d − factor · S φ(q* ⊕ d), S b the least step with J d = b.
+            Each multiplies the error by about ‖d‖ over the size of the scene: three are enough
+            after a step, twelve where d is a tenth of the scene. 1 is the linearized projection,
+            which leaves O(‖d‖²) and is differentiated as it is.
+        tolerance: max |φ|, a number or a `Tolerance`. A world stays as it is once it is there, and
+            is NOT_CONVERGED if it is not there at the end. If None, worlds stay within 4 ε s and
+            fail beyond ε^⅔ s with s = 1 + max |q| and ε the spacing of floating numbers, and the
+            linearized projection never fails.
+        factor: of each step, in (0, 1].
+        every: how many steps there are from one projection to the next.
+        coupled: whether d/h is added to v before v is projected, as if the step had led there.
+        position: whether q is projected.
+        velocity: whether v is projected.
+
+    References:
+        Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), section IV.4.
+        Ascher, Chin, Reich, Stabilization of DAEs and invariant manifolds (1994).
+    """
+
+    metric: str = static(default="mass")
+    iterations: int = static(default=12)
+    tolerance: Any = None
+    factor: Any = 1.0
+    every: int = static(default=1)
+    coupled: bool = static(default=False)
+    position: bool = static(default=True)
+    velocity: bool = static(default=True)
+
+    def init(self, system: Any, q: Array, v: Array) -> PyTree:
+        """How many steps ago the last projection was, where not every step has one.
+
+        Raises:
+            ValueError: a choice that does not exist, or a number out of range.
+        """
+        self._check()
+        return () if self.every == 1 else jnp.zeros((), jnp.int32)
+
+    def advance(self, rows: Rows, memory: PyTree, dt: Any) -> PyTree:
+        """One step more, modulo `every`."""
+        return memory if self.every == 1 else (memory + 1) % self.every
+
+    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
+        """The state on the constraints, where its projection is due, and a status."""
+        if self.every == 1:
+            return self.project(system, solver, state, dt)
+        due = memory == 0
+
+        def go(q: Array, v: Array) -> tuple[Array, Array, Array]:
+            new, code = self.project(system, solver, dataclasses.replace(state, q=q, v=v), dt)
+            return new.q, new.v, code
+
+        def rest(q: Array, v: Array) -> tuple[Array, Array, Array]:
+            return q, v, jnp.zeros_like(state.status)
+
+        q, v, code = jax.lax.cond(jnp.any(due), go, rest, state.q, state.v)
+        q, v = (jnp.where(lift(due, x), x, y) for x, y in ((q, state.q), (v, state.v)))
+        return dataclasses.replace(state, q=q, v=v), jnp.where(due, code, Status.OK)
+
+    def project(self, system: Any, solver: Any, state: State, dt: Any) -> tuple[State, Array]:
+        """The state on the constraints, and a status: failures of the solver, or NOT_CONVERGED."""
+        code = jnp.zeros_like(state.status)
+        if self.position:
+            q, step, code = self._positions(system, solver, state)
+            v = state.v
+            if self.coupled:
+                v = v + numerics.safe_divide(step, dt[None])
+            state = dataclasses.replace(state, q=q, v=v)
+        if self.velocity:
+            v, late = self._velocities(system, solver, state)
+            state, code = dataclasses.replace(state, v=v), status.first(code, late)
+        return state, code
+
+    def _positions(self, system: Any, solver: Any, state: State) -> tuple[Array, Array, Array]:
+        """q with φ(q, t) = 0, the step d that leads there, and a status."""
+        q, still = state.q, jnp.zeros_like(state.v)
+        rows = linearize(system, q, still, state.time)
+        held, rotors = _held(rows.layout)
+        if not held.any():
+            return q, still, jnp.zeros_like(state.status)
+        surface = _Surface(system, state, rows, self._problem(system, q, rows, held, rotors), held)
+        solve = solver.factor(surface.problem)
+
+        def nearest(b: Array) -> Array:
+            """d = W⁻¹ J(q*)ᵀ μ with J(q*) d = b."""
+            return solve(still, b).acceleration
+
+        bounds = self._bounds(system, state)
+        step, left = self._step(surface, nearest, bounds)
+        late = jnp.where(left > bounds.fails, Status.NOT_CONVERGED, Status.OK)
+        code = status.first(_failures(solve(still, 0 * rows.bias).status), late.astype(jnp.int32))
+        return system.retract(q, step), step, code
+
+    def _step(self, surface: _Surface, nearest: Operator, bounds: Bounds) -> tuple[Array, Array]:
+        """d with φ(q* ⊕ d) = 0, and max |φ| there, where it is needed."""
+        factor = jnp.asarray(self.factor, surface.start.dtype)[None]
+        if self.iterations == 1:
+            step = -factor * nearest(surface.start)
+            left = surface.start if self.tolerance is None else surface.residual(step)
+            return step, _largest(left)
+
+        def iterate(_: Any, d: Array) -> tuple[Array, Array]:
+            def once(_: Any, known: tuple[Array, Array]) -> tuple[Array, Array]:
+                d, left = known
+                goes = (_largest(left) > bounds.stays)[None]
+                d = jnp.where(goes, d - factor * nearest(left), d)
+                return d, surface.residual(d)
+
+            return jax.lax.fori_loop(0, self.iterations, once, (d, surface.start))
+
+        def equation(d: Array) -> Array:
+            """d − S (J(q*) d − φ(q* ⊕ d)), S b the least step with J(q*) d = b: near to d itself.
+
+            Where it vanishes d is among the steps S b, and φ is zero, or at least S φ is.
+            """
+            return d - nearest(surface.apply(d) - surface.residual(d))
+
+        still = jnp.zeros_like(surface.problem.force)
+        step, left = roots.implicit(equation, still, iterate, self.iterations)
+        return step, _largest(left)
+
+    def _velocities(self, system: Any, solver: Any, state: State) -> tuple[Array, Array]:
+        """v with φ̇ = 0 and ψ = 0, and a status."""
+        rows = linearize(system, state.q, state.v, state.time)
+        if not rows.layout.size:
+            return state.v, jnp.zeros_like(state.status)
+        rotors = _held(rows.layout)[1]
+        problem = self._problem(system, state.q, rows, ~rotors, rotors)
+        solution = solver.factor(problem)(problem.force, -rows.rate)
+        return state.v + solution.acceleration, _failures(solution.status)
+
+    def _problem(
+        self, system: Any, q: Array, rows: Rows, held: np.ndarray, rotors: np.ndarray
+    ) -> Saddle:
+        """W d = Jᵀ μ, J d = b of the rows held, and of rotors where they are inertia."""
+        still = jnp.zeros((rows.jacobian.shape[1], *q.shape[1:]), q.dtype)
+        massive = self.metric == "mass"
+        kept = rows.only(held | rotors if massive else held)
+        problem = saddle(system, q, kept, still, jnp.zeros_like(rows.bias))
+        return problem if massive else dataclasses.replace(problem, mass=Diagonal(still + 1))
+
+    def _bounds(self, system: Any, state: State) -> Bounds:
+        """At which max |φ| a world stays, and beyond which it fails."""
+        state = jax.lax.stop_gradient(state)
+        if self.tolerance is not None:
+            given = self.tolerance
+            given = given if isinstance(given, Tolerance) else Tolerance(given)
+            bound = given.at(jax.lax.stop_gradient(system), state)
+            return Bounds(bound, bound)
+        size = 1 + _largest(state.q)
+        eps = float(jnp.finfo(size.dtype).eps)
+        fails = jnp.full_like(size, jnp.inf) if self.iterations == 1 else eps ** (2 / 3) * size
+        return Bounds(4 * eps * size, fails)
+
+    def _check(self) -> None:
+        if self.metric not in METRICS:
+            raise ValueError(f"Projection: metric must be one of {METRICS}, got {self.metric!r}.")
+        for what in ("iterations", "every"):
+            count = getattr(self, what)
+            if not isinstance(count, int) or count < 1:
+                raise ValueError(
+                    f"Projection: {what} must be a whole number from 1, got {count!r}."
+                )
+        checks.positive("Projection", "factor", self.factor)
+        if checks.is_concrete(self.factor) and np.any(np.asarray(self.factor) > 1):
+            raise ValueError(f"Projection: factor must be at most 1, got {self.factor}.")
+        checks.positive("Projection", "tolerance", jax.tree.leaves(self.tolerance), strictly=False)
+        if self.coupled and not (self.position and self.velocity):
+            raise ValueError("Projection: coupled=True needs both position=True and velocity=True.")
+
+
+class _Surface:
+    """φ(q* ⊕ d) of the rows that are projected, zero for the others.
+
+    Attributes:
+        problem: M, J and C at q*.
+        start: φ(q*), (n_c,).
+    """
+
+    def __init__(
+        self, system: Any, state: State, rows: Rows, problem: Saddle, held: np.ndarray
+    ) -> None:
+        self.system, self.state, self.problem = system, state, problem
+        self.held = jnp.asarray(held).reshape(-1, *(1,) * (rows.bias.ndim - 1))
+        self.start = rows.residual  # rows of velocities and rotors have φ = 0
+
+    def residual(self, d: Array) -> Array:
+        """φ(q* ⊕ d), (n_c,)."""
+        moved = self.system.retract(self.state.q, d)
+        still = jnp.zeros_like(d)
+        return linearize(self.system, moved, still, self.state.time).residual
+
+    def apply(self, d: Array) -> Array:
+        """J(q*) d, (n_c,)."""
+        return jnp.where(self.held, self.problem.jacobian.apply(d), 0)
+
+
+def _held(layout: RowLayout) -> tuple[np.ndarray, np.ndarray]:
+    """Which rows have a φ to be projected, and which are rotors, (n_c,) each."""
+    rotors = ~np.isin(np.arange(layout.size), layout.holding)
+    return layout.holonomic & ~rotors, rotors
+
+
+def _largest(x: Array) -> Array:
+    """max |x| by world."""
+    return jnp.max(jnp.abs(x), axis=0, initial=0)
+
+
+def _failures(code: Array) -> Array:
+    """The code of a failure; notes are left out: rounding of dependent rows looks like conflict."""
+    return jnp.where(status.failed(code), code, Status.OK).astype(code.dtype)
+
+
+def _number(x: Any, state: State) -> Array:
+    """A number of a method in the dtype of the state."""
+    return jnp.asarray(x, state.q.dtype)

@@ -1,0 +1,364 @@
+"""Projections: nearest points by hand, what they keep, and their derivatives."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from tolerances import DIFFERENCE, IDENTITY
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
+from jaxcon.core import status
+from jaxcon.geometry import quaternion
+from jaxcon.scenes import four_bar
+
+PROJECTION = jc.Projection()
+STANDING, HERE = np.eye(3), np.zeros(3)
+
+
+def projecting(system, stabilizer=PROJECTION, solver=None):
+    """The compiled function (system, state) → state that does nothing but project."""
+    solver = jc.RankSafe() if solver is None else solver
+    method = jc.Method(stabilizer=stabilizer, solver=solver)
+
+    @quick_jit
+    def project(system, state):
+        start = jc.init(system, method, state.q, state.v, state.time)
+        return jc.step(system, method, start, None, 0.0)[0]
+
+    return project
+
+
+def moved(state, size, seed=0, velocity=0.0):
+    """The state off its constraints."""
+    rng = np.random.default_rng(seed)
+    q, v = (rng.normal(size=x.shape) for x in (state.q, state.v))
+    dtype = state.q.dtype
+    return dataclasses.replace(
+        state,
+        q=state.q + size * jnp.asarray(q, dtype),
+        v=state.v + velocity * jnp.asarray(v, dtype),
+    )
+
+
+def dumbbell(masses=(1.0, 3.0)):
+    """Two particles at a distance of 1, in the plane."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    for i, mass in enumerate(masses):
+        scene.add_particle(f"p{i}", mass=mass, position=(float(i), 0.0))
+    scene.add(jc.Distance("rod", "p0", "p1"))
+    return scene.build()
+
+
+def arm(turn=STANDING, shift=HERE, hinges=1, dtype=None):
+    """A link in space on a door with one or two hinges, turned and shifted as a whole."""
+    scene = jc.Scene(gravity=tuple(turn @ (0.0, 0.0, -9.81)), dtype=dtype)
+    attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turn)))
+    solid = {"mass": 2.0, "inertia": (0.1, 0.2, 0.15), "quaternion": attitude}
+    for i, name in enumerate(("door", "link")):
+        scene.add_body(name, position=turn @ (0.5 + i, 0.0, 0.2 * i) + shift, **solid)
+    axis = turn @ (0.0, 0.0, 1.0)
+    for i in range(hinges):
+        hinge = turn @ (0.0, 0.0, 0.8 * i) + shift
+        scene.add(jc.Revolute(f"hinge{i}", jc.WORLD, "door", point=hinge, axis=axis))
+    scene.add(jc.Spherical("elbow", "door", "link", point=turn @ (1.0, 0.0, 0.1) + shift))
+    return scene.build()
+
+
+def skate():
+    """A blade at the end of a rod of length 1."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("skate", mass=2.0, inertia=0.5, position=(1.0, 0.0), angle=0.3)
+    scene.add(jc.Distance("rod", jc.WORLD, "skate"))
+    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(0.0, 1.0)))
+    return scene.build()
+
+
+@pytest.mark.parametrize(("metric", "shares"), [("mass", (0.75, 0.25)), ("euclidean", (0.5, 0.5))])
+def test_a_dumbbell_by_hand(metric, shares):
+    """Lengths and speeds along the rod are shared in inverse proportion to masses, or equally."""
+    system, state = dumbbell()
+    q, v = jnp.array([-0.2, 1.2, 0.0, 0.0]), jnp.array([0.0, 1.0, 2.0, 5.0])
+    state = dataclasses.replace(state, q=q, v=v)
+    new = projecting(system, jc.Projection(metric=metric))(system, state)
+    a, b = shares
+    np.testing.assert_allclose(new.q, [-0.2 + 0.4 * a, 1.2 - 0.4 * b, 0.0, 0.0], atol=IDENTITY)
+    np.testing.assert_allclose(new.v, [a, 1.0 - b, 2.0, 5.0], atol=IDENTITY)
+
+
+@pytest.mark.parametrize(
+    ("metric", "dtype", "bound"),
+    [("mass", jnp.float64, 1e-12), ("euclidean", jnp.float32, 2e-6)],
+)
+def test_a_door_with_two_hinges_is_projected_to_rounding(metric, dtype, bound):
+    """Redundant rows, an error of a tenth of the scene's size."""
+    system, state = arm(hinges=2, dtype=dtype)
+    new = projecting(system, jc.Projection(metric=metric))(system, moved(state, 0.1, 1, 1.0))
+    left = jc.violation(system, new)
+    assert not status.failed(new.status)
+    assert float(left.worst) < bound
+    assert float(left.worst_rate) < bound
+
+
+def test_the_point_solves_its_equations():
+    """M d = J(q*)ᵀ μ and φ(q* ⊕ d) = 0, and a change of velocity M Δv = J(q)ᵀ μ."""
+    system, state = four_bar()
+    start = moved(state, 0.05, 2, 1.0)
+    new = projecting(system)(system, start)
+    mass = np.asarray(system.mass(start.q).values)
+    for q, step in ((start.q, new.q - start.q), (new.q, new.v - start.v)):
+        normal = np.asarray(linearize(system, q, start.v, start.time).jacobian.dense()).T
+        force = mass * np.asarray(step)
+        left = force - normal @ np.linalg.lstsq(normal, force, rcond=None)[0]
+        assert np.max(np.abs(left)) < IDENTITY
+        assert np.max(np.abs(step)) > 1e-2
+
+
+def test_symmetries_are_kept():
+    """Exercise 3: a turned and shifted scene is projected alike."""
+    system, state = arm()
+    start, project = moved(state, 0.05, 3, 0.5), projecting(system)
+    new = project(system, start)
+    turn = np.asarray(quaternion.matrix(quaternion.exp(jnp.array([0.4, -0.7, 1.1]))))
+    shift = np.array([0.3, -0.2, 0.5])
+    other, standing = arm(turn, shift)
+    p = quaternion.from_matrix(jnp.asarray(turn))
+
+    def placed(s):
+        x, q = s.q[:6].reshape(3, 2), s.q[6:].reshape(4, 2)
+        u = s.v[:6].reshape(3, 2)
+        x = turn @ np.asarray(x) + shift[:, None]
+        q = quaternion.multiply(jnp.stack([p, p], 1), q)
+        return np.concatenate([x.ravel(), q.ravel()]), np.append(turn @ np.asarray(u), s.v[6:])
+
+    q, v = placed(start)
+    placed_start = dataclasses.replace(standing, q=jnp.asarray(q), v=jnp.asarray(v))
+    other_new = project(other, placed_start)
+    for got, expected in zip((other_new.q, other_new.v), placed(new), strict=True):
+        np.testing.assert_allclose(got, expected, atol=IDENTITY)
+
+
+def triangle(order):
+    """Three particles held by rods, listed in some order."""
+    scene = jc.Scene(dim=2)
+    for i, place in enumerate([(0.0, 0.0), (1.0, 0.0), (0.3, 0.8)]):
+        scene.add_particle(f"p{i}", mass=1.0 + i, position=place)
+    rods = [jc.Distance(f"rod{i}", f"p{i}", f"p{(i + 1) % 3}") for i in range(3)]
+    for i in order:
+        scene.add([*rods, jc.Distance("top", jc.WORLD, "p2", point_a=(0.3, 2.0))][i])
+    return scene.build()
+
+
+def test_the_order_in_which_constraints_are_listed_does_not_matter():
+    ends = []
+    for order in ((0, 1, 2, 3), (3, 1, 0, 2)):
+        system, state = triangle(order)
+        new = projecting(system)(system, moved(state, 0.05, 7, 1.0))
+        ends.append(np.concatenate([new.q, new.v]))
+    np.testing.assert_allclose(*ends, atol=IDENTITY)
+
+
+def test_rows_of_velocities_are_part_of_the_second_projection_only():
+    system, state = skate()
+    start = moved(state, 0.1, 4, 1.0)
+    new = projecting(system)(system, start)
+    left = jc.violation(system, new)
+    assert float(left.worst) < IDENTITY
+    assert float(left.worst_rate) < IDENTITY
+    assert float(jnp.abs(jc.violation(system, start).rate("blade"))) > 0.1
+    radius = np.linalg.norm(start.q[:2])
+    np.testing.assert_allclose(new.q, [*(start.q[:2] / radius), start.q[2]], atol=IDENTITY)
+
+
+def test_a_motion_in_time_is_followed():
+    """A rotor and a driven angle: φ̇ = 0 contains ∂φ/∂t, and the rotor adds to the inertia."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("a", mass=1.0, inertia=1.0)
+    scene.add_body("b", mass=1.0, inertia=1.0)
+    scene.add(jc.Prismatic("rail", jc.WORLD, "a", axis=(1.0, 0.0)))
+    scene.add(jc.Prismatic("slide", "a", "b", axis=(1.0, 0.0)))
+    scene.add(jc.Drive("drive", "slide", lambda t, p: 2.0 * t))
+    scene.add(jc.Armature("rotor", "rail", inertia=2.0))
+    system, state = scene.build()
+    state = dataclasses.replace(state, time=jnp.asarray(0.5))
+    new = projecting(system)(system, state)
+    np.testing.assert_allclose(new.q[:2], [-0.25, 0.75], atol=IDENTITY)  # 1 m between 3 kg and 1 kg
+    np.testing.assert_allclose(new.v[:2], [-0.5, 1.5], atol=IDENTITY)
+
+
+def test_generalized_coordinates_with_a_full_mass_matrix():
+    mass = np.array([[2.0, 0.5], [0.5, 1.0]])
+    system = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.asarray(mass),
+        force=lambda q, v, t, u, p: jnp.zeros_like(q),
+        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q @ q - 1.0]), name="circle"),),
+    )
+    method = jc.Method(stabilizer=PROJECTION)
+    start = jc.init(system, method, jnp.array([1.0, 0.2]), jnp.array([1.0, 1.0]))
+    project = quick_jit(jax.vmap(lambda s: jc.step(system, method, s, None, 0.0)[0]))
+    new = jax.tree.map(lambda x: x[0], project(jax.tree.map(lambda x: x[None], start)))
+    assert abs(float(new.q @ new.q) - 1) < IDENTITY
+    assert abs(float(new.q @ new.v)) < IDENTITY
+    pull = mass @ (new.q - start.q)  # along J(q*)
+    assert abs(pull[0] * start.q[1] - pull[1] * start.q[0]) < IDENTITY
+
+
+def test_every_third_step_and_the_batch():
+    """The error is gone after the third step, not before; worlds may be at different counts."""
+    system, state = dumbbell()
+    method = jc.Method(stabilizer=jc.Projection(every=3))
+    start = jc.init(system, method, moved(state, 0.1).q, state.v)
+    memory = start.memory._replace(stabilizer=jnp.asarray([0, 1]))
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), dataclasses.replace(start, memory=()))
+    batch = dataclasses.replace(batch, memory=memory)
+    step = quick_jit(jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0]))
+    closed = []
+    for _ in range(4):
+        batch = step(batch)
+        worst = jax.vmap(lambda s: jc.violation(system, s).worst)(batch)
+        closed.append((worst < IDENTITY).tolist())
+    assert closed == [[False, False], [False, True], [True, True], [True, True]]
+
+
+def test_what_does_not_arrive_says_so():
+    system, state = four_bar()
+    start = moved(state, 0.05)
+    late = projecting(system, jc.Projection(iterations=2))(system, start)
+    assert int(late.status) == jc.Status.NOT_CONVERGED
+    np.testing.assert_array_equal(late.q, start.q)
+    once = projecting(system, jc.Projection(iterations=1))(system, start)
+    first, then = (jc.violation(system, s).worst for s in (start, once))
+    assert int(once.status) == jc.Status.OK
+    assert 1e-5 < then < first**2  # linearized
+    easy = jc.Projection(tolerance=jc.Tolerance(0.05, speed=100.0, force=1.0))
+    np.testing.assert_array_equal(projecting(system, easy)(system, start).q, start.q)
+
+
+def test_half_steps_halve_the_error():
+    system, state = dumbbell()
+    start = dataclasses.replace(state, q=jnp.array([-0.2, 1.2, 0.0, 0.0]))
+    new = projecting(system, jc.Projection(factor=0.5, iterations=1))(system, start)
+    assert abs(float(jc.violation(system, new).worst) - 0.2) < IDENTITY
+
+
+def test_coupled_velocities_contain_the_correction():
+    """As if the step had led there: v + d/h, before v is projected; along d nothing is left."""
+    system, state = dumbbell((1.0, 1.0))
+    q = jnp.array([-0.1, 1.1, 0.0, 0.3])
+    start = dataclasses.replace(state, q=q, v=jnp.zeros(4))
+    method = jc.Method(stabilizer=jc.Projection(coupled=True))
+    start = jc.init(system, method, start.q, start.v)
+    new = quick_jit(lambda s: jc.step(system, method, s, None, 0.1)[0])(start)
+    d = np.asarray(new.q - q)  # nothing moves otherwise
+    along = np.array([new.q[1] - new.q[0], new.q[3] - new.q[2]])
+    normal = np.array([-along[0], along[0], -along[1], along[1]])
+    expected = d / 0.1 - normal * (normal @ d / 0.1) / (normal @ normal)
+    np.testing.assert_allclose(new.v, expected, atol=IDENTITY)
+
+
+def test_choices_that_do_not_exist_are_refused():
+    system, state = dumbbell()
+    for bad in ({"metric": "size"}, {"iterations": 0}, {"every": 0}, {"factor": 1.5}):
+        with pytest.raises(ValueError, match=f"Projection: {next(iter(bad))}"):
+            jc.init(system, jc.Method(stabilizer=jc.Projection(**bad)), state.q, state.v)
+
+
+def on_circle(q):
+    """A particle taken to a circle of radius 1: the point and its derivatives by hand."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("bead", mass=2.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bead"))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=PROJECTION)
+    new, _ = jc.step(system, method, dataclasses.replace(state, q=q), None, 0.0)
+    return new.q @ jnp.array([0.3, -0.8])
+
+
+def test_first_and_second_derivatives_by_hand():
+    q = jnp.array([0.7, 0.9])
+
+    def by_hand(q):
+        return q @ jnp.array([0.3, -0.8]) / jnp.sqrt(q @ q)
+
+    for transform in (jax.grad, jax.hessian):
+        got = quick_jit(transform(on_circle))(q)
+        np.testing.assert_allclose(got, transform(by_hand)(q), atol=IDENTITY)
+
+
+def by_newton(system, start):
+    """q = q* ⊕ M⁻¹J(q*)ᵀ μ by many rounds of Newton's method, dense, as it stands."""
+    normal = linearize(system, start.q, start.v, start.time).jacobian.dense()
+    away = normal.T / system.mass(start.q).values[:, None]
+    μ = jnp.zeros(len(normal))
+    for _ in range(12):
+        q = start.q + away @ μ
+        rows = linearize(system, q, start.v, start.time)
+        μ = μ - jnp.linalg.solve(rows.jacobian.dense() @ away, rows.residual)
+    return start.q + away @ μ
+
+
+def test_the_derivative_is_that_of_the_root():
+    """By a length and by q*: of the dense iteration as it is, and central differences."""
+    system, state = four_bar()
+    start = moved(state, 0.05, 5)
+    weight = jnp.asarray(np.random.default_rng(6).normal(size=9))
+    method = jc.Method(stabilizer=PROJECTION)
+
+    def with_length(x):
+        anchor = system.params["crank_coupler"]["anchor_a"] + jnp.stack([x[0], 0.0 * x[0]])
+        changed = system.with_params({"crank_coupler": {"anchor_a": anchor}})
+        return changed, dataclasses.replace(start, q=start.q + x[1] * weight)
+
+    def projected(x, speeds=1.0):
+        changed, world = with_length(x)
+        new, _ = jc.step(changed, method, world, None, 0.0)
+        return weight @ new.q + speeds * jnp.sum(jnp.sin(new.v))
+
+    def plain(x):
+        return weight @ by_newton(*with_length(x))
+
+    x, h = jnp.array([0.01, 0.02]), 1e-5
+    gradient = quick_jit(jax.grad(projected))
+    np.testing.assert_allclose(gradient(x, 0.0), quick_jit(jax.grad(plain))(x), rtol=1e-9)
+    value = quick_jit(projected)
+    differences = [(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(2)]
+    np.testing.assert_allclose(gradient(x), differences, rtol=DIFFERENCE)
+    forward = quick_jit(jax.jacfwd(projected))(x)
+    np.testing.assert_allclose(forward, gradient(x), rtol=1e-9)
+
+
+@pytest.mark.parametrize("solver", [jc.Dense(), jc.ConjugateGradients()], ids=["dense", "cg"])
+def test_solvers_agree_and_batches_are_loops(solver):
+    system, state = four_bar()
+    worlds = [moved(state, 0.03, seed, 1.0) for seed in range(3)]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
+    reference, method = projecting(system), jc.Method(stabilizer=PROJECTION, solver=solver)
+    got = quick_jit(jax.vmap(lambda s: jc.step(system, method, s, None, 0.0)[0]))(batch)
+    for i, world in enumerate(worlds):
+        expected = reference(system, world)
+        np.testing.assert_allclose(got.q[i], expected.q, atol=1e-10)
+        np.testing.assert_allclose(got.v[i], expected.v, atol=1e-8)
+
+
+def test_projection_keeps_the_order_of_runge_kutta():
+    """Fourth order on a double pendulum, by halving the step."""
+    scene = jc.Scene(dim=2)
+    for i in range(2):
+        scene.add_particle(f"p{i}", mass=1.0, position=(i + 1.0, 0.0))
+        scene.add(jc.Distance(f"rod{i}", f"p{i - 1}" if i else jc.WORLD, f"p{i}"))
+    system, state = scene.build()
+    method = jc.Method(jc.RK4(), PROJECTION)
+
+    @quick_jit
+    def run(dt, steps):
+        return jax.lax.fori_loop(
+            0, steps, lambda _, s: jc.step(system, method, s, None, dt)[0], state
+        )
+
+    ends = [run(1.0 / n, n).q for n in (40, 80, 160)]
+    errors = [float(jnp.max(jnp.abs(a - b))) for a, b in zip(ends, ends[1:], strict=False)]
+    order = np.log2(errors[0] / errors[1])
+    assert 3.8 < order < 4.4
