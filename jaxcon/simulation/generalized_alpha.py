@@ -28,6 +28,7 @@ References:
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -130,7 +131,8 @@ class GeneralizedAlpha:
     rho: Any = 0.9
     tolerance: Any = None
     tikhonov: Any = None
-    iterations: int = static(default=4)
+    iterations: int = static(default=6)
+    projects: bool = static(default=True)
 
     def init(self, system: Any, q: Array, v: Array) -> History:
         """Not started."""
@@ -181,15 +183,16 @@ class GeneralizedAlpha:
         rows = linearize(dynamics.system, state.q, state.v, state.time)
         scheme = Scheme.of(jnp.asarray(self.rho, state.q.dtype)[None], dt[None])
         equations = Equations(dynamics, state, known, scheme, self._softness(dynamics, state, rows))
-        x, moved, singular = root(equations, self.iterations)
+        allowed = self._tolerance(q := state.q) * (1 + jnp.max(jnp.abs(q), axis=0, initial=0))
+        x, late, singular = root(equations, jax.lax.stop_gradient(allowed), self.iterations)
         acceleration, multipliers = equations.split(x)
         average, q, v = equations.end(acceleration)
-        allowed = self._tolerance(q.dtype) * (1 + jnp.max(jnp.abs(state.q), axis=0, initial=0))
-        late = jnp.where(moved <= allowed, Status.OK, Status.NOT_CONVERGED).astype(jnp.int32)
-        code = status.first(began, status.first(judge(x, singular), late))
+        t = state.time + dt
+        v, moved = projected(dynamics, q, v, t) if self.projects else (v, jnp.zeros_like(began))
+        late = jnp.where(late, Status.NOT_CONVERGED, Status.OK).astype(jnp.int32)
+        code = functools.reduce(status.first, (began, judge(x, singular), late, moved))
         kept = History(acceleration, average, multipliers, jnp.ones_like(memory.started))
-        solution = Solution(acceleration, multipliers, code)
-        return Advanced((q, v, state.time + dt), solution, rows, kept)
+        return Advanced((q, v, t), Solution(acceleration, multipliers, code), rows, kept)
 
     def _softness(self, dynamics: Dynamics, state: State, rows: Rows) -> Array | None:
         """ε W, (n_c,); None where there is none."""
@@ -201,10 +204,10 @@ class GeneralizedAlpha:
         problem = saddle(dynamics.system, state.q, rows, state.v, rows.bias)
         return share * scaled(problem, 1e-6)
 
-    def _tolerance(self, dtype: Any) -> Any:
+    def _tolerance(self, q: Array) -> Any:
         if self.tolerance is None:
-            return float(jnp.finfo(dtype).eps) ** (2 / 3)
-        return jnp.asarray(self.tolerance, dtype)
+            return float(jnp.finfo(q.dtype).eps) ** (2 / 3)
+        return jnp.asarray(self.tolerance, q.dtype)
 
 
 def _begun(dynamics: Dynamics, state: State, memory: History) -> tuple[History, Array]:
@@ -276,11 +279,16 @@ class Equations:
         return jnp.where(compliance > 0, soft, hard)
 
 
-def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
-    """x with r(x) = 0 by Newton's method, the root's derivative in place of the iterations'.
+def root(equations: Equations, allowed: Array, iterations: int) -> tuple[Array, Array, Array]:
+    """x with r(x) = 0 by Newton's method; the derivative is that of the root.
+
+    Args:
+        equations: r.
+        allowed: by how much the last correction may move q, ().
+        iterations: how many.
 
     Returns:
-        x (n_v + n_c,), by how much the last correction moved q, (), and whether a matrix was
+        x (n_v + n_c,), whether the last correction was too large, (), and whether a matrix was
         singular, ().
     """
     inertia = jax.lax.stop_gradient(equations.inertia)
@@ -289,22 +297,36 @@ def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
         columns = matrix(linear, right)
         return native.per_world(_solve, right.ndim - 1)(columns, right, inertia)
 
-    def newton(residual: Any, x: Array) -> tuple[Array, tuple[Array, Array]]:
+    def newton(residual: Any, guess: Array) -> tuple[Array, tuple[Array, Array]]:
         def improve(known: Any, _: None) -> tuple[Any, None]:
             x, _, singular = known
             value, linear = jax.linearize(residual, x)
             correction, dependent = solve(linear, value)
             return (x - correction, correction, singular | dependent), None
 
-        start = x, jnp.zeros_like(x), jnp.zeros(x.shape[1:], bool)
+        start = guess, jnp.zeros_like(guess), jnp.zeros(allowed.shape, bool)
         (x, last, singular), _ = jax.lax.scan(improve, start, length=iterations)
-        turned = jnp.abs(equations.split(last)[0]) * equations.scheme.reach
-        return x, (jnp.max(turned, axis=0, initial=0), singular)
+        moved = jnp.abs(equations.split(last)[0]) * equations.scheme.reach
+        return x, (~(jnp.max(moved, axis=0, initial=0) <= allowed), singular)
 
-    x, (moved, singular) = jax.lax.custom_root(
+    x, (late, singular) = jax.lax.custom_root(
         equations, equations.guess, newton, lambda g, y: solve(g, y)[0], has_aux=True
     )
-    return x, moved, singular
+    return x, late, singular
+
+
+def projected(dynamics: Dynamics, q: Array, v: Array, t: Any) -> tuple[Array, Array]:
+    """v with φ̇ = 0, nearest in the metric of M, and the status of the solution.
+
+    M w = Jᵀ Λ, J w + C Λ = −φ̇: what is compliant gets its share of the impulse.
+    """
+    rows = linearize(dynamics.system, q, v, t)
+    law = dynamics.stabilizer.impose(rows, dynamics.memory, dynamics.dt)
+    compliance = law.rows.compliance
+    target = -rows.rate if compliance is None else jnp.where(compliance > 0, 0, -rows.rate)
+    problem = saddle(dynamics.system, q, law.rows, jnp.zeros_like(v), target)
+    change, _, code = dynamics.solver.solve(problem)
+    return v + change, code
 
 
 def matrix(linear: Any, like: Array) -> Array:
