@@ -47,7 +47,7 @@ from jaxcon.simulation.integrators import Advanced
 from jaxcon.simulation.recovery import keep
 from jaxcon.solvers import lu
 from jaxcon.solvers.proximal import scaled
-from jaxcon.solvers.saddle import Solution, judge
+from jaxcon.solvers.saddle import judge
 from jaxcon.stabilization.baumgarte import Baumgarte, Law
 
 
@@ -107,17 +107,21 @@ class Scheme(NamedTuple):
 
 @pytree
 class GeneralizedAlpha:
-    """Implicit, second order: holds φ = 0 and ψ = 0 at the end of each step, whatever its length.
+    """Implicit, second order: holds φ = 0 and φ̇ = 0 at the end of each step, whatever its length.
 
     For scenes that are stiff in their springs or in the ratios of their masses, where an explicit
-    method would need steps as short as the fastest vibration: here such a vibration is damped.
-    There is no feedback: `Baumgarte()` without gains means nothing, as `Unstabilized()` does. φ̇
-    is kept small, of order h², but not at zero. The solver serves the first step alone.
+    method needs steps as short as the fastest vibration: here such a vibration is damped. There is
+    no feedback: `Baumgarte()` without gains means nothing, as `Unstabilized()` does.
 
-    `info` has the acceleration and λ that the step found, at its end. Where rows may depend on each
-    other, as those of closed loops do, each gives way by its λ times ε W κβh², W the diagonal of
-    J M⁻¹ Jᵀ, which is below rounding: λ is then unique. The derivative of a step is that of its
-    solution, exact to every order. Newton's matrix is dense: for up to some hundreds of rows.
+    The equations above leave φ̇ of order h². It is brought to zero by the smallest change of v in
+    the metric of M, as without it light links between heavy ends start to shake where ρ > 0.7. Then
+    the λ of the equations is of first order only, and `info` has a and λ as they are at the end of
+    the step, by `solver` from q and v there.
+
+    Where rows may depend on each other, as those of closed loops do, each gives way by its λ times
+    ε W κβh², W the diagonal of J M⁻¹ Jᵀ, which is below rounding: λ is then unique. The derivative
+    of a step is that of its solution, exact to every order. Newton's matrix is dense: for up to
+    some hundreds of rows. A state that is changed by hand starts anew, by `init`.
 
     Attributes:
         rho: ρ∞, from 1 (no dissipation) to 0 (the highest frequencies are gone after a step).
@@ -126,6 +130,7 @@ class GeneralizedAlpha:
         tikhonov: ε; if None, the third root of the spacing of floating numbers where the scene has
             loops, and 0 elsewhere.
         iterations: of Newton's method, each with a new matrix.
+        projects: whether φ̇ is brought to zero.
     """
 
     rho: Any = 0.9
@@ -184,15 +189,16 @@ class GeneralizedAlpha:
         scheme = Scheme.of(jnp.asarray(self.rho, state.q.dtype)[None], dt[None])
         equations = Equations(dynamics, state, known, scheme, self._softness(dynamics, state, rows))
         allowed = self._tolerance(q := state.q) * (1 + jnp.max(jnp.abs(q), axis=0, initial=0))
-        x, late, singular = root(equations, jax.lax.stop_gradient(allowed), self.iterations)
+        x, moved, singular = root(equations, self.iterations)
         acceleration, multipliers = equations.split(x)
         average, q, v = equations.end(acceleration)
         t = state.time + dt
-        v, moved = projected(dynamics, q, v, t) if self.projects else (v, jnp.zeros_like(began))
-        late = jnp.where(late, Status.NOT_CONVERGED, Status.OK).astype(jnp.int32)
-        code = functools.reduce(status.first, (began, judge(x, singular), late, moved))
+        v, nearest = projected(dynamics, q, v, t) if self.projects else (v, jnp.zeros_like(began))
+        late = jnp.where(moved <= allowed, Status.OK, Status.NOT_CONVERGED).astype(jnp.int32)
+        code = functools.reduce(status.first, (began, judge(x, singular), late, nearest))
         kept = History(acceleration, average, multipliers, jnp.ones_like(memory.started))
-        return Advanced((q, v, t), Solution(acceleration, multipliers, code), rows, kept)
+        solution, _ = dynamics(q, v, t)  # compiled only where it is read
+        return Advanced((q, v, t), solution._replace(status=code), rows, kept)
 
     def _softness(self, dynamics: Dynamics, state: State, rows: Rows) -> Array | None:
         """ε W, (n_c,); None where there is none."""
@@ -279,16 +285,11 @@ class Equations:
         return jnp.where(compliance > 0, soft, hard)
 
 
-def root(equations: Equations, allowed: Array, iterations: int) -> tuple[Array, Array, Array]:
+def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
     """x with r(x) = 0 by Newton's method; the derivative is that of the root.
 
-    Args:
-        equations: r.
-        allowed: by how much the last correction may move q, ().
-        iterations: how many.
-
     Returns:
-        x (n_v + n_c,), whether the last correction was too large, (), and whether a matrix was
+        x (n_v + n_c,), by how much the last correction moved q, (), and whether a matrix was
         singular, ().
     """
     inertia = jax.lax.stop_gradient(equations.inertia)
@@ -304,21 +305,23 @@ def root(equations: Equations, allowed: Array, iterations: int) -> tuple[Array, 
             correction, dependent = solve(linear, value)
             return (x - correction, correction, singular | dependent), None
 
-        start = guess, jnp.zeros_like(guess), jnp.zeros(allowed.shape, bool)
+        start = guess, jnp.zeros_like(guess), jnp.zeros(guess.shape[1:], bool)
         (x, last, singular), _ = jax.lax.scan(improve, start, length=iterations)
         moved = jnp.abs(equations.split(last)[0]) * equations.scheme.reach
-        return x, (~(jnp.max(moved, axis=0, initial=0) <= allowed), singular)
+        # the derivative of a root passes on real numbers only
+        return x, (jnp.max(moved, axis=0, initial=0), singular.astype(x.dtype))
 
-    x, (late, singular) = jax.lax.custom_root(
+    x, (moved, singular) = jax.lax.custom_root(
         equations, equations.guess, newton, lambda g, y: solve(g, y)[0], has_aux=True
     )
-    return x, late, singular
+    return x, moved, singular > 0
 
 
 def projected(dynamics: Dynamics, q: Array, v: Array, t: Any) -> tuple[Array, Array]:
     """v with φ̇ = 0, nearest in the metric of M, and the status of the solution.
 
-    M w = Jᵀ Λ, J w + C Λ = −φ̇: what is compliant gets its share of the impulse.
+    M w = Jᵀ Λ, J w + C Λ = −φ̇: what is compliant gets its share of the impulse. Dependent rows
+    seem to contradict each other where φ̇ is but rounding; only failures count.
     """
     rows = linearize(dynamics.system, q, v, t)
     law = dynamics.stabilizer.impose(rows, dynamics.memory, dynamics.dt)
@@ -326,7 +329,7 @@ def projected(dynamics: Dynamics, q: Array, v: Array, t: Any) -> tuple[Array, Ar
     target = -rows.rate if compliance is None else jnp.where(compliance > 0, 0, -rows.rate)
     problem = saddle(dynamics.system, q, law.rows, jnp.zeros_like(v), target)
     change, _, code = dynamics.solver.solve(problem)
-    return v + change, code
+    return v + change, jnp.where(status.failed(code), code, Status.OK).astype(jnp.int32)
 
 
 def matrix(linear: Any, like: Array) -> Array:
