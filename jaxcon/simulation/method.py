@@ -25,7 +25,8 @@ class Method:
     """Integrator, stabiliser and solver; the defaults suit a scene that nobody has tuned.
 
     Attributes:
-        integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
+        integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`; for stiff
+            scenes `GeneralizedAlpha()`, which is implicit.
         stabilizer: `Baumgarte(…)` or `Unstabilized()`.
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
             want independent rows.
