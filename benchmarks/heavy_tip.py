@@ -164,10 +164,12 @@ def main() -> None:
     for name, (method, steps) in METHODS.items():
         for dt in steps:
             got = run(chain, method, dt, reference)
-            said = "OK" if got.status == jc.Status.OK else f"{got.status.name} at {got.time:.3f} s"
+            held = got.status == jc.Status.OK
+            said = "OK" if held else f"{got.status.name} at {got.time:.3f} s"
+            cost = f"{got.cost:.2g}" if held else "-"
             print(
                 f"| {name} | {dt:g} | {said} | {got.violation:.1e} | {got.energy:.1e}"
-                f" | {got.error:.1e} | {got.cost:.2g} |",
+                f" | {got.error:.1e} | {cost} |",
                 flush=True,
             )
 
