@@ -80,6 +80,7 @@ from jaxcon.model.elastic import Bending, Flexure
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
+from jaxcon.simulation.generalized_alpha import GeneralizedAlpha
 from jaxcon.simulation.initialize import init
 from jaxcon.simulation.integrators import (
     RK4,
@@ -147,6 +148,7 @@ __all__ = [
     "Flexure",
     "Force",
     "Gear",
+    "GeneralizedAlpha",
     "GeneralizedSystem",
     "Heun",
     "Holonomic",

@@ -36,8 +36,9 @@ class Method:
     """Integrator, stabiliser and solver; the defaults suit a scene that nobody has tuned.
 
     Attributes:
-        integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
-        stabilizer: `Baumgarte(…)`, `PID(…)`, `Penalty(…)`, …, or `Unstabilized()`.
+        integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`; `RATTLE()`
+            and, for stiff scenes, `GeneralizedAlpha()`, which keep constraints by themselves.
+        stabilizer: `Baumgarte(…)`, `PID(…)`, `Projection(…)`, `Penalty(…)`, …, `Unstabilized()`.
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
             want independent rows; `Priority(levels)` meets them level by level.
         recovery: `Recovery(…)`, which repairs steps that fail; None, and a world that fails stops.

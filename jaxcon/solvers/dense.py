@@ -1,14 +1,11 @@
 """The whole saddle matrix, factored as it is (chapter 3.2.5, method 1): the reference."""
 
-from collections.abc import Callable
-from typing import Any
-
-import jax
 import jax.numpy as jnp
 
 from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
+from jaxcon.solvers import lu
 from jaxcon.solvers.saddle import Factored, Saddle, Solution, free_motion, judge
 
 
@@ -38,51 +35,17 @@ class Dense:
         return lambda force, target: native.per_world(_solve, rank)(known, force, target)
 
 
-@pytree
-class Whole:
-    """S K S = P L U, of one world."""
-
-    scale: Array
-    matrix: Array
-    factor: tuple[Array, Array]
-    singular: Array
-
-
-def _factor(system: Saddle) -> Whole:
+def _factor(system: Saddle) -> lu.Factored:
     """Of one world."""
     j = system.jacobian.dense()
-    scale = jax.lax.stop_gradient(_scale(system, j))
-    matrix = saddle_matrix(system, j) * scale[None] * scale[:, None]
-    factor = jax.scipy.linalg.lu_factor(jax.lax.stop_gradient(matrix))
-    pivots = jnp.abs(jnp.diagonal(factor[0]))
-    singular = ~jnp.all(pivots > matrix.shape[0] * jnp.finfo(matrix.dtype).eps)
-    return Whole(scale, matrix, factor, singular & jnp.all(jnp.isfinite(matrix)))
+    return lu.factor(saddle_matrix(system, j), _scale(system, j))
 
 
-def _solve(known: Whole, force: Array, target: Array) -> Solution:
+def _solve(known: lu.Factored, force: Array, target: Array) -> Solution:
     """Of one world."""
-    right = jnp.concatenate([force, target]) * known.scale
-    solution = known.scale * jax.lax.custom_linear_solve(
-        lambda x: known.matrix @ x,
-        right,
-        lambda multiply, x: _refined(multiply, known.factor, 0, x),
-        lambda multiply, x: _refined(multiply, known.factor, 1, x),
-    )
+    solution = known.solve(jnp.concatenate([force, target]))
     n = force.shape[0]
     return Solution(solution[:n], solution[n:], judge(solution, known.singular))
-
-
-def _refined(multiply: Callable[[Array], Array], factor: Any, trans: int, right: Array) -> Array:
-    """The solution after one step of refinement.
-
-    Of the two it is the one whose error is small in each entry beside its own size, so that a light
-    body that moves with a heavy rotor has the right acceleration.
-
-    References:
-        Skeel, Iterative refinement implies numerical stability for Gaussian elimination (1980).
-    """
-    x = jax.scipy.linalg.lu_solve(factor, right, trans=trans)
-    return x + jax.scipy.linalg.lu_solve(factor, right - multiply(x), trans=trans)
 
 
 def saddle_matrix(system: Saddle, jacobian: Array) -> Array:
