@@ -25,8 +25,9 @@ class Method:
     """Integrator, stabiliser and solver; the defaults suit a scene that nobody has tuned.
 
     Attributes:
-        integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`.
-        stabilizer: `Baumgarte(…)` or `Unstabilized()`.
+        integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, any `RungeKutta(a, b)`, or
+            `RATTLE()`, which needs no stabiliser.
+        stabilizer: `Baumgarte(…)`, `Projection(…)` or `Unstabilized()`.
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
             want independent rows.
     """
