@@ -261,9 +261,15 @@ def test_coupled_velocities_contain_the_correction():
 
 def test_choices_that_do_not_exist_are_refused():
     system, state = dumbbell()
-    for bad in ({"metric": "size"}, {"iterations": 0}, {"every": 0}, {"factor": 1.5}):
-        with pytest.raises(ValueError, match=f"Projection: {next(iter(bad))}"):
-            jc.init(system, jc.Method(stabilizer=jc.Projection(**bad)), state.q, state.v)
+    bad = {
+        "metric": jc.Projection(metric="size"),
+        "iterations": jc.Projection(iterations=0),
+        "every": jc.Projection(every=0),
+        "factor": jc.Projection(factor=1.5),
+    }
+    for what, stabilizer in bad.items():
+        with pytest.raises(ValueError, match=f"Projection: {what}"):
+            jc.init(system, jc.Method(stabilizer=stabilizer), state.q, state.v)
 
 
 def on_circle(q):

@@ -35,7 +35,8 @@ class RankSafe:
         share: ε; if None, 1e-9 in float64 and 1e-5 in float32.
         rounds: k.
         scaling: w, the least length of a row beside the longest one.
-        conflict: the part of b that least squares may leave before it is called a conflict.
+        conflict: the part of b and J M⁻¹ f that least squares may leave before it is called a
+            conflict.
         always: also where the structure has no loops, for rows that depend on each other by their
             numbers alone.
 
@@ -86,13 +87,15 @@ class RankSafe:
         length = jnp.sqrt(weight)
 
         def solve(force: Array, target: Array) -> Solution:
+            asked = jnp.abs(target) + jnp.abs(system.jacobian.apply(system.mass.solve(force)))
+            size = jnp.max(asked / length, axis=0)
+
             def twice(right: Array, _: Any) -> Any:
                 solution = iterate(force, right, jnp.zeros_like(right))
-                left, size = remainder(system, right, solution, length)
-                return right - left, (solution, size)
+                return right - remainder(system, right, solution), solution
 
             met, found = jax.lax.scan(twice, target, None, length=2)
-            solution, size = jax.tree.map(lambda x: x[1], found)
+            solution = jax.tree.map(lambda x: x[1], found)
             left = target - met
             allowed = (jnp.asarray(self.conflict, target.dtype) * size)[None] * length
             allowed = allowed if system.noise is None else allowed + system.noise
@@ -173,12 +176,9 @@ def keep(chosen: Array, x: Solution, y: Solution) -> Solution:
     return jax.tree.map(lambda a, b: jnp.where(native.lift(chosen, a), a, b), x, y)
 
 
-def remainder(
-    system: Saddle, target: Array, solution: Solution, length: Array
-) -> tuple[Array, Array]:
-    """b − J a − C λ (n_c,), and by world how large b and J a are in rows of these lengths."""
+def remainder(system: Saddle, target: Array, solution: Solution) -> Array:
+    """b − J a − C λ, (n_c,)."""
     moved = system.jacobian.apply(solution.acceleration)
     if system.compliance is not None:
         moved = moved + system.compliance * solution.multipliers
-    size = jnp.max((jnp.abs(target) + jnp.abs(moved)) / length, axis=0)
-    return target - moved, size
+    return target - moved

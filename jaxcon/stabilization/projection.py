@@ -69,6 +69,9 @@ class Projection(Unstabilized):
     along the surface. Then velocities at that q: v = v* + W⁻¹ Jᵀ μ with J v + ∂φ/∂t = 0, the
     smallest change in the metric. Doing it in the other order would leave J v = −J d/h.
 
+    Rows that depend on each other do so on the surface only: off it J(q*) has directions too many,
+    by which the point is not unique; the solver's regularization chooses, within O(‖d‖).
+
     Rows of velocities alone are part of the second projection only. Rotors are inertia of the mass
     metric. The derivative is that of the root, in every world, and not of the iterations.
 
