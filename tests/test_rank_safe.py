@@ -163,6 +163,15 @@ def test_a_tree_is_solved_directly():
 SOLVERS = {"default": jc.RankSafe(), "strict": jc.Sparse()}
 
 
+def test_rest_is_no_conflict():
+    """With nothing asked of the rows, what rounding leaves of them contradicts nothing."""
+    system, state = table(4)
+    still = dataclasses.replace(state, v=jnp.zeros_like(state.v))
+    for s in (system, system.with_params({"gravity": (0.0, 0.0, 0.0)})):
+        for method in (jc.Method(), GENTLE):
+            assert jc.forward_dynamics(s, still, None, method, 1e-3).status == Status.OK
+
+
 def two_lengths(first, second):
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.05, 0.0))
