@@ -23,6 +23,7 @@ from benchmarks import (  # noqa: E402
     regression,
     residuals,
     roofline,
+    stabilisation,
     tables,
     targets,
     throughput,
@@ -30,6 +31,23 @@ from benchmarks import (  # noqa: E402
 )
 
 SMALL = ("chain-3", "planar-chain-3", "four-bar", "n-four-bar-2", "rope-5", "stewart")
+
+
+@pytest.mark.parametrize("name", list(stabilisation.STABILIZERS))
+def test_every_stabilizer_holds_a_double_pendulum(name):
+    """Projection to rounding, feedback and springs to what a step of RK4 adds."""
+    row = stabilisation.measure("double_pendulum", np.float64, "RK4", name, 2000, 1e-3)
+    assert row.remark == ""
+    bound = {"projection": 1e-12, "linearized projection": 1e-12}.get(name, 1e-4)
+    assert row.position < bound
+    assert row.velocity < max(bound, 1e-12) * 100
+    assert row.energy < 1e-3
+
+
+def test_an_implicit_method_says_what_it_refuses():
+    row = stabilisation.measure("pendulum", np.float64, "RATTLE", "PID", 10, 1e-3)
+    assert row.remark.startswith("refused: RATTLE")
+    assert np.isnan(row.position)
 
 
 def test_drift_grows_without_feedback_and_stays_small_with_it():

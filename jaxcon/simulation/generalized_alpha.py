@@ -38,7 +38,8 @@ from jaxcon.simulation.integrators import Advanced
 from jaxcon.simulation.recovery import keep
 from jaxcon.solvers.proximal import scaled
 from jaxcon.solvers.saddle import judge
-from jaxcon.stabilization.baumgarte import Baumgarte
+from jaxcon.stabilization.baumgarte import asks_nothing
+from jaxcon.stabilization.projection import Projection
 
 
 @pytree
@@ -88,13 +89,12 @@ class GeneralizedAlpha:
                 "it solves M v̇ = f + Jᵀλ, which variational equations are not;"
                 " use an explicit integrator such as RK4()"
             )
-        gains = (getattr(stabilizer, name, None) for name in ("alpha", "beta"))
-        if isinstance(stabilizer, Baumgarte) and any(gain is not None for gain in gains):
-            return (
-                "it solves φ = 0 itself and leaves nothing to feedback, but Baumgarte got gains;"
-                " use Baumgarte() without them, or Unstabilized()"
-            )
-        return None
+        if asks_nothing(stabilizer) or isinstance(stabilizer, Projection):
+            return None
+        return (
+            f"it solves φ = 0 itself and leaves nothing to {type(stabilizer).__name__}; use"
+            " Baumgarte() without gains, Unstabilized() or Projection()"
+        )
 
     def check(self) -> None:
         """Checks the numbers.

@@ -18,7 +18,7 @@ from jaxcon.model.state import State
 from jaxcon.simulation.integrators import Advanced
 from jaxcon.solvers import roots
 from jaxcon.solvers.saddle import Factored, Solution
-from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
+from jaxcon.stabilization.baumgarte import asks_nothing
 
 
 @pytree
@@ -64,9 +64,7 @@ class RATTLE:
 
     def refuses(self, system: Any, stabilizer: Any) -> str | None:
         """Feedback and projection: the step keeps both levels of the constraints itself."""
-        plain = type(stabilizer) is Unstabilized
-        default = type(stabilizer) is Baumgarte and stabilizer.alpha is stabilizer.beta is None
-        if plain or default:
+        if asks_nothing(stabilizer):
             return None
         return (
             "it keeps positions and velocities on the constraints itself, and a stabilizer would"

@@ -130,3 +130,9 @@ class Baumgarte(Unstabilized):
         alpha = by_row(self.alpha, self.fallback[0], rows)
         beta = by_row(self.beta, self.fallback[1], rows)
         return -rows.bias - 2 * alpha * rows.rate - beta * beta * rows.residual
+
+
+def asks_nothing(stabilizer: Any) -> bool:
+    """Whether it has no gains of its own, and may stand beside what keeps constraints by itself."""
+    default = type(stabilizer) is Baumgarte and stabilizer.alpha is stabilizer.beta is None
+    return default or type(stabilizer) is Unstabilized
