@@ -34,9 +34,9 @@ class RankSafe:
         solver: `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`.
         share: ε; if None, 1e-9 in float64 and 1e-5 in float32.
         rounds: k.
-        scaling: w, the least length of a row beside the longest one.
+        scaling: w, the least length of a row beside the longest one; if None, 1e-6.
         conflict: the part of b and J M⁻¹ f that least squares may leave before it is called a
-            conflict.
+            conflict; if None, a hundredth.
         always: also where the structure has no loops, for rows that depend on each other by their
             numbers alone.
 
@@ -48,8 +48,8 @@ class RankSafe:
 
     solver: Any = Sparse()
     share: Any = None
-    scaling: Any = 1e-6
-    conflict: Any = 1e-2
+    scaling: Any = None
+    conflict: Any = None
     rounds: int = static(default=3)
     always: bool = static(default=False)
 
@@ -82,7 +82,8 @@ class RankSafe:
         It is done twice: what the first one leaves of b is taken out of it for the second, which
         otherwise would bring 1/ε of it into λ.
         """
-        weight = self._share(system.target.dtype) * scaled(system, self.scaling)
+        floor = 1e-6 if self.scaling is None else self.scaling
+        weight = self._share(system.target.dtype) * scaled(system, floor)
         iterate = proximal(self.solver, system, weight, self.rounds)
         length = jnp.sqrt(weight)
 
@@ -97,7 +98,8 @@ class RankSafe:
             met, found = jax.lax.scan(twice, target, None, length=2)
             solution = jax.tree.map(lambda x: x[1], found)
             left = target - met
-            allowed = (jnp.asarray(self.conflict, target.dtype) * size)[None] * length
+            share = 1e-2 if self.conflict is None else jnp.asarray(self.conflict, target.dtype)
+            allowed = (share * size)[None] * length
             allowed = allowed if system.noise is None else allowed + system.noise
             conflict = jnp.any(jnp.abs(left) > allowed, axis=0)
             code = jnp.where(conflict, Status.CONFLICT, Status.OK).astype(jnp.int32)
