@@ -91,7 +91,7 @@ class RATTLE:
         middle, pull = between[: len(v)], between[len(v) :]
         end, code = self._arrive(dynamics, state, middle, dt)
         code = status.first(drift.solve(*_no_load(rows, v)).status, code)
-        code = status.first(_failures(code), _late(moved, middle))
+        code = status.first(_failures(code), _late(moved, middle, _rounding(q, dt)))
         q = system.retract(q, h * middle)
         acceleration = numerics.safe_divide(end - v, h)
         solution = Solution(acceleration, numerics.safe_divide(2 * pull, h), code)
@@ -129,7 +129,7 @@ class RATTLE:
             return v - kicked(v).acceleration
 
         v, moved = roots.implicit(residual, first.acceleration, iterate, self.rounds)
-        return v, status.first(_failures(first.status), _late(moved, v))
+        return v, status.first(_failures(first.status), _late(moved, v, jnp.zeros_like(moved[0])))
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """None: there is nothing to feed back."""
@@ -199,11 +199,17 @@ def _failures(code: Array) -> Array:
     return jnp.where(status.failed(code), code, Status.OK).astype(code.dtype)
 
 
-def _late(moved: Array, v: Array) -> Array:
-    """NOT_CONVERGED where v still changed at last."""
+def _rounding(q: Array, dt: Any) -> Array:
+    """What the rounding of q makes of φ/h, by world."""
+    eps = float(jnp.finfo(q.dtype).eps)
+    return numerics.safe_divide(64 * eps * (1 + jnp.max(jnp.abs(q), axis=0)), dt)
+
+
+def _late(moved: Array, v: Array, rounding: Array) -> Array:
+    """NOT_CONVERGED where v still changed at last by more than rounding makes of it."""
     eps = float(jnp.finfo(v.dtype).eps)
     size = 1 + jnp.max(jnp.abs(v), axis=0)
-    late = jnp.max(jnp.abs(moved), axis=0) > eps ** (2 / 3) * size
+    late = jnp.max(jnp.abs(moved), axis=0) > eps ** (2 / 3) * size + rounding
     return jnp.where(late, Status.NOT_CONVERGED, Status.OK).astype(jnp.int32)
 
 

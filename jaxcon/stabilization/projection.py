@@ -83,8 +83,8 @@ class Projection(Unstabilized):
             after a step, twelve where d is a tenth of the scene. 1 is the linearized projection,
             which leaves O(‖d‖²) and is differentiated as it is.
         tolerance: max |φ|, a number or a `Tolerance`. A world stays as it is once it is there, and
-            is NOT_CONVERGED if it is not there at the end. If None, worlds stay within 4 ε s and
-            fail beyond ε^⅔ s with s = 1 + max |q| and ε the spacing of floating numbers, and the
+            is NOT_CONVERGED if it is not there at the end. If None, all iterations are made, and
+            worlds fail beyond ε^⅔ s with s = 1 + max |q| and ε the spacing of floating numbers; the
             linearized projection never fails.
         factor: of each step, in (0, 1].
         every: how many steps there are from one projection to the next.
@@ -229,7 +229,7 @@ class Projection(Unstabilized):
         size = 1 + _largest(state.q)
         eps = float(jnp.finfo(size.dtype).eps)
         fails = jnp.full_like(size, jnp.inf) if self.iterations == 1 else eps ** (2 / 3) * size
-        return Bounds(4 * eps * size, fails)
+        return Bounds(jnp.zeros_like(size), fails)
 
     def _check(self) -> None:
         if self.metric not in METRICS:
