@@ -9,7 +9,7 @@ import pytest
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
-from jaxcon.core.status import Status
+from jaxcon.core.status import Status, first
 from jaxcon.dynamics.forward import saddle
 from jaxcon.verification import singular
 from tests.tolerances import DIFFERENCE
@@ -172,11 +172,11 @@ def test_rest_is_no_conflict():
             assert jc.forward_dynamics(s, still, None, method, 1e-3).status == Status.OK
 
 
-def two_lengths(first, second):
+def two_lengths(short, long):
     scene = jc.Scene(dim=2)
-    scene.add_particle("bob", mass=1.0, position=(1.05, 0.0))
-    scene.add(jc.Distance("short", jc.WORLD, "bob", length=first))
-    scene.add(jc.Distance("long", jc.WORLD, "bob", length=second))
+    scene.add_particle("bob", mass=1.0, position=((short + long) / 2, 0.0))
+    scene.add(jc.Distance("short", jc.WORLD, "bob", length=short))
+    scene.add(jc.Distance("long", jc.WORLD, "bob", length=long))
     return scene.build()
 
 
@@ -263,3 +263,56 @@ def test_rows_of_generalized_coordinates():
     lengths = np.array([1.0, 3.0])
     weights = found[1].multipliers @ lengths
     np.testing.assert_allclose(weights, found[0].multipliers[0], rtol=1e-8)
+
+
+CONFLICT, LATE = Status.CONFLICT, Status.NOT_CONVERGED
+TOLD = {
+    "feedback": (jc.Method(), CONFLICT),
+    "multipliers": (jc.Method(stabilizer=jc.AugmentedLagrangian()), CONFLICT),
+    "implicit": (jc.Method(jc.GeneralizedAlpha()), CONFLICT),
+    "RATTLE": (jc.Method(jc.RATTLE()), LATE),
+    "projection": (jc.Method(jc.RK4(), jc.Projection()), LATE),
+}
+
+
+@pytest.mark.parametrize("name", list(TOLD))
+def test_every_method_tells_a_contradiction(name):
+    """By least squares and a note, or by a failure where positions must be met."""
+    method, expected = TOLD[name]
+
+    @jax.jit
+    def statuses(system, state):
+        state = jc.init(system, method, state.q, state.v)
+        record = rolled_status
+        return jc.rollout(system, method, state, None, 1e-3, 20, record=record)[1]
+
+    assert np.all(statuses(*two_lengths(1.0, 1.0)) == Status.OK)
+    for off in (0.1, 1e-3):
+        assert np.all(statuses(*two_lengths(1.0, 1.0 + off)) == expected)
+
+
+def rolled_status(state, info):
+    return info.status
+
+
+def test_a_conflict_is_seen_through_the_note_of_a_repair():
+    codes = jnp.asarray([Status.ROLLED_BACK, Status.CONFLICT, Status.SINGULAR, Status.OK])
+    graver = first(codes[:, None], codes[None, :])
+    expected = np.array([[17, 16, 2, 17], [16, 16, 2, 16], [2, 2, 2, 2], [17, 16, 2, 0]])
+    np.testing.assert_array_equal(graver, expected)
+
+
+def test_two_drives_that_agree():
+    scene = jc.Scene(dim=2)
+    scene.add_body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0), angular_velocity=0.3)
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
+    for name in ("first", "second"):
+        scene.add(jc.Drive(name, "hinge", slowly))
+    system, state = scene.build()
+    solution = jc.forward_dynamics(system, state, None, GENTLE, 1e-3)
+    assert solution.status == Status.OK
+    np.testing.assert_allclose(solution.acceleration[2], 0.0, atol=1e-7)
+
+
+def slowly(t, params):
+    return 0.3 * t

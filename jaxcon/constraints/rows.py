@@ -201,6 +201,9 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     inertial = tuple(name for group in rotors for name in group.names)
     pairs = list(zip(system.constraints, sets, strict=True))
     loops = has_loops(rows for group, rows in pairs if not isinstance(group, Armatures | Drives))
+    drives = [group.along for group, _ in pairs if isinstance(group, Drives)]
+    driven = [(along.group, along.joints, along.name) for along in drives]
+    loops |= len(set(driven)) < len(driven)
     loops |= any(isinstance(group, Custom) and len(rows.value) > 1 for group, rows in pairs)
     layout = RowLayout(tuple(entries), tuple(free), inertial, loops)
     return Rows(residual, rate, jacobian, bias, layout, compliance)

@@ -51,6 +51,16 @@ def positive(owner: str, what: str, x: Any, strictly: bool = True) -> None:
             raise ValueError(f"{owner}: {what} must be {bound} and finite, got {values.tolist()}.")
 
 
+def count(owner: str, what: str, x: Any, least: int = 1) -> None:
+    """Checks that a value is a whole number, and not below the least one.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not isinstance(x, int) or isinstance(x, bool) or x < least:
+        raise ValueError(f"{owner}: {what} must be a whole number from {least}, got {x!r}.")
+
+
 def nonzero(owner: str, what: str, x: Any) -> None:
     """Checks that a vector has a direction."""
     if is_concrete(x):

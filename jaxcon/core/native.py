@@ -218,6 +218,11 @@ def spread(tree: PyTree, batch: tuple[int, ...]) -> PyTree:
     return jax.tree.map(one, tree)
 
 
+def keep(chosen: Array, x: PyTree, y: PyTree) -> PyTree:
+    """One tree in the chosen worlds, another in the others."""
+    return jax.tree.map(lambda a, b: jnp.where(lift(chosen, a), a, b), x, y)
+
+
 def lift(x: Array, like: Array) -> Array:
     """A number of each world, (…), with leading axes to meet an array (n, …)."""
     return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)

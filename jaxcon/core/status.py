@@ -57,9 +57,16 @@ def failed(code: Array) -> Array:
     return (code != Status.OK) & (code < Status.CONFLICT)
 
 
+def failures(code: Array) -> Array:
+    """The code where it is a failure, OK where it is a note."""
+    return jnp.where(failed(code), code, Status.OK).astype(code.dtype)
+
+
 def first(earlier: Array, later: Array) -> Array:
-    """The earlier code unless it is OK, or only a note and the later one a failure."""
-    return jnp.where(failed(later) & ~failed(earlier) | (earlier == Status.OK), later, earlier)
+    """The graver code, a failure before a conflict before a repair; of equals the earlier."""
+    conflict = (later == Status.CONFLICT) & (earlier > Status.CONFLICT)
+    graver = failed(later) & ~failed(earlier) | conflict
+    return jnp.where((earlier == Status.OK) | graver, later, earlier)
 
 
 def raise_for_status(result: object) -> None:

@@ -27,6 +27,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, layout_of, linearize
 from jaxcon.core import checks, status
+from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
@@ -35,9 +36,8 @@ from jaxcon.dynamics.vakonomic import Vakonomic
 from jaxcon.model.state import State
 from jaxcon.simulation.implicit import Equations, History, Scheme, root
 from jaxcon.simulation.integrators import Advanced
-from jaxcon.simulation.recovery import keep
 from jaxcon.solvers.proximal import scaled
-from jaxcon.solvers.saddle import judge
+from jaxcon.solvers.saddle import Solution, judge
 from jaxcon.stabilization.baumgarte import asks_nothing
 from jaxcon.stabilization.projection import Projection
 
@@ -105,10 +105,7 @@ class GeneralizedAlpha:
         rho = np.asarray(self.rho) if checks.is_concrete(self.rho) else np.ones(())
         if not np.all((rho >= 0) & (rho <= 1)):
             raise ValueError(f"GeneralizedAlpha: rho must be from 0 to 1, got {self.rho}.")
-        if self.iterations < 1:
-            raise ValueError(
-                f"GeneralizedAlpha: iterations must be 1 or more, got {self.iterations}."
-            )
+        checks.count("GeneralizedAlpha", "iterations", self.iterations)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """None: α = β = 0."""
@@ -133,8 +130,22 @@ class GeneralizedAlpha:
         late = jnp.where(moved <= allowed, Status.OK, Status.NOT_CONVERGED).astype(jnp.int32)
         code = functools.reduce(status.first, (began, judge(x, singular), late, nearest))
         kept = History(acceleration, average, multipliers, jnp.ones_like(memory.started))
-        solution, _ = dynamics(q, v, t)  # compiled only where it is read
+        solution, ends = dynamics(q, v, t)  # compiled only where it is read
+        if equations.soft is not None:
+            code = status.first(code, self._contradicted(equations, solution, ends, allowed))
         return Advanced((q, v, t), solution._replace(status=code), rows, kept)
+
+    def _contradicted(
+        self, equations: Equations, solution: Solution, ends: Rows, allowed: Array
+    ) -> Array:
+        """CONFLICT where φ gave way by more than the λ of least norm accounts for.
+
+        φ = −κβh² ε W λ, and the λ of rows that contradict each other is that large.
+        """
+        gives = equations.scheme.reach * equations.soft * jnp.abs(solution.multipliers)
+        most = allowed + 10 * jnp.max(gives, axis=0)
+        bad = jnp.max(jnp.abs(ends.residual), axis=0) > most
+        return jnp.where(bad, Status.CONFLICT, Status.OK).astype(jnp.int32)
 
     def _softness(self, dynamics: Dynamics, state: State, rows: Rows) -> Array | None:
         """ε W, (n_c,); None where there is none."""
@@ -176,4 +187,4 @@ def projected(dynamics: Dynamics, q: Array, v: Array, t: Any) -> tuple[Array, Ar
     target = -rows.rate if compliance is None else jnp.where(compliance > 0, 0, -rows.rate)
     problem = saddle(dynamics.system, q, law.rows, jnp.zeros_like(v), target)
     change, _, code = dynamics.solver.solve(problem)
-    return v + change, jnp.where(status.failed(code), code, Status.OK).astype(jnp.int32)
+    return v + change, status.failures(code)

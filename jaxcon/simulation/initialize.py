@@ -13,7 +13,7 @@ from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.status import Status
 from jaxcon.model.state import State, recall
-from jaxcon.simulation.method import Method
+from jaxcon.simulation.method import Method, check_method
 
 
 def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: Any = None) -> State:
@@ -32,8 +32,10 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
         The state; nothing is projected.
 
     Raises:
+        TypeError: the method is none, or a part of it is not.
         ValueError: wrong shapes, mixed dtypes, or a user's function that returns the wrong shape.
     """
+    check_method(method)
     # only an array of JAX is a choice of dtype; numpy's are numbers like others
     chosen = [x for x in (q, v, *jax.tree.leaves(system)) if isinstance(x, jax.Array)]
     floating = (x.dtype for x in chosen if jnp.issubdtype(x.dtype, jnp.floating))

@@ -86,8 +86,9 @@ class Method:
             absent = part == "recovery" and value is None
             if not absent and (isinstance(value, type) or not hasattr(value, verb)):
                 raise TypeError(f"Method: {part} must be a value such as {example}, got {value!r}.")
-        if hasattr(self.stabilizer, "check"):
-            self.stabilizer.check()
+        for part in (self.stabilizer, self.solver):
+            if hasattr(part, "check"):
+                part.check()
 
 
 def check_method(method: Any) -> None:
@@ -100,6 +101,6 @@ def check_method(method: Any) -> None:
         got = method.__name__ if isinstance(method, type) else type(method).__name__
         raise TypeError(
             f"the method must be a value such as jc.Method(jc.RK4()), got {got}; the arguments of"
-            " step and rollout are (system, method, state, …)."
+            " step and rollout are (system, method, state, …), of init (system, method, q, v)."
         )
     method.check()

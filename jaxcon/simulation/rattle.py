@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import RowLayout, Rows, linearize
-from jaxcon.core import numerics, status
+from jaxcon.core import checks, numerics, status
 from jaxcon.core.dependence import depends
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status
@@ -62,6 +62,15 @@ class RATTLE:
         """No memory."""
         return ()
 
+    def check(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: there are no iterations or rounds.
+        """
+        checks.count("RATTLE", "iterations", self.iterations)
+        checks.count("RATTLE", "rounds", self.rounds)
+
     def refuses(self, system: Any, stabilizer: Any) -> str | None:
         """Feedback and projection: the step keeps both levels of the constraints itself."""
         if asks_nothing(stabilizer):
@@ -91,7 +100,7 @@ class RATTLE:
         middle, pull = between[: len(v)], between[len(v) :]
         end, code = self._arrive(dynamics, state, middle, dt)
         code = status.first(drift.solve(*_no_load(rows, v)).status, code)
-        code = status.first(_failures(code), _late(moved, middle, _rounding(q, dt)))
+        code = status.first(status.failures(code), _late(moved, middle, _rounding(q, dt)))
         q = system.retract(q, h * middle)
         acceleration = numerics.safe_divide(end - v, h)
         solution = Solution(acceleration, numerics.safe_divide(2 * pull, h), code)
@@ -115,8 +124,9 @@ class RATTLE:
             return solve(momentum + force(v), target)
 
         first = kicked(middle)
+        code = status.first(status.failures(first.status), _off(rows, q))
         if not depends(force, middle):
-            return first.acceleration, _failures(first.status)
+            return first.acceleration, code
 
         def iterate(_: Any, v: Array) -> tuple[Array, Array]:
             def once(_: Any, known: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -129,7 +139,7 @@ class RATTLE:
             return v - kicked(v).acceleration
 
         v, moved = roots.implicit(residual, first.acceleration, iterate, self.rounds)
-        return v, status.first(_failures(first.status), _late(moved, v, jnp.zeros_like(moved[0])))
+        return v, status.first(code, _late(moved, v, jnp.zeros_like(moved[0])))
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """None: there is nothing to feed back."""
@@ -194,9 +204,12 @@ def _no_load(rows: Rows, v: Array) -> tuple[Array, Array]:
     return jnp.zeros_like(v), jnp.zeros_like(rows.rate)
 
 
-def _failures(code: Array) -> Array:
-    """The code of a failure; notes are left out: rounding of dependent rows looks like conflict."""
-    return jnp.where(status.failed(code), code, Status.OK).astype(code.dtype)
+def _off(rows: Rows, q: Array) -> Array:
+    """NOT_CONVERGED where φ does not vanish, as with constraints that contradict each other."""
+    eps = float(jnp.finfo(q.dtype).eps)
+    size = 1 + jnp.max(jnp.abs(q), axis=0)
+    off = jnp.max(jnp.abs(rows.residual), axis=0, initial=0) > eps ** (2 / 3) * size
+    return jnp.where(off, Status.NOT_CONVERGED, Status.OK).astype(jnp.int32)
 
 
 def _rounding(q: Array, dt: Any) -> Array:

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.native import lift, spread
+from jaxcon.core.native import keep, lift, spread
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
 
@@ -52,11 +52,6 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     floats = [x for x, flag in zip(arrays, inexact, strict=True) if flag]
     others = [x for x, flag in zip(arrays, inexact, strict=True) if not flag]
     return contained(floats, others)
-
-
-def keep(healthy: Array, new: PyTree, old: PyTree) -> PyTree:
-    """The new values in healthy worlds, the old ones in failed worlds."""
-    return jax.tree.map(lambda x, y: jnp.where(lift(healthy, x), x, y), new, old)
 
 
 def stop_failed(status: Array, tree: PyTree) -> PyTree:

@@ -11,13 +11,16 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
+from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import saddle
 from jaxcon.model.state import State
-from jaxcon.simulation.recovery import contain, keep
+from jaxcon.simulation.recovery import contain
 from jaxcon.stabilization.baumgarte import Law, Unstabilized
+from jaxcon.stabilization.hybrid import Hybrid
+from jaxcon.stabilization.penalty import Penalty
 
 UNWANTED = Status.NOT_CONVERGED
 """Of a projection that nobody asked for."""
@@ -45,9 +48,11 @@ class Recovery:
 
         α → r α,  β → r β,    r ← shrink · r at a failure,  r ← min(1, growth · r) after a success.
 
-    That is done by what the feedback sees, φ → r² φ and φ̇ → r φ̇, and so works with any. Where the
-    step fails again, or the state itself is beyond the limit, the state is also projected to the
-    nearest valid configuration. After `retries` failures in a row the failure sticks.
+    That is done by what the feedback sees, φ → r² φ and φ̇ → r φ̇, and so works with any; springs of
+    a `Penalty` stay as they are. An integrator that keeps constraints by itself has no feedback to
+    relax: there projection and damping are what can help. Where the step fails again, or the state
+    itself is beyond the limit, the state is also projected to the nearest valid configuration.
+    After `retries` failures in a row the failure sticks.
 
     What acted is in `info.status` of each step, as a note: ROLLED_BACK, PROJECTED, or RELAXED where
     the step was taken with r < 1; the state remembers the first note. A world decides by itself and
@@ -78,6 +83,8 @@ class Recovery:
             ValueError: one is out of range.
             TypeError: the projector is no stabiliser.
         """
+        checks.positive("Recovery", "shrink", self.shrink)
+        checks.count("Recovery", "retries", self.retries, 0)
         for name, low, high in (("shrink", 0, 1), ("growth", 1, np.inf), ("damping", 0, 1)):
             value = getattr(self, name)
             if checks.is_concrete(value) and np.any(np.clip(value, low, high) != value):
@@ -86,13 +93,22 @@ class Recovery:
             checks.positive("Recovery", "limit", self.limit)
         if self.projector is not None and not hasattr(self.projector, "correct"):
             raise TypeError(f"Recovery: projector must be a stabiliser, got {self.projector!r}.")
+        if getattr(self.projector, "every", 1) != 1:
+            raise ValueError(
+                "Recovery: a projector acts at once and counts no steps; leave every=1."
+            )
 
     def init(self, system: Any, q: Array, v: Array) -> Repairs:
         """Full gains, and no failure yet."""
         return Repairs(jnp.ones((), jnp.result_type(q)), jnp.zeros((), jnp.int32))
 
-    def relax(self, stabilizer: Any, memory: Repairs) -> Relaxed:
-        """The stabiliser with its feedback made weaker."""
+    def relax(self, stabilizer: Any, memory: Repairs) -> Any:
+        """The stabiliser with its feedback made weaker; springs, which are physics, stay."""
+        if isinstance(stabilizer, Penalty):
+            others = self.relax(stabilizer.others, memory)
+            return dataclasses.replace(stabilizer, others=others)
+        if isinstance(stabilizer, Hybrid):
+            return dataclasses.replace(stabilizer, middle=self.relax(stabilizer.middle, memory))
         return Relaxed(stabilizer, memory.relaxation)
 
     def judge(self, system: Any, state: State) -> Array:

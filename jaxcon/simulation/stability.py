@@ -100,6 +100,8 @@ def parts(stabilizer: Any) -> list[Any]:
 
 def unstable_gains(integrator: Any, stabilizer: Any, h: float) -> str | None:
     """What is wrong with the feedback gains, None where nothing is."""
+    if h == 0:
+        return None
     gains = [getattr(stabilizer, name, None) for name in ("alpha", "beta", "integral")]
     if isinstance(stabilizer, PID):
         with jax.ensure_compile_time_eval():

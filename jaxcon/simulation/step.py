@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import Violation
 from jaxcon.core import checks, native, status
+from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
@@ -18,7 +19,7 @@ from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State, at, recall
 from jaxcon.simulation.initialize import check_dtype
 from jaxcon.simulation.method import Memory, Method, check_method
-from jaxcon.simulation.recovery import contain, keep
+from jaxcon.simulation.recovery import contain
 from jaxcon.simulation.stability import warn_if_unstable
 from jaxcon.solvers.saddle import Solution
 
@@ -208,5 +209,8 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
     method.check_system(system)
     memory = method.init(system, state.q, state.v)
     if jax.tree.structure(memory) != jax.tree.structure(state.memory):
-        raise ValueError("step: the state has the memory of another method; start with jc.init.")
+        raise ValueError(
+            "step: the state does not have the memory that this method keeps; start with"
+            " state = jc.init(system, method, state.q, state.v)."
+        )
     return control

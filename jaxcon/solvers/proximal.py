@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core import native
+from jaxcon.core import checks, native
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, first
 from jaxcon.core.typing import Array
@@ -53,6 +54,14 @@ class RankSafe:
     rounds: int = static(default=3)
     always: bool = static(default=False)
 
+    def check(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: there are no rounds.
+        """
+        checks.count("RankSafe", "rounds", self.rounds)
+
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status."""
         return self.factor(system)(system.force, system.target)
@@ -70,7 +79,7 @@ class RankSafe:
             known = direct(force, target)
 
             def rescued() -> Solution:
-                return keep(independent, known, self._iterated(system)(force, target))
+                return native.keep(independent, known, self._iterated(system)(force, target))
 
             return jax.lax.cond(jnp.all(independent), lambda: known, rescued)
 
@@ -88,21 +97,14 @@ class RankSafe:
         length = jnp.sqrt(weight)
 
         def solve(force: Array, target: Array) -> Solution:
-            asked = jnp.abs(target) + jnp.abs(system.jacobian.apply(system.mass.solve(force)))
-            size = jnp.max(asked / length, axis=0)
-
             def twice(right: Array, _: Any) -> Any:
                 solution = iterate(force, right, jnp.zeros_like(right))
                 return right - remainder(system, right, solution), solution
 
             met, found = jax.lax.scan(twice, target, None, length=2)
             solution = jax.tree.map(lambda x: x[1], found)
-            left = target - met
             share = 1e-2 if self.conflict is None else jnp.asarray(self.conflict, target.dtype)
-            allowed = (share * size)[None] * length
-            allowed = allowed if system.noise is None else allowed + system.noise
-            conflict = jnp.any(jnp.abs(left) > allowed, axis=0)
-            code = jnp.where(conflict, Status.CONFLICT, Status.OK).astype(jnp.int32)
+            code = conflicts(system, force, target, target - met, length, share)
             return solution._replace(status=first(solution.status, code))
 
         return solve
@@ -127,9 +129,7 @@ def proximal(solver: Any, system: Saddle, weight: Array, rounds: int) -> Any:
         rounds: how many.
     """
     compliance = weight if system.compliance is None else system.compliance + weight
-    solve = solver.factor(
-        Saddle(system.mass, system.force, system.jacobian, system.target, compliance)
-    )
+    solve = solver.factor(dataclasses.replace(system, compliance=compliance))
 
     def iterate(force: Array, target: Array, multipliers: Array) -> Solution:
         batch = jnp.broadcast_shapes(force.shape[1:], target.shape[1:], weight.shape[1:])
@@ -173,9 +173,25 @@ def _diagonal(mass: Mass, jacobian: Jacobian) -> Array:
     return jnp.diagonal(delassus(mass, jacobian.dense(), None))
 
 
-def keep(chosen: Array, x: Solution, y: Solution) -> Solution:
-    """One solution in the chosen worlds, another in the others."""
-    return jax.tree.map(lambda a, b: jnp.where(native.lift(chosen, a), a, b), x, y)
+def conflicts(
+    system: Saddle, force: Array, target: Array, left: Array, length: Array, share: Any
+) -> Array:
+    """CONFLICT where more of b is left open than rounding and a share of b and J M⁻¹ f, by world.
+
+    Args:
+        system: M, J and C.
+        force: f, (n_v,).
+        target: b, (n_c,).
+        left: of b, (n_c,).
+        length: in which rows are compared, (n_c,).
+        share: what may be left, a number or one by world.
+    """
+    asked = jnp.abs(target) + jnp.abs(system.jacobian.apply(system.mass.solve(force)))
+    size = jnp.max(asked / length, axis=0)
+    allowed = (share * size)[None] * length
+    allowed = allowed if system.noise is None else allowed + system.noise
+    conflict = jnp.any(jnp.abs(left) > allowed, axis=0)
+    return jnp.where(conflict, Status.CONFLICT, Status.OK).astype(jnp.int32)
 
 
 def remainder(system: Saddle, target: Array, solution: Solution) -> Array:

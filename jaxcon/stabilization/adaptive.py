@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, layout_of
-from jaxcon.core import numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
@@ -135,8 +135,7 @@ class SlidingWindowBaumgarte(Unstabilized):
         check_between(owner, "damping_ratio", self.damping_ratio, LEAST_RATIO, 1)
         check_between(owner, "margin", self.margin, 0, 1)
         check_between(owner, "reach", self.reach, 1, jnp.inf)
-        if self.window < 4:
-            raise ValueError(f"{owner}: window must be 4 steps or more, got {self.window}.")
+        checks.count(owner, "window", self.window, 4)
 
     def init(self, system: Any, q: Array, v: Array) -> History:
         """A window that has seen nothing."""

@@ -11,10 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.rows import Rows, layout_of
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.status import first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
-from jaxcon.solvers.proximal import RankSafe, proximal, scaled
+from jaxcon.solvers.proximal import RankSafe, conflicts, proximal, remainder, scaled
 from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
 from jaxcon.stabilization.gains import check_gains, column
@@ -37,7 +39,9 @@ class AugmentedLagrangian(Unstabilized):
     rows depend on each other or a mechanism passes a singular position, and stiffness bounds how
     stiff it is; rounds share one factorization. Each step starts from the λ of the last one, which
     is near, so that one or two rounds do. b is that of the feedback. The derivative is that of the
-    rounds as they are, with W held. Rotors, which hold nothing, are solved as they are.
+    rounds as they are, with W held. Rotors, which hold nothing, are solved as they are. Rows that
+    contradict each other are met by least squares and the status is CONFLICT, while their λ, which
+    nothing bounds, grows from step to step.
 
     Attributes:
         stiffness: in units of the mass that a row feels, 1/A_ii.
@@ -63,10 +67,7 @@ class AugmentedLagrangian(Unstabilized):
             ValueError: the stiffness is not positive, or there is no round.
         """
         check_gains("AugmentedLagrangian", strictly=True, stiffness=self.stiffness)
-        if not isinstance(self.iterations, int) or self.iterations < 1:
-            raise ValueError(
-                f"AugmentedLagrangian: iterations must be 1 or more, got {self.iterations!r}."
-            )
+        checks.count("AugmentedLagrangian", "iterations", self.iterations)
         if hasattr(self.feedback, "check"):
             self.feedback.check()
 
@@ -100,7 +101,14 @@ class AugmentedLagrangian(Unstabilized):
         weight = scaled(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
-        return rounds(system.force, system.target, start)
+        solution = rounds(system.force, system.target, start)
+        if not system.loops:
+            return solution
+        left = remainder(system, system.target, solution)
+        open_ = 1e-2 + (1 + jnp.asarray(self.stiffness, start.dtype)) ** -self.iterations
+        length = jnp.sqrt(scaled(system, 1e-6))
+        code = conflicts(system, system.force, system.target, left, length, open_)
+        return solution._replace(status=first(solution.status, code))
 
     def advance(self, rows: Rows, memory: Held, dt: Any) -> Held:
         """With the memory of the feedback after the step."""

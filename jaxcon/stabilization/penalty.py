@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.rows import RowLayout, Rows
+from jaxcon.core.numerics import safe_divide
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
@@ -18,6 +19,7 @@ from jaxcon.solvers.proximal import own_diagonal
 from jaxcon.solvers.saddle import Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
 from jaxcon.stabilization.gains import by_row, check_gains, column, named
+from jaxcon.stabilization.projection import Projection
 
 
 @pytree
@@ -73,14 +75,19 @@ class Penalty(Unstabilized):
         """Checks the numbers.
 
         Raises:
-            ValueError: one is negative or no number, or there is no or more than one of stiffness
-                and time.
+            ValueError: one is negative or no number, there is no or more than one of stiffness and
+                time, or the others are projected.
         """
         if (self.stiffness is None) == (self.time is None):
             raise ValueError("Penalty: give a stiffness, or a time by `Penalty.from_time`.")
         check_gains("Penalty", stiffness=self.stiffness, damping=self.damping)
         check_gains("Penalty", damping_ratio=self.damping_ratio)
         check_gains("Penalty", strictly=True, time=self.time)
+        if isinstance(self.others, Projection):
+            raise ValueError(
+                "Penalty: others=Projection() would project the soft constraints, too, and no"
+                " spring would be left; take feedback for those that stay hard."
+            )
         if hasattr(self.others, "check"):
             self.others.check()
 
@@ -145,7 +152,7 @@ class Penalty(Unstabilized):
         k, d = self.constants(rows)
         h, chosen = dt[None], column(soft, rows)
         compliance = yielding(h * (d + h * k), rows)
-        target = -rows.bias - rows.rate / h - k * rows.residual * compliance
+        target = -rows.bias - safe_divide(rows.rate, h) - k * rows.residual * compliance
         known = hard.rows.compliance
         rest = jnp.zeros_like(compliance) if known is None else known
         rows = dataclasses.replace(hard.rows, compliance=jnp.where(chosen, compliance, rest))

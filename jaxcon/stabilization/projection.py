@@ -107,12 +107,7 @@ class Projection(Unstabilized):
     velocity: bool = static(default=True)
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:
-        """How many steps ago the last projection was, where not every step has one.
-
-        Raises:
-            ValueError: a choice that does not exist, or a number out of range.
-        """
-        self._check()
+        """How many steps ago the last projection was, where not every step has one."""
         return () if self.every == 1 else jnp.zeros((), jnp.int32)
 
     def advance(self, rows: Rows, memory: PyTree, dt: Any) -> PyTree:
@@ -167,7 +162,9 @@ class Projection(Unstabilized):
         bounds = self._bounds(system, state)
         step, left = self._step(surface, nearest, bounds)
         late = jnp.where(left > bounds.fails, Status.NOT_CONVERGED, Status.OK)
-        code = status.first(_failures(solve(still, 0 * rows.bias).status), late.astype(jnp.int32))
+        code = status.first(
+            status.failures(solve(still, 0 * rows.bias).status), late.astype(jnp.int32)
+        )
         return system.retract(q, step), step, code
 
     def _step(self, surface: _Surface, nearest: Operator, bounds: Bounds) -> tuple[Array, Array]:
@@ -206,7 +203,7 @@ class Projection(Unstabilized):
         rotors = _held(rows.layout)[1]
         problem = self._problem(system, state.q, rows, ~rotors, rotors)
         solution = solver.factor(problem)(problem.force, -rows.rate)
-        return state.v + solution.acceleration, _failures(solution.status)
+        return state.v + solution.acceleration, status.failures(solution.status)
 
     def _problem(
         self, system: Any, q: Array, rows: Rows, held: np.ndarray, rotors: np.ndarray
@@ -231,15 +228,16 @@ class Projection(Unstabilized):
         fails = jnp.full_like(size, jnp.inf) if self.iterations == 1 else eps ** (2 / 3) * size
         return Bounds(jnp.zeros_like(size), fails)
 
-    def _check(self) -> None:
+    def check(self) -> None:
+        """Checks the choices.
+
+        Raises:
+            ValueError: one that does not exist, or a number out of range.
+        """
         if self.metric not in METRICS:
             raise ValueError(f"Projection: metric must be one of {METRICS}, got {self.metric!r}.")
         for what in ("iterations", "every"):
-            count = getattr(self, what)
-            if not isinstance(count, int) or count < 1:
-                raise ValueError(
-                    f"Projection: {what} must be a whole number from 1, got {count!r}."
-                )
+            checks.count("Projection", what, getattr(self, what))
         checks.positive("Projection", "factor", self.factor)
         if checks.is_concrete(self.factor) and np.any(np.asarray(self.factor) > 1):
             raise ValueError(f"Projection: factor must be at most 1, got {self.factor}.")
@@ -283,11 +281,6 @@ def _held(layout: RowLayout) -> tuple[np.ndarray, np.ndarray]:
 def _largest(x: Array) -> Array:
     """max |x| by world."""
     return jnp.max(jnp.abs(x), axis=0, initial=0)
-
-
-def _failures(code: Array) -> Array:
-    """The code of a failure; notes are left out: rounding of dependent rows looks like conflict."""
-    return jnp.where(status.failed(code), code, Status.OK).astype(code.dtype)
 
 
 def _number(x: Any, state: State) -> Array:
