@@ -565,9 +565,9 @@ STEPS = {
         lambda: stepping(control=jnp.zeros(3, F32)),
         ["control is float32", "float64"],
     ),
-    "memory of another method": (
+    "memory that this method keeps": (
         lambda: stepping(state=with_memory({"integral": jnp.zeros(8)})),
-        ["memory of another method", "jc.init"],
+        ["memory that this method keeps", "jc.init"],
     ),
     "batch without vmap": (
         lambda: stepping(state=with_q(jnp.zeros((5, 14)))),

@@ -229,7 +229,7 @@ def test_the_first_step_starts_from_the_accelerations_there_and_the_next_remembe
     twice = jc.step(system, method, once, None, 1e-2)[0]
     forgetful = dataclasses.replace(start, q=once.q, v=once.v, time=once.time)
     assert np.max(abs(jc.step(system, method, forgetful, None, 1e-2)[0].v - twice.v)) > 1e-12
-    with pytest.raises(ValueError, match=r"memory of another method; start with jc\.init"):
+    with pytest.raises(ValueError, match="does not have the memory that this method keeps"):
         jc.step(system, method, state, None, 1e-2)
 
 
@@ -354,7 +354,7 @@ def test_it_refuses_what_it_cannot_do():
         step(jc.Baumgarte.critical(rate=10.0))
     with pytest.raises(ValueError, match="rho must be from 0 to 1, got 1.5"):
         step(rho=1.5)
-    with pytest.raises(ValueError, match="iterations must be 1 or more, got 0"):
+    with pytest.raises(ValueError, match="iterations must be a whole number from 1, got 0"):
         step(iterations=0)
     with pytest.raises(ValueError, match=r"variational equations are not.*RK4"):
         step(None, *jc.vakonomic(system, state))

@@ -364,9 +364,10 @@ def test_generalized_coordinates(name):
         (jc.Penalty({"spring": 1.0}, {"sp": 1.0}), ["Penalty", r"\['sp'\]"]),
         (jc.Penalty(jnp.ones(4)), ["Penalty", r"\(1,\)", r"\(4,\)"]),
         (jc.AugmentedLagrangian(0.0), ["AugmentedLagrangian", "stiffness", "positive"]),
-        (jc.AugmentedLagrangian(iterations=0), ["iterations must be 1 or more"]),
+        (jc.AugmentedLagrangian(iterations=0), ["iterations must be a whole number from 1"]),
         (jc.Hybrid(jc.Penalty(1.0, implicit=False)), ["Hybrid", "implicit"]),
         (jc.Hybrid(jc.Penalty(-1.0)), ["Penalty", "stiffness"]),
+        (jc.Penalty(1.0, others=jc.Projection()), ["others=Projection", "soft constraints"]),
         (jc.Hybrid(jc.Penalty(1.0), sharpness=0), ["Hybrid", "sharpness"]),
     ],
 )

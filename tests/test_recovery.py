@@ -224,5 +224,5 @@ def test_what_is_refused(scene):
         with pytest.raises(kind, match=words):
             jc.step(system, jc.Method(recovery=wrong), state, None, DT)
     forgetful = dataclasses.replace(state, memory=())
-    with pytest.raises(ValueError, match="start with jc.init"):
+    with pytest.raises(ValueError, match="does not have the memory"):
         jc.step(system, METHOD, forgetful, None, DT)
