@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scenes
 from compiling import quick_jit
-from tolerances import DERIVATIVE, DIFFERENCE
+from tolerances import DERIVATIVE, DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
@@ -67,6 +67,26 @@ def test_rows_are_derivatives_of_the_residual(name):
         np.testing.assert_allclose(moved, rate[rows], **close)
     assert np.all(np.abs(residual[~level]) > 1e-6), "the state is not off the constraints"
     np.testing.assert_array_equal(residual[level], 0)
+
+
+@pytest.mark.parametrize("name", [n for n in scenes.NAMES if n.startswith("all-")])
+def test_rows_of_single_precision_are_those_of_double_precision(name):
+    """At the same numbers, but for the rounding of what is added up."""
+    built = scenes.build(name, "float32")
+    rows = quick_jit(by_hand)
+    state = built.off
+    found = rows(built.system, state.q, state.v, state.time)
+    system, state = jax.tree.map(to_double, (built.system, state))
+    expected = rows(system, state.q, state.v, state.time)
+    single, double = np.dtype("float32"), np.dtype("float64")
+    for got, exact in zip(found, expected, strict=True):
+        assert (got.dtype, exact.dtype) == (single, double)
+        size = 1 + np.max(np.abs(exact))
+        np.testing.assert_allclose(got, exact, rtol=0, atol=ROUND_OFF[single] * size)
+
+
+def to_double(x):
+    return x.astype(jnp.float64) if x.dtype == jnp.float32 else x
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.rows import Rows
-from jaxcon.core import status
+from jaxcon.core import checks, status
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
@@ -149,7 +149,8 @@ class RungeKutta(Explicit):
         for i, weights in enumerate(self.a):
             table[i, : i + 1] = weights
         inputs = jnp.asarray(table, q.dtype), jnp.arange(1, len(self.b))
-        (slopes, code), _ = jax.lax.scan(stage, (slopes, solution.status), inputs)
+        through = one_by_one if checks.is_concrete((q, v)) else jax.lax.scan
+        (slopes, code), _ = through(stage, (slopes, solution.status), inputs)
         dq, dv = (combine(self.b, x) for x in slopes)
         q, v = system.normalize(q + h * dq), v + h * dv
         return Advanced((q, v, t + dt), solution._replace(status=code), rows)
@@ -208,6 +209,13 @@ def Heun() -> RungeKutta:  # noqa: N802
 def RK4() -> RungeKutta:  # noqa: N802
     """The classical method of Kutta: fourth order, four solves."""
     return RungeKutta(((0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
+
+
+def one_by_one(function: Any, carry: Any, inputs: Any) -> tuple[Any, None]:
+    """`scan` outside a trace, so that what is called sees values."""
+    for row in zip(*inputs, strict=True):
+        carry, _ = function(carry, row)
+    return carry, None
 
 
 def combine(weights: Any, slopes: Array) -> Array:

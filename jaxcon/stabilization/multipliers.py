@@ -21,6 +21,9 @@ from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
 from jaxcon.stabilization.gains import check_gains, column
 
+OPEN = 0.5
+"""The part of b that rows may leave open before it is a conflict; rounds that begin leave some."""
+
 
 class Held(NamedTuple):
     """What the method of multipliers remembers: λ of the last step (n_c,), and the feedback's."""
@@ -40,8 +43,8 @@ class AugmentedLagrangian(Unstabilized):
     stiff it is; rounds share one factorization. Each step starts from the λ of the last one, which
     is near, so that one or two rounds do. b is that of the feedback. The derivative is that of the
     rounds as they are, with W held. Rotors, which hold nothing, are solved as they are. Rows that
-    contradict each other are met by least squares and the status is CONFLICT, while their λ, which
-    nothing bounds, grows from step to step.
+    contradict each other are met by least squares, and where they leave open more than half of what
+    the rows ask for the status is CONFLICT; their λ, which nothing bounds, grows from step to step.
 
     Attributes:
         stiffness: in units of the mass that a row feels, 1/A_ii.
@@ -105,9 +108,8 @@ class AugmentedLagrangian(Unstabilized):
         if not system.loops:
             return solution
         left = remainder(system, system.target, solution)
-        open_ = 1e-2 + (1 + jnp.asarray(self.stiffness, start.dtype)) ** -self.iterations
         length = jnp.sqrt(scaled(system, 1e-6))
-        code = conflicts(system, system.force, system.target, left, length, open_)
+        code = conflicts(system, system.force, system.target, left, length, OPEN)
         return solution._replace(status=first(solution.status, code))
 
     def advance(self, rows: Rows, memory: Held, dt: Any) -> Held:
