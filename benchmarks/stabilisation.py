@@ -144,7 +144,7 @@ def measure(scene: str, dtype: Any, integrator: str, stabilizer: str, steps: int
     began = time.perf_counter()
     final, (off, energy) = jax.block_until_ready(compiled(start))
     seconds = time.perf_counter() - began
-    if bool(jc.Status(int(final.status)) not in (jc.Status.OK, jc.Status.CONFLICT)):
+    if jc.Status(int(final.status)) not in (jc.Status.OK, jc.Status.CONFLICT):
         code = jc.Status(int(final.status)).name
         return Row(*known, *failed, f"{code} at {float(final.time):.3g} s")
     change = np.max(np.abs(np.asarray(energy) - float(jc.energy(system, state).total))) / G

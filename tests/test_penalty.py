@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import scenes
 from compiling import quick_jit
-from tolerances import DIFFERENCE, IDENTITY
+from derivatives import assert_smooth_and_batched
+from tolerances import IDENTITY
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
@@ -302,17 +303,7 @@ def test_gradients_are_differences_and_worlds_are_a_loop(name):
         final, _ = rolled(built, jc.Method(stabilizer=kind(**x)), 30)
         return jnp.sum(final.q**3) + jnp.sum(final.v)
 
-    x = {key: jnp.asarray(number) for key, number in numbers.items()}
-    run, gradient = quick_jit(value), quick_jit(jax.grad(value))(x)
-    scale = max(abs(float(gradient[key] * x[key])) for key in x)
-    for key in x:
-        at = [float(run(x | {key: x[key] * (1 + s * 1e-3)})) for s in (2, 1, -1, -2)]
-        slope = (8 * (at[1] - at[2]) - (at[0] - at[3])) / 12e-3
-        assert abs(float(gradient[key] * x[key]) - slope) < DIFFERENCE * scale, key
-    worlds = {key: jnp.stack([number, 1.05 * number]) for key, number in x.items()}
-    one_by_one = [run({key: number[i] for key, number in worlds.items()}) for i in (0, 1)]
-    got = quick_jit(jax.vmap(value))(worlds)
-    np.testing.assert_allclose(got, jnp.stack(one_by_one), rtol=1e-10)
+    assert_smooth_and_batched(value, numbers, 1e-3, 1e-10)
 
 
 @pytest.mark.parametrize("name", ["implicit", "explicit", "time", "multipliers"])

@@ -222,7 +222,7 @@ def test_float32_and_batches():
 
 def test_steps_too_large_say_so():
     _, state, run = scene("top")
-    end, _ = run(state, 0.02, 8)
+    end, _ = run(state, 0.05, 8)
     assert int(end.status) == jc.Status.NOT_CONVERGED
 
 

@@ -181,9 +181,9 @@ class Watched(Dynamics):
 
     seen: list[tuple[list[Finding], Status]] = field(default_factory=list)
 
-    def __call__(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows]:
+    def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
         """a and λ at (q, v, t), and the rows there."""
-        solution, rows = super().__call__(q, v, t)
+        solution, rows = super().__call__(q, v, t, age)
         if checks.is_concrete((q, v, t, solution)):
             self.seen.append(self._judge(q, v, t, solution, rows))
         return solution, rows

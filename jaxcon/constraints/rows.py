@@ -152,6 +152,16 @@ class Rows:
         """φ and φ̇ by constraint."""
         return Violation(self.residual, self.rate, self.layout)
 
+    def earlier(self, age: Array) -> Rows:
+        """The same with the rates at t − age, () [s], had v always been what it is.
+
+        φ̇(q ⊖ age v, v, t − age) = φ̇ − age γ to first order. What holds nothing has no rate.
+        """
+        held = np.isin(np.arange(self.layout.size), self.layout.holding)
+        held = held.reshape(-1, *(1,) * (self.bias.ndim - 1))
+        rate = self.rate - jnp.where(held, age[None] * self.bias, 0)
+        return dataclasses.replace(self, rate=rate)
+
     def only(self, kept: np.ndarray) -> Rows:
         """The same rows, of which those that are not kept, (n_c,), say λ = b and act on nothing."""
         if kept.all():

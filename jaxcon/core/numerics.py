@@ -7,6 +7,7 @@ Each takes the safe branch of the input before the singular operation (the "doub
 import math
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.core.lanes import Vector
@@ -40,6 +41,12 @@ def safe_arctan2(y: Lane, x: Lane) -> Array:
     """The angle of (x, y), and 0 with zero gradient at the origin."""
     origin = (x == 0) & (y == 0)
     return jnp.arctan2(jnp.where(origin, 0, y), jnp.where(origin, 1, x))
+
+
+def negligible(x: Array) -> Array:
+    """ε^⅔ (1 + max |x|) by world: what an iteration may leave open at x (n, …), a constant."""
+    size = 1 + jnp.max(jnp.abs(x), axis=0, initial=0)
+    return jax.lax.stop_gradient(float(jnp.finfo(x.dtype).eps) ** (2 / 3) * size)
 
 
 def wrap(angle: Lane) -> Array:

@@ -253,8 +253,7 @@ def _allowed(x: Array, tolerance: Any) -> Array:
     """Up to which a residual at x counts as zero, ()."""
     if tolerance is not None:
         return tolerance
-    eps = float(jnp.finfo(x.dtype).eps)
-    return jax.lax.stop_gradient((1 + jnp.max(jnp.abs(x), initial=0)) * eps ** (2 / 3))
+    return numerics.negligible(x)
 
 
 def _start(system: Any, q: Any, v: Any, time: Any) -> State:

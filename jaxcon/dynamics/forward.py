@@ -52,10 +52,11 @@ class Dynamics:
     memory: PyTree
     dt: Any
 
-    def __call__(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows]:
-        """a and λ at (q, v, t), and the rows there."""
+    def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
+        """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago."""
         rows = dataclasses.replace(linearize(self.system, q, v, t), mass=self.system.mass(q))
-        law = self.stabilizer.impose(rows, self.memory, self.dt)
+        seen = rows if age is None else rows.earlier(age)
+        law = self.stabilizer.impose(seen, self.memory, self.dt)
         force = self.system.force(q, v, t, self.control)
         force = force if law.force is None else force + law.force
         problem = saddle(self.system, q, law.rows, force, law.target, law.noise)

@@ -182,9 +182,8 @@ def projected(dynamics: Dynamics, q: Array, v: Array, t: Any) -> tuple[Array, Ar
     seem to contradict each other where φ̇ is but rounding; only failures count.
     """
     rows = linearize(dynamics.system, q, v, t)
-    law = dynamics.stabilizer.impose(rows, dynamics.memory, dynamics.dt)
-    compliance = law.rows.compliance
-    target = -rows.rate if compliance is None else jnp.where(compliance > 0, 0, -rows.rate)
-    problem = saddle(dynamics.system, q, law.rows, jnp.zeros_like(v), target)
+    held = -rows.rate
+    target = held if rows.compliance is None else jnp.where(rows.compliance > 0, 0, held)
+    problem = saddle(dynamics.system, q, rows, jnp.zeros_like(v), target)
     change, _, code = dynamics.solver.solve(problem)
     return v + change, status.failures(code)

@@ -27,7 +27,6 @@ from jaxcon.core.typing import Array
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
 from jaxcon.solvers import lu
-from jaxcon.stabilization.baumgarte import Law
 
 
 @pytree
@@ -121,24 +120,20 @@ class Equations:
         _, q, v = self.end(acceleration)
         t = self.state.time + own.dt
         rows = linearize(own.system, q, v, t)
-        law = own.stabilizer.impose(rows, own.memory, own.dt)
-        force = own.system.force(q, v, t, own.control)
-        force = force if law.force is None else force + law.force
-        pull = law.rows.jacobian.transpose(multipliers)
-        balance = own.system.mass(q).apply(acceleration) - force - pull
-        return jnp.concatenate([balance, self.closed(rows, law, acceleration, multipliers)])
+        pull = own.system.force(q, v, t, own.control) + rows.jacobian.transpose(multipliers)
+        balance = own.system.mass(q).apply(acceleration) - pull
+        return jnp.concatenate([balance, self.closed(rows, acceleration, multipliers)])
 
-    def closed(self, rows: Rows, law: Law, acceleration: Array, multipliers: Array) -> Array:
-        """φ/κβh², ψ/κγh, or J v̇⁺ + C λ⁺ − b where there is compliance, (n_c,)."""
+    def closed(self, rows: Rows, acceleration: Array, multipliers: Array) -> Array:
+        """φ/κβh², ψ/κγh, or J v̇⁺ + C λ⁺ + γ where there is compliance, (n_c,)."""
         holonomic = rows.layout.holonomic.reshape(-1, *(1,) * (multipliers.ndim - 1))
         scaled = rows.residual / self.scheme.reach, rows.rate / self.scheme.push
         hard = jnp.where(holonomic, *scaled)
         hard = hard if self.soft is None else hard + self.soft * multipliers
-        if law.rows.compliance is None:
+        if rows.compliance is None:
             return hard
-        compliance = law.rows.compliance
-        soft = law.rows.jacobian.apply(acceleration) + compliance * multipliers - law.target
-        return jnp.where(compliance > 0, soft, hard)
+        soft = rows.jacobian.apply(acceleration) + rows.compliance * multipliers + rows.bias
+        return jnp.where(rows.compliance > 0, soft, hard)
 
 
 def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import RowLayout, Rows, linearize
@@ -17,6 +16,7 @@ from jaxcon.dynamics.forward import Dynamics, saddle
 from jaxcon.model.state import State
 from jaxcon.simulation.integrators import Advanced
 from jaxcon.solvers import roots
+from jaxcon.solvers.roots import Operator
 from jaxcon.solvers.saddle import Factored, Solution
 from jaxcon.stabilization.baumgarte import asks_nothing
 
@@ -37,17 +37,17 @@ class RATTLE:
     whole turn a step.
 
     V and λ are found together by iterations that share one factorization of [M, −Jᵀ; J, 0] at q;
-    each multiplies the error by about half of the angle by which bodies turn in a step, so that ten
-    are enough up to a fifth of a radian. Where forces depend on velocities, F⁺ = F(q⁺, v⁺) is
-    found by fixed-point rounds, each of which reduces the error in proportion to h ∂F/∂v. Worlds in
-    which either is not done are NOT_CONVERGED. Derivatives are those of the equations, whatever was
-    done to solve them.
+    each multiplies the error by about half of the angle by which bodies turn in a step, and they
+    end where only rounding is left: some five are enough at a hundredth of a radian, all are needed
+    at one. Where forces depend on velocities, F⁺ = F(q⁺, v⁺) is found by fixed-point rounds, each
+    of which reduces the error in proportion to h ∂F/∂v. Worlds in which either is not done are
+    NOT_CONVERGED. Derivatives are those of the equations, whatever was done to solve them.
 
     λ in the solution is that of the kick at the start, and a = (v⁺ − v)/h.
 
     Attributes:
-        iterations: for V and λ.
-        rounds: for F⁺; none are spent where no force depends on velocities.
+        iterations: for V and λ, at most.
+        rounds: for F⁺, at most; none are spent where no force depends on velocities.
 
     References:
         Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52 (1983).
@@ -55,8 +55,8 @@ class RATTLE:
         Marsden, West, Discrete mechanics and variational integrators, Acta Numerica 10 (2001).
     """
 
-    iterations: int = static(default=10)
-    rounds: int = static(default=5)
+    iterations: int = static(default=40)
+    rounds: int = static(default=20)
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:
         """No memory."""
@@ -128,12 +128,8 @@ class RATTLE:
         if not depends(force, middle):
             return first.acceleration, code
 
-        def iterate(_: Any, v: Array) -> tuple[Array, Array]:
-            def once(_: Any, known: tuple[Array, Array]) -> tuple[Array, Array]:
-                new = kicked(known[0]).acceleration
-                return new, new - known[0]
-
-            return jax.lax.fori_loop(0, self.rounds, once, (v, jnp.zeros_like(v)))
+        def iterate(function: Operator, v: Array) -> tuple[Array, Array]:
+            return roots.settle(function, v, self.rounds)
 
         def residual(v: Array) -> Array:
             return v - kicked(v).acceleration
@@ -175,13 +171,11 @@ class _Drift:
     def iterate(self, iterations: int) -> Any:
         """Quasi-Newton from a start: z, and by how much V changed at last."""
         inverse, n = self.inverses(0)[1], len(self.momentum)
+        rounding = _rounding(self.q, self.h[0]) / 16
 
-        def iterate(function: Any, z: Array) -> tuple[Array, Array]:
-            def once(_: Any, known: tuple[Array, Array]) -> tuple[Array, Array]:
-                down = inverse(function(known[0]))
-                return known[0] - down, down[:n]
-
-            return jax.lax.fori_loop(0, iterations, once, (z, jnp.zeros_like(z[:n])))
+        def iterate(function: Operator, z: Array) -> tuple[Array, Array]:
+            z, moved = roots.settle(lambda z: inverse(function(z)), z, iterations, rounding)
+            return z, moved[:n]
 
         return iterate
 
@@ -206,9 +200,7 @@ def _no_load(rows: Rows, v: Array) -> tuple[Array, Array]:
 
 def _off(rows: Rows, q: Array) -> Array:
     """NOT_CONVERGED where φ does not vanish, as with constraints that contradict each other."""
-    eps = float(jnp.finfo(q.dtype).eps)
-    size = 1 + jnp.max(jnp.abs(q), axis=0)
-    off = jnp.max(jnp.abs(rows.residual), axis=0, initial=0) > eps ** (2 / 3) * size
+    off = jnp.max(jnp.abs(rows.residual), axis=0, initial=0) > numerics.negligible(q)
     return jnp.where(off, Status.NOT_CONVERGED, Status.OK).astype(jnp.int32)
 
 
@@ -220,9 +212,7 @@ def _rounding(q: Array, dt: Any) -> Array:
 
 def _late(moved: Array, v: Array, rounding: Array) -> Array:
     """NOT_CONVERGED where v still changed at last by more than rounding makes of it."""
-    eps = float(jnp.finfo(v.dtype).eps)
-    size = 1 + jnp.max(jnp.abs(v), axis=0)
-    late = jnp.max(jnp.abs(moved), axis=0) > eps ** (2 / 3) * size + rounding
+    late = jnp.max(jnp.abs(moved), axis=0) > numerics.negligible(v) + rounding
     return jnp.where(late, Status.NOT_CONVERGED, Status.OK).astype(jnp.int32)
 
 

@@ -15,12 +15,12 @@ from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.dynamics.forward import saddle
 from jaxcon.model.state import State
 from jaxcon.simulation.recovery import contain
-from jaxcon.stabilization.baumgarte import Law, Unstabilized
+from jaxcon.stabilization.baumgarte import Law
 from jaxcon.stabilization.hybrid import Hybrid
 from jaxcon.stabilization.penalty import Penalty
+from jaxcon.stabilization.projection import Projection
 
 UNWANTED = Status.NOT_CONVERGED
 """Of a projection that nobody asked for."""
@@ -65,7 +65,7 @@ class Recovery:
         growth: of r after a success.
         damping: share of v that a world loses when it rolls back.
         projector: a stabiliser without memory, whose `correct` finds the nearest valid
-            configuration; None for one linearised step of q and v in the metric of M.
+            configuration; one linearized step of q and v in the metric of M unless given.
         retries: how many failures in a row are repaired.
     """
 
@@ -73,7 +73,7 @@ class Recovery:
     shrink: Any = 0.5
     growth: Any = 1.05
     damping: Any = 0.0
-    projector: Any = None
+    projector: Any = Projection(iterations=1)
     retries: int = static(default=10)
 
     def check(self) -> None:
@@ -91,7 +91,7 @@ class Recovery:
                 raise ValueError(f"Recovery: {name} must be from {low} to {high}, got {value}.")
         if self.limit is not None:
             checks.positive("Recovery", "limit", self.limit)
-        if self.projector is not None and not hasattr(self.projector, "correct"):
+        if not hasattr(self.projector, "correct"):
             raise TypeError(f"Recovery: projector must be a stabiliser, got {self.projector!r}.")
         if getattr(self.projector, "every", 1) != 1:
             raise ValueError(
@@ -157,7 +157,7 @@ class Recovery:
         wanted = again & (state.memory.recovery.failures > 0)
         if self.limit is not None:
             wanted |= again & failed(self.judge(system, state))
-        args = (self.projector or Linearized(), system, solver, back, wanted, dt)
+        args = (self.projector, system, solver, back, wanted, dt)
         # most steps of most batches need none
         projected, code = jax.lax.cond(jnp.any(wanted), _project, _leave, *args)
         done = ~failed(code)
@@ -189,25 +189,6 @@ class Relaxed:
         return dataclasses.replace(rows, residual=r * r * rows.residual, rate=r * rows.rate)
 
 
-@pytree
-class Linearized(Unstabilized):
-    """q ⊕ M⁻¹Jᵀμ with J M⁻¹Jᵀ μ = −φ, then v + M⁻¹Jᵀν with J M⁻¹Jᵀ ν = −φ̇ there: one step."""
-
-    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
-        """The state nearer to the constraints, and the status of the two solves."""
-        rows = linearize(system, state.q, state.v, state.time)
-        kept = rows.layout.holonomic
-        for name in rows.layout.inertial:  # rotors resist a displacement, too
-            kept[rows.layout.rows(name)] = True
-        rest = jnp.zeros_like(state.v)
-        problem = saddle(system, state.q, rows.only(kept), rest, -rows.residual)
-        step, _, code = solver.solve(problem)
-        q = system.retract(state.q, step)
-        rows = linearize(system, q, state.v, state.time)
-        step, _, later = solver.solve(saddle(system, q, rows, rest, -rows.rate))
-        return dataclasses.replace(state, q=q, v=state.v + step), first(code, later)
-
-
 def _project(*args: Any) -> tuple[State, Array]:
     """The state corrected; where it is not used its derivative, which may be infinite, is none."""
     return contain(_correct, args)
@@ -217,7 +198,7 @@ def _correct(
     projector: Any, system: Any, solver: Any, state: State, wanted: Array, dt: Any
 ) -> tuple[State, Array]:
     """The state corrected where that is wanted, and a failure where it is not or does not help."""
-    new, code = projector.correct(system, solver, state, (), dt)
+    new, code = projector.correct(system, solver, state, state, (), 0 * dt)
     finite = jnp.all(jnp.isfinite(new.q), axis=0) & jnp.all(jnp.isfinite(new.v), axis=0)
     code = first(code, jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32))
     return new, jnp.where(wanted, code, UNWANTED).astype(jnp.int32)

@@ -113,7 +113,7 @@ def _attempt(system: Any, method: Method, state: State, control: PyTree, dt: Arr
     new = dataclasses.replace(state, q=q, v=v, time=time)
     stabilizer = method.feedback(dt)
     own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
-    new, corrected = stabilizer.correct(system, method.solver, new, own, dt)
+    new, corrected = stabilizer.correct(system, method.solver, state, new, own, dt)
     turns = system.count(state.q, state.v, state.time)
     kept = Memory(advanced.memory, own, memory.recovery) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
@@ -153,7 +153,7 @@ def judge(state: State, solution: Solution) -> Array:
 def forward_dynamics(
     system: Any, state: State, control: PyTree, method: Method, dt: Any
 ) -> Solution:
-    """a and λ at a state, under the method's feedback.
+    """a and λ at a state, under the method's feedback of φ and φ̇ as they are there.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.

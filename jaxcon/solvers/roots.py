@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxcon.core.typing import Array
 
@@ -34,7 +35,7 @@ def implicit(
         function: f, (n, …) → (n, …).
         start: (n, …).
         iterate: (f, start) → the root and anything more; never differentiated.
-        rounds: how many.
+        rounds: how many at most.
         inverse: y → P y, near to f′(x)⁻¹ y.
         transposed: y → Pᵀ y.
     """
@@ -49,9 +50,34 @@ def implicit(
 
 def _refined(inverse: Operator, rounds: int) -> Callable[[Operator, Array], Array]:
     def refine(linear: Operator, right: Array) -> Array:
-        def once(_: Any, x: Array) -> Array:
-            return x + inverse(right - linear(x))
-
-        return jax.lax.fori_loop(0, rounds, once, inverse(right))
+        return settle(lambda x: inverse(linear(x) - right), inverse(right), rounds)[0]
 
     return refine
+
+
+def settle(down: Operator, x: Array, rounds: int, rounding: Any = 0.0) -> tuple[Array, Array]:
+    """x ← x − d(x), until in every world only rounding is left of d, or the rounds are over.
+
+    Args:
+        down: d, (n, …) → (n, …).
+        x: where to begin, (n, …).
+        rounds: how many at most.
+        rounding: what rounding makes of x besides its own spacing, a number or one by world.
+
+    Returns:
+        x, and the last d.
+    """
+
+    def goes(known: tuple[Array, Array, Array]) -> Array:
+        count, x, step = known
+        size, moved = (jnp.max(jnp.abs(y), axis=0, initial=0) for y in (x, step))
+        settled = 4 * float(jnp.finfo(x.dtype).eps) * size + rounding
+        return (count < rounds) & jnp.any(moved > settled)
+
+    def once(known: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, x, _ = known
+        step = down(x)
+        return count + 1, x - step, step
+
+    start = jnp.zeros((), jnp.int32), x, jnp.full_like(x, jnp.inf)
+    return jax.lax.while_loop(goes, once, start)[1:]

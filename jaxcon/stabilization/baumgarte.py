@@ -67,7 +67,9 @@ class Unstabilized:
         """The same after what was solved at the start of the step."""
         return memory
 
-    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
+    def correct(
+        self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
+    ) -> Any:
         """The state after a step, corrected, and a status of its own: here as it is."""
         return state, jnp.zeros_like(state.status)
 

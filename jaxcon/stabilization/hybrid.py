@@ -129,11 +129,13 @@ class Hybrid(Unstabilized):
         """The memories of the parts after what was solved."""
         return self._map(lambda part, own: part.remember(own, solution), Parts(*memory))
 
-    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
+    def correct(
+        self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
+    ) -> Any:
         """The state moved by the share w of the correction of `large`."""
         if self.large is None:
             return state, jnp.zeros_like(state.status)
-        new, code = self.large.correct(system, solver, state, Parts(*memory).large, dt)
+        new, code = self.large.correct(system, solver, before, state, Parts(*memory).large, dt)
         residual = linearize(system, state.q, state.v, state.time).residual
         size = jnp.asarray(self.project_above, residual.dtype)[None]
         w = self.beyond(jnp.sum((residual / size) ** 2, axis=0))[None]

@@ -121,6 +121,8 @@ class AugmentedLagrangian(Unstabilized):
         own = self.feedback.remember(memory.feedback, solution)
         return Held(solution.multipliers, own)
 
-    def correct(self, system: Any, solver: Any, state: State, memory: Held, dt: Any) -> Any:
+    def correct(
+        self, system: Any, solver: Any, before: State, state: State, memory: Held, dt: Any
+    ) -> Any:
         """As the feedback does."""
-        return self.feedback.correct(system, solver, state, memory.feedback, dt)
+        return self.feedback.correct(system, solver, before, state, memory.feedback, dt)

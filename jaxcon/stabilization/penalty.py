@@ -175,9 +175,11 @@ class Penalty(Unstabilized):
         """The memory of the others."""
         return self.others.remember(memory, solution)
 
-    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
+    def correct(
+        self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
+    ) -> Any:
         """As the others are corrected."""
-        return self.others.correct(system, solver, state, memory, dt)
+        return self.others.correct(system, solver, before, state, memory, dt)
 
 
 def felt(rows: Rows) -> Array:

@@ -19,7 +19,7 @@ from jaxcon.dynamics.forward import saddle
 from jaxcon.model.state import State
 from jaxcon.solvers import roots
 from jaxcon.solvers.roots import Operator
-from jaxcon.solvers.saddle import Diagonal, Saddle
+from jaxcon.solvers.saddle import Diagonal, Mass, Saddle
 from jaxcon.stabilization.baumgarte import Unstabilized
 
 METRICS = ("mass", "euclidean")
@@ -63,11 +63,19 @@ class Bounds(NamedTuple):
 class Projection(Unstabilized):
     """Takes q and then v to the constraints after each step; within a step b = −γ.
 
-    Positions first: q = q* ⊕ d with d = W⁻¹ J(q*)ᵀ μ and φ(q, t) = 0, W the metric. The directions
-    are those at q*, so that one factorization of J W⁻¹ Jᵀ serves all iterations and the root does
-    not depend on how it was found; it differs from the nearest point in the metric of W by O(‖d‖²)
-    along the surface. Then velocities at that q: v = v* + W⁻¹ Jᵀ μ with J v + ∂φ/∂t = 0, the
-    smallest change in the metric. Doing it in the other order would leave J v = −J d/h.
+    Positions first: q = q* ⊕ d with d = W⁻¹ J₀ᵀ μ and φ(q, t) = 0, W the metric. One J₀ serves all
+    iterations, so that one factorization of J W⁻¹ Jᵀ does, too, and the root does not depend on how
+    it was found. Then velocities at that q: v = v* + W⁻¹ Jᵀ μ with J v + ∂φ/∂t = 0, the smallest
+    change in the metric. Doing it in the other order would leave J v = −J d/h.
+
+    Coupled, J₀ is that of the point where the step began, and d/h is added to v before v is
+    projected: W⁻¹ J₀ᵀ μ/h is what the constraint forces of the step missed. Semi-implicit Euler so
+    becomes the symplectic Euler method of constrained systems, whose energy stays near its start;
+    split, it would grow in proportion to h. Runge–Kutta methods keep their order either way. What
+    the state was off before the step is nothing that the step's forces missed; d/h therefore
+    counts by 1/(1 + r²), r = T(d/h)/T(v*), T the kinetic energy in the metric: r is O(h²) after a
+    step from the surface, and large after one from far off it. Split, J₀ is that of q*, and q
+    differs from the nearest point in the metric of W by O(‖d‖²) along the surface.
 
     Rows that depend on each other do so on the surface only: off it J(q*) has directions too many,
     by which the point is not unique; the solver's regularization chooses, within O(‖d‖).
@@ -78,31 +86,32 @@ class Projection(Unstabilized):
     Attributes:
         metric: W, "mass" for M with rotors, or "euclidean" for 1 [m, rad], in which heavy bodies
             move as much as light ones.
-        iterations: of quasi-Newton d ← d − factor · S φ(q* ⊕ d), S b the least step with J d = b.
-            Each multiplies the error by about ‖d‖ over the size of the scene: three are enough
-            after a step, twelve where d is a tenth of the scene. 1 is the linearized projection,
+        iterations: at most, of quasi-Newton d ← d − factor · S φ(q* ⊕ d), S b the least step with
+            J₀ d = b; they end where only rounding is left. Each multiplies the error by about the
+            distance from where J₀ belongs, over the size of the scene: some six are enough after a
+            step of a hundredth of a radian, all are needed at one. 1 is the linearized projection,
             which leaves O(‖d‖²) and is differentiated as it is.
         tolerance: max |φ|, a number or a `Tolerance`. A world stays as it is once it is there, and
-            is NOT_CONVERGED if it is not there at the end. If None, all iterations are made, and
-            worlds fail beyond ε^⅔ s with s = 1 + max |q| and ε the spacing of floating numbers; the
-            linearized projection never fails.
+            is NOT_CONVERGED if it is not there at the end. If None, worlds fail beyond ε^⅔ s with
+            s = 1 + max |q| and ε the spacing of floating numbers; the linearized projection never
+            fails.
         factor: of each step, in (0, 1].
         every: how many steps there are from one projection to the next.
-        coupled: whether d/h is added to v before v is projected, as if the step had led there.
+        coupled: whether d belongs to the step, and d/h to its velocity; or q and v are split.
         position: whether q is projected.
         velocity: whether v is projected.
 
     References:
-        Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), section IV.4.
+        Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections IV.4 and VII.1.3.
         Ascher, Chin, Reich, Stabilization of DAEs and invariant manifolds (1994).
     """
 
     metric: str = static(default="mass")
-    iterations: int = static(default=12)
+    iterations: int = static(default=40)
     tolerance: Any = None
     factor: Any = 1.0
     every: int = static(default=1)
-    coupled: bool = static(default=False)
+    coupled: bool = static(default=True)
     position: bool = static(default=True)
     velocity: bool = static(default=True)
 
@@ -114,14 +123,18 @@ class Projection(Unstabilized):
         """One step more, modulo `every`."""
         return memory if self.every == 1 else (memory + 1) % self.every
 
-    def correct(self, system: Any, solver: Any, state: State, memory: PyTree, dt: Any) -> Any:
+    def correct(
+        self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
+    ) -> Any:
         """The state on the constraints, where its projection is due, and a status."""
         if self.every == 1:
-            return self.project(system, solver, state, dt)
+            return self.project(system, solver, before, state, dt)
         due = memory == 0
 
         def go(q: Array, v: Array) -> tuple[Array, Array, Array]:
-            new, code = self.project(system, solver, dataclasses.replace(state, q=q, v=v), dt)
+            new, code = self.project(
+                system, solver, before, dataclasses.replace(state, q=q, v=v), dt
+            )
             return new.q, new.v, code
 
         def rest(q: Array, v: Array) -> tuple[Array, Array, Array]:
@@ -131,32 +144,38 @@ class Projection(Unstabilized):
         q, v = (jnp.where(lift(due, x), x, y) for x, y in ((q, state.q), (v, state.v)))
         return dataclasses.replace(state, q=q, v=v), jnp.where(due, code, Status.OK)
 
-    def project(self, system: Any, solver: Any, state: State, dt: Any) -> tuple[State, Array]:
+    def project(
+        self, system: Any, solver: Any, before: State, state: State, dt: Any
+    ) -> tuple[State, Array]:
         """The state on the constraints, and a status: failures of the solver, or NOT_CONVERGED."""
         code = jnp.zeros_like(state.status)
         if self.position:
-            q, step, code = self._positions(system, solver, state)
-            v = state.v
-            if self.coupled:
-                v = v + numerics.safe_divide(step, dt[None])
+            start = state
+            if self.coupled and self.velocity:
+                start = dataclasses.replace(before, q=system.normalize(before.q))
+            q, v, code = self._positions(system, solver, start, state, dt)
             state = dataclasses.replace(state, q=q, v=v)
         if self.velocity:
             v, late = self._velocities(system, solver, state)
             state, code = dataclasses.replace(state, v=v), status.first(code, late)
         return state, code
 
-    def _positions(self, system: Any, solver: Any, state: State) -> tuple[Array, Array, Array]:
-        """q with φ(q, t) = 0, the step d that leads there, and a status."""
+    def _positions(
+        self, system: Any, solver: Any, start: State, state: State, dt: Any
+    ) -> tuple[Array, Array, Array]:
+        """q with φ(q, t) = 0 by the directions at the start, the v that goes with it, a status."""
         q, still = state.q, jnp.zeros_like(state.v)
-        rows = linearize(system, q, still, state.time)
+        rows = linearize(system, start.q, still, start.time)
         held, rotors = _held(rows.layout)
         if not held.any():
-            return q, still, jnp.zeros_like(state.status)
-        surface = _Surface(system, state, rows, self._problem(system, q, rows, held, rotors), held)
-        solve = solver.factor(surface.problem)
+            return q, state.v, jnp.zeros_like(state.status)
+        problem = self._problem(system, start.q, rows, held, rotors)
+        off = rows if start is state else linearize(system, q, still, state.time)
+        surface = _Surface(system, state, off.residual, problem, held)
+        solve = solver.factor(problem)
 
         def nearest(b: Array) -> Array:
-            """d = W⁻¹ J(q*)ᵀ μ with J(q*) d = b."""
+            """d = W⁻¹ J₀ᵀ μ with J₀ d = b."""
             return solve(still, b).acceleration
 
         bounds = self._bounds(system, state)
@@ -165,7 +184,8 @@ class Projection(Unstabilized):
         code = status.first(
             status.failures(solve(still, 0 * rows.bias).status), late.astype(jnp.int32)
         )
-        return system.retract(q, step), step, code
+        v = state.v if start is state else state.v + _missed(problem.mass, state.v, step, dt)
+        return system.retract(q, step), v, code
 
     def _step(self, surface: _Surface, nearest: Operator, bounds: Bounds) -> tuple[Array, Array]:
         """d with φ(q* ⊕ d) = 0, and max |φ| there, where it is needed."""
@@ -175,17 +195,27 @@ class Projection(Unstabilized):
             left = surface.start if self.tolerance is None else surface.residual(step)
             return step, _largest(left)
 
-        def iterate(_: Any, d: Array) -> tuple[Array, Array]:
-            def once(_: Any, known: tuple[Array, Array]) -> tuple[Array, Array]:
-                d, left = known
-                goes = (_largest(left) > bounds.stays)[None]
-                d = jnp.where(goes, d - factor * nearest(left), d)
-                return d, surface.residual(d)
+        def goes(left: Array, before: Array) -> Array:
+            """Whether a world is still off, and not yet where only rounding is left."""
+            return (left > bounds.stays) & ((left < before) | (left > bounds.fails))
 
-            return jax.lax.fori_loop(0, self.iterations, once, (d, surface.start))
+        def iterate(_: Any, d: Array) -> tuple[Array, Array]:
+            def wanted(known: tuple[Array, ...]) -> Array:
+                count, _, left, before = known
+                return (count < self.iterations) & jnp.any(goes(_largest(left), before))
+
+            def once(known: tuple[Array, ...]) -> tuple[Array, ...]:
+                count, d, left, before = known
+                most = _largest(left)
+                d = jnp.where(goes(most, before)[None], d - factor * nearest(left), d)
+                return count + 1, d, surface.residual(d), most
+
+            first = (jnp.zeros((), jnp.int32), d, surface.start, _largest(surface.start) + jnp.inf)
+            _, d, left, _ = jax.lax.while_loop(wanted, once, first)
+            return d, left
 
         def equation(d: Array) -> Array:
-            """d − S (J(q*) d − φ(q* ⊕ d)), S b the least step with J(q*) d = b: near to d itself.
+            """d − S (J₀ d − φ(q* ⊕ d)), S b the least step with J₀ d = b: near to d itself.
 
             Where it vanishes d is among the steps S b, and φ is zero, or at least S φ is.
             """
@@ -223,10 +253,9 @@ class Projection(Unstabilized):
             given = given if isinstance(given, Tolerance) else Tolerance(given)
             bound = given.at(jax.lax.stop_gradient(system), state)
             return Bounds(bound, bound)
-        size = 1 + _largest(state.q)
-        eps = float(jnp.finfo(size.dtype).eps)
-        fails = jnp.full_like(size, jnp.inf) if self.iterations == 1 else eps ** (2 / 3) * size
-        return Bounds(jnp.zeros_like(size), fails)
+        fails = numerics.negligible(state.q)
+        fails = jnp.full_like(fails, jnp.inf) if self.iterations == 1 else fails
+        return Bounds(jnp.zeros_like(fails), fails)
 
     def check(self) -> None:
         """Checks the choices.
@@ -242,24 +271,30 @@ class Projection(Unstabilized):
         if checks.is_concrete(self.factor) and np.any(np.asarray(self.factor) > 1):
             raise ValueError(f"Projection: factor must be at most 1, got {self.factor}.")
         checks.positive("Projection", "tolerance", jax.tree.leaves(self.tolerance), strictly=False)
-        if self.coupled and not (self.position and self.velocity):
-            raise ValueError("Projection: coupled=True needs both position=True and velocity=True.")
+
+
+def _missed(mass: Mass, v: Array, step: Array, dt: Any) -> Array:
+    """The velocity d/h, as far as its kinetic energy is small beside that of v."""
+    gain = numerics.safe_divide(step, dt[None])
+    own, present = (jnp.sum(x * mass.apply(x), axis=0) for x in (gain, v))
+    ratio = numerics.safe_divide(own, present)
+    return gain / (1 + ratio * ratio)[None]
 
 
 class _Surface:
     """φ(q* ⊕ d) of the rows that are projected, zero for the others.
 
     Attributes:
-        problem: M, J and C at q*.
+        problem: M, J₀ and C.
         start: φ(q*), (n_c,).
     """
 
     def __init__(
-        self, system: Any, state: State, rows: Rows, problem: Saddle, held: np.ndarray
+        self, system: Any, state: State, start: Array, problem: Saddle, held: np.ndarray
     ) -> None:
         self.system, self.state, self.problem = system, state, problem
-        self.held = jnp.asarray(held).reshape(-1, *(1,) * (rows.bias.ndim - 1))
-        self.start = rows.residual  # rows of velocities and rotors have φ = 0
+        self.held = jnp.asarray(held).reshape(-1, *(1,) * (start.ndim - 1))
+        self.start = start  # rows of velocities and rotors have φ = 0
 
     def residual(self, d: Array) -> Array:
         """φ(q* ⊕ d), (n_c,)."""
@@ -268,7 +303,7 @@ class _Surface:
         return linearize(self.system, moved, still, self.state.time).residual
 
     def apply(self, d: Array) -> Array:
-        """J(q*) d, (n_c,)."""
+        """J₀ d, (n_c,)."""
         return jnp.where(self.held, self.problem.jacobian.apply(d), 0)
 
 

@@ -1,0 +1,29 @@
+"""A function of named numbers against differences and, by world, against a loop."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from compiling import quick_jit
+from tolerances import DIFFERENCE
+
+
+def assert_smooth_and_batched(value, numbers, step, close):
+    """Gradients are differences of fourth order, relative to the largest; worlds are a loop.
+
+    Args:
+        value: from a dict of numbers to a number.
+        numbers: where.
+        step: of the differences, relative to each number.
+        close: what a batch may be off by, relative.
+    """
+    x = {key: jnp.asarray(number) for key, number in numbers.items()}
+    run, gradient = quick_jit(value), quick_jit(jax.grad(value))(x)
+    scale = max(abs(float(gradient[key] * x[key])) for key in x)
+    for key in x:
+        at = [float(run(x | {key: x[key] * (1 + s * step)})) for s in (2, 1, -1, -2)]
+        slope = (8 * (at[1] - at[2]) - (at[0] - at[3])) / (12 * step)
+        assert abs(float(gradient[key] * x[key]) - slope) < DIFFERENCE * scale, key
+    worlds = {key: jnp.stack([number, 1.05 * number]) for key, number in x.items()}
+    one_by_one = [run({key: number[i] for key, number in worlds.items()}) for i in (0, 1)]
+    got = quick_jit(jax.vmap(value))(worlds)
+    np.testing.assert_allclose(got, jnp.stack(one_by_one), rtol=close)
