@@ -234,7 +234,7 @@ def test_multipliers_hold_a_closed_loop():
 class Homing(jc.Unstabilized):
     """A correction that takes the particle to the origin, at rest."""
 
-    def correct(self, system, solver, state, memory, dt):
+    def correct(self, system, solver, before, state, memory, dt):
         code = jnp.zeros_like(state.status)
         return dataclasses.replace(state, q=0 * state.q, v=0 * state.v), code
 
@@ -275,7 +275,7 @@ def test_a_mixture_projects_by_the_share_of_the_violation():
     law = mixture(large=Homing(), project_above=0.05)
     for x, share in ((0.05, 0.5), (5.0, 1.0), (5e-4, 0.0)):
         at = dataclasses.replace(state, q=jnp.asarray([x, 0.3]), v=jnp.asarray([2.0, 1.0]))
-        new, _ = law.correct(system, jc.RankSafe(), at, (), jnp.asarray(H))
+        new, _ = law.correct(system, jc.RankSafe(), at, at, (), jnp.asarray(H))
         np.testing.assert_allclose(new.q, (1 - share) * at.q, atol=1e-7)
         np.testing.assert_allclose(new.v, (1 - share) * at.v, atol=1e-7)
 

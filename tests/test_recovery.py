@@ -190,7 +190,7 @@ def test_generalized_coordinates_recover_too(dtype):
     """World by world, and with another projector; each dtype stays what it is."""
 
     class Straight(jc.Unstabilized):
-        def correct(self, system, solver, state, memory, dt):
+        def correct(self, system, solver, before, state, memory, dt):
             return dataclasses.replace(state, q=jnp.zeros_like(state.q).at[0].set(1)), state.status
 
     straight = jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True)(Straight))

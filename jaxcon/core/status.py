@@ -35,7 +35,7 @@ MEANING = {
     " solved by `RankSafe()`, the solver of a `Method` that names none",
     Status.NOT_CONVERGED: "an iteration did not reach its tolerance; likely (a) too few iterations,"
     " (b) a tolerance below what rounding allows, (c) a start too far off the constraints,"
-    " (d) redundant rows that contradict each other",
+    " (d) redundant rows that contradict each other, (e) a step too large for the fastest motion",
     Status.CONFLICT: "constraints contradict each other; the world goes on by least squares;"
     " `report` names them",
     Status.VIOLATED: "constraints are off by more than the limit of the method's Recovery, which"

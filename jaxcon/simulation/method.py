@@ -15,7 +15,7 @@ from jaxcon.solvers.proximal import RankSafe
 from jaxcon.stabilization.baumgarte import Baumgarte
 
 PARTS = (
-    ("integrator", "advance", "SemiImplicitEuler()"),
+    ("integrator", "default_gains", "SemiImplicitEuler()"),
     ("stabilizer", "target", "Baumgarte()"),
     ("solver", "solve", "RankSafe()"),
     ("recovery", "repair", "Recovery()"),

@@ -77,8 +77,8 @@ class RATTLE:
             return None
         return (
             "it keeps positions and velocities on the constraints itself, and a stabilizer would"
-            f" undo what it conserves, so that {type(stabilizer).__name__} with gains of its own"
-            " has no place beside it; leave the stabilizer out, or take RK4() with it"
+            f" undo what it conserves, so that {type(stabilizer).__name__} has no place beside it;"
+            " leave the stabilizer out, or take RK4() with it"
         )
 
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:

@@ -37,16 +37,24 @@ def frequency_response(
         dt: h [s].
 
     Returns:
-        φ/w as complex numbers, in the shape to which the arguments broadcast [s²].
+        φ/w as complex numbers, in the shape to which the arguments broadcast [s²]: the steady
+        response, which is never reached where the feedback is unstable; `largest_stable_rate` says
+        up to where it is not.
 
     Raises:
-        ValueError: one of integrator and step is given without the other.
+        ValueError: one of integrator and step is given without the other, or the integrator keeps
+            constraints by itself and has no feedback.
 
     References:
         Åström and Wittenmark, Computer-Controlled Systems (1997), section 3.3.
     """
     if (integrator is None) != (dt is None):
         raise ValueError("frequency_response: integrator and dt go together; give both or neither.")
+    if integrator is not None and not hasattr(integrator, "error_map"):
+        raise ValueError(
+            f"frequency_response: {type(integrator).__name__} keeps constraints itself and has no"
+            " feedback; give SemiImplicitEuler() or a Runge-Kutta method such as RK4()."
+        )
     ω, α, β, k = (
         jnp.asarray(x, jnp.result_type(float)) for x in (frequency, alpha, beta, integral)
     )

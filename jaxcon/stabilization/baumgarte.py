@@ -14,7 +14,7 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Saddle, Solution
-from jaxcon.stabilization.gains import by_row
+from jaxcon.stabilization.gains import by_row, check_gains
 
 
 class Law(NamedTuple):
@@ -98,6 +98,14 @@ class Baumgarte(Unstabilized):
     alpha: Any = None
     beta: Any = None
     fallback: Any = None
+
+    def check(self) -> None:
+        """Checks that gains are zero or more and finite, as far as they are known.
+
+        Raises:
+            ValueError: one is not.
+        """
+        check_gains("Baumgarte", alpha=self.alpha, beta=self.beta)
 
     @classmethod
     def critical(cls, rate: Any) -> Baumgarte:

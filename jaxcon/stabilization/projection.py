@@ -255,7 +255,8 @@ class Projection(Unstabilized):
             return Bounds(bound, bound)
         fails = numerics.negligible(state.q)
         fails = jnp.full_like(fails, jnp.inf) if self.iterations == 1 else fails
-        return Bounds(jnp.zeros_like(fails), fails)
+        spacing = float(jnp.finfo(fails.dtype).eps)
+        return Bounds(2 * spacing * (1 + _largest(state.q)), fails)
 
     def check(self) -> None:
         """Checks the choices.
