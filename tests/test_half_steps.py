@@ -98,6 +98,19 @@ def test_a_rotor_has_no_rate():
     assert np.max(np.abs(seen[others] - rows.rate[others])) > 0.1
 
 
+def test_rows_of_velocities_are_held_where_q_is():
+    """A blade in a turn does not slip by ½hγ."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    moving = {"velocity": (3.0, 0.0), "angular_velocity": 1.0}
+    scene.add_body("skate", mass=60.0, inertia=2.0, position=(0.0, 0.0), **moving)
+    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    built = scene.build()
+    code, _, slip, change = watched(built, jc.Method(), 1e-2, 400)
+    assert code == jc.Status.OK
+    assert slip < 1e-4  # 3 m/s · 1 rad/s · h/2 = 1.5e-2
+    assert change < 0.05 * 0.5 * 60.0 * 3.0**2
+
+
 def test_a_start_off_the_surface_gains_no_speed():
     """What the state was off before the step is not counted as a displacement by it."""
     system, state = pendulum(0.0)

@@ -155,9 +155,10 @@ class Rows:
     def earlier(self, age: Array) -> Rows:
         """The same with the rates at t − age, () [s], had v always been what it is.
 
-        φ̇(q ⊖ age v, v, t − age) = φ̇ − age γ to first order. What holds nothing has no rate.
+        φ̇(q ⊖ age v, v, t − age) = φ̇ − age γ to first order. Rows of velocities alone hold ψ at q
+        itself, and rotors hold nothing: theirs are as they are.
         """
-        held = np.isin(np.arange(self.layout.size), self.layout.holding)
+        held = np.isin(np.arange(self.layout.size), self.layout.holding) & self.layout.holonomic
         held = held.reshape(-1, *(1,) * (self.bias.ndim - 1))
         rate = self.rate - jnp.where(held, age[None] * self.bias, 0)
         return dataclasses.replace(self, rate=rate)
