@@ -54,8 +54,7 @@ class World:
         size: a length by which φ is measured [m].
         energy: the scale of its energy [J].
         dt: h [s].
-        method: what is changed in the method; the same function in the whole family.
-        number: what that change is given.
+        number: what the family's `adapt` is given.
         text: the same mechanism for MuJoCo; None where it has none.
         rates: its joint velocities at the start.
     """

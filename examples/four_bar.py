@@ -52,7 +52,8 @@ def main(picture: str = "four_bar.png") -> None:
     print(f"\nafter 2 s: violation {jc.violation(system, final).worst:.1e} m")
 
     # What the last hinge holds: force (2,) and torque on the ground, from the multipliers.
-    solution = jc.forward_dynamics(system, final, None, jc.Method(), 1e-3)
+    no_feedback = jc.Method(stabilizer=jc.Unstabilized())
+    solution = jc.forward_dynamics(system, final, None, no_feedback, 1e-3)
     print("force of the rocker on the ground [N]:", jc.wrench(system, final, solution, "d")[:2])
     path = jax.vmap(lambda s: jc.position(system, s, "coupler"))(trajectory)
     print("the middle of the coupler, first and last [m]:", np.asarray(path[0]), path[-1])

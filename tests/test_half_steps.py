@@ -54,13 +54,16 @@ def watched(built, method, dt, steps):
 
 
 @pytest.mark.parametrize("keeper", KEEPERS)
-def test_energy_stays_in_a_band(keeper):
-    """A four-bar at 10 rad/s for 20 s: with φ̇ as it is, energy grew a hundredfold in 100 s."""
+def test_energy_stays_in_a_band_or_drifts_slowly(keeper):
+    """A four-bar at 10 rad/s for 20 s; slow feedback and sparse projections drift by 0.005/s."""
     method = jc.Method(stabilizer=KEEPERS[keeper])
-    code, _, _, change = watched(four_bar(), method, 1e-3, 20_000)
-    assert code == jc.Status.OK
+    half, whole = (watched(four_bar(), method, 1e-3, steps) for steps in (10_000, 20_000))
+    assert half[0] == whole[0] == jc.Status.OK
     start = float(jc.energy(*four_bar()).kinetic)
-    assert change < {"slow": 0.15, "PID": 0.15}.get(keeper, 0.05) * start
+    if keeper in ("default", "projection", "linearized"):
+        assert whole[3] < min(1.1 * half[3], 0.02 * start)
+    else:
+        assert whole[3] < 0.006 * 20 * start
 
 
 def test_the_circle_is_kept_to_third_order():
@@ -120,6 +123,58 @@ def test_a_start_off_the_surface_gains_no_speed():
         new, _ = jc.step(system, method, start, None, 1e-3)
         assert jc.violation(system, new).worst < IDENTITY
         assert np.max(np.abs(new.v)) < 1e-9
+
+
+@pytest.mark.parametrize("speed", [0.0, 1e-9, 1e-3])
+def test_two_links_off_the_surface_gain_no_speed(speed):
+    """Here d is not normal to the surface where it ends, and d/h would be kept in part."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    for i, place in enumerate([(1.1, 0.1), (1.2, 1.2)]):
+        scene.add_particle(f"bob{i}", mass=1.0, position=place)
+        before = f"bob{i - 1}" if i else jc.WORLD
+        scene.add(jc.Distance(f"rod{i}", before, f"bob{i}", length=1.0))
+    system, state = scene.build()
+    for dtype in (jnp.float64, jnp.float32):
+        own, at = jax.tree.map(
+            lambda x, dtype=dtype: x.astype(dtype) if x.dtype == jnp.float64 else x, (system, state)
+        )
+        for integrator in (jc.SemiImplicitEuler(), jc.RK4()):
+            method = jc.Method(integrator, jc.Projection())
+            start = jc.init(own, method, at.q, at.v + dtype(speed))
+            new, _ = jc.step(own, method, start, None, 1e-3)
+            assert np.max(np.abs(new.v)) < 3 * speed + 1e-12
+
+
+def test_derivatives_of_a_hanging_rod_in_float32():
+    """At rest T(v*) is rounding, of which nothing may be divided away."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -G), dtype=jnp.float32)
+    scene.add_particle("bob", mass=0.1, position=(0.0, -0.1))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Projection())
+
+    def swing(speed, steps):
+        push = speed * jnp.array([1.0, 0.0], jnp.float32)
+        start = jc.init(system, method, state.q, state.v + push)
+        return jc.rollout(system, method, start, None, 1e-3, steps)[0].q[0]
+
+    for steps in (1, 20, 200):
+        got = quick_jit(jax.grad(lambda x, steps=steps: swing(x, steps)))(jnp.float32(0.0))
+        assert np.isfinite(got)
+    frequency = np.sqrt(G / 0.1)
+    np.testing.assert_allclose(got, np.sin(0.2 * frequency) / frequency, rtol=2e-2)
+
+
+def test_forces_are_read_without_feedback():
+    """λ of a body on a circle, after steps that left φ̇ = ½hγ: minus m v²/l."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0), velocity=(0.0, 2.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    final, _ = jc.rollout(system, jc.Method(), state, None, 1e-3, 50)
+    _, info = jc.step(system, jc.Method(), final, None, 1e-3)
+    read = jc.forward_dynamics(system, final, None, jc.Method(stabilizer=jc.Unstabilized()), 1e-3)
+    np.testing.assert_allclose([info.multipliers[0], read.multipliers[0]], -4.0, rtol=1e-3)
 
 
 def test_derivatives_at_rest_and_under_way():

@@ -61,8 +61,11 @@ class SemiImplicitEuler(Explicit):
     v leads from one q to the next, and so belongs to the time half a step before q. The rate at
     which a constraint moved then is p = φ̇ − ½h γ = (φ − φ⁻)/h + O(h²), and p is what feedback acts
     on. It would hold φ̇ itself against ½h γ, and so do work on the motion: energy would grow in
-    proportion to h, and φ be off by h² γ/2. A start with φ̇ = 0 is taken back by half a step in the
-    first one, whose λ therefore differs by what that takes; `forward_dynamics` tells λ without it.
+    proportion to h, and φ be off by h² γ/2. Rows of velocities alone are held at q itself.
+
+    A start with φ̇ = 0 is taken back by half a step in the first one, whose λ therefore lacks a
+    share of what bends the path (half, by default gains); `forward_dynamics` without feedback has
+    it all.
     """
 
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:

@@ -10,7 +10,7 @@ from jaxcon.constraints.rows import RowLayout, Rows, linearize
 from jaxcon.core import checks, numerics, status
 from jaxcon.core.dependence import depends
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.status import Status
+from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics, saddle
 from jaxcon.model.state import State
@@ -95,7 +95,11 @@ class RATTLE:
         drift = _Drift(dynamics, state, rows, system.mass(q).apply(v) + kick, dt)
         start = jnp.concatenate([v, jnp.zeros_like(rows.rate)])
         between, moved = roots.implicit(
-            drift.residual, start, drift.iterate(self.iterations), *drift.inverses(self.iterations)
+            drift.residual,
+            start,
+            drift.iterate(self.iterations, failed(state.status)),
+            *drift.inverses(self.iterations),
+            leading=len(v),
         )
         middle, pull = between[: len(v)], between[len(v) :]
         end, code = self._arrive(dynamics, state, middle, dt)
@@ -129,7 +133,7 @@ class RATTLE:
             return first.acceleration, code
 
         def iterate(function: Operator, v: Array) -> tuple[Array, Array]:
-            return roots.settle(function, v, self.rounds)
+            return roots.settle(function, v, self.rounds, stopped=failed(state.status))
 
         def residual(v: Array) -> Array:
             return v - kicked(v).acceleration
@@ -168,13 +172,15 @@ class _Drift:
         balance = momentum - self.rows.jacobian.transpose(pull) - self.momentum
         return jnp.concatenate([balance, numerics.safe_divide(φ, self.h)])
 
-    def iterate(self, iterations: int) -> Any:
+    def iterate(self, iterations: int, stopped: Array) -> Any:
         """Quasi-Newton from a start: z, and by how much V changed at last."""
         inverse, n = self.inverses(0)[1], len(self.momentum)
         rounding = _rounding(self.q, self.h[0]) / 16
 
         def iterate(function: Operator, z: Array) -> tuple[Array, Array]:
-            z, moved = roots.settle(lambda z: inverse(function(z)), z, iterations, rounding)
+            z, moved = roots.settle(
+                lambda z: inverse(function(z)), z, iterations, rounding, n, stopped
+            )
             return z, moved[:n]
 
         return iterate

@@ -198,7 +198,7 @@ def _correct(
     projector: Any, system: Any, solver: Any, state: State, wanted: Array, dt: Any
 ) -> tuple[State, Array]:
     """The state corrected where that is wanted, and a failure where it is not or does not help."""
-    new, code = projector.correct(system, solver, state, state, (), 0 * dt)
+    new, code = projector.correct(system, solver, state, state, (), dt)
     finite = jnp.all(jnp.isfinite(new.q), axis=0) & jnp.all(jnp.isfinite(new.v), axis=0)
     code = first(code, jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32))
     return new, jnp.where(wanted, code, UNWANTED).astype(jnp.int32)

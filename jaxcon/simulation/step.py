@@ -155,6 +155,9 @@ def forward_dynamics(
 ) -> Solution:
     """a and λ at a state, under the method's feedback of φ and φ̇ as they are there.
 
+    To read the forces at a state, take `Unstabilized()`: what feedback adds is not of the motion,
+    and the φ̇ that semi-implicit Euler leaves, ½hγ, is no error to be fed back.
+
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
         state: where.

@@ -25,6 +25,7 @@ def implicit(
     rounds: int,
     inverse: Operator = itself,
     transposed: Operator = itself,
+    leading: int | None = None,
 ) -> tuple[Array, Any]:
     """x with f(x) = 0, and whatever else its iteration tells; exact to every order of derivative.
 
@@ -38,24 +39,38 @@ def implicit(
         rounds: how many at most.
         inverse: y → P y, near to f′(x)⁻¹ y.
         transposed: y → Pᵀ y.
+        leading: how many entries say whether only rounding is left; all unless given.
     """
 
     def tangent(linear: Operator, right: Array) -> Array:
         return jax.lax.custom_linear_solve(
-            linear, right, _refined(inverse, rounds), _refined(transposed, rounds)
+            linear,
+            right,
+            _refined(inverse, rounds, leading),
+            _refined(transposed, rounds, leading),
         )
 
     return jax.lax.custom_root(function, start, iterate, tangent, has_aux=True)
 
 
-def _refined(inverse: Operator, rounds: int) -> Callable[[Operator, Array], Array]:
+def _refined(
+    inverse: Operator, rounds: int, leading: int | None
+) -> Callable[[Operator, Array], Array]:
     def refine(linear: Operator, right: Array) -> Array:
-        return settle(lambda x: inverse(linear(x) - right), inverse(right), rounds)[0]
+        down = settle(lambda x: inverse(linear(x) - right), inverse(right), rounds, leading=leading)
+        return down[0]
 
     return refine
 
 
-def settle(down: Operator, x: Array, rounds: int, rounding: Any = 0.0) -> tuple[Array, Array]:
+def settle(
+    down: Operator,
+    x: Array,
+    rounds: int,
+    rounding: Any = 0.0,
+    leading: int | None = None,
+    stopped: Any = False,
+) -> tuple[Array, Array]:
     """x ← x − d(x), until in every world only rounding is left of d, or the rounds are over.
 
     Args:
@@ -63,21 +78,26 @@ def settle(down: Operator, x: Array, rounds: int, rounding: Any = 0.0) -> tuple[
         x: where to begin, (n, …).
         rounds: how many at most.
         rounding: what rounding makes of x besides its own spacing, a number or one by world.
+        leading: how many entries are looked at; all unless given.
+        stopped: worlds for which nothing is done.
 
     Returns:
         x, and the last d.
     """
+    spacing = 4 * float(jnp.finfo(x.dtype).eps)
 
-    def goes(known: tuple[Array, Array, Array]) -> Array:
+    def goes(x: Array, step: Array) -> Array:
+        size, moved = (jnp.max(jnp.abs(y[:leading]), axis=0, initial=0) for y in (x, step))
+        return (moved > spacing * size + rounding) & ~jnp.asarray(stopped)
+
+    def unsettled(known: tuple[Array, Array, Array]) -> Array:
         count, x, step = known
-        size, moved = (jnp.max(jnp.abs(y), axis=0, initial=0) for y in (x, step))
-        settled = 4 * float(jnp.finfo(x.dtype).eps) * size + rounding
-        return (count < rounds) & jnp.any(moved > settled)
+        return (count < rounds) & jnp.any(goes(x, step))
 
     def once(known: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, x, _ = known
-        step = down(x)
-        return count + 1, x - step, step
+        count, x, step = known
+        going, new = goes(x, step)[None], down(x)
+        return count + 1, jnp.where(going, x - new, x), jnp.where(going, new, step)
 
     start = jnp.zeros((), jnp.int32), x, jnp.full_like(x, jnp.inf)
-    return jax.lax.while_loop(goes, once, start)[1:]
+    return jax.lax.while_loop(unsettled, once, start)[1:]

@@ -70,9 +70,9 @@ class Projection(Unstabilized):
 
     Coupled, J₀ is that of the point where the step began, and d/h is added to v before v is
     projected: W⁻¹ J₀ᵀ μ/h is what the constraint forces of the step missed. Semi-implicit Euler so
-    becomes the symplectic Euler method of constrained systems, whose energy stays near its start;
-    split, it would grow in proportion to h. Runge–Kutta methods keep their order either way. What
-    the state was off before the step is nothing that the step's forces missed; d/h therefore
+    becomes the symplectic Euler method of constrained particles and plane bodies, whose energy
+    stays near its start; split, it would grow in proportion to h. Runge–Kutta methods keep their
+    order either way. What the state was off before the step, its forces did not miss; d/h therefore
     counts by 1/(1 + r²), r = T(d/h)/T(v*), T the kinetic energy in the metric: r is O(h²) after a
     step from the surface, and large after one from far off it. Split, J₀ is that of q*, and q
     differs from the nearest point in the metric of W by O(‖d‖²) along the surface.
@@ -92,12 +92,13 @@ class Projection(Unstabilized):
             step of a hundredth of a radian, all are needed at one. 1 is the linearized projection,
             which leaves O(‖d‖²) and is differentiated as it is.
         tolerance: max |φ|, a number or a `Tolerance`. A world stays as it is once it is there, and
-            is NOT_CONVERGED if it is not there at the end. If None, worlds fail beyond ε^⅔ s with
-            s = 1 + max |q| and ε the spacing of floating numbers; the linearized projection never
-            fails.
+            is NOT_CONVERGED if it is not there at the end. If None, it stays below 2 ε s and fails
+            beyond ε^⅔ s, with s = 1 + max |q| and ε the spacing of floating numbers; the linearized
+            projection never fails.
         factor: of each step, in (0, 1].
         every: how many steps there are from one projection to the next.
-        coupled: whether d belongs to the step, and d/h to its velocity; or q and v are split.
+        coupled: whether d belongs to the step, and d/h to its velocity; or q and v are split, as
+            they are where only one of them is projected.
         position: whether q is projected.
         velocity: whether v is projected.
 
@@ -151,7 +152,7 @@ class Projection(Unstabilized):
         code = jnp.zeros_like(state.status)
         if self.position:
             start = state
-            if self.coupled and self.velocity:
+            if self.coupled and self.velocity and before is not state:
                 start = dataclasses.replace(before, q=system.normalize(before.q))
             q, v, code = self._positions(system, solver, start, state, dt)
             state = dataclasses.replace(state, q=q, v=v)
@@ -197,7 +198,8 @@ class Projection(Unstabilized):
 
         def goes(left: Array, before: Array) -> Array:
             """Whether a world is still off, and not yet where only rounding is left."""
-            return (left > bounds.stays) & ((left < before) | (left > bounds.fails))
+            off = (left > bounds.stays) & ((left < before) | (left > bounds.fails))
+            return off & ~status.failed(surface.state.status)
 
         def iterate(_: Any, d: Array) -> tuple[Array, Array]:
             def wanted(known: tuple[Array, ...]) -> Array:
@@ -278,8 +280,9 @@ def _missed(mass: Mass, v: Array, step: Array, dt: Any) -> Array:
     """The velocity d/h, as far as its kinetic energy is small beside that of v."""
     gain = numerics.safe_divide(step, dt[None])
     own, present = (jnp.sum(x * mass.apply(x), axis=0) for x in (gain, v))
-    ratio = numerics.safe_divide(own, present)
-    return gain / (1 + ratio * ratio)[None]
+    scale = jax.lax.stop_gradient(jnp.maximum(own, present))
+    own, present = (numerics.safe_divide(x, scale) for x in (own, present))
+    return gain * numerics.safe_divide(present**2, present**2 + own**2)[None]
 
 
 class _Surface:
