@@ -25,6 +25,7 @@ import numpy as np
 
 import jaxcon as jc
 from benchmarks import mjcf
+from benchmarks.stabilisation import cast
 
 G = 9.81
 FRAMES = 100
@@ -95,18 +96,14 @@ def chain(masses: Sequence[float], length: float, dt: float = 1e-3) -> World:
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     before, inside = jc.WORLD, ""
     for i, mass in enumerate(masses):
-        inertia, place = mass * length * length / 12, ((i + 0.5) * length, 0.0)
+        inertia, place = mass * length**2 / 12, ((i + 0.5) * length, 0.0)
         scene.add_body(f"link{i}", mass=mass, inertia=inertia, position=place)
         scene.add(jc.Revolute(f"hinge{i}", before, f"link{i}", point=(i * length, 0.0)))
         before = f"link{i}"
     for i, mass in reversed(list(enumerate(masses))):
         hinge = mjcf.joint("hinge", axis=mjcf.OUT_OF_PLANE, pos=(-length / 2, 0.0, 0.0))
         place = mjcf.in_space((length if i else length / 2, 0.0))
-        moments = (
-            1e-3 * mass * length * length,
-            mass * length * length / 12,
-            mass * length * length / 12,
-        )
+        moments = (1e-3 * mass * length**2, *(mass * length**2 / 12,) * 2)
         inside = mjcf.body(f"link{i}", place, mass, moments, hinge + inside)
     n = np.arange(len(masses)) + 0.5
     scale = G * length * float(np.asarray(masses) @ n)
@@ -140,11 +137,15 @@ def gains(multiple: float) -> World:
     return World(pendulum.system, pendulum.state, 2.0, pendulum.energy, number=multiple)
 
 
+def feeds_back(method: jc.Method) -> bool:
+    """Whether it is feedback that keeps constraints, and not the integrator or a projection."""
+    own = isinstance(method.integrator, jc.RATTLE | jc.GeneralizedAlpha)
+    return type(method.stabilizer) is jc.Baumgarte and not own
+
+
 def feedback(method: jc.Method, multiple: Any) -> jc.Method | None:
     """The method with that feedback, where it has any."""
-    if type(method.stabilizer) is not jc.Baumgarte or not hasattr(method.integrator, "growth"):
-        return None
-    if isinstance(method.integrator, jc.RATTLE | jc.GeneralizedAlpha):
+    if not feeds_back(method):
         return None
     rate = multiple * jc.largest_stable_rate(method.integrator, 1e-3)
     return jc.Method(method.integrator, jc.Baumgarte(rate, rate))
@@ -173,9 +174,7 @@ def spring(stiffness: float) -> World:
 
 def penalty(method: jc.Method, stiffness: Any) -> jc.Method | None:
     """The method with the penalty, where it stands beside one."""
-    if type(method.stabilizer) is not jc.Baumgarte or isinstance(
-        method.integrator, jc.RATTLE | jc.GeneralizedAlpha
-    ):
+    if not feeds_back(method):
         return None
     return jc.Method(method.integrator, jc.Penalty(stiffness, 0.0))
 
@@ -288,7 +287,7 @@ def _side_by_side(
     family: Family, worlds: list[World], method: jc.Method, dtype: np.dtype
 ) -> list[tuple[str, float, float, float]]:
     def stacked(trees: list[Any]) -> Any:
-        return jax.tree.map(lambda *x: _cast(jnp.stack(x), dtype), *trees)
+        return jax.tree.map(lambda *x: cast(jnp.stack(x), dtype), *trees)
 
     systems, states = stacked([w.system for w in worlds]), stacked([w.state for w in worlds])
     numbers = (jnp.asarray([getattr(w, x) for w in worlds], dtype) for x in ("dt", "number"))
@@ -316,10 +315,6 @@ def _side_by_side(
         (name, float(t), float(off / w.size), float(change / w.energy))
         for name, (w, t, off, change) in zip(names, sizes, strict=True)
     ]
-
-
-def _cast(x: Any, dtype: Any) -> Any:
-    return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
 def peer(family: Family, integrator: str) -> list[Outcome] | str:

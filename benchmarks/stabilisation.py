@@ -120,7 +120,7 @@ class Row:
 def measure(scene: str, dtype: Any, integrator: str, stabilizer: str, steps: int, dt: float) -> Row:
     """Runs one pair."""
     built = SCENES[scene]()
-    system, state = jax.tree.map(lambda x: _cast(x, dtype), built)
+    system, state = jax.tree.map(lambda x: cast(x, dtype), built)
     method = jc.Method(INTEGRATORS[integrator], STABILIZERS[stabilizer])
     known = (scene, np.dtype(dtype).name, integrator, stabilizer)
     failed = (float("nan"),) * 4
@@ -159,7 +159,8 @@ def measure(scene: str, dtype: Any, integrator: str, stabilizer: str, steps: int
     )
 
 
-def _cast(x: Any, dtype: Any) -> Any:
+def cast(x: Any, dtype: Any) -> Any:
+    """An array of numbers in another precision; one of integers as it is."""
     return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 

@@ -52,10 +52,17 @@ class RowLayout:
         return ~np.isin(np.arange(self.size), self.free)
 
     @property
+    def holds(self) -> np.ndarray:
+        """Whether each row takes away a freedom, (n_c,): all do but those of rotors."""
+        holds = np.ones(self.size, bool)
+        for name in self.inertial:
+            holds[self.rows(name)] = False
+        return holds
+
+    @property
     def holding(self) -> np.ndarray:
-        """Numbers of the rows that take away a freedom: all but those of rotors."""
-        rotors = [self.rows(name) for name in self.inertial]
-        return np.setdiff1d(np.arange(self.size), np.concatenate([[], *rotors]).astype(int))
+        """Numbers of the rows that take away a freedom."""
+        return np.flatnonzero(self.holds)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -158,7 +165,7 @@ class Rows:
         φ̇(q ⊖ age v, v, t − age) = φ̇ − age γ to first order. Rows of velocities alone hold ψ at q
         itself, and rotors hold nothing: theirs are as they are.
         """
-        held = np.isin(np.arange(self.layout.size), self.layout.holding) & self.layout.holonomic
+        held = self.layout.holds & self.layout.holonomic
         held = held.reshape(-1, *(1,) * (self.bias.ndim - 1))
         rate = self.rate - jnp.where(held, age[None] * self.bias, 0)
         return dataclasses.replace(self, rate=rate)

@@ -10,7 +10,7 @@ from jaxcon.constraints.rows import RowLayout, Rows, linearize
 from jaxcon.core import checks, numerics, status
 from jaxcon.core.dependence import depends
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.status import Status, failed
+from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics, saddle
 from jaxcon.model.state import State
@@ -97,7 +97,7 @@ class RATTLE:
         between, moved = roots.implicit(
             drift.residual,
             start,
-            drift.iterate(self.iterations, failed(state.status)),
+            drift.iterate(self.iterations, status.failed(state.status)),
             *drift.inverses(self.iterations),
             leading=len(v),
         )
@@ -133,7 +133,7 @@ class RATTLE:
             return first.acceleration, code
 
         def iterate(function: Operator, v: Array) -> tuple[Array, Array]:
-            return roots.settle(function, v, self.rounds, stopped=failed(state.status))
+            return roots.settle(function, v, self.rounds, stopped=status.failed(state.status))
 
         def residual(v: Array) -> Array:
             return v - kicked(v).acceleration

@@ -93,7 +93,7 @@ def rows_of(layout: RowLayout, names: Iterable[str]) -> np.ndarray:
 def named(gain: Any, layout: RowLayout, owner: str) -> np.ndarray:
     """Whether a gain is given for each row, (n_c,): by all but a mapping for those that hold."""
     if not isinstance(gain, Mapping):
-        return np.isin(np.arange(layout.size), layout.holding)
+        return layout.holds
     names = keyed(gain, layout.names, owner).values()
     return rows_of(layout, (name for own in names for name in own))
 

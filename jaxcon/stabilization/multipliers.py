@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcon.constraints.rows import Rows, layout_of
 from jaxcon.core import checks
@@ -100,7 +99,7 @@ class AugmentedLagrangian(Unstabilized):
         if not system.target.size:
             return solver.solve(system)
         solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
-        holding = np.isin(np.arange(rows.layout.size), rows.layout.holding)
+        holding = rows.layout.holds
         weight = scaled(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)

@@ -313,7 +313,7 @@ class _Surface:
 
 def _held(layout: RowLayout) -> tuple[np.ndarray, np.ndarray]:
     """Which rows have a φ to be projected, and which are rotors, (n_c,) each."""
-    rotors = ~np.isin(np.arange(layout.size), layout.holding)
+    rotors = ~layout.holds
     return layout.holonomic & ~rotors, rotors
 
 
