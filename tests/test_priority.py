@@ -219,3 +219,28 @@ def test_what_levels_are_refused():
     unnamed = dataclasses.replace(problem()[0], layout=None)
     with pytest.raises(ValueError, match="no constraint 'rest'"):
         jc.Priority({"rest": 1}).solve(unnamed)
+
+
+@pytest.mark.parametrize("rate", [5.0, 20.0, 50.0])
+def test_a_rod_too_short_to_reach_disturbs_no_higher_level(rate):
+    """A bob at 1 m from the origin that a rod of 1.9 m should hold to a point 3 m away.
+
+    It comes to the end of its reach, 2 m from that point, where the rod's row is that of the rail.
+    """
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(0.6, 0.8))
+    scene.add(jc.Distance("left", jc.WORLD, "bob", length=1.0))
+    scene.add(jc.Distance("right", jc.WORLD, "bob", length=1.9, point_a=(3.0, 0.0)))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Baumgarte.critical(rate), solver=jc.Priority({"right": 1}))
+
+    def record(s, _):
+        found = jc.violation(system, s)
+        return found["left"], found["right"]
+
+    run = quick_jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 10000, record=record))
+    final, (left, right) = run(state)
+    assert final.status == jc.Status.OK
+    assert np.max(left) < 1e-2  # while it is pulled in, at up to 80 m/s
+    assert np.max(left[-1000:]) < 1e-5
+    np.testing.assert_allclose(right[-1000:], 0.1, rtol=2e-2)

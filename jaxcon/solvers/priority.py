@@ -23,7 +23,7 @@ LEVELS = range(4)
 
 
 def Priority(  # noqa: N802
-    levels: Mapping[str, int], cutoff: Any = None, conflict: Any = 1e-2
+    levels: Mapping[str, int], cutoff: Any = None, conflict: Any = 1e-2, damping: Any = None
 ) -> Lexicographic:
     """A solver that meets constraints level by level: see `Lexicographic`.
 
@@ -32,6 +32,7 @@ def Priority(  # noqa: N802
             highest, to 3; where several match a name, the last one counts. Others have level 0.
         cutoff: as of `Lexicographic`.
         conflict: as of `Lexicographic`.
+        damping: as of `Lexicographic`.
 
     Raises:
         ValueError: a level is not 0, 1, 2 or 3.
@@ -41,7 +42,8 @@ def Priority(  # noqa: N802
             raise ValueError(
                 f"Priority: the level of '{name}' must be 0, 1, 2 or 3, got {level!r}."
             )
-    return Lexicographic(cutoff, conflict, tuple((str(n), int(k)) for n, k in levels.items()))
+    pairs = tuple((str(name), int(level)) for name, level in levels.items())
+    return Lexicographic(cutoff, conflict, damping, pairs)
 
 
 @pytree
@@ -60,6 +62,12 @@ class Lexicographic:
     rounding, and λ of each level is the one of least norm. Rows are compared in units of their own
     length √A_ii. Dense, for mechanisms of up to some hundreds of rows.
 
+    Where a lower level comes to ask for what those above it no longer leave free, as an arm at the
+    end of its reach does, J_k N loses rank, and what it asks for stays: S_k⁺ would answer without
+    bound. Below level 0, S_k⁺ is therefore damped, by three rounds of (S² + μ²)⁻¹ S on what is
+    left: the part (μ² / (σ² + μ²))³ is not met where S_k, its rows scaled, has the eigenvalue σ.
+    Level 0 is not damped, so that a mechanism passes its singular positions.
+
     Rows with a compliance, as those of rotors and soft constraints, can always be met. The status
     is CONFLICT where the rows of one level contradict each other; a level that cannot be met
     because of those above it is what priorities are for, and no conflict. `report` names both.
@@ -71,18 +79,23 @@ class Lexicographic:
         cutoff: eigenvalues of S_k, its rows scaled, that count as zero; if None, 1e-9 in float64
             and 1e-5 in float32.
         conflict: the part of b that a level may leave open on its own before it is a conflict.
+        damping: μ; a lower level gives way where its rows come within an angle of √μ of those
+            above it; if None, 3e-3, which is 3 degrees.
         levels: (pattern, level) of constraints.
 
     References:
         Siciliano and Slotine, A general framework for managing multiple tasks in highly redundant
             robotic systems, ICAR 1991.
         Khatib, A unified approach for motion and force control of robot manipulators (1987).
+        Nakamura and Hanafusa, Inverse kinematic solutions with singularity robustness for robot
+            manipulator control, ASME J. Dynamic Systems, Measurement and Control 108 (1986).
         Escande, Mansard and Wieber, Hierarchical quadratic programming, Int. J. Robotics Research
             33 (2014).
     """
 
     cutoff: Any = None
     conflict: Any = 1e-2
+    damping: Any = None
     levels: tuple[tuple[str, int], ...] = static(default=())
 
     def solve(self, system: Saddle) -> Solution:
@@ -97,8 +110,11 @@ class Lexicographic:
         rank, dtype = system.target.ndim - 1, system.target.dtype
         usual = 1e-9 if jnp.finfo(dtype).bits == 64 else 1e-5
         cutoff = jnp.full((1,) * rank, usual) if self.cutoff is None else self.cutoff
-        cutoff, conflict = (jnp.asarray(x, dtype) for x in (cutoff, self.conflict))
-        known = native.per_world(partial(_factor, parts), rank)(system, cutoff)
+        damping = jnp.full((1,) * rank, 3e-3) if self.damping is None else self.damping
+        cutoff, damping, conflict = (
+            jnp.asarray(x, dtype) for x in (cutoff, damping, self.conflict)
+        )
+        known = native.per_world(partial(_factor, parts), rank)(system, cutoff, damping)
         solve = native.per_world(partial(_solve, parts), rank)
         return lambda force, target: solve(known, force, target, conflict)
 
@@ -128,7 +144,7 @@ class Pivot(NamedTuple):
     """One level of the elimination.
 
     Attributes:
-        inverse: S⁺.
+        inverse: S⁺, below level 0 damped.
         coupling: S⁺ times the block beside S, of the levels below.
         own: A A⁺ of the level alone: the projector on what its rows can be given together.
     """
@@ -156,7 +172,9 @@ class Eliminated(NamedTuple):
     pivots: tuple[Pivot, ...]
 
 
-def _factor(parts: tuple[np.ndarray, ...], system: Saddle, cutoff: Array) -> Eliminated:
+def _factor(
+    parts: tuple[np.ndarray, ...], system: Saddle, cutoff: Array, damping: Array
+) -> Eliminated:
     """Of one world."""
     order = np.concatenate(parts)
     j = system.jacobian.dense()[order]
@@ -167,7 +185,10 @@ def _factor(parts: tuple[np.ndarray, ...], system: Saddle, cutoff: Array) -> Eli
     pivots, left, start = [], a, 0
     for part in parts:
         n = part.size
-        inverse = pseudoinverse(left[:n, :n], cutoff)
+        pivot = left[:n, :n]
+        inverse = pseudoinverse(pivot, cutoff)
+        if start:
+            inverse = inverse @ pivot @ damped(pivot, damping)
         coupling = inverse @ left[:n, n:]
         alone = jax.lax.stop_gradient(a[start : start + n, start : start + n])
         own = inverse if start == 0 else pseudoinverse(alone, cutoff)
@@ -219,6 +240,14 @@ def _contradicts(pivots: tuple[Pivot, ...], right: Array, size: Array, bound: Ar
         found |= jnp.max(jnp.abs(left)) > bound * jnp.max(size[rows])
         start = rows.stop
     return found
+
+
+def damped(matrix: Array, damping: Array) -> Array:
+    """(1 − (1 − D A)³) A⁻¹ with D = (A² + μ²)⁻¹ A, for A = Aᵀ: A⁻¹ where A is much above μ."""
+    one, small = jnp.eye(len(matrix), dtype=matrix.dtype), jnp.square(damping)
+    inverse = pseudoinverse(matrix @ matrix + small * one, jnp.zeros_like(damping))
+    lacking = small * inverse
+    return (one + lacking + lacking @ lacking) @ inverse @ matrix
 
 
 @jax.custom_jvp
