@@ -92,6 +92,10 @@ class GeneralizedCoordinates:
         """p: v is q̇."""
         return p
 
+    def kicked(self, q: Array, v: Array, change: Array, dt: Any) -> Array:
+        """v + Δv: v is q̇."""
+        return v + change
+
     def kinematics(self, q: Array, v: Array) -> Array:
         """q̇ = v."""
         return v

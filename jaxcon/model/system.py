@@ -179,6 +179,14 @@ class BodySystem:
         pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
         return _join([kind.carry(own, momentum) for kind, own, momentum in pairs], q)
 
+    def kicked(self, q: Array, v: Array, change: Array, dt: Any) -> Array:
+        """v after a change h a (n_v,), which bodies that turn in space meet between two turns."""
+        if all(g.kind.n_q == g.kind.n_v for g in self.layout.groups):
+            return v + change
+        parts = zip(self.layout.groups, self.inertia, strict=True)
+        pairs = [(g.kind, g.unpack(q, v)[1], g.unpack(q, change)[1], p.moments) for g, p in parts]
+        return _join([kind.kicked(*known, dt) for kind, *known in pairs], q)
+
     def complete(self, solution: Solution) -> Solution:
         """The solution of the saddle system as it is."""
         return solution
