@@ -360,6 +360,8 @@ def test_generalized_coordinates(name):
         (jc.Hybrid(jc.Penalty(-1.0)), ["Penalty", "stiffness"]),
         (jc.Penalty(1.0, others=jc.Projection()), ["others=Projection", "soft constraints"]),
         (jc.Hybrid(jc.Penalty(1.0), sharpness=0), ["Hybrid", "sharpness"]),
+        (jc.Hybrid(jc.Penalty(1.0), large=jc.Baumgarte()), ["Hybrid", "corrects nothing"]),
+        (jc.Hybrid(jc.Penalty(1.0), soft_below=1.0), ["Hybrid", "must not exceed"]),
     ],
 )
 def test_bad_numbers_are_refused(stabilizer, words):

@@ -1,5 +1,7 @@
 """Degrees of freedom, rank and redundant rows of mechanisms known from textbooks."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -90,6 +92,20 @@ def test_violation_is_listed_by_constraint():
     report = jc.report(*scene.build())
     np.testing.assert_allclose(report.violation["rod"], (0.5, 0.6))
     assert "rod: violation 5.00e-01, rate 6.00e-01" in str(report)
+
+
+def test_a_rod_too_short_to_reach_is_sent_to_assemble():
+    """Its rows are independent where it starts, and no rank tells that they cannot be met."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(0.6, 0.8))
+    scene.add(jc.Distance("left", jc.WORLD, "bob", length=1.0))
+    scene.add(jc.Distance("right", jc.WORLD, "bob", length=1.9, point_a=(3.0, 0.0)))
+    system, state = scene.build()
+    assert "jc.assemble(system, state)" in str(jc.report(system, state))
+    assert "'right'" in str(jc.assemble(system, state))
+    near = dataclasses.replace(state, q=jnp.array([1.0, 0.0]))
+    system = system.with_params({"right": {"length": 2.0}})
+    assert "assemble" not in str(jc.report(system, near))
 
 
 def test_without_constraints():

@@ -16,6 +16,8 @@ from jaxcon.simulation.method import Method
 
 SHARE = 1e-2
 """Of the largest entry, from which a part that least squares leave is called a conflict."""
+OFF = 1e-4
+"""‖φ‖ [m, rad] from which on a report speaks of it."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +59,9 @@ class Report:
         if self.redundant:
             named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
             lines.append(
-                f"redundant rows (each depends on rows before it): {named}; keep only independent"
-                " ones, for example close a loop with a joint or a Holonomic of fewer rows, or give"
-                " the solver a little tikhonov"
+                f"redundant rows (each depends on rows before it): {named}; the default solver"
+                " takes them as they are, but shares forces among them as it chooses; to know"
+                " these, keep only independent rows, as with a joint of fewer rows in the loop"
             )
         if self.conflicts:
             lines.append(
@@ -76,6 +78,11 @@ class Report:
             f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
             for name, (phi, rate) in self.violation.items()
         ]
+        if max((phi for phi, _ in self.violation.values()), default=0.0) > OFF:
+            lines.append(
+                "off its constraints: print(jc.assemble(system, state)) takes it to the nearest"
+                " positions that meet them, or names those that cannot be met"
+            )
         return "\n".join(lines)
 
 

@@ -92,6 +92,10 @@ class GeneralizedCoordinates:
         """p: v is q̇."""
         return p
 
+    def extent(self, q: Array) -> Array:
+        """max |q|."""
+        return jnp.max(jnp.abs(q), axis=0, initial=0)
+
     def kicked(self, q: Array, v: Array, change: Array, dt: Any) -> Array:
         """v + Δv: v is q̇."""
         return v + change

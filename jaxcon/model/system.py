@@ -195,6 +195,14 @@ class BodySystem:
         """How many positions and velocities a state has."""
         return self.layout.n_q, self.layout.n_v
 
+    def extent(self, q: Array) -> Array:
+        """max |x| over all bodies [m]; angles in the plane, which grow by every turn, left out."""
+        most = jnp.zeros(q.shape[1:], q.dtype)
+        for g in self.layout.groups:
+            place = Vector.of_rows(q, g.q, g.kind.dim, len(g.names))
+            most = jnp.maximum(most, jnp.max(jnp.abs(place.stack()), axis=(0, 1)))
+        return most
+
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""
         if all(g.kind.n_q == g.kind.n_v for g in self.layout.groups):

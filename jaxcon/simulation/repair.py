@@ -17,7 +17,7 @@ from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.recovery import contain
-from jaxcon.stabilization.baumgarte import Law
+from jaxcon.stabilization.baumgarte import Law, corrects
 from jaxcon.stabilization.hybrid import Hybrid
 from jaxcon.stabilization.penalty import Penalty
 from jaxcon.stabilization.projection import Projection
@@ -93,6 +93,11 @@ class Recovery:
             checks.positive("Recovery", "limit", self.limit)
         if not hasattr(self.projector, "correct"):
             raise TypeError(f"Recovery: projector must be a stabiliser, got {self.projector!r}.")
+        if not corrects(self.projector):
+            raise ValueError(
+                f"Recovery: projector={type(self.projector).__name__} corrects nothing; take a"
+                " Projection."
+            )
         if getattr(self.projector, "every", 1) != 1:
             raise ValueError(
                 "Recovery: a projector acts at once and counts no steps; leave every=1."

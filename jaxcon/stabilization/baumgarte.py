@@ -74,6 +74,11 @@ class Unstabilized:
         return state, jnp.zeros_like(state.status)
 
 
+def corrects(stabilizer: Any) -> bool:
+    """Whether a stabiliser does anything to q and v after a step."""
+    return type(stabilizer).correct is not Unstabilized.correct
+
+
 @pytree
 class Baumgarte(Unstabilized):
     """b = −γ − 2α φ̇ − β² φ, so that the error obeys φ̈ + 2α φ̇ + β² φ = 0.

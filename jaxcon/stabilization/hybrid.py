@@ -7,13 +7,15 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
-from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
+from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, corrects
 from jaxcon.stabilization.gains import check_gains, column, squares
 
 
@@ -60,12 +62,24 @@ class Hybrid(Unstabilized):
         """Checks the parts and the sizes.
 
         Raises:
-            ValueError: a size is not positive, the sharpness no positive integer, or `small` acts
-                by a force or a solver of its own, which cannot be mixed.
+            ValueError: a size is not positive, the two are the wrong way round, the sharpness is no
+                positive integer, `large` corrects nothing, or `small` acts by a force or a solver
+                of its own, which cannot be mixed.
         """
         check_gains(
             "Hybrid", strictly=True, soft_below=self.soft_below, project_above=self.project_above
         )
+        sizes = self.soft_below, self.project_above
+        if all(map(checks.is_concrete, sizes)) and np.any(np.greater(*sizes)):
+            raise ValueError(
+                f"Hybrid: soft_below={sizes[0]} must not exceed project_above={sizes[1]}; a"
+                " constraint is soft below the one, and projected above the other."
+            )
+        if self.large is not None and not corrects(self.large):
+            raise ValueError(
+                f"Hybrid: large={type(self.large).__name__} corrects nothing after a step; take a"
+                " Projection, or None."
+            )
         if not isinstance(self.sharpness, int) or self.sharpness < 1:
             raise ValueError(f"Hybrid: sharpness must be 1 or more, got {self.sharpness!r}.")
         for part in self._parts():

@@ -92,9 +92,9 @@ class Projection(Unstabilized):
             step of a hundredth of a radian, all are needed at one. 1 is the linearized projection,
             which leaves O(‖d‖²) and is differentiated as it is.
         tolerance: max |φ|, a number or a `Tolerance`. A world stays as it is once it is there, and
-            is NOT_CONVERGED if it is not there at the end. If None, it stays below 2 ε s and fails
-            beyond ε^⅔ s, with s = 1 + max |q| and ε the spacing of floating numbers; the linearized
-            projection never fails.
+            is NOT_CONVERGED if it is not there at the end. If None, it stays below 2 ε times 1 +
+            max |x| over all places x, and fails beyond ε^⅔ (1 + max |q|), ε the spacing of
+            floating numbers; the linearized projection never fails.
         factor: of each step, in (0, 1].
         every: how many steps there are from one projection to the next.
         coupled: whether d belongs to the step, and d/h to its velocity; or q and v are split, as
@@ -258,7 +258,7 @@ class Projection(Unstabilized):
         fails = numerics.negligible(state.q)
         fails = jnp.full_like(fails, jnp.inf) if self.iterations == 1 else fails
         spacing = float(jnp.finfo(fails.dtype).eps)
-        return Bounds(2 * spacing * (1 + _largest(state.q)), fails)
+        return Bounds(2 * spacing * (1 + system.extent(state.q)), fails)
 
     def check(self) -> None:
         """Checks the choices.
