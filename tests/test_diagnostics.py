@@ -161,6 +161,15 @@ def test_violation_is_told_apart_by_its_source():
     assert 1e-8 < coarse.sources["round-off"] < 1e-6
 
 
+def test_gains_beyond_their_limit_and_worlds_that_end_are_named():
+    system, state = pendulum()
+    wild = jc.Method(stabilizer=jc.Baumgarte.critical(rate=5e3))
+    found = str(jc.diagnose(system, wild, state, None, 1e-3, 300))
+    assert "NON_FINITE at" in found
+    assert "are unstable at dt=0.001" in found
+    assert not jc.diagnose(system, SLOW, state, None, 1e-3, 5).trouble
+
+
 def test_what_hardly_any_motion_changes_is_a_matter_of_rank():
     """Two nearly parallel rods, 5 cm apart in what they ask: half of that each."""
     scene = jc.Scene(dim=2)

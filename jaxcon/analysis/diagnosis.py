@@ -14,12 +14,13 @@ import numpy as np
 from jaxcon.analysis.quantities import angular_momentum, energy, momentum
 from jaxcon.analysis.report import Report, UnitRows, linearized, report
 from jaxcon.constraints.rows import linearize
+from jaxcon.core.status import MEANING, Status
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.assembly import assemble
 from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.stability import largest_stable_rate
+from jaxcon.simulation.stability import instability, largest_stable_rate
 
 WEAK = 1e-2
 """Singular values of the rows, scaled to unit length, below which a direction is nearly lost."""
@@ -46,6 +47,7 @@ class Diagnosis:
         energy: at the start and at the end [J].
         momentum: linear and angular at the start and at the end; None where there are no bodies.
         report: of the start.
+        trouble: what the status of the end says, and which gains are unstable, in words.
     """
 
     violation: float
@@ -55,6 +57,7 @@ class Diagnosis:
     energy: tuple[float, float]
     momentum: tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]] | None
     report: Report
+    trouble: tuple[str, ...] = ()
 
     @property
     def main_source(self) -> str:
@@ -62,7 +65,8 @@ class Diagnosis:
         return max(self.sources, key=lambda name: self.sources[name])
 
     def __str__(self) -> str:
-        lines = [f"violation up to {self.violation:.2e}, most of it from: {self.main_source}"]
+        lines = [*self.trouble]
+        lines.append(f"violation up to {self.violation:.2e}, most of it from: {self.main_source}")
         lines += [f"  {name}: {x:.2e}, {METHODS[name]}" for name, x in self.sources.items()]
         lines.append(f"energy {self.energy[0]:.6g} J → {self.energy[1]:.6g} J")
         if self.momentum:
@@ -119,7 +123,16 @@ def diagnose(
         energy=(float(energy(system, state).total), float(energy(system, end).total)),
         momentum=(_momenta(system, state), _momenta(system, end)) if bodies else None,
         report=report(system, state),
+        trouble=_trouble(system, method, state, end, float(dt)),
     )
+
+
+def _trouble(system: Any, method: Method, state: State, end: State, dt: float) -> tuple[str, ...]:
+    """What became of the world, and which gains are unstable, in words."""
+    code = Status(int(end.status))
+    ended = f"{code.name} at {float(end.time):.4g} s: {MEANING[code]}" if code else None
+    found = ended, instability(method, dt, system, state)
+    return tuple(words for words in found if words)
 
 
 def _simulate(

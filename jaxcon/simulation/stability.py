@@ -83,13 +83,20 @@ def warn_if_unstable(method: Any, dt: Any, system: Any = None, state: Any = None
         h = float(dt)
     except (TypeError, ValueError):  # the step itself says what is wrong with it
         return
+    message = instability(method, h, system, state)
+    if message:
+        warnings.warn(message, stacklevel=3)
+
+
+def instability(method: Any, h: float, system: Any = None, state: Any = None) -> str | None:
+    """What is wrong with the first gains or springs that are unstable; None where none are."""
     for part in parts(method.stabilizer):
         message = unstable_gains(method.integrator, part, h)
         if isinstance(part, Penalty) and not part.implicit and checks.is_concrete((system, state)):
             message = message or unstable_spring(method.integrator, part, h, system, state)
         if message:
-            warnings.warn(message, stacklevel=3)
-            return
+            return message
+    return None
 
 
 def parts(stabilizer: Any) -> list[Any]:
