@@ -67,6 +67,7 @@ from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.io.mjcf import Keyframe, MujocoModel, from_mjcf
+from jaxcon.learning.tuning import Tuned, tune
 from jaxcon.model.actuators import (
     AffineActuator,
     JointDamper,
@@ -204,6 +205,7 @@ __all__ = [
     "Status",
     "StepInfo",
     "Tolerance",
+    "Tuned",
     "TurnCounter",
     "Twist",
     "Universal",
@@ -240,6 +242,7 @@ __all__ = [
     "rollout",
     "rope",
     "step",
+    "tune",
     "vakonomic",
     "velocity",
     "violation",
