@@ -67,6 +67,8 @@ from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.io.mjcf import Keyframe, MujocoModel, from_mjcf
+from jaxcon.learning import losses
+from jaxcon.learning.identification import Identified, identify
 from jaxcon.learning.tuning import Tuned, tune
 from jaxcon.model.actuators import (
     AffineActuator,
@@ -154,6 +156,7 @@ __all__ = [
     "Heun",
     "Holonomic",
     "Hybrid",
+    "Identified",
     "Integrability",
     "JointDamper",
     "JointSpring",
@@ -226,10 +229,12 @@ __all__ = [
     "frequency_response",
     "from_mjcf",
     "hanging",
+    "identify",
     "inertia",
     "init",
     "integrability",
     "largest_stable_rate",
+    "losses",
     "memory",
     "momentum",
     "multipliers",

@@ -48,9 +48,24 @@ class Space:
         x = [jnp.exp(z) if p else z for z, p in zip(y, self.positive, strict=True)]
         inside = map(jnp.clip, x, self.low, self.high)
         # a clip has no derivative at the bound itself, where a search must be able to turn back
-        free = iter([z + jax.lax.stop_gradient(c - z) for z, c in zip(x, inside, strict=True)])
-        leaves = [next(free) if f is None else f for f in self.fixed]
-        return jax.tree.unflatten(self.structure, leaves)
+        return self.fill(z + jax.lax.stop_gradient(c - z) for z, c in zip(x, inside, strict=True))
+
+    def fill(self, leaves: Iterable[Any]) -> PyTree:
+        """These in the place of the leaves that are searched."""
+        free = iter(leaves)
+        whole = [next(free) if f is None else f for f in self.fixed]
+        return jax.tree.unflatten(self.structure, whole)
+
+    def flatten(self, y: Iterable[Array]) -> Array:
+        """All numbers of y in one array."""
+        return jnp.concatenate([jnp.ravel(z) for z in y])
+
+    def split(self, flat: Array) -> tuple[Array, ...]:
+        """y of all its numbers."""
+        ends = np.cumsum([x.size for x in self.low])[:-1]
+        return tuple(
+            z.reshape(x.shape) for z, x in zip(jnp.split(flat, ends), self.low, strict=True)
+        )
 
     def clip(self, y: tuple[Array, ...]) -> tuple[Array, ...]:
         """The nearest y within the bounds."""
