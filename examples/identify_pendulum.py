@@ -47,7 +47,7 @@ def swing(p: dict, torque: jax.Array) -> jax.Array:
         return jnp.stack([jc.orientation(system, s, name) for name in ("upper", "lower")])
 
     control = jnp.zeros((STEPS, 3)).at[:, 2].set(torque)
-    method = jc.Method(jc.RK4())
+    method = jc.Method(solver=jc.Schur())
     final, angles = jc.rollout(
         system, method, state, control, DT, STEPS, record=record, every=EVERY
     )
