@@ -114,26 +114,23 @@ def oscillate(rate, node):
     return x[:-1], {"x": x[-1], "v": v[-1]}
 
 
-def long_recording(stretches=20):
+def long_recording(stretches):
     t = 0.05 * np.arange(20 * stretches)
     return np.cos(3.0 * t) + 0.05 * np.random.default_rng(2).normal(size=t.shape)
 
 
 def test_a_long_recording_is_fitted_in_stretches_and_not_in_one():
     """The least over ω of a long cosine has a narrow basin; that of short ones is wide."""
-    x = long_recording()
-    start = {"x": jnp.array([1.0]), "v": jnp.array([0.0])}
-    one = jc.identify(
-        lambda rate: jnp.cos(rate * 0.05 * jnp.arange(400.0)), jnp.asarray(4.0), x, positive=True
-    )
+    x = long_recording(10)
+    times = 0.05 * jnp.arange(200.0)
+    one = jc.identify(lambda rate: jnp.cos(rate * times), jnp.asarray(4.0), x, positive=True)
     assert abs(one.params - 3) > 0.5
-    del start
-    data = x.reshape(20, 20)
-    nodes = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(20)}
+    data = x.reshape(10, 20)
+    nodes = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(10)}
     found = jc.identify(oscillate, jnp.asarray(4.0), data, nodes=nodes, positive=True)
     assert abs(found.params - 3) < 3 * found.errors
-    assert found.errors < 2e-3
-    assert abs(found.noise - 0.05) < 0.005
+    assert found.errors < 4e-3
+    assert abs(found.noise - 0.05) < 0.01
     ends = jax.vmap(lambda n: oscillate(found.params, n)[1])(found.nodes)
     np.testing.assert_allclose(ends["x"][:-1], found.nodes["x"][1:], atol=1e-3)
 
@@ -210,10 +207,9 @@ def test_with_a_known_torque_errors_are_of_the_order_of_the_bound(pendulum):
     """Over draws of noise the squares of errors by their deviation have the mean 1."""
     truth = jax.tree.leaves(pendulum["TRUTH"])
     squares = []
-    for seed in range(8):
+    for seed in range(20):
         found = pendulum["identify"](pendulum["driven"], seed)
         assert not found.untold
         table = found.table.values()
         squares += [((x - y) / e) ** 2 for y, (x, e) in zip(truth, table, strict=True)]
-    print(np.mean(squares))
-    assert 0.4 < np.mean(squares) < 2.0
+    assert 0.5 < np.mean(squares) < 1.6

@@ -63,8 +63,9 @@ def least_squares(
     stopped = "every step was taken"
     try:
         for _ in tqdm(range(steps), desc="identifying", unit="step", disable=None):
+            move = _steps(z, r, J, low, high, tolerance)
             while True:
-                ahead = np.clip(z + _step(z, r, J, low, high, damping, tolerance), low, high)
+                ahead = np.clip(z + move(damping), low, high)
                 small = bool(np.all(np.abs(ahead - z) <= tolerance * (1 + np.abs(z))))
                 found = linearize(ahead)
                 better = _cost(*found) < costs[-1]
@@ -88,20 +89,19 @@ def _cost(r: np.ndarray, J: np.ndarray) -> float:
     return float(r @ r / 2) if np.all(np.isfinite(r)) and np.all(np.isfinite(J)) else np.inf
 
 
-def _step(
-    z: np.ndarray,
-    r: np.ndarray,
-    J: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    damping: float,
-    tolerance: float,
-) -> np.ndarray:
+def _steps(
+    z: np.ndarray, r: np.ndarray, J: np.ndarray, low: np.ndarray, high: np.ndarray, tolerance: float
+) -> Callable[[float], np.ndarray]:
+    """Damping → step, (n,)."""
     slope = J.T @ r
     free = ~((z <= low) & (slope > 0) | (z >= high) & (slope < 0))
     U, s, V = np.linalg.svd(J[:, free], full_matrices=False)
     told = s > tolerance * np.max(s, initial=0)
-    share = np.where(told, s / np.where(told, s * s + damping * np.max(s, initial=0) ** 2, 1), 0)
-    step = np.zeros_like(z)
-    step[free] = -V.T @ (share * (U.T @ r))
+    s, V, along = s[told], V[told], U.T[told] @ r
+
+    def step(damping: float) -> np.ndarray:
+        move = np.zeros_like(z)
+        move[free] = -(along * s / (s * s + damping * np.max(s, initial=0) ** 2)) @ V
+        return move
+
     return step
