@@ -166,6 +166,47 @@ def test_the_jacobian_of_stretches_is_the_derivative_of_their_residuals():
         np.testing.assert_allclose(jacobian[:, i], difference, atol=1e-7)
 
 
+def test_stretches_of_a_mechanism_have_states_in_minimal_coordinates():
+    """The length of a pendulum from its angle alone, its starts and rates unknown."""
+    steps, dt, count = 40, 1e-2, 3
+
+    def stretch(length, node):
+        scene, (angle, rate) = jc.Scene(dim=2), node
+        way = jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
+        across = rate * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+        scene.add_particle("bob", mass=1.0, position=length * way, velocity=length * across)
+        scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+        system, state = scene.build()
+
+        def record(s, _):
+            x, y = s.q
+            return jnp.arctan2(x, -y), (x * s.v[1] - y * s.v[0]) / (x * x + y * y)
+
+        method = jc.Method(solver=jc.Schur())
+        _, (angles, rates) = jc.rollout(system, method, state, None, dt, steps, record=record)
+        return angles[3::4], (angles[-1], rates[-1])
+
+    truth, start = jnp.asarray(0.8), (jnp.asarray(1.2), jnp.asarray(0.0))
+    seen = []
+    for _ in range(count):
+        angles, start = jax.jit(stretch)(truth, start)
+        seen.append(angles)
+    data = np.array(seen) + 1e-3 * np.random.default_rng(0).normal(size=(count, steps // 4))
+    nodes = (jnp.asarray(data[:, 0]), jnp.zeros(count))
+    found = jc.identify(stretch, jnp.asarray(1.0), data, nodes=nodes, positive=True)
+    assert abs(found.params - truth) < 3 * found.errors
+    assert found.errors < 5e-3
+    assert abs(found.noise - 1e-3) < 4e-4
+    np.testing.assert_allclose(found.nodes[0][0], 1.2, atol=5e-3)
+
+
+def test_fewer_numbers_than_parameters_leave_directions_untold():
+    found = jc.identify(lambda x: x[:1] * x[1:2], jnp.array([1.0, 2.0, 3.0]), np.array([4.0]))
+    np.testing.assert_allclose(found.params[0] * found.params[1], 4.0)
+    assert len(found.untold) == 2
+    assert found.params[2] == 3.0
+
+
 def test_float32_finds_what_its_rounding_allows():
     guess = {name: jnp.float32(x) for name, x in GUESS.items()}
     times = TIMES.astype(jnp.float32)

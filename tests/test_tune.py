@@ -274,3 +274,32 @@ def test_numbers_of_a_system_a_start_and_controls_together():
     assert found.loss < 1e-3 * found.history[0]
     for x, y in zip(jax.tree.leaves(found.params), jax.tree.leaves(params), strict=True):
         assert jnp.max(jnp.abs(x - y)) > 1e-2
+
+
+def test_the_stiffness_of_a_constraint_that_is_least_in_expectation():
+    """argmin E[L_task + α L_constraint(k)] is one call; starts are drawn with each key."""
+    system, state = pendulum()
+
+    def loss(k, key):
+        method = jc.Method(stabilizer=jc.Penalty(k, 1.0))
+        start = dataclasses.replace(state, v=0.3 * jax.random.normal(key, (2,)))
+        final, (q, off) = jc.rollout(
+            system, method, start, None, 1e-2, 20, record=lambda s, i: (s.q, i.violation)
+        )
+        task = jc.losses.tracking(q, np.tile([1.0, 0.0], (20, 1)))
+        terms = {"task": task, "constraint": jc.losses.violation(off, 1e-2)}
+        value, terms = jc.losses.weighted(terms, {"task": 1.0, "constraint": 0.3})
+        return jc.losses.unless_failed(value, final), terms
+
+    options = {"samples": 8, "key": jax.random.key(0), "optimizer": optax.adam(0.2)}
+    found = jc.tune(loss, jnp.asarray(10.0), positive=True, steps=40, **options)
+    assert found.aux["task"].shape == (8,)
+    assert found.params > 20.0
+    judge = jax.jit(
+        lambda k: jnp.mean(jax.vmap(lambda key: loss(k, key)[0])(jax.random.split(KEY, 64)))
+    )
+    assert judge(found.params) < judge(jnp.asarray(10.0)) - 0.05
+
+
+KEY = jax.random.key(9)
+"""Of draws that no search has seen."""
