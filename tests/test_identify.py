@@ -105,6 +105,12 @@ def test_bounds_hold_and_an_optimum_may_lie_on_one():
     np.testing.assert_allclose(found.params["offset"], expected.params["offset"], rtol=1e-6)
 
 
+def test_all_may_lie_on_their_bounds():
+    found = jc.identify(lambda x: x * jnp.ones(3), 0.0, np.ones(3), bounds=(-1.0, 0.5), noise=1.0)
+    assert found.params == 0.5
+    assert found.stopped == "converged"
+
+
 def oscillate(rate, node):
     """A stretch of 20 samples of ẍ = −ω² x, and its end."""
     t = 0.05 * jnp.arange(21.0)
@@ -227,6 +233,11 @@ def test_what_does_not_fit_is_refused_in_words():
         jc.identify(ringing, GUESS, {"x": np.zeros(3)})
     with pytest.raises(ValueError, match="not finite at the start"):
         jc.identify(lambda p: jnp.sqrt(p) * jnp.ones(3), -1.0, np.ones(3))
+    with pytest.raises(ValueError, match="noise must be positive"):
+        jc.identify(ringing, GUESS, recorded(0.0), noise=0.0)
+    nodes = {"x": jnp.ones(3), "v": jnp.ones(3)}
+    with pytest.raises(ValueError, match="3 nodes the data must have a first axis"):
+        jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes=nodes)
 
 
 @pytest.fixture(scope="module")

@@ -34,13 +34,13 @@ class Identified:
         errors: their standard deviations, in the same structure and units; infinite where the data
             tell nothing, NaN where a leaf was not searched.
         nodes: the states at the nodes, as they were given; None without.
-        noise: that was given, or by how much it must be multiplied to explain the residuals: with
-            none given, the standard deviation of a residual.
-        observed: number of residuals.
+        noise: what remains, its root mean square by degree of freedom: in units of the noise that
+            was given, so that 1 is as expected, or in those of the data where none was.
+        observed: how many numbers were seen.
         names: of the parameters, one by one.
         singular_values: largest first, (n,).
         directions: of unit length, (n, n), a row for each singular value.
-        costs: ½ ‖r‖² by step.
+        costs: ½ ‖r‖² by step; with nodes, of the last search, at the continuity asked for.
         stopped: why it went no further, in words.
     """
 
@@ -67,7 +67,7 @@ class Identified:
     @property
     def condition(self) -> float:
         """cond(JᵀJ) = (s₁/sₙ)²."""
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore"):
             return float((self.singular_values[0] / self.singular_values[-1]) ** 2)
 
     @property
@@ -118,7 +118,7 @@ def identify(
         simulate: params → predictions; with nodes (params, node) → predictions of one stretch and
             its end, in the structure of a node. Trouble on the way should show as NaN
             (`losses.unless_failed`).
-        params: the start. Leaves that are no floating numbers are kept.
+        params: the start. Leaves that are no floating numbers are kept, and traced.
         data: what was recorded, in the structure of the predictions, NaN where nothing was seen;
             with nodes an axis of stretches comes first.
         noise: standard deviation of the data, a number or a pytree whose leaves broadcast with
@@ -128,7 +128,7 @@ def identify(
         nodes: first guesses of the states at the nodes, with a first axis of stretches. Minimal
             coordinates, such as angles and rates, so that every value is a state.
         continuity: standard deviation by which an end may miss the next node, in its units.
-        steps: at most so many.
+        steps: at most so many; with nodes, for each decade by which ends come closer to them.
 
     Returns:
         An `Identified`.
@@ -142,6 +142,9 @@ def identify(
         Nocedal, Wright, Numerical Optimization (2006), section 10.3.
     """
     checks.count("identify", "steps", steps)
+    checks.positive("identify", "continuity", continuity)
+    for x in jax.tree.leaves(noise):
+        checks.positive("identify", "noise", x)
     space = space_of(params, positive, bounds, "identify")
     y = space.flatten(space.encode(params))
     logs = [jnp.full(x.shape, p) for x, p in zip(space.low, space.positive, strict=True)]

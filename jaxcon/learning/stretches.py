@@ -61,7 +61,17 @@ class Stretches:
     def linearize(self, continuity: float) -> Callable[[np.ndarray], Any]:
         """unknowns → residuals with the gaps between stretches, and their Jacobian."""
         p, (stretches, n) = self.scale.size, self.nodes.shape
-        data = self.data if self.given is not None else jax.tree.map(lambda x: x[None], self.data)
+        data = (
+            self.data
+            if self.given is not None
+            else jax.tree.map(lambda x: np.asarray(x)[None], self.data)
+        )
+        shapes = [np.shape(x) for x in jax.tree.leaves(data)]
+        if any(shape[:1] != (stretches,) for shape in shapes):
+            raise ValueError(
+                f"identify: with {stretches} nodes the data must have a first axis of as many"
+                f" stretches, got shapes {shapes}."
+            )
 
         def rows(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             x = np.concatenate([np.tile(z[:p], (stretches, 1)), z[p:].reshape(stretches, n)], 1)

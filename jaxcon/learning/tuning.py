@@ -19,6 +19,7 @@ from jaxcon.core import checks
 from jaxcon.core.typing import PyTree
 from jaxcon.learning import checkpoint as files
 from jaxcon.learning.descent import Descent, Search, Stop
+from jaxcon.learning.least_squares import INTERRUPTED
 from jaxcon.learning.leaves import Space, by_name, space_of
 
 RATE = 0.05
@@ -97,8 +98,9 @@ def tune(
 
     Args:
         loss: params → a scalar, or a scalar and anything else; (params, key) → the same where
-            `samples` is given. Traced once.
-        params: the start. Leaves that are no floating numbers are kept.
+            `samples` is given.
+        params: the start. Leaves that are no floating numbers are kept; what else shall stay is
+            closed over by the loss.
         steps: at most so many for each start.
         optimizer: a transformation of optax, line searches included; Adam unless given, its rate
             falling from 0.05 along a cosine.
@@ -124,6 +126,7 @@ def tune(
         TypeError: the loss is no floating scalar.
     """
     _check(steps, samples, restarts, chunk, key)
+    chunk = min(chunk, steps)
     space = space_of(params, positive, bounds, "tune")
     if optimizer is None:
         optimizer = optax.adam(optax.cosine_decay_schedule(RATE, steps))
@@ -168,7 +171,8 @@ def _loop(advance: Callable[..., Any], found: Any, steps: int, save: Callable[..
     except (KeyboardInterrupt, OSError, jax.errors.JaxRuntimeError) as error:
         if not found[1].size:
             raise  # there is nothing to be lost
-        return found, f"{type(error).__name__} {error}".strip()
+        keyboard = isinstance(error, KeyboardInterrupt)
+        return found, INTERRUPTED if keyboard else f"{type(error).__name__}: {error}"
     return found, ""
 
 
@@ -194,6 +198,8 @@ def _starts(space: Space, y: Any, restarts: int, spread: Any, key: Any) -> Any:
     batch = [jnp.broadcast_to(x, (restarts, *x.shape)) for x in y]
     if restarts == 1:
         return tuple(batch)
+    if not any(np.any(np.asarray(w)) for w in widths):
+        raise ValueError("tune: restarts from one place find one thing: give spread=, such as 0.5.")
     keys = jax.random.split(key, len(batch))
     noise = [
         jax.random.normal(k, x.shape, x.dtype).at[0].set(0) * jnp.asarray(w, x.dtype)
