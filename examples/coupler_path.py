@@ -37,11 +37,12 @@ def linkage(lengths: jax.Array):
     )
 
 
-def draw(p: dict) -> jax.Array:
-    """Where the point of the coupler is at each angle of the crank, (12, 2) [m]."""
+@jax.jit
+def turn(p: dict) -> tuple:
+    """Where the point of the coupler is at each angle of the crank, (12, 2) [m], and q there."""
     own = linkage(p["lengths"])
 
-    def place(angle: jax.Array) -> jax.Array:
+    def place(angle: jax.Array) -> tuple:
         rough = scenes.four_bar_poses(jnp.asarray(scenes.CRANK_ROCKER), angle)
         crank = p["lengths"][1] / 2 * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
         q = state.q
@@ -49,14 +50,20 @@ def draw(p: dict) -> jax.Array:
             q = q.at[own.layout.q(name)].set(pose)
         q = q.at[own.layout.q("crank")[:2]].set(crank)
         closed = jc.assemble(own, q, hold="crank").state
-        return jc.losses.unless_failed(jc.position(own, closed, "coupler", p["point"]), closed)
+        point = jc.position(own, closed, "coupler", p["point"])
+        return jc.losses.unless_failed(point, closed), closed.q
 
     return jax.vmap(place)(jnp.asarray(ANGLES, p["lengths"].dtype))
 
 
+def draw(p: dict) -> jax.Array:
+    """The places alone."""
+    return turn(p)[0]
+
+
 def find() -> jc.Identified:
     """The lengths and the point whose path is nearest to the wanted one."""
-    wanted = np.asarray(jax.jit(draw)(TRUTH))
+    wanted = np.asarray(draw(TRUTH))
     return jc.identify(draw, GUESS, wanted, positive="lengths")
 
 
@@ -64,7 +71,7 @@ def main(picture: str = "coupler_path.png") -> None:
     """Finds, prints and draws."""
     found = find()
     print(found)
-    start, end, wanted = (jax.jit(draw)(p) for p in (GUESS, found.params, TRUTH))
+    start, end, wanted = (draw(p) for p in (GUESS, found.params, TRUTH))
     for label, path in (("at the start", start), ("found", end)):
         worst = float(jnp.max(jnp.linalg.norm(path - wanted, axis=1)))
         print(f"{label} the point misses its places by up to {worst:.1e} m")
@@ -72,7 +79,7 @@ def main(picture: str = "coupler_path.png") -> None:
     from jaxcon import view
 
     own = linkage(found.params["lengths"])
-    axes = view.draw(own, jc.assemble(own, state.q).q)
+    axes = view.draw(own, turn(found.params)[1][1])
     axes.plot(*np.asarray(wanted).T, "ko", mfc="none", label="wanted")
     axes.plot(*np.asarray(start).T, ":", label="at the start")
     axes.plot(*np.asarray(end).T, ".-", label="found")

@@ -82,12 +82,13 @@ def main(picture: str = "identify_pendulum.png") -> None:
     from jaxcon import view
 
     axes = view.pyplot().subplots()[1]
-    angles = np.asarray(driven(TRUTH))
+    motion = jax.jit(driven)
+    angles = np.asarray(motion(TRUTH))
     noisy = angles + NOISE * np.random.default_rng(0).normal(size=angles.shape)
     axes.plot(TIMES[EVERY - 1 :: EVERY], noisy, ".", ms=3)
     for p, style in ((GUESS, ":"), (found.params, "-")):
         axes.set_prop_cycle(None)
-        axes.plot(TIMES[EVERY - 1 :: EVERY], driven(p), style, lw=1)
+        axes.plot(TIMES[EVERY - 1 :: EVERY], motion(p), style, lw=1)
     axes.set(xlabel="time [s]", ylabel="angles [rad]", title="recorded, guessed (dotted), fitted")
     axes.figure.savefig(picture)
     print(f"wrote {picture}")
