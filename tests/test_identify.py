@@ -10,6 +10,7 @@ import optax
 import pytest
 
 import jaxcon as jc
+from jaxcon.learning.least_squares import least_squares
 from jaxcon.learning.leaves import space_of
 from jaxcon.learning.stretches import Stretches
 
@@ -103,6 +104,28 @@ def test_bounds_hold_and_an_optimum_may_lie_on_one():
         lambda p: ringing(p | free), {"size": 1.0, "offset": 0.0}, recorded(0.05)
     )
     np.testing.assert_allclose(found.params["offset"], expected.params["offset"], rtol=1e-6)
+
+
+def test_an_interrupt_keeps_what_was_found():
+    """Rosenbrock's valley, left after a few evaluations."""
+    calls = []
+
+    def valley(z):
+        calls.append(z)
+        if len(calls) == 8:
+            raise KeyboardInterrupt
+        x, y = z
+        return np.array([1 - x, 10 * (y - x * x)]), np.array([[-1.0, 0.0], [-20 * x, 10.0]])
+
+    start, free = np.array([-1.2, 1.0]), np.full(2, np.inf)
+    fit = least_squares(valley, start, -free, free, 50, 1e-8)
+    assert fit.interrupted
+    assert fit.costs[-1] < fit.costs[0]
+    np.testing.assert_allclose(fit.costs[-1], np.sum(fit.residual**2) / 2)
+    calls = [None] * 8
+    whole = least_squares(valley, start, -free, free, 50, 1e-8)
+    np.testing.assert_allclose(whole.z, 1.0, atol=1e-7)
+    assert whole.stopped == "converged"
 
 
 def test_all_may_lie_on_their_bounds():
