@@ -12,7 +12,6 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 import jaxcon as jc
 
@@ -63,20 +62,13 @@ def main(picture: str = "five_bar_leg.png") -> None:
     phase = jnp.linspace(0.0, 2 * jnp.pi, 24, endpoint=False)
     goals = foot + jnp.stack([0.05 * jnp.sin(phase), 0.03 * (1 - jnp.cos(phase))], axis=1)
 
-    optimizer = optax.adam(0.05)
-    loss = jax.vmap(lambda a, goal: jnp.sum((reach(a) - goal) ** 2))
+    def loss(angles: jax.Array) -> jax.Array:
+        """The mean square of the distance from the goals, log₁₀ [m]."""
+        return jnp.log10(jc.losses.tracking(jax.vmap(reach)(angles), goals)) / 2
 
-    @jax.jit
-    def improve(angles: jax.Array, memory: optax.OptState) -> tuple:
-        value, slope = jax.value_and_grad(lambda a: jnp.sum(loss(a, goals)))(angles)
-        change, memory = optimizer.update(slope, memory)
-        return angles + change, memory, value
-
-    angles = jnp.zeros((len(phase), 2))
-    memory = optimizer.init(angles)
-    for _ in range(150):
-        angles, memory, value = improve(angles, memory)
-    print(f"the foot is within {float(jnp.sqrt(value / len(phase))):.1e} m of the step's 24 places")
+    found = jc.tune(loss, jnp.zeros((len(phase), 2)), steps=150)
+    angles = found.params
+    print(f"the foot is within {10**found.loss:.1e} m of the step's 24 places")
 
     clock = jnp.linspace(0.0, 2 * jnp.pi, STEPS)
     controls = jax.vmap(

@@ -7,7 +7,6 @@ A scene can be built inside a differentiated function: numbers may be traced, na
 
 import jax
 import jax.numpy as jnp
-import optax
 
 import jaxcon as jc
 
@@ -26,17 +25,13 @@ def angle_after(length: jax.Array, gravity: jax.Array) -> jax.Array:
     return jnp.arctan2(x, -y)
 
 
-def find_length(target: jax.Array, guess: float = 1.0, iterations: int = 60) -> jax.Array:
+def find_length(target: float, guess: float = 1.0) -> jax.Array:
     """The length [m] at which the angle after one second is the target [rad]."""
-    slope = jax.jit(jax.value_and_grad(lambda x: (angle_after(x, jnp.asarray(9.81)) - target) ** 2))
-    optimizer = optax.adam(0.05)
-    length = jnp.asarray(guess)
-    memory = optimizer.init(length)
-    for _ in range(iterations):
-        _, gradient = slope(length)
-        change, memory = optimizer.update(gradient, memory)
-        length = optax.apply_updates(length, change)
-    return length
+
+    def loss(length: jax.Array) -> jax.Array:
+        return (angle_after(length, jnp.asarray(9.81)) - target) ** 2
+
+    return jc.tune(loss, jnp.asarray(guess), steps=60, positive=True).params
 
 
 def main() -> None:
@@ -46,7 +41,7 @@ def main() -> None:
     print(f"angle after 1 s: {jax.jit(angle_after)(length, gravity):.6f} rad")
     print(f"its derivative by length: {by_length:.6f} rad/m")
     print(f"its derivative by gravity: {by_gravity:.6f} rad/(m/s²)")
-    found = find_length(jnp.asarray(-0.9))
+    found = find_length(-0.9)
     print(f"at length {found:.4f} m the angle after 1 s is -0.9 rad")
 
 

@@ -67,6 +67,9 @@ from jaxcon.dynamics.vakonomic import Vakonomic, vakonomic
 from jaxcon.geometry import inertia, quaternion
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.io.mjcf import Keyframe, MujocoModel, from_mjcf
+from jaxcon.learning import losses
+from jaxcon.learning.identification import Identified, identify
+from jaxcon.learning.tuning import Tuned, tune
 from jaxcon.model.actuators import (
     AffineActuator,
     JointDamper,
@@ -153,6 +156,7 @@ __all__ = [
     "Heun",
     "Holonomic",
     "Hybrid",
+    "Identified",
     "Integrability",
     "JointDamper",
     "JointSpring",
@@ -204,6 +208,7 @@ __all__ = [
     "Status",
     "StepInfo",
     "Tolerance",
+    "Tuned",
     "TurnCounter",
     "Twist",
     "Universal",
@@ -224,10 +229,12 @@ __all__ = [
     "frequency_response",
     "from_mjcf",
     "hanging",
+    "identify",
     "inertia",
     "init",
     "integrability",
     "largest_stable_rate",
+    "losses",
     "memory",
     "momentum",
     "multipliers",
@@ -240,6 +247,7 @@ __all__ = [
     "rollout",
     "rope",
     "step",
+    "tune",
     "vakonomic",
     "velocity",
     "violation",

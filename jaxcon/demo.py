@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +18,7 @@ from jaxcon import scenes
 from jaxcon.analysis.quantities import energy
 from jaxcon.core.status import raise_for_status
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.learning import losses, tuning
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 from jaxcon.solvers.sparse import Sparse
@@ -94,26 +96,20 @@ def simulate(worlds: PyTree, seconds: float, chunks: int = 50) -> Simulation:
 
 
 def loss(gains: Array, worlds: PyTree, steps: int) -> Array:
-    """log₁₀ of the root mean square of (φ, h φ̇) over rows, time and worlds [m].
-
-    φ is the error now, h φ̇ the one that it is about to grow by.
+    """The size of the violation over rows, time and worlds, as `losses.violation`.
 
     Args:
-        gains: (log α, log β).
+        gains: (α, β) [1/s].
         worlds: batch of systems and states.
         steps: of the rollout that is differentiated.
     """
-    method = dataclasses.replace(METHOD, stabilizer=Baumgarte(*jnp.exp(gains)))
+    method = dataclasses.replace(METHOD, stabilizer=Baumgarte(*gains))
 
-    def record(state: Any, info: Any) -> Array:
-        off = info.violation
-        return jnp.mean(off.position**2) + jnp.mean((STEP * off.velocity) ** 2)
-
-    def one(system: Any, state: Any) -> Array:
+    def one(system: Any, state: Any) -> Any:
         dt = jnp.asarray(STEP, state.q.dtype)
-        return jnp.mean(rollout(system, method, state, None, dt, steps, record=record)[1])
+        return rollout(system, method, state, None, dt, steps, record=lambda s, i: i.violation)[1]
 
-    return jnp.log10(jnp.mean(jax.vmap(one)(*worlds))) / 2
+    return losses.violation(jax.vmap(one)(*worlds), STEP)
 
 
 @dataclass(frozen=True)
@@ -128,23 +124,18 @@ class Tuning:
 
 def tune(worlds: PyTree, steps: int = 250, iterations: int = 60, rate: float = 1.0) -> Tuning:
     """Adam on log α and log β from a poor start, by gradients through the rollout."""
-    gradient = jax.jit(jax.value_and_grad(lambda x: loss(x, worlds, steps)))
+    dtype = worlds[1].q.dtype
+    start = jnp.full(2, rate, dtype)
+    default = jnp.asarray(Method().integrator.default_gains(STEP), dtype)
     optimizer = optax.adam(optax.cosine_decay_schedule(0.3, iterations))
-    gains = start = jnp.full(2, np.log(rate), worlds[1].q.dtype)
-    memory, history, best = optimizer.init(gains), [], (np.inf, gains)
-    for _ in tqdm(range(iterations), desc="tuning", unit="iteration", disable=None):
-        value, slope = gradient(gains)
-        history.append(float(value))
-        best = min(best, (float(value), gains), key=lambda pair: pair[0])
-        change, memory = optimizer.update(slope, memory)
-        gains = jnp.asarray(optax.apply_updates(gains, change))
-    default = jnp.log(jnp.asarray(Method().integrator.default_gains(STEP), start.dtype))
-    first, second = (float(gradient(x)[0]) for x in (start, default))
+    own = functools.partial(loss, worlds=worlds, steps=steps)
+    found = tuning.tune(own, start, positive=True, steps=iterations, optimizer=optimizer)
+    before = float(jax.jit(own)(default))
     return Tuning(
-        (np.exp(start), first),
-        (np.exp(default), second),
-        (np.exp(best[1]), best[0]),
-        np.array(history),
+        (np.asarray(start), float(found.history[0])),
+        (np.asarray(default), before),
+        (np.asarray(found.params), found.loss),
+        found.history,
     )
 
 
@@ -157,14 +148,14 @@ def main(copies: int = 1024, seconds: float = 5.0, picture: str = "jaxcon.png") 
     print(f"  {result.throughput:,.0f} environment-steps per second")
     print(f"  worst violation {result.violation.max():.2e} m")
     print(f"  energy drift: median {result.drift[0]:.2e}, worst {result.drift[1]:.2e} (relative)")
-    tuning = tune(jax.tree.map(lambda x: x[:64], worlds))
+    tuned = tune(jax.tree.map(lambda x: x[:64], worlds))
     print("Baumgarte gains by gradient through 250 steps of 64 linkages")
     for label in ("start", "default", "tuned"):
-        (alpha, beta), value = getattr(tuning, label)
+        (alpha, beta), value = getattr(tuned, label)
         print(
             f"  {label:8s} alpha {alpha:7.2f}  beta {beta:7.2f} 1/s   violation {10**value:.2e} m"
         )
     from jaxcon import view
 
-    view.main_job(result, tuning, jax.tree.map(lambda x: x[0], worlds), STEP, picture)
+    view.main_job(result, tuned, jax.tree.map(lambda x: x[0], worlds), STEP, picture)
     print(f"wrote {picture}")

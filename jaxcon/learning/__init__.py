@@ -1,0 +1,1 @@
+"""Floor 8: what is found by derivatives: gains, lengths, controls, and what a recording shows."""

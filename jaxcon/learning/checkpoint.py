@@ -1,0 +1,70 @@
+"""A search on disk: one file that is replaced as a whole, and refused by another search."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core.typing import PyTree
+
+
+def write(file: Path, about: Mapping[str, Any], contents: PyTree) -> None:
+    """Writes leaves and what they belong to; a crash leaves the old file or the new one."""
+    arrays: dict[str, Any] = {
+        f"leaf_{i}": numbers(x) for i, x in enumerate(jax.tree.leaves(contents))
+    }
+    arrays["about"] = np.array(json.dumps(about))
+    part = file.with_name(file.name + ".part")
+    with part.open("wb") as stream:
+        np.savez(stream, **arrays)
+        stream.flush()
+        os.fsync(stream.fileno())
+    part.replace(file)
+
+
+def read(file: Path, like: PyTree, about: Mapping[str, Any]) -> PyTree:
+    """The leaves in the structure of `like`; arrays of numpy may have grown since.
+
+    Raises:
+        ValueError: no checkpoint, or one of another search; names what is not the same.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            written = json.loads(str(stored["about"]))
+            arrays = [stored[f"leaf_{i}"] for i in range(len(stored.files) - 1)]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"tune: {file} is no checkpoint of tune; give another path.") from error
+    other = [what for what in about if written.get(what) != about[what]]
+    if other:
+        raise ValueError(
+            f"tune: {file} holds another search; not the same: {', '.join(other)}. Call tune as it"
+            " was called then, delete the file to begin anew, or give another path."
+        )
+    templates, structure = jax.tree.flatten(like)
+    leaves = [_restored(x, y) for x, y in zip(arrays, templates, strict=True)]
+    return jax.tree.unflatten(structure, leaves)
+
+
+def numbers(x: Any) -> np.ndarray:
+    """A leaf as numbers; keys of random numbers are made of such."""
+    return np.asarray(jax.random.key_data(x) if _is_key(x) else x)
+
+
+def _restored(stored: np.ndarray, like: Any) -> Any:
+    if isinstance(like, np.ndarray):
+        return stored
+    if _is_key(like):
+        return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
+    return jnp.asarray(stored.view(like.dtype))  # numpy does not know every dtype by name
+
+
+def _is_key(x: Any) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

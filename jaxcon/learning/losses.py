@@ -1,0 +1,115 @@
+"""What may be made small: functions of what a rollout recorded, to be added as they are.
+
+    def record(s, i):
+        return jc.position(system, s, "foot"), i.violation, jc.energy(system, s)
+
+    final, (foot, off, energy) = jc.rollout(system, method, state, None, dt, steps, record=record)
+    loss = losses.tracking(foot, wanted) + 0.1 * losses.energy_drift(energy)
+
+`tracking` and `violation` are means, over worlds too where a batch was recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.constraints.rows import Violation
+from jaxcon.core import numerics
+from jaxcon.core.status import failed
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.model.state import Energy
+
+
+def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
+    """The mean over quantities of ((x − x_ref) / scale)², averaged over time, ().
+
+    Args:
+        path: arrays of chosen quantities.
+        reference: the same as they should be; NaN where nobody knows.
+        scale: of each quantity: a number, or numbers in the structure of the path, or of its first
+            levels, that broadcast with it.
+
+    Raises:
+        ValueError: path and reference differ in structure or shape.
+    """
+    off = jax.tree.leaves(misfit(path, reference, scale))
+    means = [
+        jnp.sum(x * x) / jnp.maximum(jnp.sum(jnp.isfinite(wanted), dtype=x.dtype), 1)
+        for x, wanted in zip(off, jax.tree.leaves(reference), strict=True)
+    ]
+    return jnp.mean(jnp.stack(means))
+
+
+def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
+    """(x − x_ref) / scale, and 0 where the reference is NaN; arguments as of `tracking`."""
+    widths = jax.tree.broadcast(scale, path)
+    found, structure = jax.tree_util.tree_flatten_with_path(path)
+    shapes = [jnp.shape(x) for x in jax.tree.leaves(path)]
+    given = [jnp.shape(x) for x in jax.tree.leaves(reference)]
+    if structure != jax.tree.structure(reference) or shapes != given:
+        names = [jax.tree_util.keystr(where, simple=True, separator="/") for where, _ in found]
+        raise ValueError(
+            f"what was recorded, {dict(zip(names, shapes, strict=True))}, must have the structure"
+            f" and shapes of the reference, {jax.tree.structure(reference)} with {given}."
+        )
+
+    def off(x: Any, wanted: Any, width: Any) -> Array:
+        wanted = jnp.asarray(wanted, x.dtype)
+        seen = jnp.isfinite(wanted)
+        return jnp.where(seen, (x - jnp.where(seen, wanted, 0)) / jnp.asarray(width, x.dtype), 0)
+
+    return jax.tree.map(off, path, reference, widths)
+
+
+def violation(off: Violation, dt: Any) -> Array:
+    """log₁₀ of the root mean square of (φ, h φ̇) over rows and time, () [m].
+
+    φ is the error now, h φ̇ the one that it is about to grow by.
+
+    Args:
+        off: `info.violation` of each step.
+        dt: h, () [s].
+    """
+    square = jnp.mean(off.position**2) + jnp.mean((dt * off.velocity) ** 2)
+    return jnp.log10(jnp.maximum(square, jnp.finfo(square.dtype).tiny)) / 2
+
+
+def energy_drift(energy: Energy, scale: Any = None) -> Array:
+    """The root mean square over time of (E − E₀) / scale, ().
+
+    Args:
+        energy: of each recorded state, its first axis time.
+        scale: [J]; the largest kinetic energy unless given.
+    """
+    scale = jnp.max(energy.kinetic) if scale is None else scale
+    change = (energy.total - energy.total[:1]) / scale
+    return numerics.safe_sqrt(jnp.mean(change**2))
+
+
+def weighted(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Σ weight · term, and the terms themselves, as `tune` takes a loss and what goes beside it.
+
+    Raises:
+        ValueError: terms and weights have other names.
+    """
+    if set(terms) != set(weights):
+        raise ValueError(f"weights {sorted(weights)} must be named as terms {sorted(terms)}.")
+    return sum((weights[name] * x for name, x in terms.items()), start=0.0), dict(terms)
+
+
+def unless_failed(x: PyTree, state: Any) -> PyTree:
+    """x, and NaN in its place where a world has failed, so that no search goes there.
+
+    A world that failed keeps its last finite state, and what follows from that looks like any
+    number.
+
+    Args:
+        x: a loss, or predictions.
+        state: the final one, of a world or a batch.
+    """
+    bad = jnp.any(failed(state.status))
+    return jax.tree.map(lambda y: jnp.where(bad, jnp.nan, y), x)

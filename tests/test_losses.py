@@ -1,0 +1,90 @@
+"""Losses are what their equations say, blind where nobody looked, and NaN where a world failed."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from jaxcon.core.status import Status
+
+
+def pendulum(offset=0.0):
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=2.0, position=(1.0 + offset, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
+    return scene.build()
+
+
+@pytest.fixture(scope="module")
+def path():
+    system, state = pendulum(0.01)
+
+    def record(s, i):
+        return s.q, i.violation, jc.energy(system, s), s
+
+    method = jc.Method()
+    return jax.jit(lambda s: jc.rollout(system, method, s, None, 1e-2, 50, record=record))(state)
+
+
+def test_tracking_is_the_mean_of_squares_by_quantity_and_scale():
+    path = {"angle": jnp.array([1.0, 2.0, 3.0]), "tip": jnp.ones((3, 2))}
+    wanted = {"angle": np.array([1.0, np.nan, 1.0]), "tip": np.zeros((3, 2))}
+    scale = {"angle": 2.0, "tip": np.array([[1.0, 2.0]])}
+    expected = ((0 + (2 / 2) ** 2) / 2 + (1 + 1 / 4) / 2) / 2
+    np.testing.assert_allclose(jc.losses.tracking(path, wanted, scale), expected)
+    slope = jax.grad(lambda p: jc.losses.tracking(p, wanted, scale))(path)
+    assert slope["angle"][1] == 0.0  # not NaN
+    np.testing.assert_allclose(slope["angle"][2], 0.25)
+
+
+def test_tracking_says_what_does_not_fit():
+    with pytest.raises(ValueError, match="'tip': .3, 2."):
+        jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})
+    with pytest.raises(ValueError, match="structure"):
+        jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"toe": np.zeros((3, 2))})
+
+
+def test_violation_is_the_size_of_position_and_of_velocity_over_a_step(path):
+    _, (_, off, _, states) = path
+    q, v = (np.asarray(x) for x in (states.q, states.v))
+    # info is of the state before a step: of all but the last
+    length = np.linalg.norm(q, axis=1)
+    position, velocity = length - 1, np.sum(q * v, axis=1) / length
+    np.testing.assert_allclose(off.position[1:, 0], position[:-1], atol=1e-12)
+    square = np.mean(np.asarray(off.position) ** 2) + np.mean((1e-2 * velocity[:-1]) ** 2) * 49 / 50
+    np.testing.assert_allclose(jc.losses.violation(off, 1e-2), np.log10(square) / 2, rtol=1e-6)
+    still = dataclasses.replace(off, position=0 * off.position, velocity=0 * off.velocity)
+    assert jnp.isfinite(jc.losses.violation(still, 1e-2))
+
+
+def test_energy_drift_is_that_of_the_energy(path):
+    _, (_, _, energy, states) = path
+    by_hand = np.sum(np.asarray(states.v) ** 2, axis=1) + 2.0 * 9.81 * np.asarray(states.q)[:, 1]
+    change = (by_hand - by_hand[0]) / np.max(np.sum(np.asarray(states.v) ** 2, axis=1))
+    np.testing.assert_allclose(
+        jc.losses.energy_drift(energy), np.sqrt(np.mean(change**2)), rtol=1e-9
+    )
+    still = jax.tree.map(jnp.ones_like, energy)
+    assert jax.grad(lambda e: jc.losses.energy_drift(e))(still).kinetic[0] == 0.0
+
+
+def test_a_sum_comes_with_its_terms():
+    terms = {"task": jnp.asarray(2.0), "drift": jnp.asarray(3.0)}
+    value, aux = jc.losses.weighted(terms, {"task": 1.0, "drift": 0.5})
+    assert value == 3.5
+    assert aux == terms
+    with pytest.raises(ValueError, match="must be named as terms"):
+        jc.losses.weighted(terms, {"task": 1.0})
+
+
+def test_a_failed_world_has_no_loss():
+    _, state = pendulum()
+    failed = dataclasses.replace(state, status=jnp.asarray(Status.SINGULAR, jnp.int32))
+    noted = dataclasses.replace(state, status=jnp.asarray(Status.CONFLICT, jnp.int32))
+    one = jnp.asarray(1.0)
+    assert jc.losses.unless_failed(one, state) == one
+    assert jc.losses.unless_failed(one, noted) == one
+    assert jnp.isnan(jc.losses.unless_failed({"x": one}, failed)["x"])
