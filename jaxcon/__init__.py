@@ -80,6 +80,7 @@ from jaxcon.model.elastic import Bending, Flexure
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
+from jaxcon.simulation.adjoints import Checkpoints, Discounted, EveryStep, Truncated
 from jaxcon.simulation.generalized_alpha import GeneralizedAlpha
 from jaxcon.simulation.initialize import init
 from jaxcon.simulation.integrators import (
@@ -128,6 +129,7 @@ __all__ = [
     "Belt",
     "Bending",
     "Chain",
+    "Checkpoints",
     "Coincident",
     "Compound",
     "ConjugateGradients",
@@ -137,9 +139,11 @@ __all__ = [
     "Dense",
     "Diagnosis",
     "Differential",
+    "Discounted",
     "Distance",
     "Drive",
     "Energy",
+    "EveryStep",
     "ExplicitEuler",
     "ExternalWrench",
     "Failure",
@@ -204,6 +208,7 @@ __all__ = [
     "Status",
     "StepInfo",
     "Tolerance",
+    "Truncated",
     "TurnCounter",
     "Twist",
     "Universal",
