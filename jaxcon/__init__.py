@@ -3,6 +3,8 @@
 from jaxcon.analysis.diagnosis import Diagnosis, diagnose
 from jaxcon.analysis.failures import Failure, find_first_failure
 from jaxcon.analysis.findings import Finding
+from jaxcon.analysis.gradients import GradientCheck, check_gradients
+from jaxcon.analysis.growth import GradientGrowth, gradient_growth
 from jaxcon.analysis.integrability import Integrability, integrability
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.quantities import (
@@ -154,6 +156,8 @@ __all__ = [
     "Gear",
     "GeneralizedAlpha",
     "GeneralizedSystem",
+    "GradientCheck",
+    "GradientGrowth",
     "Heun",
     "Holonomic",
     "Hybrid",
@@ -220,6 +224,7 @@ __all__ = [
     "angular_velocity",
     "assemble",
     "center_of_mass",
+    "check_gradients",
     "coordinate",
     "coordinate_rate",
     "diagnose",
@@ -228,6 +233,7 @@ __all__ = [
     "forward_dynamics",
     "frequency_response",
     "from_mjcf",
+    "gradient_growth",
     "hanging",
     "inertia",
     "init",
