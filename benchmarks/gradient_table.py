@@ -10,10 +10,9 @@ random states in float32, none of which may be NaN.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
-from benchmarks import mechanisms
 from benchmarks.stabilisation import cast
 from jaxcon.analysis.differences import ridders
 

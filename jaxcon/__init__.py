@@ -6,7 +6,7 @@ from jaxcon.analysis.findings import Finding
 from jaxcon.analysis.gradients import GradientCheck, check_gradients
 from jaxcon.analysis.growth import GradientGrowth, gradient_growth
 from jaxcon.analysis.integrability import Integrability, integrability
-from jaxcon.analysis.memory import Memory, memory
+from jaxcon.analysis.memory import GradientMemory, Memory, gradient_memory, memory
 from jaxcon.analysis.quantities import (
     angular_momentum,
     angular_velocity,
@@ -158,6 +158,7 @@ __all__ = [
     "GeneralizedSystem",
     "GradientCheck",
     "GradientGrowth",
+    "GradientMemory",
     "Heun",
     "Holonomic",
     "Hybrid",
@@ -234,6 +235,7 @@ __all__ = [
     "frequency_response",
     "from_mjcf",
     "gradient_growth",
+    "gradient_memory",
     "hanging",
     "inertia",
     "init",

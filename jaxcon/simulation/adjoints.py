@@ -80,6 +80,10 @@ class EveryStep:
         """The final state and the record of a path."""
         return path.scan()
 
+    def sizes(self, steps: int, state: State) -> tuple[int, ...]:
+        """No segments."""
+        return ()
+
 
 @pytree
 class Checkpoints:
@@ -123,9 +127,9 @@ class Checkpoints:
         own = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
         choices = [equal_levels(steps, n) for n in range(1, steps.bit_length() + 1)]
         for sizes in choices:
-            if kept(steps, sizes) * own <= self.budget:
+            if sum(kept(steps, sizes)) * own <= self.budget:
                 return sizes
-        least = min(kept(steps, sizes) for sizes in choices) * own
+        least = min(sum(kept(steps, sizes)) for sizes in choices) * own
         raise ValueError(
             f"Checkpoints: budget={self.budget} bytes do not hold the states that a rollout of"
             f" {steps} steps must keep; {least} bytes are the least for this state of {own} bytes."
@@ -157,6 +161,10 @@ class Truncated:
 
         return self.within.scan(dataclasses.replace(path, step=step))
 
+    def sizes(self, steps: int, state: State) -> tuple[int, ...]:
+        """The segments of the adjoint within."""
+        return self.within.sizes(steps, state)
+
 
 @pytree
 class Discounted:
@@ -178,6 +186,10 @@ class Discounted:
             return path.step(faded(state, self.factor), given)
 
         return self.within.scan(dataclasses.replace(path, step=step))
+
+    def sizes(self, steps: int, state: State) -> tuple[int, ...]:
+        """The segments of the adjoint within."""
+        return self.within.sizes(steps, state)
 
 
 EVERY_STEP = EveryStep()
@@ -218,10 +230,10 @@ def equal_levels(steps: int, levels: int) -> tuple[int, ...]:
     return tuple(root**i for i in range(levels - 1, 0, -1))
 
 
-def kept(steps: int, sizes: Sequence[int]) -> int:
-    """How many states the reverse pass keeps at most."""
-    bounds = (steps, *(min(size, steps) for size in sizes), 1)
-    return sum(-(-a // b) for a, b in itertools.pairwise(bounds))
+def kept(steps: int, sizes: Sequence[int]) -> tuple[int, ...]:
+    """How many states the reverse pass keeps at most, by level; the last are those of steps."""
+    bounds = (steps, *(size for size in sizes if size < steps), 1)
+    return tuple(-(-a // b) for a, b in itertools.pairwise(bounds))
 
 
 def nested(
