@@ -124,6 +124,7 @@ def test_a_hanging_pendulum_has_no_horizon():
     growth = jc.gradient_growth(system, jc.Method(jc.RK4()), state, None, 1e-2, 400)
     assert growth.horizon() == np.inf
     assert growth.growth.max() < 4.0
+    assert "no more than a power of time" in str(growth)
 
 
 def test_no_freedom_is_refused():

@@ -22,6 +22,10 @@ FULL = 16
 """Up to so many degrees of freedom in (q, v), every one is moved; beyond, as many random ones."""
 
 
+POLYNOMIAL = 4.0
+"""exponent · time up to which growth may be that of a power: t² is fitted to 2.8 there."""
+
+
 @dataclass(frozen=True)
 class GradientGrowth:
     """‖∂x_t/∂x_0‖ along a rollout, x = (q, v); `print` it.
@@ -64,12 +68,10 @@ class GradientGrowth:
     def __str__(self) -> str:
         head = f"a move of the start grows by {self.growth[-1]:.3g} in {self.time[-1]:.3g} s"
         rate = f"exponent {self.exponent:.3g} /s"
+        if math.isinf(self.horizon(1e-3)):
+            return f"{head}; {rate}, no more than a power of time: derivatives reach as far as runs"
         horizons = f"useless beyond {self.horizon():.3g} s by rounding"
         return f"{head}; {rate}; {horizons}, {self.horizon(1e-3):.3g} s by a start known to 1e-3"
-
-
-POLYNOMIAL = 4.0
-"""exponent · time up to which growth may be that of a power: t² is fitted to 2.8 there."""
 
 
 def gradient_growth(
