@@ -184,6 +184,7 @@ def test_a_budget_takes_as_few_levels_as_it_can():
     assert sizes(1000) == ()
     assert sizes(999) == sizes(64) == (32,)
     assert sizes(63) == (100, 10)
+    assert jc.Checkpoints(budget=own).sizes(0, STATE) == ()
     with pytest.raises(ValueError, match=r"budget=40 bytes.*least"):
         jc.Checkpoints(budget=40).sizes(1000, STATE)
 

@@ -19,7 +19,7 @@ from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 
 FULL = 16
-"""Up to so many degrees of freedom in (q, v), every one is moved; beyond, as many random ones."""
+"""Up to so many independent moves of (q, v) all are taken; beyond, as many random ones."""
 
 
 POLYNOMIAL = 4.0
@@ -81,7 +81,7 @@ def gradient_growth(
 
     Moves of the start are those that keep φ = 0 and φ̇ = 0; others would be taken back by feedback
     at once. The growth is ‖∂x_t/∂x_0‖_F/√n over n such moves, in SI units: all that there are, or
-    as many random ones as are enough for a tenth.
+    16 random ones where there are more.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.

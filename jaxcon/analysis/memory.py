@@ -140,17 +140,15 @@ def gradient_memory(
     """
     policy = control if callable(control) else None
 
-    def run(start: PyTree, steps: int) -> Any:
-        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), control)
-        state = dataclasses.replace(start[1], q=start[0][0], v=start[0][1])
-        final, _ = rollout(system, method, state, controls, DT, steps, record=lambda s, i: None)
-        return jnp.sum(final.q) + jnp.sum(final.v)
-
     def planned(steps: int, worlds: int) -> int:
-        def gradient(q: Any, v: Any, rest: State) -> Any:
-            return jax.grad(lambda x: run((x, rest), steps))((q, v))
+        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), control)
 
-        return _planned(gradient, (state.q, state.v, state), worlds)
+        def end(moved: tuple[Any, Any], rest: State) -> Any:
+            start = dataclasses.replace(rest, q=moved[0], v=moved[1])
+            final, _ = rollout(system, method, start, controls, DT, steps, record=nothing)
+            return jnp.sum(final.q) + jnp.sum(final.v)
+
+        return _planned(jax.grad(end), ((state.q, state.v), state), worlds)
 
     small, large = (planned(SHORT, worlds) for worlds in BATCHES)
     longer = planned(LONGER, BATCHES[0])
@@ -159,6 +157,10 @@ def gradient_memory(
     start = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
     shared = small - own * BATCHES[0]
     return GradientMemory(start, _bytes(state), step, own - SHORT * step, shared)
+
+
+def nothing(state: State, info: Any) -> None:
+    """Recorded of a step."""
 
 
 def _bytes(tree: PyTree) -> int:

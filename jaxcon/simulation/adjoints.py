@@ -48,7 +48,7 @@ class Path:
         a time, those of all its steps.
         """
         within = [size for size in sizes if size < self.every]
-        beyond = [max(size // self.every, 1) for size in sizes if size >= self.every]
+        beyond = [size // self.every for size in sizes if size >= self.every]
         first = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self.inputs)
         seen = jax.eval_shape(lambda s, x: self.step(s, x)[1], self.start, first)
         empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), seen)
@@ -125,7 +125,7 @@ class Checkpoints:
             checks.count("Checkpoints", "levels", self.levels)
             return equal_levels(steps, self.levels)
         own = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
-        choices = [equal_levels(steps, n) for n in range(1, steps.bit_length() + 1)]
+        choices = [equal_levels(steps, n) for n in range(1, steps.bit_length() + 2)]
         for sizes in choices:
             if sum(kept(steps, sizes)) * own <= self.budget:
                 return sizes
