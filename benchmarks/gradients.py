@@ -94,8 +94,11 @@ def measure(loss: Loss, worlds: jax.Array, steps: int, short: int) -> Cost:
 def error(loss: Loss, worlds: jax.Array, steps: int) -> float:
     """Of the derivatives along the velocities, relative to the largest of all worlds."""
     both = jax.jit(jax.vmap(jax.value_and_grad(functools.partial(loss, steps=steps))))
-    ahead, behind = (np.asarray(both((1 + s * STEP) * worlds)[0], np.float64) for s in (1, -1))
-    by_difference = (ahead - behind) / (2 * STEP)
+
+    def at(s: float) -> np.ndarray:
+        return np.asarray(both((1 + s * STEP) * worlds)[0], np.float64)
+
+    by_difference = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * STEP)
     along = np.sum(np.asarray(both(worlds)[1] * worlds, np.float64), axis=1)
     return float(np.max(np.abs(along - by_difference)) / np.max(np.abs(by_difference)))
 
