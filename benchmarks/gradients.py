@@ -30,7 +30,7 @@ from benchmarks.peers import FLAGS, mjx_start, mjx_step, speeds
 
 SHORT = 100
 """Steps of MJX, and of the comparison with differences."""
-STEP = 1e-2
+STEP = 3e-2
 """Of the differences, relative."""
 LENGTHS = (100, 1000, 10000)
 ADJOINTS = {"every step": jc.EveryStep(), "checkpoints": jc.Checkpoints()}

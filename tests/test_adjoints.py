@@ -11,6 +11,8 @@ from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
+from jaxcon.simulation.adjoints import faded
+from jaxcon.simulation.segments import kept
 
 METHOD = jc.Method()
 DT = 0.01
@@ -163,7 +165,7 @@ def test_a_cut_stops_what_is_not_finite():
 
     def value(x):
         state = dataclasses.replace(STATE, q=jnp.stack([x, x]))
-        return jnp.sum(jnp.sqrt(jc.simulation.adjoints.faded(state, 0.0).q))
+        return jnp.sum(jnp.sqrt(faded(state, 0.0).q))
 
     assert jax.grad(value)(0.0) == 0.0
 
@@ -172,7 +174,7 @@ def test_a_cut_stops_what_is_not_finite():
 @pytest.mark.parametrize("levels", [1, 2, 3])
 def test_states_kept_grow_as_a_root(steps, levels):
     sizes = jc.Checkpoints(levels=levels).sizes(steps, STATE)
-    assert sum(jc.simulation.adjoints.kept(steps, sizes)) <= levels * (steps ** (1 / levels) + 1)
+    assert sum(kept(steps, sizes)) <= levels * (steps ** (1 / levels) + 1)
 
 
 def test_a_budget_takes_as_few_levels_as_it_can():

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
-from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint, kept
+from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
+from jaxcon.simulation.segments import kept
 from jaxcon.simulation.step import check_step, step_quietly
 
 BATCHES = 64, 256
