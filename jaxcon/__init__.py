@@ -3,8 +3,10 @@
 from jaxcon.analysis.diagnosis import Diagnosis, diagnose
 from jaxcon.analysis.failures import Failure, find_first_failure
 from jaxcon.analysis.findings import Finding
+from jaxcon.analysis.gradients import GradientCheck, check_gradients
+from jaxcon.analysis.growth import GradientGrowth, gradient_growth
 from jaxcon.analysis.integrability import Integrability, integrability
-from jaxcon.analysis.memory import Memory, memory
+from jaxcon.analysis.memory import GradientMemory, Memory, gradient_memory, memory
 from jaxcon.analysis.quantities import (
     angular_momentum,
     angular_velocity,
@@ -83,6 +85,7 @@ from jaxcon.model.elastic import Bending, Flexure
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
+from jaxcon.simulation.adjoints import Checkpoints, Discounted, EveryStep, Truncated
 from jaxcon.simulation.generalized_alpha import GeneralizedAlpha
 from jaxcon.simulation.initialize import init
 from jaxcon.simulation.integrators import (
@@ -131,6 +134,7 @@ __all__ = [
     "Belt",
     "Bending",
     "Chain",
+    "Checkpoints",
     "Coincident",
     "Compound",
     "ConjugateGradients",
@@ -140,9 +144,11 @@ __all__ = [
     "Dense",
     "Diagnosis",
     "Differential",
+    "Discounted",
     "Distance",
     "Drive",
     "Energy",
+    "EveryStep",
     "ExplicitEuler",
     "ExternalWrench",
     "Failure",
@@ -153,6 +159,9 @@ __all__ = [
     "Gear",
     "GeneralizedAlpha",
     "GeneralizedSystem",
+    "GradientCheck",
+    "GradientGrowth",
+    "GradientMemory",
     "Heun",
     "Holonomic",
     "Hybrid",
@@ -208,6 +217,7 @@ __all__ = [
     "Status",
     "StepInfo",
     "Tolerance",
+    "Truncated",
     "Tuned",
     "TurnCounter",
     "Twist",
@@ -220,6 +230,7 @@ __all__ = [
     "angular_velocity",
     "assemble",
     "center_of_mass",
+    "check_gradients",
     "coordinate",
     "coordinate_rate",
     "diagnose",
@@ -228,6 +239,8 @@ __all__ = [
     "forward_dynamics",
     "frequency_response",
     "from_mjcf",
+    "gradient_growth",
+    "gradient_memory",
     "hanging",
     "identify",
     "inertia",

@@ -1,7 +1,11 @@
 """What a world takes, against what XLA plans for batches that were not asked about."""
 
+import dataclasses
+import functools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxcon as jc
@@ -88,3 +92,45 @@ def test_control_is_that_of_a_step():
     assert jc.memory(system, jc.Method(), state, control).working > 0
     with pytest.raises(ValueError, match="control must have shape"):
         jc.memory(system, jc.Method(), state, [*control, 1.0])
+
+
+LENGTHS = (100, 1000, 10000)
+
+
+def bob():
+    """A bob on a rod in the plane."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    return scene.build()
+
+
+def planned_gradient(system, method, state, steps, adjoint, worlds=300):
+    """Of a gradient by positions, as XLA plans it [B]."""
+
+    def end(q, state):
+        start = dataclasses.replace(state, q=q)
+        run = functools.partial(jc.rollout, record=lambda s, i: None, adjoint=adjoint)
+        return jnp.sum(run(system, method, start, None, 2e-3, steps)[0].q)
+
+    return planned(lambda s: jax.grad(end)(s.q, s), state, worlds)[1]
+
+
+def test_memory_of_gradients_is_foretold_and_grows_as_a_root():
+    (system, state), method = bob(), jc.Method(solver=jc.Sparse())
+    memory = jc.gradient_memory(system, method, state)
+    adjoints = {"every step": jc.EveryStep(), "root": jc.Checkpoints()}
+    exponents = {}
+    for name, adjoint in adjoints.items():
+        found = []
+        for steps in LENGTHS:
+            found.append(planned_gradient(system, method, state, steps, adjoint))
+            assert abs(memory.of(300, steps, adjoint) / found[-1] - 1) < CLOSE, (name, steps)
+        growing = np.array(found) - memory.of(300, 0)
+        exponents[name] = np.polyfit(np.log(LENGTHS), np.log(growing), 1)[0]
+    assert abs(exponents["every step"] - 1.0) < 0.02
+    assert abs(exponents["root"] - 0.5) < 0.02
+    assert memory.of(300, 1000, jc.Truncated(5, jc.Checkpoints())) == memory.of(
+        300, 1000, jc.Checkpoints()
+    )
+    assert f"{memory.state} B by checkpoint" in str(memory)

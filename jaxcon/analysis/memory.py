@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +11,16 @@ import jax.numpy as jnp
 
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
+from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
 from jaxcon.simulation.method import Method
+from jaxcon.simulation.rollout import rollout
+from jaxcon.simulation.segments import kept
 from jaxcon.simulation.step import check_step, step_quietly
 
 BATCHES = 64, 256
 """Sizes that are compiled: what a world takes is in proportion from here on."""
+SHORT, LONGER = 4, 68
+"""Steps of the gradients that are compiled."""
 DT = 1e-3
 """A step [s]; sizes do not depend on it."""
 
@@ -71,8 +77,96 @@ def memory(system: Any, method: Method, state: State, control: PyTree = None) ->
 
     small, large = (_planned(step, (state, control), worlds) for worlds in BATCHES)
     working = (large - small) / (BATCHES[1] - BATCHES[0])
-    own = sum(x.nbytes for x in jax.tree.leaves(state))
-    return Memory(own, working, small - working * BATCHES[0])
+    return Memory(_bytes(state), working, small - working * BATCHES[0])
+
+
+@dataclass(frozen=True)
+class GradientMemory:
+    """What the gradient of a rollout by its start takes, for any number of steps and any adjoint.
+
+    Attributes:
+        start: shapes and dtypes of the state of one world.
+        state: what a checkpoint keeps of one world [B].
+        step: what the derivative of a step needs of one world, beside parameters [B].
+        working: what one world needs at any length [B].
+        shared: what does not grow with the batch [B].
+    """
+
+    start: State
+    state: int
+    step: float
+    working: float
+    shared: float
+
+    def of(self, worlds: int, steps: int, adjoint: Any = EVERY_STEP) -> float:
+        """Of a batch, what is recorded and given as control not counted [B].
+
+        Args:
+            worlds: of the batch.
+            steps: of the rollout.
+            adjoint: as of `rollout`.
+        """
+        check_adjoint(adjoint)
+        *checkpoints, last = kept(steps, adjoint.sizes(steps, self.start))
+        own = self.working + sum(checkpoints) * self.state + last * self.step
+        return self.shared + worlds * own
+
+    def __str__(self) -> str:
+        return (
+            f"memory of a world in a batch for a gradient: {self.state} B by checkpoint,"
+            f" {self.step:.0f} B by step between checkpoints, and {self.working:.0f} B besides"
+        )
+
+
+def gradient_memory(
+    system: Any, method: Method, state: State, control: PyTree = None
+) -> GradientMemory:
+    """The memory of `jax.jit(jax.vmap(jax.grad(…)))` of a rollout, as XLA plans it for this device.
+
+    Gradients through a few steps are compiled for two sizes of a batch and two lengths, which takes
+    seconds; the differences are what worlds and steps add.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        method: integrator, stabiliser and solver.
+        state: of one world.
+        control: of one step of one world, or a function of the state, as of `rollout`.
+
+    Returns:
+        The `GradientMemory`.
+
+    Raises:
+        ValueError: state and control do not fit, as in `step`.
+        RuntimeError: the compiler of this device does not say what it plans.
+    """
+    policy = control if callable(control) else None
+
+    def planned(steps: int, worlds: int) -> int:
+        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), control)
+
+        def end(moved: tuple[Any, Any], rest: State) -> Any:
+            start = dataclasses.replace(rest, q=moved[0], v=moved[1])
+            final, _ = rollout(system, method, start, controls, DT, steps, record=nothing)
+            return jnp.sum(final.q) + jnp.sum(final.v)
+
+        return _planned(jax.grad(end), ((state.q, state.v), state), worlds)
+
+    small, large = (planned(SHORT, worlds) for worlds in BATCHES)
+    longer = planned(LONGER, BATCHES[0])
+    own = (large - small) / (BATCHES[1] - BATCHES[0])
+    step = (longer - small) / (LONGER - SHORT) / BATCHES[0]
+    start = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+    shared = small - own * BATCHES[0]
+    return GradientMemory(start, _bytes(state), step, own - SHORT * step, shared)
+
+
+def nothing(state: State, info: Any) -> None:
+    """Recorded of a step."""
+
+
+def _bytes(tree: PyTree) -> int:
+    """Of all leaves."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def _planned(step: Any, args: PyTree, worlds: int) -> int:

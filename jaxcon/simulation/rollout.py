@@ -14,6 +14,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
+from jaxcon.simulation.adjoints import EVERY_STEP, Path, check_adjoint
 from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain, stop_failed
 from jaxcon.simulation.stability import warn_if_unstable
@@ -37,6 +38,7 @@ def rollout(
     *,
     record: Record = record_state,
     every: int = 1,
+    adjoint: Any = EVERY_STEP,
 ) -> tuple[State, PyTree]:
     """Steps in one scan, with a trajectory of chosen quantities at a chosen stride.
 
@@ -50,6 +52,8 @@ def rollout(
         record: (state, info) → what to keep; the whole state unless given. `info` is what the step
             that led to the state saw at its start.
         every: keep one of so many steps; must divide `steps`.
+        adjoint: what the reverse pass keeps, `EveryStep()` or `Checkpoints(…)`, and how far back
+            it goes, `Truncated(…)` or `Discounted(…)`.
 
     Returns:
         The final state, and what was recorded with a first axis of steps // every. A world that
@@ -57,29 +61,22 @@ def rollout(
 
     Raises:
         ValueError: `every` does not divide `steps`, or controls of another length.
-        TypeError: `steps` or `every` is not an integer.
+        TypeError: `steps` or `every` is not an integer, or the adjoint is none.
     """
     steps, every = _integer("steps", steps), _integer("every", every)
     if steps < 0 or every < 1 or steps % every:
         raise ValueError(f"rollout: every={every} must divide steps={steps}.")
-    policy = controls if callable(controls) else None
-    inputs = None if policy else _split(controls, steps, every)
     check_method(method)
+    check_adjoint(adjoint)
     warn_if_unstable(method, dt, system, state)
+    policy = controls if callable(controls) else None
+    inputs = jnp.arange(steps), None if policy else _rows(controls, steps)
 
-    def one(carry: tuple[State, Any], control: PyTree) -> tuple[tuple[State, StepInfo], None]:
-        state, _ = carry
-        control = contained_policy(policy, state) if policy else control
-        return step_quietly(system, method, state, control, dt), None
+    def one(state: State, given: Any) -> tuple[State, StepInfo]:
+        control = contained_policy(policy, state) if policy else given[1]
+        return step_quietly(system, method, state, control, dt)
 
-    def several(state: State, controls: PyTree) -> tuple[State, PyTree]:
-        (state, info), _ = jax.lax.scan(one, (state, empty), controls, every)
-        return state, record(state, info)
-
-    first = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), inputs)
-    shapes = jax.eval_shape(lambda s, u: one((s, None), u)[0][1], state, first)
-    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    final, trajectory = jax.lax.scan(several, state, inputs, steps // every)
+    final, trajectory = adjoint.scan(Path(one, record, state, inputs, steps, every))
     return stop_failed(final.status, final), stop_failed(final.status, trajectory)
 
 
@@ -109,16 +106,16 @@ def _integer(what: str, number: Any) -> int:
         ) from error
 
 
-def _split(controls: PyTree, steps: int, every: int) -> PyTree:
-    """The controls with a first axis of recorded steps and a second of those between."""
+def _rows(controls: PyTree, steps: int) -> PyTree:
+    """The controls as arrays, one row a step."""
 
-    def split(x: Any) -> Any:
+    def checked(x: Any) -> Any:
         x = jnp.asarray(x)
         if x.ndim == 0 or x.shape[0] != steps:
             raise ValueError(
                 f"rollout: controls must have {steps} rows, one a step, got shape {x.shape}; repeat"
                 " a constant one with jnp.tile, or give a function of the state."
             )
-        return x.reshape((steps // every, every, *x.shape[1:]))
+        return x
 
-    return jax.tree.map(split, controls)
+    return jax.tree.map(checked, controls)

@@ -1,0 +1,70 @@
+"""Derivatives along directions by central differences that choose their own step. Host code."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.core.typing import Array
+
+LEVELS = 10
+"""Of differences, each with half the step of the one before."""
+ROUNDING = 64
+"""What a long computation makes of the rounding of one number, in spacings of the result."""
+
+
+def steps(eps: float) -> np.ndarray:
+    """From ε^⅛ down by halves, relative."""
+    return eps**0.125 * 0.5 ** np.arange(LEVELS)
+
+
+def unseen(eps: float) -> float:
+    """The derivative that rounding hides, relative to the values of f."""
+    return ROUNDING * eps / steps(eps)[0]
+
+
+def differences(of: Any, at: list[Array], moves: list[Array]) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives along directions, and how exact they are.
+
+    Args:
+        of: a list of arrays → a number.
+        at: where.
+        moves: directions, (n, …) in each array.
+
+    Returns:
+        Derivatives (n,), extrapolated from all `steps`, and their uncertainties (n,).
+    """
+    sizes = jnp.asarray(steps(float(jnp.finfo(at[0].dtype).eps)), at[0].dtype)
+
+    def along(move: list[Array], step: Array) -> Array:
+        return of([x + step.astype(x.dtype) * dx for x, dx in zip(at, move, strict=True)])
+
+    every = jax.jit(jax.vmap(jax.vmap(along, (None, 0)), (0, None)))
+    values = np.asarray(every(moves, jnp.concatenate([sizes, -sizes])), np.float64)
+    ahead, behind = np.split(values, 2, axis=1)
+    return ridders((ahead - behind) / (2 * np.asarray(sizes, np.float64)))
+
+
+def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The limit of central differences whose steps are halved, and its uncertainty.
+
+    Each column of Neville's table takes away the next even power of the step. The entry that
+    differs least from the two that it is made of is taken for the best. That one may owe it to
+    chance, and so the fourth least of these differences says how exact it is.
+
+    Args:
+        slopes: (directions, levels), from the largest step on.
+    """
+    column, entries, apart = slopes, [], []
+    for power in range(1, slopes.shape[1]):
+        factor = 4.0**power
+        after = (factor * column[:, 1:] - column[:, :-1]) / (factor - 1)
+        apart += [np.maximum(np.abs(after - column[:, 1:]), np.abs(after - column[:, :-1]))]
+        entries, column = [*entries, after], after
+    table, spread = np.concatenate(entries, axis=1), np.concatenate(apart, axis=1)
+    order = np.argsort(np.where(np.isfinite(spread), spread, np.inf), axis=1)
+    pick = [np.take_along_axis(x, order, axis=1) for x in (table, spread)]
+    return pick[0][:, 0], pick[1][:, 3]

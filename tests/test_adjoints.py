@@ -1,0 +1,209 @@
+"""Adjoints of rollouts: the same gradient by less memory, and gradients cut short on purpose."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from tolerances import IDENTITY
+
+import jaxcon as jc
+from jaxcon.simulation.adjoints import faded
+from jaxcon.simulation.segments import kept
+
+METHOD = jc.Method()
+DT = 0.01
+
+
+def pushed():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=2.0, position=(1.0, 0.0), velocity=(0.0, 1.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    scene.add(jc.ExternalWrench("push", "bob"))
+    return scene.build()
+
+
+SYSTEM, STATE = pushed()
+
+
+def outcome(x, adjoint, steps, every, feedback=False):
+    """A number that the end and every recorded state and force enter."""
+    system = SYSTEM.with_params({"bob": {"mass": x["mass"]}})
+    state = dataclasses.replace(STATE, v=x["v"])
+    controls = (lambda s: x["u"][0] * s.v) if feedback else x["u"][:steps]
+
+    def record(state, info):
+        return {"end": state.q[0] * state.v[1], "pull": info.multipliers[0]}
+
+    run = functools.partial(jc.rollout, record=record, every=every, adjoint=adjoint)
+    final, kept = run(system, METHOD, state, controls, x["dt"], steps)
+    weights = 1.0 + jnp.arange(1.0 * (steps // every))
+    return final.q @ final.v + weights @ kept["end"] + 1e-2 * weights @ kept["pull"]
+
+
+def numbers():
+    random = np.random.default_rng(0)
+    own = {"mass": 2.0, "v": [0.0, 1.0], "u": random.normal(size=(12, 2)), "dt": DT}
+    return {name: jnp.asarray(x) for name, x in own.items()}
+
+
+@functools.cache
+def gradient(adjoint, *shape):
+    """By value and gradient, in one program."""
+    return quick_jit(jax.value_and_grad(lambda x: outcome(x, adjoint, *shape)))(numbers())
+
+
+def close(got, expected, tolerance=IDENTITY):
+    for path, leaf in jax.tree.leaves_with_path(expected):
+        other = functools.reduce(lambda tree, key: tree[getattr(key, "key", None)], path, got)
+        scale = np.max(np.abs(leaf), initial=1e-3)
+        np.testing.assert_allclose(other, leaf, rtol=0, atol=tolerance * scale, err_msg=str(path))
+
+
+DEFAULT = jc.EveryStep()
+SAME = [
+    (jc.Checkpoints(), 11, 1, False),
+    (jc.Checkpoints(), 12, 4, False),
+    (jc.Checkpoints(), 12, 6, True),
+    (jc.Checkpoints(levels=3), 11, 1, True),
+    (jc.Checkpoints(segments=(6, 2)), 12, 3, False),
+    (jc.Checkpoints(segments=5), 12, 12, False),
+    (jc.Truncated(20), 11, 1, False),
+    (jc.Discounted(1.0, within=jc.Checkpoints()), 11, 1, True),
+]
+
+
+@pytest.mark.parametrize(("adjoint", "steps", "every", "feedback"), SAME)
+def test_the_gradient_is_that_of_every_step(adjoint, steps, every, feedback):
+    value, slope = gradient(adjoint, steps, every, feedback)
+    expected_value, expected = gradient(DEFAULT, steps, every, feedback)
+    np.testing.assert_allclose(value, expected_value, rtol=IDENTITY)
+    close(slope, expected)
+
+
+def test_forward_mode_and_batches_in_both_orders():
+    x = numbers()
+    worlds = jnp.stack([x["v"], 2 * x["v"], -x["v"]])
+
+    def value(v):
+        return outcome(x | {"v": v}, jc.Checkpoints(), 11, 1)
+
+    slope = quick_jit(jax.grad(value))
+    expected = jnp.stack([slope(v) for v in worlds])
+    inside = quick_jit(jax.vmap(jax.grad(value)))(worlds)
+    outside = quick_jit(jax.grad(lambda vs: jnp.sum(jax.vmap(value)(vs))))(worlds)
+    direction = jnp.array([0.3, -0.7])
+    forward = quick_jit(lambda v: jax.jvp(value, (v,), (direction,))[1])(x["v"])
+    np.testing.assert_allclose(inside, expected, rtol=1e-11)
+    np.testing.assert_allclose(outside, expected, rtol=1e-11)
+    np.testing.assert_allclose(forward, expected[0] @ direction, rtol=1e-11)
+
+
+def test_a_failed_world_has_no_gradient_and_the_others_do_not_notice():
+    x = numbers()
+    worlds = jnp.stack([x["v"], jnp.full(2, jnp.nan)])
+    shared = jnp.asarray(2.0)
+
+    def total(mass, adjoint, worlds):
+        def value(v):
+            system = SYSTEM.with_params({"bob": {"mass": mass}})
+            state = dataclasses.replace(STATE, v=v)
+            return jc.rollout(system, METHOD, state, x["u"], DT, 12, adjoint=adjoint)[0].q[1]
+
+        return jnp.sum(jax.vmap(value)(worlds))
+
+    got = quick_jit(jax.grad(functools.partial(total, adjoint=jc.Checkpoints(), worlds=worlds)))
+    alone = functools.partial(total, adjoint=DEFAULT, worlds=worlds[:1])
+    np.testing.assert_allclose(got(shared), quick_jit(jax.grad(alone))(shared), rtol=1e-11)
+
+
+def free(steps, adjoint):
+    """A free particle pushed along a line: dq_T/dv_0, dq_T/du, and the same of all q."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("bob", mass=2.0)
+    scene.add(jc.ExternalWrench("push", "bob"))
+    system, state = scene.build()
+
+    def end(v, controls):
+        start = dataclasses.replace(state, v=jnp.stack([v, 0.0 * v]))
+        controls = jnp.stack([controls, 0.0 * controls], axis=-1)
+        final, path = jc.rollout(system, METHOD, start, controls, DT, steps, adjoint=adjoint)
+        return final.q[0], path.q[:, 0]
+
+    return quick_jit(jax.jacrev(end, argnums=(0, 1)))(jnp.asarray(1.0), jnp.zeros(steps))
+
+
+def effects(steps, count):
+    """dq_j+1/du_i = (h²/m)(j − i + 1) · count(i, j) by hand, with semi-implicit Euler."""
+    j, i = np.mgrid[:steps, :steps]
+    return np.where(i <= j, DT**2 / 2.0 * (j - i + 1) * count(i, j), 0.0)
+
+
+@pytest.mark.parametrize("within", [DEFAULT, jc.Checkpoints(segments=3)])
+def test_a_truncated_gradient_by_hand(within):
+    (by_v, by_u), (_, path_by_u) = free(10, jc.Truncated(4, within))
+    assert by_v == 0.0
+    table = effects(10, lambda i, j: i // 4 == j // 4)
+    np.testing.assert_allclose(path_by_u, table, rtol=1e-12)
+    np.testing.assert_allclose(by_u, table[-1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("within", [DEFAULT, jc.Checkpoints()])
+def test_a_discounted_gradient_by_hand(within):
+    (by_v, by_u), (_, path_by_u) = free(10, jc.Discounted(0.7, within))
+    np.testing.assert_allclose(by_v, 0.7**10 * 10 * DT, rtol=1e-12)
+    table = effects(10, lambda i, j: 0.7 ** (j - i).clip(0))
+    np.testing.assert_allclose(path_by_u, table, rtol=1e-12)
+    np.testing.assert_allclose(by_u, table[-1], rtol=1e-12)
+
+
+def test_a_cut_stops_what_is_not_finite():
+    """Where 0 · ∞ would be NaN."""
+
+    def value(x):
+        state = dataclasses.replace(STATE, q=jnp.stack([x, x]))
+        return jnp.sum(jnp.sqrt(faded(state, 0.0).q))
+
+    assert jax.grad(value)(0.0) == 0.0
+
+
+@pytest.mark.parametrize("steps", [1, 2, 10, 100, 1000, 4097])
+@pytest.mark.parametrize("levels", [1, 2, 3])
+def test_states_kept_grow_as_a_root(steps, levels):
+    sizes = jc.Checkpoints(levels=levels).sizes(steps, STATE)
+    assert sum(kept(steps, sizes)) <= levels * (steps ** (1 / levels) + 1)
+
+
+def test_a_budget_takes_as_few_levels_as_it_can():
+    own = sum(x.nbytes for x in jax.tree.leaves(STATE))
+
+    def sizes(states):
+        return jc.Checkpoints(budget=states * own).sizes(1000, STATE)
+
+    assert sizes(1000) == ()
+    assert sizes(999) == sizes(64) == (32,)
+    assert sizes(63) == (100, 10)
+    assert jc.Checkpoints(budget=own).sizes(0, STATE) == ()
+    with pytest.raises(ValueError, match=r"budget=40 bytes.*least"):
+        jc.Checkpoints(budget=40).sizes(1000, STATE)
+
+
+@pytest.mark.parametrize(
+    ("adjoint", "error", "match"),
+    [
+        (jc.Checkpoints, TypeError, "adjoint must be a value"),
+        ("sqrt", TypeError, "adjoint must be a value"),
+        (jc.Truncated(3, within=jc.Checkpoints), TypeError, "adjoint must be a value"),
+        (jc.Checkpoints(levels=0), ValueError, "levels must be a whole number"),
+        (jc.Checkpoints(segments=(6, 4)), ValueError, "divisor of the one before"),
+        (jc.Checkpoints(segments=3, budget=9), ValueError, "exclude each other"),
+        (jc.Truncated(0), ValueError, "steps must be a whole number"),
+        (jc.Discounted(-0.5), ValueError, "factor must be zero or more"),
+    ],
+)
+def test_what_is_no_adjoint_is_refused(adjoint, error, match):
+    with pytest.raises(error, match=match):
+        jc.rollout(SYSTEM, METHOD, STATE, jnp.zeros((6, 2)), DT, 6, adjoint=adjoint)

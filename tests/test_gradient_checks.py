@@ -1,0 +1,136 @@
+"""What tells users whether their gradients are right, and how far they reach."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from jaxcon.analysis.differences import ridders
+
+
+@jax.custom_jvp
+def slightly_wrong(x):
+    return x**2
+
+
+slightly_wrong.defjvp(lambda x, dx: (x[0] ** 2, 2.0001 * x[0] * dx[0]))
+
+
+def several(x):
+    large = jnp.sin(x["large"]) @ jnp.arange(1.0, 8.0)
+    return {"a": slightly_wrong(x["wrong"]) + large, "b": x["right"] ** 3 * large}
+
+
+NUMBERS = {"wrong": 1.5, "right": jnp.array([0.7, -0.3]), "large": jnp.linspace(0, 1, 7), "n": 3}
+
+
+def test_a_wrong_leaf_is_named_and_the_others_are_not():
+    check = jc.check_gradients(several, NUMBERS)
+    assert not check.ok
+    assert check.wrong == ("wrong",)
+    assert [leaf.name for leaf in check.leaves] == ["large", "right", "wrong"]
+    bad = check.leaves[2]
+    np.testing.assert_allclose(bad.error, 1e-4 / 2.0001, rtol=1e-6)
+    np.testing.assert_allclose(bad.reverse / bad.difference, 2.0001 / 2, rtol=1e-9)
+    assert "wrong: the modes differ by" in str(check)
+    assert "DISAGREES" in str(bad)
+
+
+def test_a_tolerance_is_the_users():
+    assert jc.check_gradients(several, NUMBERS, tolerance=1e-3).ok
+
+
+def test_right_leaves_are_right_to_rounding():
+    check = jc.check_gradients(lambda x: several(x | {"wrong": 0.0}), NUMBERS)
+    assert max(leaf.error for leaf in check.leaves[:2]) < 1e-10
+
+
+def half_differentiable(x):
+    """x below zero, where the derivative of the root is NaN in the branch that is not taken."""
+    return jnp.where(x > 0, jnp.sqrt(x), x)
+
+
+def test_nan_is_no_agreement():
+    check = jc.check_gradients(half_differentiable, -1.0)
+    assert check.wrong == ("x",)
+
+
+def test_what_differences_cannot_see_is_undecided():
+    """A function with noise a million times that of rounding."""
+
+    def noisy(x):
+        return jnp.sin(x) + 1e-6 * jnp.sin(1e9 * jax.lax.stop_gradient(x))
+
+    (leaf,) = jc.check_gradients(noisy, 1.0).leaves
+    assert leaf.undecided
+    assert not leaf.ok
+
+
+def test_a_pendulum_in_float32():
+    scene = jc.Scene(dim=2, dtype=jnp.float32)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+
+    def end(params):
+        dt = jnp.asarray(1e-2, jnp.float32)
+        return jc.rollout(system.with_params(params), jc.Method(), state, None, dt, 5)[0].q
+
+    check = jc.check_gradients(end, {"rod": {"length": system.params["rod"]["length"]}})
+    assert check.ok, check
+    assert check.leaves[0].name == "rod.length"
+
+
+def test_nothing_to_differentiate_by():
+    with pytest.raises(ValueError, match="no leaf of floating numbers"):
+        jc.check_gradients(lambda x: 1.0 * x, 3)
+
+
+def test_ridders_takes_away_every_even_power():
+    steps = 0.1 * 0.5 ** np.arange(10)
+    slopes = 2.0 + np.stack([3 * steps**2 - steps**4, np.sin(steps) * steps])
+    best, uncertainty = ridders(slopes)
+    assert np.all(np.abs(best - 2.0) <= np.maximum(uncertainty, 1e-14))
+    assert np.all(uncertainty < 1e-11)
+
+
+def swing(height):
+    """A bob on a rod of 1 m, hanging or upright."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(0.0, height))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    return scene.build()
+
+
+def test_an_inverted_pendulum_falls_as_its_exponent_says():
+    """e^√(g/l) t: cosh in closed form, from moves of φ and of the speed across."""
+    system, state = swing(1.0)
+    growth = jc.gradient_growth(system, jc.Method(jc.RK4()), state, None, 1e-2, 400)
+    rate, t = np.sqrt(9.81), growth.time
+    c, s = np.cosh(rate * t), np.sinh(rate * t)
+    expected = np.sqrt((2 * c**2 + (s / rate) ** 2 + (s * rate) ** 2) / 2)
+    np.testing.assert_allclose(growth.growth, expected, rtol=1e-5)
+    np.testing.assert_allclose(growth.exponent, rate, rtol=1e-3)
+    # where ε · growth is 1
+    reach = np.log(2 / (np.finfo(float).eps * np.sqrt((2 + 9.81 + 1 / 9.81) / 2))) / rate
+    np.testing.assert_allclose(growth.horizon(), reach, rtol=1e-3)
+    assert growth.horizon(1e-3) < growth.time[-1] < growth.horizon()
+    assert "useless beyond" in str(growth)
+
+
+def test_a_hanging_pendulum_has_no_horizon():
+    system, state = swing(-1.0)
+    growth = jc.gradient_growth(system, jc.Method(jc.RK4()), state, None, 1e-2, 400)
+    assert growth.horizon() == np.inf
+    assert growth.growth.max() < 4.0
+    assert "no more than a power of time" in str(growth)
+
+
+def test_no_freedom_is_refused():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Coincident("pin", jc.WORLD, "bob", point=(1.0, 0.0)))
+    system, state = scene.build()
+    with pytest.raises(ValueError, match="no freedom"):
+        jc.gradient_growth(system, jc.Method(), state, None, 1e-2, 10)
