@@ -42,7 +42,7 @@ STABILIZERS = {
     "adaptive": jc.AdaptiveBaumgarte(20.0, 20.0),
     "sliding window": jc.SlidingWindowBaumgarte(20.0),
     "penalty": jc.Penalty.from_time(0.1),
-    "multipliers": jc.AugmentedLagrangian(iterations=8),  # W is held; it matters less with each
+    "multipliers": jc.AugmentedLagrangian(),
     "hybrid": jc.Hybrid(jc.Penalty.from_time(0.1), soft_below=1e-3),
     "projection": jc.Projection(),
 }

@@ -361,6 +361,8 @@ def test_generalized_coordinates(name):
         (jc.Penalty(1.0, others=jc.Projection()), ["others=Projection", "soft constraints"]),
         (jc.Hybrid(jc.Penalty(1.0), sharpness=0), ["Hybrid", "sharpness"]),
         (jc.Hybrid(jc.Penalty(1.0), large=jc.Baumgarte()), ["Hybrid", "corrects nothing"]),
+        (jc.Hybrid(jc.Penalty(1.0), large=jc.Penalty(2.0)), ["Hybrid", "corrects nothing"]),
+        (jc.Hybrid(jc.Penalty(1.0), jc.Projection()), ["Hybrid", "corrects after a step"]),
         (jc.Hybrid(jc.Penalty(1.0), soft_below=1.0), ["Hybrid", "must not exceed"]),
     ],
 )
@@ -376,3 +378,28 @@ def test_damping_for_what_is_hard_is_refused():
     method = jc.Method(stabilizer=jc.Penalty({"rod": 1.0}, {"hinge": 1.0}))
     with pytest.raises(ValueError, match="damping is given for .*hinge.*only .*rod.* soft"):
         jax.eval_shape(lambda s: jc.step(system, method, s, None, H), state)
+
+
+def test_a_hybrid_comes_back_and_does_not_mind_a_projection_of_no_weight():
+    """From a tenth off; and with rods that differ by 1e-7, which no projection can meet."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.1, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Hybrid(jc.Penalty(1e3)))
+    final, _ = quick_jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 2000))(
+        jc.init(system, method, state.q, state.v)
+    )
+    assert final.status == jc.Status.OK
+    assert jc.violation(system, final).worst < 1e-3
+    assert jnp.linalg.norm(final.v) < 5.0  # √(2 g l) = 4.4
+
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
+    scene.add(jc.Distance("other", jc.WORLD, "bob", length=1.0 + 1e-7))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Hybrid(jc.Penalty(1e5), large=jc.Projection()))
+    start = jc.init(system, method, state.q, state.v)
+    final, _ = quick_jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 100))(start)
+    assert final.status == jc.Status.OK

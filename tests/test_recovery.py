@@ -218,7 +218,13 @@ def test_what_is_refused(scene):
     for wrong, kind, words in (
         (jc.Recovery(shrink=2.0), ValueError, "shrink must be from 0 to 1, got 2.0"),
         (jc.Recovery(limit=-1.0), ValueError, "limit must be positive"),
-        (jc.Recovery(projector=jc.Baumgarte()), ValueError, "projector=Baumgarte corrects nothing"),
+        (jc.Recovery(projector=jc.Baumgarte()), ValueError, "Baumgarte corrects no positions"),
+        (jc.Recovery(projector=jc.Penalty(1.0)), ValueError, "Penalty corrects no positions"),
+        (
+            jc.Recovery(projector=jc.Projection(position=False)),
+            ValueError,
+            "Projection corrects no positions",
+        ),
         (jc.Recovery(projector="projection"), TypeError, "projector must be a stabiliser"),
         (jc.Recovery, TypeError, r"recovery must be a value such as Recovery\(\)"),
     ):

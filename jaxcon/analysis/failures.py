@@ -181,12 +181,12 @@ class Watched(Dynamics):
 
     seen: list[tuple[list[Finding], Status]] = field(default_factory=list)
 
-    def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
-        """a and λ at (q, v, t), and the rows there."""
-        solution, rows = super().__call__(q, v, t, age)
-        if checks.is_concrete((q, v, t, solution)):
-            self.seen.append(self._judge(q, v, t, solution, rows))
-        return solution, rows
+    def allowing(self, q: Array, v: Array, t: Any, age: Any = None) -> Any:
+        """a and λ at (q, v, t), the rows there, and which changes of v they allow."""
+        found = super().allowing(q, v, t, age)
+        if checks.is_concrete((q, v, t, found[0])):
+            self.seen.append(self._judge(q, v, t, *found[:2]))
+        return found
 
     def _judge(
         self, q: Array, v: Array, t: Any, solution: Solution, rows: Rows

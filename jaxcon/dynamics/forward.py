@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
+import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core.typing import Array, PyTree
@@ -54,11 +57,22 @@ class Dynamics:
 
     def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
         """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago."""
+        return self.allowing(q, v, t, age)[:2]
+
+    def allowing(
+        self, q: Array, v: Array, t: Any, age: Any = None
+    ) -> tuple[Solution, Rows, Callable[[Array], Array]]:
+        """The same, and Δv → the nearest change of v in the metric of M that the rows allow."""
         rows = dataclasses.replace(linearize(self.system, q, v, t), mass=self.system.mass(q))
         seen = rows if age is None else rows.earlier(age)
         law = self.stabilizer.impose(seen, self.memory, self.dt)
         force = self.system.force(q, v, t, self.control)
         force = force if law.force is None else force + law.force
         problem = saddle(self.system, q, law.rows, force, law.target, law.noise)
-        own = self.solver.solve(problem) if law.solve is None else law.solve(self.solver, problem)
-        return self.system.complete(own), rows
+        solve = self.solver.factor(problem)
+        own = solve(force, law.target) if law.solve is None else law.solve(self.solver, problem)
+
+        def allowed(change: Array) -> Array:
+            return solve(problem.mass.apply(change), jnp.zeros_like(law.target)).acceleration
+
+        return self.system.complete(own), rows, allowed

@@ -179,16 +179,13 @@ class SpatialRigid(Particle):
         is, but for terms of (hω)², what the discrete Lagrangian ½ ω·Iω of a body that turns by hω
         and then by hΩ leads to: turning freely it neither gains energy nor loses any. The equation
         is quadratic, and one step of Newton's method from ω + h a is enough.
-
-        Rows were asked for ω + h a, which a body that turns fast within a step would miss by too
-        much for feedback to be stable: from a third to half a radian a step it goes back to that.
         """
-        inertia, ω = Vector.of(moments), Vector(*v[3:])
-        after = ω + Vector(*change[3:])
-        weight = dt / 2 * jnp.clip(1.5 - 5 * dt * dt * after.dot(after), 0, 1)
-        grown = after.cross(scaled(inertia, after)) - ω.cross(scaled(inertia, ω))
-        after = after - cramer(gyroscopic_slope(inertia, after, weight), grown * weight)
-        return Vector(*(Vector(*v[:3]) + Vector(*change[:3])), *after)
+        move, turn, weight = change[:3], Vector(*change[3:]), dt / 2
+        ω, shares = Vector(*v[3:]), shares_of(Vector.of(moments))
+        after = ω + turn
+        grown = (spun(shares, after) - spun(shares, ω)) * weight
+        after = after - cramer(gyroscopic_slope(shares, after * weight), grown)
+        return Vector(*(Vector(*v[:3]) + Vector(*move)), *after)
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
@@ -202,16 +199,23 @@ class SpatialRigid(Particle):
         )
 
 
-def scaled(x: Vector, y: Vector) -> Vector:
-    """(x₁y₁, x₂y₂, …)."""
-    return Vector(*(a * b for a, b in zip(x, y, strict=True)))
+def shares_of(moments: Vector) -> Vector:
+    """((I₃ − I₂)/I₁, (I₁ − I₃)/I₂, (I₂ − I₁)/I₃): of a body's moments each is at most 1."""
+    i1, i2, i3 = moments
+    return Vector((i3 - i2) * (1 / i1), (i1 - i3) * (1 / i2), (i2 - i1) * (1 / i3))
 
 
-def gyroscopic_slope(inertia: Vector, ω: Vector, weight: Lane) -> tuple[Vector, ...]:
-    """Rows of I + w ∂(ω × Iω)/∂ω."""
-    (i1, i2, i3), (x, y, z) = inertia, ω * weight
-    a, b, c = i3 - i2, i1 - i3, i2 - i1
-    return Vector(i1, a * z, a * y), Vector(b * z, i2, b * x), Vector(c * y, c * x, i3)
+def spun(shares: Vector, ω: Vector) -> Vector:
+    """I⁻¹ (ω × Iω)."""
+    (a, b, c), (x, y, z) = shares, ω
+    return Vector(a * y * z, b * z * x, c * x * y)
+
+
+def gyroscopic_slope(shares: Vector, ω: Vector) -> tuple[Vector, ...]:
+    """Rows of 1 + ∂(I⁻¹ (ω × Iω))/∂ω."""
+    (a, b, c), (x, y, z) = shares, ω
+    one = jnp.ones_like(x)
+    return Vector(one, a * z, a * y), Vector(b * z, one, b * x), Vector(c * y, c * x, one)
 
 
 def rest(pose: Pose) -> Motion:

@@ -91,12 +91,12 @@ class Recovery:
                 raise ValueError(f"Recovery: {name} must be from {low} to {high}, got {value}.")
         if self.limit is not None:
             checks.positive("Recovery", "limit", self.limit)
-        if not hasattr(self.projector, "correct"):
+        if isinstance(self.projector, type) or not hasattr(self.projector, "correct"):
             raise TypeError(f"Recovery: projector must be a stabiliser, got {self.projector!r}.")
-        if not corrects(self.projector):
+        if not (corrects(self.projector) and getattr(self.projector, "position", True)):
             raise ValueError(
-                f"Recovery: projector={type(self.projector).__name__} corrects nothing; take a"
-                " Projection."
+                f"Recovery: projector={type(self.projector).__name__} corrects no positions;"
+                " take a Projection."
             )
         if getattr(self.projector, "every", 1) != 1:
             raise ValueError(

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core import native, numerics
+from jaxcon.core import checks, native, numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, first
 from jaxcon.core.typing import Array
@@ -64,9 +64,9 @@ class Lexicographic:
 
     Where a lower level comes to ask for what those above it no longer leave free, as an arm at the
     end of its reach does, J_k N loses rank, and what it asks for stays: S_k⁺ would answer without
-    bound. Below level 0, S_k⁺ is therefore damped, by three rounds of (S² + μ²)⁻¹ S on what is
+    bound. Below the highest level, S_k⁺ is damped, by three rounds of (S² + μ²)⁻¹ S on what is
     left: the part (μ² / (σ² + μ²))³ is not met where S_k, its rows scaled, has the eigenvalue σ.
-    Level 0 is not damped, so that a mechanism passes its singular positions.
+    The highest level is not damped, so that a mechanism passes its singular positions.
 
     Rows with a compliance, as those of rotors and soft constraints, can always be met. The status
     is CONFLICT where the rows of one level contradict each other; a level that cannot be met
@@ -97,6 +97,16 @@ class Lexicographic:
     conflict: Any = 1e-2
     damping: Any = None
     levels: tuple[tuple[str, int], ...] = static(default=())
+
+    def check(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: one is not positive.
+        """
+        for what in ("cutoff", "conflict", "damping"):
+            if getattr(self, what) is not None:
+                checks.positive("Priority", what, getattr(self, what))
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status."""
@@ -144,7 +154,7 @@ class Pivot(NamedTuple):
     """One level of the elimination.
 
     Attributes:
-        inverse: S⁺, below level 0 damped.
+        inverse: S⁺, below the highest level damped.
         coupling: S⁺ times the block beside S, of the levels below.
         own: A A⁺ of the level alone: the projector on what its rows can be given together.
     """

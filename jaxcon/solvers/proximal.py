@@ -149,11 +149,16 @@ def proximal(solver: Any, system: Saddle, weight: Array, rounds: int) -> Any:
 
 def scaled(system: Saddle, floor: Any) -> Array:
     """W = max(diag A, w² max diag A), (n_c,), constant under differentiation."""
+    return jax.lax.stop_gradient(row_weights(system, floor))
+
+
+def row_weights(system: Saddle, floor: Any) -> Array:
+    """W = max(diag A, w² max diag A), (n_c,)."""
     own = own_diagonal(system.mass, system.jacobian, system.target.ndim - 1)
     if system.compliance is not None:
         own = own + system.compliance
     least = jnp.asarray(floor, own.dtype) ** 2 * jnp.max(own, axis=0)
-    return jax.lax.stop_gradient(jnp.maximum(own, least[None]))
+    return jnp.maximum(own, least[None])
 
 
 def own_diagonal(mass: Mass, jacobian: Jacobian, worlds: int) -> Array:

@@ -75,8 +75,14 @@ class Unstabilized:
 
 
 def corrects(stabilizer: Any) -> bool:
-    """Whether a stabiliser does anything to q and v after a step."""
-    return type(stabilizer).correct is not Unstabilized.correct
+    """Whether a stabiliser, or the one that it leaves this to, moves q or v after a step."""
+    for name in ("others", "feedback"):
+        if hasattr(stabilizer, name):
+            return corrects(getattr(stabilizer, name))
+    if hasattr(stabilizer, "large"):
+        return stabilizer.large is not None and corrects(stabilizer.large)
+    acts = getattr(stabilizer, "position", True) or getattr(stabilizer, "velocity", True)
+    return acts and type(stabilizer).correct is not Unstabilized.correct
 
 
 @pytree

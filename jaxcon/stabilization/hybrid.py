@@ -11,7 +11,9 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
+from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
@@ -62,6 +64,7 @@ class Hybrid(Unstabilized):
         """Checks the parts and the sizes.
 
         Raises:
+            TypeError: a part is no stabiliser.
             ValueError: a size is not positive, the two are the wrong way round, the sharpness is no
                 positive integer, `large` corrects nothing, or `small` acts by a force or a solver
                 of its own, which cannot be mixed.
@@ -75,16 +78,28 @@ class Hybrid(Unstabilized):
                 f"Hybrid: soft_below={sizes[0]} must not exceed project_above={sizes[1]}; a"
                 " constraint is soft below the one, and projected above the other."
             )
-        if self.large is not None and not corrects(self.large):
-            raise ValueError(
-                f"Hybrid: large={type(self.large).__name__} corrects nothing after a step; take a"
-                " Projection, or None."
-            )
+        self._check_parts()
         if not isinstance(self.sharpness, int) or self.sharpness < 1:
             raise ValueError(f"Hybrid: sharpness must be 1 or more, got {self.sharpness!r}.")
         for part in self._parts():
             if hasattr(part, "check"):
                 part.check()
+
+    def _check_parts(self) -> None:
+        """Checks that laws are where laws belong, and what corrects is where that belongs."""
+        parts = [("small", self.small), ("middle", self.middle), ("large", self.large)]
+        for what, part in parts if self.large is not None else parts[:2]:
+            if isinstance(part, type) or not hasattr(part, "correct"):
+                raise TypeError(
+                    f"Hybrid: {what} must be a stabiliser like Baumgarte(), got {part}."
+                )
+            if corrects(part) == (what == "large"):
+                continue
+            if what == "large":
+                reason = "corrects nothing after a step; take a Projection, or None"
+            else:
+                reason = "corrects after a step, as only large does; take feedback or springs"
+            raise ValueError(f"Hybrid: {what}={type(part).__name__} {reason}.")
 
     def _parts(self) -> Parts:
         return Parts(self.small, self.middle, Unstabilized() if self.large is None else self.large)
@@ -97,7 +112,12 @@ class Hybrid(Unstabilized):
         return self._map(lambda part: part.init(system, q, v))
 
     def resolve(self, gains: tuple[Any, Any]) -> Hybrid:
-        """The same with parts that have all their gains."""
+        """The same with parts that have all their gains: a tenth of β, critically damped.
+
+        Gains that remove an error in one step do so by a velocity, which springs that take over
+        where φ is small would only turn round.
+        """
+        gains = gains[1] / 10, gains[1] / 10
         small, middle, large = self._map(lambda part: part.resolve(gains))
         large = None if self.large is None else large
         return dataclasses.replace(self, small=small, middle=middle, large=large)
@@ -153,6 +173,9 @@ class Hybrid(Unstabilized):
         residual = linearize(system, state.q, state.v, state.time).residual
         size = jnp.asarray(self.project_above, residual.dtype)[None]
         w = self.beyond(jnp.sum((residual / size) ** 2, axis=0))[None]
+        # one that failed is left out where it has less than half of the say
+        ignored = failed(code) & (w[0] < 0.5)
+        new, code = keep(ignored, (state, jnp.zeros_like(code)), (new, code))
         q = system.normalize(state.q + w * (new.q - state.q))
         return dataclasses.replace(new, q=q, v=state.v + w * (new.v - state.v)), code
 

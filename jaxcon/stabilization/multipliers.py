@@ -15,7 +15,7 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
-from jaxcon.solvers.proximal import RankSafe, conflicts, proximal, remainder, scaled
+from jaxcon.solvers.proximal import RankSafe, conflicts, proximal, remainder, row_weights, scaled
 from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
 from jaxcon.stabilization.gains import check_gains, column
@@ -100,7 +100,8 @@ class AugmentedLagrangian(Unstabilized):
             return solver.solve(system)
         solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
         holding = rows.layout.holds
-        weight = scaled(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
+        # few rounds leave a trace of W in the solution, and so in its derivative
+        weight = row_weights(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
         solution = rounds(system.force, system.target, start)
