@@ -22,7 +22,7 @@ LAWS = [name for name in STABILIZERS if name != "none"]
 PAIRS = [("four_bar", EULER, law) for law in LAWS] + [
     ("four_bar", "RK4", "Baumgarte"),
     ("four_bar", "RATTLE", "none"),
-    ("spatial_loop", EULER, "Baumgarte"),
+    ("spatial_loop", EULER, "Baumgarte, 50/s"),
     ("spatial_loop", "RATTLE", "none"),
 ]
 
