@@ -322,3 +322,19 @@ def test_a_top_goes_round_steadily(stabilizer):
     assert off < 1e-2
     assert change < 1e-3 * 0.5 * 0.03 * 200.0**2
     np.testing.assert_allclose(np.arctan2(y, x) / 0.6, rate, rtol=3e-2)
+
+
+def test_the_rule_of_the_torque_is_nothing_in_the_plane_and_not_for_every_stabilizer():
+    system, state = four_bar()
+    explicit, other = (
+        quick_jit(lambda s, m=m: jc.step(system, m, s, None, 1e-3)[0].v)(state)
+        for m in (jc.Method(), VARIATIONAL)
+    )
+    np.testing.assert_array_equal(explicit, other)
+    system, state = tumbling(1.0)
+    with pytest.raises(ValueError, match="gyroscopic must be one of"):
+        jc.step(system, jc.Method(jc.SemiImplicitEuler("implicit")), state, None, 1e-3)
+    rounds = jc.Method(VARIATIONAL.integrator, jc.AugmentedLagrangian())
+    start = jc.init(system, rounds, state.q, state.v)
+    with pytest.raises(ValueError, match="rounds of its own"):
+        jc.step(system, rounds, start, None, 1e-3)

@@ -380,26 +380,16 @@ def test_damping_for_what_is_hard_is_refused():
         jax.eval_shape(lambda s: jc.step(system, method, s, None, H), state)
 
 
-def test_a_hybrid_comes_back_and_does_not_mind_a_projection_of_no_weight():
-    """From a tenth off; and with rods that differ by 1e-7, which no projection can meet."""
+@pytest.mark.parametrize("integrator", [jc.SemiImplicitEuler(), jc.RK4()], ids=["euler", "rk4"])
+def test_a_hybrid_comes_back_from_a_tenth_off(integrator):
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.1, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
     system, state = scene.build()
-    method = jc.Method(stabilizer=jc.Hybrid(jc.Penalty(1e3)))
+    method = jc.Method(integrator, jc.Hybrid(jc.Penalty(1e3)))
     final, _ = quick_jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 2000))(
         jc.init(system, method, state.q, state.v)
     )
     assert final.status == jc.Status.OK
     assert jc.violation(system, final).worst < 1e-3
     assert jnp.linalg.norm(final.v) < 5.0  # √(2 g l) = 4.4
-
-    scene = jc.Scene(dim=2)
-    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
-    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
-    scene.add(jc.Distance("other", jc.WORLD, "bob", length=1.0 + 1e-7))
-    system, state = scene.build()
-    method = jc.Method(stabilizer=jc.Hybrid(jc.Penalty(1e5), large=jc.Projection()))
-    start = jc.init(system, method, state.q, state.v)
-    final, _ = quick_jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 100))(start)
-    assert final.status == jc.Status.OK

@@ -181,9 +181,16 @@ class Watched(Dynamics):
 
     seen: list[tuple[list[Finding], Status]] = field(default_factory=list)
 
-    def allowing(self, q: Array, v: Array, t: Any, age: Any = None) -> Any:
-        """a and λ at (q, v, t), the rows there, and which changes of v they allow."""
-        found = super().allowing(q, v, t, age)
+    def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
+        """a and λ at (q, v, t), and the rows there."""
+        return self._watched(q, v, t, super().__call__(q, v, t, age))
+
+    def factored(self, q: Array, v: Array, t: Any, age: Any = None) -> Any:
+        """The same, and which changes of v the rows allow."""
+        return self._watched(q, v, t, super().factored(q, v, t, age))
+
+    def _watched(self, q: Array, v: Array, t: Any, found: Any) -> Any:
+        """What was found, after a look at it."""
         if checks.is_concrete((q, v, t, found[0])):
             self.seen.append(self._judge(q, v, t, *found[:2]))
         return found

@@ -57,22 +57,28 @@ class Dynamics:
 
     def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
         """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago."""
-        return self.allowing(q, v, t, age)[:2]
+        rows, law, problem = self._problem(q, v, t, age)
+        own = self.solver.solve(problem) if law.solve is None else law.solve(self.solver, problem)
+        return self.system.complete(own), rows
 
-    def allowing(
+    def factored(
         self, q: Array, v: Array, t: Any, age: Any = None
-    ) -> tuple[Solution, Rows, Callable[[Array], Array]]:
+    ) -> tuple[Solution, Rows, Callable[[Array], Solution]]:
         """The same, and Δv → the nearest change of v in the metric of M that the rows allow."""
+        rows, law, problem = self._problem(q, v, t, age)
+        solve, none = self.solver.factor(problem), jnp.zeros_like(law.target)
+
+        def allowed(change: Array) -> Solution:
+            return solve(problem.mass.apply(change), none)
+
+        return self.system.complete(solve(problem.force, law.target)), rows, allowed
+
+    def _problem(self, q: Array, v: Array, t: Any, age: Any) -> tuple[Rows, Any, Saddle]:
+        """The rows, the law of the stabiliser, and the saddle system of both."""
         rows = dataclasses.replace(linearize(self.system, q, v, t), mass=self.system.mass(q))
-        seen = rows if age is None else rows.earlier(age)
-        law = self.stabilizer.impose(seen, self.memory, self.dt)
+        law = self.stabilizer.impose(
+            rows if age is None else rows.earlier(age), self.memory, self.dt
+        )
         force = self.system.force(q, v, t, self.control)
         force = force if law.force is None else force + law.force
-        problem = saddle(self.system, q, law.rows, force, law.target, law.noise)
-        solve = self.solver.factor(problem)
-        own = solve(force, law.target) if law.solve is None else law.solve(self.solver, problem)
-
-        def allowed(change: Array) -> Array:
-            return solve(problem.mass.apply(change), jnp.zeros_like(law.target)).acceleration
-
-        return self.system.complete(own), rows, allowed
+        return rows, law, saddle(self.system, q, law.rows, force, law.target, law.noise)

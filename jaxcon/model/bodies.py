@@ -64,8 +64,8 @@ class Particle:
         return p
 
     def kicked(self, v: Vector, change: Vector, moments: Any, dt: Lane) -> Vector:
-        """v + Δv: these velocities are rates of coordinates."""
-        return v + change
+        """Nothing: these velocities are rates of coordinates."""
+        return v.map(jnp.zeros_like)
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
@@ -172,7 +172,7 @@ class SpatialRigid(Particle):
         return Vector(*p[:3], *turned)
 
     def kicked(self, v: Vector, change: Vector, moments: Array, dt: Lane) -> Vector:
-        """The velocity Ω after a change h a, the gyroscopic torque by the trapezoidal rule.
+        """What ω + h a lacks of Ω, the gyroscopic torque by the trapezoidal rule.
 
             I Ω = I ω + h (I a + ω × Iω) − ½ h (ω × Iω + Ω × IΩ)
 
@@ -180,12 +180,12 @@ class SpatialRigid(Particle):
         and then by hΩ leads to: turning freely it neither gains energy nor loses any. The equation
         is quadratic, and one step of Newton's method from ω + h a is enough.
         """
-        move, turn, weight = change[:3], Vector(*change[3:]), dt / 2
+        turn, weight = Vector(*change[3:]), dt / 2
         ω, shares = Vector(*v[3:]), shares_of(Vector.of(moments))
         after = ω + turn
         grown = (spun(shares, after) - spun(shares, ω)) * weight
-        after = after - cramer(gyroscopic_slope(shares, after * weight), grown)
-        return Vector(*(Vector(*v[:3]) + Vector(*move)), *after)
+        lacking = -cramer(gyroscopic_slope(shares, after * weight), grown)
+        return Vector(*(jnp.zeros_like(x) for x in v[:3]), *lacking)
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""

@@ -96,10 +96,6 @@ class GeneralizedCoordinates:
         """max |q|."""
         return jnp.max(jnp.abs(q), axis=0, initial=0)
 
-    def kicked(self, q: Array, v: Array, change: Array, dt: Any) -> Array:
-        """v + Δv: v is q̇."""
-        return v + change
-
     def kinematics(self, q: Array, v: Array) -> Array:
         """q̇ = v."""
         return v

@@ -180,9 +180,7 @@ class BodySystem:
         return _join([kind.carry(own, momentum) for kind, own, momentum in pairs], q)
 
     def kicked(self, q: Array, v: Array, change: Array, dt: Any) -> Array:
-        """v after a change h a (n_v,), which bodies that turn in space meet between two turns."""
-        if all(g.kind.n_q == g.kind.n_v for g in self.layout.groups):
-            return v + change
+        """What a change h a of v lacks (n_v,), where bodies turn in space before and after it."""
         parts = zip(self.layout.groups, self.inertia, strict=True)
         pairs = [(g.kind, g.unpack(q, v)[1], g.unpack(q, change)[1], p.moments) for g, p in parts]
         return _join([kind.kicked(*known, dt) for kind, *known in pairs], q)

@@ -17,7 +17,7 @@ from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.recovery import contain
-from jaxcon.stabilization.baumgarte import Law, corrects
+from jaxcon.stabilization.baumgarte import Law
 from jaxcon.stabilization.hybrid import Hybrid
 from jaxcon.stabilization.penalty import Penalty
 from jaxcon.stabilization.projection import Projection
@@ -93,7 +93,8 @@ class Recovery:
             checks.positive("Recovery", "limit", self.limit)
         if isinstance(self.projector, type) or not hasattr(self.projector, "correct"):
             raise TypeError(f"Recovery: projector must be a stabiliser, got {self.projector!r}.")
-        if not (corrects(self.projector) and getattr(self.projector, "position", True)):
+        moves = getattr(self.projector, "corrects", True)
+        if not (moves and getattr(self.projector, "position", True)):
             raise ValueError(
                 f"Recovery: projector={type(self.projector).__name__} corrects no positions;"
                 " take a Projection."

@@ -102,11 +102,11 @@ class Lexicographic:
         """Checks the numbers.
 
         Raises:
-            ValueError: one is not positive.
+            ValueError: one is negative.
         """
-        for what in ("cutoff", "conflict", "damping"):
+        for what in ("cutoff", "damping"):
             if getattr(self, what) is not None:
-                checks.positive("Priority", what, getattr(self, what))
+                checks.positive("Priority", what, getattr(self, what), strictly=False)
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status."""

@@ -67,22 +67,16 @@ class Unstabilized:
         """The same after what was solved at the start of the step."""
         return memory
 
+    @property
+    def corrects(self) -> bool:
+        """Whether it moves q or v after a step."""
+        return type(self).correct is not Unstabilized.correct
+
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
     ) -> Any:
         """The state after a step, corrected, and a status of its own: here as it is."""
         return state, jnp.zeros_like(state.status)
-
-
-def corrects(stabilizer: Any) -> bool:
-    """Whether a stabiliser, or the one that it leaves this to, moves q or v after a step."""
-    for name in ("others", "feedback"):
-        if hasattr(stabilizer, name):
-            return corrects(getattr(stabilizer, name))
-    if hasattr(stabilizer, "large"):
-        return stabilizer.large is not None and corrects(stabilizer.large)
-    acts = getattr(stabilizer, "position", True) or getattr(stabilizer, "velocity", True)
-    return acts and type(stabilizer).correct is not Unstabilized.correct
 
 
 @pytree

@@ -11,13 +11,11 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
-from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
-from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, corrects
+from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
 from jaxcon.stabilization.gains import check_gains, column, squares
 
 
@@ -27,6 +25,10 @@ class Parts(NamedTuple):
     small: PyTree = ()
     middle: PyTree = ()
     large: PyTree = ()
+
+
+GENTLE = 50.0
+"""The largest of default gains beside springs [1/s]."""
 
 
 @pytree
@@ -42,11 +44,12 @@ class Hybrid(Unstabilized):
     of all φ, since a projection moves everything. At the two sizes the weights are ½, and at ten
     times a size the other side has 10⁻²ⁿ. Nothing switches, so gradients exist everywhere; between
     the ranges the law is the mixture and neither of the two. Rows of velocities, which have no φ,
-    follow the middle.
+    follow the middle. A projection that fails ends its world whatever its weight; one of a single
+    iteration never fails.
 
     Attributes:
         small: stabiliser whose law is that of small violations, an implicit `Penalty`.
-        middle: stabiliser of the middle.
+        middle: stabiliser of the middle; default gains are held to 50/s.
         large: stabiliser whose `correct` large violations get, or None.
         soft_below: ‖φ‖ up to which constraints are soft.
         project_above: Φ from which the state is projected.
@@ -78,12 +81,12 @@ class Hybrid(Unstabilized):
                 f"Hybrid: soft_below={sizes[0]} must not exceed project_above={sizes[1]}; a"
                 " constraint is soft below the one, and projected above the other."
             )
-        self._check_parts()
         if not isinstance(self.sharpness, int) or self.sharpness < 1:
             raise ValueError(f"Hybrid: sharpness must be 1 or more, got {self.sharpness!r}.")
         for part in self._parts():
-            if hasattr(part, "check"):
+            if hasattr(part, "check") and not isinstance(part, type):
                 part.check()
+        self._check_parts()
 
     def _check_parts(self) -> None:
         """Checks that laws are where laws belong, and what corrects is where that belongs."""
@@ -93,7 +96,7 @@ class Hybrid(Unstabilized):
                 raise TypeError(
                     f"Hybrid: {what} must be a stabiliser like Baumgarte(), got {part}."
                 )
-            if corrects(part) == (what == "large"):
+            if getattr(part, "corrects", what == "large") == (what == "large"):
                 continue
             if what == "large":
                 reason = "corrects nothing after a step; take a Projection, or None"
@@ -112,12 +115,12 @@ class Hybrid(Unstabilized):
         return self._map(lambda part: part.init(system, q, v))
 
     def resolve(self, gains: tuple[Any, Any]) -> Hybrid:
-        """The same with parts that have all their gains: a tenth of β, critically damped.
+        """The same with parts that have all their gains, none of them above 50/s.
 
         Gains that remove an error in one step do so by a velocity, which springs that take over
         where φ is small would only turn round.
         """
-        gains = gains[1] / 10, gains[1] / 10
+        gains = jnp.minimum(gains[0], GENTLE), jnp.minimum(gains[1], GENTLE)
         small, middle, large = self._map(lambda part: part.resolve(gains))
         large = None if self.large is None else large
         return dataclasses.replace(self, small=small, middle=middle, large=large)
@@ -163,6 +166,11 @@ class Hybrid(Unstabilized):
         """The memories of the parts after what was solved."""
         return self._map(lambda part, own: part.remember(own, solution), Parts(*memory))
 
+    @property
+    def corrects(self) -> bool:
+        """Whether it moves q or v after a step."""
+        return self.large is not None
+
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
     ) -> Any:
@@ -173,9 +181,6 @@ class Hybrid(Unstabilized):
         residual = linearize(system, state.q, state.v, state.time).residual
         size = jnp.asarray(self.project_above, residual.dtype)[None]
         w = self.beyond(jnp.sum((residual / size) ** 2, axis=0))[None]
-        # one that failed is left out where it has less than half of the say
-        ignored = failed(code) & (w[0] < 0.5)
-        new, code = keep(ignored, (state, jnp.zeros_like(code)), (new, code))
         q = system.normalize(state.q + w * (new.q - state.q))
         return dataclasses.replace(new, q=q, v=state.v + w * (new.v - state.v)), code
 

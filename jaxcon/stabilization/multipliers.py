@@ -41,7 +41,7 @@ class AugmentedLagrangian(Unstabilized):
     rows depend on each other or a mechanism passes a singular position, and stiffness bounds how
     stiff it is; rounds share one factorization. Each step starts from the λ of the last one, which
     is near, so that one or two rounds do. b is that of the feedback. The derivative is that of the
-    rounds as they are, with W held. Rotors, which hold nothing, are solved as they are. Rows that
+    rounds as they are. Rotors, which hold nothing, are solved as they are. Rows that
     contradict each other are met by least squares, and where they leave open more than half of what
     the rows ask for the status is CONFLICT; their λ, which nothing bounds, grows from step to step.
 
@@ -120,6 +120,11 @@ class AugmentedLagrangian(Unstabilized):
         """With the λ of the step."""
         own = self.feedback.remember(memory.feedback, solution)
         return Held(solution.multipliers, own)
+
+    @property
+    def corrects(self) -> bool:
+        """Whether the feedback moves q or v after a step."""
+        return self.feedback.corrects
 
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: Held, dt: Any

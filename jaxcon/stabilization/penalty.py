@@ -175,6 +175,11 @@ class Penalty(Unstabilized):
         """The memory of the others."""
         return self.others.remember(memory, solution)
 
+    @property
+    def corrects(self) -> bool:
+        """Whether the others move q or v after a step."""
+        return self.others.corrects
+
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
     ) -> Any:

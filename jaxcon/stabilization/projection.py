@@ -124,6 +124,11 @@ class Projection(Unstabilized):
         """One step more, modulo `every`."""
         return memory if self.every == 1 else (memory + 1) % self.every
 
+    @property
+    def corrects(self) -> bool:
+        """Whether q or v is projected."""
+        return self.position or self.velocity
+
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
     ) -> Any:
