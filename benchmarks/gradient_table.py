@@ -23,18 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
-from benchmarks.stabilisation import cast, chain, spatial_loop
+from benchmarks.stabilisation import INTEGRATORS, cast, chain, spatial_loop
 from jaxcon.analysis.differences import ridders
 from jaxcon.scenes import four_bar
 
 DT, STEPS = 1e-2, 3
-INTEGRATORS = {
-    "semi-implicit Euler": jc.SemiImplicitEuler(),
-    "Heun": jc.Heun(),
-    "RK4": jc.RK4(),
-    "RATTLE": jc.RATTLE(),
-    "generalized-α": jc.GeneralizedAlpha(),
-}
 STABILIZERS = {
     "none": jc.Unstabilized(),
     "Baumgarte": jc.Baumgarte(),

@@ -14,7 +14,7 @@ from jaxcon.model.state import State
 from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.segments import kept
+from jaxcon.simulation.segments import bytes_of, kept
 from jaxcon.simulation.step import check_step, step_quietly
 
 BATCHES = 64, 256
@@ -77,7 +77,7 @@ def memory(system: Any, method: Method, state: State, control: PyTree = None) ->
 
     small, large = (_planned(step, (state, control), worlds) for worlds in BATCHES)
     working = (large - small) / (BATCHES[1] - BATCHES[0])
-    return Memory(_bytes(state), working, small - working * BATCHES[0])
+    return Memory(bytes_of(state), working, small - working * BATCHES[0])
 
 
 @dataclass(frozen=True)
@@ -157,16 +157,11 @@ def gradient_memory(
     step = (longer - small) / (LONGER - SHORT) / BATCHES[0]
     start = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
     shared = small - own * BATCHES[0]
-    return GradientMemory(start, _bytes(state), step, own - SHORT * step, shared)
+    return GradientMemory(start, bytes_of(state), step, own - SHORT * step, shared)
 
 
 def nothing(state: State, info: Any) -> None:
     """Recorded of a step."""
-
-
-def _bytes(tree: PyTree) -> int:
-    """Of all leaves."""
-    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 
 def _planned(step: Any, args: PyTree, worlds: int) -> int:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.learning.leaves import Space
@@ -180,8 +181,3 @@ def split(result: Any) -> tuple[Array, PyTree]:
             f" {value!r}."
         )
     return jnp.asarray(value), jax.tree.map(jnp.asarray, aux)
-
-
-def keep(condition: Array, new: PyTree, old: PyTree) -> PyTree:
-    """The new values where a condition holds."""
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)

@@ -20,7 +20,7 @@ from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
-from jaxcon.simulation.segments import equal_levels, kept, nested, split
+from jaxcon.simulation.segments import bytes_of, equal_levels, kept, nested, split
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Checkpoints:
         if self.budget is None:
             checks.count("Checkpoints", "levels", self.levels)
             return equal_levels(steps, self.levels)
-        own = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state))
+        own = bytes_of(state)
         choices = [equal_levels(steps, n) for n in range(1, steps.bit_length() + 2)]
         for sizes in choices:
             if sum(kept(steps, sizes)) * own <= self.budget:

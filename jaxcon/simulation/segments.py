@@ -26,6 +26,11 @@ def kept(steps: int, sizes: Sequence[int]) -> tuple[int, ...]:
     return tuple(-(-a // b) for a, b in itertools.pairwise(bounds))
 
 
+def bytes_of(tree: PyTree) -> int:
+    """Of all leaves."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
 def nested(
     body: Callable[[Any, Any], tuple[Any, Any]],
     carry: Any,
