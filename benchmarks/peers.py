@@ -50,24 +50,29 @@ def mujoco_rate(
         repeats: how many.
         threads: one a core unless given.
     """
+    model, start = model_of(mechanisms.find(name))
+    states = world_states(model, start, batch)
+    begin = time.perf_counter()
+    rate_of(model, states, 20, 1, threads)
+    steps = max(20, round(20 * seconds / (time.perf_counter() - begin)))
+    return rate_of(model, states, steps, repeats, threads)
+
+
+def rate_of(model: Any, states: np.ndarray, steps: int, repeats: int = 5, threads: int = 0) -> Rate:
+    """The same of any model over some steps from states (batch, full physics state)."""
     import mujoco
     from mujoco import rollout
 
-    model, start = model_of(mechanisms.find(name))
-    threads = threads or timing.cores()
-    states = world_states(model, start, batch)
+    batch, threads = len(states), threads or timing.cores()
     data = [mujoco.MjData(model) for _ in range(threads)]
     models = [model] * batch
     with rollout.Rollout(nthread=threads) as pool:
 
-        def run(steps: int) -> None:
+        def run() -> None:
             # unchecked, so that no trajectory is allocated or written
             pool.rollout(models, data, states, nstep=steps, skip_checks=True)
 
-        begin = time.perf_counter()
-        run(20)
-        steps = max(20, round(20 * seconds / (time.perf_counter() - begin)))
-        return timing.rate(lambda: run(steps), batch * steps, repeats)
+        return timing.rate(run, batch * steps, repeats)
 
 
 def world_states(model: Any, data: Any, batch: int) -> np.ndarray:
@@ -117,18 +122,24 @@ class Mjx:
         return f"{best.rate}, batch {best.batch}" if best else "; ".join(self.notes)
 
 
-def mjx(name: str, batches: tuple[int, ...] = BATCHES, limit: float = 240.0) -> Mjx:
+def mjx(
+    name: str,
+    batches: tuple[int, ...] = BATCHES,
+    limit: float = 240.0,
+    module: str = "benchmarks.peers",
+) -> Mjx:
     """World-steps a second of MJX, one process a run, until one takes longer than the limit.
 
     Args:
         name: of the mechanism.
         batches: worlds.
         limit: for compiling and running one batch [s].
+        module: that knows the name.
     """
     runs, notes = [], []
     for flags in FLAGS:
         for batch in batches:
-            found = mjx_process(name, batch, flags, limit)
+            found = mjx_process(name, batch, flags, limit, module)
             if isinstance(found, str):
                 notes.append(found)
                 break
@@ -136,9 +147,11 @@ def mjx(name: str, batches: tuple[int, ...] = BATCHES, limit: float = 240.0) -> 
     return Mjx(tuple(runs), tuple(notes))
 
 
-def mjx_process(name: str, batch: int, flags: str, limit: float) -> MjxRun | str:
+def mjx_process(
+    name: str, batch: int, flags: str, limit: float, module: str = "benchmarks.peers"
+) -> MjxRun | str:
     """One run in a process of its own, or why there is none."""
-    arguments = ["benchmarks.peers", "--mjx", name, "--batch", str(batch)]
+    arguments = [module, "--mjx", name, "--batch", str(batch)]
     environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
     found = timing.in_process(arguments, environment, limit, "does not compile and run in")
     if isinstance(found, str):
@@ -148,12 +161,15 @@ def mjx_process(name: str, batch: int, flags: str, limit: float) -> MjxRun | str
 
 def mjx_here(name: str, batch: int, work: int = 20_000, repeats: int = 5) -> dict[str, Any]:
     """The same in this process, at one batch: rate, and compile time of one step [s]."""
-    mechanism = mechanisms.find(name)
-    model, data = mjx_start(mechanism, batch)
+    model, data = mjx_start(mechanisms.find(name), batch)
+    return mjx_rate(model, data, batch, max(10, work // batch), repeats)
+
+
+def mjx_rate(model: Any, data: Any, batch: int, steps: int, repeats: int = 5) -> dict[str, Any]:
+    """The same of any model of MJX and a batch of its data, over some steps."""
     data = timing.over_devices(data, batch)
     step = jax.vmap(functools.partial(mjx_step(), model))
     _, seconds = timing.compile_seconds(step, data)
-    steps = max(10, work // batch)
 
     @jax.jit
     def run(data: Any) -> Any:

@@ -1,4 +1,43 @@
-"""Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable."""
+"""Constrained dynamics in JAX: M a = f + Jᵀλ, J a + C λ = b, jitted, batched, differentiable.
+
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    final, path = jc.rollout(system, jc.Method(), state, None, 1e-3, 1000)
+
+A tour of the names; `help` of each says more.
+
+Scenes: Scene, WORLD, inertia, quaternion, Pose, Motion; rope, rod, hanging, Chain; from_mjcf,
+    MujocoModel, Keyframe; in coordinates of one's own GeneralizedSystem, Vakonomic, vakonomic.
+Joints: Revolute, Prismatic, Spherical, Fixed, Distance, Coincident, Cylindrical, Universal, Planar,
+    Screw, ConstantVelocity, RevoluteSpherical, SphericalSpherical, Span, Twist, Parallel,
+    PointOnLine, PointOnPlane, PointOnCurve, Compound.
+Couplings: Gear, Belt, RackAndPinion, Pulley, Differential, PolynomialCoupling, Armature.
+Other constraints: Drive; RollingDisc, RollingSphere, RollingCylinder, KnifeEdge; LinearMomentum,
+    AngularMomentum; Holonomic, VelocityLevel of one's own.
+Ends, friction and contact: Limit, RateLimit, RateMotor, JointFriction, Rope, PlaneContact,
+    CapsuleContact, BoxContact, HeightFieldContact, box_corners.
+Forces: Spring, JointSpring, JointDamper, Bending, Flexure, ExternalWrench, CustomForce, Force;
+    Motor, PositionServo, VelocityServo, AffineActuator; TurnCounter.
+Simulation: init, step, rollout, forward_dynamics, assemble; State, StepInfo, Solution, Assembly.
+Methods: Method of an integrator (SemiImplicitEuler, Heun, RK4, RungeKutta, ExplicitEuler, RATTLE,
+    GeneralizedAlpha), a stabiliser (Baumgarte, AdaptiveBaumgarte, SlidingWindowBaumgarte, PID,
+    Projection, Tolerance, Penalty, AugmentedLagrangian, Hybrid, Unstabilized), a solver (RankSafe,
+    Sparse, Schur, Dense, ConjugateGradients, Priority, Lexicographic), one of bounded rows
+    (InteriorPoint, GaussSeidel, Nearest), Events with Impacts, and a Recovery;
+    largest_stable_rate, frequency_response.
+Read out: position, velocity, orientation, angular_velocity, coordinate, coordinate_rate, energy,
+    Energy, momentum, angular_momentum, center_of_mass, multipliers, wrench, violation.
+Gradients: EveryStep, Checkpoints, Reversible, Truncated, Discounted; check_gradients,
+    GradientCheck, gradient_growth, GradientGrowth, gradient_memory, GradientMemory.
+Search: tune, Tuned, identify, Identified, losses.
+Trouble: report, Report, Finding, diagnose, Diagnosis, find_first_failure, Failure, Status,
+    raise_for_status, SimulationError; integrability, Integrability; memory, Memory.
+"""
+
+import importlib
+from typing import Any
 
 from jaxcon.analysis.diagnosis import Diagnosis, diagnose
 from jaxcon.analysis.failures import Failure, find_first_failure
@@ -25,7 +64,9 @@ from jaxcon.analysis.quantities import (
 from jaxcon.analysis.report import Report, report
 from jaxcon.constraints.armature import Armature
 from jaxcon.constraints.blades import KnifeEdge
+from jaxcon.constraints.boxes import BoxContact
 from jaxcon.constraints.compound import Compound
+from jaxcon.constraints.contact import CapsuleContact, PlaneContact, Rope
 from jaxcon.constraints.couplings import (
     Belt,
     Differential,
@@ -37,6 +78,7 @@ from jaxcon.constraints.couplings import (
 from jaxcon.constraints.curves import PointOnCurve
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
+from jaxcon.constraints.height_fields import HeightFieldContact
 from jaxcon.constraints.joints import (
     Coincident,
     Distance,
@@ -45,6 +87,7 @@ from jaxcon.constraints.joints import (
     Revolute,
     Spherical,
 )
+from jaxcon.constraints.limits import JointFriction, Limit, RateLimit, RateMotor
 from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum
 from jaxcon.constraints.pairs import (
     Cylindrical,
@@ -56,6 +99,7 @@ from jaxcon.constraints.pairs import (
     Screw,
     SphericalSpherical,
 )
+from jaxcon.constraints.point_sets import box_corners
 from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphere
 from jaxcon.constraints.shafts import ConstantVelocity, Universal
 from jaxcon.constraints.span import Span
@@ -71,7 +115,8 @@ from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.io.mjcf import Keyframe, MujocoModel, from_mjcf
 from jaxcon.learning import losses
 from jaxcon.learning.identification import Identified, identify
-from jaxcon.learning.tuning import Tuned, tune
+from jaxcon.learning.tuned import Tuned
+from jaxcon.learning.tuning import tune
 from jaxcon.model.actuators import (
     AffineActuator,
     JointDamper,
@@ -86,6 +131,8 @@ from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
 from jaxcon.simulation.adjoints import Checkpoints, Discounted, EveryStep, Truncated
+from jaxcon.simulation.attempt import StepInfo
+from jaxcon.simulation.events import Events, Impacts
 from jaxcon.simulation.generalized_alpha import GeneralizedAlpha
 from jaxcon.simulation.initialize import init
 from jaxcon.simulation.integrators import (
@@ -99,11 +146,15 @@ from jaxcon.simulation.method import Method
 from jaxcon.simulation.rattle import RATTLE
 from jaxcon.simulation.repair import Recovery
 from jaxcon.simulation.response import frequency_response
+from jaxcon.simulation.reversible import Reversible
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import largest_stable_rate
-from jaxcon.simulation.step import StepInfo, forward_dynamics, step
+from jaxcon.simulation.step import forward_dynamics, step
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.dense import Dense
+from jaxcon.solvers.gauss_seidel import GaussSeidel
+from jaxcon.solvers.interior_point import InteriorPoint
+from jaxcon.solvers.nearest_rows import Nearest
 from jaxcon.solvers.priority import Lexicographic, Priority
 from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Solution
@@ -119,7 +170,26 @@ from jaxcon.stabilization.projection import Projection, Tolerance
 
 __version__ = "0.1.0"
 
+
+def __getattr__(name: str) -> Any:
+    """`jc.environments`, imported when it is first asked for: it tells Gymnasium of its tasks."""
+    if name == "environments":
+        return importlib.import_module("jaxcon.environments")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 __all__ = [
+    "BoxContact",
+    "CapsuleContact",
+    "HeightFieldContact",
+    "PlaneContact",
+    "Rope",
+    "GaussSeidel",
+    "InteriorPoint",
+    "JointFriction",
+    "Limit",
+    "RateLimit",
+    "RateMotor",
     "PID",
     "RATTLE",
     "RK4",
@@ -148,6 +218,7 @@ __all__ = [
     "Distance",
     "Drive",
     "Energy",
+    "Events",
     "EveryStep",
     "ExplicitEuler",
     "ExternalWrench",
@@ -166,6 +237,7 @@ __all__ = [
     "Holonomic",
     "Hybrid",
     "Identified",
+    "Impacts",
     "Integrability",
     "JointDamper",
     "JointSpring",
@@ -178,6 +250,7 @@ __all__ = [
     "Motion",
     "Motor",
     "MujocoModel",
+    "Nearest",
     "Parallel",
     "Planar",
     "Penalty",
@@ -195,6 +268,7 @@ __all__ = [
     "RankSafe",
     "Recovery",
     "Report",
+    "Reversible",
     "Revolute",
     "RevoluteSpherical",
     "RollingCylinder",
@@ -229,6 +303,7 @@ __all__ = [
     "angular_momentum",
     "angular_velocity",
     "assemble",
+    "box_corners",
     "center_of_mass",
     "check_gradients",
     "coordinate",

@@ -6,6 +6,7 @@ Their numbers may be traced: `jax.vmap` over lengths and masses builds a batch o
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -26,7 +27,11 @@ CRANK_ROCKER = (1.0, 0.3, 0.9, 0.7)
 
 
 def four_bar(
-    lengths: Any = CRANK_ROCKER, masses: Any = (0.3, 0.9, 0.7), angle: Any = 0.5, rate: Any = 10.0
+    lengths: Any = CRANK_ROCKER,
+    masses: Any = (0.3, 0.9, 0.7),
+    angle: Any = 0.5,
+    rate: Any = 10.0,
+    elements: Iterable[Any] = (),
 ) -> tuple[BodySystem, State]:
     """A planar four-bar linkage under gravity: three uniform rods, four hinges, a closed loop.
 
@@ -35,6 +40,7 @@ def four_bar(
         masses: of crank, coupler and rocker, (3,) [kg].
         angle: of the crank at the start, () [rad].
         rate: of the crank at the start, () [rad/s]; the other rods move consistently.
+        elements: added to the scene last, such as a motor at the hinge "ground_crank".
 
     Returns:
         The system, and the state at the start.
@@ -59,6 +65,8 @@ def four_bar(
     scene.add(Revolute("crank_coupler", "crank", "coupler", point=b))
     scene.add(Revolute("coupler_rocker", "coupler", "rocker", point=c))
     scene.add(Revolute("rocker_ground", "rocker", WORLD, point=d))
+    for element in elements:
+        scene.add(element)
     return scene.build()
 
 

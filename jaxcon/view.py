@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.typing import PyTree
+from jaxcon.core.typing import Array, PyTree
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 
@@ -22,8 +22,30 @@ def pyplot() -> Any:
     try:
         import matplotlib.pyplot as plt
     except ImportError as error:
-        raise ImportError("Pictures need matplotlib: pip install 'jaxcon[plot]'.") from error
+        raise ImportError(MISSING) from error
     return plt
+
+
+MISSING = "Pictures need matplotlib: pip install 'jaxcon[plot]'."
+
+
+def canvas(width: float, height: float, dpi: float) -> Any:
+    """A canvas with a figure of its own, which needs no window and no pyplot.
+
+    Args:
+        width: [inch].
+        height: [inch].
+        dpi: dots per inch.
+
+    Raises:
+        ImportError: matplotlib is not installed; names the extra that brings it.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ImportError(MISSING) from error
+    return FigureCanvasAgg(Figure(figsize=(width, height), dpi=dpi))
 
 
 def links(system: Any, q: Any) -> dict[str, np.ndarray]:
@@ -31,6 +53,13 @@ def links(system: Any, q: Any) -> dict[str, np.ndarray]:
 
     Bodies held at one point only are drawn from their centre of mass.
     """
+    found = _links(system, q)
+    return {name: np.asarray(found[name]) for name in system.layout.bodies}
+
+
+@jax.jit
+def _links(system: Any, q: Array) -> dict[str, Array]:
+    """Compiled once for all pictures of a mechanism."""
     v = jnp.zeros(system.n_v, q.dtype)
     layout = system.layout
     result = {}
@@ -39,9 +68,9 @@ def links(system: Any, q: Any) -> dict[str, np.ndarray]:
         anchors = []
         for group in (*system.constraints, *system.forces):
             anchors += _anchors(group, layout.locate(name))
-        points = [np.asarray(motion.position)] if len(anchors) < 2 else []
-        points += [np.asarray(motion.point(jnp.asarray(a))) for a in anchors]
-        result[name] = np.array(points)
+        points = [motion.position] if len(anchors) < 2 else []
+        points += [motion.point(jnp.asarray(a)) for a in anchors]
+        result[name] = jnp.stack(points)
     return result
 
 

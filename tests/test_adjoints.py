@@ -84,6 +84,28 @@ def test_the_gradient_is_that_of_every_step(adjoint, steps, every, feedback):
     close(slope, expected)
 
 
+def test_a_spatial_body_in_float32():
+    """To the rounding of its rollout, and in its own precision; both in one program."""
+    scene = jc.Scene(dtype=jnp.float32)
+    rod = jc.inertia.rod(1.0, length=1.0, radius=0.05)
+    scene.add_body("rod", inertia=rod, position=(0.5, 0.0, 0.0), angular_velocity=(0.0, 1.0, 0.3))
+    scene.add(jc.Spherical("hinge", jc.WORLD, "rod", (0.0, 0.0, 0.0)))
+    system, state = scene.build()
+    weights = jnp.linspace(-1, 1, len(state.q), dtype=jnp.float32)
+
+    def value(x, adjoint):
+        start = dataclasses.replace(state, v=x["v"])
+        changed = system.with_params({"rod": {"mass": x["mass"]}})
+        dt = jnp.asarray(DT, jnp.float32)
+        return weights @ jc.rollout(changed, METHOD, start, None, dt, 6, adjoint=adjoint)[0].q
+
+    x = {"v": state.v, "mass": jnp.float32(1.0)}
+    both = quick_jit(lambda x: [jax.grad(value)(x, a) for a in (DEFAULT, jc.Checkpoints())])(x)
+    assert {leaf.dtype for leaf in jax.tree.leaves(both)} == {jnp.dtype(jnp.float32)}
+    assert np.max(np.abs(both[0]["v"])) > 1e-2
+    close(both[1], both[0], 1e-5)
+
+
 def test_forward_mode_and_batches_in_both_orders():
     x = numbers()
     worlds = jnp.stack([x["v"], 2 * x["v"], -x["v"]])
@@ -200,8 +222,11 @@ def test_a_budget_takes_as_few_levels_as_it_can():
         (jc.Checkpoints(levels=0), ValueError, "levels must be a whole number"),
         (jc.Checkpoints(segments=(6, 4)), ValueError, "divisor of the one before"),
         (jc.Checkpoints(segments=3, budget=9), ValueError, "exclude each other"),
+        (jc.Checkpoints(levels=3, segments=3), ValueError, "exclude each other"),
+        (jc.Checkpoints(segments=[2]), ValueError, "as a tuple"),
         (jc.Truncated(0), ValueError, "steps must be a whole number"),
         (jc.Discounted(-0.5), ValueError, "factor must be zero or more"),
+        (jc.Discounted(1.5), ValueError, "factor must be from 0 to 1"),
     ],
 )
 def test_what_is_no_adjoint_is_refused(adjoint, error, match):

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ FLOORS = {
     "analysis": 7,
     "io": 7,
     "learning": 8,
+    "environments": 8,
     "verification": 8,
     "scenes": 8,
     "demo": 8,
@@ -103,6 +105,12 @@ def test_every_public_name_exists_and_says_what_it_is():
         assert name == "WORLD" or inspect.getdoc(thing), name
 
 
+def test_the_tour_of_the_package_has_every_public_name_once():
+    tour = jc.__doc__.split("A tour of the names")[1]
+    words = re.findall(r"\w+", tour)
+    assert [name for name in jc.__all__ if words.count(name) != 1] == []
+
+
 def test_every_public_method_says_what_it_does():
     for name in jc.__all__:
         thing = getattr(jc, name)
@@ -126,7 +134,9 @@ before = dict(jax.config.values)
 import jaxcon
 changed = {k for k, v in jax.config.values.items() if before.get(k) != v}
 assert not changed, changed
-assert "matplotlib" not in sys.modules and "mujoco" not in sys.modules
+optional = {"matplotlib", "mujoco", "gymnasium"} & set(sys.modules)
+assert not optional, optional
+assert jaxcon.environments.TASKS  # and this registers them with gymnasium
 """
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr

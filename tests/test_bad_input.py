@@ -383,6 +383,10 @@ MISTAKES = {
         lambda: body(2, inertia=np.eye(2)),
         ["body 'arm'", "inertia", r"\(\)", r"\(2, 2\)"],
     ),
+    "principal moments in the plane": (
+        lambda: body(2, inertia=(1.0, 2.0, 3.0)),
+        ["body 'arm'", "inertia", r"shape \(\) in the plane", r"\(3,\)", "give the third"],
+    ),
     "mass as a list": (
         lambda: particle(mass=[1.0]),
         ["particle 'bob'", "mass", r"\(\)", r"\(1,\)"],
@@ -571,7 +575,7 @@ STEPS = {
     ),
     "batch without vmap": (
         lambda: stepping(state=with_q(jnp.zeros((5, 14)))),
-        ["state.q", r"\(14,\)", r"\(5, 14\)", "vmap"],
+        ["state.q", r"\(14,\)", r"\(5, 14\)", r"vmap\(lambda s: jc\.\w+\(system, "],
     ),
     "state of another dtype": (
         lambda: stepping(state=scenes.build("mixed-2d", "float32").state),
@@ -686,3 +690,21 @@ def test_what_is_no_method_is_named(method):
     ):
         with pytest.raises(TypeError, match="jc.Method.*got (RungeKutta|Method)"):
             act()
+
+
+@pytest.mark.parametrize(
+    "call", ["position", "angular_velocity", "energy", "momentum", "report", "step", "rollout"]
+)
+def test_what_is_done_for_a_batch_names_what_was_called(call):
+    scene = jc.Scene(dim=2)
+    scene.add_body("arm", mass=1.0, inertia=1.0)
+    system, state = scene.build()
+    many = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    given = {
+        "position": (system, many, "arm"),
+        "angular_velocity": (system, many, "arm"),
+        "step": (system, jc.Method(), many, None, 1e-3),
+        "rollout": (system, jc.Method(), many, None, 1e-3, 5),
+    }.get(call, (system, many))
+    with pytest.raises(ValueError, match=rf"jax.vmap\(lambda s: jc.{call}\(system, "):
+        getattr(jc, call)(*given)

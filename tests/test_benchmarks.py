@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import (  # noqa: E402
     accuracy,
+    bounded,
     drift,
     equivalence,
     mechanisms,
@@ -48,6 +49,14 @@ def test_an_implicit_method_says_what_it_refuses():
     row = stabilisation.measure("pendulum", np.float64, "RATTLE", "PID", 10, 1e-3)
     assert row.remark.startswith("refused: RATTLE")
     assert np.isnan(row.position)
+
+
+def test_more_sweeps_and_iterations_miss_less():
+    solvers = (jc.GaussSeidel(sweeps=3), jc.GaussSeidel(sweeps=300), jc.InteriorPoint())
+    missed = [bounded.measure("chain", jnp.dtype("float64"), s, 20)[0].max() for s in solvers]
+    column = [bounded.measure("column", jnp.dtype("float64"), s, 20)[0].max() for s in solvers]
+    assert column[0] > column[1] > column[2]
+    assert max(missed[2], column[2]) < 1e-8
 
 
 def test_drift_grows_without_feedback_and_stays_small_with_it():

@@ -161,6 +161,22 @@ def test_violation_is_told_apart_by_its_source():
     assert 1e-8 < coarse.sources["round-off"] < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("stabilizer", "gains"),
+    [
+        (jc.Hybrid(jc.Penalty(1e3)), (50.0, 50.0)),
+        (jc.Penalty({}, others=jc.PID()), (500.0, 1000.0)),
+        (jc.Projection(), (500.0, 1000.0)),
+    ],
+)
+def test_default_gains_are_those_that_the_stabilizer_takes(stabilizer, gains):
+    system, state = pendulum()
+    method = jc.Method(stabilizer=stabilizer)
+    state = jc.init(system, method, state.q, state.v)
+    found = jc.diagnose(system, method, state, None, 1e-3, 1)
+    assert found.gains == pytest.approx(gains)
+
+
 def test_gains_beyond_their_limit_and_worlds_that_end_are_named():
     system, state = pendulum()
     wild = jc.Method(stabilizer=jc.Baumgarte.critical(rate=5e3))

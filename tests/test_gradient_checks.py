@@ -37,6 +37,17 @@ def test_a_wrong_leaf_is_named_and_the_others_are_not():
     assert "DISAGREES" in str(bad)
 
 
+def test_empty_leaves_and_results_are_left_out():
+    """Such as the controls of a scene that has none."""
+    check = jc.check_gradients(
+        lambda x: (x["a"] ** 2, x["none"] * 2.0), {"a": 2.0, "none": jnp.zeros((5, 0))}
+    )
+    assert check.ok
+    assert [leaf.name for leaf in check.leaves] == ["a"]
+    with pytest.raises(ValueError, match="no leaf of floating numbers"):
+        jc.check_gradients(lambda x: 1.0, {"none": jnp.zeros(0)})
+
+
 def test_a_tolerance_is_the_users():
     assert jc.check_gradients(several, NUMBERS, tolerance=1e-3).ok
 
@@ -44,6 +55,42 @@ def test_a_tolerance_is_the_users():
 def test_right_leaves_are_right_to_rounding():
     check = jc.check_gradients(lambda x: several(x | {"wrong": 0.0}), NUMBERS)
     assert max(leaf.error for leaf in check.leaves[:2]) < 1e-10
+
+
+@jax.custom_jvp
+def forgotten(x):
+    return x**2
+
+
+forgotten.defjvp(lambda x, dx: (x[0] ** 2, 0.0 * dx[0]))
+
+
+def test_a_missing_derivative_does_not_hide_behind_a_large_one_of_its_leaf():
+    (leaf,) = jc.check_gradients(lambda x: 1e6 * x[1] ** 2 + forgotten(x[0]), jnp.ones(2)).leaves
+    assert not leaf.ok
+    np.testing.assert_allclose(leaf.error, 1.0, rtol=1e-3)
+    assert "reverse 0, forward 0, differences 2.0" in str(leaf)
+
+
+@pytest.mark.parametrize("coarse", ["leaf", "result"])
+def test_the_coarsest_of_mixed_numbers_says_what_differences_can_tell(coarse):
+    """A right gradient is not accused of rounding."""
+
+    def f(x):
+        size = jnp.exp(x["b"].astype(jnp.float64)) * jnp.sin(x["a"])
+        return (size.astype(jnp.float32) if coarse == "result" else size), 1.0 * x["b"]
+
+    b = jnp.asarray(0.7, jnp.float32 if coarse == "leaf" else jnp.float64)
+    check = jc.check_gradients(f, {"a": jnp.asarray(1.3), "b": b})
+    assert check.ok, check
+    np.testing.assert_allclose(check.tolerance, float(jnp.finfo(jnp.float32).eps) ** (1 / 3))
+
+
+def test_leaves_that_are_no_floating_numbers_are_left_as_they_are():
+    def power(x):
+        return sum(x["a"] ** i for i in range(1, x["n"]))
+
+    assert jc.check_gradients(power, {"a": 1.3, "n": 4}).ok
 
 
 def half_differentiable(x):
@@ -85,6 +132,8 @@ def test_a_pendulum_in_float32():
 def test_nothing_to_differentiate_by():
     with pytest.raises(ValueError, match="no leaf of floating numbers"):
         jc.check_gradients(lambda x: 1.0 * x, 3)
+    with pytest.raises(ValueError, match="f returns no floating number"):
+        jc.check_gradients(lambda x: jnp.round(x).astype(int), 1.3)
 
 
 def test_ridders_takes_away_every_even_power():
@@ -125,6 +174,16 @@ def test_a_hanging_pendulum_has_no_horizon():
     assert growth.horizon() == np.inf
     assert growth.growth.max() < 4.0
     assert "no more than a power of time" in str(growth)
+
+
+def test_a_rollout_that_fails_is_refused():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(0.0, -1.0))
+    scene.add(jc.ExternalWrench("push", "bob"))
+    system, state = scene.build()
+    push = jnp.zeros((8, 2)).at[5].set(jnp.nan)
+    with pytest.raises(ValueError, match="rollout fails, NON_FINITE.*find_first_failure"):
+        jc.gradient_growth(system, jc.Method(), state, push, 1e-2, 8)
 
 
 def test_no_freedom_is_refused():

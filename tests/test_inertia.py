@@ -84,7 +84,7 @@ def test_moments_are_the_integrals_over_the_solid(name):
 
 def test_a_rod_is_a_cylinder_along_x():
     points, weights = cylinder(0.1, -0.6, 0.6)
-    got = np.array(inertia.rod(MASS, 1.2, 0.1).moments, float)
+    got = np.array(inertia.rod(MASS, length=1.2, radius=0.1).moments, float)
     np.testing.assert_allclose(got, moments(points[:, [2, 0, 1]], weights), rtol=QUADRATURE)
 
 

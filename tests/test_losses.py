@@ -43,6 +43,8 @@ def test_tracking_is_the_mean_of_squares_by_quantity_and_scale():
 def test_tracking_says_what_does_not_fit():
     with pytest.raises(ValueError, match="'tip': .3, 2."):
         jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})
+    with pytest.raises(ValueError, match=r"scale of shape \(4, 1\).*\(3, 1\)"):
+        jc.losses.tracking(jnp.ones((3, 1)), np.zeros((3, 1)), np.ones((4, 1)))
     with pytest.raises(ValueError, match="structure"):
         jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"toe": np.zeros((3, 2))})
 
@@ -58,6 +60,15 @@ def test_violation_is_the_size_of_position_and_of_velocity_over_a_step(path):
     np.testing.assert_allclose(jc.losses.violation(off, 1e-2), np.log10(square) / 2, rtol=1e-6)
     still = dataclasses.replace(off, position=0 * off.position, velocity=0 * off.velocity)
     assert jnp.isfinite(jc.losses.violation(still, 1e-2))
+    assert jc.losses.mean_violation(still, 1e-2) == 0.0
+    np.testing.assert_allclose(jc.losses.mean_violation(off, 1e-2), square, rtol=1e-6)
+
+
+def test_a_scene_without_rows_has_no_violation(path):
+    _, (_, off, _, _) = path
+    none = jax.tree.map(lambda x: x[:, :0], off)
+    with pytest.raises(ValueError, match="no constraints"):
+        jc.losses.violation(none, 1e-2)
 
 
 def test_energy_drift_is_that_of_the_energy(path):

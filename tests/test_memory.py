@@ -19,7 +19,8 @@ def chain(links, dtype):
     """Rods on hinges in space; of one, the pendulum."""
     scene, before = jc.Scene(dtype=dtype), jc.WORLD
     for i in range(links):
-        rod, middle, end = jc.inertia.rod(1.0, 1.0, 0.05), (i + 0.5, 0.0, 0.0), (float(i), 0.0, 0.0)
+        rod = jc.inertia.rod(1.0, length=1.0, radius=0.05)
+        middle, end = (i + 0.5, 0.0, 0.0), (float(i), 0.0, 0.0)
         scene.add_body(f"link{i}", inertia=rod, position=middle)
         scene.add(jc.Revolute(f"hinge{i}", before, f"link{i}", end, (0.0, 1.0, 0.0)))
         before = f"link{i}"

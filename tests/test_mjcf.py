@@ -65,6 +65,15 @@ ON_ARM = """
   biasprm="0.1 -0.5 -0.3" gear="1.5"/>
 <general joint="out" gainprm="3" forcelimited="true" forcerange="-2 2"/>
 """
+LIMITED = (
+    f'<body><joint name="turn" axis="0 1 0" actuatorfrcrange="-0.4 0.7"/>{BODY}'
+    '<body pos="0 0 1"><joint name="out" type="slide" axis="1 0 0" actuatorfrcrange="-2 2"/>'
+    f"{SMALL}</body></body>"
+)
+ON_LIMITED = """
+<position joint="turn" kp="4" gear="-2" forcelimited="true" forcerange="-0.3 2"/>
+<motor joint="out" gear="30"/>
+"""
 FLOATING = (
     f'<body euler="0.2 0.3 0.4"><freejoint name="free"/>{BODY}'
     f'<body euler="0.1 0.5 0.2"><joint name="ball" type="ball"/>{SMALL}</body></body>'
@@ -93,12 +102,18 @@ def tree(name):
 
 TREES = {name: tree(name) for name in JOINTS}
 TREES |= {"arm and actuators": ARM, "floating and actuators": FLOATING, "loaded": LOADED}
+TREES |= {"limited actuators": LIMITED}
+ACTUATORS = {
+    "arm and actuators": ON_ARM,
+    "floating and actuators": ON_FLOATING,
+    "limited actuators": ON_LIMITED,
+}
 
 
 @pytest.mark.parametrize("name", TREES)
 def test_accelerations_and_coordinates_are_those_of_mujoco(name):
-    actuators = {"arm and actuators": ON_ARM, "floating and actuators": ON_FLOATING}.get(name, "")
-    m = mujoco.MjModel.from_xml_string(model(TREES[name], f"<actuator>{actuators}</actuator>"))
+    actuators = f"<actuator>{ACTUATORS.get(name, '')}</actuator>"
+    m = mujoco.MjModel.from_xml_string(model(TREES[name], actuators))
     read = jc.from_mjcf(m)
     states = agreement.random_states(m, 4)
     expected = agreement.mujoco_accelerations(m, states)
@@ -258,29 +273,26 @@ def test_equalities_that_are_not_active_are_left_out():
     assert not system.constraints
 
 
-GEOM = '<geom name="{}" size="0.1"/>'
 HINGE = f'<body name="b"><joint name="j" {{}}/>{BODY}{{}}</body>'
+BALL = f'<body name="b"><joint name="j" type="ball" {{}}/>{BODY}</body>'
+GEOM = '<geom name="{}" size="0.1 0.1 0.1" {}/>'
+TENDON = '<tendon><fixed name="t" {}><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
-    "contact": (
-        model(HINGE.format("", GEOM.format("g")) + GEOM.format("floor")),
-        "g' and 'floor|floor and g",
+    "shape": (
+        model(HINGE.format("", GEOM.format("g", 'type="cylinder"')) + GEOM.format("floor", "")),
+        r"contacts between '(g|floor) and (g|floor) \((sphere|cylinder) and (sphere|cylinder)\)'",
     ),
-    "limit": (model(HINGE.format('range="0 1"', "")), "limits of 'j'"),
-    "friction": (model(HINGE.format('frictionloss="1"', "")), "frictionloss of 'j'"),
+    "torsion": (
+        model(HINGE.format("", GEOM.format("g", 'condim="4"')) + GEOM.format("floor", "")),
+        "torsional and rolling friction of 'floor and g'",
+    ),
+    "ball_limit": (model(BALL.format('range="0 1"')), "limits of 'j'"),
     "fluid": (model(HINGE.format("", ""), options='density="1.2"'), "option 'density'"),
-    "tendon": (
-        model(
-            HINGE.format("", ""),
-            '<tendon><fixed name="t" stiffness="1"><joint joint="j" coef="1"/></fixed></tendon>',
-        ),
+    "tendon": (model(HINGE.format("", ""), TENDON.format('stiffness="1"')), "tendons 't'"),
+    "tendon that ends": (model(HINGE.format("", ""), TENDON.format('range="0 1"')), "tendons 't'"),
+    "tendon that rubs": (
+        model(HINGE.format("", ""), TENDON.format('frictionloss="1"')),
         "tendons 't'",
-    ),
-    "limit of a tendon": (
-        model(
-            HINGE.format("", ""),
-            '<tendon><fixed name="t" range="0 1"><joint joint="j" coef="1"/></fixed></tendon>',
-        ),
-        "limits of 't'",
     ),
     "gravcomp": (model(f'<body name="b" gravcomp="1"><joint/>{BODY}</body>'), "gravcomp of 'b'"),
 }
@@ -311,7 +323,20 @@ UNSUPPORTED = {
         '<general joint="turn" biastype="muscle" biasprm="0.75 1.05 1 200 0.5 1.6 1.5 1.3 1.2"'
         ' lengthrange="0 1"/>'
     ),
-    "actuatorfrcrange of joint 'j'": model(HINGE.format('actuatorfrcrange="-1 1"', "")),
+    "joint 'j' has an actuatorfrcrange and 2 actuators": model(
+        HINGE.format('actuatorfrcrange="-1 1"', ""),
+        '<actuator><motor joint="j"/><motor joint="j"/></actuator>',
+    ),
+    "surfacevel of geom 'floor'": model(
+        HINGE.format("", GEOM.format("g", "")) + GEOM.format("floor", 'surfacevel="1 0 0 0 0 0"')
+    ),
+    "adhesion of geom 'g'": model(
+        HINGE.format("", GEOM.format("g", 'adhesion="1"')) + GEOM.format("floor", "")
+    ),
+    "friction that depends on the direction, of floor and g": model(
+        HINGE.format("", GEOM.format("g", "")) + GEOM.format("floor", ""),
+        '<contact><pair geom1="floor" geom2="g" friction="1 0.5"/></contact>',
+    ),
     "equality 'e' is of type 'tendon'": model(
         HINGE.format("", ""),
         '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'

@@ -130,6 +130,9 @@ def test_a_batch_of_systems():
         ({"gravity": 9.81}, ["gravity", r"\(2,\)", r"\(\)"]),
         ({"link": {"mass": jnp.asarray(1.0, jnp.float32)}}, ["link.mass", "float32", "float64"]),
         ({"link": {"mass": "heavy"}}, ["link.mass", "heavy"]),
+        ({"hinge": {"anchor_b": (jnp.nan, 0.0)}}, ["hinge.anchor_b", "finite", "nan"]),
+        ({"coil": {"rest": jnp.inf}}, ["coil.rest", "finite", "inf"]),
+        ({"gravity": (0.0, jnp.inf)}, ["gravity", "finite", "inf"]),
     ],
 )
 def test_changes_that_do_not_fit(changes, words):
@@ -171,3 +174,16 @@ def test_parameters_of_generalized_coordinates():
     built = scenes.build("polar")
     heavier = built.system.with_params(built.system.params | {"mass": jnp.asarray(3.0)})
     np.testing.assert_allclose(heavier.mass(built.state.q).values, 3.0 * np.array([1, 1.2**2]))
+
+
+def test_some_of_the_parameters_of_generalized_coordinates_are_changed_by_name():
+    theta = {"m": jnp.asarray(1.0), "spring": {"k": jnp.asarray(2.0), "rest": jnp.asarray(0.5)}}
+    system = jc.GeneralizedSystem(
+        mass=lambda q, p: p["m"] * jnp.eye(1), force=lambda q, v, t, u, p: -q, params=theta
+    )
+    changed = system.with_params({"spring": {"k": jnp.asarray(3.0)}})
+    assert changed.params == theta | {"spring": theta["spring"] | {"k": 3.0}}
+    for unknown in ({"n": 1.0}, {"spring": {"c": 1.0}}):
+        with pytest.raises(ValueError, match="is unknown; known are"):
+            system.with_params(unknown)
+    assert system.with_params(jnp.ones(2)).params.shape == (2,)  # another kind of θ

@@ -10,7 +10,7 @@ import pytest
 import scenes
 from compiling import quick_jit
 from derivatives import assert_smooth_and_batched
-from tolerances import IDENTITY
+from tolerances import IDENTITY, ROUND_OFF
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
@@ -280,6 +280,22 @@ def test_a_mixture_projects_by_the_share_of_the_violation():
         np.testing.assert_allclose(new.v, (1 - share) * at.v, atol=1e-7)
 
 
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("sharpness", [1, 6, 40])
+def test_a_sharp_mixture_is_finite_however_far_it_is_off(sharpness, dtype):
+    """w = 1/(1 + x⁻²ⁿ) and dw/dx² = n/(xⁿ⁺¹ + x¹⁻ⁿ)², from x² = 0 to beyond all numbers."""
+    weight = jax.value_and_grad(mixture(sharpness=sharpness).beyond)
+    largest = float(jnp.finfo(dtype).max)
+    for square in (0.0, 0.7, 1.0, 1.3, 1e10, largest, np.inf):
+        with np.errstate(divide="ignore", over="ignore"):
+            x = np.sqrt(np.float64(square))
+            w = 1 / (1 + x ** (-2 * sharpness))
+            slope = sharpness / (x ** (1 + sharpness) + x ** (1 - sharpness)) ** 2
+        found = weight(jnp.asarray(square, dtype))
+        rounding = 1e2 * ROUND_OFF[np.dtype(dtype)]
+        np.testing.assert_allclose(found, (w, slope), rtol=rounding, atol=1e-30)
+
+
 STABILIZERS = {
     "implicit": (jc.Penalty, {"stiffness": 3e3, "damping": 7.0}),
     "explicit": (lambda **x: jc.Penalty(**x, implicit=False), {"stiffness": 3e3, "damping": 7.0}),
@@ -371,6 +387,26 @@ def test_bad_numbers_are_refused(stabilizer, words):
     method = jc.Method(stabilizer=stabilizer)
     with pytest.raises(ValueError, match=".*".join(words)):
         jax.eval_shape(lambda s: jc.step(system, method, s, None, H), state)
+
+
+@pytest.mark.parametrize(
+    ("stabilizer", "words"),
+    [
+        (jc.Penalty(1.0, others=None), "Penalty: others must be a stabiliser"),
+        (jc.AugmentedLagrangian(feedback=None), "AugmentedLagrangian: feedback must be"),
+        (jc.AugmentedLagrangian(feedback=jc.Baumgarte), "AugmentedLagrangian: feedback must be"),
+        (jc.Hybrid(jc.Penalty), "Hybrid: small must be"),
+        (jc.Hybrid(jc.Penalty(1.0), middle=None), "Hybrid: middle must be"),
+        (jc.Hybrid(jc.Penalty(1.0), large="Projection"), "Hybrid: large must be"),
+        (jc.Hybrid(jc.Penalty(1.0, others=None)), "Penalty: others must be a stabiliser"),
+        (jc.Hybrid(jc.Penalty(1.0), soft_below={"rod": 1e-3}), "soft_below must be one number"),
+        (jc.Hybrid(jc.Penalty(1.0), project_above=None), "project_above must be one number"),
+    ],
+)
+def test_parts_that_are_none_are_refused(stabilizer, words):
+    system, state = oscillator()
+    with pytest.raises(TypeError, match=words):
+        jc.init(system, jc.Method(stabilizer=stabilizer), state.q, state.v)
 
 
 def test_damping_for_what_is_hard_is_refused():

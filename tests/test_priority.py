@@ -83,6 +83,7 @@ def test_one_level_that_contradicts_itself_is_met_by_least_squares_and_says_so()
     expected = by_null_spaces(j, MASS, FORCE, TARGET, BY_LEVEL)
     np.testing.assert_allclose(a, expected, rtol=1e-10)
     assert status == jc.Status.CONFLICT
+    assert jc.Priority(LEVELS, conflict=np.inf).solve(system).status == jc.Status.OK
     agreeing = TARGET.copy()
     agreeing[1] = 2 * agreeing[0]
     system, _ = problem(j, target=agreeing)
@@ -98,8 +99,10 @@ def test_order_within_a_level_does_not_matter():
         np.testing.assert_allclose(λ, reference.multipliers[rows], rtol=1e-11, atol=1e-12)
 
 
-def test_the_gradient_holds_where_rank_is_lost():
-    """Against differences of numpy's projections; dependent rows stay so along the way."""
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("numbers", [{}, {"damping": 0.0}, {"damping": 0.0, "cutoff": 0.0}])
+def test_value_and_gradient_hold_where_rank_is_lost(numbers, dtype):
+    """Against numpy's projections and their differences; dependent rows stay so along the way."""
     weight = np.arange(1.0, 6.0)
     direction = [RANDOM.normal(size=x.shape) for x in (J, MASS, FORCE, TARGET)]
     direction[1] = direction[1] + direction[1].T
@@ -114,15 +117,21 @@ def test_the_gradient_holds_where_rank_is_lost():
         return array(free) @ j, mass, force, target
 
     def ours(s):
-        solution = jc.Priority(LEVELS).solve(problem(*moved(s, jnp.asarray))[0])
-        return jnp.asarray(weight) @ solution.acceleration
+        numbers_in = moved(s, lambda x: jnp.asarray(x, dtype))
+        solution = jc.Priority(LEVELS, **numbers).solve(problem(*numbers_in)[0])
+        return jnp.asarray(weight, dtype) @ solution.acceleration
 
     ahead, behind = (
         weight @ by_null_spaces(*moved(s, np.asarray), BY_LEVEL) for s in (1e-5, -1e-5)
     )
-    _, forward = quick_jit(lambda: jax.jvp(ours, (0.0,), (1.0,)))()
-    reverse = quick_jit(jax.grad(ours))(0.0)
-    np.testing.assert_allclose([forward, reverse], (ahead - behind) / 2e-5, rtol=DIFFERENCE)
+    zero, one = jnp.asarray([0, 1], dtype)
+    value, forward = quick_jit(lambda: jax.jvp(ours, (zero,), (one,)))()
+    reverse = quick_jit(jax.grad(ours))(zero)
+    rounding = 1e2 * ROUND_OFF[np.dtype(dtype)]
+    expected = weight @ by_null_spaces(J, MASS, FORCE, TARGET, BY_LEVEL)
+    np.testing.assert_allclose(value, expected, rtol=rounding)
+    slope = (ahead - behind) / 2e-5
+    np.testing.assert_allclose([forward, reverse], slope, rtol=max(DIFFERENCE, rounding))
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
@@ -202,6 +211,28 @@ def test_a_row_of_zeros_leaves_solution_and_gradient_finite():
         np.testing.assert_array_equal(slope[jnp.array([0, 3])], 0)
 
 
+def test_a_level_near_the_one_above_it_gives_way():
+    """Two unit rows at an angle θ: S = sin²θ below, and (μ²/(S² + μ²))⁶ of its row is not met."""
+    entries = (("above", 0, 1, 1), ("below", 1, 1, 1))
+
+    def unmet(angle, damping):
+        j = jnp.stack([jnp.array([1.0, 0.0]), jnp.stack([jnp.cos(angle), jnp.sin(angle)])])
+        value = tuple(Vector(*(x[None] for x in row)) for row in j)
+        jacobian = Jacobian((Block(value, 0, Columns(0, 2, 1, (0,))),), (2, 2))
+        target, layout = jnp.array([0.0, 1.0]), RowLayout(entries)
+        system = Saddle(Diagonal(jnp.ones(2)), jnp.zeros(2), jacobian, target, layout=layout)
+        return 1 - j[1] @ jc.Priority({"below": 1}, damping=damping).solve(system).acceleration
+
+    def share(angle, damping):
+        return (damping**2 / (jnp.sin(angle) ** 4 + damping**2)) ** 6
+
+    angle, damping = jnp.array([0.03, 0.0548, 0.08]), jnp.array([3e-3, 3e-3, 3e-3])
+    both = [quick_jit(jax.vmap(jax.value_and_grad(x, (0, 1)))) for x in (unmet, share)]
+    (found, slopes), (expected, exact) = (x(angle, damping) for x in both)
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(slopes, exact, rtol=1e-7)
+
+
 def test_dependent_rows_that_agree_move_as_without_levels():
     system, _ = problem(target=J @ TARGET)
     expected = jc.RankSafe(always=True).solve(system)
@@ -216,6 +247,13 @@ def test_what_levels_are_refused():
         jc.Priority({"rod": 4})
     with pytest.raises(ValueError, match=r"no constraint 'rood\*'; there are \['hold'"):
         jc.Priority({"rood*": 1}).solve(problem()[0])
+    for x in (-1.0, np.nan):
+        with pytest.raises(ValueError, match=f"conflict must lie between 0 and inf, got {x}"):
+            jc.Priority({}, conflict=x).check()
+    with pytest.raises(ValueError, match="conflict must be a real number, got 'some'"):
+        jc.Priority({}, conflict="some").check()
+    for conflict in (None, np.inf):
+        jc.Priority({}, conflict=conflict).check()
     unnamed = dataclasses.replace(problem()[0], layout=None)
     with pytest.raises(ValueError, match="no constraint 'rest'"):
         jc.Priority({"rest": 1}).solve(unnamed)

@@ -349,6 +349,46 @@ def test_solvers_agree_and_batches_are_loops(solver):
         np.testing.assert_allclose(got.v[i], expected.v, atol=1e-8)
 
 
+def door():
+    """On two hinges: ten rows of rank five."""
+    scene = jc.Scene()
+    scene.add_body("door", mass=20.0, inertia=(2.0, 3.0, 1.0), position=(0.5, 0.1, 1.0))
+    for name, height in (("lower", 0.3), ("upper", 1.7)):
+        point = (0.0, 0.0, height)
+        scene.add(jc.Revolute(name, jc.WORLD, "door", point=point, axis=(0.0, 0.0, 1.0)))
+    return scene.build()
+
+
+def test_a_linearized_projection_hears_a_solver_that_does_not_converge():
+    """A door off both of its hinges: rows that contradict each other."""
+    system, state = door()
+    still = jc.Projection(iterations=1, velocity=False)
+    for solver, code in ((jc.ConjugateGradients(), jc.Status.NOT_CONVERGED), (None, jc.Status.OK)):
+        new = projecting(system, still, solver)(system, moved(state, 1e-3))
+        assert new.status == code
+
+
+@pytest.mark.parametrize("tolerance", [None, 1e-5])
+def test_a_linearized_projection_leaves_what_is_there(tolerance):
+    """The rows of a door contradict each other by rounding alone, which no solver can mend."""
+    system, state = door()
+    still = jc.Projection(iterations=1, velocity=False, tolerance=tolerance)
+    few = jc.ConjugateGradients(iterations=30)
+    noise = 1e-16 * np.random.default_rng(1).standard_normal((4, 7))
+
+    def place(shift, noise):
+        start = dataclasses.replace(state, q=(state.q + noise).at[0].add(shift))
+        new, code = still.project(system, few, start, start, jnp.asarray(1e-3))
+        return new.q[0], (new.q - start.q, code)
+
+    places = quick_jit(jax.vmap(jax.value_and_grad(place, has_aux=True), (None, 0)))
+    (_, (change, code)), slope = places(0.0, noise)
+    assert (code == jc.Status.OK).all()
+    np.testing.assert_allclose(change, 0, atol=1e-14)
+    # what a push along x leaves is its share of the turn about the hinges, m y²/(m r² + I)
+    np.testing.assert_allclose(slope, 20 * 0.1**2 / (20 * 0.26 + 1.0), rtol=1e-9)
+
+
 def test_projection_keeps_the_order_of_runge_kutta():
     """Fourth order on a double pendulum, by halving the step."""
     scene = jc.Scene(dim=2)

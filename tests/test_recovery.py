@@ -213,10 +213,27 @@ def test_generalized_coordinates_recover_too(dtype):
     assert np.all(np.isfinite(final.q))
 
 
+def test_numbers_that_are_arrays_are_checked_inside_a_trace_too():
+    """Those of a method that was tuned are; they are not traced by a function that has them."""
+
+    def check(**numbers):
+        recovery = jax.tree.map(jnp.asarray, jc.Recovery(**numbers))
+        jax.make_jaxpr(recovery.check)()
+
+    check(limit=0.1)
+    with pytest.raises(ValueError, match="shrink must lie between 0 and 1"):
+        check(shrink=1.5)
+
+
 def test_what_is_refused(scene):
     system, state = scene
     for wrong, kind, words in (
-        (jc.Recovery(shrink=2.0), ValueError, "shrink must be from 0 to 1, got 2.0"),
+        (jc.Recovery(growth=float("nan")), ValueError, "growth must lie between 1 and inf"),
+        (jc.Recovery(growth=float("inf")), ValueError, "growth must be positive and finite"),
+        (jc.Recovery(shrink=2.0), ValueError, "shrink must lie between 0 and 1, got 2.0"),
+        (jc.Recovery(shrink="a"), ValueError, "shrink must be a real number, got 'a'"),
+        (jc.Recovery(limit=1j), ValueError, "limit must be a real number, got 1j"),
+        (jc.Recovery(limit=True), ValueError, "limit must be a real number, got True"),
         (jc.Recovery(limit=-1.0), ValueError, "limit must be positive"),
         (jc.Recovery(projector=jc.Baumgarte()), ValueError, "Baumgarte corrects no positions"),
         (jc.Recovery(projector=jc.Penalty(1.0)), ValueError, "Penalty corrects no positions"),
@@ -225,6 +242,23 @@ def test_what_is_refused(scene):
             ValueError,
             "Projection corrects no positions",
         ),
+        (
+            jc.Recovery(projector=jc.Hybrid(jc.Penalty(1.0), large=jc.Projection(position=False))),
+            ValueError,
+            "Hybrid corrects no positions",
+        ),
+        (
+            jc.Recovery(projector=jc.Hybrid(jc.Penalty(1.0), large=jc.Projection(every=10))),
+            ValueError,
+            "Hybrid has a memory",
+        ),
+        (
+            jc.Recovery(projector=jc.AugmentedLagrangian(feedback=jc.Projection())),
+            ValueError,
+            "AugmentedLagrangian has a memory",
+        ),
+        (jc.Recovery(projector=jc.Projection(metric="Mass")), ValueError, "metric must be one of"),
+        (jc.Recovery(projector=jc.Projection(factor=3.0)), ValueError, "factor must be at most 1"),
         (jc.Recovery(projector="projection"), TypeError, "projector must be a stabiliser"),
         (jc.Recovery, TypeError, r"recovery must be a value such as Recovery\(\)"),
     ):

@@ -108,6 +108,23 @@ def test_a_rod_too_short_to_reach_is_sent_to_assemble():
     assert "assemble" not in str(jc.report(system, near))
 
 
+def test_a_skate_that_slips_is_where_it_may_be():
+    """Its row holds a velocity, ψ = 0.5 m/s, and no position that assembly could mend."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("skate", mass=60.0, inertia=2.0, velocity=(3.0, 0.5))
+    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
+    system, state = scene.build()
+    report = jc.report(system, state)
+    np.testing.assert_allclose(report.violation["blade"], (0.5, 0.5))
+    assert report.off == ()
+    assert "assemble" not in str(report)
+    report = jc.report(system.with_params({"rod": {"length": 1.1}}), state)
+    assert report.off == ("rod",)
+    assert "off rod: print(jc.assemble(system, state))" in str(report)
+
+
 def test_without_constraints():
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0)

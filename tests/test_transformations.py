@@ -57,7 +57,7 @@ def compiled_step(name, integrator, solver):
 @pytest.mark.parametrize(("name", "integrator", "solver"), CASES[:2] + CASES[3:])
 def test_jit_is_eager(name, integrator, solver):
     built = scenes.build(name)
-    with jax.disable_jit(), jax.numpy_dtype_promotion("standard"):
+    with jax.disable_jit():
         eager = jc.step(built.system, method_of(integrator, solver), built.state, None, DT)
     same_step(compiled_step(name, integrator, solver)(built.state), eager)
 

@@ -9,9 +9,10 @@ import optax
 import pytest
 
 import jaxcon as jc
+from jaxcon.learning import checkpoint as files
 from jaxcon.learning.leaves import space_of
 
-BOWL = {"a": jnp.array([1.0, 3.0]), "b": {"c": 0.0, "n": 3}}
+BOWL = {"a": jnp.array([1.0, 3.0]), "b": {"c": 0.0, "n": jnp.asarray(3)}}
 
 
 def bowl(p):
@@ -28,7 +29,20 @@ def test_the_least_of_a_bowl_is_found_and_its_history_kept():
     assert found.history.shape == (205,)
     assert found.loss == found.history.min()
     np.testing.assert_allclose(found.aux, jnp.sum(found.params["a"]))  # at the best, not the last
-    assert "every step was taken" in str(found)
+    assert "every step was taken, and the second half" in str(found)
+    short = jc.tune(bowl, BOWL, steps=20, positive="a", optimizer=optax.adam(0.03))
+    assert "before it converged" in short.stopped
+    assert "ask for more" in str(short)
+
+
+def test_the_default_rate_reaches_what_is_a_hundred_times_larger():
+    """In as many steps as a first call may ask for, with a second leaf a hundred times smaller."""
+
+    def loss(x):
+        return jnp.sum(jnp.log(x / jnp.array([100.0, 0.01])) ** 2)
+
+    found = jc.tune(loss, jnp.ones(2), steps=60, positive=True)
+    np.testing.assert_allclose(found.params, [100.0, 0.01], rtol=0.1)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32])
@@ -117,7 +131,21 @@ def test_a_gradient_that_is_not_finite_ends_the_start_and_keeps_the_best():
     found = jc.tune(lambda x: jnp.sqrt(jnp.abs(x)) + 1, jnp.asarray(0.0), steps=100)
     assert found.loss == 1.0  # whose derivative is NaN
     assert found.steps < 30
+    assert found.refused == found.steps
+    assert f"{found.steps} steps were taken back" in str(found)
     assert "not finite" in found.stopped
+
+
+def test_a_loss_that_is_finite_at_no_start_is_refused_at_once():
+    seen = []
+
+    def loss(x):
+        jax.debug.callback(seen.append, x)
+        return x * jnp.nan
+
+    with pytest.raises(ValueError, match="not finite at the start"):
+        jc.tune(loss, jnp.asarray(1.0), steps=50, chunk=3)
+    assert len(seen) == 3
 
 
 def test_a_start_without_a_number_harms_no_other():
@@ -142,6 +170,66 @@ def test_the_least_of_an_expectation():
     assert abs(found.params - 1) < 4 * 0.5 / 64**0.5
     assert 0.15 < found.loss < 0.4
     assert found.loss > found.history.min()  # a lucky draw is not taken for the best
+
+
+def test_a_start_that_is_the_best_is_what_comes_back():
+    """Steps by single draws lead away from the least of an expectation."""
+
+    def loss(x, key):
+        return x**2 + 3 * x * jax.random.normal(key)
+
+    options = {"samples": 2, "key": jax.random.key(0), "optimizer": optax.sgd(0.3)}
+    found = jc.tune(loss, jnp.asarray(0.0), steps=10, **options)
+    assert found.params == found.loss == 0.0
+
+
+def test_samples_without_a_number_are_left_out_and_counted():
+    """Their gradient, too; but no search goes where more of them fail, however low the rest."""
+
+    def loss(x, key):
+        chance = jax.random.uniform(key)
+        root = jnp.sqrt(jnp.where(chance < jnp.where(x > 0.5, 0.35, 0.05), -1.0, 1.0) + 0 * x)
+        return (x - 1) ** 2 * root
+
+    options = {"samples": 32, "key": jax.random.key(0), "optimizer": optax.adam(0.02)}
+    found = jc.tune(loss, jnp.asarray(0.0), steps=40, **options)
+    assert 0 < found.lost < 6
+    assert 0.2 < found.params <= 0.5
+    np.testing.assert_allclose(found.loss, (found.params - 1) ** 2, rtol=1e-12)
+    assert f"not finite at {found.lost} of its keys" in str(found)
+
+
+def test_forward_mode_takes_the_same_way_and_goes_through_loops():
+    """A loop whose length is found on the way has no reverse mode."""
+
+    def looped(p):
+        def more(known):
+            return known[0] < 3
+
+        def one(known):
+            return known[0] + 1, known[1] + (known[1] - p["a"]) ** 2
+
+        value = jnp.sum((jnp.log(p["a"]) - 1) ** 2) + (p["c"] - 2.0) ** 2
+        return value + 1e-3 * jnp.sum(jax.lax.while_loop(more, one, (0, p["a"]))[1])
+
+    def unrolled(p):
+        value = jnp.sum((jnp.log(p["a"]) - 1) ** 2) + (p["c"] - 2.0) ** 2
+        return value + 1e-3 * jnp.sum(p["a"])
+
+    start = {"a": jnp.array([1.0, 3.0]), "c": 0.0}
+    with pytest.raises(ValueError, match="Reverse-mode"):
+        jc.tune(looped, start, steps=3)
+    found = jc.tune(looped, start, steps=30, forward=True, positive="a")
+    expected = jc.tune(unrolled, start, steps=30, positive="a")
+    np.testing.assert_allclose(found.history, expected.history, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("progress", "shown"), [(None, False), (False, False), (True, True)])
+def test_a_bar_is_shown_where_it_is_wanted(progress, shown, capsys):
+    jc.tune(lambda x: x**2, jnp.asarray(1.0), steps=2, progress=progress)
+    jc.identify(lambda x: x * jnp.ones(3), 1.0, np.ones(3), noise=1.0, progress=progress)
+    written = capsys.readouterr().err
+    assert ("tuning" in written) == ("identifying" in written) == shown
 
 
 def noisy(x, key):
@@ -199,9 +287,50 @@ def test_a_checkpoint_is_refused_by_another_search(tmp_path):
     for other, params, options, what in others:
         with pytest.raises(ValueError, match=f"(?s)another search.*{what}"):
             jc.tune(other, params, steps=10, checkpoint=file, **options)
-    file.write_text("no checkpoint")
+    with pytest.raises(ValueError, match="another search.*the number of steps"):
+        jc.tune(loss, start, steps=20, checkpoint=file)
+    other = optax.sgd(0.1)
+    own = tmp_path / "own.npz"
+    jc.tune(loss, start, steps=10, checkpoint=own, optimizer=other)
+    assert jc.tune(loss, start, steps=20, checkpoint=own, optimizer=other).steps == 20
+
+
+def damaged_header(file):
+    """A compression that nobody knows."""
+    np.savez(file, about=np.array("{}"))
+    written = bytearray(file.read_bytes())
+    written[written.rindex(b"PK\x01\x02") + 10] = 99
+    file.write_bytes(written)
+
+
+def array(file):
+    np.save(file.with_suffix(".npy"), np.ones(3))
+    file.with_suffix(".npy").rename(file)
+
+
+FOREIGN = {
+    "text": lambda file: file.write_text("no checkpoint"),
+    "array": array,
+    "list": lambda file: np.savez(file, about=np.array("[1]")),
+    "header": damaged_header,
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_what_is_no_checkpoint_is_refused_in_words(kind, tmp_path):
+    file = tmp_path / "search.npz"
+    FOREIGN[kind](file)
     with pytest.raises(ValueError, match="is no checkpoint"):
-        jc.tune(loss, start, steps=10, checkpoint=file)
+        files.read(file, {}, {"x": 1}, "tune")
+
+
+def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_search(tmp_path):
+    def never(x):
+        raise AssertionError
+
+    for file, what in ((tmp_path / "no" / "x.npz", "lies in no folder"), (tmp_path, "is a folder")):
+        with pytest.raises(ValueError, match=what):
+            jc.tune(never, jnp.zeros(2), checkpoint=file)
 
 
 @pytest.mark.parametrize(
@@ -216,6 +345,8 @@ def test_a_checkpoint_is_refused_by_another_search(tmp_path):
         ({"restarts": 2}, "give key="),
         ({"restarts": 2, "key": jax.random.key(0)}, "give spread="),
         ({"steps": 0}, "whole number from 1"),
+        ({"patience": 0}, "patience must be a whole number from 1"),
+        ({"patience": 5, "tolerance": np.nan}, "tolerance must be zero or more and finite"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(options, what):
@@ -226,8 +357,21 @@ def test_what_makes_no_sense_is_refused_in_words(options, what):
 def test_a_loss_must_be_a_scalar_and_parameters_numbers():
     with pytest.raises(TypeError, match="floating scalar"):
         jc.tune(lambda x: x, jnp.zeros(2))
+    with pytest.raises(TypeError, match="floating scalar.*None"):
+        jc.tune(lambda x: None, jnp.zeros(2))
+    with pytest.raises(TypeError, match=r"called as loss\(params\).*missing.*'key'"):
+        jc.tune(noisy, jnp.zeros(2))
+    with pytest.raises(TypeError, match=r"called as loss\(params, key\).*samples=2"):
+        jc.tune(lambda x: x, jnp.zeros(2), samples=2, key=jax.random.key(0))
+    with pytest.raises(TypeError, match=r"key must be one of jax.random.key.*got 0"):
+        jc.tune(noisy, jnp.zeros(2), samples=2, key=0)
+    with pytest.raises(TypeError, match="optimizer must be a transformation of optax"):
+        jc.tune(jnp.sum, jnp.zeros(2), optimizer=optax.adam)
     with pytest.raises(ValueError, match="no floating number"):
-        jc.tune(lambda x: 0.0, {"n": 3})
+        jc.tune(lambda x: 0.0, {"n": jnp.asarray(3)})
+    for whole in (3, np.int64(3), np.array([3])):
+        with pytest.raises(ValueError, match="'stiffness' is a whole number.*write it as a float"):
+            jc.tune(lambda p: p["stiffness"], {"stiffness": whole, "damping": 0.1})
     with pytest.raises(ValueError, match="must be finite"):
         jc.tune(lambda x: x, jnp.nan)
 
@@ -256,6 +400,21 @@ def test_gains_of_a_method_are_leaves_like_others(dtype):
     assert found.params.stabilizer.beta > 4.0
     assert found.loss < found.history[0] - 0.5
     assert found.params.stabilizer.beta.dtype == dtype
+
+
+def test_a_tuned_method_runs_under_jit():
+    """Its gains are arrays then, which checks of their values must not take for traced ones."""
+    system, state = pendulum()
+
+    def loss(method):
+        start = jc.init(system, method, state.q, state.v)
+        run = jc.rollout(system, method, start, None, 1e-2, 10, record=lambda s, i: i.violation)
+        return jc.losses.violation(run[1], 1e-2)
+
+    method = jc.Method(stabilizer=jc.PID(25.0, 10.0, 1.0))
+    found = jc.tune(loss, method, steps=np.int64(2), positive="stabilizer")
+    assert isinstance(found.params.stabilizer.integral, jax.Array)
+    np.testing.assert_allclose(jax.jit(lambda: loss(found.params))(), found.loss)
 
 
 def test_numbers_of_a_system_a_start_and_controls_together():
@@ -304,3 +463,17 @@ def test_the_stiffness_of_a_constraint_that_is_least_in_expectation():
 
 KEY = jax.random.key(9)
 """Of draws that no search has seen."""
+
+
+def test_samples_that_fail_at_first_do_not_end_a_search():
+    """Every step has fresh keys: those of the first fail, and yet all steps are taken."""
+
+    def loss(x, key):
+        fails = jax.random.uniform(key) < 0.4
+        return jnp.where(fails, jnp.nan, (x - 1.0) ** 2)
+
+    steps, key = 30, jax.random.key(3)
+    found = jc.tune(loss, 0.0, samples=3, steps=steps, chunk=1, key=key, optimizer=optax.adam(0.1))
+    assert np.isnan(found.history[0])
+    assert found.history.shape == (steps,)
+    assert found.loss < 1.0

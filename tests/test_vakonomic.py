@@ -194,3 +194,12 @@ def test_readers_and_errors():
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     with pytest.raises(ValueError, match="'rod' has a φ in each of its rows"):
         jc.vakonomic(*scene.build(), {"rod": 0.2})
+
+
+def test_bounded_rows_have_no_variational_form():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bead", mass=1.0)
+    scene.add(jc.Rope("leash", jc.WORLD, "bead", length=1.0, point_a=(0.5, 0.0)))
+    system, state = scene.build()
+    with pytest.raises(ValueError, match=r"no variational form of the bounded rows of \['leash'\]"):
+        jc.vakonomic(system, state)

@@ -20,7 +20,7 @@ from jaxcon.dynamics.assembly import assemble
 from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.stability import instability, largest_stable_rate
+from jaxcon.simulation.stability import instability, largest_stable_rate, parts
 
 WEAK = 1e-2
 """Singular values of the rows, scaled to unit length, below which a direction is nearly lost."""
@@ -42,7 +42,7 @@ class Diagnosis:
     Attributes:
         violation: the largest |φ| of the simulation.
         sources: the part of it by source, as of `METHODS`; they need not add up.
-        gains: (α, β) that the integrator takes at this step unless others are given [1/s].
+        gains: (α, β) of the method's feedback at this step unless others are given [1/s].
         stable_rate: the largest α = β that is stable at this step [1/s].
         energy: at the start and at the end [J].
         momentum: linear and angular at the start and at the end; None where there are no bodies.
@@ -61,7 +61,9 @@ class Diagnosis:
 
     @property
     def main_source(self) -> str:
-        """The largest."""
+        """The largest; "unknown" where the run grew without bound, so that none can be told."""
+        if not all(np.isfinite(x) for x in (self.violation, *self.sources.values())):
+            return "unknown"
         return max(self.sources, key=lambda name: self.sources[name])
 
     def __str__(self) -> str:
@@ -73,8 +75,9 @@ class Diagnosis:
             (p, spin), (p_end, spin_end) = self.momentum
             lines.append(f"momentum {p} → {p_end} kg m/s, angular {spin} → {spin_end} kg m²/s")
         lines.append(
-            f"gains at this step: α = {self.gains[0]:.4g}, β = {self.gains[1]:.4g} 1/s by default;"
-            f" α = β is stable up to {self.stable_rate:.4g} 1/s"
+            f"gains at this step where none are given: α = {self.gains[0]:.4g},"
+            f" β = {self.gains[1]:.4g} 1/s; given ones with α = β are stable up to"
+            f" {self.stable_rate:.4g} 1/s"
         )
         return "\n".join([*lines, str(self.report)])
 
@@ -113,7 +116,7 @@ def diagnose(
         "round-off": _rounding(system, end),
         **_lost(system, end),
     }
-    gains = method.integrator.default_gains(jnp.asarray(dt, state.q.dtype))
+    gains = _default_gains(method, jnp.asarray(dt, state.q.dtype))
     bodies = hasattr(system, "layout")
     return Diagnosis(
         violation=_largest(given),
@@ -125,6 +128,15 @@ def diagnose(
         report=report(system, state),
         trouble=_trouble(system, method, state, end, float(dt)),
     )
+
+
+def _default_gains(method: Method, dt: Array) -> tuple[Array, Array]:
+    """(α, β) of the first feedback in the stabiliser, or of the integrator where there is none."""
+    for part in parts(method.feedback(dt)):
+        fallback = getattr(part, "fallback", None)
+        if fallback is not None:
+            return fallback
+    return method.integrator.default_gains(dt)
 
 
 def _trouble(system: Any, method: Method, state: State, end: State, dt: float) -> tuple[str, ...]:

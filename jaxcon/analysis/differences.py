@@ -26,18 +26,21 @@ def unseen(eps: float) -> float:
     return ROUNDING * eps / steps(eps)[0]
 
 
-def differences(of: Any, at: list[Array], moves: list[Array]) -> tuple[np.ndarray, np.ndarray]:
+def differences(
+    of: Any, at: list[Array], moves: list[Array], eps: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Derivatives along directions, and how exact they are.
 
     Args:
         of: a list of arrays → a number.
         at: where.
         moves: directions, (n, …) in each array.
+        eps: ε of the coarsest number on the way.
 
     Returns:
         Derivatives (n,), extrapolated from all `steps`, and their uncertainties (n,).
     """
-    sizes = jnp.asarray(steps(float(jnp.finfo(at[0].dtype).eps)), at[0].dtype)
+    sizes = jnp.asarray(steps(eps), at[0].dtype)
 
     def along(move: list[Array], step: Array) -> Array:
         return of([x + step.astype(x.dtype) * dx for x, dx in zip(at, move, strict=True)])

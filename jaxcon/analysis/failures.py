@@ -20,8 +20,9 @@ from jaxcon.core.status import MEANING, Status, failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
+from jaxcon.simulation.attempt import dynamics_at
 from jaxcon.simulation.method import Memory, Method
-from jaxcon.simulation.step import check_step, dynamics_at, step_quietly
+from jaxcon.simulation.step import check_step, step_quietly
 from jaxcon.solvers.saddle import Solution
 
 

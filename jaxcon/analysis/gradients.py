@@ -25,7 +25,7 @@ class LeafGradient:
         name: of the leaf in x.
         reverse, forward, difference: by direction, (n,).
         uncertainty: of the differences, as far as these tell, (n,).
-        scale: what errors are relative to.
+        scale: what errors are relative to, (n,).
         tolerance: relative.
     """
 
@@ -34,7 +34,7 @@ class LeafGradient:
     forward: np.ndarray
     difference: np.ndarray
     uncertainty: np.ndarray
-    scale: float
+    scale: np.ndarray
     tolerance: float
 
     @property
@@ -64,7 +64,7 @@ class LeafGradient:
         return self.agrees and not self.undecided
 
     def _largest(self, x: np.ndarray) -> float:
-        return float(np.max(np.abs(x))) / self.scale
+        return float(np.max(np.abs(x) / self.scale))
 
     def __str__(self) -> str:
         head = f"{self.name}: the modes differ by {self.modes_apart:.1e},"
@@ -77,7 +77,8 @@ class LeafGradient:
             return (
                 f"; UNDECIDED: differences tell no more than {self._largest(self.uncertainty):.1e}"
             )
-        i = int(np.argmax(np.abs(self.reverse - self.difference)))  # argmax finds NaN first
+        apart = np.maximum(*(np.abs(x - self.difference) for x in (self.reverse, self.forward)))
+        i = int(np.argmax(apart / self.scale))  # argmax finds NaN first
         return (
             f"; DISAGREES: reverse {self.reverse[i]:.9g}, forward {self.forward[i]:.9g},"
             f" differences {self.difference[i]:.9g}"
@@ -134,9 +135,10 @@ def check_gradients(
 
     Args:
         f: x → a number, or a pytree of them; a rollout, say.
-        x: pytree; leaves of integers are left as they are.
-        tolerance: relative to the largest derivative by the leaf; ε^⅓ unless given, which is 6e-6
-            in float64 and 5e-3 in float32. A derivative that rounding hides from differences is
+        x: pytree; leaves that are no floating numbers, and empty ones, are left as they are.
+        tolerance: relative to the derivative by the number, or to the largest along random
+            directions; ε^⅓ unless given, which is 6e-6 in float64 and 5e-3 in float32, ε being that
+            of the coarsest number in x and f. A derivative that rounding hides from differences is
             held to what they see.
         directions: of a leaf.
         seed: of random directions.
@@ -145,42 +147,51 @@ def check_gradients(
         The `GradientCheck`.
 
     Raises:
-        ValueError: x has no floating numbers.
+        ValueError: x or f has no floating numbers.
 
     References:
         Ridders, Accurate computation of F'(x) and F'(x)F''(x), Adv. Eng. Softw. 4 (1982).
     """
     checks.count("check_gradients", "directions", directions)
     random = np.random.default_rng(seed)
-    known = [(_name(path), jnp.asarray(leaf)) for path, leaf in jax.tree.leaves_with_path(x)]
-    floating = [i for i, (_, leaf) in enumerate(known) if _is_floating(leaf)]
+    named = [(_name(path), leaf) for path, leaf in jax.tree.leaves_with_path(x)]
+    floating = [i for i, (_, leaf) in enumerate(named) if _is_floating(leaf)]
     if not floating:
         raise ValueError("check_gradients: x has no leaf of floating numbers to differentiate by.")
-    structure, given = jax.tree.structure(x), [leaf for _, leaf in known]
-    weighted = _weighted(f, x, random)
+    structure, given = jax.tree.structure(x), [leaf for _, leaf in named]
 
-    def of(moved: list[Array]) -> tuple[Array, Array]:
+    def at(moved: list[Array]) -> PyTree:
         chosen = dict(zip(floating, moved, strict=True))
-        return weighted(structure.unflatten([chosen.get(i, x) for i, x in enumerate(given)]))
+        return f(structure.unflatten([chosen.get(i, leaf) for i, leaf in enumerate(given)]))
 
-    at = [given[i] for i in floating]
-    ways = [_directions(leaf, directions, random) for leaf in at]
-    results, size = _three_ways(of, at, ways)
-    eps = float(jnp.finfo(at[0].dtype).eps)
+    here = [jnp.asarray(given[i]) for i in floating]
+    results = [y for y in jax.tree.leaves(jax.eval_shape(at, here)) if _is_floating(y)]
+    if not results:
+        raise ValueError("check_gradients: f returns no floating number to differentiate.")
+    eps = max(float(jnp.finfo(y.dtype).eps) for y in [*here, *results])
+    ways = [_directions(leaf, directions, random) for leaf in here]
+    found, size = _three_ways(_weighted(at, results, random), here, ways, eps)
     allowed = eps ** (1 / 3) if tolerance is None else tolerance
     hidden = unseen(eps) * size / allowed
-    return GradientCheck(
-        tuple(
-            LeafGradient(known[i][0], *result, scale=_scale(result, hidden), tolerance=allowed)
-            for i, result in zip(floating, results, strict=True)
-        ),
-        allowed,
-    )
+    leaves = []
+    for i, leaf, result in zip(floating, here, found, strict=True):
+        scale = _scale(result, hidden, leaf.size <= directions)
+        leaves += [LeafGradient(named[i][0], *result, scale=scale, tolerance=allowed)]
+    return GradientCheck(tuple(leaves), allowed)
 
 
-def _scale(result: tuple[np.ndarray, ...], hidden: float) -> float:
-    """The largest derivative by a leaf, or what differences see at least."""
-    return float(np.nanmax([hidden, *np.abs(np.concatenate(result[:3]))])) or 1.0
+def _scale(result: tuple[np.ndarray, ...], hidden: float, alone: bool) -> np.ndarray:
+    """The derivative by each number, or the largest along random directions; no less than is seen.
+
+    Args:
+        result: by three ways, and their uncertainty.
+        hidden: what differences see at least.
+        alone: whether each direction is one number.
+    """
+    largest = np.fmax.reduce(np.abs(result[:3]), axis=0)
+    largest = largest if alone else np.full_like(largest, np.fmax.reduce(largest, initial=0.0))
+    largest = np.fmax(largest, hidden)
+    return np.where(largest > 0, largest, 1.0)
 
 
 def _name(path: Any) -> str:
@@ -188,25 +199,26 @@ def _name(path: Any) -> str:
     return jax.tree_util.keystr(path, simple=True, separator=".") or "x"
 
 
-def _weighted(f: Callable[[Any], PyTree], x: PyTree, random: Any) -> Callable[[Any], Any]:
+def _weighted(f: Callable[[Any], PyTree], results: list[Any], random: Any) -> Callable[[Any], Any]:
     """x → f, or a random combination of its results, and the sum of sizes that this adds up."""
-    shapes = [leaf for leaf in jax.tree.leaves(jax.eval_shape(f, x)) if leaf.size]
-    alone = len(shapes) == 1 and shapes[0].size == 1
-    weights = [np.ones(y.shape) if alone else random.normal(size=y.shape) for y in shapes]
+    alone = len(results) == 1 and results[0].size == 1
+    weights = [np.ones(y.shape) if alone else random.normal(size=y.shape) for y in results]
+    widest = max((y.dtype for y in results), key=lambda dtype: dtype.itemsize)
 
-    def value(x: PyTree) -> tuple[Array, Array]:
-        results = [y for y in jax.tree.leaves(f(x)) if y.size]
-        pairs = zip(weights, results, strict=True)
-        parts = [jnp.ravel(jnp.asarray(w, y.dtype) * y) for w, y in pairs if _is_floating(y)]
-        every = jnp.concatenate(parts)
+    def value(x: Any) -> tuple[Array, Array]:
+        found = [y for y in jax.tree.leaves(f(x)) if _is_floating(y)]
+        pairs = zip(weights, found, strict=True)
+        every = jnp.concatenate(
+            [jnp.ravel(jnp.asarray(w, widest) * jnp.asarray(y, widest)) for w, y in pairs]
+        )
         return jnp.sum(every), jnp.sum(jnp.abs(every))
 
     return value
 
 
 def _is_floating(x: Any) -> bool:
-    """Whether it has real numbers."""
-    return jnp.issubdtype(x.dtype, jnp.floating)
+    """Whether it has real numbers, and not none of them."""
+    return bool(jnp.issubdtype(jnp.result_type(x), jnp.floating) and np.prod(np.shape(x)) > 0)
 
 
 def _directions(leaf: Array, count: int, random: Any) -> Array:
@@ -220,7 +232,7 @@ def _directions(leaf: Array, count: int, random: Any) -> Array:
     return jnp.asarray(size * ways, leaf.dtype).reshape((len(ways), *leaf.shape))
 
 
-def _three_ways(of: Any, at: list[Array], ways: list[Array]) -> tuple[list[Any], float]:
+def _three_ways(of: Any, at: list[Array], ways: list[Array], eps: float) -> tuple[list[Any], float]:
     """By leaf: reverse, forward, difference, uncertainty, by direction; and the size of f."""
     counts = [len(way) for way in ways]
     total, ends = sum(counts), np.cumsum(counts)
@@ -237,6 +249,7 @@ def _three_ways(of: Any, at: list[Array], ways: list[Array]) -> tuple[list[Any],
     gradient, size = jax.jit(jax.grad(of, has_aux=True))(at)
     pairs = zip(ways, gradient, strict=True)
     reverse = [np.asarray(w.reshape(len(w), -1), np.float64) @ np.ravel(g) for w, g in pairs]
-    known = np.concatenate(reverse), np.asarray(forward, np.float64), *differences(value, at, moves)
+    apart = differences(value, at, moves, eps)
+    known = np.concatenate(reverse), np.asarray(forward, np.float64), *apart
     by_leaf = [tuple(x[end - n : end] for x in known) for n, end in zip(counts, ends, strict=True)]
     return by_leaf, float(size)

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import linearize
 from jaxcon.core import checks
+from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import Array
 from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method
@@ -96,7 +97,7 @@ def gradient_growth(
         The `GradientGrowth`, with some hundred times.
 
     Raises:
-        ValueError: the constraints leave no freedom, or what `rollout` refuses.
+        ValueError: the constraints leave no freedom, the rollout fails, or what `rollout` refuses.
     """
     checks.count("gradient_growth", "steps", steps, 4)
     moves = _allowed(at(system, state), state)
@@ -107,10 +108,10 @@ def gradient_growth(
         moves = moves @ np.linalg.qr(np.random.default_rng(seed).normal(size=(n, FULL)))[0]
     every = next(k for k in range(max(steps // 100, 1), 0, -1) if steps % k == 0)
 
-    def path(move: Array) -> Array:
+    def path(move: Array) -> tuple[Array, Array]:
         q = system.retract(state.q, move[: len(state.v)])
         start = dataclasses.replace(state, q=q, v=state.v + move[len(state.v) :])
-        _, kept = rollout(
+        final, kept = rollout(
             system,
             method,
             start,
@@ -120,14 +121,21 @@ def gradient_growth(
             record=lambda s, i: jnp.concatenate([s.q, s.v]),
             every=every,
         )
-        return jnp.concatenate([jnp.concatenate([start.q, start.v])[None], kept])
+        first = jnp.concatenate([start.q, start.v])
+        return jnp.concatenate([first[None], kept]), final.status
 
-    def along(move: Array) -> Array:
-        moved = jax.jvp(path, (jnp.zeros_like(move),), (move,))[1]
-        return jnp.sum(moved**2, axis=-1)
+    def along(move: Array) -> tuple[Array, Array]:
+        _, moved, code = jax.jvp(path, (jnp.zeros_like(move),), (move,), has_aux=True)
+        return jnp.sum(moved**2, axis=-1), code
 
     tangents = jnp.asarray(moves.T, state.q.dtype)
-    squares = np.asarray(jax.jit(jax.vmap(along))(tangents), np.float64)
+    squares, codes = jax.jit(jax.vmap(along))(tangents)
+    if failed(code := codes[0]):
+        raise ValueError(
+            f"gradient_growth: the rollout fails, {Status(int(code)).name}, and derivatives end"
+            " there; `find_first_failure` names the step and the term."
+        )
+    squares = np.asarray(squares, np.float64)
     growth = np.sqrt(np.sum(squares, axis=0) / np.sum(squares[:, 0]))
     time = float(dt) * every * np.arange(len(growth))
     half = len(growth) // 2

@@ -96,7 +96,7 @@ def integrability(system: Any, state: State, names: Sequence[str] | None = None)
     References:
         Bloch, Nonholonomic Mechanics and Control (2003), sections 2.8 and 4.3.
     """
-    system = at(system, state)
+    system = at(system, state, "jc.integrability(system, s)")
     layout = layout_of(system, state.q, state.v, state.time)
     holding = tuple(name for name in layout.names if name not in layout.inertial)
     chosen = holding if names is None else (names,) if isinstance(names, str) else tuple(names)

@@ -14,7 +14,7 @@ from jaxcon.model.state import State
 from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.segments import bytes_of, kept
+from jaxcon.simulation.segments import bytes_of
 from jaxcon.simulation.step import check_step, step_quietly
 
 BATCHES = 64, 256
@@ -107,7 +107,7 @@ class GradientMemory:
             adjoint: as of `rollout`.
         """
         check_adjoint(adjoint)
-        *checkpoints, last = kept(steps, adjoint.sizes(steps, self.start))
+        *checkpoints, last = adjoint.kept(steps, self.start)
         own = self.working + sum(checkpoints) * self.state + last * self.step
         return self.shared + worlds * own
 

@@ -20,36 +20,36 @@ from jaxcon.model.state import Energy, State, at
 
 def energy(system: Any, state: State) -> Energy:
     """Kinetic energy ½ vᵀMv and the potential of gravity and springs, () [J] each."""
-    system = at(system, state)
+    system = at(system, state, "jc.energy(system, s)")
     return system.energy(state.q, state.v, state.time)
 
 
 def violation(system: Any, state: State) -> Violation:
     """φ and φ̇ of a state, by constraint."""
-    system = at(system, state)
+    system = at(system, state, "jc.violation(system, s)")
     return linearize(system, state.q, state.v, state.time).violation
 
 
 def position(system: Any, state: State, body: str, point: Any = None) -> Array:
     """Where a body is, or a point given in its frame, (dim,) [m], world frame."""
-    motion = _motion(system, state, body)
+    motion = _motion(system, state, body, "position")
     return motion.position if point is None else motion.point(_local(motion, point))
 
 
 def velocity(system: Any, state: State, body: str, point: Any = None) -> Array:
     """How fast a body, or a point given in its frame, moves, (dim,) [m/s], world frame."""
-    motion = _motion(system, state, body)
+    motion = _motion(system, state, body, "velocity")
     return motion.velocity if point is None else motion.point_velocity(_local(motion, point))
 
 
 def orientation(system: Any, state: State, body: str) -> Array:
     """Its angle () [rad] in the plane, or quaternion wxyz (4,), body to world, in space."""
-    return _oriented(system, state, body).orientation
+    return _oriented(system, state, body, "orientation").orientation
 
 
 def angular_velocity(system: Any, state: State, body: str) -> Array:
     """() in the plane, (3,) in the body frame in space [rad/s]."""
-    return _oriented(system, state, body).angular_velocity
+    return _oriented(system, state, body, "angular_velocity").angular_velocity
 
 
 def coordinate(system: Any, state: State, joint: str, name: str | None = None) -> Array:
@@ -67,12 +67,12 @@ def coordinate(system: Any, state: State, joint: str, name: str | None = None) -
     Raises:
         ValueError: no such joint or coordinate.
     """
-    return jnp.reshape(_row(system, state, joint, name).value, ())
+    return jnp.reshape(_row(system, state, joint, name, "coordinate").value, ())
 
 
 def coordinate_rate(system: Any, state: State, joint: str, name: str | None = None) -> Array:
     """The rate of a coordinate of a joint, () [rad/s] or [m/s]; arguments as of `coordinate`."""
-    return jnp.reshape(_row(system, state, joint, name).rate, ())
+    return jnp.reshape(_row(system, state, joint, name, "coordinate_rate").rate, ())
 
 
 def center_of_mass(
@@ -85,13 +85,13 @@ def center_of_mass(
         state: where.
         bodies: whose; all that move unless given.
     """
-    found = _momentum(system, state, bodies)
+    found = _momentum(system, state, bodies, "center_of_mass")
     return _point(found.position), _point(found.velocity)
 
 
 def momentum(system: Any, state: State, bodies: Sequence[str] | None = None) -> Array:
     """Σ m ẋ of chosen bodies, all that move unless given, (dim,) [kg m/s], world frame."""
-    return _point(_momentum(system, state, bodies).linear)
+    return _point(_momentum(system, state, bodies, "momentum").linear)
 
 
 def angular_momentum(
@@ -109,7 +109,7 @@ def angular_momentum(
         The angular momentum, world frame. About the centre of mass it does not change where no
         outer torque acts, whatever the bodies do to each other.
     """
-    found = _momentum(system, state, bodies)
+    found = _momentum(system, state, bodies, "angular_momentum")
     own = found.angular
     if about is not None:
         point = checks.number(
@@ -120,8 +120,8 @@ def angular_momentum(
     return _point(own) if isinstance(own, Vector) else own[0]
 
 
-def _momentum(system: Any, state: State, bodies: Sequence[str] | None) -> Momentum:
-    system = at(system, state)
+def _momentum(system: Any, state: State, bodies: Sequence[str] | None, caller: str) -> Momentum:
+    system = at(system, state, f"jc.{caller}(system, s, bodies)")
     if not hasattr(system, "layout"):
         raise TypeError("momentum: a GeneralizedSystem has no bodies whose momentum could be read.")
     names = (
@@ -159,7 +159,7 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
         ValueError: no such constraint, or it does not act on this body.
         TypeError: `info` has no multipliers.
     """
-    system = at(system, state)
+    system = at(system, state, "jc.wrench(system, s, info, name)")
     if not hasattr(info, "multipliers"):
         raise TypeError(
             f"wrench: info must be a StepInfo or the Solution of forward_dynamics, got"
@@ -203,13 +203,14 @@ def multipliers(system: Any, state: State, info: Any, name: str) -> Array:
     Raises:
         ValueError: no such constraint.
     """
-    layout = layout_of(at(system, state), state.q, state.v, state.time)
+    here = at(system, state, "jc.multipliers(system, s, info, name)")
+    layout = layout_of(here, state.q, state.v, state.time)
     return info.multipliers[layout.rows(name)]
 
 
-def _row(system: Any, state: State, joint: str, name: str | None) -> Any:
+def _row(system: Any, state: State, joint: str, name: str | None, caller: str) -> Any:
     """A coordinate of one joint with its rate."""
-    system = at(system, state)
+    system = at(system, state, f"jc.{caller}(system, s, joint)")
     where = coordinates.directory(system.constraints)
     end = coordinates.find(system.constraints, where, "coordinate", joint, name)
     along = coordinates.at(coordinates.numbered(system.counted), [end])
@@ -252,13 +253,13 @@ def _local(motion: Motion, point: Any) -> Array:
     return checks.number("point", "it", point, dtype, shape)
 
 
-def _motion(system: Any, state: State, body: str) -> Motion:
-    system = at(system, state)
+def _motion(system: Any, state: State, body: str, caller: str) -> Motion:
+    system = at(system, state, f"jc.{caller}(system, s, body)")
     return system.motion(body, state.q, state.v)
 
 
-def _oriented(system: Any, state: State, body: str) -> Motion:
-    motion = _motion(system, state, body)
+def _oriented(system: Any, state: State, body: str, caller: str) -> Motion:
+    motion = _motion(system, state, body, caller)
     if motion.orientation is None:
         raise ValueError(f"'{body}' is a particle: it has no orientation.")
     return motion

@@ -34,8 +34,10 @@ class Report:
             displacement, velocity or acceleration can take away, because rows contradict each
             other; only of constraints where there is such a part.
         condition: of J M⁻¹ Jᵀ with rows scaled to unit length, independent rows only.
-        violation: ‖φ‖ and ‖φ̇‖ by constraint.
+        violation: ‖φ‖ and ‖φ̇‖ by constraint; both ‖ψ‖ where it holds velocities alone.
         memory: of a world in a batch [B], where a method was given.
+        bounded: names of what has bounded rows, limits, friction and contact, left out of the rest.
+        off: names of the constraints with ‖φ‖ above 1e-4; those that hold velocities have no φ.
     """
 
     coordinates: int
@@ -48,6 +50,8 @@ class Report:
     violation: dict[str, tuple[float, float]]
     memory: Memory | None = None
     conflicts: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    off: tuple[str, ...] = ()
+    bounded: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = [
@@ -56,12 +60,15 @@ class Report:
             f"{self.degrees_of_freedom} degrees of freedom",
             f"condition of the independent rows: {self.condition:.2g}",
         ]
+        if self.bounded:
+            lines.append(f"besides, rows with bounds: {', '.join(self.bounded)}")
         if self.redundant:
             named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
             lines.append(
-                f"redundant rows (each depends on rows before it): {named}; the default solver"
-                " takes them as they are, but shares forces among them as it chooses; to know"
-                " these, keep only independent rows, as with a joint of fewer rows in the loop"
+                f"redundant rows (each depends on rows before it here): {named}; the default"
+                " solver takes them as they are, but shares forces among them as it chooses; to"
+                " know these, keep only independent rows, as with a joint of fewer rows in the"
+                " loop, unless this is a singular position, which another state tells"
             )
         if self.conflicts:
             lines.append(
@@ -78,10 +85,10 @@ class Report:
             f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
             for name, (phi, rate) in self.violation.items()
         ]
-        if max((phi for phi, _ in self.violation.values()), default=0.0) > OFF:
+        if self.off:
             lines.append(
-                "off its constraints: print(jc.assemble(system, state)) takes it to the nearest"
-                " positions that meet them, or names those that cannot be met"
+                f"off {', '.join(self.off)}: print(jc.assemble(system, state)) takes it to the"
+                " nearest positions that meet them, or names those that cannot be met"
             )
         return "\n".join(lines)
 
@@ -104,13 +111,17 @@ def report(
     Returns:
         A `Report`.
     """
-    system = at(system, state)
+    system = at(system, state, "jc.report(system, s)")
     rows, dense_j, dense_m = linearized(system, state)
     unit = UnitRows(rows.layout, dense_j, dense_m)
     dependent = dependent_rows(unit.values, unit.tolerance)
     singular = np.linalg.svd(np.delete(unit.values, dependent, axis=0), compute_uv=False)
     rank = len(unit.values) - len(dependent)
     left = [unit.contradicting(x) for x in (rows.residual, rows.rate, rows.bias)]
+    violation = {
+        name: (float(rows.violation[name]), float(rows.violation.rate(name)))
+        for name in rows.layout.names
+    }
     return Report(
         coordinates=state.q.shape[0],
         velocities=state.v.shape[0],
@@ -119,10 +130,13 @@ def report(
         degrees_of_freedom=state.v.shape[0] - rank,
         redundant=tuple(unit.owners[i] for i in dependent),
         condition=float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
-        violation={
-            name: (float(rows.violation[name]), float(rows.violation.rate(name)))
-            for name in rows.layout.names
-        },
+        violation=violation,
+        off=tuple(
+            name
+            for name, (size, _) in violation.items()
+            if size > OFF and name not in rows.layout.velocity_level
+        ),
+        bounded=tuple(name for group in system.bounds for name in group.names),
         memory=None if method is None else memory(system, method, state, control),
         conflicts={
             name: (left[0].get(name, 0.0), left[1].get(name, 0.0), left[2].get(name, 0.0))

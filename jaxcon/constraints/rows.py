@@ -144,6 +144,7 @@ class Rows:
         layout: rows by constraint.
         compliance: the diagonal of C, (n_c,); None where it is zero.
         mass: M, where a step tells it to those who weigh rows.
+        reactions: what bounded rows did, where there are any.
     """
 
     residual: Array
@@ -153,6 +154,7 @@ class Rows:
     layout: RowLayout = static()
     compliance: Array | None = None
     mass: Mass | None = None
+    reactions: Any = None
 
     @property
     def violation(self) -> Violation:

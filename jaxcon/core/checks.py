@@ -18,6 +18,11 @@ def is_concrete(x: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
 
 
+def plain_zero(x: Any) -> bool:
+    """Whether a user gave the number 0 itself, which leaves no trace in the compiled step."""
+    return isinstance(x, int | float) and x == 0
+
+
 def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = ()) -> Array:
     """The value as an array of this dtype and shape.
 
@@ -42,13 +47,55 @@ def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = (
 
 
 def positive(owner: str, what: str, x: Any, strictly: bool = True) -> None:
-    """Checks that every value is positive (or not negative) and finite."""
+    """Checks that every value is positive (or not negative) and finite.
+
+    Raises:
+        ValueError: one is not, or is no number.
+    """
     if is_concrete(x):
-        values = np.asarray(x)
+        values = _values(owner, what, x)
         good = (values > 0) if strictly else (values >= 0)
         if not np.all(good & np.isfinite(values)):
             bound = "positive" if strictly else "zero or more"
             raise ValueError(f"{owner}: {what} must be {bound} and finite, got {values.tolist()}.")
+
+
+def amount(owner: str, what: str, x: Any, dtype: Any) -> Array:
+    """The value as an array () of this dtype, zero or more and finite.
+
+    Raises:
+        ValueError: as of `number` and `positive`.
+    """
+    value = number(owner, what, x, dtype)
+    positive(owner, what, value, strictly=False)
+    return value
+
+
+def between(owner: str, what: str, x: Any, low: float, high: float) -> None:
+    """Checks that every value lies between two.
+
+    Raises:
+        ValueError: one does not, or is no number.
+    """
+    if is_concrete(x):
+        values = _values(owner, what, x)
+        if not np.all((values >= low) & (values <= high)):
+            raise ValueError(f"{owner}: {what} must lie between {low} and {high}, got {x}.")
+
+
+def _values(owner: str, what: str, x: Any) -> np.ndarray:
+    """Real numbers as an array of the host.
+
+    Raises:
+        ValueError: they are none.
+    """
+    try:
+        values = np.asarray([np.asarray(y) for y in x] if isinstance(x, list | tuple) else x)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{owner}: {what} must be numbers of one shape, got {x!r}.") from error
+    if not any(jnp.issubdtype(values.dtype, kind) for kind in (jnp.floating, jnp.integer)):
+        raise ValueError(f"{owner}: {what} must be a real number, got {x!r}.")
+    return values.astype(float)
 
 
 def count(owner: str, what: str, x: Any, least: int = 1) -> None:
@@ -57,19 +104,30 @@ def count(owner: str, what: str, x: Any, least: int = 1) -> None:
     Raises:
         ValueError: it is not.
     """
-    if not isinstance(x, int) or isinstance(x, bool) or x < least:
+    whole = isinstance(x, int | np.integer) and not isinstance(x, bool)
+    if not whole or x < least:
         raise ValueError(f"{owner}: {what} must be a whole number from {least}, got {x!r}.")
 
 
 def nonzero(owner: str, what: str, x: Any) -> None:
-    """Checks that a vector has a direction."""
+    """Checks that a vector has a direction.
+
+    Raises:
+        ValueError: it has none, or is none of numbers.
+    """
     if is_concrete(x):
-        values = np.asarray(x)
+        values = _values(owner, what, x)
         if not np.all(np.isfinite(values)) or not np.linalg.norm(values) > 0:
             raise ValueError(f"{owner}: {what} must have a length, got {values.tolist()}.")
 
 
 def finite(owner: str, what: str, x: Any) -> None:
-    """Checks that every value is finite."""
-    if is_concrete(x) and not np.all(np.isfinite(np.asarray(x))):
-        raise ValueError(f"{owner}: {what} must be finite, got {np.asarray(x).tolist()}.")
+    """Checks that every value is finite.
+
+    Raises:
+        ValueError: one is not, or is no number.
+    """
+    if is_concrete(x):
+        values = _values(owner, what, x)
+        if not np.all(np.isfinite(values)):
+            raise ValueError(f"{owner}: {what} must be finite, got {values.tolist()}.")

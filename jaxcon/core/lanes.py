@@ -285,3 +285,11 @@ def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
         return result.stack() if isinstance(result, Vector) else result
 
     return wrapped
+
+
+def widened(tree: Any) -> Any:
+    """Lanes with a last axis of size 1, for what is done to many right sides at once.
+
+    Those lie along the last axis, so that memory is contiguous over them even for a single world.
+    """
+    return jax.tree.map(lambda x: x[..., None] if jnp.ndim(x) else x, tree)

@@ -22,17 +22,22 @@ class Status(IntEnum):
     RELAXED = 19
 
 
+_CONFLICT = int(Status.CONFLICT)
+"""A member is no Python number to JAX where jit is disabled, and would make an int64 of a code."""
+
 REPAIRS = (Status.ROLLED_BACK, Status.PROJECTED, Status.RELAXED)
 """Notes of a `Recovery`: what acted."""
 
 
 MEANING = {
     Status.NON_FINITE: "a state, force or parameter is NaN or infinite; likely (a) a step too large"
-    " for the fastest motion, (b) a NaN in the control or parameters, (c) an unstable gain",
+    " for the fastest motion, (b) a NaN in the control or parameters, (c) an unstable gain,"
+    " (d) a start far off the constraints under gains that are not gentle",
     Status.SINGULAR: "the constraint rows are dependent, or the mass matrix is not positive"
     " definite; `report` names redundant rows; likely (a) a closed spatial loop of revolute joints,"
-    " (b) the same constraint twice, (c) a singular position of the mechanism; rows that agree are"
-    " solved by `RankSafe()`, the solver of a `Method` that names none",
+    " (b) the same constraint twice, (c) a singular position of the mechanism, (d) a motion that"
+    " had grown without bound before, as under unstable gains; rows that agree are solved by"
+    " `RankSafe()`, the solver of a `Method` that names none",
     Status.NOT_CONVERGED: "an iteration did not reach its tolerance; likely (a) too few iterations,"
     " (b) a tolerance below what rounding allows, (c) a start too far off the constraints,"
     " (d) redundant rows that contradict each other, (e) a step too large for the fastest motion",
@@ -54,7 +59,7 @@ class SimulationError(RuntimeError):
 
 def failed(code: Array) -> Array:
     """Whether a world has failed, by its code: it keeps its last finite state."""
-    return (code != Status.OK) & (code < Status.CONFLICT)
+    return (code != 0) & (code < _CONFLICT)
 
 
 def failures(code: Array) -> Array:
@@ -64,9 +69,9 @@ def failures(code: Array) -> Array:
 
 def first(earlier: Array, later: Array) -> Array:
     """The graver code, a failure before a conflict before a repair; of equals the earlier."""
-    conflict = (later == Status.CONFLICT) & (earlier > Status.CONFLICT)
+    conflict = (later == _CONFLICT) & (earlier > _CONFLICT)
     graver = failed(later) & ~failed(earlier) | conflict
-    return jnp.where((earlier == Status.OK) | graver, later, earlier)
+    return jnp.where((earlier == 0) | graver, later, earlier)
 
 
 def raise_for_status(result: object) -> None:

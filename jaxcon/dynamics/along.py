@@ -11,6 +11,7 @@ from jaxcon.constraints.armature import Armature, Armatures
 from jaxcon.constraints.base import Joints
 from jaxcon.constraints.couplings import Couplings
 from jaxcon.constraints.drive import Drives
+from jaxcon.constraints.limits import Bounds
 from jaxcon.model.actuators import JointForces
 from jaxcon.model.coordinates import (
     End,
@@ -62,6 +63,15 @@ class Along:
             Armatures(params, names, places, along=along)
             for _, params, names, (along,), places, _ in self._gather(rotors)
         ]
+
+    def bounds(self) -> list[Bounds]:
+        """Limits, dry friction, and motors by their rate."""
+        bounded = [e for e in self.elements if hasattr(e, "law") and hasattr(e, "joint")]
+        result = []
+        for cls, params, names, (along,), places, _ in self._gather(bounded):
+            own = [self.layout.control(n).start for n in names] if _width(cls) else ()
+            result.append(Bounds(params, names, places, law=cls, along=along, starts=tuple(own)))
+        return result
 
     def couplings(self) -> list[Couplings]:
         """Gears and their like."""

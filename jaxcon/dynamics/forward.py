@@ -5,13 +5,20 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
 
+from jaxcon.constraints.bound_layout import Reactions
+from jaxcon.constraints.bounds import BoundRows, linearize_bounds
 from jaxcon.constraints.rows import Rows, linearize
+from jaxcon.core.lanes import widened
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.solvers.saddle import Saddle, Solution
+from jaxcon.dynamics.parts import Part, Struck
+from jaxcon.dynamics.reactions import Impulse
+from jaxcon.solvers.nearest_rows import Nearest
+from jaxcon.solvers.saddle import Factored, Saddle, Solution
 
 
 def saddle(
@@ -46,6 +53,10 @@ class Dynamics:
         control: u.
         memory: of the stabiliser.
         dt: h, () [s].
+        bounded: the solver of bounded rows; None where there are none.
+        guess: their multipliers a step ago, (n,); None where they are not kept.
+        held: what they do over the whole step, once it is known, (n_v,).
+        part: of the step that is advanced; None for all of it.
     """
 
     system: Any
@@ -54,24 +65,104 @@ class Dynamics:
     control: PyTree
     memory: PyTree
     dt: Any
+    bounded: Any = None
+    guess: Any = None
+    held: Any = None
+    part: Part | None = None
 
     def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
         """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago."""
         rows, law, problem = self._problem(q, v, t, age)
+        if self.bounded is not None:
+            return self._reacted(q, v, t, rows, law, problem)[:2]
         own = self.solver.solve(problem) if law.solve is None else law.solve(self.solver, problem)
         return self.system.complete(own), rows
+
+    def begun(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows, Dynamics]:
+        """The same at the start of a step, and what the rest of it sees.
+
+        Bounded rows contain the step: they are solved once, and act as a force that stays.
+        """
+        if self.bounded is None:
+            return *self(q, v, t), self
+        rows, law, problem = self._problem(q, v, t, None)
+        solution, rows, force = self._reacted(q, v, t, rows, law, problem)
+        return solution, rows, dataclasses.replace(self, bounded=None, held=force)
+
+    def _reacted(
+        self, q: Array, v: Array, t: Any, rows: Rows, law: Any, problem: Saddle
+    ) -> tuple[Solution, Rows, Array]:
+        """a and λ with bounded rows, the rows with what these do, and their generalized force."""
+        if self.part is None:
+            bounds, length, acts = self.bounds(q, v, t, self.dt), self.dt, None
+        else:
+            bounds, acts = self.part.ask(lambda dt: self.bounds(q, v, t, dt), self.dt)
+            length = self.part.length
+        impulse = self._impulse(bounds, law, problem, length, acts)
+        known = impulse.react(self.bounded, self.guess)
+        solution = self.system.complete(impulse.motion(known.multipliers))
+        if self._leaves_out(bounds):
+            missed = impulse.overlooked(known.multipliers, solution.acceleration)
+            known = dataclasses.replace(known, residual=jnp.maximum(known.residual, missed))
+        own = bounds.jacobian.transpose(known.multipliers)
+        return solution, dataclasses.replace(rows, reactions=known), own
+
+    def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
+        """The bounded rows, and what a step of dt wants of them."""
+        return linearize_bounds(self.system, q, v, t, self.control, dt)
+
+    def unbounded(self, q: Array, v: Array, t: Any) -> Array:
+        """a without bounded rows."""
+        _, law, problem = self._problem(q, v, t, None)
+        return self._factors(law, problem)(problem.force, law.target).acceleration
+
+    def impact(self, q: Array, v: Array, t: Any, struck: Struck) -> tuple[Array, Reactions]:
+        """Δv of an impact, and its impulses [N s, N m s] in the place of multipliers.
+
+        Time stands still, and forces have none of it: M Δv = J_eᵀ Λ_e + Jᵀ Λ, J_e Δv + C Λ_e = 0.
+        """
+        _, law, problem = self._problem(q, v, t, None)
+        rows, acts = struck.ask(self.bounds(q, v, t, self.dt), self.dt)
+        none = jnp.zeros_like(problem.force), jnp.zeros_like(law.target)
+        still = dataclasses.replace(problem, force=none[0], target=none[1])
+        impulse = self._impulse(rows, law, still, jnp.ones_like(self.dt), acts)
+        known = impulse.react(self.bounded, None)
+        return impulse.change(known.multipliers), known
 
     def factored(
         self, q: Array, v: Array, t: Any, age: Any = None
     ) -> tuple[Solution, Rows, Callable[[Array], Solution]]:
         """The same, and Δv → the nearest change of v in the metric of M that the rows allow."""
         rows, law, problem = self._problem(q, v, t, age)
-        solve, none = self.solver.factor(problem), jnp.zeros_like(law.target)
+        solve, none = self._factors(law, problem), jnp.zeros_like(law.target)
 
         def allowed(change: Array) -> Solution:
             return solve(problem.mass.apply(change), none)
 
         return self.system.complete(solve(problem.force, law.target)), rows, allowed
+
+    def _impulse(self, rows: BoundRows, law: Any, problem: Saddle, dt: Any, acts: Any) -> Impulse:
+        """How bounded rows act, by factors of wide lanes, to which the solver's numbers belong."""
+        wide = dataclasses.replace(self, solver=widened(self.solver))
+        factor = partial(wide._factors, law)
+        return Impulse.of(rows, factor, problem, dt, acts, sifts=self._leaves_out(rows))
+
+    def _leaves_out(self, rows: BoundRows) -> bool:
+        """Whether only some of the rows are solved."""
+        return isinstance(self.bounded, Nearest) and self.bounded.leaves_out(rows.kinds)
+
+    def _factors(self, law: Any, problem: Saddle) -> Factored:
+        """The solution as a function of f and b.
+
+        Raises:
+            ValueError: the stabiliser solves by itself, without factors to be used again.
+        """
+        if law.solve is not None:
+            raise ValueError(
+                'gyroscopic="trapezoidal" and bounded rows solve with the factors of the step, and'
+                " AugmentedLagrangian has rounds of its own; take Baumgarte(), or do without them."
+            )
+        return self.solver.factor(problem)
 
     def _problem(self, q: Array, v: Array, t: Any, age: Any) -> tuple[Rows, Any, Saddle]:
         """The rows, the law of the stabiliser, and the saddle system of both."""
@@ -81,4 +172,5 @@ class Dynamics:
         )
         force = self.system.force(q, v, t, self.control)
         force = force if law.force is None else force + law.force
+        force = force if self.held is None else force + self.held
         return rows, law, saddle(self.system, q, law.rows, force, law.target, law.noise)

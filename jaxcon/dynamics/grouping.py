@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.base import Joints
+from jaxcon.constraints.contact import Touches
 from jaxcon.constraints.curves import Curves, PointOnCurve
 from jaxcon.constraints.custom import CustomOnBodies, Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
@@ -93,6 +94,15 @@ class Gather:
         momenta = self.momenta(_of(elements, AngularMomentum, LinearMomentum))
         custom = self.customs(_of(elements, Holonomic, VelocityLevel))
         return [*along.joints, *held, *curves, *momenta, *custom]
+
+    def bounds(self, elements: Iterable[Any], along: Along) -> list[Any]:
+        """What has bounded multipliers: along joints, and between bodies."""
+        pairs = [e for e in elements if hasattr(e, "bounds") and not hasattr(e, "joint")]
+        for pair in pairs:
+            self._check_joint(pair)
+        groups = self._gather(pairs, lambda e: (e.body_a, e.body_b))
+        touches = [Touches(p, names, places, law=cls) for cls, p, names, places in groups]
+        return [*along.bounds(), *touches]
 
     def forces(self, elements: Iterable[Any], along: Along) -> list[Any]:
         """Force elements of every class."""
@@ -201,7 +211,7 @@ class Gather:
         groups: dict[Any, list[Any]] = {}
         for element in elements:
             names = bodies(element)
-            params = element.attach(*(self.poses[name] for name in names))
+            params = self._attach(element, names)
             sides = tuple(self._group(name) for name in names)
             fields = tuple((field, jax.tree.map(jnp.shape, x)) for field, x in params.items())
             groups.setdefault((_kind(element), sides, fields), []).append((element, params))
@@ -212,6 +222,14 @@ class Gather:
             places = tuple(map(self._place, columns))
             result.append((cls, stack([p for _, p in members]), names, places))
         return result
+
+    def _attach(self, element: Any, names: tuple[str, ...]) -> dict[str, Any]:
+        """The numbers of an element, which may ask for the users' frames of its bodies too."""
+        poses = [self.poses[name] for name in names]
+        if getattr(element, "framed", False):
+            origin = Pose(jnp.zeros(self.dim, self.dtype))
+            poses += [self.own.get(name, origin) for name in names]
+        return element.attach(*poses)
 
     def _group(self, name: str) -> int | None:
         return self.layout.locate(name)[0] if name in self.layout.places else None

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
@@ -117,6 +118,11 @@ def _solid(body: BodyInput, dim: int, dtype: Any) -> solids.Inertia:
             body.mass, checks.number(_label(body), "inertia", given, dtype, (3, 3))
         )
     else:
+        if dim == 2 and np.ndim(given):
+            raise ValueError(
+                f"{_label(body)}: inertia must have shape () in the plane, about the normal through"
+                f" the centre of mass, got {np.shape(given)}; of principal moments give the third."
+            )
         given = solids.Inertia(body.mass, given)
     moments = given.moments
     if dim == 2 and jnp.asarray(moments).shape == (3,):

@@ -159,6 +159,7 @@ class Scene:
             turns=turns,
             layout=layout,
             counted=along.counted,
+            bounds=tuple(gather.bounds(elements, along)),
         )
         state = dataclasses.replace(self._state(layout, bodies), turns=turns)
         for group in constraints:

@@ -75,6 +75,11 @@ class Vakonomic:
         """Those of the system."""
         return self.system.params
 
+    @property
+    def bounds(self) -> tuple[Any, ...]:
+        """None, as of the physical system."""
+        return ()
+
     def with_params(self, changes: Any) -> Vakonomic:
         """With other parameters of the system."""
         return dataclasses.replace(self, system=self.system.with_params(changes))
@@ -182,8 +187,14 @@ def vakonomic(
         The variational system, and its state.
 
     Raises:
-        ValueError: an unknown name, one whose rows all have a φ, or a wrong shape.
+        ValueError: an unknown name, one whose rows all have a φ, or a wrong shape; bounded rows.
     """
+    if system.bounds:
+        names = [name for group in system.bounds for name in group.names]
+        raise ValueError(
+            f"vakonomic: there is no variational form of the bounded rows of {names} here; build"
+            " the scene without these elements."
+        )
     layout = layout_of(at(system, state), state.q, state.v, state.time)
     result = Vakonomic(system, layout)
     μ = jnp.zeros(len(result.free), state.v.dtype)

@@ -61,8 +61,11 @@ def cylinder(mass: Any, radius: Any, length: Any) -> Inertia:
     return Inertia(mass, (across, across, mass * radius**2 / 2))
 
 
-def rod(mass: Any, length: Any, radius: Any) -> Inertia:
+def rod(mass: Any, *, length: Any, radius: Any) -> Inertia:
     """Rod along x of circular section: I_x = m r² / 2, I_y = I_z = m (3 r² + l²) / 12.
+
+    Its sizes go by name: `cylinder` and `capsule`, which are thick and lie along z, have the radius
+    first.
 
     A rod without thickness cannot be turned about itself in space; in the plane use
     `inertia=mass * length**2 / 12`.

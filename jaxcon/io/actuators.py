@@ -92,10 +92,37 @@ def _law(compiled: Compiled, i: int, name: str, transmission: Transmission) -> A
         law[1] *= measured
     obeyed = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl")
     control = m.actuator_ctrlrange[i] if obeyed else None
-    force = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
+    force = _force_range(compiled, i, gear)
     if not gain[1:].any() and not bias.any() and force is None:
         return Motor(name, at.joint, gear * gain[0], control, at.name)
     return AffineActuator(name, at.joint, gain, bias, gear, control, force, at.name)
+
+
+def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
+    """Of the actuator and of its joint, before gear: what passes both, one after the other.
+
+    Raises:
+        NotImplementedError: the joint limits the sum of several actuators.
+    """
+    m, joint = compiled.model, int(compiled.model.actuator_trnid[i, 0])
+    own = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
+    if not m.jnt_actfrclimited[joint] or not gear:
+        return own
+    at_joint = [_acts_on(compiled, k, joint) for k in range(m.nu)]
+    if sum(at_joint) > 1:
+        raise NotImplementedError(
+            f"from_mjcf: joint '{compiled.name('joint', joint)}' has an actuatorfrcrange and"
+            f" {sum(at_joint)} actuators, whose sum it limits; give each a forcerange instead."
+        )
+    joints = np.sort(m.jnt_actfrcrange[joint] / gear)
+    return joints if own is None else np.clip(own, *joints)
+
+
+def _acts_on(compiled: Compiled, i: int, joint: int) -> bool:
+    """Whether an actuator acts on a joint."""
+    m = compiled.model
+    kind = compiled.choice("mjtTrn", m.actuator_trntype[i])
+    return kind in ("joint", "jointinparent") and int(m.actuator_trnid[i, 0]) == joint
 
 
 def _vector(

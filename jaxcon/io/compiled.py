@@ -12,6 +12,7 @@ class Compiled:
 
     Args:
         source: path of an MJCF or URDF file, its text, or an `mujoco.MjModel`.
+        ignored: what the user leaves out.
 
     Raises:
         ImportError: MuJoCo is not installed.
@@ -20,8 +21,8 @@ class Compiled:
         TypeError: it is none of these.
     """
 
-    def __init__(self, source: Any) -> None:
-        self.mujoco = _mujoco()
+    def __init__(self, source: Any, ignored: frozenset[str] = frozenset()) -> None:
+        self.mujoco, self.ignored = _mujoco(), ignored
         self.model = self._compile(source)
         self.data = self.mujoco.MjData(self.model)
         self.mujoco.mj_kinematics(self.model, self.data)
@@ -56,7 +57,9 @@ class Compiled:
         return getattr(self.mujoco, enum)(int(value)).name.split("_", 1)[1].lower()
 
     def disabled(self, *features: str) -> bool:
-        """Whether a flag of the options disables one of these features."""
+        """Whether a flag of the options, or the user, disables one of these features."""
+        if self.ignored.intersection(features):
+            return True
         known = self.mujoco.mjtDisableBit.__members__
         bits = [known[f"mjDSBL_{f.upper()}"] for f in features if f"mjDSBL_{f.upper()}" in known]
         return any(self.model.opt.disableflags & int(bit) for bit in bits)

@@ -1,19 +1,16 @@
-"""The joints of a link, and the springs, dampers and rotors on them."""
+"""The joints of a link."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxcon.constraints.armature import Armature
 from jaxcon.constraints.compound import DEPENDENT, Compound
 from jaxcon.constraints.joints import Prismatic, Revolute, Spherical
 from jaxcon.constraints.twist import Twist
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.links import Link, LinkJoint
-from jaxcon.model.actuators import JointDamper, JointSpring
 from jaxcon.model.layout import WORLD
 
 MEETING = 1e-9
@@ -131,54 +128,6 @@ def _meeting_point(compiled: Compiled, link: Link, joints: list[LinkJoint]) -> n
             f" {distance:.2g} m; hinges of one body must meet in a point. Put a body between them."
         )
     return nearest
-
-
-def passive(
-    compiled: Compiled, link: Link, joint: LinkJoint, at: Coordinate | None, names: Names
-) -> Iterator[Any]:
-    """The spring, damper and rotor of one of MuJoCo's joints, along its coordinate or freedoms."""
-    m = compiled.model
-    own = compiled.name("joint", joint.id)
-    numbers = {
-        "stiffness": 0.0 if compiled.disabled("spring", "passive") else m.jnt_stiffness[joint.id],
-        "damping": 0.0 if compiled.disabled("damper", "passive") else m.dof_damping[joint.v],
-        "armature": m.dof_armature[joint.v],
-    }
-    if at is not None:
-        rest = m.qpos_spring[joint.q] - m.qpos0[joint.q]
-        yield from _along(own, at, numbers, rest, names)
-    elif any(numbers.values()):
-        elements, coordinates = _freedoms(compiled, link, joint, names)
-        yield from elements
-        for freedom in coordinates:
-            yield from _along(f"{own} {freedom.name}", freedom, numbers, 0.0, names)
-
-
-def _along(
-    own: str, at: Coordinate, numbers: dict[str, float], rest: float, names: Names
-) -> Iterator[Any]:
-    """A spring with damping, or a damper, and a rotor."""
-    stiffness, damping, armature = numbers.values()
-    if stiffness:
-        name = names.take(f"{own} spring", "spring")
-        yield JointSpring(name, at.joint, stiffness, damping, rest, at.name)
-    elif damping:
-        yield JointDamper(names.take(f"{own} damper", "damper"), at.joint, damping, at.name)
-    if armature:
-        yield Armature(names.take(f"{own} rotor", "rotor"), at.joint, armature, at.name)
-
-
-def _freedoms(compiled: Compiled, link: Link, joint: LinkJoint, names: Names) -> Any:
-    """Joints without rows along the freedoms of a ball or free joint, and their coordinates."""
-    own = compiled.name("joint", joint.id)
-    frame = compiled.data.xmat[link.body].reshape(3, 3)
-    elements = [turning(link, axis, names.take(f"{own} twist", "twist")) for axis in frame.T]
-    coordinates = [Coordinate(twist.name, "twist") for twist in elements]
-    if joint.kind == "free":
-        push = pushing(compiled, link, np.eye(3), names.take(f"{own} push", "push"))
-        elements = [push, *elements]
-        coordinates = [Coordinate(push.name, f"travel_{i}") for i in (1, 2, 3)] + coordinates
-    return elements, coordinates
 
 
 def turning(link: Link, axis: Any, name: str, backward: bool = False) -> Twist:

@@ -16,11 +16,13 @@ from jaxcon.core.typing import Array
 from jaxcon.dynamics.scene import Scene
 from jaxcon.io.actuators import actuators
 from jaxcon.io.compiled import Compiled, Names
+from jaxcon.io.contacts import contacts
 from jaxcon.io.equalities import equalities
-from jaxcon.io.joints import Coordinate, join, passive
+from jaxcon.io.joints import Coordinate, join
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Scalar, Tree
-from jaxcon.io.refusals import refuse
+from jaxcon.io.passive import passive
+from jaxcon.io.refusals import left_out, refuse
 from jaxcon.model.coordinates import TurnCounter
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
@@ -128,10 +130,28 @@ def from_mjcf(
     step are the user's, `timestep` is the model's. What has no effect on the motion (sites,
     cameras, sensors) is left out; what has one and is not supported is refused by name.
 
+    Ranges of hinges and slides are `Limit`s, frictionloss is `JointFriction`, and pairs of geoms
+    that may touch are contacts: spheres, capsules by the balls at their ends, and boxes by their
+    corners on planes, and spheres and capsules on each other. Stops and contacts are hard and
+    without rebound, not soft by `solref` and `solimp`; they act where MuJoCo's soft ones begin to,
+    at `margin` from the stop or surface. Friction is Coulomb's, by the sliding coefficient alone.
+    `info.reactions["knee limit"]`, `["knee friction"]` and `["floor and foot"]`, numbered where a
+    shape touches at several points, read what they do.
+
+    Every pair is rows in every step, whether it touches or not. Where a model lets its own limbs
+    touch, many pairs are between them; `ignore=("self_contact",)` keeps the ground alone.
+
     Args:
         source: path of a file, its text, or a `mujoco.MjModel`.
-        ignore: what to leave out although it has an effect, out of "contact", "limit", "friction",
-            "tendon", "fluid" and "gravcomp".
+        ignore: what to leave out although it has an effect, out of
+            "contact": all contacts,
+            "self_contact": those between two bodies that move,
+            "shape": those of shapes for which there is none here,
+            "torsion": torsional and rolling friction, by condim 4 or 6,
+            "limit": all limits of joints,
+            "ball_limit": those of ball joints,
+            "friction": dry friction of joints,
+            "tendon": tendons with all that they do, "fluid", and "gravcomp".
         count_turns: whether every hinge counts its whole turns, so that `qpos` gives them.
         dtype: of every number; JAX's default float unless given.
 
@@ -144,8 +164,8 @@ def from_mjcf(
         ValueError: MuJoCo cannot compile it, or nothing in it moves.
         NotImplementedError: it has what is not supported; the message names it.
     """
-    compiled = Compiled(source)
-    refuse(compiled, ignore)
+    compiled = Compiled(source, left_out(ignore))
+    refuse(compiled)
     names = Names()
     links = find_links(compiled, names)
     scene = Scene(gravity=_gravity(compiled), dtype=dtype)
@@ -198,6 +218,8 @@ def _add_elements(
             if count and at is not None and joint.kind == "hinge":
                 own = compiled.name("joint", joint.id)
                 scene.add(TurnCounter(names.take(f"{own} turns", "turns"), *at))
+    for element in contacts(compiled, links, names):
+        scene.add(element)
     return found
 
 

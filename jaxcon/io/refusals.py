@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxcon.io import pairs
 from jaxcon.io.compiled import Compiled
+from jaxcon.io.pairs import Pair
 
 ZERO = (
     ("joint", "jnt_stiffnesspoly", "polynomial stiffness"),
     ("joint", "jnt_springyield", "a spring that yields"),
-    ("joint", "jnt_actfrclimited", "actuatorfrcrange"),
     ("actuator", "actuator_damping", "damping"),
     ("actuator", "actuator_dampingpoly", "polynomial damping"),
     ("actuator", "actuator_armature", "armature"),
@@ -21,50 +22,34 @@ ZERO = (
 """Arrays of MuJoCo's model that must be zero: of what, which, and what they mean."""
 
 
-def contacts(compiled: Compiled) -> list[str]:
-    """Pairs of geoms that may touch."""
-    if compiled.disabled("contact", "constraint"):
-        return []
+def shapes(compiled: Compiled) -> list[str]:
+    """Pairs of geoms for whose shapes there is no contact."""
+    unknown = [p for p in pairs.pairs(compiled) if not pairs.supported(compiled, p)]
+    return [_described(compiled, p) for p in unknown]
+
+
+def torsion(compiled: Compiled) -> list[str]:
+    """Pairs of geoms with more than sliding friction."""
+    found = [p for p in pairs.pairs(compiled) if p.condim > 3 and pairs.supported(compiled, p)]
+    return [pairs.label(compiled, p) for p in found]
+
+
+def ball_limits(compiled: Compiled) -> list[str]:
+    """Ball joints that have a range."""
     m = compiled.model
-    pairs = [f"pair {i}" for i in range(m.npair)]
-    weld, parent = m.body_weldid, m.body_weldid[m.body_parentid]
-    excluded = {int(x) for x in m.exclude_signature}
-    filtered = not compiled.disabled("filterparent")
-    for g in range(m.ngeom):
-        for h in range(g):
-            a, b = sorted((int(m.geom_bodyid[h]), int(m.geom_bodyid[g])))
-            u, w = int(weld[a]), int(weld[b])
-            related = u and w and (parent[u] == w or parent[w] == u)
-            known = u == w or (a << 16) + b in excluded
-            first = m.geom_contype[g] & m.geom_conaffinity[h]
-            second = m.geom_contype[h] & m.geom_conaffinity[g]
-            if (first or second) and not known and not (related and filtered):
-                pairs.append(f"{compiled.name('geom', h)} and {compiled.name('geom', g)}")
-    return pairs
-
-
-def limits(compiled: Compiled) -> list[str]:
-    """Joints and tendons that have a range."""
     if compiled.disabled("limit", "constraint"):
         return []
-    m = compiled.model
-    return _named(compiled, "joint", m.jnt_limited) + _named(compiled, "tendon", m.tendon_limited)
-
-
-def friction(compiled: Compiled) -> list[str]:
-    """Joints and tendons with dry friction."""
-    if compiled.disabled("frictionloss", "constraint"):
-        return []
-    m = compiled.model
-    rubbing = np.unique(m.dof_jntid[m.dof_frictionloss > 0])
-    joints = [compiled.name("joint", int(i)) for i in rubbing]
-    return joints + _named(compiled, "tendon", m.tendon_frictionloss)
+    balls = m.jnt_type == int(compiled.mujoco.mjtJoint.mjJNT_BALL)
+    return _named(compiled, "joint", m.jnt_limited.astype(bool) & balls)
 
 
 def tendons(compiled: Compiled) -> list[str]:
-    """Tendons that pull or resist; those which are only measured have no effect."""
+    """Tendons that pull, resist or end; those which are only measured have no effect."""
     m = compiled.model
-    fields = ("stiffness", "damping", "armature")
+    fields = ["stiffness", "damping", "armature"]
+    fields += [] if compiled.disabled("limit", "constraint") else ["limited"]
+    rubs = not compiled.disabled("friction", "frictionloss", "constraint")
+    fields += ["frictionloss"] if rubs else []
     arrays = [np.asarray(getattr(m, f"tendon_{f}", np.zeros(m.ntendon))) != 0 for f in fields]
     return _named(compiled, "tendon", np.any(arrays, axis=0))
 
@@ -80,30 +65,39 @@ def gravity_compensation(compiled: Compiled) -> list[str]:
     return _named(compiled, "body", compiled.model.body_gravcomp)
 
 
-IGNORABLE: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
-    "contact": ("contacts between", contacts),
-    "limit": ("the limits of", limits),
-    "friction": ("the frictionloss of", friction),
+REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
+    "shape": ("contacts between", shapes),
+    "torsion": ("the torsional and rolling friction of", torsion),
+    "ball_limit": ("the limits of", ball_limits),
     "tendon": ("the tendons", tendons),
     "fluid": ("the option", fluid),
     "gravcomp": ("the gravcomp of", gravity_compensation),
 }
-"""What may be left out where the user says so: what it is, and what has it."""
+"""What must be left out where the model has it: what it is, and what has it."""
+IGNORABLE = ("contact", "self_contact", "limit", "friction", *REFUSED)
 
 
-def refuse(compiled: Compiled, ignore: tuple[str, ...]) -> None:
-    """Checks that everything that has an effect is simulated, but for what the user gives up.
+def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
+    """What the user gives up.
 
     Raises:
         ValueError: `ignore` has an unknown entry.
-        NotImplementedError: the model has what is not supported.
     """
     if isinstance(ignore, str) or set(ignore) - set(IGNORABLE):
         raise ValueError(
             f"from_mjcf: ignore must be names out of {list(IGNORABLE)}, got {ignore!r}."
         )
-    for key, (what, found) in IGNORABLE.items():
-        if key not in ignore and (names := found(compiled)):
+    return frozenset(ignore)
+
+
+def refuse(compiled: Compiled) -> None:
+    """Checks that everything that has an effect is simulated, but for what the user gives up.
+
+    Raises:
+        NotImplementedError: the model has what is not supported.
+    """
+    for key, (what, found) in REFUSED.items():
+        if key not in compiled.ignored and (names := found(compiled)):
             raise NotImplementedError(
                 f"from_mjcf: {what} {_listed(names)} are not supported; to simulate the model"
                 f" without them, say so by ignore=('{key}',)."
@@ -127,6 +121,30 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
         yield "the flag actuation='disable' of a model with actuators"
     if m.opt.disableactuator:
         yield "the option actuatorgroupdisable"
+    yield from _unsupported_contacts(compiled)
+
+
+def _unsupported_contacts(compiled: Compiled) -> Iterable[str]:
+    """What a contact may have beside its shapes and condim."""
+    m, found = compiled.model, pairs.pairs(compiled)
+    if found and m.opt.enableflags & int(compiled.mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+        yield "the flag override='enable' of a model with contacts"
+    touching = sorted({g for pair in found for g in pair[:2]})
+    for field, what in (("surfacevel", "surfacevel"), ("adhesion", "adhesion")):
+        values = np.asarray(getattr(m, f"geom_{field}", np.zeros(m.ngeom)))
+        for g in touching:
+            if values[g].any():
+                yield f"{what} of geom '{compiled.name('geom', g)}'"
+    if found and np.any(getattr(m, "pair_adhesion", 0.0)):
+        yield "adhesion of a pair"
+    for pair in found:
+        if pair.condim > 1 and pair.friction[0] != pair.friction[1]:
+            yield f"friction that depends on the direction, of {_described(compiled, pair)},"
+
+
+def _described(compiled: Compiled, pair: Pair) -> str:
+    """The geoms and their shapes."""
+    return f"{pairs.label(compiled, pair)} ({' and '.join(pairs.shapes(compiled, pair))})"
 
 
 def _named(compiled: Compiled, kind: str, flags: Any) -> list[str]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.typing import PyTree
+
+
+def path(file: str | Path, owner: str) -> Path:
+    """Where a checkpoint is or will be, checked before anything is done for it.
+
+    Raises:
+        ValueError: nothing can be written there.
+    """
+    file = Path(file)
+    folder = file.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK) or file.is_dir():
+        what = "is a folder" if file.is_dir() else "lies in no folder that can be written to"
+        raise ValueError(f"{owner}: checkpoint {file} {what}.")
+    return file
 
 
 def write(file: Path, about: Mapping[str, Any], contents: PyTree) -> None:
@@ -30,7 +44,7 @@ def write(file: Path, about: Mapping[str, Any], contents: PyTree) -> None:
     part.replace(file)
 
 
-def read(file: Path, like: PyTree, about: Mapping[str, Any]) -> PyTree:
+def read(file: Path, like: PyTree, about: Mapping[str, Any], owner: str) -> PyTree:
     """The leaves in the structure of `like`; arrays of numpy may have grown since.
 
     Raises:
@@ -38,19 +52,27 @@ def read(file: Path, like: PyTree, about: Mapping[str, Any]) -> PyTree:
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
-            written = json.loads(str(stored["about"]))
+            written = dict(json.loads(str(stored["about"])))
             arrays = [stored[f"leaf_{i}"] for i in range(len(stored.files) - 1)]
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"tune: {file} is no checkpoint of tune; give another path.") from error
+    except Exception as error:  # what is damaged or of another kind may raise anything
+        raise ValueError(
+            f"{owner}: {file} is no checkpoint of {owner}; give another path."
+        ) from error
     other = [what for what in about if written.get(what) != about[what]]
     if other:
         raise ValueError(
-            f"tune: {file} holds another search; not the same: {', '.join(other)}. Call tune as it"
-            " was called then, delete the file to begin anew, or give another path."
+            f"{owner}: {file} holds another search; not the same: {', '.join(other)}. Call {owner}"
+            " as it was called then, delete the file to begin anew, or give another path."
         )
     templates, structure = jax.tree.flatten(like)
     leaves = [_restored(x, y) for x, y in zip(arrays, templates, strict=True)]
     return jax.tree.unflatten(structure, leaves)
+
+
+def digest(*parts: Any) -> str:
+    """Of texts and arrays, to tell whether they are the same."""
+    raw = (x.encode() if isinstance(x, str) else numbers(x).tobytes() for x in parts)
+    return hashlib.sha256(b"".join(raw)).hexdigest()
 
 
 def numbers(x: Any) -> np.ndarray:
@@ -67,4 +89,4 @@ def _restored(stored: np.ndarray, like: Any) -> Any:
 
 
 def _is_key(x: Any) -> bool:
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

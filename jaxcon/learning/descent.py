@@ -10,12 +10,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
+from jax.flatten_util import ravel_pytree
 
 from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree
+from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.learning.leaves import Space
+from jaxcon.simulation.recovery import contain
 
 SMALLEST = 2.0**-20
 """Of the share of its step that an optimiser may take, below which a start is given up."""
@@ -33,11 +37,15 @@ class Stop(IntEnum):
 
 @pytree
 class Best:
-    """The least loss so far, where it was, and what the loss returned beside it."""
+    """The least loss so far, where it was, what the loss returned beside it, and samples lost.
+
+    A point at which more samples are not finite is never better: those may be the worst ones.
+    """
 
     y: tuple[Array, ...]
     loss: Array
     aux: PyTree
+    lost: Array
 
 
 @pytree
@@ -53,6 +61,7 @@ class Search:
         since: the step of the mark.
         share: of the optimiser's step that is taken; halved where the loss is not finite.
         step: how many were taken.
+        refused: how many of these were taken back.
         stop: a `Stop`.
     """
 
@@ -64,6 +73,7 @@ class Search:
     since: Array
     share: Array
     step: Array
+    refused: Array
     stop: Array
 
 
@@ -78,6 +88,7 @@ class Descent:
         samples: over how many keys the loss is averaged; 0 for a loss that takes none.
         patience: steps without progress after which a start stops.
         tolerance: a fall of the loss that counts as progress.
+        forward: whether gradients are taken in forward mode, number by number.
     """
 
     loss: Callable[..., Any]
@@ -86,25 +97,40 @@ class Descent:
     samples: int
     patience: int
     tolerance: float
+    forward: bool = False
 
     def start(self, y: tuple[Array, ...], key: Any) -> Search:
         """A search that begins at y."""
-        value, aux = jax.eval_shape(self.evaluate, y, key)
+        value, (aux, lost) = jax.eval_shape(self.evaluate, y, key)
         memory = self.optimizer.init(y)
         zero = jnp.zeros((), jnp.int32)
         none = jnp.full((), jnp.inf, value.dtype)
-        best = Best(y, none, jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux))
+        nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), aux)
+        best = Best(y, none, nothing, jnp.full((), max(self.samples, 1), lost.dtype))
         share = jnp.ones((), value.dtype)
-        return Search(y, memory, (y, memory), best, none, zero, share, zero, zero)
+        return Search(y, memory, (y, memory), best, none, zero, share, zero, zero, zero)
 
     def evaluate(self, y: Any, key: Any) -> tuple[Array, PyTree]:
-        """Loss and aux at y; the mean over keys and all aux where there are samples."""
-        params = self.space.decode(y)
+        """Loss at y, aux there, and how many samples are not finite.
+
+        Where there are samples the loss is the mean over those that are finite, if most are. The
+        others have no gradient.
+        """
         if not self.samples:
-            return split(self.loss(params))
+            value, aux = split(self.loss(self.space.decode(y)))
+            return value, (aux, jnp.zeros((), jnp.int32))
+
+        def one(y: Any, key: Any) -> Any:
+            value, aux = split(self.loss(self.space.decode(y), key))
+            good = jnp.isfinite(value)
+            return (value, aux), jnp.where(good, Status.OK, Status.NON_FINITE).astype(jnp.int32)
+
         keys = jax.random.split(key, self.samples)
-        values, aux = jax.vmap(lambda k: split(self.loss(params, k)))(keys)
-        return jnp.mean(values), aux
+        (values, aux), status = jax.vmap(lambda k: contain(one, (y, k)))(keys)
+        lost = jnp.sum(failed(status), dtype=jnp.int32)
+        count = jnp.maximum(self.samples - lost, 1).astype(values.dtype)
+        mean = jnp.sum(jnp.where(failed(status), 0, values)) / count
+        return jnp.where(2 * lost < self.samples, mean, jnp.nan), (aux, lost)
 
     def run(self, search: Search, limit: Array, key: Any, length: int) -> tuple[Search, Array]:
         """So many steps, or as many as are left up to the limit, and their losses, (length,)."""
@@ -116,14 +142,22 @@ class Descent:
             return keep(active, new, search), jnp.where(active, loss, jnp.nan)
 
         new, losses = jax.lax.scan(one, search, None, length)
-        if self.samples:  # always the same keys, so that a lucky draw does not win
-            judged = self.judge(new, new.y, *self.evaluate(new.y, jax.random.fold_in(key, 0)))
-            new = keep(new.step > search.step, judged, new)
+        if self.samples:
+            new = keep(new.step > search.step, self.compare(new, (search.y, new.y), key), new)
         return new, losses
+
+    def compare(self, search: Search, points: Any, key: Any) -> Search:
+        """The search after points were judged by keys that stay the same: no lucky draw wins."""
+        fixed = jax.random.fold_in(key, 0)
+        y = jax.tree.map(lambda *x: jnp.stack(x), *points)
+        found = jax.vmap(lambda y: self.evaluate(y, fixed))(y)
+        for i in range(len(points)):
+            search = self.judge(search, points[i], *jax.tree.map(lambda x, i=i: x[i], found))
+        return search
 
     def step(self, search: Search, key: Any) -> tuple[Search, Array]:
         """One step, and the loss before it; where that is not finite, back to where it was."""
-        (loss, aux), slope = jax.value_and_grad(self.evaluate, has_aux=True)(search.y, key)
+        (loss, seen), slope = self.slope(search.y, key)
         good = jnp.isfinite(loss)
         for x in jax.tree.leaves(slope):
             good &= jnp.all(jnp.isfinite(x))
@@ -151,15 +185,33 @@ class Descent:
             last=keep(good, (search.y, search.memory), search.last),
             share=share,
             step=search.step + 1,
+            refused=search.refused + (~good).astype(search.refused.dtype),
             stop=stop.astype(search.stop.dtype),
         )
-        return (new if self.samples else self.judge(new, search.y, loss, aux)), loss
+        return (new if self.samples else self.judge(new, search.y, loss, seen)), loss
 
-    def judge(self, search: Search, y: Any, loss: Array, aux: PyTree) -> Search:
-        """The search after y was found to have this loss."""
-        better = jnp.isfinite(loss) & (loss < search.best.loss)
-        best = keep(better, Best(y, loss, aux), search.best)
-        progress = best.loss < search.mark - self.tolerance
+    def slope(self, y: Any, key: Any) -> Any:
+        """(loss, (aux, lost)) and the gradient."""
+        if not self.forward:
+            return jax.value_and_grad(self.evaluate, has_aux=True)(y, key)
+        with jax.numpy_dtype_promotion("standard"):  # leaves may have several precisions
+            flat, back = ravel_pytree(y)
+
+        def push(tangent: Array) -> Any:
+            return jax.jvp(lambda y: self.evaluate(back(y), key), (flat,), (tangent,), has_aux=True)
+
+        value, slope, seen = jax.vmap(push, out_axes=(None, 0, None))(
+            jnp.eye(flat.size, dtype=flat.dtype)
+        )
+        return (value, seen), back(slope)
+
+    def judge(self, search: Search, y: Any, loss: Array, seen: tuple[PyTree, Array]) -> Search:
+        """The search after y was found to have this loss, aux and number of lost samples."""
+        aux, lost = seen
+        fewer = lost < search.best.lost
+        less = (lost == search.best.lost) & (loss < search.best.loss)
+        best = keep(jnp.isfinite(loss) & (fewer | less), Best(y, loss, aux, lost), search.best)
+        progress = (best.lost < search.best.lost) | (best.loss < search.mark - self.tolerance)
         since = jnp.where(progress, search.step, search.since)
         stalled = (search.stop == Stop.RUNNING) & (search.step - since >= self.patience)
         stop = jnp.where(stalled, Stop.STALLED, search.stop).astype(search.stop.dtype)
@@ -175,7 +227,8 @@ def split(result: Any) -> tuple[Array, PyTree]:
     """
     value: Any
     value, aux = result if isinstance(result, tuple) and len(result) == 2 else (result, ())
-    if jnp.shape(value) != () or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
+    number = isinstance(value, float | np.ndarray | np.generic | jax.Array)
+    if not number or jnp.shape(value) or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
         raise TypeError(
             "tune: the loss must return a floating scalar, or a pair of one and anything else; got"
             f" {value!r}."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,34 +14,48 @@ import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.learning.least_squares import Fit, least_squares
-from jaxcon.learning.leaves import Space, space_of
+from jaxcon.learning import checkpoint as files
+from jaxcon.learning.attempts import Attempt, remaining, remembered, searched
+from jaxcon.learning.information import deviations, told
+from jaxcon.learning.least_squares import Fit
+from jaxcon.learning.leaves import Space, is_searched, space_of
+from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.stretches import Stretches
 
 VAGUE = 1.0
 """Standard deviation of a relative change from which on the data do not tell it: a factor of e."""
+
+ALIKE = 1e-2
+"""By what the ends of two starts may differ, relative, to be called alike."""
 
 
 @dataclass(frozen=True)
 class Identified:
     """Parameters with what is known of them; `print` it.
 
-    A direction is a combination of relative changes: of log x for positive parameters, of x by its
-    size at the start for others. Singular values are those of the residuals by noise, σ = 1, along
-    them, so that 1/s is the standard deviation of the estimate there (Cramér and Rao's bound).
+    A direction is a combination of relative changes: of log x for positive parameters, of others by
+    their size, found or at the start, whichever is larger. A start within √ε of 0 counts as 0, and
+    what starts at 0 has the size 1 at least. Singular values are those of the residuals by noise,
+    σ = 1, along them, so that 1/s is the standard deviation of the estimate there (Cramér and Rao's
+    bound).
 
     Attributes:
         params: like those given.
         errors: their standard deviations, in the same structure and units; infinite where the data
-            tell nothing, NaN where a leaf was not searched.
+            tell nothing; NaN where a leaf was not searched, where a parameter lies on its bound,
+            and where nothing tells the noise. Those of others hold if it belongs on its bound.
         nodes: the states at the nodes, as they were given; None without.
         noise: what remains, its root mean square by degree of freedom: in units of the noise that
-            was given, so that 1 is as expected, or in those of the data where none was.
+            was given, so that 1 is as expected, or in those of the data where none was. NaN where
+            no degree of freedom is left.
         observed: how many numbers were seen.
         names: of the parameters, one by one.
-        singular_values: largest first, (n,).
-        directions: of unit length, (n, n), a row for each singular value.
+        bounded: the names of those that lie on their bounds.
+        singular_values: largest first, (n,), n parameters being off their bounds.
+        directions: of unit length by all parameters, a row for each singular value.
         costs: ½ ‖r‖² by step; with nodes, of the last search, at the continuity asked for.
+        ends: ½ ‖r‖² where each start ended, in units of the noise that was given, or of the data;
+            infinite where it could not begin, (restarts,).
         stopped: why it went no further, in words.
     """
 
@@ -50,25 +65,28 @@ class Identified:
     noise: float
     observed: int
     names: tuple[str, ...]
+    bounded: tuple[str, ...]
     singular_values: np.ndarray
     directions: np.ndarray
     costs: np.ndarray
+    ends: np.ndarray
     stopped: str
 
     @property
     def table(self) -> dict[str, tuple[float, float]]:
         """Each number that was searched with its standard deviation, by name."""
-        errors = np.concatenate([np.ravel(x) for x in jax.tree.leaves(self.errors)])
-        values = [np.ravel(x) for x in jax.tree.leaves(self.params)]
-        searched = ~np.isnan(errors)
-        pairs = zip(np.concatenate(values)[searched], errors[searched], strict=True)
+        leaves = zip(jax.tree.leaves(self.params), jax.tree.leaves(self.errors), strict=True)
+        found = [(np.ravel(x), np.ravel(e)) for x, e in leaves if is_searched(x)]
+        values, errors = (np.concatenate(x) for x in zip(*found, strict=True))
+        pairs = zip(values, errors, strict=True)
         return {name: (float(x), float(e)) for name, (x, e) in zip(self.names, pairs, strict=True)}
 
     @property
     def condition(self) -> float:
-        """cond(JᵀJ) = (s₁/sₙ)²."""
+        """cond(JᵀJ) = (s₁/sₙ)²; NaN where every parameter lies on a bound."""
+        s = self.singular_values
         with np.errstate(divide="ignore", invalid="ignore"):
-            return float((self.singular_values[0] / self.singular_values[-1]) ** 2)
+            return float((s[0] / s[-1]) ** 2) if s.size else np.nan
 
     @property
     def untold(self) -> list[dict[str, float]]:
@@ -80,16 +98,25 @@ class Identified:
         ]
 
     def __str__(self) -> str:
-        head = f"{len(self.names)} parameters from {self.observed} numbers,"
+        count = len(self.names)
+        head = f"{count} parameter{'s' * (count > 1)} from {self.observed} numbers,"
         lines = [f"{head} {len(self.costs) - 1} steps: {self.stopped}"]
         for name, (x, e) in self.table.items():
-            lines.append(f"  {name or 'the parameter'} = {x:.6g} ± {e:.2g}")
-        lines.append(f"noise {self.noise:.3g}, cond(JᵀJ) = {self.condition:.1e}")
+            error = ", on its bound" if name in self.bounded else f" ± {e:.2g}"
+            lines.append(f"  {name or 'the parameter'} = {x:.6g}{error}")
+        if self.ends.size > 1:
+            close = np.sum(self.ends <= (1 + ALIKE) * np.min(self.ends))
+            lines.append(f"the best of {self.ends.size} starts, {close} of which ended alike")
+        if np.isnan(self.noise):
+            lines.append("no degree of freedom is left to tell the noise")
+        else:
+            lines.append(f"noise {self.noise:.3g}, cond(JᵀJ) = {self.condition:.1e}")
         for row in self.untold:
-            change = " ".join(f"{x:+.2f} {name}" for name, x in row.items())
+            change = " ".join(f"{x:+.2f} {name or 'of it'}" for name, x in row.items())
             lines.append(f"the data do not tell the relative change {change}")
-        if not self.untold:
-            lines.append("the data tell every parameter")
+        if not self.untold and not np.isnan(self.noise):
+            off = " that is off its bounds" if self.bounded else ""
+            lines.append(f"the data tell every parameter{off}")
         return "\n".join(lines)
 
 
@@ -104,6 +131,11 @@ def identify(
     nodes: PyTree = None,
     continuity: float = 1e-3,
     steps: int = 50,
+    restarts: int = 1,
+    spread: Any = 0.0,
+    key: Any = None,
+    checkpoint: str | Path | None = None,
+    progress: bool | None = None,
 ) -> Identified:
     """The parameters whose simulation is nearest to a recording, by damped Gauss–Newton steps.
 
@@ -118,101 +150,119 @@ def identify(
         simulate: params → predictions; with nodes (params, node) → predictions of one stretch and
             its end, in the structure of a node. Trouble on the way should show as NaN
             (`losses.unless_failed`).
-        params: the start. Leaves that are no floating numbers are kept, and traced.
+        params: the start; leaves as of `tune`.
         data: what was recorded, in the structure of the predictions, NaN where nothing was seen;
             with nodes an axis of stretches comes first.
-        noise: standard deviation of the data, a number or a pytree whose leaves broadcast with
-            those of the data; estimated from what remains unless given.
+        noise: standard deviation of the data, a number or a pytree whose leaves broadcast to those
+            of the data; estimated from what remains unless given.
         positive: as of `tune`.
         bounds: as of `tune`.
         nodes: first guesses of the states at the nodes, with a first axis of stretches. Minimal
             coordinates, such as angles and rates, so that every value is a state.
         continuity: standard deviation by which an end may miss the next node, in its units.
         steps: at most so many; with nodes, for each decade by which ends come closer to them.
+        restarts: how many starts are searched in one batch; the first is the one given, and all
+            have the same nodes.
+        spread: as of `tune`, of the parameters of other starts.
+        key: of random numbers for them.
+        checkpoint: a file that is written after each step. Where it exists the search goes on from
+            it, with the very numbers of a search that was not interrupted. Without nodes more steps
+            may be asked of it.
+        progress: whether a bar is shown; None is in terminals and notebooks.
+
+    An interrupt from the keyboard, or an error of the machine, ends the search with what was found.
 
     Returns:
-        An `Identified`.
+        An `Identified`, of the start that led to the least.
 
     Raises:
-        ValueError: predictions and data do not fit, unknown names, a start out of its bounds or at
-            which the residuals are not finite.
+        ValueError: predictions, data and noise do not fit, unknown names, a start out of its
+            bounds, residuals that are finite at no start, or a checkpoint of another search, or
+            where none can be written.
 
     References:
         Bock, Recent advances in parameter identification techniques for ODE (1983).
         Nocedal, Wright, Numerical Optimization (2006), section 10.3.
     """
     checks.count("identify", "steps", steps)
+    checks.count("identify", "restarts", restarts)
     checks.positive("identify", "continuity", continuity)
+    check_key(key, restarts > 1, "identify")
+    file = None if checkpoint is None else files.path(checkpoint, "identify")
     for x in jax.tree.leaves(noise):
         checks.positive("identify", "noise", x)
     space = space_of(params, positive, bounds, "identify")
-    y = space.flatten(space.encode(params))
-    logs = [jnp.full(x.shape, p) for x, p in zip(space.low, space.positive, strict=True)]
-    scale = jnp.where(space.flatten(logs) | (y == 0), 1, jnp.abs(y))
-    problem = Stretches(simulate, space, scale, data, 1.0 if noise is None else noise, nodes)
-    start = np.append(y / scale, problem.nodes)
-    low, high = (np.full(start.shape, x) for x in (-np.inf, np.inf))
-    low[: y.size], high[: y.size] = (space.flatten(x) / scale for x in space.limits)
-    tolerance = float(jnp.finfo(y.dtype).eps) ** 0.5
-    residual, _ = problem.linearize(1.0)(start)
-    if not np.all(np.isfinite(residual)):
-        raise ValueError(
-            "identify: the residuals are not finite at the start; simulate must be finite there."
-        )
-    first, *rest = problem.widths(residual, continuity)
-    fit = least_squares(problem.linearize(first), start, low, high, steps, tolerance)
-    for width in () if fit.interrupted else rest:
-        fit = least_squares(problem.linearize(width), fit.z, low, high, steps, tolerance)
-    return _report(problem, fit, noise is not None, tolerance)
+    own = space.encode(params)
+    batch = scattered(space, own, restarts, spread, key, "identify")
+    problem = Stretches(simulate, space, _scale(space, space.flatten(own)), data, noise, nodes)
+    if not problem.observed:
+        raise ValueError("identify: the data are NaN throughout: no number was seen.")
+    starts = np.asarray(jax.vmap(space.flatten)(batch) / problem.scale[None])
+    searches = [Attempt(problem, x, continuity, steps) for x in starts]
+    save = remembered(problem, searches, file) if file is not None else _ignore
+    found = searched(problem, searches, save, progress)
+    ends = np.array([np.inf if end is None else end.cost for end in found])
+    best = found[int(np.argmin(ends))]
+    assert best is not None
+    return _report(problem, best.fit, best.noise, continuity, ends)
 
 
-def _report(problem: Stretches, fit: Fit, known: bool, tolerance: float) -> Identified:
-    """What a fit says of the parameters, whatever the nodes are."""
-    space, p = problem.space, problem.scale.size
-    observed = sum(int(np.sum(np.isfinite(x))) for x in jax.tree.leaves(problem.data))
-    left = fit.residual[: fit.residual.size - problem.gaps]
-    unknown = p + problem.nodes.shape[1]  # the first node; others follow from it
-    noise = float(np.sqrt(left @ left / max(observed - unknown, 1)))
-    s, V = _told(fit.jacobian[:, :p], fit.jacobian[:, p:], tolerance)
-    s = s / (1 if known else max(noise, np.finfo(float).tiny))
-    y = space.split(jnp.asarray(fit.z[:p], problem.scale.dtype) * problem.scale)
+def _ignore() -> None:
+    """A search that nobody wants on disk."""
+
+
+def _scale(space: Space, y: Array) -> Array:
+    """By what coordinates are divided: 1 for logarithms and what starts at 0, |y| for others."""
+    return jnp.where(space.logarithms | (y == 0), 1, jnp.abs(y))
+
+
+def _report(
+    problem: Stretches, fit: Fit, own: float, continuity: float, ends: np.ndarray
+) -> Identified:
+    """What a fit says of the parameters, whatever the nodes are.
+
+    Args:
+        problem: the recording.
+        fit: of it.
+        own: the noise by which its residuals were divided.
+        continuity: as of `identify`.
+        ends: as of `Identified`.
+    """
+    space, scale, p = problem.space, np.asarray(problem.scale), problem.scale.size
+    precision, free = problem.told(own), fit.free[:p]
+    J = problem.condensed(fit.jacobian, continuity)
+    left = remaining(problem, fit, J, own)
+    unit = np.where(space.logarithms, 1, np.maximum(np.abs(fit.z[:p]), 1))
+    s, V = told(J[:, :p][:, free], J[:, p:], unit[free], precision)
+    if problem.noise is None:
+        with np.errstate(divide="ignore"):
+            s = np.where(s > 0, s / left, 0)
+    y = space.split(jnp.asarray(fit.z[:p] * scale, problem.scale.dtype))
+    deviation = np.full(p, np.nan)
+    deviation[free] = deviations(s, V, precision.tolerance) * (unit * scale)[free]
+    names, directions = _scalars(space), np.zeros((len(s), p))
+    directions[:, free] = V
     return Identified(
         params=space.decode(y),
-        errors=_errors(space, y, _deviations(s, V, tolerance) * np.asarray(problem.scale)),
+        errors=_errors(space, y, deviation),
         nodes=problem.restore(fit.z[p:]),
-        noise=noise,
-        observed=observed,
-        names=_scalars(space),
+        noise=left * (own if problem.noise is None else 1.0),
+        observed=problem.observed,
+        names=names,
+        bounded=tuple(name for name, off in zip(names, free, strict=True) if not off),
         singular_values=s,
-        directions=V,
+        directions=directions,
         costs=fit.costs,
+        ends=ends,
         stopped=fit.stopped,
     )
-
-
-def _told(own: np.ndarray, others: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Singular values and directions of what residuals say of some unknowns whatever the others."""
-    Q, _ = np.linalg.qr(others)
-    own = own - Q @ (Q.T @ own)
-    full = np.concatenate([own, np.zeros((own.shape[1], own.shape[1]))])  # never fewer rows
-    _, s, V = np.linalg.svd(full, full_matrices=False)
-    largest = np.take_along_axis(V, np.abs(V).argmax(axis=1)[:, None], axis=1)
-    V = V * np.sign(largest)
-    return np.where(s > tolerance * s[0], s, 0), V
-
-
-def _deviations(s: np.ndarray, V: np.ndarray, tolerance: float) -> np.ndarray:
-    """(Σ (v / s)²)^½ of each unknown; infinite where it has a share in what is not told."""
-    shares = np.abs(V) > tolerance
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.sqrt(np.sum(np.where(shares, V / s[:, None], 0) ** 2, axis=0))
 
 
 def _errors(space: Space, y: tuple[Array, ...], deviations: np.ndarray) -> PyTree:
     """Standard deviations like the parameters; d x = x d log x for positive ones."""
     own = space.split(jnp.asarray(deviations, y[0].dtype))
     factors = [jnp.exp(z) if p else 1.0 for z, p in zip(y, space.positive, strict=True)]
-    nothing = [None if x is None else jnp.nan for x in space.fixed]
+    nothing = [None if x is None else np.full(np.shape(x), np.nan) for x in space.fixed]
     return dataclasses.replace(space, fixed=tuple(nothing)).fill(
         [d * f for d, f in zip(own, factors, strict=True)]
     )

@@ -60,6 +60,11 @@ class Space:
         """All numbers of y in one array."""
         return jnp.concatenate([jnp.ravel(z) for z in y])
 
+    @property
+    def logarithms(self) -> np.ndarray:
+        """Which of all numbers of y are logarithms."""
+        return np.repeat(self.positive, [x.size for x in self.low])
+
     def split(self, flat: Array) -> tuple[Array, ...]:
         """y of all its numbers."""
         ends = np.cumsum([x.size for x in self.low])[:-1]
@@ -97,7 +102,8 @@ def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
     found, structure = jax.tree_util.tree_flatten_with_path(params)
     names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in found]
     leaves = [x for _, x in found]
-    free = [jnp.issubdtype(jnp.result_type(x), jnp.floating) for x in leaves]
+    _check_whole(names, leaves, owner)
+    free = [is_searched(x) for x in leaves]
     if not any(free):
         raise ValueError(f"{owner}: there is no floating number among the parameters {names}.")
     logs = _flags(positive, params, names, owner)
@@ -109,6 +115,29 @@ def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
     low, high = zip(*ends, strict=True)
     own = tuple(names[i] for i in searched)
     return Space(fixed, low, high, structure, own, tuple(logs[i] for i in searched))
+
+
+def _check_whole(names: list[str], leaves: list[Any], owner: str) -> None:
+    """Checks that no whole number was written where a real one is meant.
+
+    Those that JAX holds, such as the status of a state, are parts of trees that nobody wrote.
+
+    Raises:
+        ValueError: there is one.
+    """
+    for name, x in zip(names, leaves, strict=True):
+        written = isinstance(x, int | np.integer | np.ndarray) and not isinstance(x, bool)
+        if written and jnp.issubdtype(jnp.result_type(x), jnp.integer):
+            what = f"'{name}'" if name else "the parameter"
+            raise ValueError(
+                f"{owner}: {what} is a whole number, {x!r}, along which there is no derivative;"
+                " write it as a float to have it searched, or leave it out of the parameters."
+            )
+
+
+def is_searched(leaf: Any) -> bool:
+    """Whether a leaf has floating numbers."""
+    return bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
 
 
 def by_name(values: Mapping[str, Any], names: Iterable[str], default: Any, owner: str) -> list[Any]:
@@ -171,6 +200,8 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
         ) from error
     if log:
         low = jnp.maximum(low, 0)
+    if not np.all(np.asarray(low) <= np.asarray(high)):
+        raise ValueError(f"{what} needs bounds (low, high) with low ≤ high, got {pair!r}.")
     if not np.all((np.asarray(low) <= start) & (start <= np.asarray(high))):
         raise ValueError(
             f"{what} must start within its bounds {np.asarray(low).tolist()} to"

@@ -6,7 +6,7 @@
     final, (foot, off, energy) = jc.rollout(system, method, state, None, dt, steps, record=record)
     loss = losses.tracking(foot, wanted) + 0.1 * losses.energy_drift(energy)
 
-`tracking` and `violation` are means, over worlds too where a batch was recorded.
+`tracking` and `mean_violation` are means, over worlds too where a batch was recorded.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
             levels, that broadcast with it.
 
     Raises:
-        ValueError: path and reference differ in structure or shape.
+        ValueError: path and reference differ in structure or shape, or the scale has more numbers.
     """
     off = jax.tree.leaves(misfit(path, reference, scale))
     means = [
@@ -45,7 +45,11 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
 
 
 def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
-    """(x − x_ref) / scale, and 0 where the reference is NaN; arguments as of `tracking`."""
+    """(x − x_ref) / scale, and 0 where the reference is NaN; arguments as of `tracking`.
+
+    Raises:
+        ValueError: path and reference differ in structure or shape, or the scale has more numbers.
+    """
     widths = jax.tree.broadcast(scale, path)
     found, structure = jax.tree_util.tree_flatten_with_path(path)
     shapes = [jnp.shape(x) for x in jax.tree.leaves(path)]
@@ -58,9 +62,15 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
         )
 
     def off(x: Any, wanted: Any, width: Any) -> Array:
+        shape, own = jnp.shape(x), jnp.shape(width)
+        if not _fits(own, shape):
+            raise ValueError(
+                f"a scale of shape {own} does not broadcast to what it scales, {shape}."
+            )
         wanted = jnp.asarray(wanted, x.dtype)
+        width = jnp.broadcast_to(jnp.asarray(width, x.dtype), shape)
         seen = jnp.isfinite(wanted)
-        return jnp.where(seen, (x - jnp.where(seen, wanted, 0)) / jnp.asarray(width, x.dtype), 0)
+        return jnp.where(seen, (x - jnp.where(seen, wanted, 0)) / width, 0)
 
     return jax.tree.map(off, path, reference, widths)
 
@@ -68,14 +78,31 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
 def violation(off: Violation, dt: Any) -> Array:
     """log₁₀ of the root mean square of (φ, h φ̇) over rows and time, () [m].
 
-    φ is the error now, h φ̇ the one that it is about to grow by.
+    For what should be as small as can be: no weight makes it matter less as it falls. Beside a
+    task, `mean_violation` does.
 
     Args:
         off: `info.violation` of each step.
         dt: h, () [s].
+
+    Raises:
+        ValueError: the scene has no rows.
     """
-    square = jnp.mean(off.position**2) + jnp.mean((dt * off.velocity) ** 2)
+    square = mean_violation(off, dt)
     return jnp.log10(jnp.maximum(square, jnp.finfo(square.dtype).tiny)) / 2
+
+
+def mean_violation(off: Violation, dt: Any) -> Array:
+    """The mean square of (φ, h φ̇) over rows and time, () [m²].
+
+    φ is the error now, h φ̇ the one that it is about to grow by. Arguments as of `violation`.
+
+    Raises:
+        ValueError: the scene has no rows.
+    """
+    if not off.position.size:
+        raise ValueError("violation: the scene has no constraints that could be violated.")
+    return jnp.mean(off.position**2) + jnp.mean((dt * off.velocity) ** 2)
 
 
 def energy_drift(energy: Energy, scale: Any = None) -> Array:
@@ -113,3 +140,9 @@ def unless_failed(x: PyTree, state: Any) -> PyTree:
     """
     bad = jnp.any(failed(state.status))
     return jax.tree.map(lambda y: jnp.where(bad, jnp.nan, y), x)
+
+
+def _fits(shape: tuple[int, ...], into: tuple[int, ...]) -> bool:
+    """Whether an array broadcasts to a shape, and that shape to none larger."""
+    pairs = zip(reversed(shape), reversed(into), strict=False)
+    return len(shape) <= len(into) and all(n in (1, m) for n, m in pairs)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -13,13 +14,22 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.learning.least_squares import Precision
 from jaxcon.learning.leaves import Space
 from jaxcon.learning.losses import misfit
 
 
 @dataclass(frozen=True)
 class Stretches:
-    """A recording in one stretch, or in several that begin at nodes."""
+    """A recording in one stretch, or in several that begin at nodes.
+
+    Attributes:
+        simulate: as of `identify`.
+        space: of the parameters.
+        scale: of their coordinates, (p,).
+        data, noise: as of `identify`.
+        given: the first guesses of the nodes, None without.
+    """
 
     simulate: Callable[..., Any]
     space: Space
@@ -42,6 +52,100 @@ class Stretches:
         back = ravel_pytree(jax.tree.map(lambda x: x[0], self.given))[1]
         return jax.vmap(back)(jnp.asarray(nodes.reshape(self.nodes.shape), self.scale.dtype))
 
+    @cached_property
+    def seen(self) -> tuple[PyTree, PyTree]:
+        """Data and the noise of each number, with a first axis of stretches.
+
+        Raises:
+            ValueError: the data do not have that axis, or the noise does not broadcast with them.
+        """
+        data = jax.tree.map(np.asarray, self.data)
+        shapes = [x.shape for x in jax.tree.leaves(data)]
+        stretches = len(self.nodes)
+        if self.given is not None and any(shape[:1] != (stretches,) for shape in shapes):
+            raise ValueError(
+                f"identify: with {stretches} nodes the data must have a first axis of as many"
+                f" stretches, got shapes {shapes}."
+            )
+        noise = jax.tree.broadcast(1.0 if self.noise is None else self.noise, data)
+        try:
+            noise = jax.tree.map(lambda w, x: np.broadcast_to(w, x.shape), noise, data)
+        except ValueError as error:
+            given = [np.shape(w) for w in jax.tree.leaves(noise)]
+            raise ValueError(
+                f"identify: noise of shapes {given} must broadcast with the data, {shapes}."
+            ) from error
+        if self.given is None:
+            return jax.tree.map(lambda x: x[None], (data, noise))
+        return data, noise
+
+    @cached_property
+    def size(self) -> float:
+        """‖data / noise‖ of what was seen."""
+        pairs = zip(*map(jax.tree.leaves, self.seen), strict=True)
+        parts = [np.where(np.isfinite(x), x / w, 0).astype(float) for x, w in pairs]
+        return float(np.sqrt(sum(np.sum(x * x) for x in parts)))
+
+    @property
+    def observed(self) -> int:
+        """How many numbers were seen."""
+        return sum(int(np.sum(np.isfinite(x))) for x in jax.tree.leaves(self.data))
+
+    @property
+    def gaps(self) -> int:
+        """How many of the residuals, the last ones, are gaps between stretches."""
+        stretches, n = self.nodes.shape
+        return (stretches - 1) * n
+
+    @property
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """(low, high) of the unknowns; nodes have none."""
+        low, high = (np.asarray(self.space.flatten(x) / self.scale) for x in self.space.limits)
+        none = np.full(self.nodes.size, np.inf)
+        return np.append(low, -none), np.append(high, none)
+
+    @property
+    def least(self) -> float:
+        """What rounding makes of each number that was seen; 1 where all are 0."""
+        spacing = float(jnp.finfo(self.scale.dtype).eps)
+        return spacing * self.size / max(self.observed, 1) ** 0.5 or 1.0
+
+    def typical(self, residual: np.ndarray) -> float:
+        """The root mean square of residuals of the data, no less than rounding makes them."""
+        own = residual[: residual.size - self.gaps]
+        return max(float(np.linalg.norm(own)) / max(self.observed, 1) ** 0.5, self.least)
+
+    def precision(self, continuity: float, noise: float = 1.0) -> Precision:
+        """Of the residuals, in the dtype in which they are computed."""
+        ends = float(np.linalg.norm(self.nodes)) / continuity
+        tolerance = float(jnp.finfo(self.scale.dtype).eps) ** 0.5
+        return Precision(tolerance, float(np.hypot(self.size / noise, ends)))
+
+    def told(self, noise: float) -> Precision:
+        """Of what residuals of the data alone tell, gaps being unknowns of their own."""
+        return dataclasses.replace(self.precision(np.inf), size=self.size / noise)
+
+    def condensed(self, J: np.ndarray, continuity: float) -> np.ndarray:
+        """J by the parameters, the first node and the gaps g, in place of the other nodes.
+
+        Node k + 1 is put as e_k(p, x_k) − g_k. The columns of p and x₀ are then those of one motion
+        without gaps, whose weight would hide from a rank what is told of them: of nodes that move
+        along together, gaps leave rounding alone. J stays as it is where one motion cannot be
+        foreseen to √ε.
+        """
+        p, (stretches, n) = self.scale.size, self.nodes.shape
+        data, gaps = np.split(J, [len(J) - self.gaps])
+        rows = continuity * gaps.reshape(stretches - 1, n, J.shape[1])
+        T = np.eye(J.shape[1])
+        for k in range(stretches - 1):
+            own, after = (slice(p + i * n, p + (i + 1) * n) for i in (k, k + 1))
+            T[after] = rows[k][:, :p] @ T[:p] + rows[k][:, own] @ T[own] + T[after]
+        if not np.max(np.abs(T), initial=1) * self.precision(np.inf).tolerance < 1:
+            return J
+        alone = np.zeros_like(gaps)
+        alone[:, p + n :] = -np.eye(self.gaps) / continuity
+        return np.concatenate([data @ T, alone])
+
     def widths(self, residual: np.ndarray, continuity: float) -> list[float]:
         """By how much ends may miss nodes, from what they do at the start, by decades.
 
@@ -52,69 +156,70 @@ class Stretches:
         decades = np.ceil(np.log10(max(missed / continuity, 1)))
         return [continuity * 10.0**k for k in np.arange(decades, -1, -1)]
 
+    def evaluate(
+        self, points: Sequence[tuple[np.ndarray, float, float]]
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Residuals with the gaps between stretches, and their Jacobian, at several points.
+
+        Args:
+            points: unknowns, the deviation of gaps, and by what the noise of data is multiplied.
+        """
+        x = np.stack([self._begins(z) for z, *_ in points])
+        found = self._derivatives(jnp.asarray(x, self.scale.dtype), *self.seen)
+        host = jax.tree.map(lambda y: np.asarray(y, float), found)
+        each = (jax.tree.map(lambda y, i=i: y[i], host) for i in range(len(points)))
+        return [self._rows(x, own, *p[1:]) for x, own, p in zip(x, each, points, strict=True)]
+
+    def program(self, starts: int) -> str:
+        """What is computed for so many points, in the compiler's words."""
+        x = jnp.zeros((starts, *self._begins(self.start).shape), self.scale.dtype)
+        return self._derivatives.lower(x, *self.seen).as_text()
+
     @property
-    def gaps(self) -> int:
-        """How many of the residuals, the last ones, are gaps between stretches."""
-        stretches, n = self.nodes.shape
-        return (stretches - 1) * n
+    def start(self) -> np.ndarray:
+        """Unknowns with zeros for the parameters."""
+        return np.append(np.zeros(self.scale.size), self.nodes)
 
-    def linearize(self, continuity: float) -> Callable[[np.ndarray], Any]:
-        """unknowns → residuals with the gaps between stretches, and their Jacobian."""
+    def _begins(self, z: np.ndarray) -> np.ndarray:
+        """Parameters and own node of each stretch, (stretches, p + n)."""
         p, (stretches, n) = self.scale.size, self.nodes.shape
-        data = (
-            self.data
-            if self.given is not None
-            else jax.tree.map(lambda x: np.asarray(x)[None], self.data)
-        )
-        shapes = [np.shape(x) for x in jax.tree.leaves(data)]
-        if any(shape[:1] != (stretches,) for shape in shapes):
-            raise ValueError(
-                f"identify: with {stretches} nodes the data must have a first axis of as many"
-                f" stretches, got shapes {shapes}."
-            )
+        return np.concatenate([np.tile(z[:p], (stretches, 1)), z[p:].reshape(stretches, n)], 1)
 
-        def rows(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            x = np.concatenate([np.tile(z[:p], (stretches, 1)), z[p:].reshape(stretches, n)], 1)
-            found = _derivatives(
-                self.simulate,
-                self.space,
-                self.scale,
-                self.noise,
-                self.given,
-                data,
-                jnp.asarray(x, self.scale.dtype),
-            )
-            (r, end), (by_r, by_end) = jax.tree.map(lambda x: np.asarray(x, float), found)
-            gap, J = (end[:-1] - x[1:, p:]) / continuity, _placed(by_r, by_end[:-1] / continuity, p)
-            J[r.size :, p + n :] -= np.eye(gap.size) / continuity
-            return np.append(r, gap), J
+    def _rows(self, x: np.ndarray, found: Any, continuity: float, noise: float) -> Any:
+        """Residuals and Jacobian of one point from what its stretches gave."""
+        p, n = self.scale.size, self.nodes.shape[1]
+        (r, end), (by_r, by_end) = found
+        gap = (end[:-1] - x[1:, p:]) / continuity
+        J = _placed(by_r / noise, by_end[:-1] / continuity, p)
+        J[r.size :, p + n :] -= np.eye(gap.size) / continuity
+        return np.append(r / noise, gap), J
 
-        return rows
+    @cached_property
+    def _derivatives(self) -> Any:
+        """(residuals, end) of every point and stretch, and both by (parameters, node).
 
+        In forward mode. One program for each recording: what a simulation reads from elsewhere may
+        change between two of them.
+        """
 
-@partial(jax.jit, static_argnames=("simulate",))
-def _derivatives(
-    simulate: Any, space: Space, scale: Array, noise: Any, nodes: Any, data: Any, x: Array
-) -> Any:
-    """(residuals, end) of every stretch, and both by (parameters, node), in forward mode."""
-    p = scale.size
+        def along(x: Array, data: PyTree, noise: PyTree) -> Any:
+            def push(tangent: Array) -> Any:
+                return jax.jvp(lambda x: self._stretch(x, data, noise), (x,), (tangent,))
 
-    def stretch(x: Array, data: PyTree) -> tuple[Array, Array]:
-        params, end = space.decode(space.split(x[:p] * scale)), ()
-        if nodes is None:
-            predicted = simulate(params)
+            return jax.vmap(push, out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype))
+
+        return jax.jit(jax.vmap(jax.vmap(along), (0, None, None)))
+
+    def _stretch(self, x: Array, data: PyTree, noise: PyTree) -> tuple[Array, Array]:
+        """Residuals and the end of one stretch."""
+        p = self.scale.size
+        params, end = self.space.decode(self.space.split(x[:p] * self.scale)), ()
+        if self.given is None:
+            predicted = self.simulate(params)
         else:
-            first = jax.tree.map(lambda node: node[0], nodes)
-            predicted, end = simulate(params, ravel_pytree(first)[1](x[p:]))
+            first = jax.tree.map(lambda node: node[0], self.given)
+            predicted, end = self.simulate(params, ravel_pytree(first)[1](x[p:]))
         return ravel_pytree(misfit(predicted, data, noise))[0], ravel_pytree(end)[0]
-
-    def along(x: Array, data: PyTree) -> Any:
-        def push(tangent: Array) -> Any:
-            return jax.jvp(lambda x: stretch(x, data), (x,), (tangent,))
-
-        return jax.vmap(push, out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype))
-
-    return jax.vmap(along)(x, data)
 
 
 def _placed(by_r: np.ndarray, by_end: np.ndarray, p: int) -> np.ndarray:

@@ -52,8 +52,7 @@ class Bending:
         )
         checks.nonzero(owner, "point_b − point_a", middle - first)
         checks.nonzero(owner, "point_c − point_b", last - middle)
-        stiffness = checks.number(owner, "stiffness", self.stiffness, a.position.dtype)
-        checks.positive(owner, "stiffness", stiffness, strictly=False)
+        stiffness = checks.amount(owner, "stiffness", self.stiffness, a.position.dtype)
         return {
             "anchor_a": a.local_point(first),
             "anchor_b": b.local_point(middle),

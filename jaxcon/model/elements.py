@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +18,21 @@ from jaxcon.geometry.pose import Pose
 from jaxcon.model.layout import Place
 
 
+class Grid(NamedTuple):
+    """Numbers of elements that stay one array (element, …): points of a set, heights of a field.
+
+    As a Vector each of them would be a lane.
+    """
+
+    values: Array
+
+
 @pytree
 class Elements:
     """Elements of one class on bodies of the same kinds.
 
     Attributes:
-        params: by field, a lane (element,) or a Vector of such.
+        params: by field, a lane (element,), a Vector of such, or a Grid.
         names: of the elements.
         places: the bodies they act on, one Place for each side.
     """
@@ -31,6 +40,26 @@ class Elements:
     params: dict[str, Any]
     names: tuple[str, ...] = static()
     places: tuple[Place, ...] = static()
+
+    @property
+    def endless(self) -> tuple[str, ...]:
+        """The fields that may be infinite, as the side on which a joint has no stop."""
+        return getattr(getattr(self, "law", None), "endless", ())
+
+    @property
+    def optional(self) -> tuple[str, ...]:
+        """The fields that the number 0 leaves out, as the friction of a smooth contact."""
+        return getattr(getattr(self, "law", None), "optional", ())
+
+    def why_without(self, fields: set[str]) -> str:
+        """Why fields are missing that these elements may have."""
+        if not (left := fields & set(self.optional)):
+            return ""
+        field = min(left)
+        return (
+            f" A {field} given as the number 0 leaves no rows to change: build the scene with"
+            f" another, or with {field}=jnp.zeros(())."
+        )
 
     def frames(self, snapshot: Any) -> tuple[Any, ...]:
         """The motion of the bodies on each side."""
@@ -45,7 +74,9 @@ class Elements:
         params = dict(self.params)
         for i, name in enumerate(self.names):
             for field, value in changes.get(name, {}).items():
-                params[field] = replace_at(f"{name}.{field}", params[field], i, value)
+                params[field] = replace_at(
+                    f"{name}.{field}", params[field], i, value, field in self.endless
+                )
         return dataclasses.replace(self, params=params)
 
     def select(self, indices: tuple[int, ...]) -> Any:
@@ -68,31 +99,49 @@ class Elements:
 
 def stack(elements: list[dict[str, Any]]) -> dict[str, Any]:
     """The numbers of elements side by side: arrays (), (n,) become lanes, Vectors of lanes."""
-    stacked = jax.tree.map(lambda *x: side_by_side(x), *elements)
-    return jax.tree.map(lambda x: x if x.ndim == 1 else Vector.of(x), stacked)
+    return jax.tree.map(_stacked, *elements, is_leaf=lambda x: isinstance(x, Grid))
 
 
-def side_by_side(arrays: Sequence[Array]) -> Array:
-    """Arrays along a new last axis; on the host where they are known, since they may be many."""
+def _stacked(*numbers: Any) -> Any:
+    if isinstance(numbers[0], Grid):
+        return Grid(side_by_side([x.values for x in numbers], axis=0))
+    lanes = side_by_side(numbers)
+    return lanes if lanes.ndim == 1 else Vector.of(lanes)
+
+
+def side_by_side(arrays: Sequence[Array], axis: int = -1) -> Array:
+    """Arrays along a new axis; on the host where they are known, since they may be many."""
     if checks.is_concrete(arrays):
-        return jnp.asarray(np.stack([np.asarray(x) for x in arrays], axis=-1))
-    return jnp.stack(arrays, axis=-1)
+        return jnp.asarray(np.stack([np.asarray(x) for x in arrays], axis=axis))
+    return jnp.stack(arrays, axis=axis)
 
 
 def element_at(x: Any, i: int) -> Array:
-    """The number () or vector (n,) of one element."""
+    """The number (), vector (n,) or grid of one element."""
+    if isinstance(x, Grid):
+        return x.values[i]
     return Vector(*(lane[i] for lane in x)).stack() if isinstance(x, Vector) else x[i]
 
 
-def replace_at(owner: str, x: Any, i: int, value: Any) -> Any:
-    """The lanes with one element's number or vector replaced.
+def replace_at(owner: str, x: Any, i: int, value: Any, endless: bool = False) -> Any:
+    """The lanes with one element's number, vector or grid replaced.
 
     Raises:
-        ValueError: a wrong shape or dtype, naming the owner.
+        ValueError: a wrong shape or dtype, or not finite, naming the owner.
     """
+    if isinstance(x, Grid):
+        known, shape = x.values, x.values.shape[1:]
+    else:
+        known, shape = (x[0], (len(x),)) if isinstance(x, Vector) else (x, ())
+    new = checks.number(owner, "the new value", value, known.dtype, shape)
+    if endless:
+        checks.between(owner, "the new value", value, -np.inf, np.inf)
+    else:
+        checks.finite(owner, "the new value", value)
+    if isinstance(x, Grid):
+        return Grid(x.values.at[i].set(new))
     if not isinstance(x, Vector):
-        return x.at[i].set(checks.number(owner, "the new value", value, x.dtype))
-    new = checks.number(owner, "the new value", value, x[0].dtype, (len(x),))
+        return x.at[i].set(new)
     pairs = zip(x, Vector.of(new), strict=True)
     return Vector(*(lane.at[i].set(component) for lane, component in pairs))
 

@@ -67,6 +67,10 @@ class Frame:
         """The origin: only bodies with an orientation have other points."""
         return Point(self.position, self.velocity, zeros(len(self.position)), lambda n: n)
 
+    def material(self, place: Vector) -> Point:
+        """What of the body is now at a place of the world, moving as its origin does."""
+        return Point(place, self.velocity, zeros(len(place)), lambda n: n)
+
     def gather(self, take: Callable[[Lane], Lane]) -> Frame:
         """The frames of some of the bodies."""
         return jax.tree.map(take, self)
@@ -83,6 +87,10 @@ class WorldFrame:
         """A point of the world."""
         rest = zeros(self.dim)
         return Point(Vector.of(anchor), rest, rest, lambda n: Vector())
+
+    def material(self, place: Vector) -> Point:
+        """The point of the world itself."""
+        return self.point(place)
 
     def direction(self, axis: Any) -> Direction:
         """A direction of the world."""
@@ -144,6 +152,10 @@ class PlanarFrame(Frame):
             lambda n: Vector(*n, r.cross(n)),
         )
 
+    def material(self, place: Vector) -> Point:
+        """What of the body is now at a place of the world."""
+        return self.point(self.rotation.T @ (place - self.position))
+
     def direction(self, axis: Any) -> Direction:
         """u = R û, u̇ = ω u⊥, bias −ω² u, pull (0, 0, u × n)."""
         u = self.rotation @ Vector.of(axis)
@@ -193,6 +205,10 @@ class SpatialFrame(Frame):
             self.spin.cross(swing),
             lambda n: Vector(*n, *s.cross(self.rotation.T @ n)),
         )
+
+    def material(self, place: Vector) -> Point:
+        """What of the body is now at a place of the world."""
+        return self.point(self.rotation.T @ (place - self.position))
 
     def direction(self, axis: Any) -> Direction:
         """u = R û, u̇ = Rω × u, bias Rω × (Rω × u), pull (0, û × Rᵀn)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -57,6 +57,11 @@ class GeneralizedCoordinates:
     @property
     def counted(self) -> tuple[Any, ...]:
         """None."""
+        return ()
+
+    @property
+    def bounds(self) -> tuple[Any, ...]:
+        """No rows are bounded."""
         return ()
 
     def remember(self, turns: PyTree) -> GeneralizedCoordinates:
@@ -132,5 +137,21 @@ class GeneralizedCoordinates:
         return Energy(v @ self.mass(q).apply(v) / 2, potential)
 
     def with_params(self, params: PyTree) -> GeneralizedCoordinates:
-        """The same system with another θ; nothing is retraced by it."""
-        return dataclasses.replace(self, params=params)
+        """The same system with other numbers; nothing is retraced by it.
+
+        Args:
+            params: where θ is a mapping, as much of it as changes; another θ elsewhere.
+
+        Raises:
+            ValueError: a name that θ does not have.
+        """
+        return dataclasses.replace(self, params=_changed(self.params, params))
+
+
+def _changed(known: PyTree, changes: PyTree) -> PyTree:
+    """Known mappings with some of their values changed, those of mappings within them likewise."""
+    if not (isinstance(known, dict) and isinstance(changes, Mapping)):
+        return changes
+    if unknown := [name for name in changes if name not in known]:
+        raise ValueError(f"with_params: {unknown} is unknown; known are {list(known)}.")
+    return known | {name: _changed(known[name], x) for name, x in changes.items()}

@@ -32,8 +32,13 @@ class State:
     turns: PyTree = ()
 
 
-def at(system: Any, state: Any) -> Any:
+def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:
     """The system as one of its worlds remembers it, checked: see `recall`.
+
+    Args:
+        system: of the state.
+        state: of one world.
+        call: what was called, of a state s, for errors.
 
     Raises:
         TypeError: they are something else, such as a Scene that was not built.
@@ -49,7 +54,7 @@ def at(system: Any, state: Any) -> Any:
         if got != (size,):
             raise ValueError(
                 f"state.{what} must have shape ({size},), got {got}; for batches and trajectories"
-                " use jax.vmap: jax.vmap(lambda s: jc.position(system, s, name))(trajectory)."
+                f" use jax.vmap: jax.vmap(lambda s: {call})(states)."
             )
     return recall(system, state.turns)
 

@@ -85,6 +85,7 @@ class BodySystem:
         turns: the angles a step ago of joints whose whole turns are counted, (n,) [rad].
         layout: names and indices.
         counted: which these are.
+        bounds: groups of equal elements whose multipliers are bounded.
     """
 
     gravity: Array
@@ -96,6 +97,7 @@ class BodySystem:
     turns: Any
     layout: Layout = static()
     counted: tuple[JointCoordinate, ...] = static(default=())
+    bounds: tuple[Any, ...] = ()
 
     @property
     def n_v(self) -> int:
@@ -250,7 +252,11 @@ class BodySystem:
 
     @property
     def params(self) -> dict[str, Any]:
-        """Every number by name: `gravity`, and for each body, constraint and force its fields."""
+        """Numbers by name: `gravity`, and for each body, constraint and force its fields.
+
+        Not among them is where the centre of mass and the principal axes of a body lie (`offsets`),
+        nor where a fixed body is: build the scene inside the differentiated function for these.
+        """
         result: dict[str, Any] = {"gravity": self.gravity}
         for group, properties in zip(self.layout.groups, self.inertia, strict=True):
             for i, name in enumerate(group.names):
@@ -258,7 +264,7 @@ class BodySystem:
                 if properties.moments is not None:
                     fields["inertia"] = element_at(properties.moments, i)
                 result[name] = fields
-        for element in (*self.constraints, *self.forces):
+        for element in (*self.constraints, *self.forces, *self.bounds):
             result.update({name: element.get(i) for i, name in enumerate(element.names)})
         return result
 
@@ -285,8 +291,10 @@ class BodySystem:
                     f" {sorted(known[name])}, got {fields!r}."
                 )
             if unknown := set(fields) - set(known[name]):
+                owners = (group for group in self.bounds if name in group.names)
+                why = "".join(group.why_without(unknown) for group in owners)
                 raise ValueError(
-                    f"'{name}' has no {sorted(unknown)}, it has {sorted(known[name])}."
+                    f"'{name}' has no {sorted(unknown)}, it has {sorted(known[name])}.{why}"
                 )
             for field in fields.keys() & POSITIVE | fields.keys() & NOT_NEGATIVE:
                 shape = known[name][field].shape
@@ -297,6 +305,7 @@ class BodySystem:
         if "gravity" in changes:
             shape = (self.layout.dim,)
             gravity = checks.number("gravity", "it", changes["gravity"], gravity.dtype, shape)
+            checks.finite("gravity", "it", changes["gravity"])
         return dataclasses.replace(
             self,
             gravity=gravity,
@@ -306,6 +315,7 @@ class BodySystem:
             ),
             constraints=tuple(element.set(changes) for element in self.constraints),
             forces=tuple(element.set(changes) for element in self.forces),
+            bounds=tuple(element.set(changes) for element in self.bounds),
         )
 
 

@@ -1,8 +1,9 @@
 """What the reverse pass of a rollout keeps, and how far back it goes.
 
 The reverse pass needs the state before each step. It can keep all of them, or some, between which
-it steps forward once more. An adjoint is a value that says which; it changes neither the rollout
-nor, but for `Truncated` and `Discounted`, its derivative. Forward mode keeps nothing.
+it steps forward once more, or step back (`reversible`). An adjoint is a value that says which; it
+changes neither the rollout nor, but for `Truncated` and `Discounted`, its derivative. Forward mode
+keeps nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
@@ -33,6 +35,8 @@ class Path:
         start: the first state.
         inputs: of all steps, by first axis.
         steps, every: how many, and the stride of the record.
+        back: (state, what the step that led there was given) → the state before; or why there is
+            no such function.
     """
 
     step: Callable[[State, Any], tuple[State, Any]]
@@ -41,6 +45,7 @@ class Path:
     inputs: PyTree
     steps: int
     every: int
+    back: Callable[[State, Any], State] | str
 
     def scan(self, sizes: Sequence[int] = ()) -> tuple[State, PyTree]:
         """The final state and the record, with segments of so many steps, each in the one before.
@@ -81,9 +86,9 @@ class EveryStep:
         """The final state and the record of a path."""
         return path.scan()
 
-    def sizes(self, steps: int, state: State) -> tuple[int, ...]:
-        """No segments."""
-        return ()
+    def kept(self, steps: int, state: State) -> tuple[int, ...]:
+        """How many states are kept, by level: those of all steps."""
+        return (steps,)
 
 
 @pytree
@@ -93,18 +98,19 @@ class Checkpoints:
     Each level beyond the first costs one more forward pass.
 
     Attributes:
-        levels: L; 1 is `EveryStep()`.
+        levels: L, 2 unless given; 1 is `EveryStep()`.
         segments: in place of L, how many steps there are from a checkpoint to the next; or several
             such numbers, each a divisor of the one before, a segment of one level being cut into
             those of the next.
-        budget: in place of L, how many bytes the states kept of one world may take. The fewest
-            levels are chosen that are enough.
+        budget: in place of L, how many bytes the states kept of one world may take; what the
+            derivative of one step needs, the record and the controls come on top. The fewest levels
+            are chosen that are enough.
 
     References:
         Griewank, Walther, Algorithm 799: revolve, ACM Trans. Math. Softw. 26 (2000).
     """
 
-    levels: int = static(default=2)
+    levels: int | None = static(default=None)
     segments: int | tuple[int, ...] | None = static(default=None)
     budget: int | None = static(default=None)
 
@@ -112,19 +118,26 @@ class Checkpoints:
         """The final state and the record of a path."""
         return path.scan(self.sizes(path.steps, path.start))
 
+    def kept(self, steps: int, state: State) -> tuple[int, ...]:
+        """How many states are kept, by level; the last are those of single steps."""
+        return kept(steps, self.sizes(steps, state))
+
     def sizes(self, steps: int, state: State) -> tuple[int, ...]:
         """The lengths of the segments by level [steps].
 
         Raises:
             ValueError: numbers out of range, or a budget that no number of levels meets.
         """
-        if self.segments is not None and self.budget is not None:
-            raise ValueError("Checkpoints: segments and budget exclude each other; give one.")
+        if sum(x is not None for x in (self.levels, self.segments, self.budget)) > 1:
+            raise ValueError(
+                "Checkpoints: levels, segments and budget exclude each other; give one."
+            )
         if self.segments is not None:
             return _given(self.segments)
         if self.budget is None:
-            checks.count("Checkpoints", "levels", self.levels)
-            return equal_levels(steps, self.levels)
+            levels = 2 if self.levels is None else self.levels
+            checks.count("Checkpoints", "levels", levels)
+            return equal_levels(steps, levels)
         own = bytes_of(state)
         choices = [equal_levels(steps, n) for n in range(1, steps.bit_length() + 2)]
         for sizes in choices:
@@ -162,9 +175,9 @@ class Truncated:
 
         return self.within.scan(dataclasses.replace(path, step=step))
 
-    def sizes(self, steps: int, state: State) -> tuple[int, ...]:
-        """The segments of the adjoint within."""
-        return self.within.sizes(steps, state)
+    def kept(self, steps: int, state: State) -> tuple[int, ...]:
+        """How many states the adjoint within keeps."""
+        return self.within.kept(steps, state)
 
 
 @pytree
@@ -182,15 +195,17 @@ class Discounted:
     def scan(self, path: Path) -> tuple[State, PyTree]:
         """The final state and the record of a path."""
         checks.positive("Discounted", "factor", self.factor, strictly=False)
+        if checks.is_concrete(self.factor) and np.any(np.asarray(self.factor) > 1):
+            raise ValueError(f"Discounted: factor must be from 0 to 1, got {self.factor}.")
 
         def step(state: State, given: Any) -> tuple[State, Any]:
             return path.step(faded(state, self.factor), given)
 
         return self.within.scan(dataclasses.replace(path, step=step))
 
-    def sizes(self, steps: int, state: State) -> tuple[int, ...]:
-        """The segments of the adjoint within."""
-        return self.within.sizes(steps, state)
+    def kept(self, steps: int, state: State) -> tuple[int, ...]:
+        """How many states the adjoint within keeps."""
+        return self.within.kept(steps, state)
 
 
 EVERY_STEP = EveryStep()
@@ -213,6 +228,8 @@ def check_adjoint(adjoint: Any) -> None:
 
 def _given(segments: int | tuple[int, ...]) -> tuple[int, ...]:
     """The lengths of segments as the user gave them, checked."""
+    if isinstance(segments, list):
+        raise ValueError(f"Checkpoints: give segments as a tuple, {tuple(segments)}.")
     sizes = segments if isinstance(segments, tuple) else (segments,)
     for size in sizes:
         checks.count("Checkpoints", "segments", size)

@@ -21,7 +21,6 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
-from jaxcon.stabilization.multipliers import AugmentedLagrangian
 
 
 class Advanced(NamedTuple):
@@ -46,6 +45,11 @@ GYROSCOPIC = ("explicit", "trapezoidal")
 
 class Explicit:
     """An integrator that needs accelerations only; admits every stabiliser."""
+
+    @property
+    def bounded(self) -> bool:
+        """Whether limits, friction and contact may act beside it."""
+        return True
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:
         """No memory."""
@@ -88,6 +92,11 @@ class SemiImplicitEuler(Explicit):
 
     gyroscopic: str = static(default="explicit")
 
+    @property
+    def bounded(self) -> bool:
+        """With the explicit torque: the other would undo what bounds allow."""
+        return self.gyroscopic == "explicit"
+
     def check(self) -> None:
         """Checks the choice.
 
@@ -99,16 +108,6 @@ class SemiImplicitEuler(Explicit):
                 f"SemiImplicitEuler: gyroscopic must be one of {GYROSCOPIC}, got"
                 f" {self.gyroscopic!r}."
             )
-
-    def refuses(self, system: Any, stabilizer: Any) -> str | None:
-        """The trapezoidal rule beside a solver that is the stabiliser's own."""
-        own = isinstance(stabilizer, AugmentedLagrangian) and turns_in_space(system)
-        if self.gyroscopic == "explicit" or not own:
-            return None
-        return (
-            'gyroscopic="trapezoidal" solves with the factors of the step, and AugmentedLagrangian'
-            " has rounds of its own; take Baumgarte() or the explicit torque"
-        )
 
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
@@ -122,7 +121,10 @@ class SemiImplicitEuler(Explicit):
             more = allowed(system.kicked(state.q, state.v, change, dt[None]))
             v = state.v + change + more.acceleration
             solution = solution._replace(status=status.first(solution.status, more.status))
-        q = system.retract(state.q, dt[None] * v)
+        moving = v
+        if rows.reactions is not None and rows.reactions.shift is not None:
+            moving = v + rows.reactions.shift
+        q = system.retract(state.q, dt[None] * moving)
         return Advanced((q, v, state.time + dt), solution, rows)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
@@ -191,7 +193,8 @@ class RungeKutta(Explicit):
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
         q, v, t, h = state.q, state.v, state.time, dt[None]
-        system, (solution, rows) = dynamics.system, dynamics(state.q, state.v, state.time)
+        system = dynamics.system
+        solution, rows, dynamics = dynamics.begun(state.q, state.v, state.time)
         first = system.kinematics(q, v), solution.acceleration
 
         def stage(carry: Any, row: tuple[Array, Array]) -> tuple[Any, None]:

@@ -6,11 +6,14 @@ import functools
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
+from jaxcon.constraints.bounds import count_bounds
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import PyTree
 from jaxcon.simulation.integrators import SemiImplicitEuler
 from jaxcon.simulation.stability import stable_rate
+from jaxcon.solvers.interior_point import InteriorPoint
 from jaxcon.solvers.proximal import RankSafe
 from jaxcon.stabilization.baumgarte import Baumgarte
 
@@ -19,6 +22,8 @@ PARTS = (
     ("stabilizer", "target", "Baumgarte()"),
     ("solver", "solve", "RankSafe()"),
     ("recovery", "repair", "Recovery()"),
+    ("bounded", "smoothing", "InteriorPoint()"),
+    ("events", "splits", "Events()"),
 )
 """What a method consists of: the field, what its value can do, and an example."""
 
@@ -29,6 +34,7 @@ class Memory(NamedTuple):
     integrator: PyTree = ()
     stabilizer: PyTree = ()
     recovery: PyTree = ()
+    bounded: PyTree = ()
 
 
 @pytree
@@ -42,18 +48,26 @@ class Method:
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
             want independent rows; `Priority(levels)` meets them level by level.
         recovery: `Recovery(…)`, which repairs steps that fail; None, and a world that fails stops.
+        bounded: of limits, friction and contact: `InteriorPoint()`, exact, `GaussSeidel(…)`,
+            cheap, or `Nearest(…)` of one of them, for few rows of many. A scene without such rows
+            has no trace of it.
+        events: `Events(…)`, which splits a step where a stop, rope or contact is hit; None, and
+            impacts are those of plain stepping. A scene without such rows has no trace of it.
     """
 
     integrator: Any = SemiImplicitEuler()
     stabilizer: Any = Baumgarte()
     solver: Any = RankSafe()
     recovery: Any = None
+    bounded: Any = InteriorPoint()
+    events: Any = None
 
     def init(self, system: Any, q: Any, v: Any) -> PyTree:
         """What a state remembers for the method: a `Memory`, or () where there is nothing."""
         repairs = () if self.recovery is None else self.recovery.init(system, q, v)
         own = self.integrator.init(system, q, v), self.stabilizer.init(system, q, v)
-        memory = Memory(*own, repairs)
+        count = count_bounds(system, q, v) if self.bounded.warm else 0
+        memory = Memory(*own, repairs, jnp.zeros(count, q.dtype) if count else ())
         return memory if jax.tree.leaves(memory) else ()
 
     def feedback(self, dt: Any) -> Any:
@@ -68,8 +82,26 @@ class Method:
             ValueError: it does not; the message says why.
         """
         reason = self.integrator.refuses(system, self.stabilizer)
+        if system.bounds and not getattr(self.integrator, "bounded", False):
+            names = [name for group in system.bounds for name in group.names]
+            reason = (
+                f"it has no place for the bounded rows of {names}, which are solved once a step"
+                " beside explicit forces; take SemiImplicitEuler() with the explicit torque, or a"
+                " Runge–Kutta method"
+            )
         if reason:
             raise ValueError(f"{type(self.integrator).__name__}: {reason}.")
+
+    def irreversible(self) -> str | None:
+        """Why a step by −h does not undo one by h; None where it does."""
+        if not getattr(self.integrator, "symmetric", False):
+            return (
+                f"a step of {type(self.integrator).__name__} is not undone by one of −h, as one of"
+                " RATTLE is"
+            )
+        if self.recovery is not None:
+            return "a Recovery leads on from states to which no step leads back"
+        return None
 
     def check(self) -> None:
         """Checks that each part is a value of its kind.
@@ -79,14 +111,19 @@ class Method:
         """
         if hasattr(self.integrator, "check") and not isinstance(self.integrator, type):
             self.integrator.check()
-        if hasattr(self.recovery, "check") and not isinstance(self.recovery, type):
-            self.recovery.check()
+        for part in (self.recovery, self.events):
+            if hasattr(part, "check") and not isinstance(part, type):
+                part.check()
         for part, verb, example in PARTS:
             value = getattr(self, part)
-            absent = part == "recovery" and value is None
+            absent = part in ("recovery", "events") and value is None
             if not absent and (isinstance(value, type) or not hasattr(value, verb)):
-                raise TypeError(f"Method: {part} must be a value such as {example}, got {value!r}.")
-        for part in (self.stabilizer, self.solver):
+                fits = [other for other, can, _ in PARTS if hasattr(value, can)]
+                hint = f"; that is one for {fits[0]}=" if fits and fits[0] != part else ""
+                raise TypeError(
+                    f"Method: {part} must be a value such as {example}, got {value!r}{hint}."
+                )
+        for part in (self.stabilizer, self.solver, self.bounded):
             if hasattr(part, "check"):
                 part.check()
 

@@ -58,6 +58,11 @@ class RATTLE:
     iterations: int = static(default=40)
     rounds: int = static(default=20)
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether a step by −h undoes one by h: both ends enter the equations alike."""
+        return True
+
     def init(self, system: Any, q: Array, v: Array) -> PyTree:
         """No memory."""
         return ()
@@ -211,9 +216,9 @@ def _off(rows: Rows, q: Array) -> Array:
 
 
 def _rounding(q: Array, dt: Any) -> Array:
-    """What the rounding of q makes of φ/h, by world."""
+    """What the rounding of q makes of φ/h, by world; h < 0 on the way back."""
     eps = float(jnp.finfo(q.dtype).eps)
-    return numerics.safe_divide(64 * eps * (1 + jnp.max(jnp.abs(q), axis=0)), dt)
+    return numerics.safe_divide(64 * eps * (1 + jnp.max(jnp.abs(q), axis=0)), jnp.abs(dt))
 
 
 def _late(moved: Array, v: Array, rounding: Array) -> Array:

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core.native import keep, lift, spread
+from jaxcon.core.pytree import Parts
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
 
@@ -28,14 +29,10 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     Returns:
         What the function returns.
     """
-    leaves, structure = jax.tree.flatten(args)
-    arrays = [jnp.asarray(x) for x in leaves]
-    inexact = [jnp.issubdtype(x.dtype, jnp.inexact) for x in arrays]
+    parts = Parts.of(args)
 
     def call(floats: list[Array], others: list[Array]) -> Any:
-        iterators = {True: iter(floats), False: iter(others)}
-        merged = [next(iterators[flag]) for flag in inexact]
-        return function(*jax.tree.unflatten(structure, merged))
+        return function(*parts.merge(floats, others))
 
     contained = jax.custom_jvp(call)
 
@@ -49,9 +46,7 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
         healthy = ~failed(output[1])
         return output, _mask(healthy, pushforward(_mask(healthy, moved)))
 
-    floats = [x for x, flag in zip(arrays, inexact, strict=True) if flag]
-    others = [x for x, flag in zip(arrays, inexact, strict=True) if not flag]
-    return contained(floats, others)
+    return contained(*parts.split(args))
 
 
 def stop_failed(status: Array, tree: PyTree) -> PyTree:

@@ -17,7 +17,7 @@ from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.recovery import contain
-from jaxcon.stabilization.baumgarte import Law
+from jaxcon.stabilization.baumgarte import Law, check_stabilizer
 from jaxcon.stabilization.hybrid import Hybrid
 from jaxcon.stabilization.penalty import Penalty
 from jaxcon.stabilization.projection import Projection
@@ -80,28 +80,26 @@ class Recovery:
         """Checks its numbers.
 
         Raises:
-            ValueError: one is out of range.
+            ValueError: one is out of range, or the projector moves no positions or has a memory.
             TypeError: the projector is no stabiliser.
         """
         checks.positive("Recovery", "shrink", self.shrink)
         checks.count("Recovery", "retries", self.retries, 0)
         for name, low, high in (("shrink", 0, 1), ("growth", 1, np.inf), ("damping", 0, 1)):
-            value = getattr(self, name)
-            if checks.is_concrete(value) and np.any(np.clip(value, low, high) != value):
-                raise ValueError(f"Recovery: {name} must be from {low} to {high}, got {value}.")
+            checks.between("Recovery", name, getattr(self, name), low, high)
+        checks.positive("Recovery", "growth", self.growth)  # finite, for the sake of derivatives
         if self.limit is not None:
             checks.positive("Recovery", "limit", self.limit)
-        if isinstance(self.projector, type) or not hasattr(self.projector, "correct"):
-            raise TypeError(f"Recovery: projector must be a stabiliser, got {self.projector!r}.")
-        moves = getattr(self.projector, "corrects", True)
-        if not (moves and getattr(self.projector, "position", True)):
+        check_stabilizer("Recovery", "projector", self.projector)
+        kind = type(self.projector).__name__
+        if "position" not in self.projector.corrects:
             raise ValueError(
-                f"Recovery: projector={type(self.projector).__name__} corrects no positions;"
-                " take a Projection."
+                f"Recovery: projector={kind} corrects no positions; take a Projection."
             )
-        if getattr(self.projector, "every", 1) != 1:
+        if self.projector.remembers:
             raise ValueError(
-                "Recovery: a projector acts at once and counts no steps; leave every=1."
+                f"Recovery: projector={kind} has a memory, but a projector acts at once; take a"
+                " Projection with every=1."
             )
 
     def init(self, system: Any, q: Array, v: Array) -> Repairs:

@@ -9,16 +9,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.errors import TracerIntegerConversionError
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 
+from jaxcon.core.closures import opened
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
-from jaxcon.model.state import State
+from jaxcon.model.state import State, at
 from jaxcon.simulation.adjoints import EVERY_STEP, Path, check_adjoint
 from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain, stop_failed
 from jaxcon.simulation.stability import warn_if_unstable
-from jaxcon.simulation.step import StepInfo, step_quietly
+from jaxcon.simulation.step import StepInfo, step_quietly, undo
+
+FEEDBACK = (
+    "controls are a function of the state, and that before a step is not known until the step is"
+    " undone"
+)
+"""Why steps under such controls are not taken back."""
 
 Record = Callable[[State, StepInfo], PyTree]
 
@@ -52,8 +58,8 @@ def rollout(
         record: (state, info) → what to keep; the whole state unless given. `info` is what the step
             that led to the state saw at its start.
         every: keep one of so many steps; must divide `steps`.
-        adjoint: what the reverse pass keeps, `EveryStep()` or `Checkpoints(…)`, and how far back
-            it goes, `Truncated(…)` or `Discounted(…)`.
+        adjoint: what the reverse pass keeps, `EveryStep()`, `Checkpoints(…)` or `Reversible()`, and
+            how far back it goes, `Truncated(…)` or `Discounted(…)`.
 
     Returns:
         The final state, and what was recorded with a first axis of steps // every. A world that
@@ -67,6 +73,7 @@ def rollout(
     if steps < 0 or every < 1 or steps % every:
         raise ValueError(f"rollout: every={every} must divide steps={steps}.")
     check_method(method)
+    at(system, state, "jc.rollout(system, method, s, controls, dt, steps)")
     check_adjoint(adjoint)
     warn_if_unstable(method, dt, system, state)
     policy = controls if callable(controls) else None
@@ -76,25 +83,27 @@ def rollout(
         control = contained_policy(policy, state) if policy else given[1]
         return step_quietly(system, method, state, control, dt)
 
-    final, trajectory = adjoint.scan(Path(one, record, state, inputs, steps, every))
+    def back(state: State, given: Any) -> State:
+        return undo(system, method, state, given[1], dt)
+
+    reason = FEEDBACK if policy else method.irreversible()
+    path = Path(one, record, state, inputs, steps, every, reason or back)
+    final, trajectory = adjoint.scan(path)
     return stop_failed(final.status, final), stop_failed(final.status, trajectory)
 
 
 def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
     """policy(state), with no gradient in a world where its result is not finite."""
-    closed, shapes = jax.make_jaxpr(policy, return_shape=True)(state)
-    structure = jax.tree.structure(shapes)
+    function, known, _ = opened(policy, state)  # what it closes over has tangents to be masked
 
     def judged(state: State, constants: Any) -> tuple[PyTree, Any]:
-        # what the policy closes over, traced or not, as arguments whose tangents can be masked
-        function = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))
-        control = jax.tree.unflatten(structure, function(*jax.tree.leaves(state)))
+        control = function(constants, state)
         good = ~failed(state.status)
         for x in jax.tree.leaves(control):
             good &= jnp.all(jnp.isfinite(x))
         return control, jnp.where(good, Status.OK, Status.NON_FINITE)
 
-    return contain(judged, (state, closed.consts))[0]
+    return contain(judged, (state, known))[0]
 
 
 def _integer(what: str, number: Any) -> int:

@@ -90,6 +90,11 @@ def warn_if_unstable(method: Any, dt: Any, system: Any = None, state: Any = None
 
 def instability(method: Any, h: float, system: Any = None, state: Any = None) -> str | None:
     """What is wrong with the first gains or springs that are unstable; None where none are."""
+    with jax.ensure_compile_time_eval():  # gains may be arrays, inside a trace that is not theirs
+        return _first_unstable(method, h, system, state)
+
+
+def _first_unstable(method: Any, h: float, system: Any, state: Any) -> str | None:
     for part in parts(method.stabilizer):
         message = unstable_gains(method.integrator, part, h)
         if isinstance(part, Penalty) and not part.implicit and checks.is_concrete((system, state)):
@@ -111,8 +116,7 @@ def unstable_gains(integrator: Any, stabilizer: Any, h: float) -> str | None:
         return None
     gains = [getattr(stabilizer, name, None) for name in ("alpha", "beta", "integral")]
     if isinstance(stabilizer, PID):
-        with jax.ensure_compile_time_eval():
-            default = [float(x) for x in integrator.default_gains(h)]
+        default = [float(x) for x in integrator.default_gains(h)]
         gains = [
             own if own is not None else x for own, x in zip(gains, (*default, 0.0), strict=True)
         ]
@@ -152,12 +156,11 @@ def unstable_spring(
 
     A spring k and damper d on the mass m = 1/A_ii obey φ̈ + (d/m) φ̇ + (k/m) φ = 0.
     """
-    with jax.ensure_compile_time_eval():
-        rows = linearize(recall(system, state.turns), state.q, state.v, state.time)
-        rows = dataclasses.replace(rows, mass=system.mass(state.q))
-        soft = penalty.soft(rows.layout)
-        numbers = (felt(rows), *penalty.constants(rows))
-        own, k, d = (np.broadcast_to(np.asarray(x), soft.shape) for x in numbers)
+    rows = linearize(recall(system, state.turns), state.q, state.v, state.time)
+    rows = dataclasses.replace(rows, mass=system.mass(state.q))
+    soft = penalty.soft(rows.layout)
+    numbers = (felt(rows), *penalty.constants(rows))
+    own, k, d = (np.broadcast_to(np.asarray(x), soft.shape) for x in numbers)
     if not soft.any():
         return None
     worst = int(np.argmax(np.where(soft, k * own + (d * own / 2) ** 2, -1.0)))

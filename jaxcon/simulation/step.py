@@ -9,36 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.constraints.rows import Violation
 from jaxcon.core import checks, native, status
 from jaxcon.core.native import keep
-from jaxcon.core.pytree import pytree
-from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State, at, recall
+from jaxcon.simulation.attempt import StepInfo, attempt, dynamics_at
 from jaxcon.simulation.initialize import check_dtype
-from jaxcon.simulation.method import Memory, Method, check_method
+from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain
 from jaxcon.simulation.stability import warn_if_unstable
 from jaxcon.solvers.saddle import Solution
-
-
-@pytree
-class StepInfo:
-    """What a step saw at its start; zeros in a world that failed.
-
-    Attributes:
-        acceleration: a, (n_v,).
-        multipliers: λ, (n_c,).
-        violation: φ and φ̇ by constraint.
-        status: what became of this step, or what stopped the world before, ().
-    """
-
-    acceleration: Array
-    multipliers: Array
-    violation: Violation
-    status: Array
 
 
 def step(
@@ -77,6 +57,17 @@ def step_quietly(
     return native.call(contained_step, system, method, state, control, h)
 
 
+def undo(system: Any, method: Method, state: State, control: PyTree, dt: Any) -> State:
+    """The state from which a step by h led to this one, by a step by −h of a symmetric integrator.
+
+    The angles that it counts turns from are those at its end, not those before its start; either
+    tells the same turns.
+    """
+    control = check_step(system, method, state, control)
+    h = checks.number("step", "dt", dt, state.q.dtype)
+    return native.call(contained_step, system, method, state, control, -h)[0]
+
+
 def contained_step(
     system: Any, method: Method, state: State, control: PyTree, dt: Array
 ) -> tuple[State, StepInfo]:
@@ -105,23 +96,9 @@ def _repair(system: Any, method: Method, state: State, attempt: Any, dt: Array) 
 
 
 def _attempt(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
-    """(new state, info) and the status of this step alone."""
-    dynamics = dynamics_at(system, method, state, control, dt)
-    system, memory = dynamics.system, Memory(*state.memory)
-    advanced = method.integrator.advance(dynamics, state, memory.integrator, dt)
-    (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
-    new = dataclasses.replace(state, q=q, v=v, time=time)
-    stabilizer = method.feedback(dt)
-    own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
-    new, corrected = stabilizer.correct(system, method.solver, state, new, own, dt)
-    turns = system.count(state.q, state.v, state.time)
-    kept = Memory(advanced.memory, own, memory.recovery) if state.memory else ()
-    new = dataclasses.replace(new, turns=turns, memory=kept)
-    code = status.first(judge(new, solution), corrected)
-    if method.recovery is not None:
-        code = status.first(code, method.recovery.judge(system, new))
-    info = StepInfo(solution.acceleration, solution.multipliers, rows.violation, code)
-    return (new, info), code
+    """(new state, info) and the status of this step alone, split at impacts where that is asked."""
+    whole = attempt if method.events is None else method.events.attempt
+    return whole(system, method, state, control, dt)
 
 
 def _settle(state: State, attempt: Any) -> Any:
@@ -134,26 +111,13 @@ def _settle(state: State, attempt: Any) -> Any:
     return (new, dataclasses.replace(info, status=jnp.where(healthy, own, code))), code
 
 
-def dynamics_at(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Dynamics:
-    """What an integrator sees of the system during a step from this state."""
-    stabilizer, memory = method.feedback(dt), Memory(*state.memory)
-    if method.recovery is not None:
-        stabilizer = method.recovery.relax(stabilizer, memory.recovery)
-    system = recall(system, state.turns)
-    return Dynamics(system, stabilizer, method.solver, control, memory.stabilizer, dt)
-
-
-def judge(state: State, solution: Solution) -> Array:
-    """What the solver said, or NON_FINITE where the new state is."""
-    finite = jnp.all(jnp.isfinite(state.q), axis=0) & jnp.all(jnp.isfinite(state.v), axis=0)
-    code = jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32)
-    return status.first(solution.status, code)
-
-
 def forward_dynamics(
     system: Any, state: State, control: PyTree, method: Method, dt: Any
 ) -> Solution:
     """a and λ at a state, under the method's feedback of φ and φ̇ as they are there.
+
+    Bounded rows are solved as over a step of h: a then holds their mean over it, of an impact the
+    impulse over h.
 
     To read the forces at a state, take `Unstabilized()`: what feedback adds is not of the motion,
     and the φ̇ that semi-implicit Euler leaves, ½hγ, is no error to be fed back.
@@ -190,7 +154,7 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
     Raises:
         ValueError: wrong shapes, mixed dtypes, or memory of another method.
     """
-    at(system, state)
+    at(system, state, "jc.step(system, method, s, control, dt)")
     check_method(method)
     layout = getattr(system, "layout", None)
     if layout is not None:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.lanes import Vector, collect, plus, take, times, total
+from jaxcon.core.lanes import Vector, collect, plus, take, times, total, widened
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 
@@ -79,6 +79,14 @@ class Jacobian:
         counts = {block.start: block.shape[1] for block in self.blocks}
         return join(rows, counts, v)
 
+    def reach(self, v: Array) -> Array:
+        """|J| |v|, (n_c,): J v as large as it could be if no terms cancelled."""
+
+        def block(old: Block) -> Block:
+            return dataclasses.replace(old, value=tuple(row.map(abs) for row in old.value))
+
+        return dataclasses.replace(self, blocks=tuple(map(block, self.blocks))).apply(jnp.abs(v))
+
     def transpose(self, multipliers: Array) -> Array:
         """Jᵀ λ, (n_v,)."""
         terms: dict[int, tuple[Columns, list[Any]]] = {}
@@ -104,6 +112,16 @@ class Jacobian:
             free = start + columns.components * columns.bodies
         lanes.append(jnp.zeros((self.shape[1] - free, *multipliers.shape[1:]), multipliers.dtype))
         return jnp.concatenate([x for x in lanes if x.shape[0]])
+
+    def columns(self, like: Array) -> Array:
+        """Jᵀ as right sides (n_v, …, n_c) for lanes like (n_c, …)."""
+        n = self.shape[0]
+        unit = jnp.eye(n, dtype=like.dtype).reshape(n, *(1,) * (like.ndim - 1), n)
+        return widened(self).transpose(jnp.broadcast_to(unit, (*like.shape, n)))
+
+    def each(self, v: Array) -> Array:
+        """J v of many v (n_v, …, k), (n_c, …, k)."""
+        return widened(self).apply(v)
 
     def only(self, kept: np.ndarray, like: Array) -> Jacobian:
         """J with rows of zeros where they are not kept, (n_c,); `like` has the axes of a lane."""
@@ -135,6 +153,31 @@ class Jacobian:
         dtype = jnp.result_type(*entries) if entries else jnp.result_type(float)
         flat = [x.astype(dtype) for x in entries]
         return jnp.concatenate([*flat, jnp.zeros(1, dtype)])[index]
+
+
+@pytree
+class Gathered:
+    """J of rows that are not the same in each world, its columns first: Jᵀ (n_v, …, n)."""
+
+    transposed: Array
+
+    def apply(self, v: Array) -> Array:
+        """J v, (n,)."""
+        return jnp.moveaxis(jnp.sum(self.transposed * v[..., None], axis=0), -1, 0)
+
+    def transpose(self, multipliers: Array) -> Array:
+        """Jᵀ λ, (n_v,)."""
+        return jnp.sum(self.transposed * jnp.moveaxis(multipliers, 0, -1)[None], axis=-1)
+
+    def columns(self, like: Array) -> Array:
+        """Jᵀ as right sides (n_v, …, n) for lanes like (n, …)."""
+        shape = (len(self.transposed), *like.shape[1:], len(like))
+        return jnp.broadcast_to(self.transposed, shape)
+
+    def each(self, v: Array) -> Array:
+        """J v of many v (n_v, …, k), (n, …, k)."""
+        every = jnp.sum(self.transposed[..., None] * v[..., None, :], axis=0)
+        return jnp.moveaxis(every, -2, 0)
 
 
 def _chosen(kept: np.ndarray, like: Array, lane: Lane) -> Lane:

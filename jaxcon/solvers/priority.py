@@ -23,7 +23,7 @@ LEVELS = range(4)
 
 
 def Priority(  # noqa: N802
-    levels: Mapping[str, int], cutoff: Any = None, conflict: Any = 1e-2, damping: Any = None
+    levels: Mapping[str, int], cutoff: Any = None, conflict: Any = None, damping: Any = None
 ) -> Lexicographic:
     """A solver that meets constraints level by level: see `Lexicographic`.
 
@@ -52,8 +52,8 @@ class Lexicographic:
 
     Of all accelerations that meet level 0, by least squares where its rows contradict each other,
     those that meet level 1 as well as is then possible, and so on; of what is left the one nearest
-    to M⁻¹f in the metric of M (Gauss). A lower level never disturbs a higher one: it acts in the
-    null space N of those above it, taken in the metric of M,
+    to M⁻¹f in the metric of M (Gauss). A lower level acts in the null space N of those above it,
+    taken in the metric of M,
 
         a ← a + N (J_k N)⁺ (b_k − J_k a),    N ← N − N (J_k N)⁺ J_k.
 
@@ -64,9 +64,11 @@ class Lexicographic:
 
     Where a lower level comes to ask for what those above it no longer leave free, as an arm at the
     end of its reach does, J_k N loses rank, and what it asks for stays: S_k⁺ would answer without
-    bound. Below the highest level, S_k⁺ is damped, by three rounds of (S² + μ²)⁻¹ S on what is
-    left: the part (μ² / (σ² + μ²))³ is not met where S_k, its rows scaled, has the eigenvalue σ.
-    The highest level is not damped, so that a mechanism passes its singular positions.
+    bound. Below the highest level, S_k⁺ is damped, by six rounds of (S² + μ²)⁻¹ S on what is left,
+    three in each of two eliminations: the part (μ² / (σ² + μ²))⁶ is not met where S_k, its rows
+    scaled, has the eigenvalue σ. The highest level is not damped, so that a mechanism passes its
+    singular positions, and nothing below disturbs it. A level between gives way to those below it
+    where it is damped, by some hundredths of what they ask for at angles around √μ.
 
     Rows with a compliance, as those of rotors and soft constraints, can always be met. The status
     is CONFLICT where the rows of one level contradict each other; a level that cannot be met
@@ -77,10 +79,11 @@ class Lexicographic:
 
     Attributes:
         cutoff: eigenvalues of S_k, its rows scaled, that count as zero; if None, 1e-9 in float64
-            and 1e-5 in float32.
-        conflict: the part of b that a level may leave open on its own before it is a conflict.
+            and 1e-5 in float32; never below what rounding makes of zero, n_c times the precision.
+        conflict: the part of b that a level may leave open on its own before it is a conflict; if
+            None, 1e-2.
         damping: μ; a lower level gives way where its rows come within an angle of √μ of those
-            above it; if None, 3e-3, which is 3 degrees.
+            above it; if None, 3e-3, which is 3 degrees; 0 for the pseudo-inverse as it is.
         levels: (pattern, level) of constraints.
 
     References:
@@ -94,7 +97,7 @@ class Lexicographic:
     """
 
     cutoff: Any = None
-    conflict: Any = 1e-2
+    conflict: Any = None
     damping: Any = None
     levels: tuple[tuple[str, int], ...] = static(default=())
 
@@ -102,11 +105,13 @@ class Lexicographic:
         """Checks the numbers.
 
         Raises:
-            ValueError: one is negative.
+            ValueError: one is negative or no number, or one but `conflict` is infinite.
         """
         for what in ("cutoff", "damping"):
             if getattr(self, what) is not None:
                 checks.positive("Priority", what, getattr(self, what), strictly=False)
+        if self.conflict is not None:
+            checks.between("Priority", "conflict", self.conflict, 0, np.inf)
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status."""
@@ -118,13 +123,16 @@ class Lexicographic:
             return free_motion(system)
         parts = self._parts(system)
         rank, dtype = system.target.ndim - 1, system.target.dtype
-        usual = 1e-9 if jnp.finfo(dtype).bits == 64 else 1e-5
-        cutoff = jnp.full((1,) * rank, usual) if self.cutoff is None else self.cutoff
-        damping = jnp.full((1,) * rank, 3e-3) if self.damping is None else self.damping
+        usual = 1e-9 if jnp.finfo(dtype).bits == 64 else 1e-5, 3e-3, 1e-2
+        given = self.cutoff, self.damping, self.conflict
         cutoff, damping, conflict = (
-            jnp.asarray(x, dtype) for x in (cutoff, damping, self.conflict)
+            jnp.full((1,) * rank, y, dtype) if x is None else jnp.asarray(x, dtype)
+            for x, y in zip(given, usual, strict=True)
         )
-        known = native.per_world(partial(_factor, parts), rank)(system, cutoff, damping)
+        rounding = system.target.shape[0] * float(jnp.finfo(dtype).eps)
+        known = native.per_world(partial(_factor, parts), rank)(
+            system, jnp.maximum(cutoff, rounding), damping
+        )
         solve = native.per_world(partial(_solve, parts), rank)
         return lambda force, target: solve(known, force, target, conflict)
 
@@ -196,9 +204,7 @@ def _factor(
     for part in parts:
         n = part.size
         pivot = left[:n, :n]
-        inverse = pseudoinverse(pivot, cutoff)
-        if start:
-            inverse = inverse @ pivot @ damped(pivot, damping)
+        inverse = damped(pivot, cutoff, damping) if start else pseudoinverse(pivot, cutoff)
         coupling = inverse @ left[:n, n:]
         alone = jax.lax.stop_gradient(a[start : start + n, start : start + n])
         own = inverse if start == 0 else pseudoinverse(alone, cutoff)
@@ -252,20 +258,29 @@ def _contradicts(pivots: tuple[Pivot, ...], right: Array, size: Array, bound: Ar
     return found
 
 
-def damped(matrix: Array, damping: Array) -> Array:
-    """(1 − (1 − D A)³) A⁻¹ with D = (A² + μ²)⁻¹ A, for A = Aᵀ: A⁻¹ where A is much above μ."""
-    one, small = jnp.eye(len(matrix), dtype=matrix.dtype), jnp.square(damping)
-    inverse = pseudoinverse(matrix @ matrix + small * one, jnp.zeros_like(damping))
-    lacking = small * inverse
-    return (one + lacking + lacking @ lacking) @ inverse @ matrix
+def damped(matrix: Array, cutoff: Array, damping: Array) -> Array:
+    """(1 − (1 − D A)³) A⁺ with D = (A² + μ²)⁻¹ A, for A = Aᵀ: A⁺ where A is much above μ."""
+    real, imaginary, _ = resolvent(matrix, cutoff, damping)
+    lacking = damping * imaginary
+    return (jnp.eye(len(matrix), dtype=matrix.dtype) + lacking + lacking @ lacking) @ real
+
+
+def pseudoinverse(matrix: Array, cutoff: Array) -> Array:
+    """A⁺ (n, n) of a symmetric A ≥ 0, eigenvalues up to a cutoff taken as zero."""
+    return resolvent(matrix, cutoff, jnp.zeros_like(cutoff))[0]
 
 
 @jax.custom_jvp
-def pseudoinverse(matrix: Array, cutoff: Array) -> Array:
-    """A⁺ (n, n) of a symmetric A ≥ 0, eigenvalues up to a cutoff taken as zero.
+def resolvent(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
+    """E and N of E − iN = (A + iμ)⁻¹ of a symmetric A ≥ 0, and A⁺, (n, n) each.
 
-    Its derivative is that at constant rank, and goes through no eigenvector:
-    dA⁺ = −A⁺ dA A⁺ + A⁺² dA (1 − A A⁺) + (1 − A⁺ A) dA A⁺².
+    E = A (A² + μ²)⁻¹ and N = μ (A² + μ²)⁻¹. Eigenvalues of A up to a cutoff are taken as zero, and
+    give zero in all three. The derivative is that at constant rank, and goes through no
+    eigenvector: with Z = E − iN and Q = 1 − A⁺A,
+
+        dZ = −Z dA Z + Z A⁺ dA Q + Q dA A⁺ Z − i Z² dμ,
+
+    of which A⁺ is the case μ = 0.
 
     References:
         Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares
@@ -273,14 +288,24 @@ def pseudoinverse(matrix: Array, cutoff: Array) -> Array:
     """
     values, vectors = jnp.linalg.eigh(matrix)
     kept = values > cutoff
-    inverse = jnp.where(kept, 1 / jnp.where(kept, values, 1), 0)
-    return (vectors * inverse[None]) @ vectors.T
+    safe = jnp.where(kept, values, 1)
+    square = safe * safe + damping * damping
+    inverses = safe / square, damping / square, 1 / safe
+    real, imaginary, inverse = (
+        (vectors * jnp.where(kept, x, 0)[None]) @ vectors.T for x in inverses
+    )
+    return real, imaginary, inverse
 
 
-@pseudoinverse.defjvp
-def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    (matrix, cutoff), (change, _) = primals, tangents
-    p = pseudoinverse(matrix, cutoff)
-    open_ = jnp.eye(len(p), dtype=p.dtype) - p @ matrix
-    spread = open_ @ (change @ (p @ p))
-    return p, spread + spread.T - p @ change @ p
+@resolvent.defjvp
+def _(primals: Any, tangents: Any) -> Any:
+    (matrix, cutoff, damping), (change, _, dμ) = primals, tangents
+    e, n, p = resolvent(matrix, cutoff, damping)
+    turn = p @ change @ (jnp.eye(len(p), dtype=p.dtype) - p @ matrix)
+
+    def turned(x: Array) -> Array:
+        return x @ turn + (x @ turn).T
+
+    de = n @ change @ n - e @ change @ e + turned(e) - 2 * e @ n * dμ
+    dn = -(e @ change @ n + n @ change @ e) + turned(n) + (e @ e - n @ n) * dμ
+    return (e, n, p), (de, dn, turned(p) - p @ change @ p)

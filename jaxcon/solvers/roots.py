@@ -26,6 +26,7 @@ def implicit(
     inverse: Operator = itself,
     transposed: Operator = itself,
     leading: int | None = None,
+    prepared: Callable[[], tuple[Operator, Operator]] | None = None,
 ) -> tuple[Array, Any]:
     """x with f(x) = 0, and whatever else its iteration tells; exact to every order of derivative.
 
@@ -40,14 +41,13 @@ def implicit(
         inverse: y → P y, near to f′(x)⁻¹ y.
         transposed: y → Pᵀ y.
         leading: how many entries say whether only rounding is left; all unless given.
+        prepared: in place of P and Pᵀ, what makes them, once, where a derivative is taken.
     """
 
     def tangent(linear: Operator, right: Array) -> Array:
+        down, up = (inverse, transposed) if prepared is None else prepared()
         return jax.lax.custom_linear_solve(
-            linear,
-            right,
-            _refined(inverse, rounds, leading),
-            _refined(transposed, rounds, leading),
+            linear, right, _refined(down, rounds, leading), _refined(up, rounds, leading)
         )
 
     return jax.lax.custom_root(function, start, iterate, tangent, has_aux=True)

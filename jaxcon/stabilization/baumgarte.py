@@ -68,9 +68,15 @@ class Unstabilized:
         return memory
 
     @property
-    def corrects(self) -> bool:
-        """Whether it moves q or v after a step."""
-        return type(self).correct is not Unstabilized.correct
+    def corrects(self) -> tuple[str, ...]:
+        """What it moves after a step: "position", "velocity", both or nothing."""
+        moves = type(self).correct is not Unstabilized.correct
+        return ("position", "velocity") if moves else ()
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it has a memory."""
+        return type(self).init is not Unstabilized.init
 
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
@@ -145,6 +151,19 @@ class Baumgarte(Unstabilized):
         alpha = by_row(self.alpha, self.fallback[0], rows)
         beta = by_row(self.beta, self.fallback[1], rows)
         return -rows.bias - 2 * alpha * rows.rate - beta * beta * rows.residual
+
+
+def check_stabilizer(owner: str, what: str, part: Any) -> None:
+    """Checks a stabiliser that is part of something else.
+
+    Raises:
+        TypeError: it is none.
+        ValueError: its own numbers are wrong.
+    """
+    if isinstance(part, type) or not (hasattr(part, "impose") and hasattr(part, "correct")):
+        raise TypeError(f"{owner}: {what} must be a stabiliser like Baumgarte(), got {part!r}.")
+    if hasattr(part, "check"):
+        part.check()
 
 
 def asks_nothing(stabilizer: Any) -> bool:

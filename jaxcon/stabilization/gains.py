@@ -137,5 +137,4 @@ def check_between(owner: str, what: str, value: Any, low: float, high: float) ->
         ValueError: one does not.
     """
     for x in value.values() if isinstance(value, Mapping) else [value]:
-        if checks.is_concrete(x) and not np.all((np.asarray(x) >= low) & (np.asarray(x) <= high)):
-            raise ValueError(f"{owner}: {what} must lie between {low} and {high}, got {x}.")
+        checks.between(owner, what, x, low, high)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
-from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
+from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
 from jaxcon.stabilization.gains import check_gains, column, squares
 
 
@@ -45,7 +45,7 @@ class Hybrid(Unstabilized):
     times a size the other side has 10⁻²ⁿ. Nothing switches, so gradients exist everywhere; between
     the ranges the law is the mixture and neither of the two. Rows of velocities, which have no φ,
     follow the middle. A projection that fails ends its world whatever its weight; one of a single
-    iteration never fails.
+    iteration only where its solver does.
 
     Attributes:
         small: stabiliser whose law is that of small violations, an implicit `Penalty`.
@@ -67,36 +67,29 @@ class Hybrid(Unstabilized):
         """Checks the parts and the sizes.
 
         Raises:
-            TypeError: a part is no stabiliser.
+            TypeError: a part is no stabiliser, or a size no number.
             ValueError: a size is not positive, the two are the wrong way round, the sharpness is no
                 positive integer, `large` corrects nothing, or `small` acts by a force or a solver
                 of its own, which cannot be mixed.
         """
-        check_gains(
-            "Hybrid", strictly=True, soft_below=self.soft_below, project_above=self.project_above
-        )
         sizes = self.soft_below, self.project_above
+        for what, size in zip(("soft_below", "project_above"), sizes, strict=True):
+            if size is None or isinstance(size, Mapping):
+                raise TypeError(f"Hybrid: {what} must be one number, got {size!r}.")
+            check_gains("Hybrid", strictly=True, **{what: size})
         if all(map(checks.is_concrete, sizes)) and np.any(np.greater(*sizes)):
             raise ValueError(
                 f"Hybrid: soft_below={sizes[0]} must not exceed project_above={sizes[1]}; a"
                 " constraint is soft below the one, and projected above the other."
             )
-        if not isinstance(self.sharpness, int) or self.sharpness < 1:
-            raise ValueError(f"Hybrid: sharpness must be 1 or more, got {self.sharpness!r}.")
-        for part in self._parts():
-            if hasattr(part, "check") and not isinstance(part, type):
-                part.check()
+        checks.count("Hybrid", "sharpness", self.sharpness)
         self._check_parts()
 
     def _check_parts(self) -> None:
         """Checks that laws are where laws belong, and what corrects is where that belongs."""
-        parts = [("small", self.small), ("middle", self.middle), ("large", self.large)]
-        for what, part in parts if self.large is not None else parts[:2]:
-            if isinstance(part, type) or not hasattr(part, "correct"):
-                raise TypeError(
-                    f"Hybrid: {what} must be a stabiliser like Baumgarte(), got {part}."
-                )
-            if getattr(part, "corrects", what == "large") == (what == "large"):
+        for what, part in self._parts()._asdict().items():
+            check_stabilizer("Hybrid", what, part)
+            if bool(part.corrects) == (what == "large" and self.large is not None):
                 continue
             if what == "large":
                 reason = "corrects nothing after a step; take a Projection, or None"
@@ -115,7 +108,7 @@ class Hybrid(Unstabilized):
         return self._map(lambda part: part.init(system, q, v))
 
     def resolve(self, gains: tuple[Any, Any]) -> Hybrid:
-        """The same with parts that have all their gains, none of them above 50/s.
+        """The same with parts that have all their gains, default ones held to 50/s.
 
         Gains that remove an error in one step do so by a velocity, which springs that take over
         where φ is small would only turn round.
@@ -154,9 +147,10 @@ class Hybrid(Unstabilized):
         return Law(mixed, target)
 
     def beyond(self, square: Array) -> Array:
-        """x²ⁿ/(1 + x²ⁿ) from x²; what is far beyond is cut off where 1 is reached to rounding."""
-        power = jnp.minimum(square, 1e8) ** self.sharpness
-        return power / (1 + power)
+        """x²ⁿ/(1 + x²ⁿ) from x², and beyond 1 the same as 1/(1 + x⁻²ⁿ), where x²ⁿ may overflow."""
+        near = square <= 1
+        power = jnp.where(near, square, 1 / jnp.where(near, 1, square)) ** self.sharpness
+        return jnp.where(near, power, 1) / (1 + power)
 
     def advance(self, rows: Rows, memory: PyTree, dt: Any) -> Parts:
         """The memories of the parts after the step."""
@@ -167,9 +161,14 @@ class Hybrid(Unstabilized):
         return self._map(lambda part, own: part.remember(own, solution), Parts(*memory))
 
     @property
-    def corrects(self) -> bool:
-        """Whether it moves q or v after a step."""
-        return self.large is not None
+    def corrects(self) -> tuple[str, ...]:
+        """What `large` moves after a step."""
+        return self._parts().large.corrects
+
+    @property
+    def remembers(self) -> bool:
+        """Whether one of the parts has a memory."""
+        return any(part.remembers for part in self._parts())
 
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any

@@ -17,7 +17,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.proximal import RankSafe, conflicts, proximal, remainder, row_weights, scaled
 from jaxcon.solvers.saddle import Saddle, Solution
-from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
+from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
 from jaxcon.stabilization.gains import check_gains, column
 
 OPEN = 0.5
@@ -66,12 +66,12 @@ class AugmentedLagrangian(Unstabilized):
         """Checks the numbers.
 
         Raises:
+            TypeError: the feedback is no stabiliser.
             ValueError: the stiffness is not positive, or there is no round.
         """
         check_gains("AugmentedLagrangian", strictly=True, stiffness=self.stiffness)
         checks.count("AugmentedLagrangian", "iterations", self.iterations)
-        if hasattr(self.feedback, "check"):
-            self.feedback.check()
+        check_stabilizer("AugmentedLagrangian", "feedback", self.feedback)
 
     def init(self, system: Any, q: Array, v: Array) -> Held:
         """λ = 0."""
@@ -122,8 +122,8 @@ class AugmentedLagrangian(Unstabilized):
         return Held(solution.multipliers, own)
 
     @property
-    def corrects(self) -> bool:
-        """Whether the feedback moves q or v after a step."""
+    def corrects(self) -> tuple[str, ...]:
+        """What the feedback moves after a step."""
         return self.feedback.corrects
 
     def correct(

@@ -17,7 +17,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.proximal import own_diagonal
 from jaxcon.solvers.saddle import Solution
-from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized
+from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
 from jaxcon.stabilization.gains import by_row, check_gains, column, named
 from jaxcon.stabilization.projection import Projection
 
@@ -75,6 +75,7 @@ class Penalty(Unstabilized):
         """Checks the numbers.
 
         Raises:
+            TypeError: `others` is no stabiliser.
             ValueError: one is negative or no number, there is no or more than one of stiffness and
                 time, or the others are projected.
         """
@@ -88,8 +89,7 @@ class Penalty(Unstabilized):
                 "Penalty: others=Projection() would project the soft constraints, too, and no"
                 " spring would be left; take feedback for those that stay hard."
             )
-        if hasattr(self.others, "check"):
-            self.others.check()
+        check_stabilizer("Penalty", "others", self.others)
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:
         """That of the stabiliser of the others."""
@@ -176,9 +176,14 @@ class Penalty(Unstabilized):
         return self.others.remember(memory, solution)
 
     @property
-    def corrects(self) -> bool:
-        """Whether the others move q or v after a step."""
+    def corrects(self) -> tuple[str, ...]:
+        """What the others move after a step."""
         return self.others.corrects
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the others have a memory."""
+        return self.others.remembers
 
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any

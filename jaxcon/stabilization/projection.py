@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,8 +20,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import saddle
 from jaxcon.model.state import State
 from jaxcon.solvers import roots
-from jaxcon.solvers.roots import Operator
-from jaxcon.solvers.saddle import Diagonal, Mass, Saddle
+from jaxcon.solvers.saddle import Diagonal, Mass, Saddle, Solution
 from jaxcon.stabilization.baumgarte import Unstabilized
 
 METRICS = ("mass", "euclidean")
@@ -85,7 +86,8 @@ class Projection(Unstabilized):
 
     Attributes:
         metric: W, "mass" for M with rotors, or "euclidean" for 1 [m, rad], in which heavy bodies
-            move as much as light ones.
+            move as much as light ones. In float32, where an angle of the plane has grown by many
+            turns, it leaves less: it moves places, whose spacing is finer.
         iterations: at most, of quasi-Newton d ← d − factor · S φ(q* ⊕ d), S b the least step with
             J₀ d = b; they end where only rounding is left. Each multiplies the error by about the
             distance from where J₀ belongs, over the size of the scene: some six are enough after a
@@ -94,7 +96,7 @@ class Projection(Unstabilized):
         tolerance: max |φ|, a number or a `Tolerance`. A world stays as it is once it is there, and
             is NOT_CONVERGED if it is not there at the end. If None, it stays below 2 ε times 1 +
             max |x| over all places x, and fails beyond ε^⅔ (1 + max |q|), ε the spacing of
-            floating numbers; the linearized projection never fails.
+            floating numbers; the linearized projection fails only where its solver does.
         factor: of each step, in (0, 1].
         every: how many steps there are from one projection to the next.
         coupled: whether d belongs to the step, and d/h to its velocity; or q and v are split, as
@@ -125,9 +127,14 @@ class Projection(Unstabilized):
         return memory if self.every == 1 else (memory + 1) % self.every
 
     @property
-    def corrects(self) -> bool:
-        """Whether q or v is projected."""
-        return self.position or self.velocity
+    def corrects(self) -> tuple[str, ...]:
+        """Which of q and v are projected."""
+        return ("position",) * self.position + ("velocity",) * self.velocity
+
+    @property
+    def remembers(self) -> bool:
+        """Whether it counts steps."""
+        return self.every != 1
 
     def correct(
         self, system: Any, solver: Any, before: State, state: State, memory: PyTree, dt: Any
@@ -178,28 +185,33 @@ class Projection(Unstabilized):
         problem = self._problem(system, start.q, rows, held, rotors)
         off = rows if start is state else linearize(system, q, still, state.time)
         surface = _Surface(system, state, off.residual, problem, held)
-        solve = solver.factor(problem)
-
-        def nearest(b: Array) -> Array:
-            """d = W⁻¹ J₀ᵀ μ with J₀ d = b."""
-            return solve(still, b).acceleration
-
-        bounds = self._bounds(system, state)
-        step, left = self._step(surface, nearest, bounds)
+        factored, bounds = solver.factor(problem), self._bounds(system, state)
+        step, left, code = self._step(surface, partial(factored, still), bounds)
         late = jnp.where(left > bounds.fails, Status.NOT_CONVERGED, Status.OK)
-        code = status.first(
-            status.failures(solve(still, 0 * rows.bias).status), late.astype(jnp.int32)
-        )
+        code = status.first(status.failures(code), late.astype(jnp.int32))
         v = state.v if start is state else state.v + _missed(problem.mass, state.v, step, dt)
         return system.retract(q, step), v, code
 
-    def _step(self, surface: _Surface, nearest: Operator, bounds: Bounds) -> tuple[Array, Array]:
-        """d with φ(q* ⊕ d) = 0, and max |φ| there, where it is needed."""
+    def _step(
+        self, surface: _Surface, solve: Callable[[Array], Solution], bounds: Bounds
+    ) -> tuple[Array, Array, Array]:
+        """d with φ(q* ⊕ d) = 0, max |φ| there, where it is needed, and what the solver said."""
         factor = jnp.asarray(self.factor, surface.start.dtype)[None]
         if self.iterations == 1:
-            step = -factor * nearest(surface.start)
+            solution = solve(surface.start)
+            step = -factor * solution.acceleration
+            # what is there already may be rounding, which redundant rows contradict: no fault
+            there = _largest(surface.start) <= bounds.stays
+            lost = there & status.failed(solution.status)
+            met = there & (solution.status == Status.NOT_CONVERGED)
+            none = jnp.where(met[None], step - jax.lax.stop_gradient(step), 0)  # a derivative alone
+            step = jnp.where(lost[None], none, step)
             left = surface.start if self.tolerance is None else surface.residual(step)
-            return step, _largest(left)
+            return step, _largest(left), jnp.where(met, Status.OK, solution.status)
+
+        def nearest(b: Array) -> Array:
+            """d = W⁻¹ J₀ᵀ μ with J₀ d = b."""
+            return solve(b).acceleration
 
         def goes(left: Array, before: Array) -> Array:
             """Whether a world is still off, and not yet where only rounding is left."""
@@ -230,7 +242,8 @@ class Projection(Unstabilized):
 
         still = jnp.zeros_like(surface.problem.force)
         step, left = roots.implicit(equation, still, iterate, self.iterations)
-        return step, _largest(left)
+        # whether there are factors; how well each round was solved is seen by what is left
+        return step, _largest(left), solve(0 * surface.start).status
 
     def _velocities(self, system: Any, solver: Any, state: State) -> tuple[Array, Array]:
         """v with φ̇ = 0 and ψ = 0, and a status."""

@@ -1,0 +1,85 @@
+"""Which bounded rows belong to which element, and what they did during a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array
+
+
+@dataclass(frozen=True)
+class BoundLayout:
+    """Which rows belong to which element.
+
+    Attributes:
+        entries: of each: name, its rows, and how many points there are with as many, one after the
+            other; None for an element that is one.
+    """
+
+    entries: tuple[tuple[str, tuple[int, ...], int | None], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the elements, in the order of their rows."""
+        return tuple(name for name, *_ in self.entries)
+
+    def rows(self, name: str) -> np.ndarray:
+        """The row numbers of an element, (rows,), or of its points, (points, rows).
+
+        Raises:
+            ValueError: no element has this name.
+        """
+        if name not in self._places:
+            raise ValueError(f"element '{name}' is unknown; known are {list(self.names)}.")
+        rows, points = self._places[name]
+        one = np.array(rows)
+        return one if points is None else np.arange(points)[:, None] + one[None]
+
+    @property
+    def owners(self) -> np.ndarray:
+        """The number of the element that has a row, (n,)."""
+        rows = [self.rows(name).ravel() for name in self.names]
+        owners = np.zeros(sum(map(len, rows)), np.int32)
+        for i, own in enumerate(rows):
+            owners[own] = i
+        return owners
+
+    @cached_property
+    def _places(self) -> dict[str, Any]:
+        return {name: place for name, *place in self.entries}
+
+
+@pytree
+class Reactions:
+    """What bounded rows did during a step; `reactions["stop"]` is the force of one element.
+
+    Attributes:
+        multipliers: λ (n,) [N, N m], means over the step: of an impact, its impulse over h.
+        gap: φ at its start, (n,); zero where a row has none.
+        residual: by how much the laws are missed, as a velocity, ().
+        shift: what the velocity by which positions move has more than v at the end, (n_v,), of a
+            bounce within the step; None where nothing can bounce.
+        kept: the part of the bounce that adds no energy, from 0 to 1, (): 1 unless it was capped.
+        layout: rows by element.
+    """
+
+    multipliers: Array
+    gap: Array
+    residual: Array
+    kept: Array
+    shift: Array | None
+    layout: BoundLayout = static()
+
+    def __getitem__(self, name: str) -> Array:
+        """λ of an element, (1,); of a contact that of the normal and of the tangents, (1 + t,).
+
+        What resists rolling and spinning comes after, moments along the tangents and about the
+        normal [N m].
+        Of an element of k points, as a box, that of each, (k, …).
+        """
+        return self.multipliers[..., self.layout.rows(name)]

@@ -1,0 +1,276 @@
+"""Joints that end, rub, and are turned no faster or harder than their motors can.
+
+Each class describes one element on a joint's coordinate θ, an angle over turns or a travel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+
+from jaxcon.constraints.bounds import BoundSet
+from jaxcon.constraints.primitives import Row
+from jaxcon.core import checks, numerics
+from jaxcon.core.lanes import take
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, Lane
+from jaxcon.model.coordinates import JointCoordinate
+from jaxcon.model.elements import Elements, label
+
+RECOVERED = 0.2
+"""The part of a penetration that a step takes back."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A joint's coordinate stays between two stops, lower ≤ θ ≤ upper.
+
+    At the nearer stop, with gap φ ≥ 0, a step ends with φ̇ ≥ −φ/h: it may reach the stop and not
+    pass it. What has passed it comes back by a fifth in each step, no faster than `recovery`. What
+    would arrive within the step leaves with −e φ̇, at the time at which it arrives. A stop with a
+    stiffness is a spring and a damper behind the gap, implicit over the step. The stop that is
+    farther away is not looked at, so that the range must be wider than twice what a step travels.
+
+    Attributes:
+        name: unique in the scene.
+        joint: name of the joint.
+        lower, upper: [rad] or [m], zero being the assembly; None where there is no stop.
+        coordinate: which of the joint's; not needed where it has but one.
+        restitution: e, 0 to 1.
+        stiffness: k of a soft stop [N m/rad] or [N/m]; None for a hard one.
+        damping: its c [N m s/rad] or [N s/m].
+        recovery: the fastest way back [rad/s] or [m/s].
+    """
+
+    name: str
+    joint: str
+    lower: Any = None
+    upper: Any = None
+    coordinate: str | None = None
+    restitution: Any = 0.0
+    stiffness: Any = None
+    damping: Any = 0.0
+    recovery: Any = 0.1
+    counts = True
+    law = "single"
+    endless = ("lower", "upper")
+    optional = ("restitution",)
+
+    def attach(self, dtype: Any) -> dict[str, Array]:
+        """The numbers of the element.
+
+        Raises:
+            ValueError: there is no stop, lower ≥ upper, or a number is out of range.
+        """
+        if self.lower is None and self.upper is None:
+            raise ValueError(f"{label(self)}: give lower, upper or both.")
+        far = float("inf")
+        lower = checks.number(
+            label(self), "lower", -far if self.lower is None else self.lower, dtype
+        )
+        upper = checks.number(
+            label(self), "upper", far if self.upper is None else self.upper, dtype
+        )
+        if checks.is_concrete((lower, upper)) and not lower < upper:
+            raise ValueError(
+                f"{label(self)}: lower must be below upper, got {float(lower)} and"
+                f" {float(upper)}; what does not move at all is a Fixed joint or a Drive."
+            )
+        return {"lower": lower, "upper": upper} | stop(self, dtype)
+
+    @staticmethod
+    def bounds(p: dict[str, Any], row: Row, u: Lane, dt: Any) -> Any:
+        """The gap of the nearer stop."""
+        near = row.value - p["lower"] < p["upper"] - row.value
+        side = jnp.where(near, 1.0, -1.0).astype(row.value.dtype)
+        gap = jnp.where(near, row.value - p["lower"], p["upper"] - row.value)
+        pulls = tuple(pull * side for pull in row.pulls)
+        own = row._replace(value=gap, rate=side * row.rate, pulls=pulls)
+        return one_sided(p, own, dt)
+
+
+@dataclass(frozen=True)
+class JointFriction:
+    """Dry friction in a joint: it holds θ̇ = 0 with up to a torque or force τ, |λ| ≤ τ.
+
+    Attributes:
+        name: unique in the scene.
+        joint: name of the joint.
+        most: τ [N m] about an angle, [N] along a travel.
+        coordinate: which of the joint's; not needed where it has but one.
+    """
+
+    name: str
+    joint: str
+    most: Any
+    coordinate: str | None = None
+    counts = False
+    law = "box"
+
+    def attach(self, dtype: Any) -> dict[str, Array]:
+        """The numbers of the element."""
+        return most(self, dtype)
+
+    @staticmethod
+    def bounds(p: dict[str, Any], row: Row, u: Lane, dt: Any) -> Any:
+        """θ̇ = 0 as far as −τ ≤ λ ≤ τ suffices."""
+        return saturating(p, row, 0.0)
+
+
+@dataclass(frozen=True)
+class RateMotor:
+    """A motor that turns a joint at the wanted rate with up to a torque or force τ, |λ| ≤ τ.
+
+    It reaches the rate within the step if τ suffices, whatever the inertia: a velocity servo of
+    infinite gain that saturates.
+
+    Attributes:
+        name: unique in the scene; also that of the control channel: the rate wanted.
+        joint: name of the joint.
+        most: τ [N m] about an angle, [N] along a travel.
+        coordinate: which of the joint's; not needed where it has but one.
+    """
+
+    name: str
+    joint: str
+    most: Any
+    coordinate: str | None = None
+    controls = 1
+    counts = False
+    law = "box"
+
+    def attach(self, dtype: Any) -> dict[str, Array]:
+        """The numbers of the element."""
+        return most(self, dtype)
+
+    @staticmethod
+    def bounds(p: dict[str, Any], row: Row, u: Lane, dt: Any) -> Any:
+        """θ̇ = u as far as −τ ≤ λ ≤ τ suffices."""
+        return saturating(p, row, u)
+
+
+@dataclass(frozen=True)
+class RateLimit:
+    """A joint's coordinate changes no faster than a rate, |θ̇| ≤ r.
+
+    The limit is that of the direction in which it moves when a step begins: what rests, or turns
+    round within a step, may overshoot for that step.
+
+    Attributes:
+        name: unique in the scene.
+        joint: name of the joint.
+        rate: r [rad/s] or [m/s].
+        coordinate: which of the joint's; not needed where it has but one.
+    """
+
+    name: str
+    joint: str
+    rate: Any
+    coordinate: str | None = None
+    counts = False
+    law = "single"
+
+    def attach(self, dtype: Any) -> dict[str, Array]:
+        """The numbers of the element."""
+        rate = checks.amount(label(self), "rate", self.rate, dtype)
+        return {"rate": rate}
+
+    @staticmethod
+    def bounds(p: dict[str, Any], row: Row, u: Lane, dt: Any) -> Any:
+        """−|θ̇| ≥ −r, in the direction in which it moves."""
+        side = jnp.where(row.rate > 0, -1.0, 1.0).astype(row.rate.dtype)
+        pulls = tuple(pull * side for pull in row.pulls)
+        own = Row(0.0, side * row.rate, 0.0, pulls, holonomic=False)
+        return own, {"target": -p["rate"]}
+
+
+@pytree
+class Bounds(Elements):
+    """Elements of one class, `law`, along one coordinate of joints of one group."""
+
+    law: Any = static(default=None)
+    along: JointCoordinate = static(default=None)  # type: ignore[assignment]
+    starts: tuple[int, ...] = static(default=())
+
+    def bounds(self, snapshot: Any, control: Any, dt: Any) -> BoundSet:
+        """The rows at one instant, and what a step of dt wants of them."""
+        row, asked = self.law.bounds(
+            self.params, self.along.read(snapshot), self._control(control), dt
+        )
+        return BoundSet(self.law.law, (row,), self.places, **asked)
+
+    def _control(self, control: Any) -> Lane:
+        """The element's own channels."""
+        return take(control, self.starts) if self.starts and control is not None else 0.0
+
+
+def saturating(p: dict[str, Any], row: Row, rate: Lane) -> tuple[Row, dict[str, Any]]:
+    """θ̇ = rate as far as −τ ≤ λ ≤ τ suffices."""
+    asked = {"target": rate, "lower": -p["most"], "upper": p["most"]}
+    return row._replace(value=0.0, holonomic=False), asked
+
+
+def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]]:
+    """A row and the least φ̇ that a step may end with, by its gap φ.
+
+    What arrives after τ = φ/|φ̇| leaves with e |φ̇|, and moves by e |φ̇| (h − τ) in the rest of the
+    step. So position and velocity after a bounce are right to first order in h, and their
+    derivatives contain that of τ.
+    """
+    h = dt[None]
+    closing = numerics.safe_divide(-row.value, h)
+    back = jnp.minimum(RECOVERED * closing, p["recovery"])
+    target = jnp.where(row.value > 0, closing, back)
+    asked = {"target": target}
+    if "restitution" in p:
+        arrives = (row.rate < 0) & (row.value + h * row.rate <= 0)
+        leaves = -p["restitution"] * row.rate
+        left = leaves - p["restitution"] * numerics.safe_divide(jnp.maximum(row.value, 0), h)
+        asked["bounce"] = jnp.where(arrives, jnp.maximum(leaves - target, 0), 0)
+        asked["travel"] = jnp.where(arrives, left, 0)
+    if "stiffness" not in p:
+        return row, asked
+    # λ = −k (φ + h u) − c u behind the gap, as u + C λ = u* with the stiffness of both over a step;
+    # before it is closed, both act on the travel beyond it alone, u + φ/h
+    both = h * p["stiffness"] + p["damping"]
+    behind = -p["stiffness"] * row.value / both
+    soft = jnp.where(row.value > 0, closing, behind)
+    return row, asked | {"target": soft, "compliance": 1 / both}
+
+
+def stop(element: Any, dtype: Any) -> dict[str, Array]:
+    """The numbers of what happens at a stop, checked.
+
+    Raises:
+        ValueError: one is out of range.
+    """
+    owner = label(element)
+    numbers = {"recovery": element.recovery}
+    if not checks.plain_zero(element.restitution):
+        if element.stiffness is not None:
+            raise ValueError(
+                f"{owner}: restitution is of a hard stop, and stiffness and damping of a soft one;"
+                " give one or the other."
+            )
+        numbers["restitution"] = element.restitution
+    if element.stiffness is not None:
+        numbers |= {"stiffness": element.stiffness, "damping": element.damping}
+    result = {what: checks.number(owner, what, x, dtype) for what, x in numbers.items()}
+    for what, x in result.items():
+        checks.positive(owner, what, x, strictly=what in ("stiffness", "recovery"))
+    e = result.get("restitution", 0.0)
+    if checks.is_concrete(e) and e > 1:
+        raise ValueError(f"{owner}: restitution must lie in 0 to 1, got {element.restitution}.")
+    return result
+
+
+def most(element: Any, dtype: Any) -> dict[str, Array]:
+    """The largest force of an element, checked.
+
+    Raises:
+        ValueError: it is negative.
+    """
+    value = checks.amount(label(element), "most", element.most, dtype)
+    return {"most": value}

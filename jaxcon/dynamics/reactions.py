@@ -1,0 +1,252 @@
+"""The multipliers of bounded rows in a step, and what they do to the motion."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.bound_layout import Reactions
+from jaxcon.constraints.bounds import BoundRows
+from jaxcon.core import numerics
+from jaxcon.core.lanes import Vector, widened
+from jaxcon.core.typing import Array
+from jaxcon.solvers import gauss_jordan
+from jaxcon.solvers.bounded import Bounded, implicit_multipliers
+from jaxcon.solvers.nearest_rows import Nearest
+from jaxcon.solvers.proximal import own_diagonal
+from jaxcon.solvers.saddle import Factored, Saddle, Solution
+
+
+@dataclass(frozen=True)
+class Impulse:
+    """How bounded multipliers act within a step, the equality rows being eliminated.
+
+    M a = f + Jᵀλ_e + J_bᵀλ and J a + C λ_e = b hold by the factors at hand, so that one solution
+    tells the velocities u = φ̇ + h J_b a that multipliers λ lead to, and n of them G = ∂u/∂λ.
+
+    Attributes:
+        rows: the bounded rows.
+        solve: (f, b) → a and λ_e, for right sides with a last axis of their own, see `widened`.
+        saddle: M and f, of the equality rows.
+        target: b, (n_c,).
+        dt: h, () [s]; 1 where λ are impulses, and time stands still.
+        start: a without them, (n_v,), a constant.
+        bare: J_b M⁻¹ J_bᵀ on the diagonal, (n,): what rows would move without the equality rows.
+        acts: which rows act, (n,), tangents where their normal does; None for all.
+    """
+
+    rows: BoundRows
+    solve: Factored
+    saddle: Saddle
+    target: Array
+    dt: Any
+    start: Array
+    bare: Array
+    acts: Any = None
+
+    @classmethod
+    def of(
+        cls,
+        rows: BoundRows,
+        factor: Callable[[Saddle], Factored],
+        saddle: Saddle,
+        dt: Any,
+        acts: Array | None = None,
+        sifts: bool = False,
+    ) -> Impulse:
+        """That of a step of h, by the factors of its saddle system.
+
+        Args:
+            rows: the bounded rows.
+            factor: wide saddle system → its solution as a function of f and b.
+            saddle: M and f, of the equality rows.
+            dt: h, () [s].
+            acts: which rows act, (n,); None for all.
+            sifts: whether rows that nothing moves are left out, as `nearest` needs it.
+        """
+        bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
+        solve = factor(widened(saddle))
+        own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts)
+        return own._sifted() if sifts else own._begun()
+
+    def _begun(self) -> Impulse:
+        """With the a of no multipliers."""
+        start = self.motion(jnp.zeros_like(self.bare)).acceleration
+        return dataclasses.replace(self, start=jax.lax.stop_gradient(start))
+
+    def _sifted(self) -> Impulse:
+        """The same, and of the rows only those act that some multipliers of all rows move.
+
+        As G is not negative, the row of it of one that nothing moves is zero, and so is G z there.
+        Where a row does move that is so for hardly any z, and for two of them hardly ever.
+        """
+        length = jnp.sqrt(self.bare)
+        force, none = self.saddle.force, jnp.zeros_like(self.target)
+        pulls = [self._pull(z * numerics.safe_divide(1.0, length)) for z in probes(length)]
+        forces = [force, *(jnp.broadcast_to(pull, force.shape) for pull in pulls)]
+        targets = jnp.stack([self.target, none, none], axis=-1)
+        found = self.solve(jnp.stack(forces, axis=-1), targets).acceleration
+        start, *moved = (jax.lax.stop_gradient(found[..., i]) for i in range(3))
+        rounding = 64 * float(jnp.finfo(force.dtype).eps) * len(length) ** 0.5
+        largest = functools.reduce(
+            jnp.maximum, (jnp.abs(self.rows.jacobian.apply(a)) for a in moved)
+        )
+        moves = largest > rounding * length
+        acts = moves if self.acts is None else moves & self.acts
+        return dataclasses.replace(self, start=start, acts=acts)
+
+    def motion(self, multipliers: Array) -> Solution:
+        """a and λ_e under multipliers λ (n,)."""
+        return self._alone(self.saddle.force + self._pull(multipliers), self.target)
+
+    def change(self, multipliers: Array) -> Array:
+        """What λ (n,) adds to a, (n_v,)."""
+        return self._alone(self._pull(multipliers), jnp.zeros_like(self.target)).acceleration
+
+    def velocity(self, multipliers: Array) -> Array:
+        """u at the end of the step, (n,)."""
+        return self.led(self.motion(multipliers).acceleration)
+
+    def led(self, acceleration: Array) -> Array:
+        """φ̇ + h J_b a, (n,)."""
+        return self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
+
+    def matrix(self) -> Array:
+        """G, (n, n), a constant: all columns at once, along the last axis of the right sides."""
+        j = jax.lax.stop_gradient(self.rows.jacobian)
+        force = j.columns(self.rows.rate)
+        none = jnp.zeros((*self.target.shape, force.shape[-1]), force.dtype)
+        u = self.dt[None, ..., None] * j.each(self.solve(force, none).acceleration)
+        return jax.lax.stop_gradient(jnp.moveaxis(u, -1, 1))
+
+    def _pull(self, multipliers: Array) -> Array:
+        return self.rows.jacobian.transpose(multipliers)
+
+    def _alone(self, force: Array, target: Array) -> Solution:
+        """The solution for one right side."""
+        found = self.solve(force[..., None], target[..., None])
+        return jax.tree.map(lambda x: x[..., 0], found)
+
+    def moves(self, matrix: Array) -> Array:
+        """Whether a row acts and moves at all, (n,).
+
+        It does not move where the equality rows hold it, but for rounding. Such a row, as of two
+        points of one body, can be neither met nor missed: it is left out.
+        """
+        own = gauss_jordan.diagonal(matrix)
+        rounding = 64 * float(jnp.finfo(matrix.dtype).eps) * self.dt[None] * self.bare
+        moving = jax.lax.stop_gradient(own > rounding)
+        moving = moving if self.acts is None else moving & self.acts
+        kinds, moves = self.rows.kinds, self.rows.kinds.split(moving)
+        sets = zip(kinds.discs, moves.discs, strict=True)  # no friction without a normal
+        discs = tuple(Vector(*(y & disc.of(moves.normal) for y in x)) for disc, x in sets)
+        return kinds.join(moves._replace(discs=discs))
+
+    def react(self, solver: Any, guess: Array | None) -> Reactions:
+        """λ by the laws of the rows, with restitution as far as it adds no energy.
+
+        Args:
+            solver: `InteriorPoint()` or `GaussSeidel()`, or `Nearest(…)` of one.
+            guess: λ of a step ago, (n,), or None.
+        """
+        if isinstance(solver, Nearest):
+            some = solver.leaves_out(self.rows.kinds)
+            return self.nearest(solver, guess) if some else self.react(solver.solver, guess)
+        rows = self.rows
+        matrix = self.matrix()
+        moves = self.moves(matrix)
+        free = self.led(self.start)
+        soft = jnp.where(moves[None] & moves[:, None], matrix, 0)
+        soft = jax.lax.stop_gradient(
+            soft + rows.compliance[None] * gauss_jordan.identity(rows.rate)
+        )
+
+        def met(wanted: Array) -> tuple[Array, Array]:
+            offset = jax.lax.stop_gradient(jnp.where(moves, free - wanted, 0))
+            bounds = jax.lax.stop_gradient((rows.lower, rows.upper, rows.friction))
+            more = jax.lax.stop_gradient(rows.resistance)
+            problem = Bounded(soft, offset, *bounds, rows.kinds, more)
+            start = jnp.zeros_like(offset) if guess is None else jax.lax.stop_gradient(guess)
+            found = jnp.where(moves, solver.solve(problem, start), 0)
+
+            def moved(multipliers: Array) -> Array:
+                here = self.velocity(multipliers) + rows.compliance * multipliers - wanted
+                return jnp.where(moves, here, 0)
+
+            live = (rows.lower, rows.upper, (rows.friction, *rows.resistance))
+            left = problem.worst(found)
+            return implicit_multipliers(problem, found, moved, live, solver.smoothing), left
+
+        if rows.bounce is None:
+            found, left = met(rows.target)
+            return Reactions(found, rows.gap, left, jnp.ones_like(left), None, rows.layout)
+        asked = (jnp.zeros_like(rows.target), rows.bounce)
+        asked = asked if rows.travel is None else (*asked, rows.travel)
+        (plain, bounced, *moving), left = jax.vmap(met)(jnp.stack([rows.target + x for x in asked]))
+        kept, shift = self.harmless(plain, bounced - plain), None
+        found = plain + kept[None] * (bounced - plain)
+        for own in moving:
+            mean = plain + kept[None] * (own - plain)
+            shift = self.dt[None] * self.change(mean - found)
+        return Reactions(found, rows.gap, jnp.max(left, axis=0), kept, shift, rows.layout)
+
+    def nearest(self, solver: Nearest, guess: Array | None) -> Reactions:
+        """The same for the rows that are nearest to act; others have λ = 0."""
+        rows, length = self.rows, jnp.sqrt(self.bare)
+        distance = numerics.safe_divide(self.led(self.start) - rows.target, length)
+        distance = jnp.where(self.acts, distance, jnp.inf)
+        choice = solver.choose(rows.kinds, jax.lax.stop_gradient(distance))
+        bare, acts = choice.take(self.bare), choice.take(self.acts)
+        own = dataclasses.replace(self, rows=rows.chosen(choice), bare=bare, acts=acts)
+        known = own.react(solver.solver, None if guess is None else choice.take(guess))
+        return dataclasses.replace(
+            known, multipliers=choice.put(known.multipliers), gap=rows.gap, layout=rows.layout
+        )
+
+    def overlooked(self, multipliers: Array, acceleration: Array) -> Array:
+        """By how much rows that do not act miss their u*, at most, ()."""
+        kinds, rows = self.rows.kinds, self.rows
+        short = jnp.where(multipliers == 0, rows.target - self.led(acceleration), 0)
+        parts = kinds.split(jax.lax.stop_gradient(jnp.where(self.acts, short, 0)))
+        return jnp.max(jnp.concatenate([parts.single, parts.normal]), axis=0, initial=0)
+
+    def harmless(self, multipliers: Array, more: Array) -> Array:
+        """An s ≤ 1 for which λ + s Δλ does no work, or no more than λ, by world; 1 where it may be.
+
+        Over a step multipliers do the work h λ·(u₀ + u)/2, u₀ the velocities without them; motors
+        and friction in joints, which are boxes, may do what they want.
+        """
+        kinds, free = self.rows.kinds, self.velocity(jnp.zeros_like(multipliers))
+        acts = jnp.ones(kinds.size, free.dtype).at[kinds.single : kinds.normal].set(0)
+        acts = acts.reshape(-1, *(1,) * (free.ndim - 1))
+        change = self.velocity(more + multipliers) - self.velocity(multipliers)
+        mean = (free + self.velocity(multipliers)) / 2
+
+        def work(x: Array, u: Array) -> Array:
+            return jnp.sum(acts * x * u, axis=0)
+
+        start = work(multipliers, mean)
+        linear = work(more, mean) + work(multipliers, change) / 2
+        square = work(more, change) / 2
+        room = jnp.maximum(-start, 0)
+        inner = numerics.safe_sqrt(linear * linear + 4 * square * room)
+        most = numerics.safe_divide(2 * room, linear + inner)
+        rounding = 64 * float(jnp.finfo(free.dtype).eps)
+        gains = start + linear + square > rounding * work(jnp.abs(more), jnp.abs(mean))
+        return jnp.where(gains & (start + linear + square > start), jnp.clip(most, 0, 1), 1)
+
+
+def probes(like: Array) -> list[Array]:
+    """Two fixed vectors (n, …) of random numbers of either sign, 1 to 2 in size."""
+    random = np.random.default_rng(0)
+    shape = (2, len(like), *(1,) * (like.ndim - 1))
+    return list(
+        jnp.asarray(random.choice([-1, 1], shape) * random.uniform(1, 2, shape), like.dtype)
+    )

@@ -1,0 +1,77 @@
+"""Environments for reinforcement learning: pure functions, and Gymnasium's interfaces to them.
+
+    environment = jc.environments.make("CartPole")
+    episode = environment.reset(key)
+    episode, outcome = environment.step(episode, action)
+
+With Gymnasium installed (`pip install 'jaxcon[rl]'`), importing this registers the tasks, so that
+`gymnasium.make("jaxcon/CartPole-v0")` and `gymnasium.make_vec` know them.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+from jaxcon.environments.copies import Copies, advance, begin, restart
+from jaxcon.environments.curricula import (
+    by_performance,
+    decay,
+    jitter,
+    vary,
+    warm_up,
+    with_stiffness,
+)
+from jaxcon.environments.environment import Channel, Environment, Episode, Outcome, near
+from jaxcon.environments.exploration import feasible_action
+from jaxcon.environments.layers import Layered
+from jaxcon.environments.registry import TASKS, make
+from jaxcon.environments.tasks.cart_pole import CartPole
+from jaxcon.environments.tasks.four_bar import FourBarTracking
+from jaxcon.environments.tasks.parking import Parking
+from jaxcon.environments.tasks.stewart import StewartBalancing
+
+__all__ = [
+    "TASKS",
+    "CartPole",
+    "Channel",
+    "Copies",
+    "Environment",
+    "Episode",
+    "FourBarTracking",
+    "Layered",
+    "Outcome",
+    "Parking",
+    "StewartBalancing",
+    "advance",
+    "begin",
+    "by_performance",
+    "decay",
+    "feasible_action",
+    "jitter",
+    "make",
+    "near",
+    "restart",
+    "vary",
+    "warm_up",
+    "with_stiffness",
+]
+
+OF_GYMNASIUM = {
+    "FunctionalEnv": "functional",
+    "GymnasiumEnv": "gym",
+    "GymnasiumVectorEnv": "vector",
+}
+"""Classes that derive from Gymnasium's, and so need it, by module."""
+
+
+def __getattr__(name: str) -> Any:
+    """A class that needs Gymnasium, imported when it is first asked for."""
+    if name in OF_GYMNASIUM:
+        return getattr(import_module(f"jaxcon.environments.{OF_GYMNASIUM[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+if find_spec("gymnasium") is not None:
+    from jaxcon.environments import gym
+
+    gym.register()

@@ -1,0 +1,79 @@
+"""What Gymnasium's interfaces to an environment have in common."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxcon.core.typing import Array
+from jaxcon.environments.environment import Environment
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+    from gymnasium.experimental.functional import FuncEnv
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise ImportError("Gymnasium's interfaces need gymnasium: pip install 'jaxcon[rl]'.") from error
+
+__all__ = ["AutoresetMode", "FuncEnv", "VectorEnv", "batch_space", "gymnasium"]
+"""Of Gymnasium, whose absence only this module explains."""
+
+PICTURES = "rgb_array"
+
+
+def observation_space(environment: Environment) -> spaces.Box:
+    """The bounds of its channels."""
+    least, most = (
+        np.array([getattr(channel, side) for channel in environment.observed], environment.dtype)
+        for side in ("least", "most")
+    )
+    return spaces.Box(least, most, dtype=environment.dtype.type)
+
+
+def action_space(environment: Environment) -> spaces.Box:
+    """From −1 to 1 for each number of an action."""
+    return spaces.Box(-1.0, 1.0, (len(environment.actions),), environment.dtype.type)
+
+
+def describe(environment: Environment) -> dict[str, Any]:
+    """Gymnasium's metadata: the pictures, and how many of them make a second."""
+    rate = round(1 / (float(environment.dt) * environment.skip))
+    return {"render_modes": [PICTURES], "render_fps": rate}
+
+
+def check_render_mode(mode: str | None) -> str | None:
+    """The mode.
+
+    Raises:
+        ValueError: it is another one.
+    """
+    if mode not in (None, PICTURES):
+        raise ValueError(f"render_mode must be None or '{PICTURES}', got {mode!r}.")
+    return mode
+
+
+def check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
+    """Checks the options of a reset.
+
+    Raises:
+        ValueError: some are unknown.
+    """
+    if unknown := sorted(set(options or {}) - set(known)):
+        there = f"known are {list(known)}" if known else "there are none"
+        raise ValueError(f"reset: unknown options {unknown}; {there}.")
+
+
+def key_from(random: np.random.Generator) -> Array:
+    """A key of JAX drawn from Gymnasium's generator, as an array that can be saved."""
+    return jax.random.PRNGKey(random.integers(2**32, dtype=np.uint32))
+
+
+def warn_of_no_mode() -> None:
+    """As Gymnasium warns of pictures that nobody asked for."""
+    gymnasium.logger.warn(
+        f"render was called without a mode; make the environment with render_mode='{PICTURES}'."
+    )

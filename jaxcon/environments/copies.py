@@ -1,0 +1,163 @@
+"""Many copies of an environment in one program, each reset with a fresh key when it is done."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.environments.environment import Environment, Episode, Outcome
+
+Randomize = Callable[[Environment, Array], Environment]
+"""(environment, key) → the same with other numbers: the world of one copy, for one episode."""
+
+MODES = ("NextStep", "SameStep", "Disabled")
+"""When a copy that is done is reset, by the names that Gymnasium gives them."""
+
+PARTS, LEAST_PART = 16, 64
+"""Few copies are a part of so many, or so few."""
+
+
+@pytree
+class Copies:
+    """Where all copies stand; every array has a first axis of their number n.
+
+    Attributes:
+        episode: of each.
+        done: which are done, (n,).
+        world: the environment of each where these differ; () where all share one.
+    """
+
+    episode: Episode
+    done: Array
+    world: PyTree = ()
+
+
+def begin(
+    environment: Environment, key: Array, count: int, randomize: Randomize | None = None
+) -> tuple[Copies, Array]:
+    """All copies at the start of an episode, and what they see.
+
+    Args:
+        environment: of all of them.
+        key: each copy gets one of its own, which does not depend on how many there are.
+        count: n.
+        randomize: draws the world of each copy, afresh for each episode.
+
+    Returns:
+        The copies and their observations (n, …).
+    """
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(count))
+    episode, world = _start(environment, keys, randomize)
+    copies = Copies(episode, jnp.zeros(count, bool), world)
+    return copies, look(environment, copies)[0]
+
+
+def advance(
+    environment: Environment,
+    copies: Copies,
+    actions: Array,
+    mode: str = "NextStep",
+    randomize: Randomize | None = None,
+) -> tuple[Copies, Outcome]:
+    """One action of every copy; pure, and good to scan.
+
+    Args:
+        environment: of all of them.
+        copies: where they stand.
+        actions: (n, number of actions).
+        mode: "NextStep": a copy that was done is reset instead of acting, with reward 0;
+            "SameStep": it is reset after the action that ends it, whose observation and info are
+            `final_obs` and `final_info` of the info; "Disabled": it goes on.
+        randomize: as of `begin`.
+
+    Returns:
+        The copies, and the outcome of each, (n, …).
+    """
+    after = over(environment, copies, "transition", actions)
+    reward, terminated, truncated = over(environment, copies, "judge", actions, after)
+    stepped = dataclasses.replace(copies, episode=after, done=terminated | truncated)
+    if mode == "NextStep":
+        waiting = copies.done
+        reward = jnp.where(waiting, 0, reward)
+        terminated, truncated = terminated & ~waiting, truncated & ~waiting
+        stepped = dataclasses.replace(stepped, done=terminated | truncated)
+        stepped = restart(environment, stepped, waiting, randomize)
+    final: dict[str, Any] = {}
+    if mode == "SameStep":
+        seen, info = look(environment, stepped)
+        final = {"final_obs": seen, "_final_obs": stepped.done}
+        final |= {"final_info": info, "_final_info": stepped.done}
+        stepped = restart(environment, stepped, stepped.done, randomize)
+    seen, info = look(environment, stepped)
+    return stepped, Outcome(seen, reward, terminated, truncated, info | final)
+
+
+def restart(
+    environment: Environment, copies: Copies, chosen: Array, randomize: Randomize | None = None
+) -> Copies:
+    """The copies with those that are chosen, (n,), at the start of a new episode.
+
+    As few starts are computed as that takes: none while no copy is chosen, a sixteenth of n while
+    few are, otherwise n. There is no loop, so that both modes of differentiation go through.
+    """
+    count = chosen.shape[0]
+    size = min(count, max(LEAST_PART, -(-count // PARTS)))
+    old = copies.episode, copies.world
+
+    def few() -> tuple[Episode, PyTree]:
+        index = jnp.nonzero(chosen, size=size, fill_value=count)[0]  # beyond the last: dropped
+        fresh = _start(environment, old[0].key.at[index].get(mode="clip"), randomize)
+        return jax.tree.map(lambda x, y: x.at[index].set(y, mode="drop"), old, fresh)
+
+    def many() -> tuple[Episode, PyTree]:
+        def keep(x: Array, y: Array) -> Array:
+            return jnp.where(chosen.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
+
+        return jax.tree.map(keep, old, _start(environment, old[0].key, randomize))
+
+    wanted = jnp.sum(chosen)
+    case = (wanted > 0).astype(int) + (wanted > size).astype(int)
+    episode, world = jax.lax.switch(case, (lambda: old, few, many))
+    return Copies(episode, copies.done, world)
+
+
+def _start(
+    environment: Environment, keys: Array, randomize: Randomize | None
+) -> tuple[Episode, PyTree]:
+    """An episode for each key, and its world where worlds differ."""
+
+    def one(key: Array) -> tuple[Episode, PyTree]:
+        if randomize is None:
+            return environment.reset(key), ()
+        own, key = jax.random.split(key)
+        world = randomize(environment, own)
+        return world.reset(key), world
+
+    return jax.vmap(one)(keys)
+
+
+def look(environment: Environment, copies: Copies) -> tuple[Array, dict[str, Array]]:
+    """What all copies see, and their info."""
+    return over(environment, copies, "look")
+
+
+def over(environment: Environment, copies: Copies, verb: str, *args: Any) -> Any:
+    """A method of the environment for all copies, each in its world.
+
+    Args:
+        environment: of all of them.
+        copies: whose episodes come first among the arguments.
+        verb: the name of the method.
+        args: what else it takes, with a first axis of n.
+    """
+
+    def one(world: PyTree, *own: Any) -> Any:
+        return getattr(environment if isinstance(world, tuple) else world, verb)(*own)
+
+    return jax.vmap(one)(copies.world, copies.episode, *args)

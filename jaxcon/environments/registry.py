@@ -1,0 +1,55 @@
+"""The tasks by name."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from jaxcon.environments.environment import Environment
+from jaxcon.environments.tasks.cart_pole import CartPole, double_cart_pole
+from jaxcon.environments.tasks.four_bar import FourBarTracking
+from jaxcon.environments.tasks.parking import Parking
+from jaxcon.environments.tasks.stewart import StewartBalancing
+
+TASKS: dict[str, Callable[..., Environment]] = {
+    "CartPole": CartPole.build,
+    "DoubleCartPole": double_cart_pole,
+    "FourBarTracking": FourBarTracking.build,
+    "Parking": Parking.build,
+    "StewartBalancing": StewartBalancing.build,
+}
+"""What builds each; Gymnasium knows them as "jaxcon/CartPole-v0" and so on."""
+
+
+def make(task: str | Environment, **options: Any) -> Environment:
+    """The environment of a task, as pure functions.
+
+    Args:
+        task: its name, or an environment, which is taken as it is.
+        options: numbers and choices of the task's `build`.
+
+    Raises:
+        ValueError: an unknown task, or options for an environment that is already built.
+        TypeError: an option that the task does not have.
+    """
+    if isinstance(task, Environment):
+        if options:
+            raise ValueError(
+                f"{type(task).__name__} is built already: give its options {sorted(options)} to"
+                " its build."
+            )
+        return task
+    if task not in TASKS:
+        raise ValueError(f"task {task!r} is unknown; known are {', '.join(TASKS)}.")
+    try:
+        inspect.signature(TASKS[task]).bind(**options)
+    except TypeError as error:
+        known = list(inspect.signature(TASKS[task]).parameters)
+        raise TypeError(f"task {task}: {error}; its options are {', '.join(known)}.") from error
+    return TASKS[task](**options)
+
+
+def horizon(task: str) -> int:
+    """Actions until an episode of a task is truncated, unless told otherwise."""
+    return inspect.signature(TASKS[task]).parameters["horizon"].default

@@ -1,0 +1,22 @@
+"""What may end a search from outside, after which what was found is kept, and how it is seen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+from tqdm.auto import tqdm
+
+ENDS = (KeyboardInterrupt, OSError, jax.errors.JaxRuntimeError)
+
+
+def words(error: BaseException) -> str:
+    """Why a search ended."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted from the keyboard"
+    return f"{type(error).__name__}: {error}"
+
+
+def bar(show: bool | None, **options: Any) -> Any:
+    """A bar of tqdm: in terminals and notebooks where it is None, always, or never."""
+    return tqdm(unit="step", disable=None if show is None else not show, **options)

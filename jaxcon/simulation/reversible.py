@@ -1,0 +1,240 @@
+"""A reverse pass that keeps no states: it steps back from the last one."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero
+
+from jaxcon.core import checks
+from jaxcon.core.closures import opened
+from jaxcon.core.native import keep
+from jaxcon.core.pytree import Parts, pytree, static
+from jaxcon.core.status import failed
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.model.state import State
+from jaxcon.simulation.adjoints import Path
+
+
+@pytree
+class Reversible:
+    """The reverse pass steps back from the final state, and keeps no others, however long the way.
+
+    It needs a symmetric integrator, a step of which by −h undoes one by h: `RATTLE()` is, whatever
+    the forces, dampers, drives and controls by array included. Everything else is refused. Like
+    `Checkpoints()` it takes one more forward pass.
+
+    States are found again but for rounding, which grows on the way back as errors of the motion run
+    backwards do: little where it is regular, and as e^ct where it is chaotic or damped. From each
+    state that is kept, rounding starts again. A world in which a kept state, or that after the
+    first step, is missed by more than ε^⅓ (1 + max |x|) has the gradient NaN, never a wrong one.
+
+    Forward mode, which keeps no states anyway, wants another adjoint.
+
+    Attributes:
+        segments: how many steps there are from a state that is kept to the next; none is kept on
+            the way unless given.
+
+    References:
+        Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections II.3 and VII.1.4.
+    """
+
+    segments: int | None = static(default=None)
+
+    def scan(self, path: Path) -> tuple[State, PyTree]:
+        """The final state and the record of a path.
+
+        Raises:
+            ValueError: nothing undoes its steps; says why.
+        """
+        if self.segments is not None:
+            checks.count("Reversible", "segments", self.segments)
+        if isinstance(path.back, str):
+            raise ValueError(
+                f"Reversible: {path.back}; take Checkpoints(), which keeps about 2 √T states."
+            )
+        return _Walk(path, self._size(path.steps)).run() if path.steps else path.scan()
+
+    def kept(self, steps: int, state: State) -> tuple[int, ...]:
+        """How many states are kept, by level: those on the way, and that of one step."""
+        return _count(steps, self._size(steps)), min(steps, 1)
+
+    def _size(self, steps: int) -> int:
+        return self.segments or max(steps - 1, 1)
+
+
+def _count(steps: int, size: int) -> int:
+    """The states kept: after the first step, after each `size` more, and the final one."""
+    return 1 + -(-(steps - 1) // size) if steps else 0
+
+
+class _Walk:
+    """A path forwards and back.
+
+    Step n belongs to segment ⌈n / size⌉, of which the state at the end is kept; segment 0 is the
+    first step alone, since where that began need not be on the constraints.
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        given = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), path.inputs)
+        self.path, self.size = path, size
+        self.step, of_step, ahead = opened(path.step, path.start, given)
+        self.record, of_record, row = opened(path.record, *ahead)
+        self.back, self.of_back, _ = opened(path.back, path.start, given)  # type: ignore[arg-type]
+        self.numbers = (of_step, of_record), path.start, path.inputs
+        self.parts = tuple(map(Parts.of, self.numbers))
+        self.results = Parts.of(path.start), Parts.of(row)
+
+    def run(self) -> tuple[State, PyTree]:
+        """The final state and the record."""
+        pairs = [parts.split(x) for parts, x in zip(self.parts, self.numbers, strict=True)]
+        real, others = map(list, zip(*pairs, strict=True))
+        walk = jax.custom_vjp(lambda *args: self.forwards(*args)[0])
+        walk.defvjp(self.begin, self.backwards, symbolic_zeros=True)
+        found = walk(real, (others, jax.lax.stop_gradient(self.of_back)))
+        return self._merged(self.results, *found)
+
+    def begin(self, *given: Any) -> tuple[Any, Any]:
+        """The same before a way back, which needs what was given, and what of it has tangents."""
+        real, rest = (jax.tree.map(lambda x: x.value, x, is_leaf=_is_primal) for x in given)
+        moved = jax.tree.map(lambda x: x.perturbed, given[0], is_leaf=_is_primal)
+        found, kept = self.forwards(real, rest)
+        return found, (_Moved(tuple(map(tuple, moved))), real, rest, kept)
+
+    def forwards(self, real: Any, rest: Any) -> tuple[Any, Any]:
+        """Real numbers and others of the results, and the states kept."""
+        (of_step, of_record), start, inputs = self._merged(self.parts, real, rest[0])
+        count = _count(self.path.steps, self.size)
+        room = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), start)
+
+        def step(known: Any, given: Any) -> Any:
+            state, seen = self.step(of_step, known[0], given)
+            put, place = jax.lax.dynamic_update_index_in_dim, self._segment(given[0])
+            return (state, jax.tree.map(lambda x, y: put(x, y, place, 0), known[1], state)), seen
+
+        def record(known: Any, seen: Any) -> PyTree:
+            return self.record(of_record, known[0], seen)
+
+        way: Any = {"step": step, "record": record, "start": (start, room), "inputs": inputs}
+        (final, kept), rows = dataclasses.replace(self.path, **way).scan()  # type: ignore[misc]
+        pairs = [p.split(x) for p, x in zip(self.results, (final, rows), strict=True)]
+        return tuple(map(list, zip(*pairs, strict=True))), kept
+
+    def backwards(self, known: Any, cotangents: Any) -> tuple[Any, None]:
+        """Cotangents of all real numbers that have tangents."""
+        moved, real, rest, kept = known
+        constants, start, inputs = self._merged(self.parts, real, rest[0])
+        of_numbers, _, of_inputs = parts = moved.parts(self.parts)
+        (bar, rows_bar), _ = cotangents
+        bar = [_zeros(x.aval.shape, x.aval.dtype) if _is_zero(x) else x for x in bar]
+
+        def back(after: State, given: Any) -> tuple[State, Array]:
+            """The state before a step, and whether it is lost."""
+            number, place = given[0], self._segment(given[0])
+            saved = jax.tree.map(lambda x: _row(x, place), kept)
+            ends = number % self.size == 0
+            before = self.back(rest[1], keep(ends, saved, after), given)
+            lost = ends & _far(after, saved) | (number > 0) & failed(before.status)
+            return keep(number == 0, start, before), lost
+
+        def one(known: Any, given: Any) -> Any:
+            after, bar, total, lost = known
+            before, missed = back(after, given)
+            rows = [_row(x, given[0] // self.path.every) for x in rows_bar]
+            more, bar, given_bar = self._pulled(parts, (constants, before, given), (bar, rows))
+            total = jax.tree.map(jnp.add, total, more)
+            return (before, bar, total, lost | missed), given_bar
+
+        final = jax.tree.map(lambda x: x[-1], kept)
+        total = jax.tree.map(jnp.zeros_like, of_numbers.split(constants)[0])
+        begin = final, bar, total, jnp.zeros_like(failed(final.status))
+        (_, bar, total, lost), inputs_bar = jax.lax.scan(one, begin, inputs, reverse=True)
+        lost &= ~failed(final.status)  # which has no gradient anyway
+        found = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), (total, bar, inputs_bar))
+        return moved.spread(found), None
+
+    def _pulled(self, parts: Any, at: Any, bars: Any) -> Any:
+        """Cotangents of the moved numbers of (constants, state, given) from those after a step."""
+        pairs = [p.split(x) for p, x in zip(parts, at, strict=True)]
+        real, others = zip(*pairs, strict=True)
+
+        def ahead(*real: Any) -> Any:
+            (of_step, of_record), state, given = self._merged(parts, real, others)
+            state, seen = self.step(of_step, state, given)
+            row = self._recorded(of_record, state, seen, given[0])
+            return [p.split(x)[0] for p, x in zip(self.results, (state, row), strict=True)]
+
+        return jax.vjp(ahead, *real)[1](list(bars))
+
+    def _recorded(self, constants: Any, state: State, seen: Any, number: Array) -> PyTree:
+        """What is kept of a step, and zeros after steps of which nothing is."""
+        if self.path.every == 1:
+            return self.record(constants, state, seen)
+        shapes = jax.eval_shape(self.record, constants, state, seen)
+
+        def nothing(*_: Any) -> PyTree:
+            return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+        due = (number + 1) % self.path.every == 0
+        return jax.lax.cond(due, self.record, nothing, constants, state, seen)
+
+    def _segment(self, number: Array) -> Array:
+        return (number + self.size - 1) // self.size
+
+    @staticmethod
+    def _merged(parts: Any, real: Any, others: Any) -> Any:
+        return tuple(p.merge(x, y) for p, x, y in zip(parts, real, others, strict=True))
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class _Moved:
+    """Which real numbers of (constants, start, inputs) have tangents."""
+
+    flags: tuple[tuple[bool, ...], ...]
+
+    def parts(self, of: tuple[Parts, ...]) -> tuple[Parts, ...]:
+        """Those of trees by what has a tangent; on its way a state has one throughout."""
+        own = self.flags[0], (True,) * len(self.flags[1]), self.flags[2]
+        return tuple(parts.among(flags) for parts, flags in zip(of, own, strict=True))
+
+    def spread(self, found: Any) -> list[list[Any]]:
+        """Cotangents of all real numbers, None of those without a tangent."""
+        constants, start, inputs = map(iter, found)
+        return [
+            [next(constants) if flag else None for flag in self.flags[0]],
+            list(start),
+            [next(inputs) if flag else None for flag in self.flags[2]],
+        ]
+
+
+def _is_primal(x: Any) -> bool:
+    return isinstance(x, CustomVJPPrimal)
+
+
+def _is_zero(x: Any) -> bool:
+    return isinstance(x, SymbolicZero)
+
+
+def _zeros(shape: tuple[int, ...], dtype: Any) -> Array:
+    return jnp.zeros(shape, dtype)
+
+
+def _row(x: Any, place: Array) -> Array:
+    """One of the first axis."""
+    if _is_zero(x):
+        return _zeros(x.aval.shape[1:], x.aval.dtype)
+    return jax.lax.dynamic_index_in_dim(x, place, keepdims=False)
+
+
+def _far(found: State, known: State) -> Array:
+    """Whether a state was not found again: by ε^⅓ (1 + max |x|), or not as a number."""
+    far = jnp.zeros_like(failed(known.status))
+    for x, y in ((found.q, known.q), (found.v, known.v)):
+        allowed = float(jnp.finfo(x.dtype).eps) ** (1 / 3) * (1 + jnp.max(jnp.abs(y), initial=0))
+        far |= ~(jnp.max(jnp.abs(x - y), initial=0) <= allowed)
+    return far

@@ -1,0 +1,155 @@
+"""Bounded rows by both solvers: the laws hold at random, in degenerate cases, in float32."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+
+import jaxcon as jc
+from jaxcon.solvers import gauss_jordan
+from jaxcon.solvers.bounded import Bounded, Kinds
+
+WORLDS = 2000
+dtypes = pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+EXACT = {"float64": 1e-8, "float32": 1e-5}
+"""Of the largest term: what a law may be missed by."""
+
+
+def problems(kinds, rank, dtype, friction=0.1):
+    """G = J M⁻¹ Jᵀ and c = J v of random rows, worlds along the last axis."""
+    rng = np.random.default_rng(3)
+    jacobian = rng.normal(size=(kinds.size, rank, WORLDS))
+    weight = np.exp(rng.normal(size=(rank, WORLDS)))
+    matrix = np.einsum("irb,rb,jrb->ijb", jacobian, weight, jacobian)
+    offset = np.einsum("irb,rb->ib", jacobian, rng.normal(size=(rank, WORLDS)))
+    most = np.abs(rng.normal(size=(kinds.boxes, WORLDS)))
+    mu = friction * rng.uniform(size=(kinds.contacts, WORLDS))
+    return Bounded(*(jnp.asarray(x, dtype) for x in (matrix, offset, -most, most, mu)), kinds)
+
+
+def missed(problem, multipliers):
+    """By how much the laws are missed, relative to the largest term of u = G λ + c, by world."""
+    terms = jnp.sum(jnp.abs(problem.matrix * multipliers[None]), axis=1) + jnp.abs(problem.offset)
+    return np.asarray(problem.worst(multipliers) / jnp.max(terms, axis=0))
+
+
+@dtypes
+@pytest.mark.parametrize(
+    ("kinds", "rank"),
+    [(Kinds(4), 6), (Kinds(4), 3), (Kinds(2, 3), 6), (Kinds(0, 4), 2), (Kinds(1, 1, 2, 2), 12)],
+    ids=["stops", "dependent stops", "stops and friction", "dependent friction", "contacts"],
+)
+def test_interior_point_solves_random_rows(kinds, rank, dtype):
+    problem = problems(kinds, rank, dtype)
+    solve = quick_jit(lambda p: jc.InteriorPoint().solve(p, jnp.zeros_like(p.offset)))
+    assert missed(problem, solve(problem)).max() < EXACT[np.dtype(dtype).name]
+
+
+def test_sweeps_come_to_the_same():
+    problem = problems(Kinds(3, 2), 8, jnp.float64)
+    zero = jnp.zeros_like(problem.offset)
+    exact = quick_jit(lambda p: jc.InteriorPoint().solve(p, zero))(problem)
+    swept = quick_jit(lambda p: jc.GaussSeidel(sweeps=2000).solve(p, zero))(problem)
+    np.testing.assert_allclose(swept, exact, atol=1e-8 * float(jnp.max(jnp.abs(exact))))
+
+
+def test_more_sweeps_miss_less():
+    problem = problems(Kinds(3, 2), 8, jnp.float64)
+    zero = jnp.zeros_like(problem.offset)
+    left = [
+        np.median(missed(problem, quick_jit(jc.GaussSeidel(sweeps=n).solve)(problem, zero)))
+        for n in (2, 8, 32)
+    ]
+    assert left[0] > 3 * left[1] > 9 * left[2]
+
+
+@dtypes
+def test_the_laws_by_hand(dtype):
+    """One row each: a stop that is hit and one that is left, friction that holds and that slips."""
+    kinds = Kinds(2, 2)
+    numbers = ([-3.0, 4.0, 1.0, -5.0], [-2.0, -2.0], [2.0, 2.0])
+    offset, lower, upper = (jnp.asarray(x, dtype)[:, None] for x in numbers)
+    matrix = 2 * jnp.eye(4, dtype=dtype)[..., None]
+    problem = Bounded(matrix, offset, lower, upper, jnp.zeros((0, 1), dtype), kinds)
+    for solver in (jc.InteriorPoint(), jc.GaussSeidel(sweeps=3)):
+        found = solver.solve(problem, jnp.zeros_like(offset))[:, 0]
+        np.testing.assert_allclose(found, [1.5, 0.0, -0.5, 2.0], atol=1e-6)
+
+
+def test_inverse_without_pivots():
+    rng = np.random.default_rng(0)
+    half = rng.normal(size=(7, 7, 5))
+    matrix = np.einsum("ikb,jkb->ijb", half, half) + 0.1 * np.eye(7)[..., None]
+    found = gauss_jordan.inverse(jnp.asarray(matrix))
+    unit = np.einsum("ijb,jkb->ikb", matrix, found)
+    np.testing.assert_allclose(unit, np.eye(7)[..., None] + 0 * unit, atol=1e-9)
+
+
+def test_zero_rows_do_nothing():
+    """A rope whose ends meet has no direction: its row is zero, and its multiplier stays finite."""
+    kinds = Kinds(2)
+    matrix = jnp.zeros((2, 2, 1)).at[0, 0].set(1.0)
+    offset = jnp.asarray([[-1.0], [0.0]])
+    none = jnp.zeros((0, 1))
+    problem = Bounded(matrix, offset, none, none, none, kinds)
+    for solver in (jc.InteriorPoint(), jc.GaussSeidel()):
+        found = np.asarray(solver.solve(problem, jnp.zeros_like(offset)))
+        assert np.isfinite(found).all()
+        np.testing.assert_allclose(found[0], 1.0, rtol=1e-9)
+        assert abs(found[1, 0]) < 10
+
+
+@pytest.mark.parametrize(
+    ("part", "match"),
+    [
+        (lambda: jc.GaussSeidel(sweeps=0), "sweeps"),
+        (lambda: jc.InteriorPoint(iterations=0), "iterations"),
+        (lambda: jc.GaussSeidel, "InteriorPoint"),
+    ],
+)
+def test_bad_numbers_are_refused(part, match):
+    system, state = _ball()
+    with pytest.raises((ValueError, TypeError), match=match):
+        jc.step(system, jc.Method(bounded=part()), state, None, 1e-3)
+
+
+def _ball():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("ball", mass=1.0, position=(0.0, 1.0))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball"))
+    return scene.build()
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [jc.RATTLE(), jc.GeneralizedAlpha(), jc.SemiImplicitEuler(gyroscopic="trapezoidal")],
+    ids=lambda x: type(x).__name__,
+)
+def test_integrators_without_a_place_for_bounds_say_so(integrator):
+    system, state = _ball()
+    method = jc.Method(integrator=integrator)
+    with pytest.raises(ValueError, match="bounded rows of \\['floor'\\]"):
+        jc.step(system, method, jc.init(system, method, state.q, state.v), None, 1e-3)
+
+
+def test_scenes_without_bounds_have_no_trace_of_them():
+    """The jaxpr of a step does not depend on the solver of bounded rows, and has no loop of it."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("link", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "link", point=(0.0, 0.0)))
+    system, state = scene.build()
+
+    def trace(method):
+        return str(jax.make_jaxpr(lambda s: jc.step(system, method, s, None, 1e-3))(state))
+
+    methods = [jc.Method(bounded=b) for b in (jc.InteriorPoint(), jc.GaussSeidel(sweeps=7))]
+    info = jc.step(system, methods[0], state, None, 1e-3)[1]
+    assert info.reactions is None
+    assert "while" not in trace(methods[0])
+    assert _sizes(system, state, methods[0]) == _sizes(system, state, methods[1])
+
+
+def _sizes(system, state, method):
+    lowered = jax.jit(lambda s: jc.step(system, method, s, None, 1e-3)).lower(state)
+    return len(lowered.as_text())

@@ -1,0 +1,397 @@
+"""Contact and ropes: closed forms, energy, Coulomb's law, gradients through impacts."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+
+import jaxcon as jc
+from jaxcon.verification import references
+
+H = 1e-3
+FORMS = {case["id"]: case for case in references.load("contact_closed_forms")["cases"]}
+CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+dtypes = pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+
+
+def run(system, state, h, steps, method=None, every=1):
+    """The states and what the bounded rows did."""
+    method = jc.Method() if method is None else method
+    state = jc.init(system, method, state.q, state.v)
+    h = jnp.asarray(h, state.q.dtype)
+
+    def record(s, i):
+        return s, i.reactions
+
+    return quick_jit(
+        lambda s: jc.rollout(system, method, s, None, h, steps, record=record, every=every)
+    )(state)[1]
+
+
+def ball(velocity, spin=(0.0, 0.0, 0.0), height=1e-9, gravity=0.0, **contact):
+    """A ball of 1 kg and 0.1 m over a floor."""
+    scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -gravity))
+    inertia = jc.inertia.sphere(1.0, 0.1)
+    scene.add_body(
+        "ball", inertia=inertia, position=(0, 0, 0.1 + height), velocity=velocity,
+        angular_velocity=spin,
+    )  # fmt: skip
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, **contact))
+    return scene.build()
+
+
+def box(slope, friction, dtype=None, size=(0.4, 0.3, 0.1)):
+    """A box on four corners; gravity is turned, not the floor."""
+    turned = (9.81 * np.sin(slope), 0.0, -9.81 * np.cos(slope))
+    scene = jc.Scene(dim=3, gravity=turned, dtype=dtype)
+    a, b, c = size
+    scene.add_body("box", inertia=jc.inertia.box(2.0, size), position=(0, 0, c / 2))
+    for k, (x, y) in enumerate(CORNERS):
+        corner = (x * a / 2, y * b / 2, 0.0)
+        scene.add(jc.PlaneContact(f"{k}", jc.WORLD, "box", center=corner, friction=friction))
+    return scene.build()
+
+
+def test_a_ball_bounces_as_high_as_it_should():
+    case = FORMS["bouncing_ball"]
+    system, state = ball((0.0, 0.0, 0.0), height=1.0, gravity=9.81, restitution=0.8)
+    h = 2.5e-4
+    states, _ = run(system, state, h, 8800)
+    height = np.asarray(states.q[:, 2]) - 0.1
+    times = [0.0, *case["impact_times"]]
+    for k in (1, 2, 3):
+        between = height[int(times[k] / h) : int(times[k + 1] / h)]
+        assert abs(between.max() / case["apex_heights"][k - 1] - 1) < 0.01
+    assert height.min() > -1e-12
+
+
+@pytest.mark.parametrize("name", ["sphere_floor_stick", "sphere_floor_slip"])
+def test_an_impact_with_friction(name):
+    """The reference is in the plane, its spin about z; here that is −y of the body."""
+    after = FORMS[name]["after"]
+    start, spin = ((1.0, 0.0, -2.0), 0.0) if "stick" in name else ((4.0, 0.0, -2.0), 5.0)
+    system, state = ball(start, (0.0, -spin, 0.0), friction=0.3, restitution=0.7)
+    states, _ = run(system, state, 1e-4, 2)
+    found = states.v[-1]
+    want = [after["vx"], 0.0, after["vy"], 0.0, -after["w"], 0.0]
+    np.testing.assert_allclose(found, want, atol=1e-9)
+
+
+def test_balls_that_meet():
+    """A central collision, and a cradle by the simultaneous rule of Newton."""
+    case = FORMS["central_collision"]
+    scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
+    scene.add_particle("a", mass=2.0, position=(0, 0, 0), velocity=(3.0, 0, 0))
+    scene.add_particle("b", mass=5.0, position=(0.2, 0, 0), velocity=(-1.0, 0, 0))
+    scene.add(jc.CapsuleContact("touch", "a", "b", radius_a=0.1, radius_b=0.1, restitution=0.6))
+    states, _ = run(*scene.build(), H, 1)
+    np.testing.assert_allclose(states.v[-1, :2], [case["v1_after"], case["v2_after"]], rtol=1e-9)
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    for i in range(3):
+        scene.add_particle(f"{i}", mass=1.0, position=(0.2 * i, 0), velocity=(float(i == 0), 0))
+    for i in range(2):
+        touch = {"radius_a": 0.1, "radius_b": 0.1, "restitution": 1.0}
+        scene.add(jc.CapsuleContact(f"touch {i}", f"{i}", f"{i + 1}", **touch))
+    states, reactions = run(*scene.build(), H, 1)
+    np.testing.assert_allclose(states.v[-1, :3], [-1 / 3, 2 / 3, 2 / 3], rtol=1e-9)
+    np.testing.assert_allclose(reactions.kept, 1.0)
+
+
+def test_a_rod_that_falls_on_its_tip():
+    case = FORMS["rod_tip_impact"]
+    turn = np.pi / 6
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    position, tip = (0.0, 0.5 * np.sin(turn)), (0.5 * np.cos(turn), 0.0)
+    scene.add_body("rod", mass=1.0, inertia=1 / 12, position=position, velocity=(0.0, -2.0))
+    scene.add(jc.PlaneContact("tip", jc.WORLD, "rod", center=tip, restitution=0.5))
+    states, reactions = run(*scene.build(), 1e-5, 1)
+    np.testing.assert_allclose(states.v[-1, 1], case["com_velocity_after"], rtol=1e-6)
+    np.testing.assert_allclose(abs(states.v[-1, 2]), case["abs_omega_after"], rtol=1e-6)
+    np.testing.assert_allclose(1e-5 * reactions["tip"][0, 0], case["normal_impulse"], rtol=1e-6)
+
+
+def test_a_bowling_ball_slides_then_rolls():
+    """The reference has y up and rolls along z; here x is along the lane and y its negative x."""
+    want = FORMS["bowling_ball"]["states"][-1]
+    errors = []
+    for h in (2e-3, 1e-3):
+        scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -9.8))
+        scene.add_body(
+            "ball", mass=6.35, inertia=(0.0296,) * 3, position=(0, 0, 0.10795),
+            velocity=(8.0, 0.0, 0.0), angular_velocity=(-8 * np.pi, 0.0, 0.0),
+        )  # fmt: skip
+        lane = jc.PlaneContact("lane", jc.WORLD, "ball", radius=0.10795, friction=0.12)
+        scene.add(lane)
+        states, _ = run(*scene.build(), h, int(2.4 / h), every=int(2.4 / h))
+        place, speed = states.q[-1, :2], states.v[-1, :2]
+        errors.append(np.abs(place - np.array([want["z"], want["x"]])).max())
+        np.testing.assert_allclose(speed, [want["vz"], want["vx"]], rtol=1e-6)
+    assert errors[1] < 2e-3
+    np.testing.assert_allclose(errors[0] / errors[1], 2.0, rtol=0.1)
+
+
+@dtypes
+@pytest.mark.parametrize("friction", [0.3, 0.7])
+def test_a_box_on_a_slope(friction, dtype):
+    """It slides with g (sin α − μ cos α), or stays; its corners bear what they must."""
+    case = FORMS["block_incline"]
+    system, state = box(np.pi / 6, friction, dtype)
+    states, reactions = run(system, state, H, 300)
+    tight = 1e-9 if dtype == jnp.float64 else 2e-4
+    want = 0.3 * case["acceleration"] if friction < np.tan(np.pi / 6) else 0.0
+    np.testing.assert_allclose(states.v[-1, 0], want, atol=tight)
+    np.testing.assert_allclose(states.v[-1, 1:], 0.0, atol=10 * tight)
+    np.testing.assert_allclose(states.q[-1, 2], 0.05, atol=tight)
+    bearing = sum(reactions[f"{k}"][-1, 0] for k in range(4))
+    np.testing.assert_allclose(bearing / 2.0, case["normal_over_m"], rtol=10 * tight)
+    assert np.all(states.status == 0)
+
+
+@pytest.mark.parametrize("slope", [0.95, 1.05])
+def test_a_box_topples_beyond_its_corner(slope):
+    """A tall box with much friction stays while tan α < width/height."""
+    system, state = box(np.arctan(slope * 0.5), 2.0, size=(0.1, 0.1, 0.2))
+    states, _ = run(system, state, 2e-3, 400)
+    tilt = np.abs(np.asarray(states.q[-1, 5]))
+    assert tilt > 0.05 if slope > 1 else tilt < 1e-6
+
+
+def test_what_is_missed_over_random_states_of_a_box():
+    """Laws, cone and the direction of friction: 2,000 boxes thrown into the floor."""
+    system, state = box(0.4, 0.5)
+    method = jc.Method()
+
+    def thrown(key):
+        place, speed = (jax.random.normal(k, (6,)) for k in jax.random.split(key))
+        q = system.retract(state.q, 3e-3 * place)
+        new, info = jc.step(system, method, dataclasses.replace(state, q=q, v=speed), None, 2e-3)
+        every = jnp.stack([info.reactions[f"{k}"] for k in range(4)])
+        return every, info.reactions.residual, jnp.max(jnp.abs(speed)), new.status
+
+    keys = jax.random.split(jax.random.PRNGKey(1), 2000)
+    every, missed, speed, status = map(np.asarray, quick_jit(jax.vmap(thrown))(keys))
+    assert np.all(status == 0)
+    normal, slip = every[..., 0], np.linalg.norm(every[..., 1:], axis=-1)
+    assert np.mean(normal > 0) > 0.2
+    assert np.all(normal >= 0)
+    assert np.all(slip <= 0.5 * normal * (1 + 1e-9) + 1e-9)
+    assert np.mean(missed / speed > 1e-8) < 1e-3
+
+
+def test_no_impact_adds_energy():
+    """Rods that fall on a rough floor: without a cap, one in eight of them would gain."""
+    turn = np.pi / 6
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("rod", mass=1.0, inertia=1 / 12, position=(0.0, 0.5 * np.sin(turn)))
+    tip = (0.5 * np.cos(turn), 0.0)
+    floor = jc.PlaneContact("tip", jc.WORLD, "rod", center=tip, restitution=0.9, friction=1.0)
+    scene.add(floor)
+    system, state = scene.build()
+
+    def gained(v):
+        start = dataclasses.replace(state, v=v * jnp.asarray([2.0, 2.0, 8.0]))
+        new, info = jc.step(system, jc.Method(), start, None, 1e-4)
+        energies = [jc.energy(system, s).kinetic for s in (new, start)]
+        return energies[0] - energies[1], energies[1], info.reactions.kept
+
+    speeds = jax.random.normal(jax.random.PRNGKey(0), (2000, 3))
+    gain, energy, kept = map(np.asarray, quick_jit(jax.vmap(gained))(speeds))
+    assert np.max(gain / energy) < 1e-12
+    assert 0.05 < np.mean(kept < 1) < 0.3
+
+
+@dtypes
+def test_a_column_with_a_heavy_block_stays_up(dtype):
+    """Ten guided blocks, the topmost a thousand times heavier."""
+    scene = jc.Scene(dim=2, dtype=dtype)
+    for i in range(10):
+        mass = 1000.0 if i == 9 else 1.0
+        scene.add_body(f"{i}", mass=mass, inertia=mass, position=(0.0, 0.05 + 0.1 * i))
+        scene.add(jc.Prismatic(f"guide {i}", jc.WORLD, f"{i}", axis=(0.0, 1.0)))
+        below = jc.PlaneContact("floor", jc.WORLD, "0", center=(0.0, 0.0))
+        touch = {"radius_a": 0.05, "radius_b": 0.05, "friction": 0.5}
+        scene.add(
+            below if i == 0 else jc.CapsuleContact(f"{i - 1}:{i}", f"{i - 1}", f"{i}", **touch)
+        )
+    system, state = scene.build()
+    states, _ = run(system, state, 5e-3, 400, every=400)
+    tight = 1e-12 if dtype == jnp.float64 else 2e-6
+    np.testing.assert_allclose(states.q[-1], state.q, atol=tight)
+
+
+@pytest.mark.parametrize("integrator", [jc.SemiImplicitEuler(), jc.RK4()], ids=["SIE", "RK4"])
+def test_a_rope_catches_a_weight(integrator):
+    scene = jc.Scene(dim=3)
+    scene.add_particle("weight", mass=1.0, position=(0.3, 0.0, -0.5))
+    scene.add(jc.Rope("rope", jc.WORLD, "weight", length=1.0, point_a=(0.0, 0.0, 0.0)))
+    system, state = scene.build()
+    states, reactions = run(system, state, H, 1500, jc.Method(integrator=integrator))
+    length = np.linalg.norm(np.asarray(states.q), axis=1)
+    slack = np.asarray(reactions["rope"])[:, 0] < 1e-9
+    assert slack[:200].all()
+    assert not slack[400:450].any()
+    assert length.max() < 1.0 + (1e-4 if isinstance(integrator, jc.SemiImplicitEuler) else 1e-2)
+    energy = jax.vmap(lambda s: jc.energy(system, s).total)(states)
+    assert float(energy.max() - energy[0]) < 0.02
+
+
+def test_gradients_through_a_bounce_contain_its_time():
+    """y(T) = r + e (−v T − (y₀ − r)): without the time of impact ∂y/∂y₀ has the wrong sign."""
+    case = references.load("grad_contact_zhong")["task1"]
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("ball", mass=1.0, position=(0.0, 1.0))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, restitution=1.0))
+    system, state = scene.build()
+
+    def height(y, v):
+        start = dataclasses.replace(state, q=state.q.at[1].set(y), v=state.v.at[1].set(v))
+        return jc.rollout(system, jc.Method(), start, None, 1 / 480, 480)[0].q[1]
+
+    value, slopes = quick_jit(jax.value_and_grad(height, (0, 1)))(1.0, -2.0)
+    np.testing.assert_allclose(value, case["h"], rtol=1e-9)
+    np.testing.assert_allclose(slopes, [case["dh_dy0"], case["dh_dvy0"]], rtol=1e-6)
+
+
+def test_gradients_through_a_collision():
+    case = references.load("grad_two_balls_nimble")
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("a", mass=1.0, position=(0.0, 0.0))
+    scene.add_particle("b", mass=1.0, position=(0.52, 0.0))
+    touch = {"radius_a": 0.1, "radius_b": 0.1, "restitution": 1.0}
+    scene.add(jc.CapsuleContact("touch", "a", "b", **touch))
+    system, state = scene.build()
+
+    def place(x):
+        still = jnp.zeros(2)
+        q, v = jnp.concatenate([x[:2], still]), jnp.concatenate([x[2:], still])
+        start = dataclasses.replace(state, q=q, v=v)
+        return jc.rollout(system, jc.Method(), start, None, 1 / 240, 240)[0].q[1]
+
+    value, slope = quick_jit(jax.value_and_grad(place))(jnp.asarray([0.0, 0.52, 1.0, 0.0]))
+    np.testing.assert_allclose(value, 1.2, rtol=1e-9)
+    np.testing.assert_allclose(slope, case["exact_gradient_d_x2T_d_x1_x2_v0_u0"], atol=1e-6)
+
+
+def test_gradients_of_where_a_block_stops():
+    """d = v²/(2 μ g), at first order in h."""
+    case = FORMS["sliding_stop_gradient"]
+    scene = jc.Scene(dim=2)
+    scene.add_particle("block", mass=1.0, position=(0.0, 0.0))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "block", friction=0.4))
+    system, state = scene.build()
+
+    def distance(v, friction, h, steps):
+        changed = system.with_params({"floor": {"friction": friction}})
+        start = dataclasses.replace(state, v=state.v.at[0].set(v))
+        return jc.rollout(changed, jc.Method(), start, None, h, steps)[0].q[0]
+
+    want = np.array([case["stop_distance"], case["d_dv0"], case["d_dmu"]])
+    for steps in (400, 800):
+        both = jax.value_and_grad(lambda v, mu, n=steps: distance(v, mu, 1 / n, n), (0, 1))
+        value, slopes = quick_jit(both)(3.0, 0.4)
+        relative = np.abs(np.array([value, *slopes]) / want - 1)
+        assert relative.max() < 4 / steps
+
+
+@dtypes
+def test_gradients_at_rest_are_finite(dtype):
+    """A box that lies still, on a floor with as much friction as it needs and with none."""
+    for friction in (0.0, 0.5):
+        system, state = box(0.0, jnp.asarray(friction, dtype), dtype)
+
+        def end(x, system=system, state=state):
+            changed = system.with_params({"0": {"friction": x[0]}, "box": {"mass": x[1]}})
+            start = dataclasses.replace(state, v=state.v + x[2])
+            final, _ = jc.rollout(changed, jc.Method(), start, None, jnp.asarray(H, dtype), 3)
+            return jnp.sum(final.q)
+
+        slope = quick_jit(jax.grad(end))(jnp.asarray([friction, 2.0, 0.0], dtype))
+        assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel()], ids=["point", "sweeps"])
+def test_there_is_no_friction_without_a_normal_force(solver):
+    """A slider on a rail beside a floor: the rail bears it, and the floor does not rub."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("slide", mass=2.0, inertia=1.0, velocity=(1.0, 0.0))
+    scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "slide", friction=0.5))
+    states, reactions = run(*scene.build(), H, 20, jc.Method(bounded=solver))
+    np.testing.assert_allclose(reactions["floor"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(states.v[-1, 0], 1.0, rtol=1e-9)
+
+
+def test_two_discs_that_touch_keep_their_momenta():
+    """Equal and opposite forces at one place, friction too, before and after they overlap."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    for name, x, v, spin in (("a", 0.0, 1.0, 3.0), ("b", 0.235, -1.0, 2.0)):
+        scene.add_body(
+            name, mass=1.0, inertia=0.02, position=(x, 0.02 * x), velocity=(v, 0.1),
+            angular_velocity=spin,
+        )  # fmt: skip
+    touch = {"radius_a": 0.1, "radius_b": 0.1, "friction": 0.8}
+    scene.add(jc.CapsuleContact("touch", "a", "b", **touch))
+    system, state = scene.build()
+    states, _ = run(system, state, 1e-2, 6)
+    linear = jax.vmap(lambda s: jc.momentum(system, s))(states)
+    angular = jax.vmap(lambda s: jc.angular_momentum(system, s))(states)
+    assert abs(float(states.v[-1, 0] - state.v[0])) > 0.1
+    np.testing.assert_allclose(linear, linear[:1] + 0 * linear, atol=1e-12)
+    np.testing.assert_allclose(angular, angular[0] + 0 * angular, atol=1e-9)
+
+
+def test_deep_overlap_ends_slowly():
+    """A ball started inside the floor comes out at the rate of recovery."""
+    system, state = ball((0.0, 0.0, 0.0), height=-0.08, recovery=0.05)
+    states, _ = run(system, state, H, 2000)
+    assert np.all(states.status == 0)
+    assert float(jnp.abs(states.v).max()) < 0.05 + 1e-9
+    assert float(states.q[-1, 2]) > 0.1 - 1e-4
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_capsules_touch_where_they_are_nearest(dim):
+    """Against the smallest distance of many pairs of points."""
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        ends = rng.normal(size=(2, 2, dim))
+        ends[1] += 2.0
+        scene = jc.Scene(dim=dim)
+        for name, own in zip("ab", ends, strict=True):
+            inertia = 1.0 if dim == 2 else (1.0, 1.0, 1.0)
+            scene.add_body(name, mass=1.0, inertia=inertia, position=own.mean(axis=0))
+        scene.add(
+            jc.CapsuleContact(
+                "touch", "a", "b", radius_a=0.1, radius_b=0.2, segment_a=ends[0],
+                segment_b=ends[1],
+            )
+        )  # fmt: skip
+        system, state = scene.build()
+        gap = jc.step(system, jc.Method(), state, None, 1e-6)[1].reactions.gap[0]
+        s = np.linspace(0, 1, 801)[:, None]
+        a, b = (e[0] + s * (e[1] - e[0]) for e in ends)
+        apart = np.linalg.norm(a[:, None] - b[None], axis=-1).min()
+        np.testing.assert_allclose(gap, apart - 0.3, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("element", "match"),
+    [
+        (jc.PlaneContact("c", jc.WORLD, "ball", friction=-0.1), "friction"),
+        (jc.PlaneContact("c", jc.WORLD, "ball", radius=-0.1), "radius"),
+        (jc.PlaneContact("c", jc.WORLD, "ball", restitution=2.0), "restitution must lie in 0 to 1"),
+        (jc.PlaneContact("c", jc.WORLD, "ball", normal=(0, 0, 0)), "normal"),
+        (jc.PlaneContact("c", jc.WORLD, "bal"), "body 'bal' is unknown"),
+        (jc.CapsuleContact("c", "ball", "ball"), "to itself"),
+        (jc.Rope("r", jc.WORLD, "ball", length=-1.0), "length"),
+    ],
+)
+def test_bad_numbers_are_refused(element, match):
+    scene = jc.Scene(dim=3)
+    scene.add_body("ball", mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0, 0, 1))
+    scene.add(element)
+    with pytest.raises(ValueError, match=match):
+        scene.build()

@@ -1,0 +1,194 @@
+"""Contacts without friction, and bodies that touch at several points."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from tolerances import DIFFERENCE
+
+import jaxcon as jc
+from jaxcon.constraints.bounds import linearize_bounds
+
+H = 1e-3
+
+
+def bounded(system, state):
+    """The bounded rows at a state."""
+    return linearize_bounds(system, state.q, state.v, state.time, None, jnp.asarray(H))
+
+
+def particles(dim, **frictions):
+    """Particles that slide over one floor at 1 m/s, each with a friction of its own."""
+    scene = jc.Scene(dim=dim)
+    rest = (0.0,) * (dim - 1)
+    for i, (name, friction) in enumerate(frictions.items()):
+        place = (float(i), *rest)
+        scene.add_particle(name, mass=1.0, position=place, velocity=(1.0, *rest))
+        scene.add(jc.PlaneContact(f"{name} floor", jc.WORLD, name, friction=friction))
+    return scene.build()
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel()], ids=["point", "sweeps"])
+def test_contacts_with_and_without_friction_share_a_scene(dim, solver):
+    """One slides on, one is braked by μ g, and the first has no rows but its normal."""
+    system, state = particles(dim, ice=0.0, road=0.4, glass=0)
+    kinds = bounded(system, state).kinds
+    assert (kinds.single, kinds.contacts, kinds.tangents) == (2, 1, dim - 1)
+    method = jc.Method(bounded=solver)
+    state = jc.init(system, method, state.q, state.v)
+    final, forces = quick_jit(
+        lambda s: jc.rollout(system, method, s, None, H, 50, record=lambda _, i: i.reactions)
+    )(state)
+    np.testing.assert_allclose(jc.velocity(system, final, "ice")[0], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(jc.velocity(system, final, "glass")[0], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(
+        jc.velocity(system, final, "road")[0], 1 - 0.4 * 9.81 * 0.05, rtol=1e-9
+    )
+    np.testing.assert_allclose(forces["ice floor"][-1], [9.81], rtol=1e-9)
+    sideways = [0.0] * (dim - 2)
+    want = [9.81, *sideways, 0.4 * 9.81]
+    np.testing.assert_allclose(np.sort(np.abs(forces["road floor"][-1])), np.sort(want), atol=1e-9)
+
+
+def test_a_friction_that_was_left_out_is_missed_by_name():
+    system, _ = particles(2, ice=0.0, road=0.4)
+    assert "friction" not in system.params["ice floor"]
+    with pytest.raises(ValueError, match=r"no \['friction'\].*friction=jnp.zeros"):
+        system.with_params({"ice floor": {"friction": 0.3}})
+    with pytest.raises(ValueError, match=r"no \['restitution'\].*restitution=jnp.zeros"):
+        system.with_params({"road floor": {"restitution": 0.3}})
+    with pytest.raises(ValueError, match=r"no \['grip'\], it has \[.*\]\.$"):
+        system.with_params({"ice floor": {"grip": 0.3}})
+    system, _ = particles(2, ice=jnp.zeros(()))
+    changed = system.with_params({"ice floor": {"friction": 0.3}})
+    np.testing.assert_allclose(changed.params["ice floor"]["friction"], 0.3)
+
+
+CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+SIZE = (0.4, 0.3, 0.1)
+SLOPE = 0.4
+TILT = (0.9, 0.1, -0.2, 0.3)
+
+
+def crate(contacts, velocity=(0.3, -0.1, 0.0)):
+    """A crate of 2 kg that slides; gravity is turned, not the floor."""
+    scene = jc.Scene(gravity=(9.81 * np.sin(SLOPE), 0.0, -9.81 * np.cos(SLOPE)))
+    inertia = jc.inertia.box(2.0, SIZE)
+    scene.add_body("crate", inertia=inertia, position=(0, 0, 0.05), velocity=velocity)
+    for contact in contacts:
+        scene.add(contact)
+    return scene.build()
+
+
+def on_floor(name, **given):
+    return jc.PlaneContact(name, jc.WORLD, "crate", friction=0.3, **given)
+
+
+def slid(system, state, steps=30):
+    """The end, and what the bounded rows did in each step."""
+    method = jc.Method(bounded=jc.GaussSeidel(sweeps=60))
+    state = jc.init(system, method, state.q, state.v)
+    final, forces = quick_jit(
+        lambda s: jc.rollout(system, method, s, None, H, steps, record=lambda _, i: i.reactions)
+    )(state)
+    return final, forces
+
+
+def test_points_in_one_element_are_those_in_many():
+    """Each has the reactions of the contact that it stands for."""
+    corners = [(x * SIZE[0] / 2, y * SIZE[1] / 2, 0.0) for x, y in CORNERS]
+    apart, forces_apart = slid(*crate(on_floor(f"{k}", center=x) for k, x in enumerate(corners)))
+    final, forces = slid(*crate([on_floor("floor", center=corners)]))
+    np.testing.assert_allclose(final.q, apart.q, atol=1e-13)
+    assert forces["floor"].shape == (30, 4, 3)
+    every = jnp.stack([forces_apart[f"{k}"] for k in range(4)], axis=1)
+    np.testing.assert_allclose(forces["floor"], every, atol=1e-9)
+
+
+def test_a_box_slides_on_its_corners():
+    """It has the acceleration of a block, and its corners bear its weight between them."""
+    box = jc.BoxContact("floor", jc.WORLD, "crate", size=SIZE, friction=0.3)
+    final, forces = slid(*crate([box], velocity=(0.3, 0.0, 0.0)))
+    assert forces["floor"].shape == (30, 8, 3)
+    total = jnp.sum(forces["floor"][-1], axis=0)
+    np.testing.assert_allclose(total[0], 2 * 9.81 * np.cos(SLOPE), rtol=1e-6)
+    np.testing.assert_allclose(jnp.linalg.norm(total[1:]), 0.3 * total[0], rtol=1e-6)
+    speed = 0.3 + 30 * H * 9.81 * (np.sin(SLOPE) - 0.3 * np.cos(SLOPE))
+    np.testing.assert_allclose(final.v[:3], [speed, 0.0, 0.0], atol=1e-6)
+
+
+def gaps(element, dim=3, **body):
+    """φ of the points of a contact of a body with a floor."""
+    scene = jc.Scene(dim=dim)
+    scene.add_body("crate", **body)
+    scene.add(element)
+    system, state = scene.build()
+    found = bounded(system, state)
+    return np.asarray(found.gap[found.layout.rows(element.name)[:, 0]])
+
+
+def test_the_corners_of_a_box_lie_where_the_body_was_given():
+    """With principal axes elsewhere than along its edges, in space and in the plane."""
+    turn, place = np.array(TILT) / np.linalg.norm(TILT), (0.1, 0.2, 1.0)
+    tensor = jnp.asarray([[2.0, 0.3, 0.1], [0.3, 3.0, -0.2], [0.1, -0.2, 2.5]])
+    off = jc.inertia.from_tensor(2.0, tensor, center=jnp.asarray([0.1, -0.2, 0.3]))
+    body = {"inertia": off, "position": place, "quaternion": turn}
+    box = jc.BoxContact("box", jc.WORLD, "crate", size=SIZE)
+    want = jc.box_corners(SIZE, place, turn)
+    np.testing.assert_allclose(gaps(box, **body), want[:, 2], atol=1e-12)
+    given = {"position": (0.4, 0.3, 0.7), "orientation": TILT}
+    box = jc.BoxContact("box", jc.WORLD, "crate", size=SIZE, **given)
+    body = {"inertia": jc.inertia.box(2.0, SIZE), "position": place}
+    want = jc.box_corners(SIZE, given["position"], turn)
+    np.testing.assert_allclose(gaps(box, **body), want[:, 2], atol=1e-12)
+    assert np.ptp(want[:, 2]) > 0.1
+    body = {"mass": 1.0, "inertia": 1.0, "position": (0.3, 1.0), "angle": 0.4}
+    box = jc.BoxContact("box", jc.WORLD, "crate", size=SIZE[:2])
+    found = gaps(box, 2, **body)
+    np.testing.assert_allclose(found, jc.box_corners(SIZE[:2], (0.3, 1.0), 0.4)[:, 1], atol=1e-12)
+    np.testing.assert_allclose(found.min(), 1 - 0.2 * np.sin(0.4) - 0.15 * np.cos(0.4), rtol=1e-9)
+
+
+def test_gradients_by_the_size_of_a_box():
+    """A box in the plane that lands on a corner; a batch of worlds has the differences."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("crate", mass=2.0, inertia=0.03, position=(0, 0.18), angle=0.1)
+    scene.add(jc.BoxContact("box", jc.WORLD, "crate", size=SIZE[:2], friction=0.3))
+    system, state = scene.build()
+    method = jc.Method(bounded=jc.GaussSeidel(sweeps=200))
+    state = jc.init(system, method, state.q, state.v)
+
+    def end(x):
+        changed = system.with_params({"box": {"size": x[:2], "friction": x[2]}})
+        return jnp.sum(jc.rollout(changed, method, state, None, 2e-3, 40)[0].q ** 2)
+
+    at, step = jnp.asarray([*SIZE[:2], 0.3]), 1e-6 * jnp.eye(3)
+    worlds = jnp.concatenate([at[None], at[None] + step, at[None] - step])
+    ends, slopes = quick_jit(jax.vmap(jax.value_and_grad(end)))(worlds)
+    assert np.abs(slopes[0]).min() > 1e-4
+    np.testing.assert_allclose(slopes[0], (ends[1:4] - ends[4:]) / 2e-6, rtol=DIFFERENCE)
+
+
+@pytest.mark.parametrize(
+    ("element", "match"),
+    [
+        (jc.BoxContact("b", jc.WORLD, "crate", size=(1.0, 1.0)), r"'b': size must have shape \(3,"),
+        (jc.BoxContact("b", jc.WORLD, "crate", size=(1.0, 1.0, 0.0)), "size must be positive"),
+        (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, friction=-1.0), "friction"),
+        (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, restitution=1.5), "lie in 0 to 1"),
+        (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, orientation=(1, 0)), "orientation must"),
+        (jc.BoxContact("b", jc.WORLD, "dot", size=SIZE), "'dot' is a particle"),
+        (jc.PlaneContact("b", jc.WORLD, "dot", center=np.zeros((2, 3))), "a particle is one"),
+        (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((2, 2))), r"shape \(2, 3\)"),
+        (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((0, 3))), r"shape \(1, 3\)"),
+    ],
+)
+def test_bad_numbers_are_refused(element, match):
+    scene = jc.Scene()
+    scene.add_body("crate", inertia=jc.inertia.box(1.0, SIZE))
+    scene.add_particle("dot", mass=1.0)
+    scene.add(element)
+    with pytest.raises(ValueError, match=match):
+        scene.build()

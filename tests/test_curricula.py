@@ -1,0 +1,194 @@
+"""Schedules, worlds that differ, actions that are allowed, and layers of control."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from scipy import optimize
+from tolerances import DIFFERENCE
+
+import jaxcon as jc
+from jaxcon import environments
+from jaxcon.environments import exploration
+
+
+@pytest.fixture(scope="module")
+def cart():
+    return environments.make("CartPole")
+
+
+def test_schedules_have_their_closed_forms():
+    t = jnp.array([0.0, 10.0, 20.0])
+    np.testing.assert_allclose(environments.decay(t, 0.5, 10.0), 0.5 * np.exp([0.0, -1.0, -2.0]))
+    episodes = jnp.array([0, 99, 100, 150, 200, 900])
+    found = environments.warm_up(episodes, 100, 200)
+    np.testing.assert_allclose(found, [0.1, 0.1, 0.1, 0.55, 1.0, 1.0])
+    found = environments.by_performance(jnp.array([-1e3, 2.0, 5.0, 1e3]), 10.0, 110.0, 2.0, 3.0)
+    half = 1 / (1 + np.exp(-1.0))
+    np.testing.assert_allclose(found, [10.0, 60.0, 10.0 + 100.0 * half, 110.0])
+    slope = jax.grad(lambda p: environments.by_performance(p, 1.0, 2.0))(0.0)
+    np.testing.assert_allclose(slope, 0.25)
+
+
+def test_schedules_refuse_what_has_no_meaning():
+    with pytest.raises(ValueError, match="time must be positive"):
+        environments.decay(1.0, 1.0, 0.0)
+    with pytest.raises(ValueError, match="end must lie beyond begin"):
+        environments.warm_up(1, 200, 100)
+    with pytest.raises(ValueError, match="width must be positive"):
+        environments.by_performance(1.0, 1.0, 2.0, width=-1.0)
+
+
+def test_stiffness_goes_into_leaves_and_constraints_give_way_as_hookes_law_says(cart):
+    """The weight m g of cart and pole on a rail of springs, once for the whole curriculum."""
+    episode = cart.reset(jax.random.key(0))
+    traces = []
+
+    @quick_jit
+    def sag(k):
+        traces.append(1)
+        soft = environments.with_stiffness(cart, {"rail": k}, {"rail": 0.3 * k})
+        soft = dataclasses.replace(soft, skip=300)
+        state = jc.init(soft.system, soft.method, episode.state.q, episode.state.v)
+        after = soft.transition(dataclasses.replace(episode, state=state), jnp.zeros(1))
+        return jc.position(soft.system, after.state, "cart")[1]
+
+    for k in (1e3, 4e3):
+        np.testing.assert_allclose(sag(k), -1.3 * 9.81 / k, rtol=0.02)
+    assert len(traces) == 1
+
+
+def test_numbers_vary_within_their_shares_and_by_copy(cart):
+    shares = {"cart": {"mass": 0.2}, "pole1": {"mass": 0.5, "inertia": 0.5}}
+
+    @quick_jit
+    @jax.vmap
+    def drawn(key):
+        params = environments.vary(cart, key, shares).system.params
+        return params["cart"]["mass"], params["pole1"]["mass"], params["pole1"]["inertia"]
+
+    found = drawn(jax.random.split(jax.random.key(0), 400))
+    for x, nominal, share in zip(found, (1.0, 0.3, 0.009), (0.2, 0.5, 0.5), strict=True):
+        factor = np.asarray(x).ravel() / nominal
+        assert np.all(np.abs(factor - 1) <= share)
+        assert np.ptp(factor) > 1.9 * share
+        assert abs(np.mean(factor) - 1) < 4 * share / np.sqrt(3 * 400)
+    assert abs(np.corrcoef(found[1], np.ravel(found[2]))[0, 1]) < 0.2
+    with pytest.raises(ValueError, match="'pole1' has no 'length', it has"):
+        environments.vary(cart, jax.random.key(0), {"pole1": {"length": 0.1}})
+    with pytest.raises(ValueError, match="'pole9' has no numbers"):
+        environments.vary(cart, jax.random.key(0), {"pole9": {"mass": 0.1}})
+
+
+def test_noise_moves_what_constraints_ask_for(cart):
+    @quick_jit
+    @jax.vmap
+    def off(key):
+        own, key = jax.random.split(key)
+        world = environments.jitter(cart, own, {"pivot1": {"anchor_b": 1e-3}})
+        episode = world.reset(key)
+        return jc.violation(world.system, episode.state)["pivot1"]
+
+    found = np.asarray(off(jax.random.split(jax.random.key(0), 400)))
+    np.testing.assert_allclose(np.sqrt(np.mean(found**2)), np.sqrt(2) * 1e-3, rtol=0.15)
+
+
+def test_projection_is_the_nearest_point():
+    """A corner, an edge, inside, beside a dependent row; and rows that contradict each other."""
+    rows = jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 2.0]])
+    bounds = jnp.array([1.0, 1.0, 1.5, 3.0])
+    cases = {(3.0, 0.2): (1.0, 0.2), (2.0, 2.0): (0.75, 0.75), (-1.0, 0.3): (-1.0, 0.3)}
+    cases |= {(2.0, 0.9): (1.0, 0.5), (0.9, 0.9): (0.75, 0.75)}
+    project = quick_jit(exploration.project)
+    for x, nearest in cases.items():
+        np.testing.assert_allclose(project(jnp.array(x), rows, bounds), nearest, atol=1e-6)
+    rows, bounds = jnp.array([[1.0], [-1.0]]), jnp.array([-1.0, -1.0])  # a ≤ −1 and a ≥ 1
+    assert abs(float(project(jnp.array([5.0]), rows, bounds)[0])) < 1e-3
+    single = [jnp.asarray(x, jnp.float32) for x in ((2.0, 2.0), np.eye(2), (1.0, 1.0))]
+    found = project(*single)
+    assert found.dtype == jnp.float32
+    np.testing.assert_allclose(found, 1.0, atol=1e-3)
+
+
+def test_projection_is_that_of_an_active_set_method():
+    project, random = quick_jit(exploration.project), np.random.default_rng(0)
+    for _ in range(5):
+        rows, bounds = random.normal(size=(12, 6)), random.uniform(0.05, 1.0, 12)
+        x = 3 * random.normal(size=6)
+        inside = {"type": "ineq", "fun": lambda a, G=rows, h=bounds: h - G @ a}
+        least = optimize.minimize(
+            lambda a, x=x: np.sum((a - x) ** 2) / 2,
+            np.zeros(6),
+            method="SLSQP",
+            constraints=[inside],
+            options={"ftol": 1e-14, "maxiter": 300},
+        )
+        np.testing.assert_allclose(project(x, rows, bounds), least.x, atol=1e-6)
+
+
+def test_projection_has_the_derivative_of_the_nearest_point():
+    rows, bounds = jnp.array([[1.0, 1.0], [1.0, 0.0]]), jnp.array([1.5, 4.0])
+    x = jnp.array([2.0, 1.0])
+    slope = quick_jit(jax.jacobian(exploration.project, argnums=(0, 2)))(x, rows, bounds)
+    np.testing.assert_allclose(slope[0], [[0.5, -0.5], [-0.5, 0.5]], atol=1e-6)
+    np.testing.assert_allclose(slope[1], [[0.5, 0.0], [0.5, 0.0]], atol=1e-6)
+
+
+def slow(episode, most):
+    """The cart goes no faster than this; its velocity comes first in v."""
+    return jnp.stack([episode.state.v[0] - most, -episode.state.v[0] - most])
+
+
+def test_actions_and_noise_are_taken_as_far_as_limits_allow(cart):
+    """A push of 20 N on 1.3 kg makes 0.15 m/s in a step of 10 ms, in which all is linear."""
+    assert cart.system.layout.v("cart")[0] == 0
+    world = dataclasses.replace(cart, skip=1)
+    episode = world.reset(jax.random.key(0))
+
+    def held(wanted, noise, most):
+        limits = functools.partial(slow, most=most)
+        return environments.feasible_action(world, episode, wanted[None], limits, noise)[0]
+
+    def along(*x):
+        return jax.jvp(held, x, tuple(map(jnp.ones_like, x)))
+
+    both = quick_jit(along)  # and its slope along (1, 1, 1)
+    speed = quick_jit(lambda a: world.transition(episode, a[None]).state.v[0])
+    wanted, noise, most = jnp.asarray(0.3), jnp.asarray(0.05), jnp.asarray(0.1)
+    action, slope = both(wanted, noise, most)  # within the limits
+    np.testing.assert_allclose(action, 0.35, atol=1e-6)
+    np.testing.assert_allclose(slope, 2.0, atol=DIFFERENCE)
+    action, slope = both(wanted, noise + 5.0, most)
+    assert action < 0.9
+    np.testing.assert_allclose(speed(action), 0.1, atol=1e-6)
+    farther, _ = both(wanted, noise + 5.0, most + 0.01)  # the action itself has no say there
+    np.testing.assert_allclose(slope, (farther - action) / 0.01, rtol=DIFFERENCE)
+    action, _ = both(wanted - 5.0, noise, most)
+    np.testing.assert_allclose(speed(action), -0.1, atol=1e-6)
+    action, _ = both(wanted, noise + 5.0, most + 10.0)
+    np.testing.assert_allclose(action, 1.0, atol=1e-6)  # as far as actions go
+
+
+def cruise(environment, episode, target):
+    """A cart at up to 1 m/s either way."""
+    speed = jc.velocity(environment.system, episode.state, "cart")[0]
+    return 2.0 * (target - speed[None])
+
+
+def test_a_slow_policy_sets_what_a_fast_controller_follows(cart):
+    layered = environments.Layered.build(cart, cruise, ("speed, of 1 m/s",), hold=10)
+    assert layered.horizon == 50
+    step = quick_jit(lambda world, episode, action: world.step(episode, action))
+    episode, outcome = step(layered, layered.reset(jax.random.key(0)), jnp.array([0.4]))
+    assert episode.steps == 1
+    np.testing.assert_allclose(outcome.observation[1], 0.4, atol=0.05)
+    np.testing.assert_allclose(episode.state.time, 10 * cart.skip * cart.dt)
+    changed = layered.system.with_params({"push": {"gear": 0.0}})
+    still, _ = step(dataclasses.replace(layered, system=changed), episode, jnp.array([-0.4]))
+    assert jc.velocity(cart.system, still.state, "cart")[0] > 0.2  # nothing brakes it
+    with pytest.raises(ValueError, match="hold must be a whole number from 1"):
+        environments.Layered.build(cart, cruise, ("speed",), hold=0)

@@ -1,0 +1,403 @@
+"""What every environment keeps, by itself and behind Gymnasium's interfaces."""
+
+import dataclasses
+import functools
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+from gymnasium.envs.functional_jax_env import FunctionalJaxEnv
+from gymnasium.utils.env_checker import check_env
+from tolerances import DIFFERENCE
+
+import jaxcon as jc
+from jaxcon import environments
+from jaxcon.environments import copies, gym, vector
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import environments as benchmark  # noqa: E402
+
+TASKS = list(environments.TASKS)
+CHEAP = {"StewartBalancing": {"method": jc.Method(solver=jc.Schur())}}
+"""Options that make a task quicker to compile."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def quick():
+    """Gymnasium's interfaces, compiled quickly into slower code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(gym, "_reset", quick_jit(lambda e, key: e.reset(key)))
+        patch.setattr(gym, "_look", quick_jit(lambda e, episode: e.look(episode)))
+        patch.setattr(gym, "_step", quick_jit(lambda e, episode, action: e.step(episode, action)))
+        patch.setattr(vector, "_look", quick_jit(copies.look))
+        patch.setattr(vector, "_begin", quick_jit(copies.begin, static_argnums=(2, 3)))
+        patch.setattr(vector, "_advance", quick_jit(copies.advance, static_argnums=(3, 4)))
+        patch.setattr(vector, "_restart", quick_jit(copies.restart, static_argnums=3))
+        yield
+
+
+def single(task="CartPole", **options):
+    return gymnasium.make(f"jaxcon/{task}-v0", **CHEAP.get(task, {}) | options)
+
+
+def many(n=4, task="CartPole", **options):
+    mode = {"vectorization_mode": "vector_entry_point"}
+    return gymnasium.make_vec(f"jaxcon/{task}-v0", num_envs=n, **mode, **options)
+
+
+def pushes(steps, n=4, seed=0):
+    return np.random.default_rng(seed).uniform(-1, 1, (steps, n, 1))
+
+
+def play(envs, actions):
+    """Everything that the actions led to, as arrays of numpy."""
+    return [jax.tree.map(np.asarray, envs.step(a)) for a in actions]
+
+
+def same(x, y):
+    """Bit for bit."""
+    jax.tree.map(np.testing.assert_array_equal, x, y)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_gymnasium_finds_nothing_to_warn_of(task):
+    """Warnings are errors here; the checker also draws a picture."""
+    env = single(task)
+    check_env(env.unwrapped)
+    built = environments.make(task, **CHEAP.get(task, {}))
+    assert env.spec.max_episode_steps == built.horizon
+    assert len(env.observation_space.low) == len(built.observed)
+    assert {c.unit for c in built.observed} <= {"1", "m", "m/s", "rad", "rad/s"}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_episodes_start_on_the_constraints_and_earn_from_0_to_1(task):
+    built = environments.make(task, **CHEAP.get(task, {}))
+
+    def off(key):
+        episode = built.reset(key)
+        found = jc.violation(built.system, episode.state)
+        action = jnp.ones(len(built.actions))
+        return found.worst, found.worst_rate, built.judge(episode, action, episode)[0]
+
+    keys = jax.random.split(jax.random.key(0), 16)
+    position, rate, reward = quick_jit(jax.vmap(off))(keys)
+    assert jnp.max(position) < 1e-12
+    assert jnp.max(rate) < 1e-12
+    assert jnp.all((reward >= 0) & (reward <= 1))
+    assert len(jnp.unique(reward)) == len(keys)
+
+
+def test_float32_stays_float32():
+    env = single("FourBarTracking", dtype="float32")
+    observation, _ = env.reset(seed=0)
+    assert observation.dtype == env.observation_space.dtype == np.float32
+    for _ in range(3):
+        observation, _, terminated, truncated, info = env.step(env.action_space.sample())
+    assert observation.dtype == np.float32
+    assert not terminated
+    assert not truncated
+    assert info["status"] == "OK"
+
+
+def test_a_seed_gives_the_same_rollout_bit_for_bit():
+    actions = pushes(12)
+    runs = []
+    for seed in (3, 3, 4):
+        envs = many(max_episode_steps=5)  # each copy begins three episodes
+        runs.append([envs.reset(seed=seed), play(envs, actions)])
+    same(runs[0], runs[1])
+    assert np.all(runs[0][0][0] != runs[2][0][0])
+
+
+def test_a_copy_starts_as_it_does_among_fewer():
+    few, more = (np.asarray(many(n).reset(seed=1)[0]) for n in (2, 4))
+    same(few, more[:2])
+
+
+def test_what_was_saved_goes_on_bit_for_bit():
+    """Beyond the next reset, through a file, and in another object."""
+    actions = pushes(12)
+    envs = many(max_episode_steps=5)
+    envs.reset(seed=0)
+    play(envs, actions[:3])
+    kept = pickle.dumps(envs.save())
+    expected = play(envs, actions[3:])
+    other = many(max_episode_steps=5)
+    other.restore(pickle.loads(kept))
+    same(play(other, actions[3:]), expected)
+
+    one = single().unwrapped
+    one.reset(seed=5)
+    one.step(actions[0, 0])
+    kept = pickle.dumps(one.save())
+    expected = [one.step(a) for a in actions[:3, 0]] + [one.reset()]
+    other = single().unwrapped
+    other.restore(pickle.loads(kept))
+    same([other.step(a) for a in actions[:3, 0]] + [other.reset()], expected)
+
+
+def test_a_copy_that_diverges_is_truncated_and_reset_and_the_others_do_not_notice():
+    actions = pushes(4)
+    bad = actions.copy()
+    bad[1, 2] = np.nan
+    healthy, hit = many(), many()
+    for envs in (healthy, hit):
+        envs.reset(seed=0)
+    expected, found = play(healthy, actions), play(hit, bad)
+    others = np.array([0, 1, 3])
+    for (*x, _), (*y, _) in zip(expected, found, strict=True):
+        same([a[others] for a in x], [a[others] for a in y])
+    observation, reward, terminated, truncated, info = found[1]
+    assert truncated.tolist() == info["diverged"].tolist() == [False, False, True, False]
+    assert jc.Status(info["status"][2]) == jc.Status.NON_FINITE
+    assert reward[2] == 0
+    assert not terminated.any()
+    assert np.isfinite(observation).all()
+    same(observation[2], found[0][0][2])  # where it last was finite
+    observation, reward, terminated, truncated, info = found[2]
+    assert not truncated.any()
+    assert not info["diverged"].any()
+    assert reward[2] == 0  # of the step in which it was reset
+    assert abs(observation[2, 0]) < 0.1  # near the start again
+    assert not np.array_equal(observation[2], expected[0][0][2])
+
+
+def test_one_copy_refuses_what_is_no_action():
+    env = single().unwrapped
+    env.reset(seed=0)
+    for bad in (np.zeros(2), 0.0, [np.nan]):
+        with pytest.raises(ValueError, match=r"must be 1 numbers from -1 to 1 \(push"):
+            env.step(bad)
+    start = env.save()
+    far, _, *_ = env.step([5.0])
+    env.restore(start)
+    same(far, env.step([1.0])[0])  # clipped, as Gymnasium's pendulum does
+
+
+def test_many_copies_refuse_what_are_no_actions():
+    envs = many()
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match=r"shape \(4, 1\), got \(4,\)"):
+        envs.step(np.zeros(4))
+
+
+def test_unknown_names_and_options_are_told():
+    with pytest.raises(gymnasium.error.NameNotFound):
+        gymnasium.make("jaxcon/CartPolo-v0")
+    with pytest.raises(ValueError, match="known are CartPole, "):
+        environments.make("CartPolo")
+    with pytest.raises(TypeError, match="its options are lengths, masses"):
+        environments.make("CartPole", length=1.0)
+    with pytest.raises(ValueError, match="built already"):
+        environments.make(environments.make("CartPole"), cart=2.0)
+    env, envs = single().unwrapped, many()
+    for reset in (env.reset, envs.reset):
+        with pytest.raises(ValueError, match=r"unknown options \['speed'\]"):
+            reset(options={"speed": 1.0})
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step([0.0])
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.step(np.zeros((4, 1)))
+    with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array'"):
+        environments.GymnasiumEnv("CartPole", render_mode="ansi")
+    with pytest.raises(ValueError, match="4 bools, got float64"):
+        envs.reset(options={"reset_mask": np.ones(4)})
+
+
+def test_time_is_up_for_one_copy_and_for_many():
+    env = single(max_episode_steps=3)
+    env.reset(seed=0)
+    assert [env.step([0.0])[3] for _ in range(3)] == [False, False, True]
+    envs = many(max_episode_steps=3)
+    start, _ = envs.reset(seed=0)
+    seen = play(envs, np.zeros((8, 4, 1)))
+    assert [bool(x[3].all()) for x in seen] == [i in (2, 6) for i in range(8)]
+    assert [bool(x[3].any()) for x in seen] == [i in (2, 6) for i in range(8)]
+    assert np.all(seen[3][1] == 0)  # the step that resets
+    assert np.all(seen[2][1] > 0)
+    assert np.all(seen[3][0] != start)  # with fresh keys
+
+
+def test_when_copies_are_reset_is_a_choice():
+    """The same motion, told at different times."""
+    actions = pushes(4)
+    seen = {}
+    for mode in ("NextStep", "SameStep", "Disabled"):
+        envs = many(max_episode_steps=3, autoreset_mode=mode)
+        assert envs.metadata["autoreset_mode"] == gymnasium.vector.AutoresetMode(mode)
+        envs.reset(seed=0)
+        seen[mode] = play(envs, actions)
+    same(seen["SameStep"][2][4]["final_obs"], seen["NextStep"][2][0])
+    same(seen["SameStep"][2][0], seen["NextStep"][3][0])
+    same(seen["Disabled"][2][:4], seen["NextStep"][2][:4])
+    assert seen["Disabled"][3][3].all()  # it is still over
+    before = np.asarray(envs.copies.episode.steps)
+    mask = np.array([True, False, False, True])
+    observation, _ = envs.reset(options={"reset_mask": mask})
+    assert np.asarray(envs.copies.episode.steps).tolist() == np.where(mask, 0, before).tolist()
+    assert np.all(np.abs(np.asarray(observation)[mask, 0]) < 0.1)
+
+
+def heavier(environment, key):
+    mass = jax.random.uniform(key, (), minval=1.0, maxval=2.0)
+    changed = environment.system.with_params({"cart": {"mass": mass}})
+    return dataclasses.replace(environment, system=changed)
+
+
+def test_worlds_are_drawn_afresh_for_each_copy_and_episode():
+    envs = many(max_episode_steps=2, randomize=heavier)
+    envs.reset(seed=0)
+
+    def masses():
+        world = envs.copies.world
+        return np.asarray(jax.vmap(lambda w: w.system.params["cart"]["mass"])(world))
+
+    first = masses()
+    assert len(set(first)) == 4
+    play(envs, np.zeros((2, 4, 1)))
+    same(masses(), first)
+    envs.step(np.zeros((4, 1)))
+    assert np.all(masses() != first)
+    assert np.all((masses() >= 1) & (masses() <= 2))
+
+
+def test_numbers_of_an_environment_can_be_changed_without_a_new_trace():
+    environment = environments.make("CartPole")
+    episode = environment.reset(jax.random.key(0))
+    traces = []
+
+    @quick_jit
+    def step(environment, episode):
+        traces.append(1)
+        return environment.step(episode, jnp.ones(1))[1].observation
+
+    light = step(environment, episode)
+    changed = environment.system.with_params({"cart": {"mass": 5.0}})
+    heavy = step(dataclasses.replace(environment, system=changed), episode)
+    assert len(traces) == 1
+    assert 3 < light[1] / heavy[1] < 5  # the speed after one push of a cart with and without load
+
+
+def test_gymnasium_drives_the_functional_interface():
+    env = FunctionalJaxEnv(environments.FunctionalEnv("CartPole"))
+    observation, info = env.reset(seed=0)
+    for _ in range(3):
+        assert np.asarray(observation) in env.observation_space
+        observation, reward, terminated, _, info = env.step(np.ones(1))
+    assert observation[1] > 0
+    assert 0 <= reward <= 1
+    assert not terminated
+    assert not info["diverged"]
+
+
+def test_params_of_the_functional_interface_make_worlds():
+    functional = environments.FunctionalEnv("CartPole")
+    lengths = jnp.array([[0.4], [0.8]])
+    build = functools.partial(environments.CartPole.build, skip=20)
+    worlds = quick_jit(jax.vmap(lambda x: build(lengths=x)))(lengths)
+
+    @quick_jit
+    @jax.vmap
+    def speed(world):
+        episode = functional.initial(jax.random.key(0), world)
+        episode = functional.transition(episode, jnp.ones(1), None, world)
+        return functional.observation(episode, None, world)[1]
+
+    found = speed(worlds)
+    assert abs(found[0] - found[1]) > 1e-3
+
+
+def test_reward_is_differentiated_through_actions_and_physics():
+    environment = environments.make("CartPole", skip=4)
+    episode = environment.reset(jax.random.key(1))
+
+    def earned(numbers):
+        changed = environment.system.with_params({"cart": {"mass": numbers[0]}})
+        world = dataclasses.replace(environment, system=changed)
+        return world.step(episode, numbers[1:])[1].reward
+
+    at, step, value = jnp.array([1.2, 0.3]), 1e-5, quick_jit(earned)
+    nudged = [value(at + e) - value(at - e) for e in step * jnp.eye(2)]
+    found = quick_jit(jax.grad(earned))(at)
+    np.testing.assert_allclose(found, np.array(nudged) / (2 * step), rtol=DIFFERENCE)
+
+
+def test_a_picture_shows_where_the_episode_stands():
+    env = single("CartPole", render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.dtype == np.uint8
+    assert first.shape[2] == 3
+    same(env.render(), first)
+    for _ in range(20):
+        env.step([1.0])
+    assert np.any(env.render() != first)
+    env.close()
+    envs = many(2, render_mode="rgb_array")
+    envs.reset(seed=0)
+    left, right = envs.render()
+    assert left.shape == right.shape == first.shape
+    assert np.any(left != right)
+
+
+def test_without_gymnasium_there_are_pure_functions_and_a_hint():
+    program = """
+import sys
+sys.modules["gymnasium"] = None
+import jaxcon as jc
+assert "Parking" in jc.environments.TASKS
+try:
+    jc.environments.GymnasiumEnv
+except ImportError as error:
+    assert "jaxcon[rl]" in str(error), error
+else:
+    raise AssertionError("no error")
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.7, 1.0])
+def test_whoever_is_chosen_starts_as_its_key_says(share):
+    """Starts are computed in parts of some of the copies; the first two of these need one part."""
+    environment, count = environments.make("CartPole"), 150
+    begin = quick_jit(copies.begin, static_argnums=(2,))
+    start, _ = begin(environment, jax.random.key(0), count)
+    chosen = np.random.default_rng(1).random(count) < share
+    after = quick_jit(copies.restart)(environment, start, jnp.asarray(chosen)).episode
+    expected = quick_jit(jax.vmap(environment.reset))(start.episode.key)
+    np.testing.assert_allclose(after.state.q[chosen], expected.state.q[chosen], rtol=1e-14)
+    assert np.all(after.state.q[chosen, 0] != start.episode.state.q[chosen, 0])
+    same(after.state.q[~chosen], start.episode.state.q[~chosen])
+
+
+def test_restarts_are_differentiated():
+    """A copy that starts anew does not depend on where it was; the others do."""
+    environment = environments.make("CartPole")
+    start, _ = copies.begin(environment, jax.random.key(0), 3)
+    chosen = jnp.array([False, True, False])
+
+    def total(q):
+        episode = start.episode
+        state = dataclasses.replace(episode.state, q=q)
+        moved = dataclasses.replace(start, episode=dataclasses.replace(episode, state=state))
+        return jnp.sum(copies.restart(environment, moved, chosen).episode.state.q)
+
+    slope = quick_jit(jax.grad(total))(start.episode.state.q)
+    same(slope, np.where(chosen[:, None], 0.0, np.ones_like(slope)))
+
+
+def test_the_benchmark_counts_what_it_says():
+    row = benchmark.measure("CartPole", copies=8, steps=2, repeats=1)
+    assert row.skip == 2
+    assert row.resets == 0
+    np.testing.assert_allclose(row.share, row.interface / row.bare)

@@ -1,0 +1,203 @@
+"""Ranges, dry friction and contacts of MuJoCo's models against MuJoCo's own constraint rows."""
+
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from compiling import quick_jit
+
+import jaxcon as jc
+from jaxcon.constraints.bounds import linearize_bounds
+
+mujoco = pytest.importorskip("mujoco")
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import legged  # noqa: E402
+from benchmarks import mjcf_agreement as agreement  # noqa: E402
+
+EXACT = 1e-9
+"""Of gaps and their rates, in metres and seconds."""
+
+
+def model(bodies, rest="", default="", flag=""):
+    return mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler angle="radian"/><option cone="elliptic">{flag}</option>'
+        f"<default>{default}</default><worldbody>{bodies}</worldbody>{rest}</mujoco>"
+    )
+
+
+def moved(m, seed=0, qpos=None):
+    """MuJoCo's data at a random state, and the bounded rows of jaxcon there."""
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    data.qpos[:], data.qvel[:] = (x[0] for x in agreement.random_states(m, 1, seed)[:2])
+    data.qpos[:] = data.qpos if qpos is None else qpos
+    mujoco.mj_forward(m, data)
+    return data, rows(read, data.qpos, data.qvel)
+
+
+def rows(read, qpos, qvel):
+    """The bounded rows at a state."""
+    state, control = read.state(qpos, qvel), jnp.zeros(read.system.layout.n_u)
+    return linearize_bounds(read.system, state.q, state.v, state.time, control, jnp.asarray(1e-3))
+
+
+def elements(found):
+    """Name → gap, its rate and friction of every bounded element."""
+    first = [np.arange(len(found.rate))[found.layout.rows(n)][0] for n in found.layout.names]
+    friction = np.concatenate([np.zeros(found.kinds.normal), found.friction])
+    return {
+        n: (found.gap[i], found.rate[i], friction[i])
+        for n, i in zip(found.layout.names, first, strict=True)
+    }
+
+
+def touching(m, data):
+    """Names of two geoms → gaps, their rates, frictions and condims of MuJoCo's contacts."""
+    result = {}
+    for c in (data.contact[i] for i in range(data.ncon)):
+        names = " and ".join(m.geom(int(g)).name for g in c.geom)
+        numbers = c.dist - c.includemargin, data.efc_vel[c.efc_address], c.friction[0], c.dim
+        result.setdefault(names, []).append(numbers)
+    return result
+
+
+def own(found, pair):
+    """The elements of a pair: one, or one for each of its points."""
+    numbered = {n for n in found if n.startswith(f"{pair} ") and n.rsplit(" ", 1)[1].isdigit()}
+    return [np.array(found[n]) for n in found if n == pair or n in numbered]
+
+
+SHAPES = """
+<geom name="floor" type="plane" size="1 1 1" pos="0.1 0.2 -0.3" euler="0.1 0.3 0" friction="0.5"
+  conaffinity="3"/>
+<body pos="0 0 0.5"><freejoint/>
+  <geom name="ball" size="0.1" pos="0.1 0.2 0.3" friction="0.7"/></body>
+<body pos="1 0 0.5" euler="0.3 0.1 0.2"><freejoint/>
+  <geom name="capsule" type="capsule" size="0.1 0.3" pos="0.1 0 0" euler="1 0.4 0.2" gap="0.01"/>
+  </body>
+<body pos="0 1 0.5"><freejoint/>
+  <geom name="rod" type="capsule" fromto="0 0 0 0.5 0.2 0.1" size="0.05" margin="4"/></body>
+<body pos="1 1 0.7"><freejoint/>
+  <geom name="box" type="box" size="0.1 0.2 0.3" pos="0 0.1 0" euler="0.3 0.6 0.2" contype="2"
+  conaffinity="0"/></body>
+"""
+FAR = '<geom margin="5"/>'
+"""All geoms are near enough to each other to be listed."""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_gaps_and_their_rates_are_those_of_mujoco(seed):
+    """MuJoCo lists the four lower corners of a box; of others, all points."""
+    m = model(SHAPES, default=FAR)
+    data, found = moved(m, seed)
+    found, expected = elements(found), touching(m, data)
+    assert "floor and box" in expected
+    for pair, contacts in expected.items():
+        got = own(found, pair)
+        assert len(got) == {"floor and box": 8}.get(pair, len(contacts))
+        for gap, rate, friction, _ in contacts:
+            nearest = min(got, key=lambda x, gap=gap: abs(x[0] - gap))
+            np.testing.assert_allclose(nearest, (gap, rate, friction), atol=EXACT)
+        np.testing.assert_allclose(min(x[0] for x in got), min(x[0] for x in contacts), atol=EXACT)
+    assert sum(len(own(found, pair)) for pair in expected) == len(found)
+
+
+FILTERED = """
+<geom name="floor" type="plane" size="1 1 1" friction="0.5" condim="1"/>
+<geom name="wall" type="plane" size="1 1 1" friction="0.2" priority="1"/>
+<geom name="post" size="0.1" condim="1" friction="2"/>
+<body name="a"><freejoint/><geom name="a1" size="0.1" friction="0.7"/>
+  <body><geom name="welded" size="0.1" condim="1" priority="1"/></body>
+  <body name="b"><joint/><geom name="b1" size="0.1" condim="1"/>
+    <body name="c"><joint/><geom name="c1" size="0.1" condim="1" friction="1.5"/></body>
+  </body></body>
+<body name="d"><freejoint/><geom name="d1" size="0.1" contype="4" conaffinity="0"/>
+  <geom name="d2" size="0.1" contype="0" conaffinity="2"/>
+  <geom name="d3" size="0.1" contype="2"/></body>
+<body name="e"><joint axis="0 1 0"/><geom name="e1" size="0.1"/></body>
+"""
+LISTED = """<contact><exclude body1="a" body2="c"/><exclude body1="e" body2="d"/>
+<pair geom1="a1" geom2="c1" friction="0.3 0.3" margin="7"/>
+<pair geom1="floor" geom2="a1" condim="1"/><pair geom1="d1" geom2="d2"/></contact>"""
+
+
+@pytest.mark.parametrize("flag", ["", '<flag filterparent="disable"/>'])
+def test_pairs_and_their_friction_are_those_of_mujoco(flag):
+    """Masks, parents, welded bodies, excluded ones, listed pairs and priorities, all in one."""
+    m = model(FILTERED, LISTED, '<geom margin="5"/><pair margin="9"/>', flag)
+    data, found = moved(m)
+    found, expected = elements(found), touching(m, data)
+    expected.pop("d1 and d2")  # of one body: they cannot move in each other
+    assert set(found) == set(expected)
+    for pair, ((gap, _, friction, condim),) in expected.items():
+        rough = friction if condim > 1 else 0.0
+        np.testing.assert_allclose(found[pair][::2], (gap, rough), atol=EXACT)
+
+
+def test_contacts_between_what_moves_can_be_left_out():
+    """The ground and the walls remain, and `contact` leaves out all."""
+    m = model(FILTERED, LISTED)
+    names = {n for group in jc.from_mjcf(m).system.bounds for n in group.names}
+    left = jc.from_mjcf(m, ignore=("self_contact",)).system.bounds
+    fixed = {n for n in names if n.split(" and ")[0] in ("floor", "wall", "post")}
+    assert {n for group in left for n in group.names} == fixed < names
+    assert not jc.from_mjcf(m, ignore=("contact",)).system.bounds
+
+
+JOINTS = """
+<body><joint name="hinge" {0} ref="0.1" {2} axis="0 1 0"/><geom size="0.1" contype="0"/>
+<body pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0" {1}/><geom size="0.1" contype="0"/>
+<body pos="0 1 0"><joint name="ball" type="ball" {2}/><geom size="0.1" contype="0"/></body></body>
+</body>"""
+RANGES = 'range="-0.5 0.3" margin="0.3"', 'range="0.1 0.4" margin="0.1"'
+RUBS = 'frictionloss="0.3"'
+
+
+def test_ranges_are_limits():
+    """MuJoCo's row of a stop within its margin is pos − margin."""
+    m = model(JOINTS.format(*RANGES, ""))
+    data, found = moved(m, qpos=[-0.4, 0.35, 1, 0, 0, 0])
+    rows, found = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT), elements(found)
+    assert rows.sum() == len(found) == 2
+    gaps = dict(zip(("hinge limit", "slide limit"), data.efc_pos - data.efc_margin, strict=True))
+    for name, rate in zip(gaps, data.efc_vel, strict=True):
+        np.testing.assert_allclose(found[name][:2], (gaps[name], rate), atol=EXACT)
+
+
+def test_frictionloss_is_dry_friction():
+    """Of hinges along their angle, of balls about the axes of their body."""
+    data, found = moved(model(JOINTS.format("", "", RUBS)))
+    assert found.kinds.boxes == len(found.rate) == 4
+    np.testing.assert_allclose(found.upper, data.efc_frictionloss)
+    np.testing.assert_allclose(found.lower, -data.efc_frictionloss)
+    np.testing.assert_allclose(found.rate, data.efc_vel, atol=EXACT)
+
+
+@pytest.mark.parametrize(
+    ("ignore", "flag"),
+    [(("limit", "friction"), ""), ((), '<flag limit="disable" frictionloss="disable"/>')],
+)
+def test_ranges_and_friction_can_be_left_out(ignore, flag):
+    assert not jc.from_mjcf(model(JOINTS.format(*RANGES, RUBS), flag=flag), ignore).system.bounds
+
+
+def test_hopper_stands_on_its_foot():
+    """It falls 4 cm and stays above the floor; the impulse of the floor is that of its weight."""
+    m = legged.load("hopper")
+    read = jc.from_mjcf(m)
+    system, method = read.system, jc.Method(solver=jc.Sparse(), bounded=jc.GaussSeidel(30))
+    state = jc.init(system, method, read.start.q, read.start.v)
+
+    def record(state, info):
+        return read.qpos(state), info.reactions.multipliers, info.reactions.residual
+
+    run = quick_jit(lambda s: jc.rollout(system, method, s, None, 2e-3, 100, record=record))
+    final, (qpos, forces, residual) = run(state)
+    jc.raise_for_status(final)
+    assert max(legged.depth(m, np.asarray(qpos))) < 1e-9
+    kinds = linearize_bounds(system, state.q, state.v, state.time, jnp.zeros(3), jnp.ones(())).kinds
+    normals = jnp.mean(kinds.split(forces.T).normal, axis=1)
+    np.testing.assert_allclose(jnp.sum(normals), mujoco.mj_getTotalmass(m) * 9.81, rtol=1e-6)
+    assert jnp.max(residual) < 1e-6
