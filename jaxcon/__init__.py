@@ -17,7 +17,7 @@ Couplings: Gear, Belt, RackAndPinion, Pulley, Differential, PolynomialCoupling, 
 Other constraints: Drive; RollingDisc, RollingSphere, RollingCylinder, KnifeEdge; LinearMomentum,
     AngularMomentum; Holonomic, VelocityLevel of one's own.
 Ends, friction and contact: Limit, RateLimit, RateMotor, JointFriction, Rope, PlaneContact,
-    CapsuleContact, BoxContact, HeightFieldContact, box_corners.
+    CapsuleContact, BoxContact, HeightFieldContact, box_corners; Inequality of one's own.
 Forces: Spring, JointSpring, JointDamper, Bending, Flexure, ExternalWrench, CustomForce, Force;
     Motor, PositionServo, VelocityServo, AffineActuator; TurnCounter.
 Simulation: init, step, rollout, forward_dynamics, assemble; State, StepInfo, Solution, Assembly.
@@ -79,6 +79,7 @@ from jaxcon.constraints.curves import PointOnCurve
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
 from jaxcon.constraints.height_fields import HeightFieldContact
+from jaxcon.constraints.inequality import Inequality
 from jaxcon.constraints.joints import (
     Coincident,
     Distance,
@@ -182,6 +183,7 @@ __all__ = [
     "BoxContact",
     "CapsuleContact",
     "HeightFieldContact",
+    "Inequality",
     "PlaneContact",
     "Rope",
     "GaussSeidel",

@@ -1,4 +1,16 @@
-"""Every test runs in float64, with strict promotion of dtypes and ranks."""
+"""Every test runs in float64, with strict promotion of dtypes and ranks.
+
+Tests compile much and run little, so that XLA's costly passes are left out; a test of what they do
+asks for them by `compiling.costly`.
+"""
+
+import os
+
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    " --xla_cpu_use_fusion_emitters=false",
+)
 
 import jax
 import pytest

@@ -302,6 +302,8 @@ CORE = (
     *("driven_revolute", "pulley", "rolling_disc", "gimbal", "holonomic", "velocity_level"),
 )
 """Joints of every kind of row, for tests in which compiling all of them would take minutes."""
+PARTS = {2: 2, 3: 5}
+"""Scenes among which the joints of one place are shared out: compiling grows faster than they."""
 TOPOLOGIES = ("tree", "between", "loop")
 
 
@@ -499,8 +501,14 @@ OTHERS = {
     "polar": polar_scene,
     "arm": arm_scene,
 }
-NAMES = (*(f"all-{dim}d-{topology}" for dim in (2, 3) for topology in TOPOLOGIES), *OTHERS)
-"""Every scene; together they hold every joint in every place."""
+ALL = tuple(
+    f"part{i}-{dim}d-{topology}"
+    for dim, parts in PARTS.items()
+    for topology in TOPOLOGIES
+    for i in range(parts)
+)
+"""Scenes that together hold every joint in every place."""
+NAMES = (*ALL, *OTHERS)
 
 
 def names(*topologies: str) -> tuple[str, ...]:
@@ -518,12 +526,17 @@ def build(name: str, dtype: str = "float64") -> Built:
     """The scene of this name."""
     if name in OTHERS:
         return OTHERS[name](jnp.dtype(dtype))
-    kind, dim, topology = name.split("-")
-    kinds = (kind,)
-    if kind in ("all", "core"):
-        chosen = JOINTS if kind == "all" else CORE
-        kinds = tuple(key for key in chosen if int(dim[0]) in JOINTS[key].dims)
-    return joints_scene(kinds, int(dim[0]), topology, jnp.dtype(dtype))
+    kind, place, topology = name.split("-")
+    dim = int(place[0])
+    return joints_scene(kinds_of(kind, dim), dim, topology, jnp.dtype(dtype))
+
+
+def kinds_of(kind: str, dim: int) -> tuple[str, ...]:
+    """The joints of a scene: one, those of the core, all, or a part of all."""
+    if kind in JOINTS:
+        return (kind,)
+    kinds = tuple(key for key in (CORE if kind == "core" else JOINTS) if dim in JOINTS[key].dims)
+    return kinds[int(kind[4:]) :: PARTS[dim]] if kind.startswith("part") else kinds
 
 
 def finish(

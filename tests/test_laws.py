@@ -26,7 +26,7 @@ def ideal_scene(dim, topology):
     return kinds, scenes.joints_scene(kinds, dim, topology, jnp.dtype("float64"))
 
 
-@pytest.mark.parametrize("name", scenes.NAMES)
+@pytest.mark.parametrize("name", ["all-2d-loop", "core-3d-loop", *scenes.OTHERS])
 def test_virtual_power(name):
     """v · (M a − f) = λ · (J v), and both vanish where no constraint moves in time."""
     built = scenes.build(name)
@@ -49,9 +49,14 @@ def test_virtual_power(name):
 def test_ideal_constraints_do_no_work(dim):
     _, built = ideal_scene(dim, "loop")
     s = built.state
-    multipliers = jc.forward_dynamics(built.system, s, None, IDEAL, 1e-3).multipliers
-    jacobian = linearize(built.system, s.q, s.v, s.time).jacobian
-    power = multipliers @ jacobian.apply(s.v)
+
+    @quick_jit
+    def reaction(s):
+        multipliers = jc.forward_dynamics(built.system, s, None, IDEAL, 1e-3).multipliers
+        return multipliers, linearize(built.system, s.q, s.v, s.time).jacobian.apply(s.v)
+
+    multipliers, rates = reaction(s)
+    power = multipliers @ rates
     assert abs(power) < IDENTITY * (1 + np.linalg.norm(multipliers))
 
 

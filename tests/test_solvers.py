@@ -53,8 +53,9 @@ def residuals(system, solution):
     )
 
 
+LOOPS = tuple(name for name in scenes.ALL if name.endswith("loop"))
 CASES = [(name, "float64") for name in (*scenes.NAMES, *scenes.names("loop"))]
-CASES += [(name, "float32") for name in ("all-2d-loop", "all-3d-loop", *scenes.OTHERS)]
+CASES += [(name, "float32") for name in (*LOOPS, *scenes.OTHERS)]
 
 
 @pytest.mark.parametrize(("name", "dtype"), CASES)

@@ -193,7 +193,7 @@ def check_function(group: Custom, snapshot: Any) -> None:
     """
     owner = f"{type(group.law).__name__} '{group.law.name}'"
     q, v, _, call = group.problem(snapshot)
-    velocities = None if isinstance(group.law, Holonomic) else v
+    velocities = v if isinstance(group.law, VelocityLevel) else None
     try:
         out = jax.eval_shape(lambda q, v, t: call(q, v, t), q, velocities, snapshot.t)
     except TypeError as error:

@@ -282,7 +282,7 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
         checks.finite("assemble", what, x)
     t = checks.number("assemble", "time", 0.0 if time is None else time, dtype)
     snapshot = system.snapshot(q, v, t)
-    for group in snapshot.system.constraints:
+    for group in (*snapshot.system.constraints, *snapshot.system.bounds):
         if isinstance(group, Custom):
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)

@@ -6,7 +6,11 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+
 from jaxcon.constraints.custom import CustomOnCoordinates, Holonomic, VelocityLevel
+from jaxcon.constraints.inequality import Inequality, InequalityOnCoordinates, numbers_of
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.generalized import GeneralizedCoordinates
 
@@ -15,7 +19,7 @@ def GeneralizedSystem(  # noqa: N802
     *,
     mass: Callable[[Array, PyTree], Array],
     force: Callable[..., Array],
-    constraints: Sequence[Holonomic | VelocityLevel] = (),
+    constraints: Sequence[Holonomic | VelocityLevel | Inequality] = (),
     params: PyTree = None,
     potential: Callable[[Array, Any, PyTree], Array] | None = None,
 ) -> GeneralizedCoordinates:
@@ -24,8 +28,8 @@ def GeneralizedSystem(  # noqa: N802
     Args:
         mass: `mass(q, params)` → M (n, n), symmetric positive definite, or its diagonal (n,).
         force: `force(q, v, t, control, params)` → f (n,), Coriolis and gravity forces included.
-        constraints: `Holonomic` with `function(q, t, params)`, `VelocityLevel` with
-            `function(q, v, t, params)`.
+        constraints: `Holonomic` and `Inequality` with `function(q, t, params)`, `VelocityLevel`
+            with `function(q, v, t, params)`.
         params: θ, any pytree of arrays: leaves of the system.
         potential: `potential(q, t, params)` → () [J], for `energy`; optional.
 
@@ -34,14 +38,16 @@ def GeneralizedSystem(  # noqa: N802
 
     Raises:
         ValueError: two constraints of one name, or one on named bodies.
-        TypeError: something else than `Holonomic` or `VelocityLevel`.
+        TypeError: something else than `Holonomic`, `VelocityLevel` or `Inequality`.
     """
     names: set[str] = set()
-    groups = []
+    groups: list[Any] = []
+    bounds: list[Any] = []
     for constraint in constraints:
-        if not isinstance(constraint, Holonomic | VelocityLevel):
+        if not isinstance(constraint, Holonomic | VelocityLevel | Inequality):
             raise TypeError(
-                f"GeneralizedSystem takes Holonomic and VelocityLevel, got {constraint!r}."
+                "GeneralizedSystem takes Holonomic, VelocityLevel and Inequality, got"
+                f" {constraint!r}."
             )
         if constraint.bodies or constraint.params is not None:
             raise ValueError(
@@ -53,5 +59,17 @@ def GeneralizedSystem(  # noqa: N802
                 f"GeneralizedSystem: two constraints are called '{constraint.name}'; give name=."
             )
         names.add(constraint.name)
-        groups.append(CustomOnCoordinates(None, dataclasses.replace(constraint)))
-    return GeneralizedCoordinates(tuple(groups), params, mass, force, potential)
+        if isinstance(constraint, Inequality):
+            numbers = numbers_of(constraint, _dtype(params))
+            bounds.append(InequalityOnCoordinates(None, constraint.bare, numbers=numbers))
+        else:
+            groups.append(CustomOnCoordinates(None, dataclasses.replace(constraint)))
+    return GeneralizedCoordinates(
+        tuple(groups), params, mass, force, potential, bounds=tuple(bounds)
+    )
+
+
+def _dtype(params: PyTree) -> Any:
+    """That of the system's own arrays, else that in use."""
+    own = (x.dtype for x in jax.tree.leaves(params) if isinstance(x, jax.Array))
+    return next((x for x in own if jnp.issubdtype(x, jnp.floating)), jnp.result_type(float))

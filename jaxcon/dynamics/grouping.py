@@ -14,6 +14,7 @@ from jaxcon.constraints.contact import Touches
 from jaxcon.constraints.curves import Curves, PointOnCurve
 from jaxcon.constraints.custom import CustomOnBodies, Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
+from jaxcon.constraints.inequality import Inequality, InequalityOnBodies, numbers_of
 from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum, Momenta
 from jaxcon.core import checks
 from jaxcon.dynamics.along import Along
@@ -102,7 +103,7 @@ class Gather:
             self._check_joint(pair)
         groups = self._gather(pairs, lambda e: (e.body_a, e.body_b))
         touches = [Touches(p, names, places, law=cls) for cls, p, names, places in groups]
-        return [*along.bounds(), *touches]
+        return [*along.bounds(), *touches, *self.inequalities(_of(elements, Inequality))]
 
     def forces(self, elements: Iterable[Any], along: Along) -> list[Any]:
         """Force elements of every class."""
@@ -154,13 +155,14 @@ class Gather:
 
     def customs(self, constraints: list[Any]) -> list[Any]:
         """User constraints on bodies, one group each."""
-        result = []
-        for constraint in constraints:
-            self._check_user(constraint)
-            moving = [name for name in constraint.bodies if name in self.layout.places]
-            places = tuple(self._place((name,)) for name in moving)
-            result.append(CustomOnBodies(self._params(constraint), _bare(constraint), places))
-        return result
+        return [CustomOnBodies(self._params(c), _bare(c), self._moving(c)) for c in constraints]
+
+    def inequalities(self, constraints: list[Inequality]) -> list[Any]:
+        """One-sided user constraints on bodies, one group each."""
+        return [
+            InequalityOnBodies(self._params(c), c.bare, self._moving(c), numbers_of(c, self.dtype))
+            for c in constraints
+        ]
 
     def momenta(self, momenta: list[Any]) -> list[Any]:
         """Prescribed momenta, one group each."""
@@ -196,6 +198,11 @@ class Gather:
                 CustomForces(params, (force.name,), places, force.function, channel, force.bodies)
             )
         return result
+
+    def _moving(self, element: Any) -> tuple[Place, ...]:
+        """The bodies of a user's element that have coordinates."""
+        self._check_user(element)
+        return tuple(self._place((n,)) for n in element.bodies if n in self.layout.places)
 
     def _params(self, element: Any) -> Any:
         def convert(x: Any) -> Any:

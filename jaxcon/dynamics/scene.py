@@ -162,7 +162,7 @@ class Scene:
             bounds=tuple(gather.bounds(elements, along)),
         )
         state = dataclasses.replace(self._state(layout, bodies), turns=turns)
-        for group in constraints:
+        for group in (*constraints, *system.bounds):
             if isinstance(group, Custom):
                 check_function(group, system.snapshot(state.q, state.v, state.time))
             if isinstance(group, Curves):

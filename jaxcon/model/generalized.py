@@ -29,6 +29,7 @@ class GeneralizedCoordinates:
         params: θ, any pytree; shared by mass, force, potential and constraints.
         mass_function, force_function, potential: the user's functions.
         size: number of coordinates, where known.
+        bounds: groups of one one-sided constraint each.
     """
 
     constraints: tuple[Any, ...]
@@ -37,6 +38,7 @@ class GeneralizedCoordinates:
     force_function: Callable[..., Array] = static()
     potential: Callable[..., Array] | None = static(default=None)
     size: int | None = static(default=None)
+    bounds: tuple[Any, ...] = ()
 
     @property
     def n_v(self) -> int:
@@ -57,11 +59,6 @@ class GeneralizedCoordinates:
     @property
     def counted(self) -> tuple[Any, ...]:
         """None."""
-        return ()
-
-    @property
-    def bounds(self) -> tuple[Any, ...]:
-        """No rows are bounded."""
         return ()
 
     def remember(self, turns: PyTree) -> GeneralizedCoordinates:

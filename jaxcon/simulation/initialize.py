@@ -45,7 +45,7 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
     v = checks.number("init", "v", v, dtype, (n_v,))
     check_dtype(system, dtype)
     snapshot = system.snapshot(q, v, jnp.zeros((), dtype))
-    for group in snapshot.system.constraints:
+    for group in (*snapshot.system.constraints, *snapshot.system.bounds):
         if isinstance(group, Custom):
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
