@@ -84,14 +84,19 @@ def choices() -> list[Choice]:
     return [x for x in every if not x.method().integrator.refuses(None, x.method().stabilizer)]
 
 
-def covering(every: Iterable[Choice]) -> list[Choice]:
-    """Few of them in which every pair of parts occurs that occurs in all of them."""
+def pairs(choice: Choice) -> set[tuple[str, str]]:
+    """Of parts."""
+    return set(itertools.combinations(choice.parts, 2))
+
+
+def covering(every: Iterable[Choice], wanted: Callable[[Choice], set[Any]] = pairs) -> list[Choice]:
+    """Few of them in which everything wanted occurs that occurs in all of them."""
     left = list(every)
-    open_pairs = {pair for x in left for pair in itertools.combinations(x.parts, 2)}
+    still = {one for x in left for one in wanted(x)}
     found = []
-    while open_pairs:
-        best = max(left, key=lambda x: len(open_pairs & set(itertools.combinations(x.parts, 2))))
-        open_pairs -= set(itertools.combinations(best.parts, 2))
+    while still:
+        best = max(left, key=lambda x: len(still & wanted(x)))
+        still -= wanted(best)
         found.append(best)
     return found
 

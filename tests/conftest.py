@@ -1,7 +1,7 @@
 """Every test runs in float64, with strict promotion of dtypes and ranks.
 
-Tests compile much and run little, so that XLA's costly passes are left out; a test of what they do
-asks for them by `compiling.costly`.
+They compile much and run little, so that XLA's costly passes are left out unless XLA_FLAGS says
+otherwise: half the time.
 """
 
 import os

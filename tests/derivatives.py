@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from compiling import quick_jit
 from tolerances import DIFFERENCE
 
 
@@ -17,7 +16,7 @@ def assert_smooth_and_batched(value, numbers, step, close):
         close: what a batch may be off by, relative.
     """
     x = {key: jnp.asarray(number) for key, number in numbers.items()}
-    run, gradient = quick_jit(value), quick_jit(jax.grad(value))(x)
+    run, gradient = jax.jit(value), jax.jit(jax.grad(value))(x)
     scale = max(abs(float(gradient[key] * x[key])) for key in x)
     for key in x:
         at = [float(run(x | {key: x[key] * (1 + s * step)})) for s in (2, 1, -1, -2)]
@@ -25,5 +24,5 @@ def assert_smooth_and_batched(value, numbers, step, close):
         assert abs(float(gradient[key] * x[key]) - slope) < DIFFERENCE * scale, key
     worlds = {key: jnp.stack([number, 1.05 * number]) for key, number in x.items()}
     one_by_one = [run({key: number[i] for key, number in worlds.items()}) for i in (0, 1)]
-    got = quick_jit(jax.vmap(value))(worlds)
+    got = jax.jit(jax.vmap(value))(worlds)
     np.testing.assert_allclose(got, jnp.stack(one_by_one), rtol=close)

@@ -18,7 +18,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.constraints.curves import Curves
@@ -555,7 +554,7 @@ def finish(
 
 def allowed(system: Any, state: jc.State, v: jax.Array) -> jax.Array:
     """The velocities nearest to v, in the metric of M, that the constraints allow."""
-    rows = quick_jit(linearize)(system, state.q, v, state.time)
+    rows = jax.jit(linearize)(system, state.q, v, state.time)
     j = np.asarray(rows.jacobian.dense(), np.float64)
     lift = np.linalg.solve(np.asarray(system.mass(state.q).dense(), np.float64), j.T)
     change = lift @ np.linalg.solve(j @ lift, np.asarray(rows.rate, np.float64))

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -162,7 +161,7 @@ def test_a_servo_goes_round_and_round(dim):
     """To an angle of two turns and a half, and there it rests, in the plane and in space."""
     system, state = wheel(dim, jc.PositionServo("servo", "hub", 40.0, 10.0))
     target = 5 * np.pi
-    run = quick_jit(
+    run = jax.jit(
         lambda s: jc.rollout(
             system, jc.Method(), s, jnp.full((1500, 1), target), 4e-3, 1500, every=500
         )
@@ -178,7 +177,7 @@ def test_turns_are_counted_where_they_are_asked_for():
     plain, start = wheel(3, angular_velocity=(0.0, 0.0, 10.0))
     counting, state = wheel(3, jc.TurnCounter("count", "hub"), angular_velocity=(0.0, 0.0, 10.0))
     assert jax.tree.leaves(start.turns) == []
-    run = quick_jit(lambda system, s: jc.rollout(system, jc.Method(), s, None, 1e-2, 100)[0])
+    run = jax.jit(lambda system, s: jc.rollout(system, jc.Method(), s, None, 1e-2, 100)[0])
     seen = jc.coordinate(plain, run(plain, start), "hub")
     counted = jc.coordinate(counting, run(counting, state), "hub")
     np.testing.assert_allclose(counted, 10.0, rtol=1e-9)
@@ -194,8 +193,8 @@ def test_turns_are_counted_backwards_and_in_batches():
         return jc.coordinate(system, final, "hub")
 
     rates = jnp.asarray([-30.0, -1.0, 0.0, 7.0])
-    np.testing.assert_allclose(quick_jit(jax.vmap(angle))(rates), rates, atol=1e-9)
-    np.testing.assert_allclose(quick_jit(jax.grad(angle))(7.0), 1.0, rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.vmap(angle))(rates), rates, atol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.grad(angle))(7.0), 1.0, rtol=1e-9)
 
 
 def test_a_state_that_does_not_count_is_refused():

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -53,7 +52,7 @@ def numbers():
 @functools.cache
 def gradient(adjoint, *shape):
     """By value and gradient, in one program."""
-    return quick_jit(jax.value_and_grad(lambda x: outcome(x, adjoint, *shape)))(numbers())
+    return jax.jit(jax.value_and_grad(lambda x: outcome(x, adjoint, *shape)))(numbers())
 
 
 def close(got, expected, tolerance=IDENTITY):
@@ -100,7 +99,7 @@ def test_a_spatial_body_in_float32():
         return weights @ jc.rollout(changed, METHOD, start, None, dt, 6, adjoint=adjoint)[0].q
 
     x = {"v": state.v, "mass": jnp.float32(1.0)}
-    both = quick_jit(lambda x: [jax.grad(value)(x, a) for a in (DEFAULT, jc.Checkpoints())])(x)
+    both = jax.jit(lambda x: [jax.grad(value)(x, a) for a in (DEFAULT, jc.Checkpoints())])(x)
     assert {leaf.dtype for leaf in jax.tree.leaves(both)} == {jnp.dtype(jnp.float32)}
     assert np.max(np.abs(both[0]["v"])) > 1e-2
     close(both[1], both[0], 1e-5)
@@ -113,12 +112,12 @@ def test_forward_mode_and_batches_in_both_orders():
     def value(v):
         return outcome(x | {"v": v}, jc.Checkpoints(), 11, 1)
 
-    slope = quick_jit(jax.grad(value))
+    slope = jax.jit(jax.grad(value))
     expected = jnp.stack([slope(v) for v in worlds])
-    inside = quick_jit(jax.vmap(jax.grad(value)))(worlds)
-    outside = quick_jit(jax.grad(lambda vs: jnp.sum(jax.vmap(value)(vs))))(worlds)
+    inside = jax.jit(jax.vmap(jax.grad(value)))(worlds)
+    outside = jax.jit(jax.grad(lambda vs: jnp.sum(jax.vmap(value)(vs))))(worlds)
     direction = jnp.array([0.3, -0.7])
-    forward = quick_jit(lambda v: jax.jvp(value, (v,), (direction,))[1])(x["v"])
+    forward = jax.jit(lambda v: jax.jvp(value, (v,), (direction,))[1])(x["v"])
     np.testing.assert_allclose(inside, expected, rtol=1e-11)
     np.testing.assert_allclose(outside, expected, rtol=1e-11)
     np.testing.assert_allclose(forward, expected[0] @ direction, rtol=1e-11)
@@ -137,9 +136,9 @@ def test_a_failed_world_has_no_gradient_and_the_others_do_not_notice():
 
         return jnp.sum(jax.vmap(value)(worlds))
 
-    got = quick_jit(jax.grad(functools.partial(total, adjoint=jc.Checkpoints(), worlds=worlds)))
+    got = jax.jit(jax.grad(functools.partial(total, adjoint=jc.Checkpoints(), worlds=worlds)))
     alone = functools.partial(total, adjoint=DEFAULT, worlds=worlds[:1])
-    np.testing.assert_allclose(got(shared), quick_jit(jax.grad(alone))(shared), rtol=1e-11)
+    np.testing.assert_allclose(got(shared), jax.jit(jax.grad(alone))(shared), rtol=1e-11)
 
 
 def free(steps, adjoint):
@@ -155,7 +154,7 @@ def free(steps, adjoint):
         final, path = jc.rollout(system, METHOD, start, controls, DT, steps, adjoint=adjoint)
         return final.q[0], path.q[:, 0]
 
-    return quick_jit(jax.jacrev(end, argnums=(0, 1)))(jnp.asarray(1.0), jnp.zeros(steps))
+    return jax.jit(jax.jacrev(end, argnums=(0, 1)))(jnp.asarray(1.0), jnp.zeros(steps))
 
 
 def effects(steps, count):

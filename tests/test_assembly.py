@@ -46,6 +46,16 @@ def spatial_loop(dtype="float64"):
     return scene.build()
 
 
+def door():
+    """Two hinges on one axis: ten rows of rank five."""
+    scene = jc.Scene()
+    scene.add_body("door", mass=2.0, inertia=(0.3, 0.4, 0.2), position=(0.5, 0.0, 0.0))
+    for i, height in enumerate((-0.5, 0.5)):
+        point, axis = (0.0, 0.0, height), (0.0, 0.0, 1.0)
+        scene.add(jc.Revolute(f"hinge{i}", jc.WORLD, "door", point=point, axis=axis))
+    return scene.build()
+
+
 def polar(q, t, p):
     return (q[0] - p["length"] * (1 + 0.1 * q[1]))[None]
 
@@ -218,13 +228,13 @@ def test_the_derivative_by_a_length_and_by_the_start():
 
 
 def test_the_derivative_beside_redundant_rows():
-    system, state = spatial_loop()
-    rough = system.retract(state.q, 0.1 * np.random.default_rng(0).normal(size=18))
-    anchor = system.params["hinge1"]["anchor_b"]
+    system, state = door()
+    rough = system.retract(state.q, 0.1 * np.random.default_rng(0).normal(size=6))
+    anchors = {name: system.params[name]["anchor_b"] for name in ("hinge0", "hinge1")}
 
     def closed(x):
-        longer = {"hinge1": {"anchor_b": anchor.at[0].add(x)}}
-        return jc.assemble(system.with_params(longer), rough, np.ones(18)).state
+        moved = {name: {"anchor_b": anchor.at[0].add(x)} for name, anchor in anchors.items()}
+        return jc.assemble(system.with_params(moved), rough, np.ones(6)).state
 
     run = jax.jit(lambda x: jax.jvp(closed, (x,), (1.0,)))
     (new, _), (old, _), (_, rate) = (run(x) for x in (1e-5, -1e-5, 0.0))

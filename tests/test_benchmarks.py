@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -79,7 +78,7 @@ def test_a_mechanism_starts_on_its_constraints_and_stays(name):
     start = jc.violation(system, state)
     assert max(start.worst, start.worst_rate) < 1e-13
 
-    @quick_jit
+    @jax.jit
     def run(s):
         final, _ = jc.rollout(system, jc.Method(), s, None, 2e-3, 50, record=lambda s, i: None)
         return final, jc.violation(system, final).worst, mechanism.markers(system, final)
@@ -185,8 +184,8 @@ def test_a_solution_of_another_system_is_seen():
 def test_steps_batched_by_hand_are_those_of_vmap(name):
     system, state = mechanisms.find(name).build(jnp.float64)
     method, states = jc.Method(), throughput.worlds(state, 3)
-    expected = quick_jit(native_share.plain(system, method, 20))(states)
-    found = quick_jit(native_share.by_hand(system, method, 20))(native_share.turned(states))
+    expected = jax.jit(native_share.plain(system, method, 20))(states)
+    found = jax.jit(native_share.by_hand(system, method, 20))(native_share.turned(states))
     found = native_share.turned(found, last=False)
     assert np.max(np.abs(expected.v - states.v)) > 1e-3
     for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.solvers import gauss_jordan
@@ -42,15 +41,15 @@ def missed(problem, multipliers):
 )
 def test_interior_point_solves_random_rows(kinds, rank, dtype):
     problem = problems(kinds, rank, dtype)
-    solve = quick_jit(lambda p: jc.InteriorPoint().solve(p, jnp.zeros_like(p.offset)))
+    solve = jax.jit(lambda p: jc.InteriorPoint().solve(p, jnp.zeros_like(p.offset)))
     assert missed(problem, solve(problem)).max() < EXACT[np.dtype(dtype).name]
 
 
 def test_sweeps_come_to_the_same():
     problem = problems(Kinds(3, 2), 8, jnp.float64)
     zero = jnp.zeros_like(problem.offset)
-    exact = quick_jit(lambda p: jc.InteriorPoint().solve(p, zero))(problem)
-    swept = quick_jit(lambda p: jc.GaussSeidel(sweeps=2000).solve(p, zero))(problem)
+    exact = jax.jit(lambda p: jc.InteriorPoint().solve(p, zero))(problem)
+    swept = jax.jit(lambda p: jc.GaussSeidel(sweeps=2000).solve(p, zero))(problem)
     np.testing.assert_allclose(swept, exact, atol=1e-8 * float(jnp.max(jnp.abs(exact))))
 
 
@@ -58,7 +57,7 @@ def test_more_sweeps_miss_less():
     problem = problems(Kinds(3, 2), 8, jnp.float64)
     zero = jnp.zeros_like(problem.offset)
     left = [
-        np.median(missed(problem, quick_jit(jc.GaussSeidel(sweeps=n).solve)(problem, zero)))
+        np.median(missed(problem, jax.jit(jc.GaussSeidel(sweeps=n).solve)(problem, zero)))
         for n in (2, 8, 32)
     ]
     assert left[0] > 3 * left[1] > 9 * left[2]

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from test_solvers import FORCE, FULL, MASS, TARGET, J, small
 from test_sparse import GRAPHS, hinge_twice, links, problem
 from tolerances import DIFFERENCE
@@ -69,14 +68,14 @@ def iterates(a, p, b, count):
 
 def multipliers(system, iterations):
     """λ after some iterations, as an array of the host."""
-    return np.asarray(quick_jit(CG(iterations=iterations).solve)(system).multipliers)
+    return np.asarray(jax.jit(CG(iterations=iterations).solve)(system).multipliers)
 
 
 @pytest.mark.parametrize("name", GRAPHS)
 def test_the_solution_is_that_of_the_dense_solver(name):
     system = problem(name)
     expected = jc.Dense().solve(system)
-    got = quick_jit(CG(tolerance=1e-14).solve)(system)
+    got = jax.jit(CG(tolerance=1e-14).solve)(system)
     assert got.status == jc.Status.OK
     np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-8, atol=1e-8)
@@ -86,7 +85,7 @@ def test_with_compliance():
     system = problem("links in a loop")
     compliance = jnp.asarray(np.random.default_rng(4).uniform(0, 1, size=system.target.shape))
     system = dataclasses.replace(system, compliance=compliance)
-    got = quick_jit(CG(tolerance=1e-14).solve)(system)
+    got = jax.jit(CG(tolerance=1e-14).solve)(system)
     expected = jc.Dense().solve(system)
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-9, atol=1e-9)
 
@@ -151,7 +150,7 @@ def test_redundant_rows_that_agree_are_solved_however_many_iterations_follow(nam
     assert np.linalg.matrix_rank(a, tol=1e-5) < len(b)
     exact = np.linalg.pinv(a, rcond=1e-6, hermitian=True) @ b
     for iterations in (40, 400):
-        got = quick_jit(CG(iterations=iterations).solve)(system)
+        got = jax.jit(CG(iterations=iterations).solve)(system)
         assert got.status == jc.Status.OK
         assert got.multipliers.dtype == dtype
         j, found = (np.asarray(x, float) for x in (system.jacobian.dense(), got.multipliers))
@@ -215,7 +214,7 @@ def test_the_default_tolerance_leaves_two_thirds_of_the_digits(dtype, bound):
     system = assembled(*hinge_twice(np.dtype(dtype)))
     a, p, b = matrices(system)
     p += 1e-9 * np.eye(len(b))
-    r = b - a @ np.asarray(quick_jit(CG().solve)(system).multipliers, float)
+    r = b - a @ np.asarray(jax.jit(CG().solve)(system).multipliers, float)
     assert r @ np.linalg.solve(p, r) < bound**2 * (b @ np.linalg.solve(p, b))
 
 
@@ -231,7 +230,7 @@ def test_a_batch_is_a_loop():
     def one(force, target):
         return solver.solve(dataclasses.replace(system, force=force, target=target))
 
-    batch, alone = quick_jit(jax.vmap(one))(force, target), quick_jit(one)
+    batch, alone = jax.jit(jax.vmap(one))(force, target), jax.jit(one)
     ok, bad = jc.Status.OK, jc.Status.NON_FINITE
     np.testing.assert_array_equal(batch.status, [ok, ok, ok, bad])
     np.testing.assert_array_equal(batch.multipliers[0], 0)
@@ -263,7 +262,7 @@ def test_derivatives_are_those_of_the_dense_solver_and_differences(name):
     random = np.random.default_rng(5)
     direction = tuple(jnp.asarray(random.normal(size=leaf.shape)) for leaf in x)
     ours, dense = (
-        quick_jit(jax.grad(lambda x, s=solver: value(s, system, *x)))(x)
+        jax.jit(jax.grad(lambda x, s=solver: value(s, system, *x)))(x)
         for solver in (CG(tolerance=1e-14), jc.Dense())
     )
     for got, expected in zip(ours, dense, strict=True):
@@ -272,9 +271,9 @@ def test_derivatives_are_those_of_the_dense_solver_and_differences(name):
     def plain(x):
         return value(CG(tolerance=1e-14), system, *x)
 
-    along = quick_jit(lambda x, dx: jax.jvp(plain, (x,), (dx,))[1])(x, direction)
+    along = jax.jit(lambda x, dx: jax.jvp(plain, (x,), (dx,))[1])(x, direction)
     ends = (jax.tree.map(lambda a, d, h=h: a + h * d, x, direction) for h in (1e-5, -1e-5))
-    ahead, behind = map(quick_jit(plain), ends)
+    ahead, behind = map(jax.jit(plain), ends)
     reverse = sum(jnp.sum(g * d) for g, d in zip(ours, direction, strict=True))
     np.testing.assert_allclose(reverse, along, rtol=1e-9)
     np.testing.assert_allclose(along, (ahead - behind) / 2e-5, rtol=DIFFERENCE)
@@ -290,12 +289,10 @@ def test_gradients_of_a_batched_rollout():
         return jnp.sum(jc.rollout(system, jc.Method(solver=solver), start, None, 1e-3, 5)[0].q ** 2)
 
     def inside(solver):
-        return quick_jit(jax.vmap(jax.grad(lambda v: final(solver, v))))(states)
+        return jax.jit(jax.vmap(jax.grad(lambda v: final(solver, v))))(states)
 
     def outside(solver):
-        return quick_jit(jax.grad(lambda v: jnp.sum(jax.vmap(lambda x: final(solver, x))(v))))(
-            states
-        )
+        return jax.jit(jax.grad(lambda v: jnp.sum(jax.vmap(lambda x: final(solver, x))(v))))(states)
 
     expected = inside(jc.Sparse())
     for found in (inside(CG(tolerance=1e-14)), outside(CG(tolerance=1e-14))):

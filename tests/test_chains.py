@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -72,7 +71,7 @@ def test_forces_are_those_of_the_energy(dim, straight):
     def potential(step):
         return system.energy(system.retract(q, step), rest, 0.0).potential
 
-    expected = -quick_jit(jax.grad(potential))(rest)
+    expected = -jax.jit(jax.grad(potential))(rest)
     np.testing.assert_allclose(system.force(q, rest, 0.0), expected, atol=1e-12)
 
 
@@ -90,7 +89,7 @@ def test_small_turns_meet_the_stiffnesses():
         return system.energy(system.retract(state.q, step), state.v, 0.0).potential
 
     np.testing.assert_allclose(
-        quick_jit(jax.hessian(potential))(jnp.zeros(3)), np.diag([3.0, 2.0, 2.0]), atol=1e-12
+        jax.jit(jax.hessian(potential))(jnp.zeros(3)), np.diag([3.0, 2.0, 2.0]), atol=1e-12
     )
 
 

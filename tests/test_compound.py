@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -62,7 +61,7 @@ def test_coordinates_are_those_that_were_composed(slides, hinges):
     def pose(x):
         return placed(system, state, x[:slides], x[slides:])
 
-    @quick_jit
+    @jax.jit
     def read(x, rates):
         q, slope = jax.jvp(pose, (x,), (rates,))
         spin = 2 * jc.quaternion.multiply(jc.quaternion.conjugate(q[3:]), slope[3:])[1:]
@@ -101,7 +100,7 @@ def test_perpendicular_hinges_up_to_gimbal_lock():
         s = dataclasses.replace(lock, q=q)
         return jc.forward_dynamics(system, s, None, FREE, 1e-3).acceleration
 
-    assert jnp.all(jnp.isfinite(quick_jit(jax.jacfwd(acceleration))(lock.q)))
+    assert jnp.all(jnp.isfinite(jax.jit(jax.jacfwd(acceleration))(lock.q)))
 
 
 def test_motors_on_two_hinges_do_the_work_of_their_angles():

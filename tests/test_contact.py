@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.verification import references
@@ -26,7 +25,7 @@ def run(system, state, h, steps, method=None, every=1):
     def record(s, i):
         return s, i.reactions
 
-    return quick_jit(
+    return jax.jit(
         lambda s: jc.rollout(system, method, s, None, h, steps, record=record, every=every)
     )(state)[1]
 
@@ -172,7 +171,7 @@ def test_what_is_missed_over_random_states_of_a_box():
         return every, info.reactions.residual, jnp.max(jnp.abs(speed)), new.status
 
     keys = jax.random.split(jax.random.PRNGKey(1), 2000)
-    every, missed, speed, status = map(np.asarray, quick_jit(jax.vmap(thrown))(keys))
+    every, missed, speed, status = map(np.asarray, jax.jit(jax.vmap(thrown))(keys))
     assert np.all(status == 0)
     normal, slip = every[..., 0], np.linalg.norm(every[..., 1:], axis=-1)
     assert np.mean(normal > 0) > 0.2
@@ -198,7 +197,7 @@ def test_no_impact_adds_energy():
         return energies[0] - energies[1], energies[1], info.reactions.kept
 
     speeds = jax.random.normal(jax.random.PRNGKey(0), (2000, 3))
-    gain, energy, kept = map(np.asarray, quick_jit(jax.vmap(gained))(speeds))
+    gain, energy, kept = map(np.asarray, jax.jit(jax.vmap(gained))(speeds))
     assert np.max(gain / energy) < 1e-12
     assert 0.05 < np.mean(kept < 1) < 0.3
 
@@ -250,7 +249,7 @@ def test_gradients_through_a_bounce_contain_its_time():
         start = dataclasses.replace(state, q=state.q.at[1].set(y), v=state.v.at[1].set(v))
         return jc.rollout(system, jc.Method(), start, None, 1 / 480, 480)[0].q[1]
 
-    value, slopes = quick_jit(jax.value_and_grad(height, (0, 1)))(1.0, -2.0)
+    value, slopes = jax.jit(jax.value_and_grad(height, (0, 1)))(1.0, -2.0)
     np.testing.assert_allclose(value, case["h"], rtol=1e-9)
     np.testing.assert_allclose(slopes, [case["dh_dy0"], case["dh_dvy0"]], rtol=1e-6)
 
@@ -270,7 +269,7 @@ def test_gradients_through_a_collision():
         start = dataclasses.replace(state, q=q, v=v)
         return jc.rollout(system, jc.Method(), start, None, 1 / 240, 240)[0].q[1]
 
-    value, slope = quick_jit(jax.value_and_grad(place))(jnp.asarray([0.0, 0.52, 1.0, 0.0]))
+    value, slope = jax.jit(jax.value_and_grad(place))(jnp.asarray([0.0, 0.52, 1.0, 0.0]))
     np.testing.assert_allclose(value, 1.2, rtol=1e-9)
     np.testing.assert_allclose(slope, case["exact_gradient_d_x2T_d_x1_x2_v0_u0"], atol=1e-6)
 
@@ -291,7 +290,7 @@ def test_gradients_of_where_a_block_stops():
     want = np.array([case["stop_distance"], case["d_dv0"], case["d_dmu"]])
     for steps in (400, 800):
         both = jax.value_and_grad(lambda v, mu, n=steps: distance(v, mu, 1 / n, n), (0, 1))
-        value, slopes = quick_jit(both)(3.0, 0.4)
+        value, slopes = jax.jit(both)(3.0, 0.4)
         relative = np.abs(np.array([value, *slopes]) / want - 1)
         assert relative.max() < 4 / steps
 
@@ -308,7 +307,7 @@ def test_gradients_at_rest_are_finite(dtype):
             final, _ = jc.rollout(changed, jc.Method(), start, None, jnp.asarray(H, dtype), 3)
             return jnp.sum(final.q)
 
-        slope = quick_jit(jax.grad(end))(jnp.asarray([friction, 2.0, 0.0], dtype))
+        slope = jax.jit(jax.grad(end))(jnp.asarray([friction, 2.0, 0.0], dtype))
         assert np.isfinite(slope).all()
 
 

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
@@ -38,7 +37,7 @@ def test_contacts_with_and_without_friction_share_a_scene(dim, solver):
     assert (kinds.single, kinds.contacts, kinds.tangents) == (2, 1, dim - 1)
     method = jc.Method(bounded=solver)
     state = jc.init(system, method, state.q, state.v)
-    final, forces = quick_jit(
+    final, forces = jax.jit(
         lambda s: jc.rollout(system, method, s, None, H, 50, record=lambda _, i: i.reactions)
     )(state)
     np.testing.assert_allclose(jc.velocity(system, final, "ice")[0], 1.0, rtol=1e-9)
@@ -90,7 +89,7 @@ def slid(system, state, steps=30):
     """The end, and what the bounded rows did in each step."""
     method = jc.Method(bounded=jc.GaussSeidel(sweeps=60))
     state = jc.init(system, method, state.q, state.v)
-    final, forces = quick_jit(
+    final, forces = jax.jit(
         lambda s: jc.rollout(system, method, s, None, H, steps, record=lambda _, i: i.reactions)
     )(state)
     return final, forces
@@ -166,7 +165,7 @@ def test_gradients_by_the_size_of_a_box():
 
     at, step = jnp.asarray([*SIZE[:2], 0.3]), 1e-6 * jnp.eye(3)
     worlds = jnp.concatenate([at[None], at[None] + step, at[None] - step])
-    ends, slopes = quick_jit(jax.vmap(jax.value_and_grad(end)))(worlds)
+    ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(end)))(worlds)
     assert np.abs(slopes[0]).min() > 1e-4
     np.testing.assert_allclose(slopes[0], (ends[1:4] - ends[4:]) / 2e-6, rtol=DIFFERENCE)
 

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -97,7 +96,7 @@ def test_a_cam_follows_its_polynomial(dim):
     (a, b, *_), _ = accelerations(system, state, 1.0)
     np.testing.assert_allclose(b, 0.5 * a + 4.0 * 9.0, rtol=1e-9)
     fine = jc.Method(jc.RK4())
-    run = quick_jit(lambda s: jc.rollout(system, fine, s, None, 1e-3, 200)[0])
+    run = jax.jit(lambda s: jc.rollout(system, fine, s, None, 1e-3, 200)[0])
     final = run(state)
     x, y = (jc.coordinate(system, final, f"{name}_hinge") for name in "ab")
     assert abs(x) > 0.1
@@ -107,7 +106,7 @@ def test_a_cam_follows_its_polynomial(dim):
 @both
 def test_a_gear_holds_over_many_turns(dim):
     system, state = shafts(dim, jc.Gear("coupling", "a_hinge", "b_hinge", 2.5), a=20.0, b=50.0)
-    run = quick_jit(lambda s: jc.rollout(system, jc.Method(), s, None, 1e-2, 200)[0])
+    run = jax.jit(lambda s: jc.rollout(system, jc.Method(), s, None, 1e-2, 200)[0])
     final = run(state)
     assert final.status == jc.Status.OK
     a, b = (jc.coordinate(system, final, f"{name}_hinge") for name in "ab")

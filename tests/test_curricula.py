@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from scipy import optimize
 from tolerances import DIFFERENCE
 
@@ -48,7 +47,7 @@ def test_stiffness_goes_into_leaves_and_constraints_give_way_as_hookes_law_says(
     episode = cart.reset(jax.random.key(0))
     traces = []
 
-    @quick_jit
+    @jax.jit
     def sag(k):
         traces.append(1)
         soft = environments.with_stiffness(cart, {"rail": k}, {"rail": 0.3 * k})
@@ -65,7 +64,7 @@ def test_stiffness_goes_into_leaves_and_constraints_give_way_as_hookes_law_says(
 def test_numbers_vary_within_their_shares_and_by_copy(cart):
     shares = {"cart": {"mass": 0.2}, "pole1": {"mass": 0.5, "inertia": 0.5}}
 
-    @quick_jit
+    @jax.jit
     @jax.vmap
     def drawn(key):
         params = environments.vary(cart, key, shares).system.params
@@ -85,7 +84,7 @@ def test_numbers_vary_within_their_shares_and_by_copy(cart):
 
 
 def test_noise_moves_what_constraints_ask_for(cart):
-    @quick_jit
+    @jax.jit
     @jax.vmap
     def off(key):
         own, key = jax.random.split(key)
@@ -103,7 +102,7 @@ def test_projection_is_the_nearest_point():
     bounds = jnp.array([1.0, 1.0, 1.5, 3.0])
     cases = {(3.0, 0.2): (1.0, 0.2), (2.0, 2.0): (0.75, 0.75), (-1.0, 0.3): (-1.0, 0.3)}
     cases |= {(2.0, 0.9): (1.0, 0.5), (0.9, 0.9): (0.75, 0.75)}
-    project = quick_jit(exploration.project)
+    project = jax.jit(exploration.project)
     for x, nearest in cases.items():
         np.testing.assert_allclose(project(jnp.array(x), rows, bounds), nearest, atol=1e-6)
     rows, bounds = jnp.array([[1.0], [-1.0]]), jnp.array([-1.0, -1.0])  # a ≤ −1 and a ≥ 1
@@ -115,7 +114,7 @@ def test_projection_is_the_nearest_point():
 
 
 def test_projection_is_that_of_an_active_set_method():
-    project, random = quick_jit(exploration.project), np.random.default_rng(0)
+    project, random = jax.jit(exploration.project), np.random.default_rng(0)
     for _ in range(5):
         rows, bounds = random.normal(size=(12, 6)), random.uniform(0.05, 1.0, 12)
         x = 3 * random.normal(size=6)
@@ -133,7 +132,7 @@ def test_projection_is_that_of_an_active_set_method():
 def test_projection_has_the_derivative_of_the_nearest_point():
     rows, bounds = jnp.array([[1.0, 1.0], [1.0, 0.0]]), jnp.array([1.5, 4.0])
     x = jnp.array([2.0, 1.0])
-    slope = quick_jit(jax.jacobian(exploration.project, argnums=(0, 2)))(x, rows, bounds)
+    slope = jax.jit(jax.jacobian(exploration.project, argnums=(0, 2)))(x, rows, bounds)
     np.testing.assert_allclose(slope[0], [[0.5, -0.5], [-0.5, 0.5]], atol=1e-6)
     np.testing.assert_allclose(slope[1], [[0.5, 0.0], [0.5, 0.0]], atol=1e-6)
 
@@ -156,8 +155,8 @@ def test_actions_and_noise_are_taken_as_far_as_limits_allow(cart):
     def along(*x):
         return jax.jvp(held, x, tuple(map(jnp.ones_like, x)))
 
-    both = quick_jit(along)  # and its slope along (1, 1, 1)
-    speed = quick_jit(lambda a: world.transition(episode, a[None]).state.v[0])
+    both = jax.jit(along)  # and its slope along (1, 1, 1)
+    speed = jax.jit(lambda a: world.transition(episode, a[None]).state.v[0])
     wanted, noise, most = jnp.asarray(0.3), jnp.asarray(0.05), jnp.asarray(0.1)
     action, slope = both(wanted, noise, most)  # within the limits
     np.testing.assert_allclose(action, 0.35, atol=1e-6)
@@ -182,7 +181,7 @@ def cruise(environment, episode, target):
 def test_a_slow_policy_sets_what_a_fast_controller_follows(cart):
     layered = environments.Layered.build(cart, cruise, ("speed, of 1 m/s",), hold=10)
     assert layered.horizon == 50
-    step = quick_jit(lambda world, episode, action: world.step(episode, action))
+    step = jax.jit(lambda world, episode, action: world.step(episode, action))
     episode, outcome = step(layered, layered.reset(jax.random.key(0)), jnp.array([0.4]))
     assert episode.steps == 1
     np.testing.assert_allclose(outcome.observation[1], 0.4, atol=0.05)

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import DERIVATIVE, IDENTITY
 
 import jaxcon as jc
@@ -96,7 +95,7 @@ def by_hand(k, x=0.4, speed=1.3):
 
 
 def test_a_bead_on_a_wire_and_its_gradient_by_hand():
-    got, slope = quick_jit(jax.value_and_grad(acceleration))(jnp.asarray(1.7))
+    got, slope = jax.jit(jax.value_and_grad(acceleration))(jnp.asarray(1.7))
     np.testing.assert_allclose(got, by_hand(1.7), rtol=IDENTITY)
     np.testing.assert_allclose(slope, jax.grad(by_hand)(1.7), rtol=DERIVATIVE)
 
@@ -119,6 +118,6 @@ def test_worlds_may_have_their_own_curves():
         return jc.step(changed, jc.Method(), state, None, 1e-3)[0].v
 
     curvatures = jnp.array([0.5, 1.0, 2.0])
-    batch = quick_jit(jax.vmap(step))(curvatures)
+    batch = jax.jit(jax.vmap(step))(curvatures)
     for i, k in enumerate(curvatures):
         np.testing.assert_allclose(batch[i], step(k), rtol=IDENTITY)

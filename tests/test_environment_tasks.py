@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon import environments
@@ -24,7 +23,7 @@ def play(environment, policy, actions=None, copies=2):
         start = environment.reset(key), jnp.asarray(True)
         return jax.lax.scan(act, start, None, actions or environment.horizon)[1]
 
-    return np.asarray(quick_jit(jax.vmap(one))(jax.random.split(jax.random.key(0), copies)))
+    return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), copies)))
 
 
 def idle(environment, actions=None):

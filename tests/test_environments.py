@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from gymnasium.envs.functional_jax_env import FunctionalJaxEnv
 from gymnasium.utils.env_checker import check_env
 from tolerances import DIFFERENCE
@@ -34,13 +33,13 @@ CHEAP = {"StewartBalancing": {"method": jc.Method(solver=jc.Schur())}}
 def quick():
     """Gymnasium's interfaces, compiled quickly into slower code."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gym, "_reset", quick_jit(lambda e, key: e.reset(key)))
-        patch.setattr(gym, "_look", quick_jit(lambda e, episode: e.look(episode)))
-        patch.setattr(gym, "_step", quick_jit(lambda e, episode, action: e.step(episode, action)))
-        patch.setattr(vector, "_look", quick_jit(copies.look))
-        patch.setattr(vector, "_begin", quick_jit(copies.begin, static_argnums=(2, 3)))
-        patch.setattr(vector, "_advance", quick_jit(copies.advance, static_argnums=(3, 4)))
-        patch.setattr(vector, "_restart", quick_jit(copies.restart, static_argnums=3))
+        patch.setattr(gym, "_reset", jax.jit(lambda e, key: e.reset(key)))
+        patch.setattr(gym, "_look", jax.jit(lambda e, episode: e.look(episode)))
+        patch.setattr(gym, "_step", jax.jit(lambda e, episode, action: e.step(episode, action)))
+        patch.setattr(vector, "_look", jax.jit(copies.look))
+        patch.setattr(vector, "_begin", jax.jit(copies.begin, static_argnums=(2, 3)))
+        patch.setattr(vector, "_advance", jax.jit(copies.advance, static_argnums=(3, 4)))
+        patch.setattr(vector, "_restart", jax.jit(copies.restart, static_argnums=3))
         yield
 
 
@@ -89,7 +88,7 @@ def test_episodes_start_on_the_constraints_and_earn_from_0_to_1(task):
         return found.worst, found.worst_rate, built.judge(episode, action, episode)[0]
 
     keys = jax.random.split(jax.random.key(0), 16)
-    position, rate, reward = quick_jit(jax.vmap(off))(keys)
+    position, rate, reward = jax.jit(jax.vmap(off))(keys)
     assert jnp.max(position) < 1e-12
     assert jnp.max(rate) < 1e-12
     assert jnp.all((reward >= 0) & (reward <= 1))
@@ -275,7 +274,7 @@ def test_numbers_of_an_environment_can_be_changed_without_a_new_trace():
     episode = environment.reset(jax.random.key(0))
     traces = []
 
-    @quick_jit
+    @jax.jit
     def step(environment, episode):
         traces.append(1)
         return environment.step(episode, jnp.ones(1))[1].observation
@@ -303,9 +302,9 @@ def test_params_of_the_functional_interface_make_worlds():
     functional = environments.FunctionalEnv("CartPole")
     lengths = jnp.array([[0.4], [0.8]])
     build = functools.partial(environments.CartPole.build, skip=20)
-    worlds = quick_jit(jax.vmap(lambda x: build(lengths=x)))(lengths)
+    worlds = jax.jit(jax.vmap(lambda x: build(lengths=x)))(lengths)
 
-    @quick_jit
+    @jax.jit
     @jax.vmap
     def speed(world):
         episode = functional.initial(jax.random.key(0), world)
@@ -325,9 +324,9 @@ def test_reward_is_differentiated_through_actions_and_physics():
         world = dataclasses.replace(environment, system=changed)
         return world.step(episode, numbers[1:])[1].reward
 
-    at, step, value = jnp.array([1.2, 0.3]), 1e-5, quick_jit(earned)
+    at, step, value = jnp.array([1.2, 0.3]), 1e-5, jax.jit(earned)
     nudged = [value(at + e) - value(at - e) for e in step * jnp.eye(2)]
-    found = quick_jit(jax.grad(earned))(at)
+    found = jax.jit(jax.grad(earned))(at)
     np.testing.assert_allclose(found, np.array(nudged) / (2 * step), rtol=DIFFERENCE)
 
 
@@ -370,11 +369,11 @@ else:
 def test_whoever_is_chosen_starts_as_its_key_says(share):
     """Starts are computed in parts of some of the copies; the first two of these need one part."""
     environment, count = environments.make("CartPole"), 150
-    begin = quick_jit(copies.begin, static_argnums=(2,))
+    begin = jax.jit(copies.begin, static_argnums=(2,))
     start, _ = begin(environment, jax.random.key(0), count)
     chosen = np.random.default_rng(1).random(count) < share
-    after = quick_jit(copies.restart)(environment, start, jnp.asarray(chosen)).episode
-    expected = quick_jit(jax.vmap(environment.reset))(start.episode.key)
+    after = jax.jit(copies.restart)(environment, start, jnp.asarray(chosen)).episode
+    expected = jax.jit(jax.vmap(environment.reset))(start.episode.key)
     np.testing.assert_allclose(after.state.q[chosen], expected.state.q[chosen], rtol=1e-14)
     assert np.all(after.state.q[chosen, 0] != start.episode.state.q[chosen, 0])
     same(after.state.q[~chosen], start.episode.state.q[~chosen])
@@ -392,7 +391,7 @@ def test_restarts_are_differentiated():
         moved = dataclasses.replace(start, episode=dataclasses.replace(episode, state=state))
         return jnp.sum(copies.restart(environment, moved, chosen).episode.state.q)
 
-    slope = quick_jit(jax.grad(total))(start.episode.state.q)
+    slope = jax.jit(jax.grad(total))(start.episode.state.q)
     same(slope, np.where(chosen[:, None], 0.0, np.ones_like(slope)))
 
 

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.verification import references
@@ -36,7 +35,7 @@ def march(system, method):
         start = jc.init(system, method, state.q, state.v)
         return jax.lax.fori_loop(0, n, lambda _, s: jc.step(system, method, s, None, h)[0], start)
 
-    return quick_jit(run)
+    return jax.jit(run)
 
 
 def bounced(y, v, e, g, end):
@@ -88,7 +87,7 @@ def test_bounces_and_their_derivatives_are_those_of_closed_forms():
     )
     x, e, g, time = worlds[:, :2], *worlds[:, 2:].T
     slopes = jax.value_and_grad(end, (0, 1), has_aux=True)
-    (found, times), (by_start, by_e) = quick_jit(jax.vmap(slopes))(x, e, g, time)
+    (found, times), (by_start, by_e) = jax.jit(jax.vmap(slopes))(x, e, g, time)
     for i, (y, v, e_, g_, time_) in enumerate(worlds[:5]):
         value, slope = bounced(y, v, e_, -g_, time_)
         np.testing.assert_allclose(found[i], value, atol=EXACT)
@@ -121,7 +120,7 @@ def test_derivatives_through_a_collision():
         return jc.rollout(system, method, start, None, 1 / 24, 24)[0].q[1]
 
     x, along = jnp.asarray([0.0, 0.52, 1.0, 0.0]), jnp.asarray([0.3, -0.7, 0.5, 1.2])
-    value, slope = quick_jit(lambda x: jax.jvp(place, (x,), (along,)))(x)
+    value, slope = jax.jit(lambda x: jax.jvp(place, (x,), (along,)))(x)
     np.testing.assert_allclose(value, 1.2, atol=EXACT)
     exact = np.array(case["exact_gradient_d_x2T_d_x1_x2_v0_u0"], float)
     np.testing.assert_allclose(slope, along @ exact, atol=EXACT)
@@ -164,7 +163,7 @@ def test_what_a_step_tells_of_its_impacts():
     system, state = falling()
     method = located()
     start = jc.init(system, method, state.q.at[1].set(R + 0.01), state.v.at[1].set(-2.0))
-    new, info = quick_jit(lambda s: jc.step(system, method, s, None, 0.05))(start)
+    new, info = jax.jit(lambda s: jc.step(system, method, s, None, 0.05))(start)
     speed = np.sqrt(4 + 2 * 9.81 * 0.01)
     when = (speed - 2) / 9.81
     assert int(info.impacts.count) == 1
@@ -184,7 +183,7 @@ def test_several_impacts_in_one_step():
     system, state = scene.build()
     method = located(jc.SemiImplicitEuler(), splits=4)
     start = jc.init(system, method, state.q, state.v)
-    new, info = quick_jit(lambda s: jc.step(system, method, s, None, 0.038))(start)
+    new, info = jax.jit(lambda s: jc.step(system, method, s, None, 0.038))(start)
     assert int(info.impacts.count) == 4
     np.testing.assert_allclose(info.impacts.times, [0.005, 0.015, 0.025, 0.035], atol=1e-9)
     np.testing.assert_allclose([new.q[0], new.v[0]], [-0.002, 1.0], atol=1e-9)
@@ -258,7 +257,7 @@ def test_a_ball_comes_to_lie(integrator, dtype):
     def rolled(s):
         return jc.rollout(changed, method, s, None, jnp.asarray(h, dtype), 400, record=record)
 
-    final, (gap, energy, count) = quick_jit(rolled)(start)
+    final, (gap, energy, count) = jax.jit(rolled)(start)
     tight = 1e-9 if dtype == jnp.float64 else 1e-5
     assert int(final.status) == 0
     assert float(gap.min()) > -9.81 * h * h / 4 - tight
@@ -315,7 +314,7 @@ def test_points_of_one_element_strike_as_one():
     system, state = scene.build()
     method = jc.Method(jc.RK4(), events=jc.Events())
     start = jc.init(system, method, state.q, state.v)
-    new, info = quick_jit(lambda s: jc.step(system, method, s, None, 0.2))(start)
+    new, info = jax.jit(lambda s: jc.step(system, method, s, None, 0.2))(start)
     np.testing.assert_allclose(info.impacts.times, [0.1], atol=1e-12)
     assert info.impacts.names[int(info.impacts.elements[0])] == "floor"
     np.testing.assert_allclose(jc.velocity(system, new, "bar"), [0.0, 0.6], atol=1e-9)

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from derivatives import assert_smooth_and_batched
 from tolerances import DIFFERENCE, IDENTITY
 
@@ -80,7 +79,7 @@ def rolled(built, method, steps, dt=H):
     return final, path
 
 
-@quick_jit
+@jax.jit
 def pushed(gains):
     return rolled(gap_scene(), jc.Method(stabilizer=Disturbed(**gains)), 4000)[0]
 
@@ -146,7 +145,7 @@ def test_the_response_to_a_sine_is_the_predicted_one(integrator, integral):
     """To the last digits, and in the limit of small steps that of continuous time."""
     ω, push = 2 * np.pi / (40 * H), 3.0
     gains = Disturbed(400.0, 30.0, integral, push=push, frequency=ω)
-    _, path = quick_jit(lambda: rolled(gap_scene(), jc.Method(integrator, gains), 3000))()
+    _, path = jax.jit(lambda: rolled(gap_scene(), jc.Method(integrator, gains), 3000))()
     response = jc.frequency_response(ω, 15.0, 20.0, integral, integrator=integrator, dt=H)
     phase = np.exp(1j * ω * H * np.arange(1, 3001))
     expected = push * (np.asarray(response) * phase).real
@@ -285,7 +284,7 @@ def test_groups_of_constraints_are_batched_and_differentiated():
         return jnp.sum(final.q * jnp.asarray([1.0, 2.0]))
 
     x = jnp.asarray([40.0, 60.0])
-    run, slopes = quick_jit(value), quick_jit(jax.vmap(jax.grad(value)))(x)
+    run, slopes = jax.jit(value), jax.jit(jax.vmap(jax.grad(value)))(x)
     for i in (0, 1):
         at = [float(run(x[i] * (1 + s * 1e-4))) for s in (2, 1, -1, -2)]
         slope = (8 * (at[1] - at[2]) - (at[0] - at[3])) / (12e-4 * float(x[i]))
@@ -313,7 +312,7 @@ def test_a_float32_world_stays_float32(name):
 
     args = (start, method, jnp.asarray(H, jnp.float32))
     assert "f64" not in str(jax.make_jaxpr(after)(*args))
-    final = quick_jit(after)(*args)
+    final = jax.jit(after)(*args)
     assert final.status == jc.Status.OK
     assert jc.violation(system, final).worst < 0.02
 

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from scipy.integrate import solve_ivp
 from tolerances import DIFFERENCE, IDENTITY
 
@@ -34,7 +33,7 @@ def rollout(system, method, state, dt, steps, control=None):
     def run(start):
         return jc.rollout(system, method, start, control, dt, steps, record=forces, every=steps)
 
-    final, λ = quick_jit(run)(start)
+    final, λ = jax.jit(run)(start)
     return final, λ[-1]
 
 
@@ -251,8 +250,8 @@ def reach(numbers):
 
 def test_the_derivative_is_that_of_the_solution_also_where_rows_are_dependent():
     x, step = jnp.array([0.8, 1.3, 0.6]), 1e-5
-    value = quick_jit(reach)
-    got = quick_jit(jax.grad(reach))(x)
+    value = jax.jit(reach)
+    got = jax.jit(jax.grad(reach))(x)
     around = [(value(x + e) - value(x - e)) / (2 * step) for e in step * np.eye(3)]
     np.testing.assert_allclose(got, around, rtol=DIFFERENCE)
 
@@ -265,8 +264,8 @@ def test_the_second_derivative_is_that_of_the_solution():
         start = jc.init(system, method, state.q, state.v)
         return jc.step(system, method, start, None, 0.2)[0].q[0]
 
-    slope = quick_jit(jax.grad(end))
-    bend = quick_jit(lambda x: jax.jvp(jax.grad(end), (x,), (jnp.ones(()),)))(jnp.asarray(1.2))
+    slope = jax.jit(jax.grad(end))
+    bend = jax.jit(lambda x: jax.jvp(jax.grad(end), (x,), (jnp.ones(()),)))(jnp.asarray(1.2))
     np.testing.assert_allclose(bend[0], slope(1.2), rtol=IDENTITY)
     around = (slope(1.2 + 1e-5) - slope(1.2 - 1e-5)) / 2e-5
     np.testing.assert_allclose(bend[1], around, rtol=DIFFERENCE)
@@ -281,14 +280,14 @@ def test_a_batch_is_its_worlds_and_one_that_fails_stops_alone():
         return jc.rollout(system, method, start, None, 2e-2, 10)[0]
 
     speeds, rhos = jnp.array([0.0, 1.0, jnp.nan, -2.0]), jnp.array([0.9, 0.5, 0.5, 0.0])
-    batch = quick_jit(jax.vmap(run))(speeds, rhos)
-    one = quick_jit(run)
+    batch = jax.jit(jax.vmap(run))(speeds, rhos)
+    one = jax.jit(run)
     worlds = [one(s, r) for s, r in zip(speeds, rhos, strict=True)]
     for i in (0, 1, 3):
         np.testing.assert_allclose(batch.q[i], worlds[i].q, rtol=IDENTITY)
         np.testing.assert_allclose(batch.v[i], worlds[i].v, rtol=IDENTITY)
     np.testing.assert_array_equal(batch.status, [0, 0, jc.Status.NON_FINITE, 0])
-    slopes = quick_jit(jax.grad(lambda s: jnp.sum(jax.vmap(run)(s, rhos).q)))(speeds)
+    slopes = jax.jit(jax.grad(lambda s: jnp.sum(jax.vmap(run)(s, rhos).q)))(speeds)
     np.testing.assert_array_equal(np.isfinite(slopes), True)
     assert slopes[2] == 0
     assert slopes[1] != 0
@@ -318,7 +317,7 @@ def test_coordinates_of_the_user_are_bodies():
         start = jc.init(system, method, state.q, jnp.stack([0.0 * speed, speed]))
         return jc.rollout(system, method, start, None, 1e-2, 30)[0]
 
-    got = quick_jit(jax.vmap(run))(jnp.array([0.0, 1.0]))
+    got = jax.jit(jax.vmap(run))(jnp.array([0.0, 1.0]))
     np.testing.assert_allclose(got.q[0], expected.q, rtol=1e-10)
     np.testing.assert_array_equal(got.status, 0)
 

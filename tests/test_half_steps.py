@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -42,7 +41,7 @@ def watched(built, method, dt, steps):
     """(status, worst φ, worst φ̇, worst change of energy) at 200 times."""
     system, state = built
 
-    @quick_jit
+    @jax.jit
     def run(state):
         start = jc.init(system, method, state.q, state.v)
 
@@ -165,7 +164,7 @@ def test_derivatives_of_a_hanging_rod_in_float32():
         return jc.rollout(system, method, start, None, 1e-3, steps)[0].q[0]
 
     for steps in (1, 20, 200):
-        got = quick_jit(jax.grad(lambda x, steps=steps: swing(x, steps)))(jnp.float32(0.0))
+        got = jax.jit(jax.grad(lambda x, steps=steps: swing(x, steps)))(jnp.float32(0.0))
         assert np.isfinite(got)
     frequency = np.sqrt(G / 0.1)
     np.testing.assert_allclose(got, np.sin(0.2 * frequency) / frequency, rtol=2e-2)
@@ -194,7 +193,7 @@ def test_derivatives_at_rest_and_under_way():
         final, _ = jc.rollout(system, method, start, None, 1e-2, 5)
         return jnp.concatenate([final.q, final.v])
 
-    derivative, value = quick_jit(jax.jacobian(after)), quick_jit(after)
+    derivative, value = jax.jit(jax.jacobian(after)), jax.jit(after)
     for x in (jnp.zeros(2), jnp.array([0.0, 2.0])):
         e = 1e-6 * jnp.eye(2)
         numbers = np.stack([(value(x + d) - value(x - d)) / 2e-6 for d in e], 1)
@@ -213,7 +212,7 @@ def test_worlds_in_float32_keep_their_dtype():
     assert jc.violation(system, final).worst < 1e-6
     worlds = jax.tree.map(lambda x: jnp.stack([x, x]), state)
     worlds = dataclasses.replace(worlds, v=worlds.v * jnp.array([[1.0], [0.5]], jnp.float32))
-    both = quick_jit(jax.vmap(lambda s: jc.rollout(system, method, s, None, 1e-3, 500)[0]))(worlds)
+    both = jax.jit(jax.vmap(lambda s: jc.rollout(system, method, s, None, 1e-3, 500)[0]))(worlds)
     np.testing.assert_allclose(both.q[0], final.q, atol=1e-5)
 
 
@@ -237,7 +236,7 @@ def test_a_free_body_neither_gains_energy_nor_momentum(spin):
     def seen(state, _):
         return jc.energy(system, state).total, jc.angular_momentum(system, state)
 
-    run = quick_jit(lambda s: jc.rollout(system, VARIATIONAL, s, None, h, 20000, record=seen)[1])
+    run = jax.jit(lambda s: jc.rollout(system, VARIATIONAL, s, None, h, 20000, record=seen)[1])
     energy, momentum = (np.asarray(x) for x in run(state))
     before = float(jc.energy(system, state).total)
     off = np.abs(energy / before - 1)
@@ -269,7 +268,7 @@ def test_a_change_of_spin_has_a_derivative_at_rest_and_at_any_speed(dtype, size)
         moved = dataclasses.replace(state, v=v)
         return jc.step(system, VARIATIONAL, moved, None, jnp.asarray(1e-2, dtype))[0].v
 
-    slope = quick_jit(jax.jacfwd(after))
+    slope = jax.jit(jax.jacfwd(after))
     for spin in (0.0, 1.0, 45.0, 1000.0):  # hω = 0, 0.01, 0.45, 10
         v = jnp.asarray([0, 0, 0, 0.3 * spin, spin, -0.2 * spin], dtype)
         found = np.asarray(slope(v))
@@ -314,7 +313,7 @@ def test_a_top_goes_round_steadily(stabilizer):
     (system, state), rate = top(200.0)
     method = jc.Method(VARIATIONAL.integrator, stabilizer)
     status, off, _, change = watched((system, state), method, 1e-3, 2000)
-    final, _ = quick_jit(
+    final, _ = jax.jit(
         lambda s: jc.rollout(system, method, s, None, 1e-3, 600, record=lambda s, i: None)
     )(jc.init(system, method, state.q, state.v))
     x, y, _ = jc.position(system, final, "top")
@@ -327,7 +326,7 @@ def test_a_top_goes_round_steadily(stabilizer):
 def test_the_rule_of_the_torque_is_nothing_in_the_plane_and_not_for_every_stabilizer():
     system, state = four_bar()
     explicit, other = (
-        quick_jit(lambda s, m=m: jc.step(system, m, s, None, 1e-3)[0].v)(state)
+        jax.jit(lambda s, m=m: jc.step(system, m, s, None, 1e-3)[0].v)(state)
         for m in (jc.Method(), VARIATIONAL)
     )
     np.testing.assert_array_equal(explicit, other)

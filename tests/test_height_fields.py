@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
@@ -23,7 +22,7 @@ def rolling(system, state, steps):
     """h → the states on the way, for contacts so few that sweeps solve them."""
     method = jc.Method(bounded=QUICK)
     state = jc.init(system, method, state.q, state.v)
-    return quick_jit(lambda h: jc.rollout(system, method, state, None, h, steps)[1])
+    return jax.jit(lambda h: jc.rollout(system, method, state, None, h, steps)[1])
 
 
 def surface(heights, size, lanes):
@@ -61,14 +60,14 @@ def test_slopes_are_continuous_and_are_those_of_the_heights():
     def height(place):
         return surface(rough, (2.0, 3.0), 1).at(Vector(place[:1], place[1:])).height[0]
 
-    both = quick_jit(jax.vmap(jax.value_and_grad(height)))
+    both = jax.jit(jax.vmap(jax.value_and_grad(height)))
     lines = np.array([-1.4, -1.0, -0.6, 0.2, 1.0])
     places = np.stack(np.meshgrid(lines, [-1.5, -0.75, 0.3, 1.5, 1.9]), -1).reshape(-1, 2)
     step = np.array([1e-9, 2e-9])
     (low, before), (high, after) = both(places - step), both(places + step)
     np.testing.assert_allclose(low, high, atol=1e-7)
     np.testing.assert_allclose(before, after, atol=1e-6)
-    inside = quick_jit(lambda p: surface(rough, (2.0, 3.0), 25).at(Vector(*p.T)).slope.stack().T)
+    inside = jax.jit(lambda p: surface(rough, (2.0, 3.0), 25).at(Vector(*p.T)).slope.stack().T)
     np.testing.assert_allclose(inside(places + step), after, atol=1e-12)
 
 
@@ -79,7 +78,7 @@ def test_distances_are_those_to_the_nearest_point():
     px, py = rng.uniform(-0.8, 0.8, 8), rng.uniform(-1.2, 1.2, 8)
     ground = surface(heights, size, 8)
     z = np.asarray(ground.at(Vector(jnp.asarray(px), jnp.asarray(py))).height) + 0.2
-    found, normal = quick_jit(lambda p: above(ground, p))(Vector(*map(jnp.asarray, (px, py, z))))
+    found, normal = jax.jit(lambda p: above(ground, p))(Vector(*map(jnp.asarray, (px, py, z))))
     fine = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 401), np.linspace(-0.2, 0.2, 401)))
     for i in range(8):
         x, y = (fine + np.array([px[i], py[i]])[:, None, None]).reshape(2, -1)
@@ -96,7 +95,7 @@ def test_beside_a_deep_pit_nothing_touches_too_early():
     px, py = rng.uniform(-1, 1, 200), rng.uniform(-1, 1, 200)
     ground = surface(rough, (2.0, 2.0), 200)
     z = np.asarray(ground.at(Vector(jnp.asarray(px), jnp.asarray(py))).height) + 1.0
-    found, _ = quick_jit(lambda p: above(ground, p))(Vector(*map(jnp.asarray, (px, py, z))))
+    found, _ = jax.jit(lambda p: above(ground, p))(Vector(*map(jnp.asarray, (px, py, z))))
     assert np.asarray(found).min() > 0
 
 
@@ -242,7 +241,7 @@ def test_gradients_by_heights():
 
     along = jnp.asarray(np.random.default_rng(6).normal(size=6))
     worlds = jnp.stack([given, given + 1e-6 * along, given - 1e-6 * along])
-    ends, slopes = quick_jit(jax.vmap(jax.value_and_grad(end)))(worlds)
+    ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(end)))(worlds)
     assert np.abs(slopes[0]).max() > 1e-3
     np.testing.assert_allclose(slopes[0] @ along, (ends[1] - ends[2]) / 2e-6, rtol=DIFFERENCE)
 
@@ -261,7 +260,7 @@ def test_a_step_in_float32_is_that_in_float64():
             return jnp.sum(jc.step(changed, method, state, None, h)[0].v)
 
         given = system.params["ground"]["heights"]
-        found.append([*map(np.asarray, quick_jit(jax.value_and_grad(speed))(given))])
+        found.append([*map(np.asarray, jax.jit(jax.value_and_grad(speed))(given))])
     (exact, slope), (value, found32) = found
     assert np.abs(slope).max() > 0.1
     np.testing.assert_allclose(value, exact, rtol=1e-4)

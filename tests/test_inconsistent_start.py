@@ -4,10 +4,10 @@ import dataclasses
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.scenes import four_bar
@@ -39,7 +39,7 @@ def run(name, integrator, law):
     method = jc.Method(INTEGRATORS[integrator], STABILIZERS[law])
     assert jc.violation(system, state).worst > 0.05
 
-    @quick_jit
+    @jax.jit
     def two_seconds(state):
         start = jc.init(system, method, state.q, state.v)
         final, _ = jc.rollout(system, method, start, None, 1e-3, 2000, record=lambda s, i: None)

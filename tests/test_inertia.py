@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY, QUADRATURE
 
 import jaxcon as jc
@@ -121,7 +120,7 @@ def numbers(tensor):
     return jnp.concatenate([solid.moments, solid.axes])
 
 
-forward, reverse = quick_jit(jax.jacfwd(numbers)), quick_jit(jax.jacrev(numbers))
+forward, reverse = jax.jit(jax.jacfwd(numbers)), jax.jit(jax.jacrev(numbers))
 
 
 def test_gradient_of_the_tensor_that_the_axes_give_back():
@@ -162,7 +161,7 @@ def test_motion_does_not_depend_on_the_choice_of_axes():
         small = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
         turn = turn @ (np.eye(3) + small + small @ small / 2)
         omega = omega + h * np.linalg.solve(tensor, np.cross(tensor @ middle, middle))
-    got = jc.quaternion.matrix(quick_jit(turn_after_build)(jnp.asarray(tensor)))
+    got = jc.quaternion.matrix(jax.jit(turn_after_build)(jnp.asarray(tensor)))
     np.testing.assert_allclose(got, turn, atol=1e-5)
 
 
@@ -171,4 +170,4 @@ def test_a_scene_can_be_differentiated_by_its_tensor(name):
     assert jnp.all(jnp.isfinite(gradient_after_build(jnp.asarray(TENSORS[name]))))
 
 
-gradient_after_build = quick_jit(jax.grad(lambda tensor: jnp.sum(turn_after_build(tensor))))
+gradient_after_build = jax.jit(jax.grad(lambda tensor: jnp.sum(turn_after_build(tensor))))

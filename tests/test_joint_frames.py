@@ -7,11 +7,11 @@ other ones in its bodies.
 import dataclasses
 import functools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import DERIVATIVE
 
 import jaxcon as jc
@@ -87,7 +87,7 @@ def build(dim, variant):
     return scenes.start_curves(system, state), state
 
 
-@quick_jit
+@jax.jit
 def equations(system, q, v, t):
     """φ, φ̇, J, γ, M and f. One trace for all variants."""
     rows = linearize(system, q, v, t)
@@ -95,7 +95,7 @@ def equations(system, q, v, t):
     return rows.residual, rows.rate, rows.jacobian.dense(), rows.bias, *forces
 
 
-move = quick_jit(lambda system, q, step: system.retract(q, step))
+move = jax.jit(lambda system, q, step: system.retract(q, step))
 
 
 @functools.cache

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
@@ -40,9 +39,7 @@ def run(system, state, steps, control=None, method=None, h=H):
     def record(s, i):
         return s.q[0], s.v[0], i.reactions, s.status
 
-    rolled = quick_jit(
-        lambda s: jc.rollout(system, method, s, controls, h, steps, record=record)[1]
-    )
+    rolled = jax.jit(lambda s: jc.rollout(system, method, s, controls, h, steps, record=record)[1])
     return rolled(state)
 
 
@@ -174,10 +171,10 @@ def test_gradients_by_the_place_of_a_stop(dim, solver):
         return jnp.sum((jc.rollout(changed, method, state, None, 4e-3, 90)[0].q + 0.3) ** 2)
 
     at, along = jnp.asarray([0.3, 1.1, 3.0]), jnp.asarray([0.6, -0.7, 0.3])
-    found = quick_jit(jax.grad(loss))(at)
-    value, forward = quick_jit(lambda s: jax.jvp(loss, (at + s * along,), (along,)))(0.0)
+    found = jax.jit(jax.grad(loss))(at)
+    value, forward = jax.jit(lambda s: jax.jvp(loss, (at + s * along,), (along,)))(0.0)
     step = 1e-5
-    moved = quick_jit(loss)
+    moved = jax.jit(loss)
     difference = (moved(at + step * along) - moved(at - step * along)) / (2 * step)
     assert np.abs(found).min() > 1e-5
     np.testing.assert_allclose(value, moved(at), rtol=1e-12)
@@ -197,7 +194,7 @@ def test_smoothing_lets_a_stop_be_felt_before_it_is_reached():
             changed = system.with_params({"end": {"upper": upper}})
             return jc.rollout(changed, method, state, None, H, 100)[0].q[0]
 
-        return quick_jit(jax.value_and_grad(end))(jnp.asarray(0.06))
+        return jax.jit(jax.value_and_grad(end))(jnp.asarray(0.06))
 
     (sharp_end, sharp), (end, little), (_, much) = slope(None), slope(0.3), slope(3.0)
     assert sharp == 0.0
@@ -217,8 +214,8 @@ def test_worlds_are_apart():
         return final.q[0], final.status
 
     speeds = jnp.asarray([0.5, 1.0, jnp.nan, 2.0], jnp.float32)
-    x, status = quick_jit(jax.vmap(end))(speeds)
-    alone = [quick_jit(end)(v)[0] for v in speeds[:2]]
+    x, status = jax.jit(jax.vmap(end))(speeds)
+    alone = [jax.jit(end)(v)[0] for v in speeds[:2]]
     np.testing.assert_allclose(x[:2], alone, rtol=1e-5)
     np.testing.assert_array_equal(np.asarray(status) != 0, [False, False, True, False])
 
@@ -275,4 +272,4 @@ def test_a_step_of_no_length_has_a_derivative():
         changed = system.with_params({"end": {"upper": upper}})
         return jnp.sum(jc.step(changed, jc.Method(), state, None, 0.0)[0].q)
 
-    assert quick_jit(jax.grad(end))(0.1) == 0.0
+    assert jax.jit(jax.grad(end))(0.1) == 0.0

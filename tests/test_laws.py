@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -32,7 +31,7 @@ def test_virtual_power(name):
     built = scenes.build(name)
     s = built.off
 
-    @quick_jit
+    @jax.jit
     def solve(s):
         a, multipliers, _ = jc.forward_dynamics(built.system, s, None, jc.Method(), 1e-3)
         jacobian = linearize(built.system, s.q, s.v, s.time).jacobian.dense()
@@ -50,7 +49,7 @@ def test_ideal_constraints_do_no_work(dim):
     _, built = ideal_scene(dim, "loop")
     s = built.state
 
-    @quick_jit
+    @jax.jit
     def reaction(s):
         multipliers = jc.forward_dynamics(built.system, s, None, IDEAL, 1e-3).multipliers
         return multipliers, linearize(built.system, s.q, s.v, s.time).jacobian.apply(s.v)
@@ -63,7 +62,7 @@ def test_ideal_constraints_do_no_work(dim):
 @functools.cache
 def marching(dim, topology):
     """Twenty steps without feedback, of a system, from a state, at a step size."""
-    return quick_jit(lambda system, state, dt: jc.rollout(system, IDEAL, state, None, dt, 20)[0])
+    return jax.jit(lambda system, state, dt: jc.rollout(system, IDEAL, state, None, dt, 20)[0])
 
 
 @both
@@ -164,7 +163,7 @@ def test_plane_and_space_agree(rail, integrator):
     found = {}
     for dim in (2, 3):
         system, state = mechanism(dim, rail)
-        run = quick_jit(lambda s, system=system: jc.rollout(system, method, s, None, 2e-3, 50)[0])
+        run = jax.jit(lambda s, system=system: jc.rollout(system, method, s, None, 2e-3, 50)[0])
         final = run(state)
         assert final.status == jc.Status.OK
         found[dim] = (system, final)
@@ -195,5 +194,5 @@ def test_a_damper_takes_what_the_energy_loses(dim):
     one, two = (system.principal_motion(n, state.q, state.v) for n in ("first", "second"))
     gap, speed = two.position - one.position, two.velocity - one.velocity
     stretching = gap @ speed / np.linalg.norm(gap)
-    rate = quick_jit(jax.grad(energy))(0.0)
+    rate = jax.jit(jax.grad(energy))(0.0)
     np.testing.assert_allclose(rate, -0.7 * stretching**2, rtol=1e-9)

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 
@@ -175,7 +174,7 @@ def test_keyframes_are_states_and_controls():
 
 def test_a_model_unpacks_and_runs_in_single_precision():
     system, state = jc.from_mjcf(model(ARM), dtype=jnp.float32)
-    final, _ = quick_jit(lambda s: jc.step(system, jc.Method(), s, None, 2e-3))(state)
+    final, _ = jax.jit(lambda s: jc.step(system, jc.Method(), s, None, 2e-3))(state)
     jc.raise_for_status(final)
     assert {x.dtype for x in jax.tree.leaves(system)} == {jnp.dtype("float32")}
 

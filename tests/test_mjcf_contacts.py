@@ -3,10 +3,10 @@
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.constraints.bounds import linearize_bounds
@@ -193,7 +193,7 @@ def test_hopper_stands_on_its_foot():
     def record(state, info):
         return read.qpos(state), info.reactions.multipliers, info.reactions.residual
 
-    run = quick_jit(lambda s: jc.rollout(system, method, s, None, 2e-3, 100, record=record))
+    run = jax.jit(lambda s: jc.rollout(system, method, s, None, 2e-3, 100, record=record))
     final, (qpos, forces, residual) = run(state)
     jc.raise_for_status(final)
     assert max(legged.depth(m, np.asarray(qpos))) < 1e-9

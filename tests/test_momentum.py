@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -84,7 +83,7 @@ def prescribed(dim):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_rows_are_the_derivatives_of_the_momentum(dim):
     system, state = prescribed(dim)
-    rows = quick_jit(linearize)(system, state.q, state.v, state.time)
+    rows = jax.jit(linearize)(system, state.q, state.v, state.time)
 
     def amounts(q, v):
         s = dataclasses.replace(state, q=q, v=v)
@@ -111,7 +110,7 @@ def test_every_solver_meets_rows_that_touch_all_bodies(dim):
         methods = [jc.Method(stabilizer=jc.Unstabilized(), solver=x) for x in solvers]
         return [jc.forward_dynamics(system, s, None, m, 1e-3) for m in methods]
 
-    reference, *others = quick_jit(accelerations)(state)
+    reference, *others = jax.jit(accelerations)(state)
     for other in others:
         assert int(other.status) == 0
         np.testing.assert_allclose(other.acceleration, reference.acceleration, atol=1e-9)

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.dynamics.reactions import probes
@@ -46,9 +45,9 @@ def run(bounded, system, start, steps=40, v=None):
 def test_what_does_not_touch_may_be_left_out(dim, solver):
     system, start = rope(dim)
     push = start.v.at[:6].add(0.3)  # to the right, so that those on the floor slide
-    whole, _ = quick_jit(lambda v: run(solver, system, start, v=v))(push)
+    whole, _ = jax.jit(lambda v: run(solver, system, start, v=v))(push)
     some = jc.Nearest(solver, contacts=4, stops=1)
-    few, missed = quick_jit(lambda v: run(some, system, start, v=v))(push)
+    few, missed = jax.jit(lambda v: run(some, system, start, v=v))(push)
     np.testing.assert_allclose(few.q, whole.q, atol=1e-12)
     np.testing.assert_allclose(few.v, whole.v, atol=1e-10)
     assert np.max(missed) < 1e-9
@@ -56,7 +55,7 @@ def test_what_does_not_touch_may_be_left_out(dim, solver):
 
 def test_too_few_show_in_the_residual():
     system, start = rope(2)
-    _, missed = quick_jit(lambda: run(jc.Nearest(contacts=1), system, start, 2))()
+    _, missed = jax.jit(lambda: run(jc.Nearest(contacts=1), system, start, 2))()
     assert missed[0] > 0.5 * 9.81 * DT  # the second bead on the floor falls freely for a step
 
 
@@ -69,7 +68,7 @@ def test_what_joints_hold_takes_no_place(solver):
     scene.add(jc.Distance("rod", "a", "b"))  # so that their overlap stays as it is
     scene.add(jc.CapsuleContact("held", "a", "b", radius_a=0.05, radius_b=0.05))
     system, start = scene.build()
-    final, missed = quick_jit(lambda: run(jc.Nearest(solver, contacts=2), system, start, 3))()
+    final, missed = jax.jit(lambda: run(jc.Nearest(solver, contacts=2), system, start, 3))()
     np.testing.assert_allclose(final.v, 0, atol=1e-12)
     np.testing.assert_allclose(missed, 0, atol=1e-12)
 
@@ -81,7 +80,7 @@ def test_no_row_of_many_is_taken_for_held():
         scene.add(jc.PlaneContact(f"c{i}", jc.WORLD, f"b{i}", radius=0.05, friction=0.4))
     system, start = scene.build()
     some = jc.Nearest(jc.GaussSeidel(5), contacts=399)  # the last one falls freely
-    final, missed = quick_jit(lambda: run(some, system, start, 1))()
+    final, missed = jax.jit(lambda: run(some, system, start, 1))()
     falling = np.flatnonzero(np.abs(final.v[400:]) > 1e-6)
     assert len(falling) == 1
     assert missed[0] > 0.9 * 9.81 * DT
@@ -114,10 +113,10 @@ def test_numbers_of_a_solver_may_differ_by_world(solver):
         state = jc.init(system, method, start.q, start.v)
         return jc.step(system, method, state, None, DT)[0].v
 
-    together = quick_jit(jax.vmap(end))(jnp.asarray([1.0, 2.0]))
-    shared = quick_jit(jax.vmap(lambda _: end(1.0)))(jnp.zeros(2))
+    together = jax.jit(jax.vmap(end))(jnp.asarray([1.0, 2.0]))
+    shared = jax.jit(jax.vmap(lambda _: end(1.0)))(jnp.zeros(2))
     np.testing.assert_allclose(together[0], shared[0], atol=1e-9)
-    np.testing.assert_allclose(together[0], quick_jit(lambda: end(1.0))(), atol=1e-9)
+    np.testing.assert_allclose(together[0], jax.jit(lambda: end(1.0))(), atol=1e-9)
 
 
 def test_as_many_as_there_are_are_all():
@@ -140,8 +139,8 @@ def test_each_world_has_its_own():
         moved = dataclasses.replace(start, q=q)
         return run(some, system, moved, 20)[0].q
 
-    together = quick_jit(jax.vmap(end))(lifts)
-    alone = jnp.stack([quick_jit(end)(lift) for lift in lifts])
+    together = jax.jit(jax.vmap(end))(lifts)
+    alone = jnp.stack([jax.jit(end)(lift) for lift in lifts])
     np.testing.assert_allclose(together, alone, atol=2e-6)
     assert np.isfinite(together).all()
 
@@ -154,9 +153,9 @@ def test_derivatives_are_those_of_all_rows():
 
     some, every = jc.Nearest(jc.GaussSeidel(50), contacts=3), jc.GaussSeidel(50)
     push = 0.3
-    reverse = quick_jit(jax.grad(functools.partial(end, some)))(push)
-    forward = quick_jit(jax.jacfwd(functools.partial(end, some)))(push)
-    value = quick_jit(functools.partial(end, every))
+    reverse = jax.jit(jax.grad(functools.partial(end, some)))(push)
+    forward = jax.jit(jax.jacfwd(functools.partial(end, some)))(push)
+    value = jax.jit(functools.partial(end, every))
     difference = (value(push + 1e-5) - value(push - 1e-5)) / 2e-5
     np.testing.assert_allclose([forward, reverse], difference, rtol=1e-6)
 

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE, IDENTITY
 
 from jaxcon.core import numerics
@@ -74,7 +73,7 @@ def derivatives(guard):
 
 @functools.cache
 def compiled(name):
-    return quick_jit(derivatives(GUARDS[name][0]))
+    return jax.jit(derivatives(GUARDS[name][0]))
 
 
 def all_finite(tree):
@@ -116,7 +115,7 @@ def test_far_from_the_singular_point(name):
 @every_guard
 def test_one_singular_row_does_not_touch_the_batch(name):
     guard, _, singular, _, regular = GUARDS[name]
-    batch = quick_jit(jax.vmap(derivatives(guard)))(jnp.asarray([regular, singular, regular]))
+    batch = jax.jit(jax.vmap(derivatives(guard)))(jnp.asarray([regular, singular, regular]))
     assert all_finite(batch)
     alone = compiled(name)(jnp.asarray(regular))
     for row in (0, 2):

@@ -2,11 +2,11 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import DERIVATIVE, IDENTITY
 
 import jaxcon as jc
@@ -15,7 +15,7 @@ METHOD = jc.Method(stabilizer=jc.Unstabilized())
 X, Y, Z = np.eye(3)
 
 
-@quick_jit
+@jax.jit
 def solve(system, state, control=None):
     return jc.forward_dynamics(system, state, control, METHOD, 1e-3)
 

@@ -5,7 +5,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 
 import jaxcon as jc
 
@@ -82,12 +81,12 @@ def test_gradient_by_every_number_against_differences():
     params = system.params
     random = np.random.default_rng(0)
     direction = jax.tree.map(lambda x: jnp.asarray(random.normal(size=x.shape)), params)
-    value = quick_jit(lambda p: after(system.with_params(p), state))
+    value = jax.jit(lambda p: after(system.with_params(p), state))
 
     def at(h):
         return value(jax.tree.map(lambda x, d: x + h * d, params, direction))
 
-    gradient = quick_jit(jax.grad(lambda p: after(system.with_params(p), state)))(params)
+    gradient = jax.jit(jax.grad(lambda p: after(system.with_params(p), state)))(params)
     slope = sum(jax.tree.leaves(jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction)))
     np.testing.assert_allclose(slope, (at(1e-6) - at(-1e-6)) / 2e-6, rtol=1e-6)
     for path, leaf in jax.tree.leaves_with_path(gradient):

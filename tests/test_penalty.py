@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from derivatives import assert_smooth_and_batched
 from tolerances import IDENTITY, ROUND_OFF
 
@@ -59,7 +58,7 @@ def test_a_penalty_has_the_frequency_of_a_spring():
     dt = 2 * np.pi / ω / 200
     method = jc.Method(jc.RK4(), jc.Penalty(k, implicit=False))
     built = oscillator()
-    _, path = quick_jit(lambda: rolled(built, method, 600, dt))()
+    _, path = jax.jit(lambda: rolled(built, method, 600, dt))()
     expected = 0.1 * np.cos(ω * dt * np.arange(1, 601))
     np.testing.assert_allclose(path, expected, atol=0.1 * 600 * (ω * dt) ** 5 / 120)
     solution = jc.forward_dynamics(*built, None, method, dt)
@@ -70,7 +69,7 @@ def test_a_penalty_has_the_frequency_of_a_spring():
 def test_an_explicit_spring_is_stable_below_four_masses_by_the_square_of_the_step():
     limit = 4 * MASS / H**2
 
-    @quick_jit
+    @jax.jit
     @jax.vmap
     def largest(share):
         method = jc.Method(stabilizer=jc.Penalty(share * limit, implicit=False))
@@ -96,12 +95,12 @@ def implicit():
     """The last states under a stiffness and damping, one world each, and the hard one."""
     built = pendulum()
 
-    @quick_jit
+    @jax.jit
     @jax.vmap
     def soft(k, d):
         return rolled(built, jc.Method(stabilizer=jc.Penalty(k, d)), 300)
 
-    hard = quick_jit(lambda: rolled(built, jc.Method(), 300))()
+    hard = jax.jit(lambda: rolled(built, jc.Method(), 300))()
     return soft, hard
 
 
@@ -136,8 +135,8 @@ def test_the_gradient_where_there_is_no_spring_is_that_of_the_spring(which):
         return jnp.sum(final.q * jnp.arange(1.0, 6.0))
 
     zero = jnp.zeros(())
-    slope = quick_jit(jax.grad(value, which))(zero, zero)
-    run = quick_jit(value)
+    slope = jax.jit(jax.grad(value, which))(zero, zero)
+    run = jax.jit(value)
     step = 1e-2  # a spring that pushes is refused, so to one side only
     args = [[(i * step if j == which else 0.0) for j in (0, 1)] for i in range(5)]
     at = [float(run(*map(jnp.asarray, x))) for x in args]
@@ -153,7 +152,7 @@ def test_a_time_and_a_damping_ratio_stand_for_the_mass_of_the_row():
         k, d = MASS / 0.2**2, 2 * 0.3 * MASS / 0.2
         known = jc.Penalty({"spring": k}, {"spring": d}, implicit=implicit)
         ends = [
-            quick_jit(lambda x=x: rolled(built, jc.Method(stabilizer=x), 50))()
+            jax.jit(lambda x=x: rolled(built, jc.Method(stabilizer=x), 50))()
             for x in (by_time, known)
         ]
         np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=1e-12)
@@ -164,7 +163,7 @@ def test_what_is_not_named_stays_hard(implicit):
     system, state = built = pendulum()
     soft = jc.Penalty({"r*": 1e3}, {"rod": 5.0}, implicit=implicit, others=jc.PID(integral=10.0))
     method = jc.Method(stabilizer=soft)
-    final, _ = quick_jit(lambda: rolled(built, method, 200))()
+    final, _ = jax.jit(lambda: rolled(built, method, 200))()
     violation = jc.violation(system, final)
     assert violation["hinge"] < 2e-3
     assert violation["rod"] > 2e-3
@@ -223,7 +222,7 @@ def test_multipliers_hold_a_closed_loop():
     built = four_bar()
     ends = []
     for law in (jc.Baumgarte(), jc.AugmentedLagrangian(100.0, iterations=2)):
-        final, _ = quick_jit(lambda law=law: rolled(built, jc.Method(stabilizer=law), 400, 1e-3))()
+        final, _ = jax.jit(lambda law=law: rolled(built, jc.Method(stabilizer=law), 400, 1e-3))()
         assert final.status == jc.Status.OK
         assert jc.violation(built[0], final).worst < 1e-4
         ends.append(final.q)
@@ -261,7 +260,7 @@ def test_a_mixture_is_each_of_its_laws_where_the_violation_is_its_own():
     λ = -(1e3 * x / s + 36 * x) / 2 / (1 / MASS + 0.5 / s)
     got = acceleration(own["all"], jnp.asarray(x))
     np.testing.assert_allclose(got, λ / MASS, rtol=1e-9)
-    slope = quick_jit(jax.vmap(jax.grad(lambda x: acceleration(own["all"], x))))
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: acceleration(own["all"], x))))
     ends = jnp.asarray([0.0, 1e-3, 3e-3])
     numbers = [
         (acceleration(own["all"], x + 1e-8) - acceleration(own["all"], x - 1e-8)) / 2e-8
@@ -337,7 +336,7 @@ def test_a_float32_world_stays_float32(name):
 
     args = (start, method, jnp.asarray(H / 2, jnp.float32))
     assert "f64" not in str(jax.make_jaxpr(after)(*args))
-    final = quick_jit(after)(*args)
+    final = jax.jit(after)(*args)
     assert final.status == jc.Status.OK
     assert jc.violation(system, final).worst < 0.1
 
@@ -355,8 +354,8 @@ def test_generalized_coordinates(name):
 
         other = dataclasses.replace(start, v=2 * start.v)
         batch = jax.tree.map(lambda *x: jnp.stack(x), other, start)
-        got = quick_jit(jax.vmap(step))(batch)[1]
-        np.testing.assert_allclose(got, quick_jit(step)(start), rtol=1e-12)
+        got = jax.jit(jax.vmap(step))(batch)[1]
+        np.testing.assert_allclose(got, jax.jit(step)(start), rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -423,7 +422,7 @@ def test_a_hybrid_comes_back_from_a_tenth_off(integrator):
     scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
     system, state = scene.build()
     method = jc.Method(integrator, jc.Hybrid(jc.Penalty(1e3)))
-    final, _ = quick_jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 2000))(
+    final, _ = jax.jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 2000))(
         jc.init(system, method, state.q, state.v)
     )
     assert final.status == jc.Status.OK

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import DERIVATIVE, DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
@@ -51,8 +50,8 @@ def test_rows_are_derivatives_of_the_residual(name):
     """A joint that closes a loop has the rows of a joint between two moving bodies."""
     built = scenes.build(name)
     level, s = level_rows(built), built.off
-    residual, rate, jacobian, bias = quick_jit(by_hand)(built.system, s.q, s.v, s.time)
-    derive = quick_jit(lambda q, v, t: by_derivation(built.system, level, q, v, t))
+    residual, rate, jacobian, bias = jax.jit(by_hand)(built.system, s.q, s.v, s.time)
+    derive = jax.jit(lambda q, v, t: by_derivation(built.system, level, q, v, t))
     expected = derive(s.q, s.v, s.time)
     layout = linearize(built.system, s.q, s.v, s.time).layout
     np.testing.assert_array_equal(layout.holonomic, ~level)
@@ -73,7 +72,7 @@ def test_rows_are_derivatives_of_the_residual(name):
 def test_rows_of_single_precision_are_those_of_double_precision(name):
     """At the same numbers, but for the rounding of what is added up."""
     built = scenes.build(name, "float32")
-    rows = quick_jit(by_hand)
+    rows = jax.jit(by_hand)
     state = built.off
     found = rows(built.system, state.q, state.v, state.time)
     system, state = jax.tree.map(to_double, (built.system, state))
@@ -341,5 +340,5 @@ def test_derivatives_of_rows_at_the_identity_are_finite(kind):
     def rows(q):
         return by_hand(system, q, state.v, state.time)
 
-    for leaf in jax.tree.leaves(quick_jit(jax.jacrev(rows))(state.q)):
+    for leaf in jax.tree.leaves(jax.jit(jax.jacrev(rows))(state.q)):
         assert jnp.all(jnp.isfinite(leaf))

@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
@@ -125,8 +124,8 @@ def test_value_and_gradient_hold_where_rank_is_lost(numbers, dtype):
         weight @ by_null_spaces(*moved(s, np.asarray), BY_LEVEL) for s in (1e-5, -1e-5)
     )
     zero, one = jnp.asarray([0, 1], dtype)
-    value, forward = quick_jit(lambda: jax.jvp(ours, (zero,), (one,)))()
-    reverse = quick_jit(jax.grad(ours))(zero)
+    value, forward = jax.jit(lambda: jax.jvp(ours, (zero,), (one,)))()
+    reverse = jax.jit(jax.grad(ours))(zero)
     rounding = 1e2 * ROUND_OFF[np.dtype(dtype)]
     expected = weight @ by_null_spaces(J, MASS, FORCE, TARGET, BY_LEVEL)
     np.testing.assert_allclose(value, expected, rtol=rounding)
@@ -146,7 +145,7 @@ def test_where_all_agree_levels_change_nothing(name, dtype):
     random = scenes.seeded(name, "priority")
     force = jnp.asarray(random.normal(size=s.v.shape), dtype)
 
-    @quick_jit
+    @jax.jit
     def both():
         rows = linearize(solved, s.q, s.v, s.time)
         target = jnp.asarray(random.normal(size=rows.bias.shape), dtype)
@@ -205,7 +204,7 @@ def test_a_row_of_zeros_leaves_solution_and_gradient_finite():
         a, λ, _ = jc.Priority(LEVELS).solve(problem(j, target=target)[0])
         return jnp.sum(a**2) + jnp.sum(λ**2)
 
-    slopes = quick_jit(jax.grad(value, (0, 1)))(jnp.asarray(j), jnp.asarray(TARGET))
+    slopes = jax.jit(jax.grad(value, (0, 1)))(jnp.asarray(j), jnp.asarray(TARGET))
     for slope in slopes:
         assert np.all(np.isfinite(slope))
         np.testing.assert_array_equal(slope[jnp.array([0, 3])], 0)
@@ -227,7 +226,7 @@ def test_a_level_near_the_one_above_it_gives_way():
         return (damping**2 / (jnp.sin(angle) ** 4 + damping**2)) ** 6
 
     angle, damping = jnp.array([0.03, 0.0548, 0.08]), jnp.array([3e-3, 3e-3, 3e-3])
-    both = [quick_jit(jax.vmap(jax.value_and_grad(x, (0, 1)))) for x in (unmet, share)]
+    both = [jax.jit(jax.vmap(jax.value_and_grad(x, (0, 1)))) for x in (unmet, share)]
     (found, slopes), (expected, exact) = (x(angle, damping) for x in both)
     np.testing.assert_allclose(found, expected, atol=1e-12)
     np.testing.assert_allclose(slopes, exact, rtol=1e-7)
@@ -276,7 +275,7 @@ def test_a_rod_too_short_to_reach_disturbs_no_higher_level(rate):
         found = jc.violation(system, s)
         return found["left"], found["right"]
 
-    run = quick_jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 10000, record=record))
+    run = jax.jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 10000, record=record))
     final, (left, right) = run(state)
     assert final.status == jc.Status.OK
     assert np.max(left) < 1e-2  # while it is pulled in, at up to 80 m/s

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE, IDENTITY
 
 import jaxcon as jc
@@ -24,7 +23,7 @@ def projecting(system, stabilizer=PROJECTION, solver=None):
     solver = jc.RankSafe() if solver is None else solver
     method = jc.Method(stabilizer=stabilizer, solver=solver)
 
-    @quick_jit
+    @jax.jit
     def project(system, state):
         start = jc.init(system, method, state.q, state.v, state.time)
         return jc.step(system, method, start, None, 0.0)[0]
@@ -198,7 +197,7 @@ def test_generalized_coordinates_with_a_full_mass_matrix():
     )
     method = jc.Method(stabilizer=PROJECTION)
     start = jc.init(system, method, jnp.array([1.0, 0.2]), jnp.array([1.0, 1.0]))
-    project = quick_jit(jax.vmap(lambda s: jc.step(system, method, s, None, 0.0)[0]))
+    project = jax.jit(jax.vmap(lambda s: jc.step(system, method, s, None, 0.0)[0]))
     new = jax.tree.map(lambda x: x[0], project(jax.tree.map(lambda x: x[None], start)))
     assert abs(float(new.q @ new.q) - 1) < IDENTITY
     assert abs(float(new.q @ new.v)) < IDENTITY
@@ -214,7 +213,7 @@ def test_every_third_step_and_the_batch():
     memory = start.memory._replace(stabilizer=jnp.asarray([0, 1]))
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), dataclasses.replace(start, memory=()))
     batch = dataclasses.replace(batch, memory=memory)
-    step = quick_jit(jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0]))
+    step = jax.jit(jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0]))
     closed = []
     for _ in range(4):
         batch = step(batch)
@@ -251,7 +250,7 @@ def test_coupled_velocities_contain_the_correction():
     start = dataclasses.replace(state, q=q, v=jnp.zeros(4))
     method = jc.Method(stabilizer=jc.Projection(coupled=True))
     start = jc.init(system, method, start.q, start.v)
-    new = quick_jit(lambda s: jc.step(system, method, s, None, 0.1)[0])(start)
+    new = jax.jit(lambda s: jc.step(system, method, s, None, 0.1)[0])(start)
     d = np.asarray(new.q - q)  # nothing moves otherwise
     along = np.array([new.q[1] - new.q[0], new.q[3] - new.q[2]])
     normal = np.array([-along[0], along[0], -along[1], along[1]])
@@ -290,7 +289,7 @@ def test_first_and_second_derivatives_by_hand():
         return q @ jnp.array([0.3, -0.8]) / jnp.sqrt(q @ q)
 
     for transform in (jax.grad, jax.hessian):
-        got = quick_jit(transform(on_circle))(q)
+        got = jax.jit(transform(on_circle))(q)
         np.testing.assert_allclose(got, transform(by_hand)(q), atol=IDENTITY)
 
 
@@ -327,12 +326,12 @@ def test_the_derivative_is_that_of_the_root():
         return weight @ by_newton(*with_length(x))
 
     x, h = jnp.array([0.01, 0.02]), 1e-5
-    gradient = quick_jit(jax.grad(projected))
-    np.testing.assert_allclose(gradient(x, 0.0), quick_jit(jax.grad(plain))(x), rtol=1e-9)
-    value = quick_jit(projected)
+    gradient = jax.jit(jax.grad(projected))
+    np.testing.assert_allclose(gradient(x, 0.0), jax.jit(jax.grad(plain))(x), rtol=1e-9)
+    value = jax.jit(projected)
     differences = [(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(2)]
     np.testing.assert_allclose(gradient(x), differences, rtol=DIFFERENCE)
-    forward = quick_jit(jax.jacfwd(projected))(x)
+    forward = jax.jit(jax.jacfwd(projected))(x)
     np.testing.assert_allclose(forward, gradient(x), rtol=1e-9)
 
 
@@ -342,7 +341,7 @@ def test_solvers_agree_and_batches_are_loops(solver):
     worlds = [moved(state, 0.03, seed, 1.0) for seed in range(3)]
     batch = jax.tree.map(lambda *x: jnp.stack(x), *worlds)
     reference, method = projecting(system), jc.Method(stabilizer=PROJECTION, solver=solver)
-    got = quick_jit(jax.vmap(lambda s: jc.step(system, method, s, None, 0.0)[0]))(batch)
+    got = jax.jit(jax.vmap(lambda s: jc.step(system, method, s, None, 0.0)[0]))(batch)
     for i, world in enumerate(worlds):
         expected = reference(system, world)
         np.testing.assert_allclose(got.q[i], expected.q, atol=1e-10)
@@ -381,7 +380,7 @@ def test_a_linearized_projection_leaves_what_is_there(tolerance):
         new, code = still.project(system, few, start, start, jnp.asarray(1e-3))
         return new.q[0], (new.q - start.q, code)
 
-    places = quick_jit(jax.vmap(jax.value_and_grad(place, has_aux=True), (None, 0)))
+    places = jax.jit(jax.vmap(jax.value_and_grad(place, has_aux=True), (None, 0)))
     (_, (change, code)), slope = places(0.0, noise)
     assert (code == jc.Status.OK).all()
     np.testing.assert_allclose(change, 0, atol=1e-14)
@@ -398,7 +397,7 @@ def test_projection_keeps_the_order_of_runge_kutta():
     system, state = scene.build()
     method = jc.Method(jc.RK4(), PROJECTION)
 
-    @quick_jit
+    @jax.jit
     def run(dt, steps):
         return jax.lax.fori_loop(
             0, steps, lambda _, s: jc.step(system, method, s, None, dt)[0], state

@@ -2,7 +2,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE, IDENTITY
 
 from jaxcon.core.lanes import Vector
@@ -169,7 +168,7 @@ def test_from_matrix_can_be_differentiated_at_every_turn(turn):
     np.testing.assert_allclose(turned_back(jnp.zeros(3), r), np.eye(3), atol=1e-9)
 
 
-@quick_jit
+@jax.jit
 @jax.jacrev
 def turned_back(phi, r):
     """φ, from the matrix of r turned by φ."""

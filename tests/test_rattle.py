@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE, IDENTITY
 
 import jaxcon as jc
@@ -80,7 +79,7 @@ def scene(name):
     """The scene, its state, and (state, h, n) → states after n steps and after each of 64 parts."""
     system, state = SCENES[name]()
 
-    @quick_jit
+    @jax.jit
     def run(state, dt, steps):
         def step(_, s):
             return jc.step(system, METHOD, s, None, dt)[0]
@@ -143,7 +142,7 @@ def test_one_step_of_a_particle_by_hand():
     """Falling from rest: q⁺ = (cos θ, −sin θ) with sin θ = g h²/2, the rod's force upright −0."""
     system, state = pendulum()
     h, g, m = 0.1, 9.81, 2.0
-    new, info = quick_jit(lambda s: jc.step(system, METHOD, s, None, h))(state)
+    new, info = jax.jit(lambda s: jc.step(system, METHOD, s, None, h))(state)
     drop = g * h * h / 2
     x = np.sqrt(1 - drop**2)
     np.testing.assert_allclose(new.q, [x, -drop], atol=IDENTITY)
@@ -163,7 +162,7 @@ def test_a_motion_in_time_is_followed():
     motion.add(jc.Drive("drive", "rail", lambda t, p: jnp.sin(t)))
     system, state = motion.build()
     state = dataclasses.replace(state, v=state.v.at[0].set(1.0))
-    end, path = quick_jit(lambda s: jc.rollout(system, METHOD, s, None, 0.1, 10))(state)
+    end, path = jax.jit(lambda s: jc.rollout(system, METHOD, s, None, 0.1, 10))(state)
     assert abs(float(end.q[0]) - np.sin(1.0)) < IDENTITY
     assert abs(float(end.v[0]) - np.cos(1.0)) < IDENTITY
 
@@ -186,10 +185,10 @@ def damped(parameter):
 def test_forces_of_velocities_and_derivatives():
     """The gradient is that of the equations: central differences, forward and reverse mode."""
     x, h = jnp.array([3.0, 0.4]), 1e-5
-    value, gradient = quick_jit(damped), quick_jit(jax.grad(damped))
+    value, gradient = jax.jit(damped), jax.jit(jax.grad(damped))
     differences = [(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(2)]
     np.testing.assert_allclose(gradient(x), differences, rtol=DIFFERENCE)
-    np.testing.assert_allclose(quick_jit(jax.jacfwd(damped))(x), gradient(x), rtol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(damped))(x), gradient(x), rtol=1e-9)
 
 
 def test_the_derivative_of_a_step_in_space():
@@ -204,16 +203,16 @@ def test_the_derivative_of_a_step_in_space():
         return jnp.sum(jnp.sin(new.q)) + jnp.sum(jnp.cos(new.v))
 
     x, h = jnp.array([1e-3, 0.1]), 1e-6
-    value = quick_jit(end)
+    value = jax.jit(end)
     differences = [(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(2)]
-    np.testing.assert_allclose(quick_jit(jax.grad(end))(x), differences, rtol=DIFFERENCE)
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(x), differences, rtol=DIFFERENCE)
 
 
 def test_float32_and_batches():
     system, state, _ = scene("double_pendulum")
     low = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == float else x, (system, state))
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), low[1])
-    run = quick_jit(jax.vmap(lambda s: jc.rollout(low[0], METHOD, s, None, 5e-3, 100)[0]))
+    run = jax.jit(jax.vmap(lambda s: jc.rollout(low[0], METHOD, s, None, 5e-3, 100)[0]))
     ends = run(batch)
     assert ends.status.tolist() == [jc.Status.OK] * 2
     left = jax.vmap(lambda s: jc.violation(low[0], s).worst)(ends)

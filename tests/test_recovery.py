@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
@@ -175,7 +174,7 @@ def test_gradients_are_finite_and_those_of_what_was_done(scene, simulate):
     def total(gravity, q):
         return jnp.sum(jax.vmap(loss, (None, 0, 0))(gravity, q, jnp.asarray(x["control"])))
 
-    value, slope = quick_jit(total), quick_jit(jax.grad(total, (0, 1)))
+    value, slope = jax.jit(total), jax.jit(jax.grad(total, (0, 1)))
     gravity, q = jnp.array([0.3, -9.81]), jnp.asarray(x["q"])
     by_gravity, by_q = slope(gravity, q)
     dg, dq = jnp.array([0.7, 0.4]), jnp.asarray(np.random.default_rng(0).normal(size=q.shape))

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.simulation.step import undo
@@ -47,7 +46,7 @@ def test_a_thousand_steps_have_the_gradient_of_every_step():
     x = {"mass": 1.0, "damping": 0.05, "dt": DT, "push": 0.0, "u": np.full((1000, 1), 0.1)}
     x = jax.tree.map(jnp.asarray, x)
     found, expected = (
-        quick_jit(jax.value_and_grad(functools.partial(value, adjoint=adjoint)))(x)
+        jax.jit(jax.value_and_grad(functools.partial(value, adjoint=adjoint)))(x)
         for adjoint in (jc.Reversible(), jc.EveryStep())
     )
     assert min(np.max(np.abs(x)) for x in jax.tree.leaves(expected)) > 1e-4
@@ -93,15 +92,15 @@ def test_batches_in_both_orders_strides_and_failed_worlds():
 
     back = jc.Truncated(5, within=jc.Reversible(segments=4))
 
-    @quick_jit
+    @jax.jit
     def expected(worlds):
         return jax.vmap(lambda v: one(v, 1.0, jc.Truncated(5)))(worlds)
 
-    @quick_jit
+    @jax.jit
     def inside(worlds):
         return jax.vmap(lambda v: one(v, 1.0, back))(worlds)
 
-    @quick_jit
+    @jax.jit
     def outside(worlds, mass):
         def total(worlds, mass):
             each = jax.vmap(lambda v: along(v, mass, back, 3))
@@ -129,7 +128,7 @@ def test_a_step_back_of_a_body_in_space_that_counts_its_turns():
     system, state = scene.build()
     state = jc.init(system, METHOD, state.q, state.v)
 
-    @quick_jit
+    @jax.jit
     def there_and_back(state):
         there, path = jc.rollout(system, METHOD, state, None, 2e-2, 40)
         again = jax.lax.scan(
@@ -157,7 +156,7 @@ def test_a_step_back_undoes_a_step():
     state = jc.assemble(system, state).check()
     control = jnp.array([3.0, -1.0])
 
-    @quick_jit
+    @jax.jit
     def there_and_back(state):
         first, _ = jc.step(system, METHOD, state, control, 1e-2)
         second, _ = jc.step(system, METHOD, first, control, 1e-2)
@@ -180,7 +179,7 @@ def test_states_that_are_lost_on_the_way_leave_no_wrong_gradient():
         ].v[1]
 
     lost, kept, expected = (
-        quick_jit(jax.grad(functools.partial(end, adjoint=adjoint)))(jnp.float32(0.5))
+        jax.jit(jax.grad(functools.partial(end, adjoint=adjoint)))(jnp.float32(0.5))
         for adjoint in (jc.Reversible(), jc.Reversible(segments=30), jc.EveryStep())
     )
     assert np.isnan(lost)

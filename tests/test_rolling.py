@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import IDENTITY
 
 import jaxcon as jc
@@ -219,7 +218,7 @@ def test_rows_of_a_disc_are_finite_upright_flat_and_next_to_it(dtype):
         return numbers_of_rows(system, q, state.v)
 
     for derivative in (rows, jax.jacrev(rows), jax.jacfwd(rows)):
-        for leaf in jax.tree.leaves(quick_jit(jax.vmap(derivative))(q)):
+        for leaf in jax.tree.leaves(jax.jit(jax.vmap(derivative))(q)):
             assert jnp.all(jnp.isfinite(leaf))
     flat = rows(q[0])
     np.testing.assert_allclose(flat[2][0, :3], [0, 0, 1], atol=1e-6)
@@ -248,9 +247,9 @@ def test_gradients_of_rolling_at_rest_and_upright():
         changed = system.with_params({"roll": {"radius": radius}})
         return jc.rollout(changed, jc.Method(), state, None, 1e-3, 20)[0].q[0]
 
-    h, run = 1e-4, quick_jit(travelled)
+    h, run = 1e-4, jax.jit(travelled)
     slope = (run(0.2 + h) - run(0.2 - h)) / (2 * h)
-    np.testing.assert_allclose(quick_jit(jax.grad(travelled))(0.2), slope, rtol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.grad(travelled))(0.2), slope, rtol=1e-5)
 
 
 def test_energy_of_rolling_converges_to_a_constant_with_the_order():

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
@@ -38,7 +37,7 @@ def rolled(system, state, h, steps, solver=SWEEPS):
     method = jc.Method(bounded=solver)
     state = jc.init(system, method, state.q, state.v)
     h = jnp.asarray(h, state.q.dtype)
-    return quick_jit(
+    return jax.jit(
         lambda s: jc.rollout(
             system, method, s, None, h, steps, record=lambda _, i: i.reactions["floor"]
         )
@@ -104,7 +103,7 @@ def test_what_spins_stops_and_others_in_the_scene_do_not():
     assert found.kinds == Kinds(1, 0, 4, 2, (Disc(1, 2, 2), Disc(2, 2, 1)))
     method = jc.Method(bounded=SWEEPS)
     state = jc.init(system, method, state.q, state.v)
-    final, forces = quick_jit(
+    final, forces = jax.jit(
         lambda s: jc.rollout(system, method, s, None, 2e-3, 20, record=lambda _, i: i.reactions)
     )(state)
     for name, given in kinds.items():
@@ -133,7 +132,7 @@ def test_the_interior_point_solves_random_rows(dtype):
     more = tuple(jnp.asarray(0.1 * rng.uniform(size=(k, worlds)), dtype) for k in (2, 1))
     problem = Bounded(*(jnp.asarray(x, dtype) for x in sizes), kinds, more)
     # without fused multiply and add, float32 loses one world of a hundred at the tip of a cone
-    compiled = quick_jit if dtype == jnp.float64 else jax.jit
+    compiled = jax.jit if dtype == jnp.float64 else jax.jit
     found = compiled(lambda p: POINT.solve(p, jnp.zeros_like(p.offset)))(problem)
     terms = jnp.sum(jnp.abs(problem.matrix * found[None]), axis=1) + jnp.abs(problem.offset)
     missed = np.asarray(problem.worst(found) / jnp.max(terms, axis=0))
@@ -159,7 +158,7 @@ def test_gradients_of_where_it_stops():
     for at in (jnp.asarray([0.02, 0.4, -3.0]), jnp.asarray([0.02, 0.1, 4.0])):
         step = 1e-6 * jnp.eye(3)
         worlds.append(jnp.concatenate([at[None], at[None] + step, at[None] - step]))
-    ends, slopes = quick_jit(jax.vmap(jax.vmap(jax.value_and_grad(end))))(jnp.stack(worlds))
+    ends, slopes = jax.jit(jax.vmap(jax.vmap(jax.value_and_grad(end))))(jnp.stack(worlds))
     assert np.abs(slopes[1, 0]).min() > 1e-4
     differences = (ends[:, 1:4] - ends[:, 4:]) / 2e-6
     np.testing.assert_allclose(slopes[:, 0], differences, rtol=DIFFERENCE, atol=1e-9)

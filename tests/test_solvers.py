@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
@@ -62,7 +61,7 @@ CASES += [(name, "float32") for name in (*LOOPS, *scenes.OTHERS)]
 def test_all_solvers_leave_no_residual_and_agree(name, dtype):
     system = problem(name, dtype)
     solutions = {
-        key: quick_jit(lambda solver=solver: solver.solve(system))()
+        key: jax.jit(lambda solver=solver: solver.solve(system))()
         for key, solver in (SOLVERS | iterative(dtype)).items()
     }
     for key, solution in solutions.items():
@@ -145,8 +144,8 @@ def test_derivative_by_every_number_is_that_of_the_solution(solver):
 
     expected = (plain(1e-5) - plain(-1e-5)) / 2e-5
     x, dx = jax.tree.map(jnp.asarray, (values, direction))
-    _, forward = quick_jit(lambda: jax.jvp(ours, (x,), (dx,)))()
-    gradient = quick_jit(jax.grad(ours))(x)
+    _, forward = jax.jit(lambda: jax.jvp(ours, (x,), (dx,)))()
+    gradient = jax.jit(jax.grad(ours))(x)
     reverse = sum(np.sum(gradient[name] * direction[name]) for name in names)
     np.testing.assert_allclose([forward, reverse], expected, rtol=DIFFERENCE)
 

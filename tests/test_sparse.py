@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
@@ -117,7 +116,7 @@ WAYS = {
 def test_the_solution_is_that_of_the_dense_solver(name, way):
     system = problem(name)
     expected = jc.Dense().solve(system)
-    got = quick_jit(lambda: WAYS[way].solve(system))()
+    got = jax.jit(lambda: WAYS[way].solve(system))()
     assert got.status == jc.Status.OK
     np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-8, atol=1e-8)
@@ -168,7 +167,7 @@ def test_with_compliance(name):
     compliance = jnp.asarray(np.random.default_rng(4).uniform(0, 1, size=system.target.shape))
     system = dataclasses.replace(system, compliance=compliance)
     expected = jc.Dense().solve(system)
-    got = quick_jit(lambda: Sparse().solve(system))()
+    got = jax.jit(lambda: Sparse().solve(system))()
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-9, atol=1e-9)
 
 
@@ -181,14 +180,14 @@ def test_compliance_and_regularisation_are_one_problem(name):
     added = 0.1 * (jnp.einsum("ri,i,ri->r", j, w, j) + compliance)
     expected = jc.Dense().solve(dataclasses.replace(system, compliance=compliance + added))
     for solver in (jc.Sparse, jc.Schur, jc.ConjugateGradients):
-        got = quick_jit(lambda s=solver: s(tikhonov=0.1).solve(system))()
+        got = jax.jit(lambda s=solver: s(tikhonov=0.1).solve(system))()
         np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("way", WAYS)
 def test_a_system_may_be_an_argument_of_a_compiled_function(way):
     system = problem("tree")
-    got = quick_jit(WAYS[way].solve)(system)
+    got = jax.jit(WAYS[way].solve)(system)
     np.testing.assert_allclose(got.multipliers, jc.Dense().solve(system).multipliers, rtol=1e-9)
 
 
@@ -216,7 +215,7 @@ def test_its_gradient_is_that_of_the_dense_solver(name):
 
     numbers = (system.mass.values, system.force, system.target, jnp.ones(len(blocks)))
     ours, dense = (
-        quick_jit(jax.grad(lambda *x, s=solver: value(s, *x), argnums=(0, 1, 2, 3)))(*numbers)
+        jax.jit(jax.grad(lambda *x, s=solver: value(s, *x), argnums=(0, 1, 2, 3)))(*numbers)
         for solver in (Sparse(), jc.Dense())
     )
     for got, expected in zip(ours, dense, strict=True):
@@ -231,7 +230,7 @@ def test_a_batch_is_a_loop():
     def one(force):
         return Sparse().solve(dataclasses.replace(system, force=force))
 
-    batch, alone = quick_jit(jax.vmap(one))(forces), quick_jit(one)
+    batch, alone = jax.jit(jax.vmap(one))(forces), jax.jit(one)
     for i, force in enumerate(forces):
         np.testing.assert_allclose(batch.multipliers[i], alone(force).multipliers, rtol=1e-11)
 
@@ -253,7 +252,7 @@ def test_a_dependent_row_is_singular(name):
         saddle(system, state.q, rows, state.v, jnp.ones(n)), jacobian=jacobian
     )
     twice = dataclasses.replace(twice, target=jnp.ones(n + size))
-    assert quick_jit(lambda: Sparse().solve(twice))().status == jc.Status.SINGULAR
+    assert jax.jit(lambda: Sparse().solve(twice))().status == jc.Status.SINGULAR
 
 
 def hinge_twice(dtype):

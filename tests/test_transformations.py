@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from compiling import quick_jit
 from tolerances import DIFFERENCE, IDENTITY
 
 import jaxcon as jc
@@ -51,7 +50,7 @@ CASES = [
 @functools.cache
 def compiled_step(name, integrator, solver):
     system, method = scenes.build(name).system, method_of(integrator, solver)
-    return quick_jit(lambda state: jc.step(system, method, state, None, DT))
+    return jax.jit(lambda state: jc.step(system, method, state, None, DT))
 
 
 @pytest.mark.parametrize(("name", "integrator", "solver"), CASES[:2] + CASES[3:])
@@ -81,7 +80,7 @@ def test_vmap_is_a_loop(name, integrator, solver):
     states, batch = several(built)
     one = compiled_step(name, integrator, solver)
     expected = jax.tree.map(lambda *x: jnp.stack(x), *(one(s) for s in states))
-    got = quick_jit(jax.vmap(lambda s: jc.step(system, method, s, None, DT)))(batch)
+    got = jax.jit(jax.vmap(lambda s: jc.step(system, method, s, None, DT)))(batch)
     for i in range(len(states)):
         ours, theirs = (jax.tree.map(lambda x, i=i: x[i], tree) for tree in (got, expected))
         same_step(ours, theirs)
@@ -128,9 +127,9 @@ def test_reverse_and_forward_mode_are_central_differences(name, integrator, solv
     def value(x):
         return outcome(built, method_of(integrator, solver), x)
 
-    gradient = quick_jit(jax.grad(value))(x)
-    along = quick_jit(lambda x, dx: jax.jvp(value, (x,), (dx,))[1])
-    run = quick_jit(value)
+    gradient = jax.jit(jax.grad(value))(x)
+    along = jax.jit(lambda x, dx: jax.jvp(value, (x,), (dx,))[1])
+    run = jax.jit(value)
     for name, direction in directions(x):
         forward = along(x, direction)
         reverse = dot(gradient, direction)
@@ -186,7 +185,7 @@ def test_gradients_at_rest_and_at_the_identity_are_finite(kind):
         final, _ = jc.rollout(system.with_params(params), jc.Method(), start, None, DT, 3)
         return jnp.sum(final.q) + jnp.sum(final.v)
 
-    gradient = quick_jit(jax.grad(value, argnums=(0, 1, 2)))(state.q, state.v, system.params)
+    gradient = jax.jit(jax.grad(value, argnums=(0, 1, 2)))(state.q, state.v, system.params)
     for path, leaf in jax.tree.leaves_with_path(gradient):
         assert jnp.all(jnp.isfinite(leaf)), path
 
@@ -200,7 +199,7 @@ def test_gradient_of_the_step_size_and_the_gains():
         return jnp.sum(final.q**2)
 
     x = {"alpha": jnp.asarray(20.0), "beta": jnp.asarray(30.0), "dt": jnp.asarray(DT)}
-    gradient, run = quick_jit(jax.grad(value))(x), quick_jit(value)
+    gradient, run = jax.jit(jax.grad(value))(x), jax.jit(value)
     for name in x:
         direction = {key: jnp.asarray(float(key == name)) * x[key] for key in x}
         slope = difference(run, x, direction)
@@ -278,7 +277,7 @@ def test_no_float64_in_the_derivative_of_a_float32_step():
 def test_a_float32_world_survives_a_thousand_steps(name):
     built = scenes.build(name, "float32")
     method, dt = jc.Method(), jnp.asarray(DT, jnp.float32)
-    final, _ = quick_jit(lambda s: jc.rollout(built.system, method, s, None, dt, 1000, every=1000))(
+    final, _ = jax.jit(lambda s: jc.rollout(built.system, method, s, None, dt, 1000, every=1000))(
         built.state
     )
     assert final.status == jc.Status.OK

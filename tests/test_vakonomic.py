@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from compiling import quick_jit
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
@@ -24,7 +23,7 @@ def skate():
 
 
 def run(system, state, dt=1e-3, steps=500, every=100):
-    return quick_jit(lambda s: jc.rollout(system, IDEAL, s, None, dt, steps, every=every)[1])(state)
+    return jax.jit(lambda s: jc.rollout(system, IDEAL, s, None, dt, steps, every=every)[1])(state)
 
 
 def test_skate_keeps_energy_and_momentum_of_the_augmented_lagrangian():
@@ -156,12 +155,12 @@ def test_batches_and_gradients():
         changed = system.with_params({"skate": {"mass": mass}})
         return jc.rollout(changed, IDEAL, start, None, 1e-2, 20)[0].q[1]
 
-    one = quick_jit(end)
+    one = jax.jit(end)
     masses = jnp.asarray([1.0, 1.3, 2.0])
-    batch = quick_jit(jax.vmap(end, (None, 0)))(0.2, masses)
+    batch = jax.jit(jax.vmap(end, (None, 0)))(0.2, masses)
     np.testing.assert_allclose(batch, [one(0.2, m) for m in masses], rtol=1e-12)
     h = 1e-5
-    slopes = quick_jit(jax.grad(end, (0, 1)))(0.2, 1.3)
+    slopes = jax.jit(jax.grad(end, (0, 1)))(0.2, 1.3)
     by_μ = (one(0.2 + h, 1.3) - one(0.2 - h, 1.3)) / (2 * h)
     by_mass = (one(0.2, 1.3 + h) - one(0.2, 1.3 - h)) / (2 * h)
     np.testing.assert_allclose(slopes, [by_μ, by_mass], rtol=1e-6)
