@@ -297,12 +297,13 @@ def by_newton(system, start):
     """q = q* ⊕ M⁻¹J(q*)ᵀ μ by many rounds of Newton's method, dense, as it stands."""
     normal = linearize(system, start.q, start.v, start.time).jacobian.dense()
     away = normal.T / system.mass(start.q).values[:, None]
-    μ = jnp.zeros(len(normal))
-    for _ in range(12):
+
+    def round_of_newton(μ, _):
         q = start.q + away @ μ
         rows = linearize(system, q, start.v, start.time)
-        μ = μ - jnp.linalg.solve(rows.jacobian.dense() @ away, rows.residual)
-    return start.q + away @ μ
+        return μ - jnp.linalg.solve(rows.jacobian.dense() @ away, rows.residual), None
+
+    return start.q + away @ jax.lax.scan(round_of_newton, jnp.zeros(len(normal)), None, 12)[0]
 
 
 def test_the_derivative_is_that_of_the_root():
