@@ -126,3 +126,116 @@ def test_a_ball_is_kept_on_the_plate():
     earned = play(environment, tilt, 150)
     assert earned[:, -20:].min() > 0.95
     assert earned.mean() > 0.8
+
+
+KINDS = {"by hand": (1.0, 0.0), "idle": (0.0, 0.0), "random": (0.0, 1.0), "lost": (np.nan, 0.0)}
+"""How much of an action is a policy's, and how much is noise within −1 to 1."""
+
+
+def compare(environment, policy, look, actions, copies=2):
+    """What `look` sees and is earned by a policy, by nothing, by noise and by NaN, in one program.
+
+    Returns:
+        By kind, of each copy and action: reward, 0 once the task is over; whether it was not over;
+        outcome; and what `look` says of the episode.
+    """
+
+    def one(weights, key):
+        def act(now, key):
+            episode, alive = now
+            noise = jax.random.uniform(key, (len(environment.actions),), minval=-1.0, maxval=1.0)
+            action = weights[0] * policy(environment.observe(episode)) + weights[1] * noise
+            episode, outcome = environment.step(episode, action)
+            reward = jnp.where(alive, outcome.reward, 0)
+            return (episode, alive & ~outcome.terminated), (reward, alive, outcome, look(episode))
+
+        own, noise = jax.random.split(key)
+        start = environment.reset(own), jnp.asarray(True)
+        return jax.lax.scan(act, start, jax.random.split(noise, actions))[1]
+
+    keys = jnp.tile(jax.random.split(jax.random.key(0), copies), len(KINDS))
+    weights = jnp.repeat(jnp.asarray(list(KINDS.values())), copies, axis=0)
+    run = jax.jit(jax.vmap(one))
+    first, again = (jax.tree.map(np.asarray, run(weights, keys)) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, first, again)  # bit for bit
+    parts = [slice(i * copies, (i + 1) * copies) for i in range(len(KINDS))]
+    return {k: jax.tree.map(lambda x, p=p: x[p], first) for k, p in zip(KINDS, parts, strict=True)}
+
+
+def assert_sound(found, violation):
+    """Rewards within bounds, no divergence but by NaN, and constraints that are kept."""
+    for kind, (reward, _, outcome, _) in found.items():
+        lost = kind == "lost"
+        assert reward.min() >= 0
+        assert reward.max() <= (0 if lost else 1)
+        assert np.all(outcome.info["diverged"] == lost)
+        assert np.isfinite(outcome.observation).all()
+        assert lost or outcome.info["violation"].max() < violation
+
+
+def returns(found):
+    """The mean over copies of what an episode earned, by kind."""
+    return {kind: rewards.sum(axis=-1).mean() for kind, (rewards, *_) in found.items()}
+
+
+def smooth(x):
+    """From 0 to 1 in x from 0 to 1, level outside."""
+    x = jnp.clip(x, 0.0, 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def turn_over(seen):
+    """Bends, lets the bend run once round the spine, and stretches; numbers of the stock cat.
+
+    The bend β is that after which a body of two equal halves without twist has made half a turn,
+    A cos² β/2 + B sin² β/2 = 2 A cos β/2, with moments A along the spine and B across it.
+    """
+    along, across = 0.07**2 / 2, (3 * 0.07**2 + 0.25**2) / 12
+    ratio = across / along
+    β = 2 * np.arccos((np.sqrt(1 + ratio * (ratio - 1)) - 1) / (ratio - 1))
+    fall = np.sqrt(2 * (1.6 - 0.15) / 9.81)
+
+    def wanted(t):
+        size = β * smooth(t / 0.45) * smooth((0.97 - t) / 0.45)
+        phase = 2 * jnp.pi * smooth((t - 0.22) / 0.52)
+        return size * jnp.stack([jnp.cos(phase), jnp.sin(phase)])
+
+    t = (0.005 - seen[11] / 9.81) / fall
+    place, rate = jax.jvp(wanted, (t,), (jnp.ones_like(t),))
+    bend, bending = seen[3:5], seen[8:10]
+    return (60 * (place - bend) + 0.5 * (rate / fall - bending) + 2 * bend) / 12
+
+
+def test_a_cat_lands_on_its_feet_without_angular_momentum():
+    method = jc.Method(jc.RATTLE(), solver=jc.Schur())
+    environment = environments.make("CatRighting", method=method)
+
+    def look(episode):
+        system, state = environment.system, episode.state
+        halves = [
+            [f(system, state, name) for f in (jc.position, jc.velocity, jc.orientation)]
+            + [jc.angular_velocity(system, state, name)]
+            for name in ("front", "rear")
+        ]
+        return environment.upright(episode), halves
+
+    found = compare(environment, turn_over, look, 54)
+    assert_sound(found, 1e-14)
+    up = {kind: seen[0][:, -1] for kind, (*_, seen) in found.items()}
+    assert up["by hand"].min() > 0.95
+    assert up["idle"].max() < -0.9
+    earned = returns(found)
+    assert earned["by hand"] > 20
+    assert earned["idle"] < 2
+    assert earned["random"] < 10
+
+    moments = 2.0 * np.array([0.07**2 / 2, *2 * [(3 * 0.07**2 + 0.25**2) / 12]])
+    halves = [[np.reshape(x, (-1, x.shape[-1])) for x in half] for half in found["by hand"][3][1]]
+    center, drift = (np.mean([half[i] for half in halves], axis=0) for i in (0, 1))
+    total = 0
+    for place, velocity, turn, spin in halves:
+        rotation = np.stack([np.asarray(jc.quaternion.matrix(x)) for x in turn])
+        own = np.einsum("nij,nj->ni", rotation, moments * spin)
+        total = total + own + np.cross(place - center, 2.0 * (velocity - drift))
+    assert np.abs(moments * spin).max() > 0.1
+    assert np.abs(total).max() < 1e-13

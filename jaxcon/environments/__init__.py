@@ -26,6 +26,7 @@ from jaxcon.environments.exploration import feasible_action
 from jaxcon.environments.layers import Layered
 from jaxcon.environments.registry import TASKS, make
 from jaxcon.environments.tasks.cart_pole import CartPole
+from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.parking import Parking
 from jaxcon.environments.tasks.stewart import StewartBalancing
@@ -33,6 +34,7 @@ from jaxcon.environments.tasks.stewart import StewartBalancing
 __all__ = [
     "TASKS",
     "CartPole",
+    "CatRighting",
     "Channel",
     "Copies",
     "Environment",

@@ -8,12 +8,14 @@ from typing import Any
 
 from jaxcon.environments.environment import Environment
 from jaxcon.environments.tasks.cart_pole import CartPole, double_cart_pole
+from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.parking import Parking
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 TASKS: dict[str, Callable[..., Environment]] = {
     "CartPole": CartPole.build,
+    "CatRighting": CatRighting.build,
     "DoubleCartPole": double_cart_pole,
     "FourBarTracking": FourBarTracking.build,
     "Parking": Parking.build,
