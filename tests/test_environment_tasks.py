@@ -239,3 +239,58 @@ def test_a_cat_lands_on_its_feet_without_angular_momentum():
         total = total + own + np.cross(place - center, 2.0 * (velocity - drift))
     assert np.abs(moments * spin).max() > 0.1
     assert np.abs(total).max() < 1e-13
+
+
+def pump(seen):
+    """Up where the body passes below the point, down where it turns, until it swings high enough.
+
+    √(height) and speed are the cosine and the sine of the phase of a swing, whose double leads the
+    climbing by what the servo lags behind.
+    """
+    cosine, sine, rate, distance = seen[:4]
+    x = jnp.sign(sine) * jnp.sqrt(distance * (1 - cosine))
+    v = distance * rate / np.sqrt(2 * 9.81)
+    height, lead = x**2 + v**2, 0.6
+    phase = (np.cos(lead) * (v**2 - x**2) + np.sin(lead) * 2 * x * v) / (height + 1e-6)
+    return jnp.stack([jnp.clip(3 * phase, -1, 1) * jnp.clip(4 * (seen[-1] - height), -1, 1)])
+
+
+def period(lengths, masses, moments, last):
+    """Of the slowest small swing of a chain of links below a point, the last body fixed to a link.
+
+    M φ̈ + K φ = 0 of the links' angles, with the horizontal arms a of the bodies per angle:
+    M = Σ m a aᵀ + moments, K = g Σ m a on the diagonal.
+    """
+    n = len(lengths)
+    arms = np.array([[*lengths[:k], lengths[k] / 2, *np.zeros(n - k - 1)] for k in range(n)])
+    arms = np.vstack([arms, [*lengths[:-1], lengths[-1] + last]])
+    inertia = np.diag([*moments[: n - 1], moments[n - 1] + moments[n]])
+    stiff = 9.81 * np.diag(masses @ arms)
+    rates = np.linalg.eigvals(np.linalg.solve(arms.T @ (masses[:, None] * arms) + inertia, stiff))
+    return 2 * np.pi / np.sqrt(rates.real.min())
+
+
+def test_a_swing_on_a_rope_is_pumped_up_to_its_height():
+    environment = environments.make("RopeSwing")
+
+    def look(episode):
+        return environment.height(episode), environment.polar(episode)[0], episode.goal
+
+    found = compare(environment, pump, look, environment.horizon)
+    assert_sound(found, 1e-3)
+    height, _, goal = found["by hand"][3]
+    np.testing.assert_allclose(height[:, -25:], goal[:, -25:], atol=0.02)
+    assert height[:, 0].max() < 0.06
+    earned = returns(found)
+    assert earned["by hand"] > 160
+    assert max(earned["idle"], earned["random"]) < 35
+
+    masses, moments = np.array([0.3] * 4 + [30.0]), [0.3 * 0.5**2 / 12] * 4 + [0.4 * 30 * 0.15**2]
+    sag = 30 * 9.81 / 6e3
+    slow = period([0.5] * 4, masses, moments, 0.4 + sag)
+    for angle in found["idle"][3][1]:
+        at = np.flatnonzero(np.diff(np.sign(angle)))
+        times = 0.04 * (at + angle[at] / (angle[at] - angle[at + 1]))
+        size = np.abs(angle).max()
+        measured = 2 * np.diff(times).mean() / (1 + size**2 / 16)
+        np.testing.assert_allclose(measured, slow, rtol=5e-4)

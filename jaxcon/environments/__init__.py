@@ -29,6 +29,7 @@ from jaxcon.environments.tasks.cart_pole import CartPole
 from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.parking import Parking
+from jaxcon.environments.tasks.rope_swing import RopeSwing
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "Layered",
     "Outcome",
     "Parking",
+    "RopeSwing",
     "StewartBalancing",
     "advance",
     "begin",
