@@ -8,6 +8,7 @@ import numpy as np
 
 import jaxcon as jc
 from jaxcon import environments
+from jaxcon.environments.tasks.hopper import HIP, SHANK, SIDES, SOLE, THIGH, knee_of
 from jaxcon.environments.tasks.stewart import FEET, HEADS, HEIGHT
 
 
@@ -294,3 +295,78 @@ def test_a_swing_on_a_rope_is_pumped_up_to_its_height():
         size = np.abs(angle).max()
         measured = 2 * np.diff(times).mean() / (1 + size**2 / 16)
         np.testing.assert_allclose(measured, slow, rtol=5e-4)
+
+
+def hop(seen):
+    """A spring between trunk and foot, stiffer on the way up; the foot is set where it will stop.
+
+    Forces on the foot become torques by the transpose of its Jacobian.
+
+    References:
+        Raibert, Legged Robots That Balance (1986), section 2, for where the foot is set.
+    """
+    height, speed, rise = seen[:3]
+    foot, velocity, goal = seen[7:9], seen[9:11], seen[11]
+    ahead = jnp.clip(0.1 * speed + 0.1 * (speed - goal), -0.15, 0.15)
+    swing = 600 * (jnp.stack([ahead, jnp.full_like(ahead, -0.4)]) - foot) - 15 * velocity
+    up = jnp.clip(2e3 * (0.4 + foot[1]) + jnp.where(rise > 0, 20.0, 0.0), 0.0, 300.0)
+    push = jnp.clip(40 * (goal - speed), -0.6 * up, 0.6 * up)
+    stands = height + foot[1] - SOLE < 3e-3
+    force = jnp.where(stands, -jnp.stack([push, up]), swing)
+    slopes = [jax.jacfwd(lambda p, s=s: knee_of(s, p))(foot) for _, s in SIDES]
+    knees = [knee_of(s, foot) - jnp.asarray([s * HIP, 0.0]) for _, s in SIDES]
+    rows = [(k[0] * d[1] - k[1] * d[0]) / THIGH**2 for k, d in zip(knees, slopes, strict=True)]
+    return jnp.linalg.solve(jnp.stack(rows, axis=1), force) / 20
+
+
+ENDS = [
+    (part, side * x / 2) for part, x in (("thigh", THIGH), ("shank", SHANK)) for side in (-1, 1)
+]
+"""Of the bars of a leg from the hip down to the foot."""
+
+
+def test_a_five_bar_leg_hops_forward():
+    """In flight the momenta are those of a throw; on the ground pushes obey Coulomb's law."""
+    environment = environments.make("FiveBarHopper", method=jc.Method(solver=jc.Schur()))
+    masses = {"trunk": 4.0, "thigh": 0.3, "shank": 0.2, "carriage": 0.2}
+    weights = {name: masses[name.split("_")[-1]] for name in environment.system.layout.bodies}
+
+    def look(episode):
+        system, state = environment.system, episode.state
+        legs = [
+            [jc.position(system, state, f"{side}_{part}", (end, 0.0)) for part, end in ENDS]
+            for side, _ in SIDES
+        ]
+        moving = {name: m * jc.velocity(system, state, name) for name, m in weights.items()}
+        ahead = sum(x[0] for x in moving.values())
+        up = sum(x[1] for name, x in moving.items() if name != "carriage")
+        low = legs[0][3][1] - SOLE
+        return legs, ahead, up, low, jc.velocity(system, state, "trunk")[0], episode.goal
+
+    found = compare(environment, hop, look, environment.horizon)
+    assert_sound(found, 1e-3)
+    earned = returns(found)
+    assert earned["by hand"] > 190
+    assert earned["idle"] < 10
+    assert earned["random"] < 20
+    *_, low, speed, goal = found["by hand"][3]
+    assert found["by hand"][1].all()  # it never falls
+    np.testing.assert_allclose(speed[:, -100:].mean(axis=1), goal[:, -1], atol=0.15)
+    assert low[:, -100:].max() > 0.15
+    hops = np.sum((low[:, 1:] > 0.02) & (low[:, :-1] <= 0.02), axis=1)
+    assert hops.min() >= 5
+
+    for kind in ("by hand", "random"):
+        _, alive, _, (legs, ahead, up, low, *_) = found[kind]
+        alive = alive[:, 1:] & alive[:, :-1]
+        (_, knee, hinge, foot), (_, other, hung, met) = legs
+        for a, b in ((knee, hinge), (other, hung), (foot, met)):
+            assert np.abs(a - b)[:, 1:][alive].max() < 1e-3
+        assert low.min() > -1e-9
+        normal = (np.diff(up) + 9.81 * (sum(weights.values()) - 0.2) * 0.01)[alive]
+        along = np.abs(np.diff(ahead))[alive]
+        assert normal.min() > -1e-12
+        assert np.max(along - 0.8 * normal) < 1e-12
+        flies = np.minimum(low[:, 1:], low[:, :-1])[alive] > 0.05
+        assert flies.sum() > 20
+        assert max(normal[flies].max(), along[flies].max()) < 1e-12

@@ -28,6 +28,7 @@ from jaxcon.environments.registry import TASKS, make
 from jaxcon.environments.tasks.cart_pole import CartPole
 from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.four_bar import FourBarTracking
+from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
 from jaxcon.environments.tasks.rope_swing import RopeSwing
 from jaxcon.environments.tasks.stewart import StewartBalancing
@@ -40,6 +41,7 @@ __all__ = [
     "Copies",
     "Environment",
     "Episode",
+    "FiveBarHopper",
     "FourBarTracking",
     "Layered",
     "Outcome",

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.core import checks
 from jaxcon.core.numerics import safe_sqrt
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
@@ -92,10 +93,14 @@ class RopeSwing(Environment):
             horizon: actions until an episode is truncated, or None.
             method: of the simulation.
             dtype: of every number.
+
+        Raises:
+            ValueError: `links` is no whole number from 1.
         """
         scene = jc.Scene(dim=2, gravity=(0.0, -GRAVITY), dtype=dtype)
-        given = dt, stroke, length, hold
-        dt, stroke, length, hold = (jnp.asarray(x, scene.dtype) for x in given)
+        checks.count("RopeSwing", "links", links)
+        given = dt, length, mass, body, hold, stroke
+        dt, length, mass, body, hold, stroke = (jnp.asarray(x, scene.dtype) for x in given)
         above = jc.WORLD
         for i, name in enumerate(link_names(links)):
             inertia = mass * length**2 / 12
