@@ -67,8 +67,8 @@ class CatRighting(Environment):
     def build(
         cls,
         mass: Any = 2.0,
-        torque: Any = 12.0,
-        stiffness: Any = 2.0,
+        torque: Any = 8.0,
+        stiffness: Any = 6.0,
         height: Any = 1.6,
         *,
         dt: Any = 2e-3,
