@@ -8,6 +8,7 @@ import numpy as np
 
 import jaxcon as jc
 from jaxcon import environments
+from jaxcon.environments.tasks.hopper import HIP, SHANK, SIDES, SOLE, THIGH, knee_of
 from jaxcon.environments.tasks.stewart import FEET, HEADS, HEIGHT
 
 
@@ -126,3 +127,246 @@ def test_a_ball_is_kept_on_the_plate():
     earned = play(environment, tilt, 150)
     assert earned[:, -20:].min() > 0.95
     assert earned.mean() > 0.8
+
+
+KINDS = {"by hand": (1.0, 0.0), "idle": (0.0, 0.0), "random": (0.0, 1.0), "lost": (np.nan, 0.0)}
+"""How much of an action is a policy's, and how much is noise within −1 to 1."""
+
+
+def compare(environment, policy, look, actions, copies=2):
+    """What `look` sees and is earned by a policy, by nothing, by noise and by NaN, in one program.
+
+    Returns:
+        By kind, of each copy and action: reward, 0 once the task is over; whether it was not over;
+        outcome; and what `look` says of the episode.
+    """
+
+    def one(weights, key):
+        def act(now, key):
+            episode, alive = now
+            noise = jax.random.uniform(key, (len(environment.actions),), minval=-1.0, maxval=1.0)
+            action = weights[0] * policy(environment.observe(episode)) + weights[1] * noise
+            episode, outcome = environment.step(episode, action)
+            reward = jnp.where(alive, outcome.reward, 0)
+            return (episode, alive & ~outcome.terminated), (reward, alive, outcome, look(episode))
+
+        own, noise = jax.random.split(key)
+        start = environment.reset(own), jnp.asarray(True)
+        return jax.lax.scan(act, start, jax.random.split(noise, actions))[1]
+
+    keys = jnp.tile(jax.random.split(jax.random.key(0), copies), len(KINDS))
+    weights = jnp.repeat(jnp.asarray(list(KINDS.values())), copies, axis=0)
+    run = jax.jit(jax.vmap(one))
+    first, again = (jax.tree.map(np.asarray, run(weights, keys)) for _ in range(2))
+    jax.tree.map(np.testing.assert_array_equal, first, again)  # bit for bit
+    parts = [slice(i * copies, (i + 1) * copies) for i in range(len(KINDS))]
+    return {k: jax.tree.map(lambda x, p=p: x[p], first) for k, p in zip(KINDS, parts, strict=True)}
+
+
+def assert_sound(found, violation):
+    """Rewards within bounds, no divergence but by NaN, and constraints that are kept."""
+    for kind, (reward, _, outcome, _) in found.items():
+        lost = kind == "lost"
+        assert reward.min() >= 0
+        assert reward.max() <= (0 if lost else 1)
+        assert np.all(outcome.info["diverged"] == lost)
+        assert np.isfinite(outcome.observation).all()
+        assert lost or outcome.info["violation"].max() < violation
+
+
+def returns(found):
+    """The mean over copies of what an episode earned, by kind."""
+    return {kind: rewards.sum(axis=-1).mean() for kind, (rewards, *_) in found.items()}
+
+
+def smooth(x):
+    """From 0 to 1 in x from 0 to 1, level outside."""
+    x = jnp.clip(x, 0.0, 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def turn_over(seen):
+    """Bends, lets the bend run once round the spine, and stretches; numbers of the stock cat.
+
+    The bend β is that after which a body of two equal halves without twist has made half a turn,
+    A cos² β/2 + B sin² β/2 = 2 A cos β/2, with moments A along the spine and B across it.
+    """
+    along, across = 0.07**2 / 2, (3 * 0.07**2 + 0.25**2) / 12
+    ratio = across / along
+    β = 2 * np.arccos((np.sqrt(1 + ratio * (ratio - 1)) - 1) / (ratio - 1))
+    fall = np.sqrt(2 * (1.6 - 0.15) / 9.81)
+
+    def wanted(t):
+        size = β * smooth(t / 0.45) * smooth((0.97 - t) / 0.45)
+        phase = 2 * jnp.pi * smooth((t - 0.22) / 0.52)
+        return size * jnp.stack([jnp.cos(phase), jnp.sin(phase)])
+
+    t = (0.005 - seen[11] / 9.81) / fall
+    place, rate = jax.jvp(wanted, (t,), (jnp.ones_like(t),))
+    bend, bending = seen[3:5], seen[8:10]
+    return (60 * (place - bend) + 0.5 * (rate / fall - bending) + 6 * bend) / 8
+
+
+def test_a_cat_lands_on_its_feet_without_angular_momentum():
+    method = jc.Method(jc.RATTLE(), solver=jc.Schur())
+    environment = environments.make("CatRighting", method=method)
+
+    def look(episode):
+        system, state = environment.system, episode.state
+        halves = [
+            [f(system, state, name) for f in (jc.position, jc.velocity, jc.orientation)]
+            + [jc.angular_velocity(system, state, name)]
+            for name in ("front", "rear")
+        ]
+        return environment.upright(episode), halves
+
+    found = compare(environment, turn_over, look, 54)
+    assert_sound(found, 1e-14)
+    up = {kind: seen[0][:, -1] for kind, (*_, seen) in found.items()}
+    assert up["by hand"].min() > 0.95
+    assert up["idle"].max() < -0.9
+    earned = returns(found)
+    assert earned["by hand"] > 20
+    assert earned["idle"] < 1
+    assert earned["random"] < 8
+
+    moments = 2.0 * np.array([0.07**2 / 2, *2 * [(3 * 0.07**2 + 0.25**2) / 12]])
+    halves = [[np.reshape(x, (-1, x.shape[-1])) for x in half] for half in found["by hand"][3][1]]
+    center, drift = (np.mean([half[i] for half in halves], axis=0) for i in (0, 1))
+    total = 0
+    for place, velocity, turn, spin in halves:
+        rotation = np.stack([np.asarray(jc.quaternion.matrix(x)) for x in turn])
+        own = np.einsum("nij,nj->ni", rotation, moments * spin)
+        total = total + own + np.cross(place - center, 2.0 * (velocity - drift))
+    assert np.abs(moments * spin).max() > 0.1
+    assert np.abs(total).max() < 1e-13
+
+
+def pump(seen):
+    """Up where the body passes below the point, down where it turns, until it swings high enough.
+
+    √(height) and speed are the cosine and the sine of the phase of a swing, whose double leads the
+    climbing by what the servo lags behind.
+    """
+    cosine, sine, rate, distance = seen[:4]
+    x = jnp.sign(sine) * jnp.sqrt(distance * (1 - cosine))
+    v = distance * rate / np.sqrt(2 * 9.81)
+    height, lead = x**2 + v**2, 0.6
+    phase = (np.cos(lead) * (v**2 - x**2) + np.sin(lead) * 2 * x * v) / (height + 1e-6)
+    return jnp.stack([jnp.clip(3 * phase, -1, 1) * jnp.clip(4 * (seen[-1] - height), -1, 1)])
+
+
+def period(lengths, masses, moments, last):
+    """Of the slowest small swing of a chain of links below a point, the last body fixed to a link.
+
+    M φ̈ + K φ = 0 of the links' angles, with the horizontal arms a of the bodies per angle:
+    M = Σ m a aᵀ + moments, K = g Σ m a on the diagonal.
+    """
+    n = len(lengths)
+    arms = np.array([[*lengths[:k], lengths[k] / 2, *np.zeros(n - k - 1)] for k in range(n)])
+    arms = np.vstack([arms, [*lengths[:-1], lengths[-1] + last]])
+    inertia = np.diag([*moments[: n - 1], moments[n - 1] + moments[n]])
+    stiff = 9.81 * np.diag(masses @ arms)
+    rates = np.linalg.eigvals(np.linalg.solve(arms.T @ (masses[:, None] * arms) + inertia, stiff))
+    return 2 * np.pi / np.sqrt(rates.real.min())
+
+
+def test_a_swing_on_a_rope_is_pumped_up_to_its_height():
+    environment = environments.make("RopeSwing")
+
+    def look(episode):
+        return environment.height(episode), environment.polar(episode)[0], episode.goal
+
+    found = compare(environment, pump, look, environment.horizon)
+    assert_sound(found, 1e-3)
+    height, _, goal = found["by hand"][3]
+    np.testing.assert_allclose(height[:, -25:], goal[:, -25:], atol=0.02)
+    assert height[:, 0].max() < 0.06
+    earned = returns(found)
+    assert earned["by hand"] > 160
+    assert max(earned["idle"], earned["random"]) < 35
+
+    masses, moments = np.array([0.3] * 4 + [30.0]), [0.3 * 0.5**2 / 12] * 4 + [0.4 * 30 * 0.15**2]
+    sag = 30 * 9.81 / 6e3
+    slow = period([0.5] * 4, masses, moments, 0.4 + sag)
+    for angle in found["idle"][3][1]:
+        at = np.flatnonzero(np.diff(np.sign(angle)))
+        times = 0.04 * (at + angle[at] / (angle[at] - angle[at + 1]))
+        size = np.abs(angle).max()
+        measured = 2 * np.diff(times).mean() / (1 + size**2 / 16)
+        np.testing.assert_allclose(measured, slow, rtol=5e-4)
+
+
+def hop(seen):
+    """A spring between trunk and foot, stiffer on the way up; the foot is set where it will stop.
+
+    Forces on the foot become torques by the transpose of its Jacobian.
+
+    References:
+        Raibert, Legged Robots That Balance (1986), section 2, for where the foot is set.
+    """
+    height, speed, rise = seen[:3]
+    foot, velocity, goal = seen[7:9], seen[9:11], seen[11]
+    ahead = jnp.clip(0.1 * speed + 0.1 * (speed - goal), -0.15, 0.15)
+    swing = 600 * (jnp.stack([ahead, jnp.full_like(ahead, -0.4)]) - foot) - 15 * velocity
+    up = jnp.clip(2e3 * (0.4 + foot[1]) + jnp.where(rise > 0, 20.0, 0.0), 0.0, 300.0)
+    push = jnp.clip(40 * (goal - speed), -0.6 * up, 0.6 * up)
+    stands = height + foot[1] - SOLE < 3e-3
+    force = jnp.where(stands, -jnp.stack([push, up]), swing)
+    slopes = [jax.jacfwd(lambda p, s=s: knee_of(s, p))(foot) for _, s in SIDES]
+    knees = [knee_of(s, foot) - jnp.asarray([s * HIP, 0.0]) for _, s in SIDES]
+    rows = [(k[0] * d[1] - k[1] * d[0]) / THIGH**2 for k, d in zip(knees, slopes, strict=True)]
+    return jnp.linalg.solve(jnp.stack(rows, axis=1), force) / 20
+
+
+ENDS = [
+    (part, side * x / 2) for part, x in (("thigh", THIGH), ("shank", SHANK)) for side in (-1, 1)
+]
+"""Of the bars of a leg from the hip down to the foot."""
+
+
+def test_a_five_bar_leg_hops_forward():
+    """In flight the momenta are those of a throw; on the ground pushes obey Coulomb's law."""
+    environment = environments.make("FiveBarHopper", method=jc.Method(solver=jc.Schur()))
+    masses = {"trunk": 4.0, "thigh": 0.3, "shank": 0.2, "carriage": 0.2}
+    weights = {name: masses[name.split("_")[-1]] for name in environment.system.layout.bodies}
+
+    def look(episode):
+        system, state = environment.system, episode.state
+        legs = [
+            [jc.position(system, state, f"{side}_{part}", (end, 0.0)) for part, end in ENDS]
+            for side, _ in SIDES
+        ]
+        moving = {name: m * jc.velocity(system, state, name) for name, m in weights.items()}
+        ahead = sum(x[0] for x in moving.values())
+        up = sum(x[1] for name, x in moving.items() if name != "carriage")
+        low = legs[0][3][1] - SOLE
+        return legs, ahead, up, low, jc.velocity(system, state, "trunk")[0], episode.goal
+
+    found = compare(environment, hop, look, environment.horizon)
+    assert_sound(found, 1e-3)
+    earned = returns(found)
+    assert earned["by hand"] > 190
+    assert earned["idle"] < 10
+    assert earned["random"] < 20
+    *_, low, speed, goal = found["by hand"][3]
+    assert found["by hand"][1].all()  # it never falls
+    np.testing.assert_allclose(speed[:, -100:].mean(axis=1), goal[:, -1], atol=0.15)
+    assert low[:, -100:].max() > 0.15
+    hops = np.sum((low[:, 1:] > 0.02) & (low[:, :-1] <= 0.02), axis=1)
+    assert hops.min() >= 5
+
+    for kind in ("by hand", "random"):
+        _, alive, _, (legs, ahead, up, low, *_) = found[kind]
+        alive = alive[:, 1:] & alive[:, :-1]
+        (_, knee, hinge, foot), (_, other, hung, met) = legs
+        for a, b in ((knee, hinge), (other, hung), (foot, met)):
+            assert np.abs(a - b)[:, 1:][alive].max() < 1e-3
+        assert low.min() > -1e-9
+        normal = (np.diff(up) + 9.81 * (sum(weights.values()) - 0.2) * 0.01)[alive]
+        along = np.abs(np.diff(ahead))[alive]
+        assert normal.min() > -1e-12
+        assert np.max(along - 0.8 * normal) < 1e-12
+        flies = np.minimum(low[:, 1:], low[:, :-1])[alive] > 0.05
+        assert flies.sum() > 20
+        assert max(normal[flies].max(), along[flies].max()) < 1e-12

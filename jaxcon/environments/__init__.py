@@ -26,21 +26,27 @@ from jaxcon.environments.exploration import feasible_action
 from jaxcon.environments.layers import Layered
 from jaxcon.environments.registry import TASKS, make
 from jaxcon.environments.tasks.cart_pole import CartPole
+from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.four_bar import FourBarTracking
+from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
+from jaxcon.environments.tasks.rope_swing import RopeSwing
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 __all__ = [
     "TASKS",
     "CartPole",
+    "CatRighting",
     "Channel",
     "Copies",
     "Environment",
     "Episode",
+    "FiveBarHopper",
     "FourBarTracking",
     "Layered",
     "Outcome",
     "Parking",
+    "RopeSwing",
     "StewartBalancing",
     "advance",
     "begin",

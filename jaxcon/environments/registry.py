@@ -8,15 +8,21 @@ from typing import Any
 
 from jaxcon.environments.environment import Environment
 from jaxcon.environments.tasks.cart_pole import CartPole, double_cart_pole
+from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.four_bar import FourBarTracking
+from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
+from jaxcon.environments.tasks.rope_swing import RopeSwing
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 TASKS: dict[str, Callable[..., Environment]] = {
     "CartPole": CartPole.build,
+    "CatRighting": CatRighting.build,
     "DoubleCartPole": double_cart_pole,
+    "FiveBarHopper": FiveBarHopper.build,
     "FourBarTracking": FourBarTracking.build,
     "Parking": Parking.build,
+    "RopeSwing": RopeSwing.build,
     "StewartBalancing": StewartBalancing.build,
 }
 """What builds each; Gymnasium knows them as "jaxcon/CartPole-v0" and so on."""
