@@ -1,12 +1,14 @@
 """Bounded rows by both solvers: the laws hold at random, in degenerate cases, in float32."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.solvers import gauss_jordan
+from jaxcon.solvers import central_path, gauss_jordan, interior_point
 from jaxcon.solvers.bounded import Bounded, Kinds
 
 WORLDS = 2000
@@ -43,6 +45,22 @@ def test_interior_point_solves_random_rows(kinds, rank, dtype):
     problem = problems(kinds, rank, dtype)
     solve = jax.jit(lambda p: jc.InteriorPoint().solve(p, jnp.zeros_like(p.offset)))
     assert missed(problem, solve(problem)).max() < EXACT[np.dtype(dtype).name]
+
+
+@dtypes
+def test_contacts_take_as_many_iterations_as_stops(dtype):
+    """What ends early, the path of a cone, keeps nothing else from its end."""
+    problem = interior_point.normalized(problems(Kinds(1, 1, 2, 2), 12, dtype, 0.5))[2]
+
+    def once(_, point):
+        on = interior_point.unfinished(problem, point)[None]
+        return jax.tree.map(partial(jnp.where, on), interior_point.iterate(problem, point), point)
+
+    def left():
+        point = jax.lax.fori_loop(0, 20, once, central_path.center(problem))
+        return interior_point.unfinished(problem, point)
+
+    assert np.mean(jax.jit(left)()) < 0.01
 
 
 def test_sweeps_come_to_the_same():

@@ -312,6 +312,27 @@ def test_gradients_at_rest_are_finite(dtype):
         assert np.isfinite(slope(jnp.asarray([friction, 2.0, 0.0], dtype))).all()
 
 
+@dtypes
+def test_what_has_left_the_floor_does_not_stick_in_a_derivative(dtype):
+    """A rough ball in the air and one that leaves, both without slip: ∂v⁺/∂v is the identity."""
+    scene = jc.Scene(dim=3, dtype=dtype)
+    scene.add_body("ball", inertia=jc.inertia.sphere(1.0, 0.1), position=(0, 0, 0.1))
+    resists = {"friction": 0.5, "rolling": 0.01, "spinning": 0.01}
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, **resists))
+    system, state = scene.build()
+    h = jnp.asarray(H, dtype)
+
+    def speed(v, height):
+        start = dataclasses.replace(state, q=state.q.at[2].add(height), v=v)
+        return jc.step(system, jc.Method(), start, None, h)[0].v
+
+    heights, rises = jnp.asarray([1.0, 0.0, 0.0], dtype), jnp.asarray([0.0, 0.1, -0.1], dtype)
+    speeds = jnp.zeros((3, 6), dtype).at[:, 2].set(rises)
+    slopes = jax.jit(jax.vmap(jax.jacfwd(speed)))(speeds, heights)
+    np.testing.assert_allclose(slopes[:2], [np.eye(6)] * 2, atol=1e-6)
+    np.testing.assert_allclose(slopes[2], 0 * np.eye(6), atol=1e-3)
+
+
 @pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel()], ids=["point", "sweeps"])
 def test_there_is_no_friction_without_a_normal_force(solver):
     """A slider on a rail beside a floor: the rail bears it, and the floor does not rub."""
@@ -386,7 +407,8 @@ def test_capsules_touch_where_they_are_nearest(dim):
         (jc.PlaneContact("c", jc.WORLD, "ball", normal=(0, 0, 0)), "normal"),
         (jc.PlaneContact("c", jc.WORLD, "bal"), "body 'bal' is unknown"),
         (jc.CapsuleContact("c", "ball", "ball"), "to itself"),
-        (jc.Rope("r", jc.WORLD, "ball", length=-1.0), "length"),
+        (jc.CapsuleContact("c", jc.WORLD, "ball"), "give radius_a, radius_b or both"),
+        (jc.Rope("r", jc.WORLD, "ball", length=-1.0), "Rope 'r': length must be positive"),
     ],
 )
 def test_bad_numbers_are_refused(element, match):

@@ -179,6 +179,7 @@ def test_gradients_by_the_size_of_a_box():
         (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, restitution=1.5), "lie in 0 to 1"),
         (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, orientation=(1, 0)), "orientation must"),
         (jc.BoxContact("b", jc.WORLD, "dot", size=SIZE), "'dot' is a particle"),
+        (jc.PlaneContact("b", jc.WORLD, "crate", damping=1.0), "'b': damping is of a soft stop"),
         (jc.PlaneContact("b", jc.WORLD, "dot", center=np.zeros((2, 3))), "a particle is one"),
         (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((2, 2))), r"shape \(2, 3\)"),
         (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((0, 3))), r"shape \(1, 3\)"),
@@ -191,3 +192,27 @@ def test_bad_numbers_are_refused(element, match):
     scene.add(element)
     with pytest.raises(ValueError, match=match):
         scene.build()
+
+
+@pytest.mark.parametrize(
+    ("given", "match"),
+    [
+        ({"size": (1.0,)}, r"size must have shape \(2,\) or \(3,\)"),
+        ({"position": (0.1,)}, r"position must have shape \(3,\), got \(1,\)"),
+        ({"orientation": 0.3}, r"orientation must have shape \(4,\)"),
+        ({"orientation": (0.0, 0.0, 0.0, 0.0)}, "orientation must have a length"),
+        ({"size": SIZE[:2], "orientation": (1.0, 0.0, 0.0, 0.0)}, r"shape \(\), got \(4,\)"),
+        ({"size": SIZE[:2], "orientation": np.nan}, "orientation must be finite"),
+    ],
+)
+def test_bad_corners_are_refused(given, match):
+    with pytest.raises(ValueError, match=match):
+        jc.box_corners(**({"size": SIZE} | given))
+
+
+def test_corners_take_a_quaternion_of_any_length():
+    """As the frame of an element does: it would be a box of another size."""
+    once, twice = (jc.box_corners(SIZE, None, k * np.array(TILT)) for k in (1.0, 2.0))
+    np.testing.assert_allclose(twice, once, atol=1e-15)
+    lengths = np.linalg.norm(once - np.mean(once, axis=0)[None], axis=1)
+    np.testing.assert_allclose(lengths, np.linalg.norm(SIZE) / 2, rtol=1e-14)

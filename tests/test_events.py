@@ -319,3 +319,19 @@ def test_points_of_one_element_strike_as_one():
     assert info.impacts.names[int(info.impacts.elements[0])] == "floor"
     np.testing.assert_allclose(jc.velocity(system, new, "bar"), [0.0, 0.6], atol=1e-9)
     np.testing.assert_allclose(jc.position(system, new, "bar"), [0.0, 0.06], atol=1e-9)
+
+
+def test_what_nearest_rows_leave_out_of_an_impact_shows_in_the_residual():
+    """Two beads hit the floor at once and one row is solved: the other goes on closing."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    for i in range(2):
+        scene.add_particle(f"{i}", mass=1.0, position=(float(i), 0.01), velocity=(0.0, -1.0))
+        scene.add(jc.PlaneContact(f"floor {i}", jc.WORLD, f"{i}", restitution=0.5))
+    system, state = scene.build()
+    missed = []
+    for stops in (1, 2):
+        some = jc.Nearest(jc.GaussSeidel(sweeps=5, warm=False), stops=stops)
+        method = jc.Method(bounded=some, events=jc.Events())
+        info = jax.jit(lambda s, m=method: jc.step(system, m, s, None, 0.02))(state)[1]
+        missed.append(float(info.reactions.residual))
+    np.testing.assert_allclose(missed, [1.0, 0.0], atol=1e-9)

@@ -292,6 +292,7 @@ FLAT = np.zeros((4, 5))
         ({"heights": np.zeros(4)}, r"HeightFieldContact 'h': heights must have shape \(n_x, n_y\)"),
         ({"heights": np.zeros((3, 5))}, r"at least 4 along each axis, got \(3, 5\)"),
         ({"heights": FLAT + np.nan}, "heights must be finite"),
+        ({"heights": [[0.0] * 4, [0.0] * 3]}, "'h': heights must be numbers, as many in each row"),
         ({"size": (1.0, 0.0)}, "size must be positive"),
         ({"size": 1.0}, r"size must have shape \(2,\)"),
         ({"radius": -1.0}, "radius"),

@@ -232,6 +232,7 @@ def test_worlds_are_apart():
             jc.Limit("s", "rail", 0.0, 1.0, restitution=0.5, stiffness=10.0),
             "give one or the other",
         ),
+        (jc.Limit("s", "rail", 0.0, 1.0, damping=1.0), "damping is of a soft stop"),
         (jc.Limit("s", "rail", 0.0, 0.0), "lower must be below upper, got 0.0 and 0.0"),
         (jc.Limit("s", "door", 0.0, 1.0), "joint 'door' is unknown"),
         (jc.JointFriction("f", "rail", -1.0), "most"),
@@ -273,3 +274,25 @@ def test_a_step_of_no_length_has_a_derivative():
         return jnp.sum(jc.step(changed, jc.Method(), state, None, 0.0)[0].q)
 
     assert jax.jit(jax.grad(end))(0.1) == 0.0
+
+
+@solvers
+def test_a_stop_may_be_moved_out_of_reach(solver):
+    """To infinity, as its other side is: in one batch with one that is reached, and derivatives."""
+    system, state = slider(2, jc.Limit("end", "rail", upper=0.1), velocity=1.0)
+    method = jc.Method(bounded=solver)
+    state = jc.init(system, method, state.q, state.v)
+
+    def speed(upper, h):
+        changed = system.with_params({"end": {"upper": upper}})
+        new, info = jc.step(changed, method, state, None, h)
+        return new.v[0], (info.reactions["end"][0], new.status)
+
+    uppers = jnp.asarray([jnp.inf, 1e-3])
+    both = jax.value_and_grad(speed, (0, 1), has_aux=True)
+    found = jax.jit(jax.vmap(both, in_axes=(0, None)))(uppers, 2e-3)
+    (speeds, (forces, status)), slopes = found
+    np.testing.assert_array_equal(status, 0)
+    np.testing.assert_allclose(speeds, [1.0, 0.5], rtol=1e-9)
+    np.testing.assert_allclose(forces, [0.0, 500.0], rtol=1e-9)
+    np.testing.assert_allclose(slopes, [[0.0, 500.0], [0.0, -250.0]], rtol=1e-6)

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxcon.constraints.bounds import BoundSet
-from jaxcon.constraints.joints import Distance, unit_vector
+from jaxcon.constraints.joints import stretched, unit_vector
 from jaxcon.constraints.limits import one_sided, stop
 from jaxcon.constraints.point_sets import given_points, own_points, spread, spread_place
 from jaxcon.constraints.primitives import Row, distance
@@ -55,9 +55,7 @@ class Rope:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The two points in their frames, the length, and what happens at its end."""
-        ends = (self.length, self.point_a, self.point_b)
-        rod = Distance(self.name, self.body_a, self.body_b, *ends)
-        return rod.attach(a, b) | stop(self, a.position.dtype)
+        return stretched(self, a, b) | stop(self, a.position.dtype)
 
     @staticmethod
     def bounds(p: dict[str, Any], a: Any, b: Any, dt: Any) -> tuple[list[Row], dict[str, Any]]:
@@ -160,7 +158,13 @@ class CapsuleContact:
     optional = MATERIAL
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The capsules in the frames of their bodies, and the material."""
+        """The capsules in the frames of their bodies, and the material.
+
+        Raises:
+            ValueError: both are without a radius: segments never overlap.
+        """
+        if checks.plain_zero(self.radius_a) and checks.plain_zero(self.radius_b):
+            raise ValueError(f"{label(self)}: give radius_a, radius_b or both.")
         result: dict[str, Array] = {}
         for side, pose in (("a", a), ("b", b)):
             given = getattr(self, f"segment_{side}")

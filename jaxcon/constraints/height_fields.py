@@ -97,7 +97,11 @@ class HeightFieldContact:
 
     def _grid(self, axes: int, dtype: Any) -> Array:
         """The heights, checked."""
-        owner, shape = label(self), np.shape(self.heights)
+        owner = label(self)
+        try:
+            shape = np.shape(self.heights)
+        except ValueError as error:
+            raise ValueError(f"{owner}: heights must be numbers, as many in each row.") from error
         if len(shape) != axes or min(shape, default=0) < LEAST:
             wanted = "(n_x, n_y)" if axes == 2 else "(n_x,)"
             raise ValueError(

@@ -76,16 +76,7 @@ class Distance:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The two points in their frames, and the length."""
-        start = own_point(self, "point_a", self.point_a, a)
-        end = own_point(self, "point_b", self.point_b, b)
-        length = numerics.norm(end - start) if self.length is None else self.length
-        length = checks.number(label(self), "length", length, a.position.dtype)
-        checks.positive(label(self), "length", length)
-        return {
-            "anchor_a": a.local_point(start),
-            "anchor_b": b.local_point(end),
-            "length": length,
-        }
+        return stretched(self, a, b)
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
@@ -320,3 +311,17 @@ def relative_orientation(a: Pose, b: Pose) -> Array:
     if a.position.shape == (2,):
         return b.orientation - a.orientation
     return quaternion.multiply(quaternion.conjugate(a.orientation), b.orientation)
+
+
+def stretched(element: Any, a: Pose, b: Pose) -> dict[str, Array]:
+    """What a rod or a rope lies between: two points in their frames, and its length.
+
+    Raises:
+        ValueError: it has no length.
+    """
+    start = own_point(element, "point_a", element.point_a, a)
+    end = own_point(element, "point_b", element.point_b, b)
+    length = numerics.norm(end - start) if element.length is None else element.length
+    length = checks.number(label(element), "length", length, a.position.dtype)
+    checks.positive(label(element), "length", length)
+    return {"anchor_a": a.local_point(start), "anchor_b": b.local_point(end), "length": length}

@@ -36,7 +36,8 @@ class Limit:
     Attributes:
         name: unique in the scene.
         joint: name of the joint.
-        lower, upper: [rad] or [m], zero being the assembly; None where there is no stop.
+        lower, upper: [rad] or [m], zero being the assembly; None where there is no stop,
+            or later an infinite one.
         coordinate: which of the joint's; not needed where it has but one.
         restitution: e, 0 to 1.
         stiffness: k of a soft stop [N m/rad] or [N/m]; None for a hard one.
@@ -86,6 +87,9 @@ class Limit:
         near = row.value - p["lower"] < p["upper"] - row.value
         side = jnp.where(near, 1.0, -1.0).astype(row.value.dtype)
         gap = jnp.where(near, row.value - p["lower"], p["upper"] - row.value)
+        # a stop that is nowhere has a row of zeros, which solvers leave out
+        nowhere = jnp.isinf(gap)
+        side, gap = jnp.where(nowhere, 0, side), jnp.where(nowhere, 0, gap)
         pulls = tuple(pull * side for pull in row.pulls)
         own = row._replace(value=gap, rate=side * row.rate, pulls=pulls)
         return one_sided(p, own, dt)
@@ -255,6 +259,8 @@ def stop(element: Any, dtype: Any) -> dict[str, Array]:
                 " give one or the other."
             )
         numbers["restitution"] = element.restitution
+    if element.stiffness is None and not checks.plain_zero(element.damping):
+        raise ValueError(f"{owner}: damping is of a soft stop; give its stiffness, too.")
     if element.stiffness is not None:
         numbers |= {"stiffness": element.stiffness, "damping": element.damping}
     result = {what: checks.number(owner, what, x, dtype) for what, x in numbers.items()}

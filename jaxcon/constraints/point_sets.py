@@ -26,23 +26,27 @@ def box_corners(size: Any, position: Any = None, orientation: Any = None) -> Arr
     Args:
         size: its edges, (dim,) [m].
         position: of its middle, (dim,) [m]; the origin unless given.
-        orientation: an angle () [rad] in the plane, a unit quaternion (4,) in space; along the axes
+        orientation: an angle () [rad] in the plane, a quaternion (4,) in space; along the axes
             unless given.
 
     Returns:
         (2^dim, dim) [m], the last coordinate changing fastest.
 
     Raises:
-        ValueError: size is not (2,) or (3,), or an edge is not positive.
+        ValueError: a wrong shape, an edge that is not positive, or an orientation without length.
     """
     size = jnp.asarray(size)
     if size.ndim != 1 or size.shape[0] not in (2, 3):
         raise ValueError(f"box_corners: size must have shape (2,) or (3,), got {size.shape}.")
     checks.positive("box_corners", "size", size)
     size = size.astype(jnp.result_type(size, float))
-    middle = jnp.zeros_like(size) if position is None else jnp.asarray(position, size.dtype)
-    turn = None if orientation is None else jnp.asarray(orientation, size.dtype)
-    halves = jnp.asarray(_signs(len(size)), size.dtype) * size[None] / 2
+    owner, dim, dtype = "box_corners", len(size), size.dtype
+    middle, turn = jnp.zeros_like(size), None
+    if position is not None:
+        middle = checks.number(owner, "position", jnp.asarray(position, dtype), dtype, (dim,))
+    if orientation is not None:
+        turn = _orientation(owner, "orientation", jnp.asarray(orientation, dtype), dim, dtype)
+    halves = jnp.asarray(_signs(dim), dtype) * size[None] / 2
     return jax.vmap(Pose(middle, turn).point)(halves)
 
 
@@ -83,10 +87,7 @@ def own_frame(
     if place is not None:
         origin = pose.local_point(own_point(element, names[0], place, pose))
     if turn is not None:
-        turn = checks.number(owner, names[1], turn, dtype, () if dim == 2 else (4,))
-        if dim == 3:
-            checks.nonzero(owner, names[1], turn)
-            turn = turn / jnp.sqrt(jnp.sum(turn * turn))
+        turn = _orientation(owner, names[1], turn, dim, dtype)
         axes = jax.vmap(pose.local_direction)(Pose(origin, turn).rotation.T)
     return origin, dict(zip(AXES, axes, strict=False))
 
@@ -129,6 +130,16 @@ def spread_place(place: Place, count: int) -> Place:
     """The bodies of elements, once for each point."""
     indices = tuple(i for i in place.indices for _ in range(count))
     return Place(place.group, indices, tuple(n for n in place.fixed for _ in range(count)))
+
+
+def _orientation(owner: str, what: str, given: Any, dim: int, dtype: Any) -> Array:
+    """An angle () in the plane, a unit quaternion (4,) in space, checked."""
+    turn = checks.number(owner, what, given, dtype, () if dim == 2 else (4,))
+    if dim == 2:
+        checks.finite(owner, what, turn)
+        return turn
+    checks.nonzero(owner, what, turn)
+    return turn / jnp.sqrt(jnp.sum(turn * turn))
 
 
 def _signs(dim: int) -> np.ndarray:

@@ -101,9 +101,7 @@ class Dynamics:
         impulse = self._impulse(bounds, law, problem, length, acts)
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
-        if self._leaves_out(bounds):
-            missed = impulse.overlooked(known.multipliers, solution.acceleration)
-            known = dataclasses.replace(known, residual=jnp.maximum(known.residual, missed))
+        known = self._judged(impulse, known, solution.acceleration)
         own = bounds.jacobian.transpose(known.multipliers)
         return solution, dataclasses.replace(rows, reactions=known), own
 
@@ -127,7 +125,8 @@ class Dynamics:
         still = dataclasses.replace(problem, force=none[0], target=none[1])
         impulse = self._impulse(rows, law, still, jnp.ones_like(self.dt), acts)
         known = impulse.react(self.bounded, None)
-        return impulse.change(known.multipliers), known
+        jump = impulse.change(known.multipliers)
+        return jump, self._judged(impulse, known, jump)
 
     def factored(
         self, q: Array, v: Array, t: Any, age: Any = None
@@ -146,6 +145,13 @@ class Dynamics:
         wide = dataclasses.replace(self, solver=widened(self.solver))
         factor = partial(wide._factors, law)
         return Impulse.of(rows, factor, problem, dt, acts, sifts=self._leaves_out(rows))
+
+    def _judged(self, impulse: Impulse, known: Reactions, acceleration: Array) -> Reactions:
+        """The reactions with what is missed by rows that were left out."""
+        if not self._leaves_out(impulse.rows):
+            return known
+        missed = impulse.overlooked(known.multipliers, acceleration)
+        return dataclasses.replace(known, residual=jnp.maximum(known.residual, missed))
 
     def _leaves_out(self, rows: BoundRows) -> bool:
         """Whether only some of the rows are solved."""

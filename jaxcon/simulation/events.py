@@ -122,7 +122,7 @@ def list_impacts(told: Impact, layout: BoundLayout) -> Impacts:
     happened, times, rows = (x[:-1] for x in told)
     elements = jnp.asarray(layout.owners)[rows]
     return Impacts(
-        jnp.sum(happened.astype(jnp.int32), axis=0),
+        jnp.sum(happened, axis=0, dtype=jnp.int32),
         jnp.where(happened, times, jnp.inf),
         jnp.where(happened, elements, -1),
         layout.names,

@@ -39,7 +39,7 @@ class InteriorPoint:
     Each contact has two pairs on the path, λ_n u_n = τ, and in the second-order cone
     (λ_n, λ_t/μ) ∘ (ψ, μ u_t) = (τ, 0), in the limit of which friction opposes slip: Coulomb's law
     with Signorini's, not its convex relaxation. An iteration inverts one matrix of the size of the
-    bounded rows; 10 to 20 are usual, whatever masses are to each other.
+    bounded rows; 10 to 20 are usual, some fewer in float32, whatever masses are to each other.
 
     Attributes:
         iterations: how many at most; worlds that have converged wait for the others.
@@ -83,14 +83,19 @@ class InteriorPoint:
             return count + 1, jax.tree.map(lambda x, y: jnp.where(keep, x, y), new, point)
 
         _, point = jax.lax.while_loop(going, once, (jnp.zeros((), jnp.int32), center(scaled)))
-        return polished(problem, scaled.kinds.join(point.primal) * scale * size, self.polish)
+        known = scaled.kinds.join(point.primal) * scale * size
+        return problem.released(polished(problem, known, self.polish))
 
 
 def target(problem: Bounded, point: Point, share: Array) -> Target:
-    """A share of the mean product, and not less than what rounding lets be reached."""
+    """A share of the mean product, and not less than what rounding lets be reached.
+
+    Of a cone that counts which is beyond its end: others would wait for what goes no further.
+    """
     numbers, heads = products(problem.kinds, point)
-    aim = share[None] * jnp.mean(jnp.concatenate([*numbers, *heads]), axis=0)[None]
     plain, ends = least(problem, point)
+    beyond = [jnp.maximum(head - end, 0) for head, end in zip(heads, ends, strict=True)]
+    aim = share[None] * jnp.mean(jnp.concatenate([*numbers, *beyond]), axis=0)[None]
     return Target(jnp.maximum(aim, plain), tuple(jnp.maximum(aim, end) for end in ends))
 
 
