@@ -513,7 +513,7 @@ def ring(q, t, p):
 GENERALIZED = {
     "a joint": (
         lambda: generalized(jc.Fixed("j", "a", "b")),
-        ["Holonomic and VelocityLevel", "Fixed"],
+        ["Holonomic, VelocityLevel and Inequality", "Fixed"],
     ),
     "a constraint on bodies": (
         lambda: generalized(jc.Holonomic(ring, bodies=("a",), name="h")),
