@@ -113,8 +113,7 @@ class Custom:
 
     def rows(self, snapshot: Any) -> RowSet:
         """φ, φ̇, J and γ at one instant."""
-        given = (snapshot.system, self, snapshot.q, snapshot.v, snapshot.t)
-        value, rate, bias, jacobian = native.per_world(_numbers, snapshot.q.ndim - 1)(*given)
+        value, rate, bias, jacobian = self.linearized(snapshot)
         blocks = [
             (snapshot.system.columns(place), tuple(_lanes(row) for row in block))
             for place, block in zip(self.places, jacobian, strict=True)
@@ -122,6 +121,11 @@ class Custom:
         value, rate, bias = (tuple(_lanes(x)) for x in (value, rate, bias))
         holonomic = (isinstance(self.law, Holonomic),) * len(rate)
         return RowSet(value, rate, bias, tuple(blocks), holonomic)
+
+    def linearized(self, snapshot: Any) -> tuple[Array, Array, Array, tuple[Array, ...]]:
+        """φ, φ̇, γ (m,) and ∂φ̇/∂v by bodies (m, d), batches behind."""
+        given = (snapshot.system, self, snapshot.q, snapshot.v, snapshot.t)
+        return native.per_world(_numbers, snapshot.q.ndim - 1)(*given)
 
     def problem(self, snapshot: Any) -> tuple[Any, Any, Any, Any]:
         """q and v as lists, q̇ = N(q) v, and the function as call(q, v, t)."""

@@ -13,7 +13,6 @@ from jaxcon.constraints.custom import CustomOnBodies, CustomOnCoordinates
 from jaxcon.constraints.limits import one_sided, stop
 from jaxcon.constraints.point_sets import spread_place
 from jaxcon.constraints.primitives import Row
-from jaxcon.core import native
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, Lane, PyTree
@@ -84,7 +83,7 @@ class OneSided:
 
     def bounds(self: Any, snapshot: Any, control: Any, dt: Any) -> BoundSet:
         """The rows at one instant, and what a step of dt wants of them."""
-        value, rate, jacobian = _gaps(self, snapshot)
+        value, rate, _, jacobian = self.linearized(snapshot)
         count = len(value)
         pulls = tuple(Vector(*(block[:, i] for i in range(block.shape[1]))) for block in jacobian)
         row, asked = one_sided(self.numbers, Row(value, rate, 0.0, pulls), dt)
@@ -121,15 +120,3 @@ def numbers_of(element: Inequality, dtype: Any) -> dict[str, Lane]:
         ValueError: one is out of range.
     """
     return stack([stop(element, dtype)])
-
-
-def _gaps(group: Any, snapshot: Any) -> tuple[Array, Array, tuple[Array, ...]]:
-    """φ, φ̇ (m,) and ∂φ̇/∂v by bodies (m, d), batches behind."""
-    given = (snapshot.system, group, snapshot.q, snapshot.v, snapshot.t)
-    return native.per_world(_gaps_of_one, snapshot.q.ndim - 1)(*given)
-
-
-def _gaps_of_one(system: Any, group: Any, q: Array, v: Array, t: Any) -> Any:
-    q, v, kinematics, call = group.problem(system.snapshot(q, v, t))
-    rate, jacobian, _ = autodiff.rows(group.law.rate(call, kinematics), kinematics, q, v, t)
-    return group.law.value(call, q, t), rate, tuple(jacobian)
