@@ -18,6 +18,15 @@ def is_concrete(x: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
 
 
+def chosen_dtype(*trees: Any) -> Any:
+    """The dtype of the first floating array of JAX in them, else that in use.
+
+    NumPy's arrays are numbers like others, and choose none.
+    """
+    own = (x.dtype for x in jax.tree.leaves(trees) if isinstance(x, jax.Array))
+    return next((x for x in own if jnp.issubdtype(x, jnp.floating)), jnp.result_type(float))
+
+
 def plain_zero(x: Any) -> bool:
     """Whether a user gave the number 0 itself, which leaves no trace in the compiled step."""
     return isinstance(x, int | float) and x == 0

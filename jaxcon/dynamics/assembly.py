@@ -268,9 +268,7 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
         v = q.v if v is None else v
         time = q.time if time is None else time
         q, memory, turns = q.q, q.memory, q.turns
-    chosen = [x.dtype for x in (*jax.tree.leaves(system), q, v) if isinstance(x, jax.Array)]
-    floating = (x for x in chosen if jnp.issubdtype(x, jnp.floating))
-    dtype = next(floating, jnp.result_type(float))
+    dtype = checks.chosen_dtype(system, q, v)
     layout = getattr(system, "layout", None)
     n_q = jnp.shape(q) if layout is None else (layout.n_q,)
     if len(n_q) != 1:

@@ -6,11 +6,9 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-
 from jaxcon.constraints.custom import CustomOnCoordinates, Holonomic, VelocityLevel
 from jaxcon.constraints.inequality import Inequality, InequalityOnCoordinates, numbers_of
+from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.generalized import GeneralizedCoordinates
 
@@ -60,16 +58,10 @@ def GeneralizedSystem(  # noqa: N802
             )
         names.add(constraint.name)
         if isinstance(constraint, Inequality):
-            numbers = numbers_of(constraint, _dtype(params))
+            numbers = numbers_of(constraint, checks.chosen_dtype(params))
             bounds.append(InequalityOnCoordinates(None, constraint.bare, numbers=numbers))
         else:
             groups.append(CustomOnCoordinates(None, dataclasses.replace(constraint)))
     return GeneralizedCoordinates(
         tuple(groups), params, mass, force, potential, bounds=tuple(bounds)
     )
-
-
-def _dtype(params: PyTree) -> Any:
-    """That of the system's own arrays, else that in use."""
-    own = (x.dtype for x in jax.tree.leaves(params) if isinstance(x, jax.Array))
-    return next((x for x in own if jnp.issubdtype(x, jnp.floating)), jnp.result_type(float))

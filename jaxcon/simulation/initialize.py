@@ -36,10 +36,7 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
         ValueError: wrong shapes, mixed dtypes, or a user's function that returns the wrong shape.
     """
     check_method(method)
-    # only an array of JAX is a choice of dtype; numpy's are numbers like others
-    chosen = [x for x in (q, v, *jax.tree.leaves(system)) if isinstance(x, jax.Array)]
-    floating = (x.dtype for x in chosen if jnp.issubdtype(x.dtype, jnp.floating))
-    dtype = next(floating, jnp.result_type(float))
+    dtype = checks.chosen_dtype(q, v, system)
     n_q, n_v = system.sizes(np.shape(q)[-1] if np.ndim(q) else 0)
     q = checks.number("init", "q", q, dtype, (n_q,))
     v = checks.number("init", "v", v, dtype, (n_v,))
