@@ -88,15 +88,21 @@ def test_distances_are_those_to_the_nearest_point():
     np.testing.assert_allclose(normal.dot(normal), 1.0, rtol=1e-14)
 
 
-def test_beside_a_deep_pit_nothing_touches_too_early():
-    """High above ground on which Newton's method does not arrive, the gap stays open."""
-    rough = 2.0 * np.random.default_rng(3).normal(size=(8, 8))
+def test_on_rough_ground_the_search_ends_where_the_way_is_level():
+    """Never further off than straight below, and for nearly all points perpendicular."""
+    rough, count = 2.0 * np.random.default_rng(3).normal(size=(8, 8)), 1000
     rng = np.random.default_rng(4)
-    px, py = rng.uniform(-1, 1, 200), rng.uniform(-1, 1, 200)
-    ground = surface(rough, (2.0, 2.0), 200)
-    z = np.asarray(ground.at(Vector(jnp.asarray(px), jnp.asarray(py))).height) + 1.0
-    found, _ = jax.jit(lambda p: above(ground, p))(Vector(*map(jnp.asarray, (px, py, z))))
-    assert np.asarray(found).min() > 0
+    px, py = rng.uniform(-1, 1, (2, count))
+    ground = surface(rough, (2.0, 2.0), count)
+    below = np.asarray(ground.at(Vector(jnp.asarray(px), jnp.asarray(py))).height)
+    point = Vector(*map(jnp.asarray, (px, py, below + rng.uniform(0, 1, count))))
+    found, _ = jax.jit(lambda p: above(ground, p))(point)
+    assert np.all((found > 0) & (found <= point[2] - below + 1e-12))
+    place = jax.jit(ground.nearest)(point)
+    shape = ground.at(place)
+    off = np.asarray(shape.height - point[2])
+    slip = np.hypot(*(np.asarray(place[i] - point[i] + shape.slope[i] * off) for i in (0, 1)))
+    assert np.mean(slip > 1e-6) < 0.05
 
 
 @pytest.mark.parametrize("dim", [2, 3])

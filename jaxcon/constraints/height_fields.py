@@ -33,7 +33,7 @@ class HeightFieldContact:
     h is C¹ between the heights of a grid and goes through them (`geometry.heights`); beyond the
     grid it goes on straight. φ is the distance from the surface to the ball, at its nearest point,
     and φ̇ the velocity along its normal. A ball touches in one point: in a valley that is narrower
-    than the ball, in the nearest one that Newton's method finds from the place below its centre. A
+    than the ball, in the nearest one to which a descent leads from the place below its centre. A
     box or a capsule touches by the points that are given, `center=jc.box_corners(…)`; what of the
     ground lies between them is not felt. λ of one ball is (1 + tangents,), of k (k, 1 + tangents).
 
