@@ -114,9 +114,10 @@ class CartPole(Environment):
 
     def start(self, key: Array) -> tuple[jc.State, Any]:
         """Hanging, all but still."""
-        n, keys = len(self.lengths), jax.random.split(key)
-        x = spread(keys[0], 0.1, (1 + n,), self.dtype).at[1:].add(jnp.pi)
-        q, v = jax.jvp(self.place, (x,), (spread(keys[1], 0.05, (1 + n,), self.dtype),))
+        n = len(self.lengths)
+        x, rates = spread(key, 1.0, (2, 1 + n), self.dtype)
+        hanging = jnp.array([0.0, *n * [jnp.pi]], self.dtype)
+        q, v = jax.jvp(self.place, (hanging + 0.1 * x,), (0.05 * rates,))
         return jc.init(self.system, self.method, q, v), ()
 
     def place(self, x: Array) -> Array:
