@@ -10,7 +10,7 @@ below bind the same primitive again, for the tangent map and for its transpose, 
 An argument that is not mapped gets a trailing axis of size 1, and the function broadcasts it: a
 parameter shared by all worlds is read once. The transpose of that broadcast is a sum over worlds,
 which is right when `grad` is outside `vmap` and wrong when it is inside. So a transposed map, when
-it is batched, gets all its arguments in full and returns one cotangent a world.
+it is batched, returns one cotangent a world, whatever its arguments share.
 
 The reverse pass keeps the arguments of each call and nothing from inside it: a call is a
 checkpoint, and its derivative evaluates the function once more.
@@ -37,11 +37,10 @@ class Native:
 
     Attributes:
         function: (arrays) → list of arrays.
-        full: whether batched arguments must have the whole batch, not a trailing 1.
     """
 
-    def __init__(self, function: Callable[..., Any], full: bool = False) -> None:
-        self.function, self.full = function, full
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
         self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self, rank=0))
         self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
         self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
@@ -96,34 +95,40 @@ class Native:
 
             return jax.jvp(along, [primals[i] for i in places], tangents)[1]
 
-        return Native(tangent, self.full)
+        return Native(tangent)
 
     def _transposed(self, linear: tuple[bool, ...], avals: Any, rank: int) -> Native:
-        """(the other arguments, ȳ) → cotangents of the arguments in which it is linear."""
+        """(the other arguments, ȳ) → cotangents of the arguments in which it is linear.
+
+        Args:
+            linear: in which arguments.
+            avals: their shapes and dtypes without the batch axes that are added later.
+            rank: of the first ȳ without these.
+        """
         n = len(linear)
         places = [i for i in range(n) if linear[i]]
         others = [i for i in range(n) if not linear[i]]
 
         def transposed(*args: Array) -> list[Array]:
+            batch = batch_of(args, args[len(others)].ndim - rank)
             fixed = dict(zip(others, args[: len(others)], strict=True))
-            cotangents = list(args[len(others) :])
-            batch = cotangents[0].shape[rank:]
+            cotangents = spread(list(args[len(others) :]), batch)
 
             def along(*xs: Array) -> list[Array]:
                 replaced = fixed | dict(zip(places, xs, strict=True))
-                return self(*(replaced[i] for i in range(n)))
+                return spread(self(*(replaced[i] for i in range(n))), batch)
 
             inputs = [jnp.zeros((*shape, *batch), dtype) for shape, dtype in avals]
             return list(jax.vjp(along, *inputs)[1](cotangents))
 
-        return Native(transposed, True)
+        return Native(transposed)
 
 
 class Part(Native):
     """Some of the results of a native function; its trace is a part of the whole's."""
 
     def __init__(self, whole: Native, wanted: tuple[bool, ...]) -> None:
-        super().__init__(self._chosen, whole.full)
+        super().__init__(self._chosen)
         self.whole, self.wanted = whole, wanted
 
     def _chosen(self, *args: Array) -> list[Array]:
@@ -237,9 +242,7 @@ def _batched(args: Any, axes: Any, *, fun: Native, rank: int) -> Any:
 
     def last(x: Any, axis: int | None) -> Array:
         x = jnp.asarray(x)  # a constant of the trace may come as a Python number
-        if axis is not None:
-            return jnp.moveaxis(x, axis, -1)
-        return jnp.broadcast_to(x[..., None], (*x.shape, size)) if fun.full else x[..., None]
+        return x[..., None] if axis is None else jnp.moveaxis(x, axis, -1)
 
     results = native_p.bind(*map(last, args, axes), fun=fun, rank=rank + 1)
     results = [jnp.broadcast_to(y, (*y.shape[:-1], size)) for y in results]
