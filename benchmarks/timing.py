@@ -17,6 +17,8 @@ from typing import Any
 import jax
 import numpy as np
 
+import jaxcon as jc
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -96,12 +98,7 @@ def use_all_cores() -> None:
 
 def over_devices(worlds: Any, batch: int) -> Any:
     """A batch spread over all devices, where it can be divided among them."""
-    devices = jax.devices()
-    if batch % len(devices):
-        return worlds
-    mesh = jax.sharding.Mesh(np.asarray(devices), ("worlds",))
-    sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("worlds"))
-    return jax.device_put(worlds, sharding)
+    return worlds if batch % jax.device_count() else jc.shard(worlds)
 
 
 def machine() -> dict[str, Any]:

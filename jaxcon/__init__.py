@@ -20,7 +20,8 @@ Ends, friction and contact: Limit, RateLimit, RateMotor, JointFriction, Rope, Pl
     CapsuleContact, BoxContact, HeightFieldContact, box_corners; Inequality of one's own.
 Forces: Spring, JointSpring, JointDamper, Bending, Flexure, ExternalWrench, CustomForce, Force;
     Motor, PositionServo, VelocityServo, AffineActuator; TurnCounter.
-Simulation: init, step, rollout, forward_dynamics, assemble; State, StepInfo, Solution, Assembly.
+Simulation: init, step, rollout, forward_dynamics, assemble, and shard and over_devices; State,
+    StepInfo, Solution, Assembly.
 Methods: Method of an integrator (SemiImplicitEuler, Heun, RK4, RungeKutta, ExplicitEuler, RATTLE,
     GeneralizedAlpha), a stabiliser (Baumgarte, AdaptiveBaumgarte, SlidingWindowBaumgarte, PID,
     Projection, Tolerance, Penalty, AugmentedLagrangian, Hybrid, Unstabilized), a solver (RankSafe,
@@ -105,6 +106,7 @@ from jaxcon.constraints.rolling import RollingCylinder, RollingDisc, RollingSphe
 from jaxcon.constraints.shafts import ConstantVelocity, Universal
 from jaxcon.constraints.span import Span
 from jaxcon.constraints.twist import Twist
+from jaxcon.core.devices import over_devices, shard
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.dynamics.assembly import Assembly, assemble
 from jaxcon.dynamics.chains import Chain, hanging, rod, rope
@@ -329,6 +331,7 @@ __all__ = [
     "momentum",
     "multipliers",
     "orientation",
+    "over_devices",
     "position",
     "quaternion",
     "raise_for_status",
@@ -336,6 +339,7 @@ __all__ = [
     "rod",
     "rollout",
     "rope",
+    "shard",
     "step",
     "tune",
     "vakonomic",

@@ -1,6 +1,4 @@
 import re
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -178,26 +176,3 @@ def test_it_can_be_left_to_the_compiler(monkeypatch):
     monkeypatch.setenv("JAXCON_STAGES", "off")
     left = jax.jit(staged(chain_of_shared_values)).lower(X, Y).as_text()
     assert "inlineable" not in left
-
-
-SHARDED = """
-import jax
-jax.config.update("jax_num_cpu_devices", 2)
-import jax.numpy as jnp, numpy as np, jaxcon as jc
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxcon.scenes import four_bar
-system, state = four_bar()
-method = jc.Method(solver=jc.Sparse())
-worlds = jax.vmap(lambda x: jc.State(state.q, x * state.v, state.time, state.status, state.memory))
-batch = worlds(jnp.linspace(0.5, 1.0, 32))
-run = jax.jit(jax.vmap(lambda s: jc.rollout(system, method, s, None, 2e-3, 20)[0].q))
-mesh = Mesh(np.asarray(jax.devices()), ("worlds",))
-spread = jax.device_put(batch, NamedSharding(mesh, PartitionSpec("worlds")))
-found = run(spread)
-assert len(found.sharding.device_set) == 2
-np.testing.assert_allclose(found, run(batch), rtol=0, atol=1e-5)
-"""
-
-
-def test_a_batch_over_two_devices():
-    subprocess.run([sys.executable, "-c", SHARDED], check=True, timeout=300)

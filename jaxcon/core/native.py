@@ -45,7 +45,7 @@ class Native:
         self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
         self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
         self.part = functools.lru_cache(maxsize=None)(functools.partial(Part, self))
-        self.traced = functools.lru_cache(maxsize=64)(self._traced)
+        self.by_mesh = functools.lru_cache(maxsize=64)(self._by_mesh)
 
     def __call__(self, *args: Array) -> list[Array]:
         """The function itself."""
@@ -59,6 +59,16 @@ class Native:
         """Shape and dtype of the results; traced as `_in_stages` does it."""
         found = self.traced(*(((*x.shape, 1), x.dtype) for x in args)).out_avals
         return [ShapedArray(y.shape[:-1], y.dtype) for y in found]
+
+    def traced(self, *avals: Any) -> Any:
+        """The closed jaxpr for arguments of these shapes and dtypes, on the devices in use.
+
+        Operations keep the mesh under which they were traced, and are refused under another.
+        """
+        return self.by_mesh(jax.sharding.get_abstract_mesh(), *avals)
+
+    def _by_mesh(self, mesh: Any, *avals: Any) -> Any:
+        return self._traced(*avals)
 
     def _traced(self, *avals: Any) -> Any:
         """The closed jaxpr for arguments of these shapes and dtypes.

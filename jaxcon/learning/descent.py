@@ -13,7 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
 
+from jaxcon.core.devices import over_devices
 from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status, failed
@@ -89,6 +91,7 @@ class Descent:
         patience: steps without progress after which a start stops.
         tolerance: a fall of the loss that counts as progress.
         forward: whether gradients are taken in forward mode, number by number.
+        mesh: over whose devices the samples lie; None for one.
     """
 
     loss: Callable[..., Any]
@@ -98,6 +101,7 @@ class Descent:
     patience: int
     tolerance: float
     forward: bool = False
+    mesh: Mesh | None = None
 
     def start(self, y: tuple[Array, ...], key: Any) -> Search:
         """A search that begins at y."""
@@ -126,7 +130,9 @@ class Descent:
             return (value, aux), jnp.where(good, Status.OK, Status.NON_FINITE).astype(jnp.int32)
 
         keys = jax.random.split(key, self.samples)
-        (values, aux), status = jax.vmap(lambda k: contain(one, (y, k)))(keys)
+        every = jax.vmap(lambda y, k: contain(one, (y, k)), in_axes=(None, 0))
+        every = every if self.mesh is None else over_devices(every, self.mesh)
+        (values, aux), status = every(y, keys)
         lost = jnp.sum(failed(status), dtype=jnp.int32)
         count = jnp.maximum(self.samples - lost, 1).astype(values.dtype)
         mean = jnp.sum(jnp.where(failed(status), 0, values)) / count

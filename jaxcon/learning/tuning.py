@@ -13,8 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.sharding import Mesh
 
 from jaxcon.core import checks
+from jaxcon.core.devices import gathered, over_devices
 from jaxcon.core.typing import PyTree
 from jaxcon.learning import checkpoint as files
 from jaxcon.learning.descent import Descent, Search, Stop
@@ -48,6 +50,7 @@ def tune(
     checkpoint: str | Path | None = None,
     chunk: int = 10,
     forward: bool = False,
+    mesh: Mesh | None = None,
     progress: bool | None = None,
 ) -> Tuned:
     """argmin of a loss over a pytree, or of its expectation E[loss(params, key)].
@@ -89,6 +92,8 @@ def tune(
         chunk: steps between two looks at the search: one call of a compiled scan.
         forward: takes gradients in forward mode, number by number: for few numbers, long rollouts
             and loops without a reverse mode. A line search still takes its own in reverse.
+        mesh: over whose devices the samples lie in equal parts, or the starts where there are no
+            samples. A loss that takes `jc.over_devices` itself needs none.
         progress: whether a bar is shown; None is in terminals and notebooks.
 
     Returns:
@@ -103,6 +108,7 @@ def tune(
     steps, samples, restarts, chunk = counts
     patience = NEVER if patience is None else _counts(patience=patience)[0]
     _check(loss, optimizer, key, samples, restarts, tolerance)
+    _check_mesh(mesh, samples, restarts)
     file = None if checkpoint is None else files.path(checkpoint, "tune")
     chunk = min(chunk, steps)
     space = space_of(params, positive, bounds, "tune")
@@ -110,17 +116,13 @@ def tune(
     if default:
         optimizer = optax.adam(optax.cosine_decay_schedule(RATE, steps))
     own = optax.with_extra_args_support(optimizer)
-    descent = Descent(loss, space, own, samples, patience, float(tolerance), forward)
+    descent = Descent(loss, space, own, samples, patience, float(tolerance), forward, mesh)
     for_starts, for_samples = (None, None) if key is None else jax.random.split(key)
     starts = scattered(space, space.encode(params), restarts, spread, for_starts, "tune")
     search = jax.vmap(lambda y: descent.start(y, for_samples))(starts)
 
-    @jax.jit
-    def run(search: Search, limit: Any, key: Any) -> Any:
-        return jax.vmap(lambda s: descent.run(s, limit, key, chunk))(search)
-
     limit = jnp.asarray(steps, jnp.int32)
-    lowered = run.lower(search, limit, for_samples)
+    lowered = _scan(descent, chunk).lower(search, limit, for_samples)
     found = search, np.zeros((restarts, 0), search.mark.dtype)
     save = _ignore
     if file is not None:
@@ -135,6 +137,24 @@ def tune(
 
     found, broken = _loop(advance, found, steps, save, progress, bool(samples))
     return result(space, found[0], found[1], broken)
+
+
+def _scan(descent: Descent, chunk: int) -> Any:
+    """A chunk of steps of every start, jitted: (search, limit, key) → (search, losses)."""
+    mesh = descent.mesh
+
+    def each(shared: Any, search: Search) -> Any:
+        limit, key = shared
+        return jax.vmap(lambda s: descent.run(s, limit, key, chunk))(search)
+
+    @jax.jit
+    def run(search: Search, limit: Any, key: Any) -> Any:
+        if mesh is None:
+            return each((limit, key), search)
+        apart = each if descent.samples else over_devices(each, mesh)
+        return gathered(apart((limit, key), gathered(search, mesh)), mesh)
+
+    return run
 
 
 def _loop(
@@ -229,3 +249,16 @@ def _check(
         ) from error
     except ValueError:  # a function without a signature
         return
+
+
+def _check_mesh(mesh: Mesh | None, samples: int, restarts: int) -> None:
+    """Checks that the devices of a mesh get equal parts.
+
+    Raises:
+        ValueError: they do not.
+    """
+    what, count = ("samples", samples) if samples else ("restarts", restarts)
+    if mesh is not None and count % mesh.size:
+        raise ValueError(
+            f"tune: {what}={count} does not divide over the {mesh.size} devices of the mesh."
+        )

@@ -1,0 +1,129 @@
+"""A batch over several devices, and over two processes, gives the numbers of one."""
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "examples" / "many_devices.py"
+CHEAP = (
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    " --xla_cpu_use_fusion_emitters=false"
+)
+LIMIT = 400
+"""On a process [s], for a machine that does much else."""
+
+
+def started(*options):
+    """A process of its own with an environment of its own, as far as JAX goes."""
+    own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    own |= {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu", "XLA_FLAGS": CHEAP}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, *map(str, options)], env=own, cwd=ROOT, **pipes)
+
+
+def finished(*processes):
+    """What they print; fails with what they complained of."""
+    try:
+        outputs = [process.communicate(timeout=LIMIT) for process in processes]
+    except subprocess.TimeoutExpired:
+        for process in processes:
+            process.kill()
+        said = "\n".join(process.communicate()[1] for process in processes)
+        pytest.fail(f"not done after {LIMIT} s:\n{said}")
+    for process, (_, complaint) in zip(processes, outputs, strict=True):
+        assert process.returncode == 0, complaint
+    return [output for output, _ in outputs]
+
+
+def free_port():
+    """One that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return probe.getsockname()[1]
+
+
+def test_two_processes_get_the_numbers_of_one(tmp_path):
+    """Final states, loss, gradient, and each step of a search, of the example."""
+    files = tmp_path / "two.npz", tmp_path / "one.npz"
+    small = [EXAMPLE, "--worlds", 8, "--steps", 5, "--devices", 1, "--save"]
+    joined = ["--coordinator", f"localhost:{free_port()}", "--processes", 2, "--process"]
+    printed = finished(*(started(*small, files[0], *joined, i) for i in range(2)))
+    assert "2 devices, processes: 2" in printed[0]
+    assert "loss" not in printed[1]
+    finished(started(*small, files[1]))
+    two, one = (np.load(file) for file in files)
+    assert two.files == one.files
+    assert one["q"].shape == (8, 9)
+    assert np.max(np.std(one["q"], axis=0)) > 1e-3
+    assert np.min(np.abs([one["d_stiffness"], one["d_damping"]])) > 1e-6
+    assert one["history"][-1] < one["history"][0]
+    for name in one.files:
+        np.testing.assert_allclose(two[name], one[name], rtol=1e-11, atol=1e-13, err_msg=name)
+
+
+FOUR_DEVICES = """
+import jax
+jax.config.update("jax_num_cpu_devices", 4)
+import jax.numpy as jnp, numpy as np, jaxcon as jc
+from benchmarks import devices
+from benchmarks.throughput import worlds
+
+def same(x, y, tolerance=1e-12):
+    for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
+        np.testing.assert_allclose(a, b, rtol=tolerance, atol=tolerance)
+
+def met(compiled):
+    return devices.exchanges(compiled.as_text())
+
+one, all = (jax.make_mesh((n,), ("x",)) for n in (1, 4))  # Explicit, as JAX makes them
+run, state = devices.world("four-bar", 5, jnp.float64)
+gain, batch = jnp.asarray(50.0), worlds(state, 8)
+apart = jc.shard(batch)
+plain = jax.jit(jax.vmap(run, in_axes=(None, 0)))
+compiled = plain.lower(gain, apart).compile()
+assert met(compiled) == {}
+found = compiled(gain, apart)
+assert len(found.q.sharding.device_set) == 4
+same(found, plain(gain, batch))
+
+compiled = jax.jit(devices.mean(run)).lower(gain, apart).compile()
+assert met(compiled) == {"all-reduce": 1}
+found, expected = compiled(gain, apart), jax.jit(devices.mean(run, one))(gain, batch)
+assert abs(expected[1]) > 1e-6
+same(found, expected)
+total = jax.jit(lambda x: jnp.sort(x))  # in which devices must meet, and are seen to
+assert met(total.lower(apart.time).compile())
+
+def loss(p, key):
+    return jnp.sum((p - jax.random.normal(key, (2,))) ** 2)
+
+bowl, key = (lambda p: loss(p, jax.random.key(0))), jax.random.key(1)
+for f, own in ((loss, {"samples": 8}), (bowl, {"restarts": 4, "spread": 1.0})):
+    own |= {"steps": 12, "key": key}
+    a, b = (jc.tune(f, jnp.zeros(2), mesh=m, **own) for m in (None, all))
+    same((a.params, a.histories), (b.params, b.histories))
+
+def refused(words, function, *args, **own):
+    try:
+        function(*args, **own)
+    except ValueError as error:
+        assert words in str(error), error
+    else:
+        raise AssertionError(f"not refused: {words}")
+
+refused("10 worlds does not divide over 4 devices; take 12", jc.shard, jnp.ones(10))
+refused("over_devices: a batch of 6", jc.over_devices(lambda p, x: x, all), 0.0, jnp.ones(6))
+refused("['t'] of the batch has no first axis", jc.shard, {"t": 1.0, "x": jnp.ones(4)})
+refused("must have as many worlds, got", jc.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})
+refused("samples=7 does not", jc.tune, loss, 0.0, samples=7, key=key, mesh=all)
+"""
+
+
+def test_four_devices_work_apart_and_sum_gradients_once():
+    finished(started("-c", FOUR_DEVICES))
