@@ -1,6 +1,6 @@
 """Whether the examples of learning reach their stated returns, over five seeds.
 
-    python -m benchmarks.training [--tasks CartPole …] [--seeds 5] [--seconds 900]
+    python -m benchmarks.training [--tasks CartPole …] [--seeds 0 1 2 3 4] [--seconds 900]
         [--json training.json] [--picture training.png]
 
 Each task is trained by `examples/learn_ppo.py` or `examples/learn_apg.py` as they stand, one seed
@@ -59,10 +59,10 @@ def span(numbers: list[float]) -> str:
     return f"{min(numbers):.3g} to {max(numbers):.3g}"
 
 
-def measure(algorithm: Algorithm, task: str, seeds: int, seconds: float) -> Row:
+def measure(algorithm: Algorithm, task: str, seeds: list[int], seconds: float) -> Row:
     """Trains every seed, for so many seconds at most."""
     setting, environment, curves = algorithm.settings[task], environments.make(task), []
-    for seed in range(seeds):
+    for seed in seeds:
         curve: list[Look] = []
         for _, look in learning(algorithm, environment, setting, seed):
             curve.append(look)
@@ -104,7 +104,7 @@ def main() -> None:
     known = [(a, task) for a in ALGORITHMS for task in a.settings]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", nargs="*", default=[task for _, task in known])
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2, 3, 4])
     parser.add_argument("--seconds", type=float, default=900.0, help="of each seed, at most")
     parser.add_argument("--json", default="training.json")
     parser.add_argument("--picture", default="training.png")

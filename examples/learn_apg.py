@@ -37,7 +37,7 @@ class Setting(NamedTuple):
     rate: float = 2e-3
 
 
-SETTINGS = {"FourBarTracking": Setting(490.0, 150)}
+SETTINGS = {"FourBarTracking": Setting(475.0, 150)}
 
 
 class Learner(NamedTuple):
