@@ -41,12 +41,12 @@ class BraxEnv(Env):
 
     def reset(self, rng: Array) -> State:
         """The start of an episode, all of whose randomness comes from the key."""
-        episode = self.sys.reset(rng)
+        episode: Any = self.sys.reset(rng)
         zero = jnp.zeros((), self.sys.dtype)
         metrics = {"violation": zero, "diverged": zero}
         return State(episode, self.sys.observe(episode), zero, zero, metrics)
 
-    def step(self, state: State, action: Array) -> State:
+    def step(self, state: Any, action: Array) -> State:
         """One action, clipped to −1 to 1."""
         before: Episode = state.pipeline_state
         episode, outcome = self.sys.step(before, action)
