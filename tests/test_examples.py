@@ -12,6 +12,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
+QUICK = {name: ["--updates", "1"] for name in ("learn_apg", "learn_ppo")}
+"""Arguments of examples that take minutes without them."""
+
+
 def blocks(file: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", (ROOT / file).read_text(), re.DOTALL)
 
@@ -69,7 +73,7 @@ def test_joint_of_contributing_lets_a_pin_slide_and_turn_in_a_slot():
 def test_example_runs(example, tmp_path):
     environment = os.environ | {"MPLBACKEND": "Agg"}
     done = subprocess.run(
-        [sys.executable, str(example)],
+        [sys.executable, str(example), *QUICK.get(example.stem, [])],
         cwd=tmp_path,
         env=environment,
         capture_output=True,

@@ -25,6 +25,7 @@ from jaxcon.environments.environment import Channel, Environment, Episode, Outco
 from jaxcon.environments.exploration import feasible_action
 from jaxcon.environments.layers import Layered
 from jaxcon.environments.registry import TASKS, make
+from jaxcon.environments.returns import returns
 from jaxcon.environments.tasks.cart_pole import CartPole
 from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.four_bar import FourBarTracking
@@ -57,23 +58,25 @@ __all__ = [
     "make",
     "near",
     "restart",
+    "returns",
     "vary",
     "warm_up",
     "with_stiffness",
 ]
 
-OF_GYMNASIUM = {
+OF_OTHERS = {
+    "BraxEnv": "brax",
     "FunctionalEnv": "functional",
     "GymnasiumEnv": "gym",
     "GymnasiumVectorEnv": "vector",
 }
-"""Classes that derive from Gymnasium's, and so need it, by module."""
+"""Classes that derive from those of Gymnasium or Brax, and so need it, by module."""
 
 
 def __getattr__(name: str) -> Any:
-    """A class that needs Gymnasium, imported when it is first asked for."""
-    if name in OF_GYMNASIUM:
-        return getattr(import_module(f"jaxcon.environments.{OF_GYMNASIUM[name]}"), name)
+    """A class that needs Gymnasium or Brax, imported when it is first asked for."""
+    if name in OF_OTHERS:
+        return getattr(import_module(f"jaxcon.environments.{OF_OTHERS[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
