@@ -22,10 +22,9 @@ MOST = 1 << 20
 """Steps of the finest run."""
 GOAL = 1e-13
 """Difference of two runs at which no finer one is asked for, of the size of the motion."""
-WHOLE = 1e-2
-"""Error at the end, of the size of the motion, up to which the whole horizon is compared."""
-GOOD = 1e-6
-"""The same up to which a part is, where the end is worse."""
+GOOD = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
+"""Errors, of the size of the motion, up to which a part is compared: the least with which at least
+half of the horizon is, or the largest."""
 ON = 1e-10
 """φ and φ̇ up to which a start is on its constraints, of 1 + max |q| and 1 + max |v|."""
 
@@ -202,7 +201,7 @@ def make(course: Course, observe: Observer, moved: float, seconds: float) -> Ref
             best = (trip, apart, count) if better else best
             size = ruler.size(trip.points.q)
             small = apart[-1] <= GOAL * size
-            if small or (not better and apart[-1] < WHOLE * size):
+            if small or (not better and apart[-1] < GOOD[-1] * size):
                 break
         count, before = 2 * count, trip
         if count * problem.parts > MOST or spent + 2 * trip.seconds > seconds:
@@ -222,7 +221,8 @@ def _trusted(
     size = ruler.size(points.q)
     error = apart + 64 * np.finfo(float).eps * size
     ends = problem.horizon / problem.parts * np.arange(1, problem.parts + 1)
-    good = len(ends) if error[-1] <= WHOLE * size else int(np.sum(error <= GOOD * size))
+    counts = [int(np.sum(error <= share * size)) for share in GOOD]
+    good = next((n for n in counts if 2 * n >= len(ends)), counts[-1])
     if not good:
         raise SimulationError(
             f"tradeoff: the reference is off by {error[0]:.1e} of a motion of {size:.2g} after"

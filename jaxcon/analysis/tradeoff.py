@@ -174,8 +174,8 @@ def _words(sweep: Sweep) -> tuple[str, ...]:
     ]
     if reference.until < problem.horizon * (1 - 1e-9):
         lines.append(
-            f"it is good up to {reference.until:.3g} s, after which the motion is too sensitive to"
-            " be told; errors are counted up to there"
+            f"that is up to {reference.until:.3g} s, as far as errors are counted; at the end it"
+            f" may be off by {reference.error[-1]:.1e}, so sensitive is the motion"
         )
     if reference.moved:
         lines.append(f"the start was off its constraints; it moved by {reference.moved:.2g} kg^½ m")
