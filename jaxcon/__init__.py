@@ -32,7 +32,7 @@ Read out: position, velocity, orientation, angular_velocity, coordinate, coordin
     Energy, momentum, angular_momentum, center_of_mass, multipliers, wrench, violation.
 Gradients: EveryStep, Checkpoints, Reversible, Truncated, Discounted; check_gradients,
     GradientCheck, gradient_growth, GradientGrowth, gradient_memory, GradientMemory.
-Search: tune, Tuned, identify, Identified, losses.
+Search: tune, Tuned, identify, Identified, losses; tradeoff, Tradeoff.
 Trouble: report, Report, Finding, diagnose, Diagnosis, find_first_failure, Failure, Status,
     raise_for_status, SimulationError; integrability, Integrability; memory, Memory.
 """
@@ -63,6 +63,7 @@ from jaxcon.analysis.quantities import (
     wrench,
 )
 from jaxcon.analysis.report import Report, report
+from jaxcon.analysis.tradeoff import Tradeoff, tradeoff
 from jaxcon.constraints.armature import Armature
 from jaxcon.constraints.blades import KnifeEdge
 from jaxcon.constraints.boxes import BoxContact
@@ -295,6 +296,7 @@ __all__ = [
     "Status",
     "StepInfo",
     "Tolerance",
+    "Tradeoff",
     "Truncated",
     "Tuned",
     "TurnCounter",
@@ -341,6 +343,7 @@ __all__ = [
     "rope",
     "shard",
     "step",
+    "tradeoff",
     "tune",
     "vakonomic",
     "velocity",

@@ -1,4 +1,4 @@
-"""The command line: `python -m jaxcon` and `python -m jaxcon verify`."""
+"""The command line: `python -m jaxcon`, `python -m jaxcon verify` and `… tradeoff SCENE`."""
 
 from __future__ import annotations
 
@@ -7,9 +7,14 @@ import dataclasses
 import json
 import math
 import os
+import runpy
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+SCENES = ("four_bar", "bicycle")
+"""Of `jaxcon.scenes`, by name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -24,9 +29,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verify = commands.add_parser("verify", help="compare with reference cases")
     verify.add_argument("cases", nargs="*", help="names of cases; all unless given")
     verify.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
+    _add_tradeoff(commands)
     options = parser.parse_args(arguments)
     if options.command == "verify":
         return run_verify(options.cases, options.json)
+    if options.command == "tradeoff":
+        return run_tradeoff(options)
     return run_demo(options.copies, options.seconds, options.picture)
 
 
@@ -37,6 +45,85 @@ def run_demo(copies: int, seconds: float, picture: str) -> int:
 
     demo.main(copies, seconds, picture)
     return 0
+
+
+def _add_tradeoff(commands: Any) -> None:
+    """The options of `tradeoff`."""
+    command = commands.add_parser("tradeoff", help="which method to take on a scene")
+    command.add_argument(
+        "scene",
+        help="a name from jaxcon.scenes, a model of MuJoCo (.xml, .urdf), or file.py:function,"
+        " which returns (system, state)",
+    )
+    command.add_argument("--seconds", type=float, default=1.0, help="simulated seconds")
+    command.add_argument("--error", type=float, help="recommend for at most this error [m]")
+    command.add_argument("--cost", type=float, help="recommend for at most this cost [s/s]")
+    command.add_argument("--budget", type=float, default=300.0, help="seconds that it may take")
+    command.add_argument("--batch", type=int, default=256, help="worlds that share the device")
+    command.add_argument("--file", metavar="FILE", help="goes on from there if interrupted")
+    command.add_argument("--picture", help="where to write the work-precision diagram")
+    command.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
+    command.add_argument("--all", action="store_true", help="print every run")
+
+
+def run_tradeoff(options: argparse.Namespace) -> int:
+    """Compares methods on a scene; 1 where none is as accurate or as cheap as asked."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    from jaxcon.analysis.front import HEAD
+    from jaxcon.analysis.tradeoff import tradeoff
+
+    try:
+        system, state = find_scene(options.scene)
+    except ValueError as error:
+        print(error)
+        return 2
+    known = {"budget": options.budget, "batch": options.batch, "file": options.file}
+    result = tradeoff(system, state, options.seconds, **known)
+    print(result)
+    if options.all:
+        print(result.table)
+    if options.json:
+        result.to_json(options.json)
+    if options.picture:
+        os.environ.setdefault("MPLBACKEND", "Agg")
+        result.plot(options.picture)
+    for what in ("error", "cost"):
+        most = getattr(options, what)
+        if most is not None:
+            try:
+                chosen = result.recommend(**{what: most})
+                print(f"\nat most {most:g} in {what}:\n{HEAD}\n{chosen}")
+            except ValueError as error:
+                print(error)
+                return 1
+    return 0
+
+
+def find_scene(name: str) -> Any:
+    """The system and state of a name, of a model, or of a function in a file.
+
+    Raises:
+        ValueError: there is none.
+    """
+    from jaxcon import scenes
+    from jaxcon.io.mjcf import from_mjcf
+
+    file, _, function = name.rpartition(":")
+    if file.endswith(".py"):
+        made = runpy.run_path(file).get(function)
+        if made is None:
+            raise ValueError(f"{file} has no function {function}.")
+        return made()
+    if Path(name).suffix in (".xml", ".urdf", ".mjcf"):
+        return from_mjcf(name)
+    if name not in SCENES:
+        raise ValueError(
+            f"scene '{name}' is unknown; known are {list(SCENES)}, files of models (.xml, .urdf),"
+            " and file.py:function."
+        )
+    return getattr(scenes, name)()
 
 
 def run_verify(names: Sequence[str], file: Path | None) -> int:

@@ -8,25 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core.pictures import MISSING, pyplot
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
-
-
-def pyplot() -> Any:
-    """matplotlib's pyplot.
-
-    Raises:
-        ImportError: it is not installed; names the extra that brings it.
-    """
-    try:
-        import matplotlib.pyplot as plt
-    except ImportError as error:
-        raise ImportError(MISSING) from error
-    return plt
-
-
-MISSING = "Pictures need matplotlib: pip install 'jaxcon[plot]'."
 
 
 def canvas(width: float, height: float, dpi: float) -> Any:

@@ -9,7 +9,7 @@ import optax
 import pytest
 
 import jaxcon as jc
-from jaxcon.learning import checkpoint as files
+from jaxcon.core import checkpoint as files
 from jaxcon.learning.leaves import space_of
 
 BOWL = {"a": jnp.array([1.0, 3.0]), "b": {"c": 0.0, "n": jnp.asarray(3)}}

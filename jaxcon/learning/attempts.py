@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxcon.core import checkpoint as files
+from jaxcon.core.ends import ENDS, bar, words
 from jaxcon.core.typing import PyTree
-from jaxcon.learning import checkpoint as files
-from jaxcon.learning.ends import ENDS, bar, words
 from jaxcon.learning.information import noise_left
 from jaxcon.learning.least_squares import Fit, Progress, least_squares, side_by_side
 from jaxcon.learning.stretches import Stretches

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core import checkpoint as files
 from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.learning import checkpoint as files
 from jaxcon.learning.attempts import Attempt, remaining, remembered, searched
 from jaxcon.learning.information import deviations, told
 from jaxcon.learning.least_squares import Fit

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcon.learning.ends import ENDS, words
+from jaxcon.core.ends import ENDS, words
 
 CONVERGED = "converged"
 EVERY_STEP = "every step was taken before it converged"

@@ -15,12 +15,12 @@ import numpy as np
 import optax
 from jax.sharding import Mesh
 
+from jaxcon.core import checkpoint as files
 from jaxcon.core import checks
 from jaxcon.core.devices import gathered, over_devices
+from jaxcon.core.ends import ENDS, bar, words
 from jaxcon.core.typing import PyTree
-from jaxcon.learning import checkpoint as files
 from jaxcon.learning.descent import Descent, Search, Stop
-from jaxcon.learning.ends import ENDS, bar, words
 from jaxcon.learning.leaves import Space, space_of
 from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.tuned import Tuned, result

@@ -10,27 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.analysis.reference import butcher
 from jaxcon.verification.case import Check
 
 CONSTANT = jc.Baumgarte.critical(rate=5.0)
 DURATION = 1.0
-
-
-def butcher() -> jc.RungeKutta:
-    """A method of order six with seven stages, for reference solutions.
-
-    References:
-        Butcher, On Runge-Kutta processes of high order, J. Australian Math. Soc. 4 (1964).
-    """
-    a = (
-        (1 / 3,),
-        (0.0, 2 / 3),
-        (1 / 12, 1 / 3, -1 / 12),
-        (-1 / 16, 9 / 8, -3 / 16, -3 / 8),
-        (0.0, 9 / 8, -3 / 8, -3 / 4, 1 / 2),
-        (9 / 44, -9 / 11, 63 / 44, 18 / 11, 0.0, -16 / 11),
-    )
-    return jc.RungeKutta(a, (11 / 120, 0.0, 27 / 40, 27 / 40, -4 / 15, -4 / 15, 11 / 120))
 
 
 METHODS: dict[str, tuple[Callable[[], Any], int, tuple[int, ...]]] = {

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.analysis.reference import butcher
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error
-from jaxcon.verification.convergence import butcher
 from jaxcon.verification.references import column
 from jaxcon.verification.sampling import multipliers, sample, solve
 

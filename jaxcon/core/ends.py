@@ -17,6 +17,6 @@ def words(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-def bar(show: bool | None, **options: Any) -> Any:
+def bar(show: bool | None, unit: str = "step", **options: Any) -> Any:
     """A bar of tqdm: in terminals and notebooks where it is None, always, or never."""
-    return tqdm(unit="step", disable=None if show is None else not show, **options)
+    return tqdm(unit=unit, disable=None if show is None else not show, **options)

@@ -1,0 +1,47 @@
+"""The work–precision diagram."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jaxcon.core.pictures import pyplot
+
+TOP = 0.98
+"""Where runs that diverged are shown, of the height of the diagram."""
+
+
+def draw(result: Any, onto: Any = None) -> Any:
+    """Error by cost of a `Tradeoff`, a line for each method and precision.
+
+    Args:
+        result: the `Tradeoff`.
+        onto: matplotlib axes, or the path of a picture; new axes unless given.
+
+    Returns:
+        The axes.
+    """
+    path = onto if isinstance(onto, str | Path) else None
+    axes: Any = pyplot().subplots(figsize=(9, 6))[1] if onto is None or path else onto
+    names = list(dict.fromkeys(run.name for run in result.runs))
+    for (name, dtype), runs in result.grouped.items():
+        timed = [run for run in runs if run.ok and run.cost > 0]
+        style = {"color": f"C{names.index(name) % 10}", "ls": "-" if dtype == "float64" else "--"}
+        x, y = [run.cost for run in timed], [run.error for run in timed]
+        axes.plot(x, y, **style, marker="o", ms=4, label=f"{name}, {dtype}")
+        if timed:  # what diverged, at the cost of as many steps that did not
+            step = timed[0].cost * timed[0].dt
+            x = [step / run.dt for run in runs if not run.ok]
+            where = axes.get_xaxis_transform()
+            axes.plot(x, [TOP] * len(x), transform=where, marker="x", **style | {"ls": ""})
+    x, y = [run.cost for run in result.front], [run.error for run in result.front]
+    axes.plot(x, y, color="0.8", lw=8, zorder=0, label="front")
+    axes.axhline(result.floor, color="0.5", ls=":", label="error of the reference")
+    axes.plot([], [], color="k", marker="x", ls="", label="diverged")
+    axes.set(xscale="log", yscale="log", xlabel="time for a simulated second of a world [s]")
+    axes.set(ylabel="error [m]", title=f"{result.horizon:g} s, {result.batch} worlds")
+    axes.legend(fontsize=7)
+    if path:
+        axes.figure.savefig(path, dpi=120, bbox_inches="tight")
+        pyplot().close(axes.figure)
+    return axes

@@ -1,0 +1,160 @@
+"""What a comparison of methods has found so far: on disk, so that it can go on; and its time."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import re
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxcon.analysis.front import LeftOut, Limit, Run
+from jaxcon.analysis.reference import Reference
+from jaxcon.analysis.sweep import Unit
+from jaxcon.analysis.trials import Course, Points, Seen
+from jaxcon.core import checkpoint as files
+from jaxcon.simulation.method import Method
+
+OWNER = "tradeoff"
+SLOWER = 1.3
+"""How much longer a piece of work may take than the longest one before it."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """A method in a precision, at steps that were asked for."""
+
+    name: str
+    method: Method
+    dtype: str
+    dts: tuple[float, ...] | None
+
+    @property
+    def key(self) -> str:
+        """Under which it is kept: the same in another process."""
+        leaves, structure = jax.tree.flatten(self.method)
+        plain = re.sub(r" at 0x[0-9a-f]+", "", str(structure))
+        digest = files.digest(plain, str(self.dts), *leaves)
+        return f"{self.name}, {self.dtype}, {digest}"
+
+
+@dataclass
+class Ledger:
+    """The reference and the units found so far.
+
+    Attributes:
+        file: where they are kept; None, and they are not.
+        about: what they belong to.
+        contents: as JSON holds them.
+    """
+
+    file: Path | None
+    about: dict[str, Any]
+    contents: dict[str, Any] = field(default_factory=lambda: {"reference": None, "units": {}})
+
+    @classmethod
+    def open(cls, file: str | Path | None, course: Course, batch: int) -> Ledger:
+        """That of a file, where there is one, or a new one.
+
+        Raises:
+            ValueError: the file holds another comparison; the message says what is not the same.
+        """
+        if file is None:
+            return cls(None, {})
+        path, problem = files.path(file, OWNER), course.problem
+        numbers = jax.tree.leaves((problem.system, problem.start, problem.inputs.rows))
+        about = {
+            "the system, its start or its inputs": files.digest(
+                course.lowered.as_text(), *map(str, map(np.shape, numbers)), *numbers
+            ),
+            "the horizon": problem.horizon,
+            "the batch": batch,
+            "the device": jax.devices()[0].device_kind,
+            "the version of jax": jax.__version__,
+        }
+        found = cls(path, about)
+        if path.exists():
+            (text,) = files.read(path, [np.zeros(())], about, OWNER)
+            found.contents = json.loads(str(text))
+        return found
+
+    def save(self) -> None:
+        """Writes all of it, where there is a file."""
+        if self.file is not None:
+            files.write(self.file, self.about, [np.array(json.dumps(self.contents))])
+
+    @property
+    def reference(self) -> Reference | None:
+        """The reference, where there is one."""
+        known = self.contents["reference"]
+        if known is None:
+            return None
+        rows = {name: [np.array(x) for x in known[name]] for name in ("points", "seen")}
+        made = {"points": Points(*rows["points"]), "seen": Seen(*rows["seen"])}
+        return Reference(**known | made | {"error": np.array(known["error"])})
+
+    def keep(self, reference: Reference) -> None:
+        """Takes the reference in."""
+        self.contents["reference"] = {
+            name: jax.tree.map(lambda x: x.tolist() if isinstance(x, np.ndarray) else x, value)
+            for name, value in vars(reference).items()
+        }
+        self.save()
+
+    def __contains__(self, wanted: Wanted) -> bool:
+        return wanted.key in self.contents["units"]
+
+    def __getitem__(self, wanted: Wanted) -> Unit:
+        known = self.contents["units"][wanted.key]
+        return Unit(
+            tuple(Run(**run, method=wanted.method) for run in known["runs"]),
+            Limit(**known["limit"]) if known["limit"] else None,
+            tuple(LeftOut(**x) for x in known["left_out"]),
+            known["differentiated"],
+        )
+
+    def __setitem__(self, wanted: Wanted, unit: Unit) -> None:
+        runs = [dataclasses.replace(run, method=None) for run in unit.runs]
+        known = asdict(dataclasses.replace(unit, runs=()))
+        known["runs"] = [{k: x for k, x in asdict(run).items() if k != "method"} for run in runs]
+        self.contents["units"][wanted.key] = known
+        self.save()
+
+
+class Clock:
+    """How much of a budget of time is left.
+
+    Attributes:
+        budget: [s].
+    """
+
+    def __init__(self, budget: float) -> None:
+        self.budget, self.begin = budget, time.perf_counter()
+        self.longest: dict[str, float] = {}
+
+    @property
+    def spent(self) -> float:
+        """So far [s]."""
+        return time.perf_counter() - self.begin
+
+    def lasts(self, work: str, share: float = 1.0) -> bool:
+        """Whether a share of the budget lasts for one more piece of this kind of work.
+
+        The first piece of a kind is taken to be as long as two of those known.
+        """
+        known = self.longest.get(work, 2 * max(self.longest.values(), default=0.0))
+        return self.spent + SLOWER * known < share * self.budget
+
+    @contextlib.contextmanager
+    def timing(self, work: str) -> Iterator[None]:
+        """Takes the time of a piece of work."""
+        begin = self.spent
+        yield
+        self.longest[work] = max(self.longest.get(work, 0.0), self.spent - begin)

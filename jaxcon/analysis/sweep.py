@@ -1,0 +1,194 @@
+"""One method in one precision over all steps: errors, the limit of stability, and costs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxcon.analysis.costs import Batch, Pace, Slope
+from jaxcon.analysis.front import OK, LeftOut, Limit, Run
+from jaxcon.analysis.reference import Reference, Ruler
+from jaxcon.analysis.trials import Course, Observer, Problem, Trip
+from jaxcon.core.status import Status
+from jaxcon.simulation.method import Method
+
+COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
+"""Steps in a part of the horizon, as far as the horizon then has no more than `MOST`."""
+MOST = 20_000
+OPEN = 0.05
+"""max |φ| from which a run counts as diverged, of the size of the motion."""
+GAINED = 1.0
+"""Difference in energy from which it does, of what moves or is exchanged."""
+BISECTIONS = 4
+"""Of the gap between a stable and an unstable step, on a logarithmic scale."""
+SHARE = 1 / 60
+"""Of the budget that one run may take."""
+NO_GAIN = 0.8
+"""Of the least error so far: a run above that gains nothing by its shorter step."""
+REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeError)
+"""What a method that does not fit a scene raises."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """What was found of one method in one precision."""
+
+    runs: tuple[Run, ...] = ()
+    limit: Limit | None = None
+    left_out: tuple[LeftOut, ...] = ()
+    differentiated: bool = False
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """What all methods share.
+
+    Attributes:
+        problem: with its start on the constraints.
+        reference: of it.
+        observe: reads energies.
+        batch: in which costs are measured.
+        dts: steps that were asked for [s]; None for those of the default.
+        budget: for all of it [s].
+    """
+
+    problem: Problem
+    reference: Reference
+    observe: Observer
+    batch: Batch
+    dts: tuple[float, ...] | None
+    budget: float
+
+    @cached_property
+    def ruler(self) -> Ruler:
+        """Of configurations."""
+        return Ruler.of(self.observe, self.problem)
+
+    @property
+    def counts(self) -> list[int]:
+        """Steps in a part, ascending; a step asked for that divides no part is shortened."""
+        parts = self.problem.parts
+        if self.dts is None:
+            return [n for n in COUNTS if n == 1 or n * parts <= MOST]
+        part = self.problem.horizon / parts
+        return sorted({max(1, math.ceil(part / dt - 1e-9)) for dt in self.dts})
+
+    def measure(self, name: str, method: Method, dtype: str) -> Unit:
+        """Runs a method at all steps; one that does not fit the scene says why."""
+        try:
+            course, pace = Course(self.problem, method, dtype), Pace(self.batch, method, dtype)
+            compile_side_by_side(course, pace)
+        except REFUSED as error:
+            return Unit(left_out=(LeftOut(name, dtype, first_line(error)),))
+        runs, why = self._refined(course, name, method)
+        limit = self._limit(course, name, runs)
+        timed = tuple(
+            dataclasses.replace(run, cost=pace.seconds(run.dt) / run.dt, memory=pace.memory)
+            if run.ok
+            else run
+            for run in runs
+        )
+        left = (LeftOut(name, dtype, why),) if why else ()
+        return Unit(timed, limit, left)
+
+    def gradients(self, unit: Unit) -> Unit:
+        """The same with the costs of gradients."""
+        able = [run for run in unit.runs if run.ok]
+        one = able[0]
+        assert one.method is not None
+        try:
+            slope = Slope(self.batch, one.method, one.dtype)
+            slope.compile()
+        except REFUSED as error:
+            why = LeftOut(one.name, one.dtype, f"its gradient: {first_line(error)}")
+            left = (*unit.left_out, why)
+            return dataclasses.replace(unit, left_out=left, differentiated=True)
+        runs = tuple(
+            dataclasses.replace(run, gradient=slope.seconds(run.dt) / run.dt) if run.ok else run
+            for run in unit.runs
+        )
+        return dataclasses.replace(unit, runs=runs, differentiated=True)
+
+    def _refined(self, course: Course, name: str, method: Method) -> tuple[list[Run], str]:
+        """Runs with shorter and shorter steps, and why there are no shorter ones."""
+        runs: list[Run] = []
+        stalled, least, trip = 0, math.inf, None
+        for count in self.counts:
+            dt = self.problem.dt(count)
+            if trip is not None and self.dts is None:
+                longer = trip.seconds * trip.dt / dt
+                if longer > self.budget * SHARE:
+                    return runs, f"steps from {dt:.3g} s on: each run would take {longer:.2g} s"
+                if runs[-1].ok and not runs[-1].told:
+                    return runs, f"steps from {dt:.3g} s on: the reference tells them no more apart"
+                if stalled > 1:
+                    return runs, f"steps from {dt:.3g} s on: the error falls no more"
+            trip = course.go(dt, count)
+            runs.append(self._run(trip, name, method, course.dtype.name))
+            stalled = stalled + 1 if runs[-1].error > NO_GAIN * least and runs[-1].ok else 0
+            least = min(least, runs[-1].error)
+        return runs, ""
+
+    def _run(self, trip: Trip, name: str, method: Method, dtype: str) -> Run:
+        """What a trip amounts to."""
+        outcome, energy = self._outcome(trip)
+        error, angle, told = math.inf, math.inf, True
+        if outcome == OK:
+            last = self.reference.last
+            far, turned = self.ruler(trip.points.q, self.reference.points.q[1:])
+            error, angle = float(np.max(far[:last])), float(np.max(turned[:last]))
+            told = error > self.reference.floor
+            error = max(error, self.reference.floor)
+        alone = trip.seconds / self.problem.horizon
+        note = trip.status.name if trip.status and outcome == OK else ""
+        known = (name, dtype, trip.dt, outcome, error, told, angle, trip.violation, energy, alone)
+        return Run(*known, note=note, method=method)
+
+    def _outcome(self, trip: Trip) -> tuple[str, float]:
+        """Whether a trip stayed within its bounds, in words, and how far its energy is off [J]."""
+        points, reference = trip.points, self.reference
+        if trip.failed:
+            code = trip.status.name if trip.status else Status.NON_FINITE.name
+            return f"{code} at {points.time[-1]:.3g} s", math.inf
+        seen = self.observe(points)
+        exact = np.interp(points.time, reference.points.time, reference.seen.energy)
+        energy = float(np.max(np.abs(seen.energy - exact)))
+        off = max(trip.violation, float(np.max(seen.violation)))
+        if not off <= OPEN * reference.size:
+            return f"violation {off:.2g}", energy
+        if reference.scale > 0 and not energy <= GAINED * reference.scale:
+            return f"energy off by {energy:.2g} J", energy
+        return OK, energy
+
+    def _limit(self, course: Course, name: str, runs: list[Run]) -> Limit:
+        """The longest step up to which all are stable, by bisection beside those that were run."""
+        tried = {run.dt: run.ok for run in runs}
+        bad = min((dt for dt, ok in tried.items() if not ok), default=None)
+        good = max((dt for dt in tried if bad is None or dt < bad), default=None)
+        if bad is not None and good is not None:
+            part = self.problem.horizon / self.problem.parts
+            for _ in range(BISECTIONS):
+                middle = math.sqrt(good * bad)
+                trip = course.go(middle, max(1, round(part / middle)))
+                stable = self._outcome(trip)[0] == OK
+                good, bad = (middle, bad) if stable else (good, middle)
+        return Limit(name, course.dtype.name, good, bad)
+
+
+def compile_side_by_side(*programs: Any) -> None:
+    """Compiles several programs at once, each on a core."""
+    with ThreadPoolExecutor(len(programs)) as pool:
+        list(pool.map(lambda program: program.compile(), programs))
+
+
+def first_line(error: BaseException) -> str:
+    """What an error says, without what follows its first line."""
+    text = str(error).strip().splitlines()
+    return f"refused: {text[0]}" if text else f"refused: {type(error).__name__}"

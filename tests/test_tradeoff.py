@@ -1,0 +1,297 @@
+"""Methods against each other on one scene, checked by integrators and laws of others."""
+
+import dataclasses
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxcon as jc
+from jaxcon.__main__ import main
+from jaxcon.analysis import reference, sweep
+from jaxcon.analysis.trials import Inputs, Observer, Points, Problem
+
+G, HORIZON = 9.81, 1.0
+METHODS = {
+    "Euler": jc.Method(solver=jc.Sparse()),
+    "RK4": jc.Method(jc.RK4(), solver=jc.Sparse()),
+    "both": jc.Method(jc.RATTLE(), jc.Projection()),
+}
+
+
+def double_pendulum(dtype=None):
+    """Two particles on rods of 1 m, released level."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -G), dtype=dtype)
+    scene.add_particle("first", mass=1.0, position=(1.0, 0.0))
+    scene.add_particle("second", mass=1.0, position=(2.0, 0.0))
+    scene.add(jc.Distance("upper", jc.WORLD, "first"))
+    scene.add(jc.Distance("lower", "first", "second"))
+    return scene.build()
+
+
+def by_others(times):
+    """The same in two angles by Dormand and Prince's method of order eight, (times, 2, 2) [m]."""
+
+    def rate(_, y):
+        a, b, wa, wb = y
+        c, s = np.cos(a - b), np.sin(a - b)
+        mass = np.array([[2.0, c], [c, 1.0]])
+        force = [-s * wb**2 - 2 * G * np.sin(a), s * wa**2 - G * np.sin(b)]
+        return np.concatenate([[wa, wb], np.linalg.solve(mass, force)])
+
+    start, options = [np.pi / 2, np.pi / 2, 0.0, 0.0], {"rtol": 1e-13, "atol": 1e-13}
+    y = solve_ivp(rate, (0, times[-1]), start, "DOP853", times, **options).y
+    first = np.stack([np.sin(y[0]), -np.cos(y[0])], -1)
+    return np.stack([first, first + np.stack([np.sin(y[1]), -np.cos(y[1])], -1)], 1)
+
+
+def compare(**options):
+    system, state = double_pendulum()
+    known = {"methods": METHODS, "batch": 4, "budget": 1e5, "progress": False}
+    return jc.tradeoff(system, state, HORIZON, **known | options)
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return tmp_path_factory.mktemp("tradeoff") / "found.npz"
+
+
+@pytest.fixture(scope="module")
+def result(file):
+    return compare(file=file)
+
+
+@pytest.mark.parametrize("asked", [1e-2, 1e-4, 1e-7])
+def test_what_is_recommended_is_as_accurate_as_asked(result, asked):
+    chosen = result.recommend(error=asked)
+    assert chosen.error <= asked
+    with jax.enable_x64(chosen.dtype == "float64"):
+        system, state = double_pendulum(chosen.dtype)
+        steps = round(HORIZON / chosen.dt)
+        run = jax.jit(lambda s: jc.rollout(system, chosen.method, s, None, chosen.dt, steps)[1])
+        part = steps // 10
+        places = np.asarray(run(state).q, np.float64)[part - 1 :: part].reshape(10, 2, 2)
+    exact = by_others(np.linspace(0, HORIZON, 11)[1:])
+    off = np.max(np.linalg.norm(np.swapaxes(places, 1, 2) - exact, axis=-1))
+    assert off <= asked
+    np.testing.assert_allclose(off, chosen.error, rtol=0.05, atol=1e-6 if asked > 1e-7 else 1e-10)
+
+
+def test_the_front_falls_and_nothing_cheaper_is_as_accurate(result):
+    front = result.front
+    assert len(front) > 2
+    for one, next_one in zip(front, front[1:], strict=False):
+        assert one.cost < next_one.cost
+        assert one.error > next_one.error
+    for run in result.runs:
+        assert not run.ok or not any(run.cost < x.cost and run.error < x.error for x in front)
+    assert result.recommend(cost=math.inf) is front[-1]
+    with pytest.raises(ValueError, match="least is"):
+        result.recommend(cost=1e-12)
+    with pytest.raises(ValueError, match="the reference itself"):
+        result.recommend(error=1e-16)
+    with pytest.raises(ValueError, match="either error"):
+        result.recommend()
+
+
+def test_the_limit_of_stability_is_that_of_the_exact_law():
+    """Feedback of rate β is stable under RK4 up to β h = 2.785; runs above are shown as such."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -G))
+    scene.add_particle("bob", mass=1.0, position=(0.1, -math.sqrt(0.99)))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    stiff = {"stiff": jc.Method(jc.RK4(), jc.Baumgarte.critical(100.0), jc.Sparse())}
+    known = {"dtypes": ("float64",), "dts": (0.3, 0.06, 0.03, 0.02, 0.01), "gradients": False}
+    found = jc.tradeoff(*scene.build(), 3.0, methods=stiff, batch=4, **known, progress=False)
+    exact = jc.largest_stable_rate(jc.RK4(), 1.0) / 100.0
+    (limit,) = found.limits
+    assert 0.95 * exact < limit.stable < limit.unstable < 1.05 * exact
+    bad = [run for run in found.runs if not run.ok]
+    assert [run.dt for run in bad] == [0.3, 0.06, 0.03]
+    assert all(f"{run.dt:.3g} s ({run.outcome})" in str(found) for run in bad)
+    assert all(run.dt < exact for run in found.front)
+
+
+def test_what_does_not_fit_is_listed_with_its_reason(result):
+    refused = [x for x in result.left_out if x.name == "both"]
+    assert [x.dtype for x in refused] == ["float64", "float32"]
+    assert all("Projection has no place beside it" in x.reason for x in refused)
+    assert "both" in str(result)
+
+
+def test_costs_of_gradients_and_memory_are_there(result):
+    for run in result.runs:
+        if run.ok:
+            figures = np.array([run.cost, run.alone, run.gradient, run.memory])
+            assert np.all(np.isfinite(figures) & (figures > 0))
+
+
+def test_a_second_call_goes_on_and_lists_what_it_has_no_time_for(result, file, monkeypatch):
+    def never(*_):
+        raise AssertionError("it ran again")
+
+    monkeypatch.setattr(sweep.Sweep, "measure", never)
+    monkeypatch.setattr(sweep.Sweep, "gradients", never)
+    more = METHODS | {"Heun": jc.Method(jc.Heun())}
+    again = compare(file=file, methods=more, budget=1e-3)
+    assert [run.plain() for run in again.runs] == [run.plain() for run in result.runs]
+    late = [x.name for x in again.left_out if "no time" in x.reason]
+    assert late == ["Heun", "Heun"]
+    system, state = double_pendulum()
+    with pytest.raises(ValueError, match="not the same: the horizon"):
+        jc.tradeoff(system, state, 2.0, methods=METHODS, batch=4, file=file, progress=False)
+
+
+def test_the_keyboard_ends_it_with_what_was_found(file, monkeypatch):
+    def pressed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sweep.Sweep, "measure", pressed)
+    found = compare(file=file, methods=METHODS | {"Heun": jc.Method(jc.Heun())})
+    assert found.runs
+    assert [x.name for x in found.left_out if "keyboard" in x.reason] == ["Heun", "Heun"]
+
+
+def test_the_diagram_and_the_file_of_figures(result, tmp_path):
+    picture = tmp_path / "diagram.png"
+    result.plot(picture)
+    assert picture.stat().st_size > 10_000
+    found = json.loads(result.to_json(tmp_path / "figures.json"))
+    assert len(found["runs"]) == len(result.runs)
+    assert len(result.table.splitlines()) == len(result.runs) + 1
+
+
+def made(horizon):
+    system, state = double_pendulum()
+    problem = Problem(system, Points.of(jax.device_get(state)), horizon, Inputs(10))
+    observe = Observer(problem)
+    course = reference.Course(problem, reference.method_for(system), np.float64)
+    return reference.make(course, observe, 0.0, 60.0)
+
+
+def test_the_error_of_the_reference_is_no_less_than_it_is():
+    found = made(2.0)
+    q = found.points.q[1:].reshape(10, 2, 2)
+    off = np.linalg.norm(np.swapaxes(q, 1, 2) - by_others(found.points.time[1:]), axis=-1)
+    assert np.all(np.max(off, axis=1) <= found.error + 1e-11)  # what the others may be off by
+    assert found.floor < 1e-9
+    assert found.until == 2.0
+
+
+def test_a_chaotic_motion_is_compared_as_far_as_the_reference_is_good():
+    found = made(30.0)
+    assert 9.0 < found.until < 30.0
+    assert found.last == round(found.until / 3.0)
+    assert found.floor < 1e-3 * found.size
+    assert found.error[-1] > 10 * found.floor
+
+
+def free_mass():
+    """2 kg in the plane that nothing holds."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("mass", mass=2.0, position=(1.0, 0.0))
+    scene.add(jc.ExternalWrench("push", "mass"))
+    return scene.build()
+
+
+def test_single_precision_where_double_is_turned_off():
+    """Under forces that change every half second RK4 is exact at every step."""
+    with jax.enable_x64(False):
+        system, state = free_mass()
+        push = np.array([[2.0, 0.0], [-4.0, 6.0]])
+        known = {"methods": {"RK4": jc.Method(jc.RK4())}, "batch": 2, "gradients": False}
+        found = jc.tradeoff(system, state, 1.0, push, dts=(0.1, 0.04), **known, progress=False)
+        assert state.q.dtype == jnp.float32
+        assert not jax.config.read("jax_enable_x64")
+    assert [run.dtype for run in found.runs] == ["float64"] * 2 + ["float32"] * 2
+    assert [run.dt for run in found.runs[:2]] == [0.1, 1 / 30]
+    assert all(run.error < 1e-14 for run in found.runs[:2])
+    assert all(run.error < 1e-6 for run in found.runs[2:])
+    assert all(math.isnan(run.gradient) for run in found.runs)
+
+
+@pytest.mark.parametrize("kind", ["rows", "policy"])
+def test_inputs_mean_the_same_at_every_step(kind):
+    """Forces held for 0.2 s are integrated exactly by RK4: two steps in a hold, or seven."""
+    system, state = free_mass()
+    rows = np.random.default_rng(0).normal(size=(5, 2))
+    held = {"rows": (rows, None), "policy": (lambda s: -3.0 * s.q - s.v, 0.2)}[kind]
+    inputs = Inputs.of(system, *held, 1.0)
+    problem = Problem(system, Points.of(jax.device_get(state)), 1.0, inputs)
+    course = reference.Course(problem, jc.Method(jc.RK4()), np.float64)
+    course.compile()
+    x, v = np.array([1.0, 0.0]), np.zeros(2)
+    for i in range(5):
+        a = (rows[i] if kind == "rows" else -3.0 * x - v) / 2.0
+        x, v = x + 0.2 * v + 0.02 * a, v + 0.2 * a
+    for count in (2, 7):
+        trip = course.go(problem.dt(count), count)
+        np.testing.assert_allclose(trip.points.q[-1], x, rtol=1e-12)
+        np.testing.assert_allclose(trip.points.v[-1], v, rtol=1e-12)
+
+
+def test_inputs_are_held_for_the_same_time_at_every_step():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("mass", mass=1.0)
+    scene.add(jc.ExternalWrench("push", "mass"))
+    system, _ = scene.build()
+    assert Inputs.of(system, None, None, 1.0).parts == 10
+    assert Inputs.of(system, np.ones(2), None, 1.0).rows.shape == (10, 2)
+    held = Inputs.of(system, np.arange(6.0).reshape(3, 2), None, 1.0)
+    np.testing.assert_array_equal(held.rows[:, 0], np.repeat([0.0, 2.0, 4.0], 4))
+    assert Inputs.of(system, lambda s: s.q, 0.05, 1.0).parts == 20
+    with pytest.raises(ValueError, match="need hold="):
+        Inputs.of(system, lambda s: s.q, None, 1.0)
+    with pytest.raises(ValueError, match="must divide the horizon"):
+        Inputs.of(system, lambda s: s.q, 0.3, 1.0)
+    with pytest.raises(ValueError, match=r"2 channels of \['push'\].*\(4, 3\)"):
+        Inputs.of(system, np.ones((4, 3)), None, 1.0)
+    with pytest.raises(ValueError, match="belongs to controls that are a function"):
+        Inputs.of(system, np.ones((4, 2)), 0.1, 1.0)
+
+
+def test_a_turn_in_space_counts_as_the_way_of_its_points():
+    """k² = 0.3/2 for the largest moment, and √(d² + k²θ²) for a turn by θ and a way d."""
+    scene = jc.Scene()
+    scene.add_body("block", mass=2.0, inertia=(0.3, 0.2, 0.15))
+    system, state = scene.build()
+    ruler, angle = reference.Ruler(system, state.q), 0.7
+    turned = np.array(state.q)
+    turned[system.layout.q("block")] = [0.3, 0, 0.4, -np.cos(angle / 2), 0, -np.sin(angle / 2), 0]
+    far, turn = ruler(np.array(state.q)[None], turned[None])
+    np.testing.assert_allclose(turn, angle, rtol=1e-12)
+    np.testing.assert_allclose(far, np.hypot(0.5, np.sqrt(0.15) * angle), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "words"),
+    [
+        ({"dts": (2.0,)}, ValueError, "steps within the horizon"),
+        ({"dtypes": ("float16",)}, ValueError, "float16"),
+        ({"methods": [jc.Method()]}, TypeError, "mapping from names"),
+        ({"methods": {"RK4": jc.RK4()}}, TypeError, "jc.Method"),
+        ({"batch": 0}, ValueError, "batch"),
+        ({"budget": 0.0}, ValueError, "budget"),
+    ],
+)
+def test_bad_options_are_named(options, error, words):
+    with pytest.raises(error, match=words):
+        compare(**options)
+
+
+def test_a_scene_that_nobody_knows_is_named_by_the_command_line(capsys):
+    assert main(["tradeoff", "five_bar"]) == 2
+    assert "four_bar" in capsys.readouterr().out
+
+
+def test_a_start_off_its_constraints_is_taken_there():
+    system, state = double_pendulum()
+    off = dataclasses.replace(state, q=state.q.at[1].add(0.01))
+    problem = Problem(system, Points.of(jax.device_get(off)), 1.0, Inputs(10))
+    observe = Observer(problem)
+    on, moved = reference.started(problem, observe)
+    assert 1e-3 < moved < 2e-2
+    assert observe(Points(*(x[None] for x in on.start))).violation[0] < 1e-9
