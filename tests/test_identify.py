@@ -614,3 +614,13 @@ def test_a_small_step_at_the_end_is_taken_in_full():
 def test_a_start_without_derivatives_is_refused():
     with pytest.raises(ValueError, match="derivatives are not finite at the start"):
         jc.identify(lambda p: jnp.sqrt(p["a"]) * jnp.ones(3), {"a": 0.0}, jnp.ones(3))
+
+
+def test_a_start_next_to_zero_counts_as_zero():
+    data = 1e-3 * np.random.default_rng(0).normal(size=60)
+    for start in (0.0, 1e-12):
+        found = jc.identify(lambda p: p["c"] + jnp.zeros(60), {"c": start}, data, noise=1e-3)
+        assert not found.untold, start
+        np.testing.assert_allclose(found.params["c"], np.mean(data), rtol=1e-6)
+    with pytest.raises(ValueError, match="infinite.*NaN for the unseen"):
+        jc.identify(lambda p: p["c"] + jnp.zeros(2), {"c": 1.0}, np.array([1.0, np.inf]))

@@ -41,7 +41,7 @@ def test_tracking_is_the_mean_of_squares_by_quantity_and_scale():
 
 
 def test_tracking_says_what_does_not_fit():
-    with pytest.raises(ValueError, match="'tip': .3, 2."):
+    with pytest.raises(ValueError, match="tip .3, 2.*tip .4, 2."):
         jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})
     with pytest.raises(ValueError, match=r"scale of shape \(4, 1\).*\(3, 1\)"):
         jc.losses.tracking(jnp.ones((3, 1)), np.zeros((3, 1)), np.ones((4, 1)))
@@ -80,6 +80,7 @@ def test_energy_drift_is_that_of_the_energy(path):
     )
     still = jax.tree.map(jnp.ones_like, energy)
     assert jax.grad(lambda e: jc.losses.energy_drift(e))(still).kinetic[0] == 0.0
+    assert np.isnan(jc.losses.energy_drift(jax.tree.map(lambda x: x.at[1].set(jnp.nan), still)))
 
 
 def test_a_sum_comes_with_its_terms():
@@ -99,3 +100,7 @@ def test_a_failed_world_has_no_loss():
     assert jc.losses.unless_failed(one, state) == one
     assert jc.losses.unless_failed(one, noted) == one
     assert jnp.isnan(jc.losses.unless_failed({"x": one}, failed)["x"])
+    batch = jax.tree.map(lambda *x: jnp.stack(x), state, failed)
+    rows = jc.losses.unless_failed({"each": jnp.ones((2, 3)), "mean": one}, batch)
+    np.testing.assert_array_equal(np.isnan(rows["each"]), [[False] * 3, [True] * 3])
+    assert jnp.isnan(rows["mean"])

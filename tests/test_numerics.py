@@ -134,6 +134,11 @@ def test_negative_numbers_have_no_root():
     assert jax.grad(numerics.safe_sqrt)(-1.0) == 0
 
 
+def test_nan_is_no_length():
+    assert np.isnan(numerics.safe_sqrt(jnp.asarray(jnp.nan)))
+    assert np.isnan(numerics.norm(jnp.array([1.0, jnp.nan])))
+
+
 def test_cos_sinc_is_exact_within_and_across_half_turns():
     edges = np.array([1, 3, 5, 41]) * np.pi / 2
     for root in (1e-9, 1e-3, 0.1, 1.5, 3.0, np.pi, 100.0, *(edges - 1e-9), *(edges + 1e-9)):

@@ -186,6 +186,22 @@ def test_states_that_are_lost_on_the_way_leave_no_wrong_gradient():
     np.testing.assert_allclose(kept, expected, rtol=1e-3)
 
 
+def test_small_motions_are_as_lost_as_large_ones():
+    """A loss without size: a stiff damper, from starts of a metre and of a micrometre."""
+    slow = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.ones_like(q), force=lambda q, v, t, u, p: -q - p * v, params=10.0
+    )
+
+    def share(damping, size):
+        own = dataclasses.replace(slow, params=damping)
+        state = jc.init(own, METHOD, jnp.array([size]), jnp.array([-0.1 * size]))
+        final, _ = jc.rollout(own, METHOD, state, None, 1e-2, 370, adjoint=jc.Reversible())
+        return (final.q[0] / size) ** 2
+
+    found = jax.jit(jax.vmap(jax.grad(share), (None, 0)))(10.0, jnp.array([1.0, 1e-6]))
+    assert np.all(np.isnan(found)), found
+
+
 def planned(steps, adjoint, worlds=300):
     """What XLA plans for a gradient by velocities [B]."""
 

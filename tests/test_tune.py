@@ -291,8 +291,13 @@ def test_a_checkpoint_is_refused_by_another_search(tmp_path):
         jc.tune(loss, start, steps=20, checkpoint=file)
     other = optax.sgd(0.1)
     own = tmp_path / "own.npz"
-    jc.tune(loss, start, steps=10, checkpoint=own, optimizer=other)
+    jc.tune(loss, start, steps=5, checkpoint=own, optimizer=other)
     assert jc.tune(loss, start, steps=20, checkpoint=own, optimizer=other).steps == 20
+
+
+def test_a_traced_search_is_refused():
+    with pytest.raises(TypeError, match="tune is host code.*map over worlds in the loss"):
+        jax.jit(lambda x: jc.tune(lambda y: y**2, x).loss)(1.0)
 
 
 def damaged_header(file):

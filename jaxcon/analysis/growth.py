@@ -55,7 +55,8 @@ class GradientGrowth:
             error: δ, such as that of a measured start or of the discretization; ε unless given.
 
         Returns:
-            The time; beyond the rollout by the exponent, and infinite where nothing grows.
+            The time; beyond the rollout by the exponent, and infinite where so far nothing grows
+            faster than a power of time might: a longer rollout may tell.
         """
         limit = 1 / (self.spacing if error is None else error)
         late = np.flatnonzero(~(self.growth < limit))
@@ -70,7 +71,10 @@ class GradientGrowth:
         head = f"a move of the start grows by {self.growth[-1]:.3g} in {self.time[-1]:.3g} s"
         rate = f"exponent {self.exponent:.3g} /s"
         if math.isinf(self.horizon(1e-3)):
-            return f"{head}; {rate}, no more than a power of time: derivatives reach as far as runs"
+            return (
+                f"{head}; {rate}, no more than a power of time might: derivatives reach as far as"
+                " this run, and a longer one tells more"
+            )
         horizons = f"useless beyond {self.horizon():.3g} s by rounding"
         return f"{head}; {rate}; {horizons}, {self.horizon(1e-3):.3g} s by a start known to 1e-3"
 

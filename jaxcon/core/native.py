@@ -41,7 +41,7 @@ class Native:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
-        self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self, rank=0))
+        self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
         self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
         self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
         self.part = functools.lru_cache(maxsize=None)(functools.partial(Part, self))
@@ -182,7 +182,7 @@ def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
     leaves, structure = jax.tree.flatten(args)
     native, result = _native(function, structure)
     arrays = [jnp.asarray(x) for x in leaves]
-    arrays = native_p.bind(*arrays, fun=native, rank=0)  # its trace leaves the structure
+    arrays = native_p.bind(*arrays, fun=native)  # its trace leaves the structure
     return jax.tree.unflatten(result[0], arrays)
 
 
@@ -243,27 +243,27 @@ def lift(x: Array, like: Array) -> Array:
     return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)
 
 
-def _abstract(*args: Any, fun: Native, rank: int) -> list[Any]:
+def _abstract(*args: Any, fun: Native) -> list[Any]:
     return fun.shapes(args)
 
 
-def _batched(args: Any, axes: Any, *, fun: Native, rank: int) -> Any:
+def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
 
     def last(x: Any, axis: int | None) -> Array:
         x = jnp.asarray(x)  # a constant of the trace may come as a Python number
         return x[..., None] if axis is None else jnp.moveaxis(x, axis, -1)
 
-    results = native_p.bind(*map(last, args, axes), fun=fun, rank=rank + 1)
+    results = native_p.bind(*map(last, args, axes), fun=fun)
     results = [jnp.broadcast_to(y, (*y.shape[:-1], size)) for y in results]
     return results, [y.ndim - 1 for y in results]
 
 
-def _jvp(primals: Any, tangents: Any, *, fun: Native, rank: int) -> Any:
-    results = native_p.bind(*primals, fun=fun, rank=rank)
+def _jvp(primals: Any, tangents: Any, *, fun: Native) -> Any:
+    results = native_p.bind(*primals, fun=fun)
     moved = tuple(type(x) is not ad.Zero for x in tangents)
     given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
-    moving = iter(native_p.bind(*primals, *given, fun=fun.tangent(moved), rank=rank))
+    moving = iter(native_p.bind(*primals, *given, fun=fun.tangent(moved)))
     return results, [
         next(moving)
         if jnp.issubdtype(y.dtype, jnp.inexact)
@@ -272,18 +272,18 @@ def _jvp(primals: Any, tangents: Any, *, fun: Native, rank: int) -> Any:
     ]
 
 
-def _transpose(cotangents: Any, *args: Any, fun: Native, rank: int) -> Any:
+def _transpose(cotangents: Any, *args: Any, fun: Native) -> Any:
     linear = tuple(ad.is_undefined_primal(x) for x in args)
     fixed = [x for x, flag in zip(args, linear, strict=True) if not flag]
     pairs = zip(args, linear, strict=True)
     avals = tuple((x.aval.shape, x.aval.dtype) for x, flag in pairs if flag)
     cotangents = [ad.instantiate_zeros(x) for x in cotangents]
     transposed = fun.transposed(linear, avals, cotangents[0].ndim)
-    found = iter(native_p.bind(*fixed, *cotangents, fun=transposed, rank=rank))
+    found = iter(native_p.bind(*fixed, *cotangents, fun=transposed))
     return [next(found) if flag else None for flag in linear]
 
 
-def _in_stages(*args: Array, fun: Native, rank: int) -> list[Array]:
+def _in_stages(*args: Array, fun: Native) -> list[Array]:
     """The function, cut into stages, of arrays with a last axis of one.
 
     XLA lets LLVM unroll the loops over the last axis of an array, which takes up to half of the
@@ -309,10 +309,10 @@ def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]
     return [True] * len(equation.invars), kept
 
 
-native_p.def_impl(lambda *args, fun, rank: fun.eager(*args))
+native_p.def_impl(lambda *args, fun: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
 mlir.register_lowering(
-    native_p, mlir.lower_fun(lambda *args, fun, rank: fun(*args), multiple_results=True)
+    native_p, mlir.lower_fun(lambda *args, fun: fun(*args), multiple_results=True)
 )
 mlir.register_lowering(
     native_p,

@@ -15,9 +15,9 @@ from jaxcon.core.typing import Array, Lane
 
 
 def safe_sqrt(x: Lane) -> Array:
-    """√x where x > 0, and 0 with zero gradient elsewhere."""
-    positive = x > 0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1)), 0)
+    """√x, and 0 with zero gradient where x ≤ 0; NaN stays NaN."""
+    low = x <= 0
+    return jnp.where(low, 0, jnp.sqrt(jnp.where(low, 1, x)))
 
 
 def safe_divide(numerator: Lane, denominator: Lane) -> Array:

@@ -212,8 +212,9 @@ def _ignore() -> None:
 
 
 def _scale(space: Space, y: Array) -> Array:
-    """By what coordinates are divided: 1 for logarithms and what starts at 0, |y| for others."""
-    return jnp.where(space.logarithms | (y == 0), 1, jnp.abs(y))
+    """By what coordinates are divided: 1 for logarithms and what starts near 0, |y| for others."""
+    none = jnp.abs(y) <= float(jnp.finfo(y.dtype).eps) ** 0.5
+    return jnp.where(space.logarithms | none, 1, jnp.abs(y))
 
 
 def _report(

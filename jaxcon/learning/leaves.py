@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 
@@ -69,7 +70,8 @@ class Space:
         """y of all its numbers."""
         ends = np.cumsum([x.size for x in self.low])[:-1]
         return tuple(
-            z.reshape(x.shape) for z, x in zip(jnp.split(flat, ends), self.low, strict=True)
+            z.reshape(x.shape).astype(x.dtype)
+            for z, x in zip(jnp.split(flat, ends), self.low, strict=True)
         )
 
     def clip(self, y: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -98,10 +100,16 @@ def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
     Raises:
         ValueError: an unknown name, nothing to search, or a start that is not positive, not finite
             or out of its bounds.
+        TypeError: they are traced.
     """
     found, structure = jax.tree_util.tree_flatten_with_path(params)
     names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in found]
     leaves = [x for _, x in found]
+    if not checks.is_concrete(leaves):
+        raise TypeError(
+            f"{owner}: the parameters are traced; {owner} is host code around a program of its own."
+            " Call it outside of jit, vmap and grad, and map over worlds in the loss."
+        )
     _check_whole(names, leaves, owner)
     free = [is_searched(x) for x in leaves]
     if not any(free):

@@ -38,7 +38,7 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
     """
     off = jax.tree.leaves(misfit(path, reference, scale))
     means = [
-        jnp.sum(x * x) / jnp.maximum(jnp.sum(jnp.isfinite(wanted), dtype=x.dtype), 1)
+        jnp.sum(x * x) / jnp.maximum(jnp.sum(~jnp.isnan(wanted), dtype=x.dtype), 1)
         for x, wanted in zip(off, jax.tree.leaves(reference), strict=True)
     ]
     return jnp.mean(jnp.stack(means))
@@ -51,14 +51,12 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
         ValueError: path and reference differ in structure or shape, or the scale has more numbers.
     """
     widths = jax.tree.broadcast(scale, path)
-    found, structure = jax.tree_util.tree_flatten_with_path(path)
     shapes = [jnp.shape(x) for x in jax.tree.leaves(path)]
     given = [jnp.shape(x) for x in jax.tree.leaves(reference)]
-    if structure != jax.tree.structure(reference) or shapes != given:
-        names = [jax.tree_util.keystr(where, simple=True, separator="/") for where, _ in found]
+    if jax.tree.structure(path) != jax.tree.structure(reference) or shapes != given:
         raise ValueError(
-            f"what was recorded, {dict(zip(names, shapes, strict=True))}, must have the structure"
-            f" and shapes of the reference, {jax.tree.structure(reference)} with {given}."
+            f"what is simulated, {_described(path)}, must have the structure and shapes of what it"
+            f" is compared with, {_described(reference)}."
         )
 
     def off(x: Any, wanted: Any, width: Any) -> Array:
@@ -69,7 +67,7 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
             )
         wanted = jnp.asarray(wanted, x.dtype)
         width = jnp.broadcast_to(jnp.asarray(width, x.dtype), shape)
-        seen = jnp.isfinite(wanted)
+        seen = ~jnp.isnan(wanted)
         return jnp.where(seen, (x - jnp.where(seen, wanted, 0)) / width, 0)
 
     return jax.tree.map(off, path, reference, widths)
@@ -101,7 +99,7 @@ def mean_violation(off: Violation, dt: Any) -> Array:
         ValueError: the scene has no rows.
     """
     if not off.position.size:
-        raise ValueError("violation: the scene has no constraints that could be violated.")
+        raise ValueError("losses: the scene has no constraints that could be violated.")
     return jnp.mean(off.position**2) + jnp.mean((dt * off.velocity) ** 2)
 
 
@@ -110,7 +108,7 @@ def energy_drift(energy: Energy, scale: Any = None) -> Array:
 
     Args:
         energy: of each recorded state, its first axis time.
-        scale: [J]; the largest kinetic energy unless given.
+        scale: [J]; the largest kinetic energy unless given: give one where nothing may move.
     """
     scale = jnp.max(energy.kinetic) if scale is None else scale
     change = (energy.total - energy.total[:1]) / scale
@@ -135,11 +133,27 @@ def unless_failed(x: PyTree, state: Any) -> PyTree:
     number.
 
     Args:
-        x: a loss, or predictions.
+        x: a loss, or predictions. Of a batch, what has its axes first is NaN for the worlds that
+            failed; what does not, such as a mean over worlds, is NaN if one of them has.
         state: the final one, of a world or a batch.
     """
-    bad = jnp.any(failed(state.status))
-    return jax.tree.map(lambda y: jnp.where(bad, jnp.nan, y), x)
+    bad = failed(state.status)
+
+    def one(y: Any) -> Array:
+        own = jnp.shape(y)[: bad.ndim] == bad.shape
+        lost = bad.reshape(*bad.shape, *(1,) * (jnp.ndim(y) - bad.ndim)) if own else jnp.any(bad)
+        return jnp.where(lost, jnp.nan, y)
+
+    return jax.tree.map(one, x)
+
+
+def _described(tree: PyTree) -> str:
+    """The shapes of arrays by name."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    if [path for path, _ in leaves] == [()]:
+        return f"an array {jnp.shape(leaves[0][1])}"
+    shapes = {jax.tree_util.keystr(path, simple=True, separator="/"): x for path, x in leaves}
+    return ", ".join(f"{name} {jnp.shape(x)}" for name, x in shapes.items())
 
 
 def _fits(shape: tuple[int, ...], into: tuple[int, ...]) -> bool:

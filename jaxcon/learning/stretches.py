@@ -57,9 +57,12 @@ class Stretches:
         """Data and the noise of each number, with a first axis of stretches.
 
         Raises:
-            ValueError: the data do not have that axis, or the noise does not broadcast with them.
+            ValueError: the data do not have that axis or are infinite, or the noise does not
+                broadcast with them.
         """
         data = jax.tree.map(np.asarray, self.data)
+        if any(np.any(np.isinf(x)) for x in jax.tree.leaves(data)):
+            raise ValueError("identify: the data have infinite numbers; write NaN for the unseen.")
         shapes = [x.shape for x in jax.tree.leaves(data)]
         stretches = len(self.nodes)
         if self.given is not None and any(shape[:1] != (stretches,) for shape in shapes):

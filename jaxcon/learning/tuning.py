@@ -29,7 +29,7 @@ RATE = 0.2
 """Of the optimiser unless one is given: a step of 20 % of a positive leaf at first."""
 NEVER = np.iinfo(np.int32).max
 SCHEDULE = "the number of steps, along which the rate of the default optimizer falls"
-PROGRAM = "the loss, its data, the optimizer, another option, or the version of jax"
+PROGRAM = "the loss, its data, the bounds, the optimizer, another option, or the version of jax"
 """What the compiled program tells apart."""
 
 
@@ -110,7 +110,8 @@ def tune(
     _check(loss, optimizer, key, samples, restarts, tolerance)
     _check_mesh(mesh, samples, restarts)
     file = None if checkpoint is None else files.path(checkpoint, "tune")
-    chunk = min(chunk, steps)
+    if checkpoint is None:  # whose chunk stays when it is resumed with more steps
+        chunk = min(chunk, steps)
     space = space_of(params, positive, bounds, "tune")
     default = optimizer is None
     if default:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero
 
-from jaxcon.core import checks
+from jaxcon.core import checks, numerics
 from jaxcon.core.closures import opened
 from jaxcon.core.native import keep
 from jaxcon.core.pytree import Parts, pytree, static
@@ -30,8 +30,9 @@ class Reversible:
 
     States are found again but for rounding, which grows on the way back as errors of the motion run
     backwards do: little where it is regular, and as e^ct where it is chaotic or damped. From each
-    state that is kept, rounding starts again. A world in which a kept state, or that after the
-    first step, is missed by more than ε^⅓ (1 + max |x|) has the gradient NaN, never a wrong one.
+    state that is kept, rounding starts again. A world has the gradient NaN in which a kept state,
+    or that after the first step, is missed by more than ε^⅓ of the largest positions or velocities
+    among them; those between are not seen.
 
     Forward mode, which keeps no states anyway, wants another adjoint.
 
@@ -131,6 +132,7 @@ class _Walk:
         of_numbers, _, of_inputs = parts = moved.parts(self.parts)
         (bar, rows_bar), _ = cotangents
         bar = [_zeros(x.aval.shape, x.aval.dtype) if _is_zero(x) else x for x in bar]
+        allowed = _allowed(kept, start.time)
 
         def back(after: State, given: Any) -> tuple[State, Array]:
             """The state before a step, and whether it is lost."""
@@ -138,7 +140,7 @@ class _Walk:
             saved = jax.tree.map(lambda x: _row(x, place), kept)
             ends = number % self.size == 0
             before = self.back(rest[1], keep(ends, saved, after), given)
-            lost = ends & _far(after, saved) | (number > 0) & failed(before.status)
+            lost = ends & _far(after, saved, allowed) | (number > 0) & failed(before.status)
             return keep(number == 0, start, before), lost
 
         def one(known: Any, given: Any) -> Any:
@@ -231,10 +233,21 @@ def _row(x: Any, place: Array) -> Array:
     return jax.lax.dynamic_index_in_dim(x, place, keepdims=False)
 
 
-def _far(found: State, known: State) -> Array:
-    """Whether a state was not found again: by ε^⅓ (1 + max |x|), or not as a number."""
+def _allowed(kept: State, began: Array) -> tuple[Array, Array]:
+    """By what q and v of a state may be missed: ε^⅓ of the largest along the path.
+
+    A mechanism at rest has velocities of rounding alone; they are compared with those that cross
+    its size in the time of the path.
+    """
+    size, speed = (jnp.max(jnp.abs(x), initial=0) for x in (kept.q, kept.v))
+    span = jnp.max(jnp.abs(kept.time - began))
+    share = float(jnp.finfo(size.dtype).eps) ** (1 / 3)
+    return share * size, share * (speed + numerics.safe_divide(size, span))
+
+
+def _far(found: State, known: State, allowed: tuple[Array, Array]) -> Array:
+    """Whether a state was not found again, or not as a number."""
     far = jnp.zeros_like(failed(known.status))
-    for x, y in ((found.q, known.q), (found.v, known.v)):
-        allowed = float(jnp.finfo(x.dtype).eps) ** (1 / 3) * (1 + jnp.max(jnp.abs(y), initial=0))
-        far |= ~(jnp.max(jnp.abs(x - y), initial=0) <= allowed)
+    for x, y, most in ((found.q, known.q, allowed[0]), (found.v, known.v, allowed[1])):
+        far |= ~(jnp.max(jnp.abs(x - y), initial=0) <= most)
     return far
