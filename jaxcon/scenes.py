@@ -71,7 +71,12 @@ def four_bar(
 
 
 def four_bar_points(lengths: Array, angle: Array) -> tuple[Array, Array, Array, Array]:
-    """The four hinges (2,) [m]; the third where two circles meet, on the upper branch."""
+    """The four hinges (2,) [m]; the third where two circles meet, on the upper branch.
+
+    Args:
+        lengths: of ground, crank, coupler and rocker, (4,) [m].
+        angle: of the crank, () [rad].
+    """
     ground, crank, coupler, rocker = lengths
     a = jnp.zeros(2, lengths.dtype)
     b = crank * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
@@ -85,7 +90,12 @@ def four_bar_points(lengths: Array, angle: Array) -> tuple[Array, Array, Array, 
 
 
 def four_bar_poses(lengths: Array, angle: Array) -> Array:
-    """Centre (2,) [m] and angle [rad] of crank, coupler and rocker, (3, 3)."""
+    """Centre (2,) [m] and angle [rad] of crank, coupler and rocker, (3, 3).
+
+    Args:
+        lengths: of ground, crank, coupler and rocker, (4,) [m].
+        angle: of the crank, () [rad].
+    """
     a, b, c, d = four_bar_points(lengths, angle)
     ends = ((a, b), (b, c), (d, c))
     return jnp.stack(

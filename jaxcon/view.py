@@ -37,6 +37,10 @@ def links(system: Any, q: Any) -> dict[str, np.ndarray]:
     """For each moving body the world points (n, dim) where joints and springs hold it [m].
 
     Bodies held at one point only are drawn from their centre of mass.
+
+    Args:
+        system: a `BodySystem`.
+        q: positions, (n_q,).
     """
     found = _links(system, q)
     return {name: np.asarray(found[name]) for name in system.layout.bodies}

@@ -111,7 +111,13 @@ class Limit:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What was not run, and why."""
+    """What was not run, and why.
+
+    Attributes:
+        name: of the method.
+        dtype: its precision; empty for all.
+        reason: in words.
+    """
 
     name: str
     dtype: str
@@ -222,6 +228,9 @@ class Tradeoff:
         """Everything but the methods themselves as JSON, also written to a path where one is given.
 
         Numbers that are not finite are null.
+
+        Args:
+            path: of a file; none unless given.
         """
         found = {
             "about": self.about,

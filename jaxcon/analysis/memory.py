@@ -41,7 +41,11 @@ class Memory:
     shared: float
 
     def of(self, worlds: int) -> float:
-        """Of a step of so many worlds, their states included [B]."""
+        """Of a step of so many worlds, their states included [B].
+
+        Args:
+            worlds: how many.
+        """
         return self.shared + worlds * (self.state + self.working)
 
     def __str__(self) -> str:

@@ -19,36 +19,72 @@ from jaxcon.model.state import Energy, State, at
 
 
 def energy(system: Any, state: State) -> Energy:
-    """Kinetic energy ½ vᵀMv and the potential of gravity and springs, () [J] each."""
+    """Kinetic energy ½ vᵀMv and the potential of gravity and springs, () [J] each.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: where, of one world.
+    """
     system = at(system, state, "jc.energy(system, s)")
     return system.energy(state.q, state.v, state.time)
 
 
 def violation(system: Any, state: State) -> Violation:
-    """φ and φ̇ of a state, by constraint."""
+    """φ and φ̇ of a state, by constraint.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: where, of one world.
+    """
     system = at(system, state, "jc.violation(system, s)")
     return linearize(system, state.q, state.v, state.time).violation
 
 
 def position(system: Any, state: State, body: str, point: Any = None) -> Array:
-    """Where a body is, or a point given in its frame, (dim,) [m], world frame."""
+    """Where a body is, or a point given in its frame, (dim,) [m], world frame.
+
+    Args:
+        system: a `BodySystem`.
+        state: where, of one world.
+        body: its name.
+        point: in the body's frame, (dim,) [m]; the frame's origin unless given.
+    """
     motion = _motion(system, state, body, "position")
     return motion.position if point is None else motion.point(_local(motion, point))
 
 
 def velocity(system: Any, state: State, body: str, point: Any = None) -> Array:
-    """How fast a body, or a point given in its frame, moves, (dim,) [m/s], world frame."""
+    """How fast a body, or a point given in its frame, moves, (dim,) [m/s], world frame.
+
+    Args:
+        system: a `BodySystem`.
+        state: where, of one world.
+        body: its name.
+        point: in the body's frame, (dim,) [m]; the frame's origin unless given.
+    """
     motion = _motion(system, state, body, "velocity")
     return motion.velocity if point is None else motion.point_velocity(_local(motion, point))
 
 
 def orientation(system: Any, state: State, body: str) -> Array:
-    """Its angle () [rad] in the plane, or quaternion wxyz (4,), body to world, in space."""
+    """Its angle () [rad] in the plane, or quaternion wxyz (4,), body to world, in space.
+
+    Args:
+        system: a `BodySystem`.
+        state: where, of one world.
+        body: its name.
+    """
     return _oriented(system, state, body, "orientation").orientation
 
 
 def angular_velocity(system: Any, state: State, body: str) -> Array:
-    """() in the plane, (3,) in the body frame in space [rad/s]."""
+    """() in the plane, (3,) in the body frame in space [rad/s].
+
+    Args:
+        system: a `BodySystem`.
+        state: where, of one world.
+        body: its name.
+    """
     return _oriented(system, state, body, "angular_velocity").angular_velocity
 
 
@@ -71,7 +107,14 @@ def coordinate(system: Any, state: State, joint: str, name: str | None = None) -
 
 
 def coordinate_rate(system: Any, state: State, joint: str, name: str | None = None) -> Array:
-    """The rate of a coordinate of a joint, () [rad/s] or [m/s]; arguments as of `coordinate`."""
+    """The rate of a coordinate of a joint, () [rad/s] or [m/s].
+
+    Args:
+        system: a `BodySystem`.
+        state: where, of one world.
+        joint: its name.
+        name: which of its coordinates; not needed where it has but one.
+    """
     return jnp.reshape(_row(system, state, joint, name, "coordinate_rate").rate, ())
 
 
@@ -90,7 +133,13 @@ def center_of_mass(
 
 
 def momentum(system: Any, state: State, bodies: Sequence[str] | None = None) -> Array:
-    """Σ m ẋ of chosen bodies, all that move unless given, (dim,) [kg m/s], world frame."""
+    """Σ m ẋ of chosen bodies, all that move unless given, (dim,) [kg m/s], world frame.
+
+    Args:
+        system: a `BodySystem`.
+        state: where, of one world.
+        bodies: whose; all that move unless given.
+    """
     return _point(_momentum(system, state, bodies, "momentum").linear)
 
 

@@ -123,7 +123,11 @@ class Violation:
         return _norm(self.position[..., self.layout.rows(name)])
 
     def rate(self, name: str) -> Array:
-        """‖φ̇‖ or ‖ψ‖ of a constraint, ()."""
+        """‖φ̇‖ or ‖ψ‖ of a constraint, ().
+
+        Args:
+            name: of the constraint.
+        """
         return _norm(self.velocity[..., self.layout.rows(name)])
 
 

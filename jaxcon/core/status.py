@@ -9,7 +9,19 @@ from jaxcon.core.typing import Array
 
 
 class Status(IntEnum):
-    """0 is healthy; below `CONFLICT` a world has failed and stops, from there on it goes on."""
+    """0 is healthy; below `CONFLICT` a world has failed and stops, from there on it goes on.
+
+    Attributes:
+        OK: nothing to say.
+        NON_FINITE: a state, force or parameter is NaN or infinite.
+        SINGULAR: rows depend on each other, or the mass matrix is not positive definite.
+        NOT_CONVERGED: an iteration did not reach its tolerance.
+        VIOLATED: constraints stayed off by more than the limit of a `Recovery`.
+        CONFLICT: constraints contradict each other; least squares go on.
+        ROLLED_BACK: a `Recovery` went back to the state before the step.
+        PROJECTED: it went to the valid configuration nearest to the state before.
+        RELAXED: it took the step with weaker feedback.
+    """
 
     OK = 0
     NON_FINITE = 1

@@ -115,6 +115,9 @@ class Scene:
     def add(self, element: Any) -> None:
         """Adds a joint, constraint or force element.
 
+        Args:
+            element: such as `Revolute`, `Spring` or `Limit`; their bodies may come later.
+
         Raises:
             ValueError: its name is taken.
             TypeError: it is neither a constraint nor a force.

@@ -57,11 +57,20 @@ class Vakonomic:
         return np.asarray(self.rows.free)
 
     def physical(self, state: State) -> State:
-        """A state of the physical system: without μ."""
+        """A state of the physical system: without μ.
+
+        Args:
+            state: of this system.
+        """
         return dataclasses.replace(state, v=state.v[: state.v.shape[0] - len(self.free)])
 
     def multipliers(self, state: State, name: str) -> Array:
-        """μ of a constraint, by those of its rows that have no φ."""
+        """μ of a constraint, by those of its rows that have no φ.
+
+        Args:
+            state: of this system.
+            name: of the constraint.
+        """
         mine = np.isin(self.free, self.rows.rows(name))
         return state.v[state.v.shape[0] - len(self.free) :][mine]
 

@@ -105,6 +105,12 @@ def restart(
 
     As few starts are computed as that takes: none while no copy is chosen, a sixteenth of n while
     few are, otherwise n. There is no loop, so that both modes of differentiation go through.
+
+    Args:
+        environment: of all of them.
+        copies: where they stand.
+        chosen: which, (n,) of bools.
+        randomize: as of `begin`.
     """
     count = chosen.shape[0]
     size = min(count, max(LEAST_PART, -(-count // PARTS)))

@@ -114,30 +114,62 @@ class Environment:
         raise NotImplementedError
 
     def start(self, key: Array) -> tuple[State, PyTree]:
-        """A state of the mechanism in which an episode begins, and its goal."""
+        """A state of the mechanism in which an episode begins, and its goal.
+
+        Args:
+            key: of JAX.
+        """
         raise NotImplementedError
 
     def control(self, episode: Episode, action: Array) -> Array:
-        """The control inputs (n_u,) for an action within −1 to 1; the action unless overridden."""
+        """The control inputs (n_u,) for an action within −1 to 1; the action unless overridden.
+
+        Args:
+            episode: where it stands.
+            action: (number of actions,).
+        """
         return action
 
     def observation(self, episode: Episode) -> Array:
-        """What is seen, before it is clipped, (n,)."""
+        """What is seen, before it is clipped, (n,).
+
+        Args:
+            episode: where it stands.
+        """
         raise NotImplementedError
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """What an action within −1 to 1 was worth, from 0 to 1, ()."""
+        """What an action within −1 to 1 was worth, from 0 to 1, ().
+
+        Args:
+            before: the episode before the action.
+            action: (number of actions,).
+            after: the episode after it.
+        """
         raise NotImplementedError
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether the task is over, ()."""
+        """Whether the task is over, ().
+
+        Args:
+            episode: where it stands.
+        """
         return jnp.zeros((), bool)
 
     def marks(self, axes: Any, episode: Episode) -> None:
-        """Draws into a picture what bodies do not show, such as the goal."""
+        """Draws into a picture what bodies do not show, such as the goal.
+
+        Args:
+            axes: of matplotlib.
+            episode: where it stands.
+        """
 
     def reset(self, key: Array) -> Episode:
-        """The start of an episode, all of whose randomness comes from the key."""
+        """The start of an episode, all of whose randomness comes from the key.
+
+        Args:
+            key: of JAX.
+        """
         own, key = jax.random.split(key)
         state, goal = self.start(own)
         zero = jnp.zeros((), jnp.int32)
@@ -231,7 +263,12 @@ class Environment:
 
 
 def near(x: Any, scale: float) -> Array:
-    """1 / (1 + (x/s)²): 1 at x = 0, ½ at x = ±s, with a slope everywhere else."""
+    """1 / (1 + (x/s)²): 1 at x = 0, ½ at x = ±s, with a slope everywhere else.
+
+    Args:
+        x: of any shape.
+        scale: s, in the unit of x.
+    """
     return 1 / (1 + (x / scale) ** 2)
 
 

@@ -68,6 +68,10 @@ class GymnasiumEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Starts an episode; those after a seed are the same whenever the seed is.
 
+        Args:
+            seed: of all that is drawn from now on; None goes on drawing.
+            options: none.
+
         Raises:
             ValueError: options, of which there are none.
         """
@@ -79,6 +83,9 @@ class GymnasiumEnv(gymnasium.Env):
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One action, (number of actions,), clipped to −1 to 1.
+
+        Args:
+            action: (number of actions,).
 
         Raises:
             ValueError: the action has another shape, or is not a number.
@@ -102,7 +109,11 @@ class GymnasiumEnv(gymnasium.Env):
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Goes on from what `save` gave, with the very same numbers."""
+        """Goes on from what `save` gave, with the very same numbers.
+
+        Args:
+            saved: from `save`.
+        """
         self.episode = jax.tree.map(jnp.asarray, saved["episode"])
         self.np_random.bit_generator.state = saved["random"]
 

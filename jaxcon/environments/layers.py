@@ -45,6 +45,12 @@ class Layered(Environment):
     ) -> Layered:
         """The task under a controller; its horizon counts targets.
 
+        Args:
+            task: the one below.
+            controller: (environment, episode, target within −1 to 1) → action of the task.
+            targets: names with the unit of a target's −1 to 1.
+            hold: actions below for each target.
+
         Raises:
             ValueError: `hold` is no whole number from 1.
         """

@@ -73,6 +73,10 @@ class GymnasiumVectorEnv(VectorEnv):
     ) -> tuple[Array, dict[str, Any]]:
         """Starts an episode in every copy, or in those of `options["reset_mask"]`, (n,) of bools.
 
+        Args:
+            seed: of all that is drawn from now on; None goes on drawing.
+            options: `reset_mask`, or none.
+
         Raises:
             ValueError: unknown options, or a mask of another shape.
         """
@@ -95,6 +99,9 @@ class GymnasiumVectorEnv(VectorEnv):
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One action of every copy, (n, number of actions), clipped to −1 to 1.
+
+        Args:
+            actions: (n, number of actions).
 
         Raises:
             ValueError: the actions have another shape.
@@ -121,7 +128,11 @@ class GymnasiumVectorEnv(VectorEnv):
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Goes on from what `save` gave, with the very same numbers."""
+        """Goes on from what `save` gave, with the very same numbers.
+
+        Args:
+            saved: from `save`.
+        """
         self.copies = jax.tree.map(jnp.asarray, saved["copies"])
         self.np_random.bit_generator.state = saved["random"]
 

@@ -41,21 +41,37 @@ class Inertia:
 
 
 def sphere(mass: Any, radius: Any) -> Inertia:
-    """Homogeneous ball: I = 2/5 m r²."""
+    """Homogeneous ball: I = 2/5 m r².
+
+    Args:
+        mass: () [kg].
+        radius: () [m].
+    """
     _check("sphere", mass=mass, radius=radius)
     moment = mass * radius**2 * 0.4
     return Inertia(mass, (moment, moment, moment))
 
 
 def box(mass: Any, size: Any) -> Inertia:
-    """Homogeneous box with edges size (3,): I_x = m (b² + c²) / 12, and so on."""
+    """Homogeneous box with edges size (3,): I_x = m (b² + c²) / 12, and so on.
+
+    Args:
+        mass: () [kg].
+        size: edges along x, y and z, (3,) [m].
+    """
     _check("box", mass=mass, size=size)
     x, y, z = (edge**2 for edge in size)
     return Inertia(mass, (mass * (y + z) / 12, mass * (z + x) / 12, mass * (x + y) / 12))
 
 
 def cylinder(mass: Any, radius: Any, length: Any) -> Inertia:
-    """Homogeneous cylinder along z: I_z = m r² / 2, I_x = I_y = m (3 r² + l²) / 12."""
+    """Homogeneous cylinder along z: I_z = m r² / 2, I_x = I_y = m (3 r² + l²) / 12.
+
+    Args:
+        mass: () [kg].
+        radius: () [m].
+        length: along z, () [m].
+    """
     _check("cylinder", mass=mass, radius=radius, length=length)
     across = mass * (3 * radius**2 + length**2) / 12
     return Inertia(mass, (across, across, mass * radius**2 / 2))
@@ -69,6 +85,11 @@ def rod(mass: Any, *, length: Any, radius: Any) -> Inertia:
 
     A rod without thickness cannot be turned about itself in space; in the plane use
     `inertia=mass * length**2 / 12`.
+
+    Args:
+        mass: () [kg].
+        length: along x, () [m].
+        radius: () [m].
     """
     _check("rod", mass=mass, length=length, radius=radius)
     across = mass * (3 * radius**2 + length**2) / 12
@@ -80,6 +101,11 @@ def capsule(mass: Any, radius: Any, length: Any) -> Inertia:
 
     A half ball of mass m_h has its centre of mass 3r/8 from its flat face, and m_h r² · 83/320
     about it across.
+
+    Args:
+        mass: () [kg].
+        radius: () [m].
+        length: of the cylinder, without the half balls, () [m].
     """
     _check("capsule", mass=mass, radius=radius, length=length)
     share = 3 * length / (3 * length + 4 * radius)  # the cylinder's share of the volume
@@ -153,6 +179,10 @@ def _check_tensor(tensor: Array, moments: Array) -> None:
 
 def check_triangle(owner: str, moments: Any) -> None:
     """Checks I₁ + I₂ ≥ I₃, which every real body satisfies.
+
+    Args:
+        owner: what the message begins with.
+        moments: principal moments, (3,) [kg m²].
 
     Raises:
         ValueError: one moment exceeds the sum of the others by more than round-off.

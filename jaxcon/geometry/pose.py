@@ -38,19 +38,35 @@ class Pose:
         return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
 
     def point(self, local: Array) -> Array:
-        """x + R s: a point of the body in the world frame."""
+        """x + R s: a point of the body in the world frame.
+
+        Args:
+            local: s, in the body frame, (dim,) [m].
+        """
         return self.position + self.direction(local)
 
     def direction(self, local: Array) -> Array:
-        """R u: a direction of the body in the world frame."""
+        """R u: a direction of the body in the world frame.
+
+        Args:
+            local: u, in the body frame, (dim,).
+        """
         return local if self.orientation is None else self.rotation @ local
 
     def local_point(self, world: Array) -> Array:
-        """Rᵀ (p − x): a world point in the body frame."""
+        """Rᵀ (p − x): a world point in the body frame.
+
+        Args:
+            world: p, (dim,) [m].
+        """
         return self.local_direction(world - self.position)
 
     def local_direction(self, world: Array) -> Array:
-        """Rᵀ n: a world direction in the body frame."""
+        """Rᵀ n: a world direction in the body frame.
+
+        Args:
+            world: n, (dim,).
+        """
         return world if self.orientation is None else self.rotation.T @ world
 
 
@@ -86,7 +102,11 @@ class Motion(Pose):
         return Pose(self.position, self.orientation)
 
     def seen_from(self, offset: Pose | None) -> Motion:
-        """The motion of a frame fixed in this body at the pose `offset` in it."""
+        """The motion of a frame fixed in this body at the pose `offset` in it.
+
+        Args:
+            offset: of the frame in the body; None for the body's own.
+        """
         if offset is None:
             return self
         position, velocity = self.point(offset.position), self.point_velocity(offset.position)
@@ -97,7 +117,11 @@ class Motion(Pose):
         return Motion(position, turned, velocity, omega)
 
     def point_velocity(self, local: Array) -> Array:
-        """ẋ + R (ω × s): the velocity of a point of the body, world frame [m/s]."""
+        """ẋ + R (ω × s): the velocity of a point of the body, world frame [m/s].
+
+        Args:
+            local: s, in the body frame, (dim,) [m].
+        """
         if self.angular_velocity is None:
             return self.velocity
         if self.position.shape[0] == 3:

@@ -37,13 +37,22 @@ def multiply(p: Any, q: Any) -> Any:
 
 @componentwise
 def conjugate(q: Any) -> Any:
-    """q*: the inverse of a unit quaternion (4, …)."""
+    """q*: the inverse of a unit quaternion (4, …).
+
+    Args:
+        q: (4, …).
+    """
     return Vector(q[0], *(times(-1, x) for x in q[1:]))
 
 
 @componentwise
 def rotate(q: Any, x: Any) -> Any:
-    """q x q*: a vector of the body (3, …) in the world frame."""
+    """q x q*: a vector of the body (3, …) in the world frame.
+
+    Args:
+        q: (4, …).
+        x: in the body frame, (3, …).
+    """
     scalar, vector = split(q)
     twice = vector.cross(x) * 2.0
     return x + twice * scalar + vector.cross(twice)
@@ -51,12 +60,20 @@ def rotate(q: Any, x: Any) -> Any:
 
 @componentwise
 def matrix(q: Any) -> Any:
-    """The rotation matrix R (3, 3, …) with R x = q x q*."""
+    """The rotation matrix R (3, 3, …) with R x = q x q*.
+
+    Args:
+        q: (4, …).
+    """
     return rotation(q)
 
 
 def rotation(q: Vector) -> Matrix:
-    """The rotation matrix of lanes, R x = q x q*."""
+    """The rotation matrix of lanes, R x = q x q*.
+
+    Args:
+        q: a `Vector` of 4 lanes.
+    """
     w, x, y, z = q
     xx, yy, zz = times(x, x), times(y, y), times(z, z)
     xy, xz, yz = times(x, y), times(x, z), times(y, z)
@@ -77,20 +94,33 @@ def rotation(q: Vector) -> Matrix:
 
 @componentwise
 def derivative(q: Any, omega: Any) -> Any:
-    """q̇ = ½ q ⊗ (0, ω), ω (3, …) in the body frame [rad/s]."""
+    """q̇ = ½ q ⊗ (0, ω), ω (3, …) in the body frame [rad/s].
+
+    Args:
+        q: (4, …).
+        omega: ω, (3, …) [rad/s].
+    """
     return multiply(q, Vector(0.0, *omega)) * 0.5
 
 
 @componentwise
 def exp(phi: Any) -> Any:
-    """The turn by ‖φ‖ about φ (3, …) [rad]: (cos ½‖φ‖, φ sin ½‖φ‖ / ‖φ‖), smooth at φ = 0."""
+    """The turn by ‖φ‖ about φ (3, …) [rad]: (cos ½‖φ‖, φ sin ½‖φ‖ / ‖φ‖), smooth at φ = 0.
+
+    Args:
+        phi: φ, (3, …) [rad].
+    """
     cos, sinc = numerics.cos_sinc(phi.dot(phi) * 0.25)
     return Vector(cos, *(phi * (sinc * 0.5)))
 
 
 @componentwise
 def log(q: Any) -> Any:
-    """The rotation vector φ (3, …) [rad] of the shorter turn: exp(φ) = ± q, smooth at identity."""
+    """The rotation vector φ (3, …) [rad] of the shorter turn: exp(φ) = ± q, smooth at identity.
+
+    Args:
+        q: (4, …).
+    """
     scalar, vector = split(q)
     sine = numerics.norm(vector)
     half = jnp.arctan2(sine, jnp.abs(scalar))
@@ -102,12 +132,21 @@ def log(q: Any) -> Any:
 
 @componentwise
 def normalize(q: Any) -> Any:
-    """q / ‖q‖ (4, …)."""
+    """q / ‖q‖ (4, …).
+
+    Args:
+        q: (4, …), not zero.
+    """
     return numerics.unit(q)
 
 
 def from_axis_angle(axis: Any, angle: Any) -> Array:
-    """The turn by an angle () [rad] about an axis (3,) of any length but zero."""
+    """The turn by an angle () [rad] about an axis (3,) of any length but zero.
+
+    Args:
+        axis: (3,), of any length but zero.
+        angle: () [rad].
+    """
     axis = jnp.asarray(axis)
     if not jnp.issubdtype(axis.dtype, jnp.floating):
         axis = axis.astype(jnp.result_type(float))
@@ -118,6 +157,9 @@ def from_matrix(r: Array) -> Array:
     """The unit quaternion (4,) of a rotation matrix (3, 3), differentiable at every rotation.
 
     The column of 4 q qᵀ with the largest diagonal entry, which is never near zero.
+
+    Args:
+        r: R, (3, 3).
 
     References:
         Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978).
@@ -138,5 +180,9 @@ def from_matrix(r: Array) -> Array:
 
 
 def split(q: Vector) -> tuple[Lane, Vector]:
-    """The scalar and the vector part."""
+    """The scalar and the vector part.
+
+    Args:
+        q: a `Vector` of 4 lanes.
+    """
     return q[0], Vector(*q[1:])

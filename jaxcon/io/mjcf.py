@@ -30,7 +30,12 @@ from jaxcon.model.system import BodySystem
 
 @pytree
 class Keyframe:
-    """A state that a model names, and the controls that go with it."""
+    """A state that a model names, and the controls that go with it.
+
+    Attributes:
+        state: the state, as `MujocoModel.state` makes it.
+        control: MuJoCo's ctrl, (nu,).
+    """
 
     state: State
     control: Array
@@ -91,15 +96,27 @@ class MujocoModel:
 
         An angle lies within half a turn of its reference unless whole turns are counted: by a
         spring, servo or coupling, or everywhere by `from_mjcf(…, count_turns=True)`.
+
+        Args:
+            state: of one world.
         """
         return self.tree.read(self.system, state)[0]
 
     def qvel(self, state: State) -> Array:
-        """MuJoCo's velocities of a state, (nv,)."""
+        """MuJoCo's velocities of a state, (nv,).
+
+        Args:
+            state: of one world.
+        """
         return self.tree.read(self.system, state)[1]
 
     def qacc(self, state: State, acceleration: Array) -> Array:
-        """MuJoCo's accelerations, (nv,): the rate of qvel where the bodies have this a (n_v,)."""
+        """MuJoCo's accelerations, (nv,): the rate of qvel where the bodies have this a (n_v,).
+
+        Args:
+            state: of one world.
+            acceleration: a, (n_v,).
+        """
 
         def qvel(q: Array, v: Array) -> Array:
             return self.qvel(dataclasses.replace(state, q=q, v=v))
@@ -109,6 +126,9 @@ class MujocoModel:
 
     def keyframe(self, name: str) -> Keyframe:
         """A keyframe by name.
+
+        Args:
+            name: as the model has it.
 
         Raises:
             ValueError: there is none of this name.

@@ -45,7 +45,12 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
 
 
 def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
-    """(x − x_ref) / scale, and 0 where the reference is NaN; arguments as of `tracking`.
+    """(x − x_ref) / scale, and 0 where the reference is NaN.
+
+    Args:
+        path: arrays of chosen quantities.
+        reference: the same as they should be; NaN where nobody knows.
+        scale: of each quantity, as of `tracking`.
 
     Raises:
         ValueError: path and reference differ in structure or shape, or the scale has more numbers.
@@ -93,7 +98,11 @@ def violation(off: Violation, dt: Any) -> Array:
 def mean_violation(off: Violation, dt: Any) -> Array:
     """The mean square of (φ, h φ̇) over rows and time, () [m²].
 
-    φ is the error now, h φ̇ the one that it is about to grow by. Arguments as of `violation`.
+    φ is the error now, h φ̇ the one that it is about to grow by.
+
+    Args:
+        off: `info.violation` of each step.
+        dt: h, () [s].
 
     Raises:
         ValueError: the scene has no rows.
@@ -117,6 +126,10 @@ def energy_drift(energy: Energy, scale: Any = None) -> Array:
 
 def weighted(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> tuple[Any, Any]:
     """Σ weight · term, and the terms themselves, as `tune` takes a loss and what goes beside it.
+
+    Args:
+        terms: numbers by name, () each.
+        weights: numbers by the same names.
 
     Raises:
         ValueError: terms and weights have other names.

@@ -114,19 +114,30 @@ class Layout:
         raise ValueError(f"body '{name}' {reason}; the bodies that move are {list(self.bodies)}.")
 
     def q(self, name: str) -> np.ndarray:
-        """Indices of a body's coordinates in q."""
+        """Indices of a body's coordinates in q.
+
+        Args:
+            name: of the body.
+        """
         group, index = self.locate(name)
         g = self.groups[group]
         return g.q + index + len(g.names) * np.arange(g.kind.n_q)
 
     def v(self, name: str) -> np.ndarray:
-        """Indices of a body's velocities in v."""
+        """Indices of a body's velocities in v.
+
+        Args:
+            name: of the body.
+        """
         group, index = self.locate(name)
         g = self.groups[group]
         return g.v + index + len(g.names) * np.arange(g.kind.n_v)
 
     def control(self, name: str) -> slice:
         """Where a control channel lies in the control array.
+
+        Args:
+            name: of the element.
 
         Raises:
             ValueError: no element has a control channel of this name.

@@ -77,7 +77,12 @@ def recall(system: Any, turns: PyTree) -> Any:
 
 @pytree
 class Energy:
-    """Mechanical energy [J]."""
+    """Mechanical energy [J].
+
+    Attributes:
+        kinetic: ½ vᵀMv, and that of rotors, () [J].
+        potential: of gravity and springs, () [J]; forces of one's own have none.
+    """
 
     kinetic: Any
     potential: Any

@@ -37,7 +37,7 @@ def frequency_response(
         dt: h [s].
 
     Returns:
-        φ/w as complex numbers, in the shape to which the arguments broadcast [s²]: the steady
+        φ/w as complex numbers, in the shape to which the arguments broadcast [s²]; the steady
         response, which is never reached where the feedback is unstable; `largest_stable_rate` says
         up to where it is not.
 

@@ -120,7 +120,11 @@ class Baumgarte(Unstabilized):
 
     @classmethod
     def critical(cls, rate: Any) -> Baumgarte:
-        """α = β = rate [1/s]: the fastest decay without oscillation."""
+        """α = β = rate [1/s]: the fastest decay without oscillation.
+
+        Args:
+            rate: number, array by row (n_c,), or a mapping by constraint name.
+        """
         return cls(rate, rate)
 
     @classmethod

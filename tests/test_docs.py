@@ -1,0 +1,197 @@
+"""Every public name is on one page of the reference, and says what its numbers are."""
+
+import dataclasses
+import enum
+import importlib
+import inspect
+import re
+from collections import Counter
+from pathlib import Path
+from types import ModuleType
+
+import jaxcon as jc
+import jaxcon.scenes
+
+ROOT = Path(__file__).parents[1]
+PAGES = {p.stem: p.read_text() for p in (ROOT / "docs" / "reference").glob("*.rst")}
+MODULES = {
+    "inertia": jc.inertia,
+    "quaternion": jc.quaternion,
+    "losses": jc.losses,
+    "scenes": jaxcon.scenes,
+}
+BESIDE = {
+    "jaxcon.model.system.BodySystem",
+    "jaxcon.model.layout.Layout",
+    "jaxcon.constraints.rows.Violation",
+    "jaxcon.analysis.front.Run",
+    "jaxcon.analysis.front.Limit",
+    "jaxcon.analysis.front.LeftOut",
+    "jaxcon.view.draw",
+    "jaxcon.view.links",
+    "jaxcon.view.canvas",
+    "jaxcon.scenes.CRANK_ROCKER",
+    "jaxcon.scenes.BICYCLE",
+}
+"""What public functions return, and other names that users meet."""
+UNREAD = "jaxcon.environments.brax.BraxEnv"
+"""It derives from a class of Brax, which tests do without."""
+SECTION = re.compile(r"(Args|Attributes):")
+FIELD = re.compile(r" {4}([\w*]+(?:, [\w*]+)*):")
+
+
+def entries(page):
+    """Full names of what a page documents, with the members of each."""
+    found, module = [], ""
+    for line in page.splitlines():
+        if match := re.fullmatch(r"\.\. currentmodule:: (.*)", line):
+            module = match[1]
+        elif match := re.fullmatch(r"\.\. (?:auto(?!module)\w+|py:data):: (.*)", line):
+            name = match[1]
+            found.append((name if name.startswith("jaxcon.") else f"{module}.{name}", []))
+        elif match := re.fullmatch(r" +:members: (.*)", line):
+            found[-1][1].extend(match[1].split(", "))
+    return found
+
+
+ENTRIES = {page: entries(text) for page, text in PAGES.items()}
+
+
+def look_up(name):
+    """What a full name stands for; modules may have it under another name."""
+    parts = name.split(".")
+    here = importlib.import_module("jaxcon")
+    for i, part in enumerate(parts[1:], 2):
+        here = getattr(here, part, None) or importlib.import_module(".".join(parts[:i]))
+    return here
+
+
+def defined(module):
+    """Public functions and classes of a module's own."""
+    return {
+        name
+        for name, thing in vars(module).items()
+        if not name.startswith("_") and getattr(thing, "__module__", "") == module.__name__
+    }
+
+
+def public():
+    """Every full name that the reference has."""
+    environments = {*jc.environments.__all__, *jc.environments.OF_OTHERS} - {"BraxEnv"}
+    return (
+        {f"jaxcon.{n}" for n in jc.__all__ if not isinstance(getattr(jc, n), ModuleType)}
+        | {f"jaxcon.{place}.{n}" for place, module in MODULES.items() for n in defined(module)}
+        | {f"jaxcon.environments.{n}" for n in environments}
+        | {*BESIDE, UNREAD}
+    )
+
+
+def test_every_public_name_is_on_one_page_and_nothing_else_is():
+    found = Counter(name for page in ENTRIES.values() for name, _ in page)
+    assert set(found) ^ public() == set()
+    assert [name for name, count in found.items() if count > 1] == []
+    listed = re.findall(r"^   (\w+)$", PAGES["index"], re.MULTILINE)
+    assert sorted(listed) == sorted(PAGES.keys() - {"index"})
+
+
+def test_pages_are_the_groups_of_the_tour():
+    tour = inspect.getdoc(jc).split("A tour of the names")[1]
+    groups = dict(re.findall(r"^(\w[^:\n]*): (.*(?:\n    .*)*)", tour, re.MULTILINE))
+    pages = {text.splitlines()[0]: page for page, text in PAGES.items()}
+    assert len(groups) == 12
+    for title, words in groups.items():
+        names = [n for n in re.findall(r"\w+", words) if hasattr(jc, n)]
+        wanted = {f"jaxcon.{n}" for n in names if n not in MODULES}
+        assert {name for name, _ in ENTRIES[pages[title]]} - BESIDE == wanted, title
+
+
+def described(doc):
+    """Names in the sections Args and Attributes of a docstring."""
+    found, inside = set(), False
+    for line in inspect.cleandoc(doc or "").splitlines():
+        if line and not line.startswith(" "):
+            inside = bool(SECTION.fullmatch(line))
+        elif inside and (match := FIELD.match(line)):
+            found |= {name.lstrip("*") for name in match[1].split(", ")}
+    return found
+
+
+def numbers(thing):
+    """Names that a docstring owes its reader: parameters, fields, or members."""
+    if dataclasses.is_dataclass(thing):
+        return {f.name for f in dataclasses.fields(thing) if not f.name.startswith("_")}
+    if inspect.isclass(thing) and issubclass(thing, enum.Enum):
+        return set(thing.__members__)
+    if inspect.isclass(thing) and issubclass(thing, Exception):
+        return set()
+    return set(inspect.signature(thing).parameters) - {"self", "cls"}
+
+
+def lacking(thing):
+    """Numbers that nothing describes, for a class neither in its docstring nor in its bases'."""
+    places = inspect.getmro(thing)[:-1] if inspect.isclass(thing) else [thing]
+    return numbers(thing) - set().union(*(described(p.__doc__) for p in places))
+
+
+def test_every_number_of_a_public_name_is_described_and_no_other():
+    missing, unknown = {}, {}
+    for name, members in (entry for page in ENTRIES.values() for entry in page):
+        if name == UNREAD:
+            continue
+        thing = look_up(name)
+        parts = {name: thing} if callable(thing) else {}
+        parts |= {f"{name}.{m}": getattr(thing, m) for m in members}
+        for label, part in parts.items():
+            if callable(part):
+                assert inspect.getdoc(part), label
+                missing[label] = lacking(part)
+                unknown[label] = described(part.__doc__) - numbers(part)
+            else:
+                assert inspect.getdoc(inspect.getattr_static(thing, label.split(".")[-1])), label
+    assert {label: left for label, left in missing.items() if left} == {}
+    assert {label: more for label, more in unknown.items() if more} == {}
+
+
+def test_the_check_sees_a_parameter_that_nothing_describes():
+    def f(mass, length, *, radius):
+        """Says little.
+
+        Args:
+            mass: () [kg].
+            radius: () [m], where
+                length: is a word of the text.
+
+        Raises:
+            length: never.
+        """
+
+    assert lacking(f) == {"length"}
+
+
+def test_the_guide_has_every_section_of_the_readme_once_and_in_order():
+    readme = (ROOT / "README.md").read_text()
+    sections = re.findall(r"^## (.*)$", readme, re.MULTILINE)
+    pages = re.findall(r"^([a-z-]+)$", (ROOT / "docs/guide/index.md").read_text(), re.MULTILINE)
+    assert len(pages) == len(list((ROOT / "docs/guide").glob("*.md"))) - 1
+    assert sections[-1] == "Licence"
+    for page, section, after in zip(pages, sections, sections[1:], strict=False):
+        text = (ROOT / "docs" / "guide" / f"{page}.md").read_text()
+        assert text.startswith(f"# {section}\n")
+        marks = [f"## {section}", f"## {after}"]
+        assert re.findall(r':(?:start-after|end-before): "(.*)"', text) == marks
+        for mark in marks:  # an include looks for the first place with these letters
+            assert readme.index(mark) == readme.index(f"\n{mark}\n") + 1
+    assert len(pages) == len(sections) - 1
+
+
+def test_every_example_is_on_the_page_of_examples():
+    text = (ROOT / "docs" / "examples.md").read_text()
+    shown = re.findall(r"{literalinclude} \.\./examples/(\w+)\.py", text)
+    assert sorted(shown) == sorted(p.stem for p in (ROOT / "examples").glob("*.py"))
+
+
+def test_pages_have_no_programs_of_their_own_that_nothing_runs():
+    pages = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.rst")]
+    assert len(pages) > 30
+    for page in pages:
+        assert not re.search(r"```py|code-block|:: *python|^::$|>>>", page.read_text()), page
