@@ -168,3 +168,42 @@ def test_a_force_that_closes_over_a_traced_number_is_refused(transform):
 
     with pytest.raises(TypeError, match="params="):
         transform(final)(jnp.ones(2) if transform is jax.vmap else 1.0)
+
+
+def test_systems_of_one_structure_keep_their_rows():
+    """Pendulums of two and of three coordinates, whose functions do not say how many."""
+
+    def system(n):
+        own = jc.GeneralizedSystem(mass=ones, force=fall, constraints=(jc.Holonomic(length),))
+        return own, jc.init(own, jc.Method(), jnp.eye(n)[0], jnp.zeros(n))
+
+    both = [system(n) for n in (2, 3)]
+    for own, state in (*both, both[0]):
+        _, info = jc.step(own, jc.Method(), state, None, 1e-3)
+        assert info.violation.layout.size == info.violation.position.size == len(state.q) - 1
+
+
+def ones(q, p):
+    return jnp.ones_like(q)
+
+
+def fall(q, v, t, u, p):
+    return -jnp.ones_like(q)
+
+
+def length(q, t, p):
+    return q[:-1] ** 2 + q[1:] ** 2 - q[0] ** 2 - q[1] ** 2
+
+
+def test_single_precision_is_traced_anew_where_double_is_off():
+    """The same function and shapes: its own constants follow what JAX now takes for real."""
+    x = jnp.ones(2, jnp.float32)
+
+    def real(x):
+        return x * jnp.zeros(()).dtype.itemsize
+
+    found = []
+    for double in (True, False, True):
+        with jax.enable_x64(double):
+            found.append(float(jax.vmap(lambda y: native.call(real, y))(x)[0]))
+    assert found == [8, 4, 8]

@@ -42,10 +42,10 @@ class Native:
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
         self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
-        self.tangent = functools.lru_cache(maxsize=None)(self._tangent)
-        self.transposed = functools.lru_cache(maxsize=None)(self._transposed)
-        self.part = functools.lru_cache(maxsize=None)(functools.partial(Part, self))
-        self.by_mesh = functools.lru_cache(maxsize=64)(self._by_mesh)
+        self.tangent = functools.lru_cache(maxsize=64)(self._tangent)
+        self.transposed = functools.lru_cache(maxsize=64)(self._transposed)
+        self.part = functools.lru_cache(maxsize=64)(functools.partial(Part, self))
+        self.among = functools.lru_cache(maxsize=64)(self._among)
 
     def __call__(self, *args: Array) -> list[Array]:
         """The function itself."""
@@ -61,13 +61,14 @@ class Native:
         return [ShapedArray(y.shape[:-1], y.dtype) for y in found]
 
     def traced(self, *avals: Any) -> Any:
-        """The closed jaxpr for arguments of these shapes and dtypes, on the devices in use.
+        """The closed jaxpr for arguments of these shapes and dtypes, where JAX now stands.
 
-        Operations keep the mesh under which they were traced, and are refused under another.
+        Operations keep the mesh and the default precision under which they were traced.
         """
-        return self.by_mesh(jax.sharding.get_abstract_mesh(), *avals)
+        mesh, real = jax.sharding.get_abstract_mesh(), jnp.result_type(float)
+        return self.among((mesh, real), *avals)
 
-    def _by_mesh(self, mesh: Any, *avals: Any) -> Any:
+    def _among(self, settings: Any, *avals: Any) -> Any:
         return self._traced(*avals)
 
     def _traced(self, *avals: Any) -> Any:
@@ -155,8 +156,11 @@ native_p.multiple_results = True
 
 
 @functools.lru_cache(maxsize=256)
-def _native(function: Callable[..., Any], structure: Any) -> tuple[Native, list[Any]]:
-    """The function of leaves, and a place where its result's structure is left when tracing."""
+def _native(function: Callable[..., Any], structure: Any, shapes: Any) -> tuple[Native, list[Any]]:
+    """The function of leaves, and a place where its result's structure is left when tracing.
+
+    What a result holds beside arrays may depend on shapes, such as the number of rows.
+    """
     result: list[Any] = [None]
 
     def flat(*leaves: Array) -> list[Array]:
@@ -180,8 +184,8 @@ def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
         What the function returns.
     """
     leaves, structure = jax.tree.flatten(args)
-    native, result = _native(function, structure)
     arrays = [jnp.asarray(x) for x in leaves]
+    native, result = _native(function, structure, tuple(x.shape for x in arrays))
     arrays = native_p.bind(*arrays, fun=native)  # its trace leaves the structure
     return jax.tree.unflatten(result[0], arrays)
 
