@@ -145,7 +145,7 @@ def test_a_second_call_goes_on_and_lists_what_it_has_no_time_for(result, file, m
         jc.tradeoff(system, state, 2.0, methods=METHODS, batch=4, file=file, progress=False)
 
 
-def test_the_keyboard_ends_it_with_what_was_found(file, monkeypatch):
+def test_the_keyboard_ends_it_with_what_was_found(result, file, monkeypatch):
     def pressed(*_):
         raise KeyboardInterrupt
 
