@@ -1,7 +1,7 @@
 """Makes reStructuredText of docstrings, which are plain text and stay readable as that.
 
 They have `code` between backticks, Google's sections, formulas and programs that stand indented,
-and references one after the other, whose further lines are indented. Bars, asterisks and
+and references one after the other, whose further lines are indented. Bars and asterisks mean
 themselves.
 """
 

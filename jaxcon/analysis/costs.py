@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcon.analysis.memory import nothing
 from jaxcon.analysis.reference import Reference
-from jaxcon.analysis.trials import Points, Problem
+from jaxcon.analysis.trials import Lowered, Points, Problem
 from jaxcon.core.precision import cast, precision
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.simulation.method import Method
@@ -52,12 +52,8 @@ class Batch:
         return cls(problem, points, jax.tree.map(lambda x: x[index], problem.inputs.rows), worlds)
 
 
-class Pace:
-    """The steps of a batch under one method, with h and their number traced.
-
-    Attributes:
-        lowered: the traced program.
-    """
+class Pace(Lowered):
+    """The steps of a batch under one method, with h and their number traced."""
 
     def __init__(self, batch: Batch, method: Method, dtype: Any) -> None:
         self.batch, self.dtype = batch, np.dtype(dtype)
@@ -78,12 +74,7 @@ class Pace:
                 return jax.vmap(world)(points, rows)
 
             self.args = cast((batch.points, batch.rows), dtype)
-            self.lowered = jax.jit(many).lower(*self.args, *self._numbers(1e-3, 1))
-        self.program: Any = None
-
-    def compile(self) -> None:
-        """Makes it ready; takes seconds."""
-        self.program = self.lowered.compile()
+            self.lowered = jax.jit(many).lower(*self.args, *self.numbers(1e-3, 1))
 
     @property
     def memory(self) -> float:
@@ -95,7 +86,7 @@ class Pace:
         with precision(self.dtype):
 
             def run(count: int) -> Callable[[], Any]:
-                numbers = self._numbers(dt, count)
+                numbers = self.numbers(dt, count)
                 return lambda: self.program(*self.args, *numbers)
 
             timed(run(FEW))  # the first touches memory that the later ones have
@@ -103,16 +94,9 @@ class Pace:
             spent = np.median([timed(run(count)) for _ in range(REPEATS)])
         return float(spent) / count / self.batch.worlds
 
-    def _numbers(self, dt: float, count: int) -> tuple[Array, Array]:
-        return jnp.asarray(dt, self.dtype), jnp.asarray(count, jnp.int32)
 
-
-class Slope:
-    """The gradient of a rollout of `STEPS` steps by its start, in a batch, with h traced.
-
-    Attributes:
-        lowered: the traced program.
-    """
+class Slope(Lowered):
+    """The gradient of a rollout of `STEPS` steps by its start, in a batch, with h traced."""
 
     def __init__(self, batch: Batch, method: Method, dtype: Any) -> None:
         self.batch, self.dtype = batch, np.dtype(dtype)
@@ -135,11 +119,6 @@ class Slope:
 
             self.args = cast((batch.points, batch.rows), dtype)
             self.lowered = jax.jit(many).lower(*self.args, jnp.asarray(1e-3, self.dtype))
-        self.program: Any = None
-
-    def compile(self) -> None:
-        """Makes it ready; takes seconds."""
-        self.program = self.lowered.compile()
 
     def seconds(self, dt: float) -> float:
         """Of value and gradient by step of one world [s]."""

@@ -161,12 +161,30 @@ class Trip:
         return bool(failed(jnp.asarray(int(self.status)))) or not finite
 
 
-class Course:
-    """One method in one precision on a problem: `lower` traces it, `compile` makes it ready.
+class Lowered:
+    """A traced program in one precision, which `compile` makes ready.
 
     Attributes:
         lowered: the traced program.
+        program: the compiled one.
+        dtype: of its numbers.
     """
+
+    lowered: Any
+    program: Any = None
+    dtype: np.dtype
+
+    def compile(self) -> None:
+        """Makes it ready; takes seconds."""
+        self.program = self.lowered.compile()
+
+    def numbers(self, dt: float, count: int) -> tuple[Array, Array]:
+        """h and a number of steps as arguments."""
+        return jnp.asarray(dt, self.dtype), jnp.asarray(count, jnp.int32)
+
+
+class Course(Lowered):
+    """One method in one precision on a problem; h and the number of steps are traced."""
 
     def __init__(self, problem: Problem, method: Method, dtype: Any) -> None:
         self.dtype, self.problem = np.dtype(dtype), problem
@@ -179,26 +197,18 @@ class Course:
                 return along(system, own, inputs.policy, (start, rows), (h, count), inputs.parts)
 
             self.args = start, inputs.rows
-            self.lowered = jax.jit(travel).lower(*self.args, *self._numbers(1e-3, 1))
-        self.program: Any = None
-
-    def compile(self) -> None:
-        """Makes it ready; takes seconds."""
-        self.program = self.lowered.compile()
+            self.lowered = jax.jit(travel).lower(*self.args, *self.numbers(1e-3, 1))
 
     def go(self, dt: float, count: int) -> Trip:
         """Runs it with so many steps of this length in each part."""
         with precision(self.dtype):
-            numbers = self._numbers(dt, count)
+            numbers = self.numbers(dt, count)
             begin = time.perf_counter()
             state, worst = jax.block_until_ready(self.program(*self.args, *numbers))
             spent = time.perf_counter() - begin
         points = jax.tree.map(lambda x: np.asarray(x, np.float64), Points.of(state))
         code = Status(int(np.asarray(state.status)[-1]))
         return Trip(dt, points, code, float(worst), spent)
-
-    def _numbers(self, dt: float, count: int) -> tuple[Array, Array]:
-        return jnp.asarray(dt, self.dtype), jnp.asarray(count, jnp.int32)
 
 
 def along(
