@@ -20,7 +20,7 @@ from benchmarks import peers, roofline, targets, throughput, timing
 from benchmarks.accuracy import has_mujoco
 
 FILE = Path(__file__).with_suffix(".json")
-BATCH, WORK = 1024, 100_000
+BATCH = 1024
 Ratios = dict[str, dict[str, float]]
 
 
@@ -29,7 +29,7 @@ def ratios(scenes: list[str], solver: str = "Sparse") -> Ratios:
     found: Ratios = {}
     for name in scenes:
         method = throughput.method_of(name, solver)
-        rate = throughput.run_batch(name, method, np.float32, BATCH, WORK, repeats=3)[0].median
+        rate = throughput.run_batch(name, method, np.float32, BATCH, repeats=3)[0].median
         found[name] = {"over_peak": rate / (roofline.peak() / 1e6)}
         if has_mujoco():
             found[name]["over_mujoco"] = rate / peers.mujoco_rate(name, seconds=0.2).median

@@ -71,7 +71,7 @@ FOUR_DEVICES = """
 import jax
 jax.config.update("jax_num_cpu_devices", 4)
 import jax.numpy as jnp, numpy as np, jaxcon as jc
-from benchmarks import devices
+from benchmarks import devices, roofline
 from benchmarks.throughput import worlds
 
 def same(x, y, tolerance=1e-12):
@@ -97,6 +97,10 @@ assert met(compiled) == {"all-reduce": 1}
 found, expected = compiled(gain, apart), jax.jit(devices.mean(run, one))(gain, batch)
 assert abs(expected[1]) > 1e-6
 same(found, expected)
+
+found = roofline.over_all(16, "float32")  # the peak is that of as many cores as the rates
+assert found.size == 64 and len(found.sharding.device_set) == 4
+assert met(roofline.sweeps(2, 3).lower(found).compile()) == {}
 total = jax.jit(lambda x: jnp.sort(x))  # in which devices must meet, and are seen to
 assert met(total.lower(apart.time).compile())
 

@@ -21,6 +21,7 @@ from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.stability import instability, largest_stable_rate, parts
+from jaxcon.simulation.step import controls_in
 
 WEAK = 1e-2
 """Singular values of the rows, scaled to unit length, below which a direction is nearly lost."""
@@ -106,6 +107,7 @@ def diagnose(
     assembled = dataclasses.replace(assembled, status=state.status, memory=state.memory)
     finer = controls
     if controls is not None and not callable(controls):
+        controls = controls_in(state.q.dtype, controls)
         finer = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), 2, axis=0), controls)
     end, given = _simulate(system, method, state, controls, dt, steps)
     _, closed = _simulate(system, method, assembled, controls, dt, steps)
