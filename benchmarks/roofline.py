@@ -2,18 +2,15 @@
 
     python -m benchmarks.roofline [--scenes chain-10 …]
 
-Each arithmetic operation on a floating-point number counts as one, whether it is an addition, a
-division or a sine; data movement, comparisons and integers count as none. What XLA finds to be
-computed twice is counted twice. The peak is what XLA
-reaches on fused multiply-adds of an array that lies in the cache, two operations each.
+`jaxcon.core.operations` says what counts. The peak is what XLA reaches on fused multiply-adds of an
+array that lies in the cache, two operations each.
 """
 
 from __future__ import annotations
 
 import argparse
 import functools
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,11 +22,8 @@ import jaxcon as jc
 from benchmarks import mechanisms, timing
 from benchmarks.mjcf import DT
 from benchmarks.targets import SCENES
+from jaxcon.core.operations import count
 
-COUNTED = """add sub mul div neg max min sqrt rsqrt cbrt square pow exp exp2 log tanh
-             sin cos tan asin acos atan atan2 sinh cosh"""
-ELEMENTWISE = frozenset(COUNTED.split())
-REDUCTIONS = frozenset({"reduce_sum", "reduce_max", "reduce_min", "reduce_prod", "cumsum"})
 WORLDS = 128
 """In the batch whose step is counted: what worlds share is then shared among so many."""
 
@@ -55,59 +49,6 @@ def work(name: str, method: jc.Method, dtype: Any) -> Work:
         step = jax.vmap(lambda s: jc.step(system, method, s, None, DT)[0])
         operations = count(jax.make_jaxpr(step)(worlds).jaxpr) / WORLDS
     return Work(operations, sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state)))
-
-
-def count(jaxpr: Any) -> float:
-    """Arithmetic operations of a jaxpr, those of inner ones included."""
-    return float(sum(operations(equation) for equation in jaxpr.eqns))
-
-
-def operations(equation: Any) -> float:
-    """Of one equation; a loop of unknown length counts as one round."""
-    name, params = equation.primitive.name, equation.params
-    if name == "scan":
-        return params["length"] * count(params["jaxpr"].jaxpr)
-    if name == "cond":
-        return max(count(branch.jaxpr) for branch in params["branches"])
-    if name == "custom_linear_solve":  # runs its solver; the matrix is only for derivatives
-        return count(params["jaxprs"].solve.jaxpr)
-    if name == "native":
-        shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
-        return count(jax.make_jaxpr(params["fun"])(*shapes).jaxpr)
-    inner = list(jaxprs(params))
-    return sum(count(x) for x in inner) if inner else arithmetic(equation)
-
-
-def jaxprs(params: dict[str, Any]) -> Iterator[Any]:
-    """Those among the parameters of an equation that it evaluates."""
-    for value in params.values():
-        closed = getattr(value, "jaxpr", value)
-        if hasattr(closed, "eqns"):
-            yield closed
-
-
-def arithmetic(equation: Any) -> float:
-    """Of one instruction, by its size."""
-    if not equation.outvars:
-        return 0.0
-    name, result = equation.primitive.name, equation.outvars[0].aval
-    if not jnp.issubdtype(getattr(result, "dtype", jnp.int32), jnp.floating):
-        return 0.0
-    if name == "integer_pow":
-        return result.size * math.ceil(math.log2(max(2, abs(equation.params["y"]))))
-    if name == "dot_general":
-        left = equation.invars[0].aval.shape
-        (contracted, _), _ = equation.params["dimension_numbers"]
-        return 2.0 * result.size * math.prod(left[i] for i in contracted)
-    if name in REDUCTIONS:
-        return equation.invars[0].aval.size
-    if name == "cholesky":
-        return result.size * result.shape[-1] / 3
-    if name == "lu":
-        return 2 * result.size * result.shape[-1] / 3
-    if name == "triangular_solve":
-        return result.size * equation.invars[0].aval.shape[-1]
-    return result.size if name in ELEMENTWISE else 0.0
 
 
 @functools.cache
