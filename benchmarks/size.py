@@ -89,9 +89,7 @@ def seconds(run: Any) -> float:
     spent = []
     for _ in range(3):
         begin = time.perf_counter()
-        for _ in range(calls):
-            done = run()
-        jax.block_until_ready(done)
+        jax.block_until_ready([run() for _ in range(calls)][-1])
         spent.append((time.perf_counter() - begin) / calls)
     return float(np.median(spent))
 
@@ -234,7 +232,8 @@ def main() -> None:
     """Prints the tables, and writes the file and the picture."""
     options = arguments()
     if options.here:
-        for row in series(*options.here, options.batch, options.limit):
+        family, name = options.here
+        for row in series(family, name, options.batch, options.limit):
             print(json.dumps(timing.plain(row)), flush=True)
         return
     print(timing.machine())

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from jaxcon.analysis import traps
+from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.analysis.memory import Memory, memory
-from jaxcon.analysis.probe import Probe, probe
-from jaxcon.analysis.traps import OFF, TRAPS, Known
+from jaxcon.analysis.probe import Probe
+from jaxcon.analysis.traps import OFF, TRAPS
 from jaxcon.analysis.work import Work, seconds, work
-from jaxcon.constraints.rows import Rows
 from jaxcon.core.status import Status
 from jaxcon.core.typing import PyTree
-from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
-from jaxcon.model.state import State, at
-from jaxcon.simulation.choice import Choice, choose
+from jaxcon.model.state import State
+from jaxcon.simulation.choice import Choice
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import largest_stable_rate
 
@@ -158,64 +158,49 @@ def report(
     Returns:
         A `Report`.
     """
-    system = at(system, state, "jc.report(system, s)")
-    rows, dense_j, dense_m = linearized(system, state)
-    unit = UnitRows(rows.layout, dense_j, dense_m)
-    dependent = dependent_rows(unit.values, unit.tolerance)
-    singular = np.linalg.svd(np.delete(unit.values, dependent, axis=0), compute_uv=False)
-    rank = len(unit.values) - len(dependent)
+    known = Known.of(system, state, method, dt, control, batch)
+    unit, layout = known.unit, known.rows.layout
+    rank = len(unit.values) - len(known.dependent)
+    independent = np.delete(unit.values, known.dependent, axis=0)
+    singular = np.linalg.svd(independent, compute_uv=False)
     violation = {
-        name: (float(rows.violation[name]), float(rows.violation.rate(name)))
-        for name in rows.layout.names
+        name: (float(known.rows.violation[name]), float(known.rows.violation.rate(name)))
+        for name in layout.names
     }
-    conflicts = _conflicts(rows, unit)
-    choice = choose(system, state, batch, dependent=len(dependent))
-    scene: dict[str, Any] = {
-        "coordinates": state.q.shape[0],
-        "velocities": state.v.shape[0],
-        "rows": len(unit.values),
-        "rank": rank,
-        "degrees_of_freedom": state.v.shape[0] - rank,
-        "redundant": tuple(unit.owners[i] for i in dependent),
-        "condition": float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
-        "violation": violation,
-        "off": tuple(
+    found = Report(
+        coordinates=state.q.shape[0],
+        velocities=state.v.shape[0],
+        rows=len(unit.values),
+        rank=rank,
+        degrees_of_freedom=state.v.shape[0] - rank,
+        redundant=tuple(unit.owners[i] for i in known.dependent),
+        condition=float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
+        violation=violation,
+        off=tuple(
             name
             for name, (size, _) in violation.items()
-            if size > OFF and name not in rows.layout.velocity_level
+            if size > OFF and name not in layout.velocity_level
         ),
-        "bounded": tuple(name for group in system.bounds for name in group.names),
-        "conflicts": conflicts,
-        "choice": choice,
-    }
-    if method is None:
-        return Report(**scene)
-    tried = None if dt is None else probe(system, method, state, control, float(dt))
-    known = Known(
-        system, state, method, None if dt is None else float(dt), rows, unit, dense_m, dependent,
-        tuple(conflicts), choice, tried,
-    )  # fmt: skip
-    return Report(
-        **scene,
-        memory=memory(system, method, state, control),
-        work=work(system, method, state, control),
-        seconds=seconds(system, method, state, control, batch) if timed else None,
-        gains=None if dt is None else _gains(method, float(dt)),
-        probe=tried,
+        bounded=tuple(name for group in known.system.bounds for name in group.names),
+        conflicts=known.conflicts,
+        choice=known.choice,
+    )
+    return found if method is None else _with_method(found, known, timed)
+
+
+def _with_method(found: Report, known: Known, timed: bool) -> Report:
+    """The same with what belongs to the method."""
+    args = known.system, known.method, known.state, known.control
+    gains = None
+    if known.dt is not None:
+        most = largest_stable_rate(known.method.integrator, known.dt)
+        gains = (*asked_gains(known.method, known.dt), most)
+    return dataclasses.replace(
+        found,
+        memory=memory(*args),
+        work=work(*args),
+        seconds=seconds(*args, known.batch) if timed else None,
+        gains=gains,
+        probe=known.probe,
         warnings=traps.found(known),
     )
-
-
-def _gains(method: Method, dt: float) -> tuple[float, float, float]:
-    """α, β, and the largest stable α = β [1/s]."""
-    return *traps.asked_gains(method, dt), largest_stable_rate(method.integrator, dt)
-
-
-def _conflicts(rows: Rows, unit: UnitRows) -> dict[str, tuple[float, float, float]]:
-    """What least squares leave of φ, φ̇ and γ, of the constraints where they leave any."""
-    left = [unit.contradicting(x) for x in (rows.residual, rows.rate, rows.bias)]
-    return {
-        name: (left[0].get(name, 0.0), left[1].get(name, 0.0), left[2].get(name, 0.0))
-        for name in rows.layout.names
-        if any(name in part for part in left)
-    }

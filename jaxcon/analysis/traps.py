@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.analysis.probe import Probe
-from jaxcon.constraints.rows import Rows, linearize
-from jaxcon.core.typing import Array
-from jaxcon.dynamics.assembly import assemble
-from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
-from jaxcon.model.state import State
-from jaxcon.simulation.choice import Choice, words
+from jaxcon.analysis.known import Known, asked_gains
+from jaxcon.dynamics.rank import linearized
+from jaxcon.simulation.choice import words
 from jaxcon.simulation.method import Method
-from jaxcon.simulation.stability import default_gains, instability, parts
+from jaxcon.simulation.stability import instability, parts
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.gauss_seidel import GaussSeidel
 from jaxcon.solvers.priority import Lexicographic
@@ -34,40 +28,10 @@ CURVED = 0.1
 """Of φ, what one linear correction may leave before the way is called curved."""
 SUDDEN = 0.5
 """h β from which on feedback takes an error away in about one step."""
-ASIDE = 0.05
-"""How far a configuration is moved to see whether rows depend on each other there, too."""
 DEARER = 3.0
 """How many times the operations of elimination are worth a word."""
 MANY = 12
 """Rows from which on that matters."""
-
-
-class Known(NamedTuple):
-    """What is known of a scene and a method; `step` is h [s] or None, `probe` needs it.
-
-    Attributes:
-        system, state, method: as given.
-        dt: h [s].
-        rows: linearized.
-        unit: the same at unit length.
-        mass: M, (n_v, n_v).
-        dependent: numbers of unit rows.
-        conflicts: names of contradicting constraints.
-        choice: of a solver.
-        probe: of the method at this step.
-    """
-
-    system: Any
-    state: State
-    method: Method
-    dt: float | None
-    rows: Rows
-    unit: UnitRows
-    mass: Array
-    dependent: list[int]
-    conflicts: tuple[str, ...]
-    choice: Choice
-    probe: Probe | None
 
 
 def found(known: Known) -> dict[str, str]:
@@ -86,7 +50,7 @@ def gains(known: Known) -> str | None:
 def singular(known: Known) -> str | None:
     """Trap 2: a position in which rows lose their rank, or nearly do."""
     if known.dependent:
-        if not _passing(known):
+        if not known.passing:
             return None
         names = _names(known, known.dependent)
         return (
@@ -114,8 +78,7 @@ def order(known: Known) -> str | None:
     swept = getattr(known.method.bounded, "solver", known.method.bounded)
     if not isinstance(swept, GaussSeidel) or known.probe is None or not known.system.bounds:
         return None
-    rounding = float(jnp.finfo(known.state.q.dtype).eps) ** 0.5
-    if not known.probe.missed > rounding:
+    if not known.probe.missed > float(jnp.finfo(known.state.q.dtype).eps) ** 0.5:
         return None
     return (
         f"GaussSeidel takes bounded rows one after the other, and {swept.sweeps} sweeps leave"
@@ -132,7 +95,7 @@ def overconstrained(known: Known) -> str | None:
             f"{', '.join(known.conflicts)} contradict each other: no motion meets all of them."
             " Leave one out, correct its numbers, or rank them by jc.Priority."
         )
-    if not known.dependent or _passing(known):
+    if not known.dependent or known.passing:
         return None
     count, names = len(known.dependent), _names(known, known.dependent)
     return (
@@ -176,10 +139,8 @@ def curved(known: Known) -> str | None:
         return None
     own = φ[known.unit.numbers] / known.unit.length
     x = np.linalg.lstsq(known.unit.values, -own, rcond=known.unit.tolerance)[0]
-    move = np.linalg.solve(np.linalg.cholesky(np.asarray(known.mass, np.float64)).T, x)
-    state, dtype = known.state, known.state.q.dtype
-    q = known.system.retract(state.q, jnp.asarray(move, dtype))
-    left = np.asarray(linearize(known.system, q, state.v, state.time).residual)
+    there = known.moved(known.velocities(x))
+    left = np.asarray(linearized(known.system, there)[0].residual)
     share = np.linalg.norm(left) / np.linalg.norm(φ)
     if share < CURVED:
         return None
@@ -207,24 +168,9 @@ def dense(known: Known) -> str | None:
 
 def iterations(known: Known) -> str | None:
     """Trap 8: more iterations than bring anything."""
-    solver, n = _innermost(known.method.solver), known.rows.layout.size
-    efforts = known.choice.efforts
-    if isinstance(solver, ConjugateGradients) and n:
-        if solver.iterations > 2 * n + 10:
-            return (
-                f"ConjugateGradients makes {solver.iterations} iterations for {n} rows, and is done"
-                f" after about as many as there are rows: take iterations={n + 5}, or"
-                f" {words(known.choice.solver)}."
-            )
-        if "Sparse" in efforts and n >= MANY:
-            share = solver.iterations / ConjugateGradients().iterations
-            swept = share * efforts["ConjugateGradients"].operations
-            if swept > DEARER * efforts["Sparse"].operations:
-                return (
-                    f"{solver.iterations} iterations of ConjugateGradients take"
-                    f" {swept / efforts['Sparse'].operations:.0f} times the operations of"
-                    f" elimination, which is exact: {words(known.choice.solver)}."
-                )
+    solver = _innermost(known.method.solver)
+    if isinstance(solver, ConjugateGradients) and (said := _swept(known, solver.iterations)):
+        return said
     for part, field, enough in _counted(known.method):
         if getattr(part, field) > enough:
             return (
@@ -233,6 +179,26 @@ def iterations(known: Known) -> str | None:
                 " the same time."
             )
     return None
+
+
+def _swept(known: Known, rounds: int) -> str | None:
+    """The same of conjugate gradients."""
+    n, efforts, better = known.rows.layout.size, known.choice.efforts, words(known.choice.solver)
+    if 0 < 2 * n + 10 < rounds:
+        return (
+            f"ConjugateGradients makes {rounds} iterations for {n} rows, and is done after about as"
+            f" many as there are rows: take iterations={n + 5}, or {better}."
+        )
+    if "Sparse" not in efforts or n < MANY:
+        return None
+    share = rounds / ConjugateGradients().iterations
+    ratio = share * efforts["ConjugateGradients"].operations / efforts["Sparse"].operations
+    if ratio < DEARER:
+        return None
+    return (
+        f"{rounds} iterations of ConjugateGradients take {ratio:.0f} times the operations of"
+        f" elimination, which is exact: {better}."
+    )
 
 
 TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
@@ -271,16 +237,6 @@ def _linear(known: Known) -> bool:
     return asked_gains(known.method, known.dt or 0.0)[1] * (known.dt or 0.0) > SUDDEN
 
 
-def asked_gains(method: Method, dt: float) -> tuple[float, float]:
-    """(α, β) of the first feedback that has numbers for all rows, or of those without gains."""
-    for part in parts(method.feedback(jnp.asarray(dt))):
-        pair = [getattr(part, name, None) for name in ("alpha", "beta")]
-        if all(x is not None and not isinstance(x, dict) and np.ndim(x) == 0 for x in pair):
-            return float(pair[0]), float(pair[1])  # type: ignore[arg-type]
-    α, β = default_gains(method, jnp.asarray(dt))
-    return float(α), float(β)
-
-
 def _taken(known: Known) -> str:
     """What the solver makes of dependent rows."""
     solver = known.method.solver
@@ -294,22 +250,3 @@ def _taken(known: Known) -> str:
 def _names(known: Known, rows: list[int]) -> str:
     """The constraints of some unit rows, each once."""
     return ", ".join(dict.fromkeys(known.unit.owners[i][0] for i in rows))
-
-
-def _passing(known: Known) -> bool:
-    """Whether fewer rows depend on each other beside this position, where it can be left."""
-    _, s, vt = np.linalg.svd(known.unit.values)
-    free = vt[int(np.sum(s > known.unit.tolerance)) :]
-    if not len(free):
-        return False
-    x = np.random.default_rng(0).normal(size=len(free)) @ free
-    move = np.linalg.solve(np.linalg.cholesky(np.asarray(known.mass, np.float64)).T, x)
-    move *= ASIDE / np.max(np.abs(move))
-    state, dtype = known.state, known.state.q.dtype
-    q = known.system.retract(state.q, jnp.asarray(move, dtype))
-    moved = assemble(known.system, dataclasses.replace(state, q=q))
-    if int(moved.status):
-        return False
-    rows, jacobian, mass = linearized(known.system, jax.tree.map(jnp.asarray, moved.state))
-    unit = UnitRows(rows.layout, jacobian, mass)
-    return len(dependent_rows(unit.values, unit.tolerance)) < len(known.dependent)

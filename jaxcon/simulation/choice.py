@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -203,9 +203,10 @@ def words(solver: Any) -> str:
     """A solver as it is written, with what is not the default."""
     inside = []
     for field in dataclasses.fields(solver):
-        own, nested = getattr(solver, field.name), dataclasses.is_dataclass(field.default)
-        if nested and words(own) != words(field.default):
+        own, default = getattr(solver, field.name), cast(Any, field.default)
+        nested = dataclasses.is_dataclass(default)
+        if nested and words(own) != words(default):
             inside.append(words(own))
-        elif not nested and not np.array_equal(own, field.default):  # numbers may be arrays
+        elif not nested and not np.array_equal(own, default):  # numbers may be arrays
             inside.append(f"{field.name}={own!r}")
     return f"{type(solver).__name__}({', '.join(inside)})"
