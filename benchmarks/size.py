@@ -7,7 +7,7 @@ Semi-implicit Euler with Baumgarte in float32, one device. Each solver goes thro
 family (`benchmarks.structures`) in a process of its own until its share of the time is spent; what
 it did not reach, and why, is said. Time is that of a step of one world in a batch, the median of
 three. The exponent is that of n from the last three sizes from ten on. `auto` is what
-`jc.Method.auto` takes.
+`jc.Method.auto` takes. `--batch 0` counts operations and compiles nothing.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import jaxcon as jc
 from benchmarks import timing
 from benchmarks.mjcf import DT
 from benchmarks.structures import FAMILIES
-from jaxcon.core.operations import count, instructions
+from jaxcon.analysis.work import work
 from jaxcon.simulation.choice import choose, words
 from jaxcon.solvers import effort
 
@@ -49,36 +49,43 @@ HELD = 3e9
 """What the matrices of a batch may take [B], with room for the copies of a factorization."""
 LEAST = 10
 """Sizes from which on exponents are fitted."""
+SLOW = 10.0
+"""Compilations from which on operations are not counted as well [s]."""
 LONG = 0.03
 """What one repeat takes, about [s]."""
 
 
-def case(family: str, name: str, n: int, batch: int, dtype: Any = np.float32) -> dict[str, Any]:
-    """One solver on one size, in this process."""
-    system, state = FAMILIES[family].build(n, dtype)
+def case(family: str, name: str, n: int, batch: int) -> dict[str, Any]:
+    """One solver on one size, in this process; operations alone where the batch is none."""
+    system, state = FAMILIES[family].build(n, np.float32)
     rows = jax.eval_shape(lambda s: jc.violation(system, s), state).position.shape[0]
     found: dict[str, Any] = {"n": n, "velocities": len(state.v), "rows": rows}
     if name == AUTO:
         begin = time.perf_counter()
-        choice = choose(system, state, batch)
+        choice = choose(system, state, max(batch, 1))
         return found | {"takes": words(choice.solver), "chosen": time.perf_counter() - begin}
     if name in DENSE:
-        held = 3 * effort.saddle(len(state.v), rows).numbers * batch * state.q.dtype.itemsize
+        numbers = effort.saddle(len(state.v), rows).numbers
+        held = 3 * numbers * max(batch, 1) * state.q.dtype.itemsize
         if held > HELD:
             return found | {"stopped": f"its matrices would take {held / 1e9:.0f} GB"}
     method = jc.Method(solver=SOLVERS[name])
-    worlds = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), state)
-    begin = time.perf_counter()
-    traced = jax.jit(jax.vmap(lambda s: jc.step(system, method, s, None, DT)[0])).trace(worlds)
-    compiled = traced.lower().compile()
-    found["compile"] = time.perf_counter() - begin
-    end = jax.block_until_ready(compiled(worlds))
-    found["step"] = seconds(lambda: compiled(worlds)) / batch
-    found["failed"] = int(np.sum(np.asarray(end.status) != 0))
-    if found["compile"] < 10:  # counting traces again
-        inner = traced.jaxpr.jaxpr
-        found |= {"operations": count(inner, min) / batch, "instructions": instructions(inner)}
+    if batch:
+        found |= timed(system, method, state, batch)
+    if found.get("compile", 0) < SLOW:  # counting traces once more
+        counted = work(system, method, state)
+        found |= {"operations": counted.usual, "instructions": counted.instructions}
     return found
+
+
+def timed(system: Any, method: jc.Method, state: jc.State, batch: int) -> dict[str, Any]:
+    """Compilation and a step of one world in a batch [s], and how many worlds failed."""
+    worlds = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), state)
+    step = jax.vmap(lambda s: jc.step(system, method, s, None, DT)[0])
+    compiled, spent = timing.compile_seconds(step, worlds)
+    end = compiled(worlds)
+    failed = int(np.sum(np.asarray(end.status) != 0))
+    return {"compile": spent, "step": seconds(lambda: compiled(worlds)) / batch, "failed": failed}
 
 
 def seconds(run: Any) -> float:
@@ -150,7 +157,7 @@ def exponent(rows: list[dict[str, Any]], what: str) -> float | None:
 
 
 def table(family: str, found: dict[str, list[dict[str, Any]]]) -> str:
-    """A family: time of a step, and of the compilation, by size and solver."""
+    """A family by size and solver: time of a step and of its compilation, or its operations."""
     names = [name for name in found if name != AUTO]
     lines = [f"**{family}**: {FAMILIES[family].says}", ""]
     lines += [f"| n | rows | {' | '.join(names)} | auto |", "|---" * (len(names) + 3) + "|"]
@@ -171,26 +178,27 @@ def shown(row: dict[str, Any]) -> str:
     if "stopped" in row:
         return row["stopped"]
     if "step" not in row:
-        return ""
+        return f"{row['operations']:.3g}" if "operations" in row else ""
     bad = ", refused" if row["failed"] else ""
     return f"{1e6 * row['step']:.3g} µs ({row['compile']:.1f} s{bad})"
 
 
-def picture(found: dict[str, Any], file: str) -> None:
-    """Time of a step against n, one plot a family, both logarithmic."""
+def picture(found: dict[str, Any], file: str, what: str = "step") -> None:
+    """Time of a step, or its operations, against n, one plot a family, both logarithmic."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    scale, unit = (1e6, "µs a step") if what == "step" else (1.0, "operations a step")
     across = math.ceil(len(found) / 2)
     figure, places = plt.subplots(2, across, figsize=(4 * across, 7), squeeze=False)
     for axes, (family, solvers) in zip(places.flat, found.items(), strict=False):
         for name, rows in solvers.items():
-            known = [(r["n"], 1e6 * r["step"]) for r in rows if "step" in r]
+            known = [(r["n"], scale * r[what]) for r in rows if what in r]
             if known:
                 axes.loglog(*zip(*known, strict=True), marker="o", label=name)
-        axes.set(title=f"{family}: {FAMILIES[family].says}", xlabel="n", ylabel="µs a step")
+        axes.set(title=f"{family}: {FAMILIES[family].says}", xlabel="n", ylabel=unit)
         axes.title.set_fontsize(9)
         axes.grid(alpha=0.3)
     places.flat[0].legend(fontsize=7)
@@ -207,8 +215,12 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     for family in options.families:
         own = found[family] = {}
         for name in names:
-            share = max(5.0, (end - time.perf_counter()) / left)
-            own[name] = in_process(family, name, options.batch, 3 * share)
+            rest = end - time.perf_counter()
+            limit = max(1.0, min(rest, 3 * rest / left))
+            if options.batch:
+                own[name] = in_process(family, name, options.batch, limit)
+            else:
+                own[name] = list(series(family, name, 0, limit))
             left -= 1
         print(table(family, own), flush=True)
     return found
@@ -219,7 +231,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--families", nargs="*", default=list(FAMILIES), choices=list(FAMILIES))
     parser.add_argument("--solvers", nargs="*", default=list(SOLVERS), choices=list(SOLVERS))
-    parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--batch", type=int, default=16, help="0 to count operations alone")
     parser.add_argument("--seconds", type=float, default=450.0, help="that all may take, about")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--picture", metavar="FILE")
@@ -242,7 +254,7 @@ def main() -> None:
         result = {"machine": timing.machine(), "batch": options.batch, "families": found}
         options.json.write_text(json.dumps(timing.plain(result), indent=1) + "\n")
     if options.picture:
-        picture(found, options.picture)
+        picture(found, options.picture, "step" if options.batch else "operations")
 
 
 if __name__ == "__main__":

@@ -97,6 +97,9 @@ def arithmetic(equation: Any) -> float:
         return result.size * result.shape[-1] / 3
     if name == "lu":
         return 2 * result.size * result.shape[-1] / 3
+    if name == "eigh":  # Golub and Van Loan, Matrix Computations (2013), section 8.3
+        vectors = max(equation.outvars, key=lambda x: x.aval.size).aval
+        return 9 * vectors.size * vectors.shape[-1]
     if name == "triangular_solve":
         return result.size * equation.invars[0].aval.shape[-1]
     return result.size if name in ELEMENTWISE else 0.0
