@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.dynamics.rank import linearized
-from jaxcon.simulation.choice import words
+from jaxcon.simulation.choice import several, words
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import instability, parts
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
@@ -99,7 +99,7 @@ def overconstrained(known: Known) -> str | None:
         return None
     count, names = len(known.dependent), _names(known, known.dependent)
     return (
-        f"{count} rows say what others say already, of {names}. The motion is right, but how"
+        f"{several(count, 'row')} of {names} repeat what others say. The motion is right, but how"
         " forces are shared among these rows is not determined: take joints with fewer rows if"
         f" you need them. {_taken(known)}"
     )
@@ -186,8 +186,8 @@ def _swept(known: Known, rounds: int) -> str | None:
     n, efforts, better = known.rows.layout.size, known.choice.efforts, words(known.choice.solver)
     if 0 < 2 * n + 10 < rounds:
         return (
-            f"ConjugateGradients makes {rounds} iterations for {n} rows, and is done after about as"
-            f" many as there are rows: take iterations={n + 5}, or {better}."
+            f"ConjugateGradients makes {rounds} iterations for {several(n, 'row')}, and is done"
+            f" after about as many as there are rows: take iterations={n + 5}, or {better}."
         )
     if "Sparse" not in efforts or n < MANY:
         return None

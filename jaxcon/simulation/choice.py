@@ -24,7 +24,7 @@ from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse, suits_device
 
 PROGRAM = 30_000
-"""Instructions of an elimination that is still worth compiling."""
+"""Instructions of an elimination that is still worth compiling: a minute or so, at 2 to 3 ms each."""
 HELD = 4e9
 """What the matrices of all worlds may take [B]."""
 SURE = 20.0
@@ -188,15 +188,23 @@ def _safe(facts: Facts, inner: Any) -> tuple[Any, str]:
     """The same for rows that may depend on each other, and why."""
     count = "" if facts.dependent is None else f", and {facts.dependent or 'none'} do here"
     if not facts.loops and not facts.dependent:
-        return inner, f"the {facts.rows} rows close no loop, so that none depends on others"
+        own = several(facts.rows, "row")
+        return inner, f"constraints, {own}, close no loop, so that no row depends on others"
     if isinstance(inner, ConjugateGradients):
         return inner, f"rows may depend on each other{count}, which iterations allow if they agree"
     if not facts.loops:
         return RankSafe(inner, always=True), (
-            f"{facts.dependent} of {facts.rows} rows depend on others by their numbers"
+            f"of {several(facts.rows, 'row')} some, {facts.dependent}, depend on others by their"
+            " numbers alone"
         )
     own = RankSafe() if isinstance(inner, Sparse) and inner.order is None else RankSafe(inner)
-    return own, f"{facts.rows} rows close loops, where they may come to depend on each other{count}"
+    rows = several(facts.rows, "row")
+    return own, f"constraints, {rows}, close loops, where they may depend on each other{count}"
+
+
+def several(count: int, what: str) -> str:
+    """A number of things in words."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def words(solver: Any) -> str:
