@@ -24,7 +24,7 @@ from jaxcon.solvers.schur import Schur
 from jaxcon.solvers.sparse import Sparse, suits_device
 
 PROGRAM = 30_000
-"""Instructions of an elimination that is still worth compiling: a minute or so, at 2 to 3 ms each."""
+"""Instructions of an elimination that is still worth compiling; at 2 to 3 ms each, a minute."""
 HELD = 4e9
 """What the matrices of all worlds may take [B]."""
 SURE = 20.0
