@@ -167,9 +167,9 @@ def table(family: str, found: dict[str, list[dict[str, Any]]]) -> str:
         cells = " | ".join(shown(at[name]) for name in names)
         lines.append(f"| {n} | {count_of} | {cells} | {at.get(AUTO, {}).get('takes', '')} |")
     for what, said in (("step", "time"), ("operations", "operations"), ("compile", "compilation")):
-        powers = (exponent(found[name], what) for name in names)
+        powers = [exponent(found[name], what) for name in names]
         cells = " | ".join("" if p is None else f"{p:.2f}" for p in powers)
-        lines.append(f"| exponent of {said} | | {cells} | |")
+        lines += [f"| exponent of {said} | | {cells} | |"] if any(powers) else []
     return "\n".join([*lines, ""])
 
 
