@@ -21,7 +21,6 @@ from benchmarks import (  # noqa: E402
     equivalence,
     mechanisms,
     native_share,
-    operations,
     regression,
     residuals,
     roofline,
@@ -31,6 +30,7 @@ from benchmarks import (  # noqa: E402
     throughput,
     timing,
 )
+from jaxcon.core import operations  # noqa: E402
 
 SMALL = ("chain-3", "planar-chain-3", "four-bar", "n-four-bar-2", "rope-5", "stewart")
 
