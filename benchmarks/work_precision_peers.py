@@ -1,0 +1,241 @@
+"""The same of MuJoCo in C and of MJX.
+
+MuJoCo in C has a thread a core and records nothing. MJX runs in processes of its own, one for each
+setting of XLA, both without contacts; its errors are those of the first. Closed loops are as stiff
+as both allow, with a time constant of two steps.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks import peers, timing
+from benchmarks.motions import MOTIONS, Motion
+from benchmarks.work_precision import BATCH, SPAN, STARTS, Point, halved
+
+STIFF = 1e-9
+"""Time constant of MuJoCo's equalities, which it raises to two steps: the stiffest it allows."""
+INTEGRATORS = ("RK4", "Euler", "implicitfast")
+"""Of MuJoCo in C."""
+ITERATIONS = (1, 3, 20)
+"""Of its solver, Newton's method, in each step."""
+MJX = (("RK4", "float64"), ("RK4", "float32"), ("Euler", "float32"))
+"""Integrators and precisions of MJX."""
+
+
+def mujoco_model(motion: Motion, integrator: str, dt: float, iterations: int) -> Any:
+    """MuJoCo's model at a step, its loops as stiff as that allows."""
+    import mujoco
+
+    mujoco.set_mju_user_warning(lambda _: None)  # or it writes a file
+    model = mujoco.MjModel.from_xml_string(motion.mjcf())
+    model.opt.timestep, model.opt.iterations, model.opt.tolerance = dt, iterations, 0.0
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if not motion.gravity:
+        model.opt.gravity[:] = 0
+    model.eq_solref[:] = (STIFF, 1.0)
+    return model
+
+
+def mujoco_start(motion: Motion, model: Any) -> Any:
+    """MuJoCo's data at the start."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qvel[:] = motion.rates
+    return data
+
+
+def mujoco(
+    motion: Motion, limit: float = 2.0, names: tuple[str, ...] = INTEGRATORS
+) -> Iterator[list[Point]]:
+    """The runs of MuJoCo in C with each integrator and, where there are loops, each effort."""
+    efforts = ITERATIONS if motion.loops else ITERATIONS[:1]
+    for integrator, iterations in itertools.product(names, efforts):
+        label = f"{integrator}, float64" + (f", {iterations} iterations" if motion.loops else "")
+        make = functools.partial(mujoco_model, motion, integrator, iterations=iterations)
+        yield list(_by_mujoco(motion, label, make, limit))
+
+
+def _by_mujoco(
+    motion: Motion, label: str, make: Callable[..., Any], limit: float
+) -> Iterator[Point]:
+    visits: dict[int, np.ndarray] = {}
+
+    def error_of(steps: int) -> float:
+        error, visits[steps] = mujoco_path(motion, make(dt=motion.seconds / steps), steps)
+        return error
+
+    for steps, error in halved(motion, error_of, limit):
+        dt = motion.seconds / steps
+        states = np.repeat(visits[steps], BATCH // STARTS, axis=0)
+        if np.all(np.isfinite(states)):
+            rate = mujoco_rate(make(dt=dt), states)
+            yield Point("MuJoCo C", label, dt, error, 1 / (rate * dt), f"batch {BATCH}")
+
+
+def mujoco_path(motion: Motion, model: Any, steps: int) -> tuple[float, np.ndarray]:
+    """The error of a run, and states along it, (STARTS, full physics state)."""
+    import mujoco
+
+    data, spec = mujoco_start(motion, model), mujoco.mjtState.mjSTATE_FULLPHYSICS
+    states = np.zeros((STARTS, mujoco.mj_stateSize(model, spec)))
+    for i, state in enumerate(states):
+        mujoco.mj_getState(model, data, state, spec)
+        mujoco.mj_step(model, data, (i + 1) * steps // STARTS - i * steps // STARTS)
+    bad = any(warning.number for warning in data.warning)
+    return float("inf") if bad else mujoco_error(motion, model, data.qpos), states
+
+
+def mujoco_error(motion: Motion, model: Any, qpos: np.ndarray) -> float:
+    """Of a configuration at the end."""
+    import mujoco
+
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    return motion.error(motion.seen(model, data))
+
+
+def mujoco_rate(model: Any, states: np.ndarray) -> float:
+    """World-steps a second of all cores."""
+    few = peers.rate_of(model, states, 4, repeats=1).median
+    steps = int(np.clip(SPAN * few / len(states), 4, 2000))
+    return peers.rate_of(model, states, steps, repeats=3).median
+
+
+class Traced:
+    """MJX on a motion with one integrator, compiled once for every step."""
+
+    def __init__(self, motion: Motion, integrator: str, dtype: str) -> None:
+        from mujoco import mjx
+
+        self.motion, self.dtype = motion, dtype
+        self.host = mujoco_model(motion, integrator, 1e-3, 1)
+        self.host.opt.ls_iterations = 4
+        self.data = mujoco_start(motion, self.host)
+        with self.precision():
+            self.model, self.state = mjx.put_model(self.host), mjx.put_data(self.host, self.data)
+
+    def precision(self) -> Any:
+        """In which its arrays are made."""
+        return jax.enable_x64(self.dtype == "float64")
+
+    def numbers(self, dt: float, steps: int) -> tuple[jax.Array, jax.Array]:
+        """h and a number of steps as arguments."""
+        return jnp.asarray(dt, self.dtype), jnp.asarray(steps, jnp.int32)
+
+    def travel(self, data: Any, dt: jax.Array, steps: jax.Array) -> Any:
+        """qpos after so many steps of one world."""
+        model = self.model.tree_replace({"opt.timestep": dt})
+        step = functools.partial(peers.mjx_step(), model)
+        return jax.lax.fori_loop(0, steps, lambda _, d: step(d), data).qpos
+
+    def runs(self, limit: float) -> list[tuple[int, float]]:
+        """Errors by steps."""
+        with self.precision():
+            one = jax.jit(self.travel).lower(self.state, *self.numbers(1.0, 1)).compile()
+
+        def error_of(steps: int) -> float:
+            with self.precision():
+                qpos = one(self.state, *self.numbers(self.motion.seconds / steps, steps))
+            return mujoco_error(self.motion, self.host, np.asarray(qpos, np.float64))
+
+        return list(halved(self.motion, error_of, limit))
+
+    def step_cost(self, batch: int, dt: float) -> float:
+        """Of a step of one world in a batch, all alike: iterations are fixed [s]."""
+        with self.precision():
+            worlds = jax.tree.map(lambda x: jnp.stack([x] * batch), self.state)
+            worlds = timing.over_devices(worlds, batch)
+            travel = jax.vmap(self.travel, (0, None, None))
+            many, _ = timing.compile_seconds(travel, worlds, *self.numbers(dt, 1))
+
+            def run(count: int) -> Any:
+                return jax.block_until_ready(many(worlds, *self.numbers(dt, count)))
+
+            run(2)
+            count = int(np.clip(SPAN * timing.rate(lambda: run(2), 2, 1).median, 2, 2000))
+            return 1 / timing.rate(lambda: run(count), batch * count).median
+
+
+def mjx(motion: Motion, limit: float = 100.0) -> tuple[list[Point], list[str]]:
+    """The runs of MJX, each at the better setting of XLA, and why others are missing.
+
+    Args:
+        motion: which.
+        limit: of each of its processes [s].
+    """
+    errors: dict[str, list[Any]] = {}
+    costs: dict[str, list[tuple[float, str]]] = {}
+    notes = []
+    for flags in peers.FLAGS:
+        found, note = _elsewhere(motion, flags, limit, not errors)
+        notes += [note] if note else []
+        errors |= found.get("errors", {})
+        for label, cost in found.get("costs", {}).items():
+            costs.setdefault(label, []).append((cost, flags))
+    points = []
+    for label, own in costs.items():
+        cost, flags = min(own)
+        said = f"batch {BATCH}, {flags}".rstrip(", ")
+        for steps, error in errors.get(label, []):
+            dt = motion.seconds / steps
+            error = float("inf") if error is None else error
+            points.append(Point("MJX", label, dt, error, cost / dt, said))
+    return points, notes
+
+
+def _elsewhere(
+    motion: Motion, flags: str, limit: float, errors: bool
+) -> tuple[dict[str, Any], str]:
+    """What a process of MJX had found when it ended or was stopped, and why it was."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "found.json"
+        given = ["benchmarks.work_precision_peers", "--mjx", motion.name, "--file", str(file)]
+        given += ["--errors"] if errors else []
+        own = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
+        ended = timing.in_process(given, own, limit, "is not done in")
+        found = json.loads(file.read_text()) if file.exists() else {}
+    said = f"MJX, {motion.name}, {flags or 'default'}: {ended}" if isinstance(ended, str) else ""
+    return found, said
+
+
+def mjx_here(motion: Motion, file: Path, errors: bool) -> None:
+    """Costs, and errors too, written as they are found."""
+    found: dict[str, dict[str, Any]] = {"errors": {}, "costs": {}}
+    for integrator, dtype in MJX:
+        label, traced = f"{integrator}, {dtype}", Traced(motion, integrator, dtype)
+        if errors:
+            found["errors"][label] = timing.plain(traced.runs(2.0))
+        found["costs"][label] = traced.step_cost(BATCH, motion.seconds / motion.first / 4)
+        file.write_text(json.dumps(found))
+
+
+def main() -> None:
+    """One process of MJX."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--mjx", metavar="MOTION", required=True, choices=list(MOTIONS))
+    parser.add_argument("--file", type=Path, required=True)
+    parser.add_argument("--errors", action="store_true", help="find errors, too")
+    given = parser.parse_args()
+    timing.use_all_cores()
+    mjx_here(MOTIONS[given.mjx](), given.file, given.errors)
+    print(json.dumps({}))
+
+
+if __name__ == "__main__":
+    main()
