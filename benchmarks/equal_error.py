@@ -1,7 +1,7 @@
 """What a simulated second costs at equal error, in jaxcon, MuJoCo in C on all cores, and MJX.
 
     python -m benchmarks.equal_error [--motions four-bar …] [--json FILE] [--picture FILE]
-        [--resume] [--without-mjx] [--seconds 2]
+        [--resume] [--without-mjx] [--seconds 1]
 
 Every method runs motions whose end is known, at halved steps, until its error no longer falls.
 The cost is that of all cores by world and simulated second, in a batch, without compilation. The
@@ -202,7 +202,7 @@ def _point(kept: dict[str, Any]) -> Point:
     return Point(**kept | {"error": np.inf if kept["error"] is None else kept["error"]})
 
 
-def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float = 2.0) -> None:
+def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float = 1.0) -> None:
     """All stages of a motion.
 
     Args:
@@ -211,9 +211,10 @@ def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float =
         codes: of `CODES`.
         limit: of a run of one world, at which halving ends [s].
     """
-    record.run(f"{motion.name}, jaxcon", own.ours(motion, limit))
-    again = own.rebatched(motion, chosen(record.points(motion.name)))
-    record.run(f"{motion.name}, jaxcon's batches", again)
+    runs = own.Runs(motion)
+    record.run(f"{motion.name}, jaxcon", runs.all(limit))
+    best_ones = chosen(record.points(motion.name))
+    record.run(f"{motion.name}, jaxcon's batches", runs.again(best_ones))
     if "MuJoCo C" in codes:
         record.run(f"{motion.name}, MuJoCo C", peers.mujoco(motion, limit))
     if "MJX" in codes:
@@ -222,9 +223,9 @@ def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float =
 
 def glance(record: Record, motion: Motion) -> None:
     """A small version: RK4 in jaxcon, and in MuJoCo where it is installed."""
-    record.run(f"{motion.name}, jaxcon", own.ours(motion, 0.1, ["RK4, float64"]))
+    record.run(f"{motion.name}, jaxcon", own.Runs(motion).all(0.1, ["RK4, float64"]))
     if has_mujoco():
-        record.run(f"{motion.name}, MuJoCo C", peers.mujoco(motion, 0.1, ["RK4"]))
+        record.run(f"{motion.name}, MuJoCo C", peers.mujoco(motion, 0.1, peers.TREES[:1]))
 
 
 def _mjx(record: Record, motion: Motion) -> Iterator[list[Point]]:
@@ -241,7 +242,7 @@ def main() -> None:
     parser.add_argument("--picture", type=Path, default=Path("equal_error.png"))
     parser.add_argument("--resume", action="store_true", help="keep the stages of the file")
     parser.add_argument("--without-mjx", action="store_true")
-    parser.add_argument("--seconds", type=float, default=2.0, help="limit of a run of one world")
+    parser.add_argument("--seconds", type=float, default=1.0, help="limit of a run of one world")
     given = parser.parse_args()
     timing.use_all_cores()
     print(timing.machine())

@@ -63,7 +63,7 @@ METHODS: dict[str, tuple[Any, Any]] = {
     "generalized-α": (jc.GeneralizedAlpha(), jc.Baumgarte()),
 }
 """Integrators and what keeps constraints beside them; the last two do so themselves."""
-SINGLE = ("semi-implicit Euler", "Heun", "RK4")
+SINGLE = ("semi-implicit Euler", "RK4")
 """Those that are tried in float32, too."""
 ITERATES = ("RATTLE", "generalized-α")
 """Those whose steps may cost more where they are long."""
@@ -178,29 +178,41 @@ def label_of(form: Form, name: str, dtype: str) -> str:
     return ", ".join(part for part in (name, dtype, form.name) if part)
 
 
-def choices(motion: Motion, labels: Sequence[str] | None = None) -> Iterator[Ours]:
-    """The methods of jaxcon on a motion, all or some, each compiled as it is reached."""
-    for form in motion.forms:
-        for dtype, names in (("float64", METHODS), ("float32", SINGLE)):
-            for name in names:
-                if labels is None or label_of(form, name, dtype) in labels:
-                    yield Ours(motion, form, name, dtype)
+class Runs:
+    """The methods of jaxcon on a motion, each compiled once and when it is first needed."""
 
+    def __init__(self, motion: Motion) -> None:
+        self.motion = motion
+        self.made: dict[str, Ours] = {}
+        self.known = {
+            label_of(form, name, dtype): (form, name, dtype)
+            for form in motion.forms
+            for dtype, names in (("float64", METHODS), ("float32", SINGLE))
+            for name in names
+        }
 
-def ours(
-    motion: Motion, limit: float = 2.0, labels: Sequence[str] | None = None
-) -> Iterator[list[Point]]:
-    """The runs of each method, all of one batch."""
-    for choice in choices(motion, labels):
-        yield choice.points(limit)
+    def of(self, label: str) -> Ours:
+        """One of them."""
+        if label not in self.made:
+            self.made[label] = Ours(self.motion, *self.known[label])
+        return self.made[label]
 
+    def all(self, limit: float, labels: Sequence[str] | None = None) -> Iterator[list[Point]]:
+        """The runs of each method, all of one batch.
 
-def rebatched(
-    motion: Motion, points: Sequence[Point], batches: Sequence[int] = OTHERS
-) -> Iterator[list[Point]]:
-    """Runs of jaxcon again in other batches."""
-    for choice in choices(motion, [point.setting for point in points]):
-        own = [point for point in points if point.setting == choice.label]
-        runs = [(round(motion.seconds / point.dt), point.error) for point in own]
-        for batch in batches:
-            yield choice.priced(runs, batch)
+        Args:
+            limit: of a run of one world [s].
+            labels: of the methods, all unless given.
+        """
+        for label in labels or self.known:
+            yield self.of(label).points(limit)
+
+    def again(
+        self, points: Sequence[Point], batches: Sequence[int] = OTHERS
+    ) -> Iterator[list[Point]]:
+        """Runs of some of them again in other batches."""
+        for label in dict.fromkeys(point.setting for point in points):
+            own = [point for point in points if point.setting == label]
+            runs = [(round(self.motion.seconds / point.dt), point.error) for point in own]
+            for batch in batches:
+                yield self.of(label).priced(runs, batch)
