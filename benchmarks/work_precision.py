@@ -28,7 +28,10 @@ ALIKE = 1.5
 STARTS = 8
 """Worlds of a batch start at so many places along the motion."""
 SPAN = 0.05
-"""How long a repeat takes, about [s]."""
+"""How long a repeat takes, about [s]; of as many steps, within these:"""
+FEW, MANY = 4, 2000
+CLOSE = 1e-2
+"""Error of the run along which worlds start, and whose steps are timed."""
 BATCH, OTHERS = 256, (64, 1024)
 """Worlds that everything is tried with, and those that the best are tried with, too."""
 
@@ -92,6 +95,24 @@ def halved(
         steps *= 2
 
 
+def step_seconds(run: Callable[[int], Any], repeats: int = 5) -> float:
+    """How long a step takes, the median of several runs of many steps [s].
+
+    Args:
+        run: does so many steps.
+        repeats: how many.
+    """
+
+    def lasts(count: int) -> float:
+        begin = time.perf_counter()
+        run(count)
+        return (time.perf_counter() - begin) / count
+
+    run(FEW)  # the first touches memory that the later ones have
+    count = int(np.clip(SPAN / lasts(FEW), FEW, MANY))
+    return float(np.median([lasts(count) for _ in range(repeats)]))
+
+
 class Ours:
     """A method on a form of a motion, compiled once for every step."""
 
@@ -147,9 +168,7 @@ class Ours:
                     given = self.numbers(dt, count)
                 return jax.block_until_ready(many(worlds, *given))
 
-            run(4)  # the first touches memory that the later ones have
-            count = int(np.clip(SPAN * timing.rate(lambda: run(4), 4, 1).median, 4, 2000))
-            return 1 / timing.rate(lambda: run(count), batch * count * dt).median
+            return step_seconds(run) / batch / dt
 
         return measured
 
@@ -163,7 +182,7 @@ class Ours:
         able = [(steps, error) for steps, error in runs if np.isfinite(error)]
         if not able:
             return []
-        near = next((steps for steps, error in able if error < 1e-2), able[-1][0])
+        near = next((steps for steps, error in able if error < CLOSE), able[-1][0])
         cost, seconds = self.cost(batch, near), self.motion.seconds
         step = None if self.name in ITERATES else cost(seconds / near) / near
         return [

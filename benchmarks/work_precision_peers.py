@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks import peers, timing
 from benchmarks.motions import MOTIONS, Motion
-from benchmarks.work_precision import BATCH, SPAN, STARTS, Point, halved
+from benchmarks.work_precision import BATCH, CLOSE, SPAN, STARTS, Point, halved, step_seconds
 
 TREES = (("RK4", 1, 2.0), ("Euler", 1, 2.0), ("implicitfast", 1, 2.0))
 LOOPS = (*TREES, ("RK4", 1, 3.0), ("RK4", 3, 3.0))
@@ -77,21 +77,23 @@ def mujoco(
         yield list(_by_mujoco(motion, label, make, limit))
 
 
-def _by_mujoco(
-    motion: Motion, label: str, make: Callable[..., Any], limit: float
-) -> Iterator[Point]:
+def _by_mujoco(motion: Motion, label: str, make: Callable[[float], Any], limit: float) -> Any:
+    """The cost of a step is that of one that is neither long nor short: effort is fixed."""
     visits: dict[int, np.ndarray] = {}
 
     def error_of(steps: int) -> float:
-        error, visits[steps] = mujoco_path(motion, make(dt=motion.seconds / steps), steps)
+        error, visits[steps] = mujoco_path(motion, make(motion.seconds / steps), steps)
         return error
 
-    for steps, error in halved(motion, error_of, limit):
-        dt = motion.seconds / steps
-        states = np.repeat(visits[steps], BATCH // STARTS, axis=0)
-        if np.all(np.isfinite(states)):
-            rate = mujoco_rate(make(dt=dt), states)
-            yield Point("MuJoCo C", label, dt, error, 1 / (rate * dt), f"batch {BATCH}")
+    runs = [(n, x) for n, x in halved(motion, error_of, limit) if np.isfinite(x)]
+    if not runs:
+        return
+    near = next((n for n, x in runs if x < CLOSE), runs[-1][0])
+    states = np.repeat(visits[near], BATCH // STARTS, axis=0)
+    step = 1 / mujoco_rate(make(motion.seconds / near), states)
+    for n, error in runs:
+        note = f"batch {BATCH}"
+        yield Point("MuJoCo C", label, motion.seconds / n, error, n * step / motion.seconds, note)
 
 
 def mujoco_path(motion: Motion, model: Any, steps: int) -> tuple[float, np.ndarray]:
@@ -176,9 +178,7 @@ class Traced:
             def run(count: int) -> Any:
                 return jax.block_until_ready(many(worlds, *self.numbers(dt, count)))
 
-            run(2)
-            count = int(np.clip(SPAN * timing.rate(lambda: run(2), 2, 1).median, 2, 2000))
-            return 1 / timing.rate(lambda: run(count), batch * count).median
+            return step_seconds(run) / batch
 
 
 def mjx(motion: Motion, limit: float = 60.0) -> tuple[list[Point], list[str]]:
