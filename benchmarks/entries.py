@@ -19,6 +19,8 @@ ENTRIES: dict[str, Entry] = {}
 GYMNASIUM, MUJOCO = "gymnasium", "mujoco"
 SMALL = ("pendulum", "four-bar")
 """The scenes of a quick run."""
+WORLDS = 512
+"""In a batch whose rate is measured."""
 
 
 def entry(name: str, *needs: str) -> Callable[[Callable[[bool], Any]], Callable[[bool], Any]]:
@@ -44,14 +46,18 @@ def scenes(quick: bool) -> list[str]:
 @entry("throughput")
 def throughput(quick: bool) -> list[Metric]:
     """World-steps a second, over the peak of the machine and over MuJoCo in C on all cores."""
-    from benchmarks import regression, roofline
+    from benchmarks import peers, roofline
+    from benchmarks.throughput import method_of, run_batch
 
     found = []
-    for name, own in regression.ratios(scenes(quick)).items():
-        found.append(rate(f"{name}, world-steps", own["over_peak"] * roofline.peak() / 1e6))
-        found.append(Metric(f"{name}, over the peak", own["over_peak"], "steps/Mop"))
-        if "over_mujoco" in own:
-            found.append(Metric(f"{name}, over MuJoCo C", own["over_mujoco"]))
+    for name in scenes(quick):
+        steps = run_batch(name, method_of(name, "Sparse"), np.float32, WORLDS, repeats=3)[0].median
+        share = steps / (roofline.peak() / 1e6)
+        found.append(rate(f"{name}, world-steps", steps))
+        found.append(Metric(f"{name}, over the peak", share, "steps/Mop"))
+        if has_mujoco():
+            other = peers.mujoco_rate(name, seconds=0.2).median
+            found.append(Metric(f"{name}, over MuJoCo C", steps / other))
     return found
 
 

@@ -199,7 +199,8 @@ def stage_of(stage: str) -> str:
 
 def _point(kept: dict[str, Any]) -> Point:
     """One from the disk, whose infinite error is null there."""
-    return Point(**kept | {"error": np.inf if kept["error"] is None else kept["error"]})
+    infinite = {"error": np.inf} if kept["error"] is None else {}
+    return Point(**(kept | infinite))
 
 
 def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float = 1.0) -> None:
@@ -216,7 +217,7 @@ def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float =
     best_ones = chosen(record.points(motion.name))
     record.run(f"{motion.name}, jaxcon's batches", runs.again(best_ones))
     if "MuJoCo C" in codes:
-        record.run(f"{motion.name}, MuJoCo C", peers.mujoco(motion, limit))
+        record.run(f"{motion.name}, MuJoCo C", peers.in_c(motion, limit))
     if "MJX" in codes:
         record.run(f"{motion.name}, MJX", _mjx(record, motion))
 
@@ -225,11 +226,11 @@ def glance(record: Record, motion: Motion) -> None:
     """A small version: RK4 in jaxcon, and in MuJoCo where it is installed."""
     record.run(f"{motion.name}, jaxcon", own.Runs(motion).all(0.1, ["RK4, float64"]))
     if has_mujoco():
-        record.run(f"{motion.name}, MuJoCo C", peers.mujoco(motion, 0.1, peers.TREES[:1]))
+        record.run(f"{motion.name}, MuJoCo C", peers.in_c(motion, 0.1, peers.TREES[:1]))
 
 
 def _mjx(record: Record, motion: Motion) -> Iterator[list[Point]]:
-    points, notes = peers.mjx(motion)
+    points, notes = peers.in_mjx(motion)
     record.notes += notes
     yield points
 

@@ -36,20 +36,20 @@ class Fallen(NamedTuple):
     """What became of the walkers.
 
     Attributes:
-        failed, count: how many failed, and of how many.
+        failed, worlds: how many failed, and of how many.
         speeds: of those that did not, the largest of each, by `QUANTILES` [m/s, rad/s].
         depth: the worst of them.
     """
 
     failed: int
-    count: int
+    worlds: int
     speeds: tuple[float, ...]
     depth: legged.Depth
 
     def __str__(self) -> str:
         """The cells of a row."""
         shown = ", ".join(f"{speed:.1e}" for speed in self.speeds)
-        return f"{self.failed} of {self.count} | {shown} | {legged.deep(self.depth)}"
+        return f"{self.failed} of {self.worlds} | {shown} | {legged.deep(self.depth)}"
 
 
 class Stood(NamedTuple):

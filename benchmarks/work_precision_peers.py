@@ -62,7 +62,7 @@ def mujoco_start(motion: Motion, model: Any) -> Any:
     return data
 
 
-def mujoco(
+def in_c(
     motion: Motion, limit: float = 1.0, settings: Sequence[Setting] | None = None
 ) -> Iterator[list[Point]]:
     """The runs of MuJoCo in C with each setting."""
@@ -181,7 +181,7 @@ class Traced:
             return step_seconds(run) / batch
 
 
-def mjx(motion: Motion, limit: float = 60.0) -> tuple[list[Point], list[str]]:
+def in_mjx(motion: Motion, limit: float = 60.0) -> tuple[list[Point], list[str]]:
     """The runs of MJX, each at the better setting of XLA, and why others are missing.
 
     Args:

@@ -20,7 +20,6 @@ from benchmarks import (  # noqa: E402
     equivalence,
     mechanisms,
     native_share,
-    regression,
     residuals,
     roofline,
     stabilisation,
@@ -148,13 +147,6 @@ def test_a_rate_is_measured():
     rate, seconds = throughput.run_batch("pendulum", jc.Method(), np.float32, 2, work=20, repeats=2)
     assert 0 < rate.least <= rate.median <= rate.most
     assert seconds > 0
-
-
-def test_what_fell_is_named():
-    before = {"a": {"over_mujoco": 4.0, "over_peak": 1.0}, "b": {"over_peak": 1.0}}
-    now = {"a": {"over_mujoco": 2.0, "over_peak": 1.0}, "b": {"over_peak": 0.9}, "c": {}}
-    assert regression.slower(before, now, 1.5) == ["a: over_mujoco fell from 4 to 2"]
-    assert not regression.slower(before, now, 2.5)
 
 
 @pytest.mark.parametrize("dtype", residuals.LIMIT)

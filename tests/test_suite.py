@@ -18,7 +18,7 @@ from benchmarks.entries import ENTRIES  # noqa: E402
 from benchmarks.suite import HIGHER, LOWER, Baseline, Entry, Found, Metric, Outcome  # noqa: E402
 from benchmarks.work_precision import Point  # noqa: E402
 
-PARTS = {"peers", "regression", "roofline", "work_precision_peers"}
+PARTS = {"peers", "roofline", "work_precision_peers"}
 """Modules with a command of their own that are parts of an entry of another name."""
 NAN, INF = float("nan"), float("inf")
 
