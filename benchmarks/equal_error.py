@@ -199,8 +199,8 @@ def stage_of(stage: str) -> str:
 
 def _point(kept: dict[str, Any]) -> Point:
     """One from the disk, whose infinite error is null there."""
-    infinite = {"error": np.inf} if kept["error"] is None else {}
-    return Point(**(kept | infinite))
+    error: Any = np.inf if kept["error"] is None else kept["error"]
+    return Point(**(kept | {"error": error}))
 
 
 def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float = 1.0) -> None:

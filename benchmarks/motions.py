@@ -115,14 +115,14 @@ def pendulum() -> Motion:
     """IFToMM's A01 after 10 s, by elliptic functions."""
     rows = references.load("iftomm_A01_pendulum")["reference"]
     row = next(row for row in rows if row["t"] == 10)
-    return swinging("pendulum", 10.0, 500, [[row["x"], row["y"]]])
+    return swinging("pendulum", 10.0, 40, [[row["x"], row["y"]]])
 
 
 def double_pendulum() -> Motion:
     """Two point masses after 3 s, by extrapolation in 80-bit arithmetic."""
     rows = references.load("an_double_pendulum")["rows"]
     row = next(row for row in rows if row["t"] == 3)
-    return swinging("double pendulum", 3.0, 150, [row["p1"], row["p2"]])
+    return swinging("double pendulum", 3.0, 15, [row["p1"], row["p2"]])
 
 
 def four_bar() -> Motion:
@@ -157,7 +157,7 @@ def four_bar() -> Motion:
     form = Form("", lambda dtype: rods.planar_scene(joined, dtype), places, jc.Sparse())
     text = rods.to_mjcf(joined)
     return Motion(
-        "four-bar", 2.0, "m", 50, (form,), lambda: text, tuple(rates), xz(DRAKE), end, loops=True
+        "four-bar", 2.0, "m", 10, (form,), lambda: text, tuple(rates), xz(DRAKE), end, loops=True
     )
 
 
@@ -278,7 +278,7 @@ def squeezer() -> Motion:
     angles = Form("angles", lambda dtype: andrews.andrews(), lambda system, q: q, jc.Schur())
     bodies = Form("bodies", own.scene, own.angles, jc.Sparse(), control=1.0)
     return Motion(
-        "Andrews", rows[-1]["t"], "rad", 300, (bodies, angles), own.mjcf, (0.0,) * 7, own.seen,
+        "Andrews", rows[-1]["t"], "rad", 50, (bodies, angles), own.mjcf, (0.0,) * 7, own.seen,
         np.array(rows[-1]["q"]), gravity=False, loops=True,
     )  # fmt: skip
 
