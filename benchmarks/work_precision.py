@@ -82,17 +82,16 @@ def halved(
         error_of: runs it with so many steps.
         limit: of a run [s].
     """
-    steps, best, idle = motion.first, float("inf"), 0
+    steps, before, idle = motion.first, float("inf"), 0
     while True:
         begin = time.perf_counter()
         error = error_of(steps)
         spent = time.perf_counter() - begin
         yield steps, error
-        idle = idle + 1 if np.isfinite(best) and error > best / ALIKE else 0
-        best = min(best, error)
-        if best <= ENOUGH or idle == 2 or 2 * spent > limit:
+        idle = idle + 1 if np.isfinite(before) and error > before / ALIKE else 0
+        if error <= ENOUGH or idle == 2 or 2 * spent > limit:
             return
-        steps *= 2
+        steps, before = 2 * steps, error
 
 
 def step_seconds(run: Callable[[int], Any], repeats: int = 5) -> float:

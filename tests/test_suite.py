@@ -184,6 +184,8 @@ def test_steps_are_halved_until_they_no_longer_matter():
     assert min(found.values()) <= runs.ENOUGH < sorted(found.values())[1]
     stalled = list(runs.halved(motion, lambda n: max(1.0 / n, 1e-3), 1e9))
     assert [error > 1e-3 for _, error in stalled[-4:]] == [True, False, False, False]
+    errors = iter([1e-3, 5e-3, 1e-3, 1e-5, 1e-10])  # the first is small by luck
+    assert len(list(runs.halved(motion, lambda n: next(errors), 1e9))) == 5
     assert len(list(runs.halved(motion, lambda n: INF, 0.0))) == 1
 
 
