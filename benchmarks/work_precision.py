@@ -80,13 +80,13 @@ def halved(
     Args:
         motion: with its coarsest run.
         error_of: runs it with so many steps.
-        limit: of a run [s].
+        limit: of a run, in time of the processor, which other work does not change [s].
     """
     steps, before, idle = motion.first, float("inf"), 0
     while True:
-        begin = time.perf_counter()
+        begin = time.process_time()
         error = error_of(steps)
-        spent = time.perf_counter() - begin
+        spent = time.process_time() - begin
         yield steps, error
         idle = idle + 1 if np.isfinite(before) and error > before / ALIKE else 0
         if error <= ENOUGH or idle == 2 or 2 * spent > limit:

@@ -153,7 +153,12 @@ class Traced:
         closing = jnp.broadcast_to(jnp.stack([3 * dt, jnp.ones_like(dt)]), self.closing)
         model = self.model.tree_replace({"opt.timestep": dt, "eq_solref": closing})
         step = functools.partial(peers.mjx_step(), model)
-        return jax.lax.fori_loop(0, steps, lambda _, d: step(d), data).qpos
+
+        def one(_: Any, data: Any) -> Any:
+            # with a tendon, 64 bits make integers of MJX wider than they were
+            return jax.tree.map(lambda new, old: new.astype(old.dtype), step(data), data)
+
+        return jax.lax.fori_loop(0, steps, one, data).qpos
 
     def runs(self, limit: float) -> list[tuple[int, float]]:
         """Errors by steps."""
