@@ -15,8 +15,6 @@ from benchmarks import gradient_scenes, gradient_states  # noqa: E402
 CHOICES = [
     ("distance", 2, "projection", "float64"),
     ("spring", 3, "Baumgarte", "float32"),
-    ("straight rope", 2, "Baumgarte", "float32"),
-    ("two balls", 2, "Baumgarte", "float64"),
 ]
 
 
