@@ -32,6 +32,7 @@ from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
 from jaxcon.environments.tasks.rope_swing import RopeSwing
+from jaxcon.environments.tasks.runners import HalfCheetah, Hopper
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 __all__ = [
@@ -44,6 +45,8 @@ __all__ = [
     "Episode",
     "FiveBarHopper",
     "FourBarTracking",
+    "HalfCheetah",
+    "Hopper",
     "Layered",
     "Outcome",
     "Parking",

@@ -110,8 +110,16 @@ class Environment:
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """What a picture shows: (left, right) and (low, high) [m]."""
+        """What a picture shows at the start: (left, right) and (low, high) [m]."""
         raise NotImplementedError
+
+    def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The part of the world in a picture, as large as `frame`, which it is unless overridden.
+
+        Args:
+            episode: where it stands.
+        """
+        return self.frame
 
     def start(self, key: Array) -> tuple[State, PyTree]:
         """A state of the mechanism in which an episode begins, and its goal.
@@ -139,7 +147,9 @@ class Environment:
         raise NotImplementedError
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """What an action within −1 to 1 was worth, from 0 to 1, ().
+        """What an action within −1 to 1 was worth, ().
+
+        From 0 to 1 in the tasks here but those from Gymnasium, which have its rewards.
 
         Args:
             before: the episode before the action.

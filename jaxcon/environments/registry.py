@@ -13,6 +13,7 @@ from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
 from jaxcon.environments.tasks.rope_swing import RopeSwing
+from jaxcon.environments.tasks.runners import HalfCheetah, Hopper
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 TASKS: dict[str, Callable[..., Environment]] = {
@@ -21,6 +22,8 @@ TASKS: dict[str, Callable[..., Environment]] = {
     "DoubleCartPole": double_cart_pole,
     "FiveBarHopper": FiveBarHopper.build,
     "FourBarTracking": FourBarTracking.build,
+    "HalfCheetah": HalfCheetah.build,
+    "Hopper": Hopper.build,
     "Parking": Parking.build,
     "RopeSwing": RopeSwing.build,
     "StewartBalancing": StewartBalancing.build,
