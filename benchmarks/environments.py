@@ -50,7 +50,7 @@ def measure(task: str, copies: int, steps: int, repeats: int) -> Row:
     weights = jax.random.normal(jax.random.key(0), (seen.shape[1], envs.action_space.shape[1]))
     policy = jax.jit(lambda x: jnp.tanh(x @ weights.astype(x.dtype)))
     bare_step = jax.jit(lambda env, episode, actions: jax.vmap(env.step)(episode, actions))
-    start = envs.copies.episode
+    start = jax.tree.map(jnp.copy, envs.copies.episode)  # a step of the interface takes its own
     ended = jnp.zeros((), int)
 
     def interface(count: bool = False) -> Any:

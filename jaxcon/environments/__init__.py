@@ -28,11 +28,11 @@ from jaxcon.environments.registry import TASKS, make
 from jaxcon.environments.returns import returns
 from jaxcon.environments.tasks.cart_pole import CartPole
 from jaxcon.environments.tasks.cat import CatRighting
+from jaxcon.environments.tasks.cheetah import HalfCheetah
 from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
 from jaxcon.environments.tasks.rope_swing import RopeSwing
-from jaxcon.environments.tasks.runners import HalfCheetah, Hopper
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 __all__ = [
@@ -46,7 +46,6 @@ __all__ = [
     "FiveBarHopper",
     "FourBarTracking",
     "HalfCheetah",
-    "Hopper",
     "Layered",
     "Outcome",
     "Parking",

@@ -81,21 +81,21 @@ def advance(
     """
     after = over(environment, copies, "transition", actions)
     reward, terminated, truncated = over(environment, copies, "judge", actions, after)
-    stepped = dataclasses.replace(copies, episode=after)
+    stepped = dataclasses.replace(copies, episode=after, done=terminated | truncated)
     if mode == "NextStep":
         waiting = copies.done
         reward = jnp.where(waiting, 0, reward)
         terminated, truncated = terminated & ~waiting, truncated & ~waiting
-    done = terminated | truncated
-    stepped, sight = dataclasses.replace(stepped, done=done), look(environment, stepped)
+        stepped = dataclasses.replace(stepped, done=terminated | truncated)
+        stepped = restart(environment, stepped, waiting, randomize)
     final: dict[str, Any] = {}
     if mode == "SameStep":
-        final = {"final_obs": sight[0], "final_info": sight[1]}
-        final |= {f"_{name}": done for name in ("final_obs", "final_info")}
-    if mode != "Disabled":
-        chosen = copies.done if mode == "NextStep" else done
-        stepped, sight = _begun(environment, stepped, sight, chosen, randomize)
-    return stepped, Outcome(sight[0], reward, terminated, truncated, sight[1] | final)
+        seen, info = look(environment, stepped)
+        final = {"final_obs": seen, "_final_obs": stepped.done}
+        final |= {"final_info": info, "_final_info": stepped.done}
+        stepped = restart(environment, stepped, stepped.done, randomize)
+    seen, info = look(environment, stepped)
+    return stepped, Outcome(seen, reward, terminated, truncated, info | final)
 
 
 def restart(
@@ -112,41 +112,25 @@ def restart(
         chosen: which, (n,) of bools.
         randomize: as of `begin`.
     """
-    return _begun(environment, copies, (), chosen, randomize)[0]
-
-
-def _begun(
-    environment: Environment,
-    copies: Copies,
-    sight: PyTree,
-    chosen: Array,
-    randomize: Randomize | None,
-) -> tuple[Copies, PyTree]:
-    """The same, and what all see, where that is given for the others: it is looked at once."""
     count = chosen.shape[0]
     size = min(count, max(LEAST_PART, -(-count // PARTS)))
-    old = copies.episode, copies.world, sight
+    old = copies.episode, copies.world
 
-    def fresh(keys: Array) -> tuple[Episode, PyTree, PyTree]:
-        episode, world = _start(environment, keys, randomize)
-        begun = Copies(episode, jnp.zeros(len(keys), bool), world)
-        return episode, world, look(environment, begun) if sight else ()
-
-    def few() -> tuple[Episode, PyTree, PyTree]:
+    def few() -> tuple[Episode, PyTree]:
         index = jnp.nonzero(chosen, size=size, fill_value=count)[0]  # beyond the last: dropped
-        begun = fresh(old[0].key.at[index].get(mode="clip"))
-        return jax.tree.map(lambda x, y: x.at[index].set(y, mode="drop"), old, begun)
+        fresh = _start(environment, old[0].key.at[index].get(mode="clip"), randomize)
+        return jax.tree.map(lambda x, y: x.at[index].set(y, mode="drop"), old, fresh)
 
-    def many() -> tuple[Episode, PyTree, PyTree]:
+    def many() -> tuple[Episode, PyTree]:
         def keep(x: Array, y: Array) -> Array:
             return jnp.where(chosen.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
 
-        return jax.tree.map(keep, old, fresh(old[0].key))
+        return jax.tree.map(keep, old, _start(environment, old[0].key, randomize))
 
     wanted = jnp.sum(chosen)
     case = (wanted > 0).astype(int) + (wanted > size).astype(int)
-    episode, world, sight = jax.lax.switch(case, (lambda: old, few, many))
-    return Copies(episode, copies.done, world), sight
+    episode, world = jax.lax.switch(case, (lambda: old, few, many))
+    return Copies(episode, copies.done, world)
 
 
 def _start(

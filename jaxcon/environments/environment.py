@@ -9,6 +9,7 @@ action does, what is seen and what it is worth.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -149,7 +150,7 @@ class Environment:
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
         """What an action within −1 to 1 was worth, ().
 
-        From 0 to 1 in the tasks here but those from Gymnasium, which have its rewards.
+        From 0 to 1 in the tasks here but `HalfCheetah`, which has Gymnasium's reward.
 
         Args:
             before: the episode before the action.
@@ -283,8 +284,11 @@ def near(x: Any, scale: float) -> Array:
 
 
 def spread(key: Array, size: float, shape: tuple[int, ...], dtype: Any) -> Array:
-    """Uniform numbers from −size to size."""
-    return jax.random.uniform(key, shape, dtype, -size, size)
+    """Uniform numbers from −size to size.
+
+    Drawn in a row: of many copies, XLA draws two rows of two at a third of the pace of one of four.
+    """
+    return jax.random.uniform(key, (math.prod(shape),), dtype, -size, size).reshape(shape)
 
 
 def angle_channels(name: str, most: float) -> tuple[Channel, ...]:

@@ -9,11 +9,11 @@ from typing import Any
 from jaxcon.environments.environment import Environment
 from jaxcon.environments.tasks.cart_pole import CartPole, double_cart_pole
 from jaxcon.environments.tasks.cat import CatRighting
+from jaxcon.environments.tasks.cheetah import HalfCheetah
 from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
 from jaxcon.environments.tasks.rope_swing import RopeSwing
-from jaxcon.environments.tasks.runners import HalfCheetah, Hopper
 from jaxcon.environments.tasks.stewart import StewartBalancing
 
 TASKS: dict[str, Callable[..., Environment]] = {
@@ -23,7 +23,6 @@ TASKS: dict[str, Callable[..., Environment]] = {
     "FiveBarHopper": FiveBarHopper.build,
     "FourBarTracking": FourBarTracking.build,
     "HalfCheetah": HalfCheetah.build,
-    "Hopper": Hopper.build,
     "Parking": Parking.build,
     "RopeSwing": RopeSwing.build,
     "StewartBalancing": StewartBalancing.build,
