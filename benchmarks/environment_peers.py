@@ -120,7 +120,7 @@ def brax(name: str, how: str, copies: int) -> Copies:
 
     env: Any = envs.get_environment(name, backend=how)
     wrapped = training.wrap(env, episode_length=1000)
-    keys = jax.random.split(jax.random.key(0), copies)
+    keys = jax.random.split(jax.random.PRNGKey(0), copies)  # its wrappers know no others
     now, key = [jc.shard(jax.jit(wrapped.reset)(keys))], [jax.random.key(1)]
     shape, step = (copies, env.action_size), jax.jit(wrapped.step)
     draw = jax.jit(lambda k: jax.random.uniform(k, shape, minval=-1.0, maxval=1.0))

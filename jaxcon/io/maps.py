@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -152,15 +153,8 @@ class Tree:
         return Motion(pose.position, pose.orientation, slope.position, 2 * spin[1:].T)
 
     def flat(self, system: Any, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        """q and v of the system, all of whose links are of one kind."""
-        layout, names = system.layout, [node.name for node in self.nodes]
-        kind = layout.groups[layout.locate(names[0])[0]].kind
-        frames = jax.tree.map(lambda *x: jnp.stack(x), *(_inverse(system, name) for name in names))
-        own = jax.vmap(lambda motion, frame: motion.seen_from(frame))
-        x, y = jax.vmap(kind.coordinates)(own(self.motions(qpos, qvel), frames))
-        q, v = jnp.zeros(layout.n_q, qpos.dtype), jnp.zeros(layout.n_v, qpos.dtype)
-        at_q, at_v = (np.stack([where(n) for n in names]) for where in (layout.q, layout.v))
-        return q.at[at_q].set(x), v.at[at_v].set(y)
+        """q and v of the system, all of whose links are of one kind; compiled as one."""
+        return _flat(self, system.layout, system.offsets, qpos, qvel)
 
     def turns_of(self, system: Any, qpos: Array) -> Any:
         """What a state at qpos remembers of the joints whose turns are counted."""
@@ -251,11 +245,24 @@ def _moves(nodes: tuple[Node, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     return np.array(order), np.array(bases), np.array(ends)
 
 
-def _inverse(system: Any, name: str) -> Pose:
+@functools.partial(jax.jit, static_argnums=1)
+def _flat(
+    tree: Tree, layout: Any, offsets: dict[str, Pose], qpos: Array, qvel: Array
+) -> tuple[Array, Array]:
+    names = [node.name for node in tree.nodes]
+    kind = layout.groups[layout.locate(names[0])[0]].kind
+    own = [_inverse(offsets.get(name), qpos.dtype) for name in names]
+    frames = jax.tree.map(lambda *x: jnp.stack(x), *own)
+    seen = jax.vmap(lambda motion, frame: motion.seen_from(frame))
+    x, y = jax.vmap(kind.coordinates)(seen(tree.motions(qpos, qvel), frames))
+    q, v = jnp.zeros(layout.n_q, qpos.dtype), jnp.zeros(layout.n_v, qpos.dtype)
+    at_q, at_v = (np.stack([where(n) for n in names]) for where in (layout.q, layout.v))
+    return q.at[at_q].set(x), v.at[at_v].set(y)
+
+
+def _inverse(offset: Pose | None, dtype: Any) -> Pose:
     """The principal frame of a link in the user's frame, from the user's in the principal frame."""
-    offset = system.offsets.get(name)
     if offset is None:
-        dtype = system.gravity.dtype
         return Pose(jnp.zeros(3, dtype), jnp.eye(4, dtype=dtype)[0])
     back = quaternion.conjugate(offset.orientation)
     return Pose(-offset.local_direction(offset.position), back)
