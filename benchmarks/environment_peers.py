@@ -165,9 +165,9 @@ def measure(case: Case, enough: float = ENOUGH, repeats: int = REPEATS) -> Run:
     steps = max(2, round(enough / (time.perf_counter() - started)))
 
     def run() -> None:
-        for _ in range(steps):
-            seen = copies.act()
-        wait(seen)
+        for _ in range(steps - 1):
+            copies.act()
+        wait(copies.act())
 
     rate = timing.rate(run, steps * case.copies, repeats)
     return Run(case.copies, copies.action, copies.steps, ready, rate)
@@ -185,7 +185,8 @@ def in_process(case: Case, limit: float) -> Run | str:
     found = timing.in_process(arguments, dict(os.environ), limit, "is not done after")
     if isinstance(found, str):
         return found
-    return Run(**(found | {"rate": Rate(**found["rate"])}))
+    rate = Rate(**found.pop("rate"))
+    return Run(**found, rate=rate)
 
 
 HEAD = """

@@ -73,9 +73,9 @@ def measure(task: str, copies: int, steps: int, repeats: int) -> Row:
     work, pairs = copies * steps, []
     for _ in range(repeats):
         pairs.append([timing.rate(run, work, 1).median for run in (interface, bare)])
-    rates = np.median(pairs, axis=0)
-    share = np.median([a / b for a, b in pairs])
-    return Row(*map(float, rates), float(share), ended, envs.environment.skip)
+    reached, possible = (float(x) for x in np.median(pairs, axis=0))
+    share = float(np.median([a / b for a, b in pairs]))
+    return Row(reached, possible, share, ended, envs.environment.skip)
 
 
 def main() -> None:

@@ -39,6 +39,14 @@ class Scalar(NamedTuple):
     at: Coordinate
 
 
+class Numbers(NamedTuple):
+    """Of joints: ids (n,), and where their coordinates begin in qpos and qvel, (n, 1)."""
+
+    id: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+
+
 @pytree
 class Tree:
     """The links of a model and how MuJoCo's coordinates move them.
@@ -83,30 +91,31 @@ class Tree:
         return Pose(places[ends], orientations[ends])
 
     def _moved(self, qpos: Array) -> list[tuple[Array, Array]]:
-        """Step (n, 3) and turn (n, 4) of each move in the frame before it, in the order of `KINDS`.
+        """Step (n, 3) and turn (n, 4) of each move in the frame before it: links, then `KINDS`."""
+        slide, hinge, ball, free = (self._joints(kind) for kind in KINDS)
+        travel = self.axes[slide.id] * (qpos - self.reference)[slide.q]
+        upright = jnp.zeros((len(travel), 4), qpos.dtype).at[:, 0].set(1)
+        angle = self.axes[hinge.id] * (qpos - self.reference)[hinge.q]
+        turned = quaternion.normalize(qpos[ball.q + np.arange(4)].T)
+        flown = quaternion.normalize(qpos[free.q + np.arange(3, 7)].T)
+        return [
+            (self.positions, self.turns),
+            (travel, upright),
+            self._about(hinge.id, quaternion.exp(angle.T)),
+            self._about(ball.id, turned),
+            (qpos[free.q + np.arange(3)], flown.T),
+        ]
 
-        Hinges and balls turn the frame about a point.
-        """
-        joints = {kind: _of_kind(self.nodes, kind) for kind in KINDS}
-        found = [(self.positions, self.turns)]
-        for kind, own in joints.items():
-            ids = jnp.asarray([joint.id for joint in own], int)
-            first = np.asarray([joint.q for joint in own], int)[:, None]
-            points, axes = self.points[ids], self.axes[ids]
-            if kind in ("slide", "hinge"):
-                along = axes * (qpos - self.reference)[first]
-                turn = quaternion.exp(along.T) if kind == "hinge" else None
-            else:
-                turns = first + (3 if kind == "free" else 0) + np.arange(4)
-                turn = quaternion.normalize(qpos[turns].T)
-            if kind == "slide":
-                upright = jnp.zeros((len(own), 4), qpos.dtype).at[:, 0].set(1)
-                found.append((along, upright))
-            elif kind == "free":
-                found.append((qpos[first + np.arange(3)], turn.T))
-            else:
-                found.append((points - quaternion.rotate(turn, points.T).T, turn.T))
-        return found
+    def _about(self, joints: np.ndarray, turn: Array) -> tuple[Array, Array]:
+        """Turns (4, n) of joints about their points."""
+        point = self.points[joints]
+        return point - quaternion.rotate(turn, point.T).T, turn.T
+
+    def _joints(self, kind: str) -> Numbers:
+        """The joints of a kind."""
+        own = _of_kind(self.nodes, kind)
+        ids, q, v = (np.array([getattr(j, x) for j in own], int) for x in ("id", "q", "v"))
+        return Numbers(ids, q[:, None], v[:, None])
 
     def check(self, qpos: Array) -> None:
         """Checks three hinges of one link, where qpos is concrete.
@@ -134,9 +143,10 @@ class Tree:
 
     def rates(self, qpos: Array, qvel: Array) -> Array:
         """q̇pos, (nq,): qvel, with the quaternions of ball and free joints by ½ q ⊗ ω."""
-        scalars = [joint for kind in ("slide", "hinge") for joint in _of_kind(self.nodes, kind)]
-        places, own = (np.asarray([getattr(j, x) for j in scalars], int) for x in "qv")
-        slopes = jnp.zeros_like(qpos).at[places].set(qvel[own])
+        slopes = jnp.zeros_like(qpos)
+        for kind in ("slide", "hinge"):
+            own = self._joints(kind)
+            slopes = slopes.at[own.q].set(qvel[own.v])
         for joint in (*_of_kind(self.nodes, "free"), *_of_kind(self.nodes, "ball")):
             q, v = joint.q, joint.v
             if joint.kind == "free":
@@ -215,7 +225,7 @@ class Tree:
 
 
 KINDS = ("slide", "hinge", "ball", "free")
-"""Of joints, in the order of their moves after those into the links."""
+"""Of joints, in the order in which `Tree._moved` has them."""
 
 
 def _of_kind(nodes: tuple[Node, ...], kind: str) -> list[LinkJoint]:

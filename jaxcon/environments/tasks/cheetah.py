@@ -157,7 +157,11 @@ class HalfCheetah(Environment):
         return jc.init(self.system, self.method, q, v, turns=self.tree.turns_of(self.system, qpos))
 
     def coordinates(self, episode: Episode) -> tuple[Array, Array]:
-        """Qpos and qvel, (9,) each; angles count whole turns."""
+        """Qpos and qvel, (9,) each; angles count whole turns.
+
+        Args:
+            episode: where it stands.
+        """
         return self.tree.read(self.system, episode.state)
 
     def observation(self, episode: Episode) -> Array:
