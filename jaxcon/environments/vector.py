@@ -190,8 +190,7 @@ class GymnasiumVectorEnv(VectorEnv):
         Args:
             saved: from `save`.
         """
-        # copied: a step takes the memory of what it gets
-        self.copies = self._spread(jax.tree.map(jnp.array, saved["copies"]))
+        self.copies = self._spread(jax.tree.map(jnp.asarray, saved["copies"]))
         self.np_random.bit_generator.state = saved["random"]
 
     def render(self) -> tuple[np.ndarray, ...] | None:
