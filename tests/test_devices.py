@@ -131,3 +131,56 @@ refused("samples=7 does not", jc.tune, loss, 0.0, samples=7, key=key, mesh=all)
 
 def test_four_devices_work_apart_and_sum_gradients_once():
     finished(started("-c", FOUR_DEVICES))
+
+
+TWO_DEVICES = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+import numpy as np
+from benchmarks import devices
+from jaxcon import environments
+from jaxcon.environments import vector
+
+def made(count):
+    return environments.GymnasiumVectorEnv("CartPole", 6, 4, devices=count)
+
+def played(envs, start=None):
+    random = np.random.default_rng(0)
+    seen = [envs.reset(seed=3) if start is None else envs.restore(start)]
+    for _ in range(7):
+        seen.append(envs.step(random.uniform(-1, 1, (6, 1))))
+    seen.append(envs.reset(options={"reset_mask": np.arange(6) % 3 == 0}))
+    return seen
+
+def same(x, y):
+    for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+one, two = made(1), made(2)
+found = played(two)
+same(found, played(one))
+assert len(two.copies.episode.state.q.sharding.device_set) == 2
+assert len(found[3][0].sharding.device_set) == 2
+assert np.asarray(found[4][3]).all()  # each began anew on the way
+assert np.any(np.asarray(found[-1][0]) != np.asarray(found[-2][0]))
+kept = two.save()
+same(played(made(2), start=kept), played(made(1), start=kept))
+lowered = vector._advance.lower(
+    two.environment, two.copies, two._spread(np.zeros((6, 1))), "NextStep", None, two.mesh)
+assert devices.exchanges(lowered.compile().as_text()) == {}
+
+def refused(words, *args, **own):
+    try:
+        environments.GymnasiumVectorEnv("CartPole", *args, **own)
+    except ValueError as error:
+        assert words in str(error), error
+    else:
+        raise AssertionError(f"not refused: {words}")
+
+refused("from 1 to the 2 of JAX, got 3", 6, devices=3)
+refused("num_envs=5 does not divide over 2 devices", 5, devices=2)
+"""
+
+
+def test_copies_over_two_devices_get_the_numbers_of_one():
+    finished(started("-c", TWO_DEVICES))

@@ -79,6 +79,10 @@ class Layered(Environment):
         """As below."""
         return self.task.frame
 
+    def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
+        """As below."""
+        return self.below.window(episode)
+
     def start(self, key: Array) -> tuple[State, PyTree]:
         """As below."""
         return self.below.start(key)
