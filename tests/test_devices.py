@@ -109,6 +109,20 @@ for f, own in ((loss, {"samples": 8}), (bowl, {"restarts": 4, "spread": 1.0})):
     a, b = (jc.tune(f, jnp.zeros(2), mesh=m, **own) for m in (None, all))
     same((a.params, a.histories), (b.params, b.histories))
 
+scene = jc.Scene(dim=2)
+scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+system, start = scene.build()
+method = jc.Method(stabilizer=jc.Projection(), solver=jc.Sparse())  # rounds until all are done
+start = jc.init(system, method, start.q, start.v)
+swing = jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0])
+apart = jc.shard(worlds(start, 4))
+together = jax.jit(swing).lower(apart).compile()
+assert met(together)
+alone = jax.jit(jc.over_devices(lambda _, batch: swing(batch))).lower(0.0, apart).compile()
+assert met(alone) == {}
+same(alone(0.0, apart), together(apart))
+
 def refused(words, function, *args, **own):
     try:
         function(*args, **own)

@@ -17,8 +17,10 @@ SHARED, APART = PartitionSpec(), PartitionSpec("worlds")
 def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
     """The same batch with equal parts of its worlds, the first axis, on each device.
 
-    What `jit(vmap(f))` makes of it stays there, and nothing is exchanged. Gradients by numbers that
-    worlds share are sums over all of them: take `over_devices` for these.
+    What `jit(vmap(f))` makes of it stays there. Nothing is exchanged where every step has a fixed
+    number of operations; methods that iterate until all worlds are done, as `Projection`, `RATTLE`,
+    `GeneralizedAlpha` and what solves limits and contacts, ask all devices in every iteration.
+    Gradients by numbers that worlds share are sums over all of them. Take `over_devices` for both.
 
     Several processes, joined by `jax.distributed.initialize`, all give the same batch and keep
     their parts of it. Where it is large, give keys or starts, and make the batch of them in `jit`.
@@ -41,9 +43,10 @@ def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
 def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Callable[..., Any]:
     """function(shared, batch), where each device works on its own part of the batch.
 
-    It is good to jit and to differentiate. The derivative by what is shared is summed on each
-    device over the whole motion, and over devices once, at the end: under `jit(grad(vmap(f)))` of a
-    batch from `shard` devices would meet in every step.
+    No device waits for another, also where methods iterate until their worlds are done. It is good
+    to jit and to differentiate. The derivative by what is shared is summed on each device over the
+    whole motion, and over devices once, at the end: under `jit(grad(vmap(f)))` of a batch from
+    `shard` devices would meet in every step.
 
         settled = jc.over_devices(jax.vmap(settle, in_axes=(None, 0)))
         slope = jax.jit(jax.grad(lambda p, worlds: jnp.mean(settled(p, worlds))))
