@@ -41,6 +41,9 @@ class GymnasiumVectorEnv(VectorEnv):
             `reset(options={"reset_mask": …})`.
         randomize: (environment, key) → the environment of a copy for an episode.
         options: of the task's `build`.
+
+    Raises:
+        ValueError: a horizon, which `max_episode_steps` says.
     """
 
     def __init__(
@@ -53,6 +56,7 @@ class GymnasiumVectorEnv(VectorEnv):
         randomize: Randomize | None = None,
         **options: Any,
     ) -> None:
+        adapters.check_no_horizon(options)
         environment = make(task, **options)
         limit = environment.horizon if max_episode_steps is None else max_episode_steps
         self.environment = dataclasses.replace(environment, horizon=limit)
@@ -74,7 +78,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """Starts an episode in every copy, or in those of `options["reset_mask"]`, (n,) of bools.
 
         Args:
-            seed: of all that is drawn from now on; None goes on drawing.
+            seed: of all that is drawn from now on, by those that are reset; None goes on drawing.
             options: `reset_mask`, or none.
 
         Raises:
@@ -93,7 +97,10 @@ class GymnasiumVectorEnv(VectorEnv):
                 f"reset: options['reset_mask'] must be {self.num_envs} bools, got {mask.dtype} of"
                 f" shape {mask.shape}."
             )
-        copies = _restart(self.environment, self._running(), jnp.asarray(mask), self.randomize)
+        copies = self._running()
+        if seed is not None:  # else each goes on with its own key
+            copies = _with_keys(copies, jnp.asarray(mask), adapters.key_from(self.np_random))
+        copies = _restart(self.environment, copies, jnp.asarray(mask), self.randomize)
         self.copies = dataclasses.replace(copies, done=copies.done & ~mask)
         return _look(self.environment, self.copies)
 
@@ -160,3 +167,10 @@ class GymnasiumVectorEnv(VectorEnv):
         if self.copies is None:
             raise gymnasium.error.ResetNeeded("call reset before step, save or render.")
         return self.copies
+
+
+def _with_keys(copies: Copies, chosen: Array, key: Array) -> Copies:
+    """The copies with those keys for the chosen ones, (n,), that `begin` gives to all of them."""
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(chosen)))
+    keys = jnp.where(chosen[:, None], keys, copies.episode.key)
+    return dataclasses.replace(copies, episode=dataclasses.replace(copies.episode, key=keys))
