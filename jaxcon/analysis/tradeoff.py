@@ -17,7 +17,7 @@ from jaxcon.analysis.ledger import Clock, Ledger, Wanted
 from jaxcon.analysis.sweep import Sweep
 from jaxcon.analysis.trials import Course, Inputs, Observer, Points, Problem
 from jaxcon.core import checks
-from jaxcon.core.ends import bar
+from jaxcon.core.ends import ENDS, bar, words
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method, check_method
@@ -145,8 +145,8 @@ def _go(
                     with clock.timing("gradients"):
                         ledger[one] = sweep.gradients(ledger[one])
                 shown.update()
-    except KeyboardInterrupt:
-        reason = "interrupted from the keyboard"
+    except ENDS as error:
+        reason = words(error)
     late = [LeftOut(one.name, one.dtype, reason) for one in wanted if one not in ledger]
     for one in _by_use(ledger, wanted) if gradients else ():
         if not ledger[one].differentiated:
