@@ -126,12 +126,13 @@ same(alone(0.0, apart), together(apart))
 def refused(words, function, *args, **own):
     try:
         function(*args, **own)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         assert words in str(error), error
     else:
         raise AssertionError(f"not refused: {words}")
 
 refused("10 worlds does not divide over 4 devices; take 12", jc.shard, jnp.ones(10))
+refused("must be one of JAX, such as", jc.shard, jnp.ones(4), jax.devices())
 refused("over_devices: a batch of 6", jc.over_devices(lambda p, x: x, all), 0.0, jnp.ones(6))
 refused("['t'] of the batch has no first axis", jc.shard, {"t": 1.0, "x": jnp.ones(4)})
 refused("must have as many worlds, got", jc.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})

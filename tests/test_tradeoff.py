@@ -340,6 +340,16 @@ def test_a_step_asked_for_that_takes_longer_than_the_budget_is_listed():
     assert str(found)
 
 
+def test_one_step_and_one_precision_need_no_list_and_one_world_no_batch():
+    system, state = free_mass()
+    known = {"methods": {"RK4": jc.Method(jc.RK4())}, "batch": 2, "gradients": False}
+    found = jc.tradeoff(system, state, 1.0, dts=0.1, dtypes="float64", **known, progress=False)
+    assert [(run.dt, run.dtype) for run in found.runs] == [(0.1, "float64")]
+    many = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    with pytest.raises(ValueError, match=r"one world, got a state with q of shape \(2, 2\)"):
+        jc.tradeoff(system, many, 1.0)
+
+
 def test_what_fails_while_it_runs_is_listed_and_the_rest_goes_on(monkeypatch):
     def short_of_memory(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")

@@ -34,6 +34,7 @@ def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
 
     Raises:
         ValueError: an array has no first axis, or another n; or n does not divide.
+        TypeError: the mesh is none.
     """
     mesh = _line(mesh)
     _check("shard", batch, mesh.size)
@@ -61,6 +62,7 @@ def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Call
 
     Raises:
         ValueError: as of `shard`, when it is called.
+        TypeError: the mesh is none.
     """
     line = _line(mesh)
     # what is shared stays so without being told apart from what is not in every operation
@@ -80,7 +82,16 @@ def gathered(tree: PyTree, mesh: Mesh) -> PyTree:
 
 
 def _line(mesh: Mesh | None) -> Mesh:
-    """The devices of a mesh along one axis, of worlds; where arrays lie is left to the compiler."""
+    """The devices of a mesh along one axis, of worlds; where arrays lie is left to the compiler.
+
+    Raises:
+        TypeError: it is no mesh.
+    """
+    if not isinstance(mesh, Mesh | None):
+        raise TypeError(
+            "a mesh must be one of JAX, such as jax.make_mesh((2,), ('worlds',)), got"
+            f" {type(mesh).__name__}."
+        )
     devices = np.asarray(jax.devices()) if mesh is None else mesh.devices
     return Mesh(devices.ravel(), ("worlds",))
 
