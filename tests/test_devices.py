@@ -113,15 +113,30 @@ for f, own in ((loss, {"samples": 8}), (bowl, {"restarts": 4, "spread": 1.0})):
     a, b = (jc.tune(f, jnp.zeros(2), mesh=m, **own) for m in (None, all))
     same((a.params, a.histories), (b.params, b.histories))
 
+scene = jc.Scene(dim=2)
+scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+system, start = scene.build()
+method = jc.Method(stabilizer=jc.Projection(), solver=jc.Sparse())  # rounds until all are done
+start = jc.init(system, method, start.q, start.v)
+swing = jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0])
+apart = jc.shard(worlds(start, 4))
+together = jax.jit(swing).lower(apart).compile()
+assert met(together)
+alone = jax.jit(jc.over_devices(lambda _, batch: swing(batch))).lower(0.0, apart).compile()
+assert met(alone) == {}
+same(alone(0.0, apart), together(apart))
+
 def refused(words, function, *args, **own):
     try:
         function(*args, **own)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         assert words in str(error), error
     else:
         raise AssertionError(f"not refused: {words}")
 
 refused("10 worlds does not divide over 4 devices; take 12", jc.shard, jnp.ones(10))
+refused("must be one of JAX, such as", jc.shard, jnp.ones(4), jax.devices())
 refused("over_devices: a batch of 6", jc.over_devices(lambda p, x: x, all), 0.0, jnp.ones(6))
 refused("['t'] of the batch has no first axis", jc.shard, {"t": 1.0, "x": jnp.ones(4)})
 refused("must have as many worlds, got", jc.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})

@@ -68,6 +68,24 @@ def test_gymnasium_finds_nothing_to_warn_of(task):
     assert {c.unit for c in built.observed} <= {"1", "m", "m/s", "rad", "rad/s"}
 
 
+def test_a_time_limit_is_gymnasiums():
+    """Its own would go before a task's: 500 actions where 50 were asked for."""
+    assert gymnasium.make("jaxcon/CartPole-v0", max_episode_steps=50).spec.max_episode_steps == 50
+    with pytest.raises(ValueError, match="max_episode_steps"):
+        gymnasium.make("jaxcon/CartPole-v0", horizon=50)
+    with pytest.raises(ValueError, match="max_episode_steps"):
+        gymnasium.make_vec("jaxcon/CartPole-v0", num_envs=2, horizon=50)
+
+
+def test_a_seed_is_that_of_the_copies_that_a_mask_resets():
+    envs, mask = many(3), np.array([True, False, True])
+    fresh, _ = envs.reset(seed=5)
+    other, _ = envs.reset(seed=6)
+    chosen, _ = envs.reset(seed=5, options={"reset_mask": mask})
+    np.testing.assert_array_equal(chosen, np.where(mask[:, None], fresh, other))
+    assert np.all(np.any(fresh != other, axis=1))
+
+
 @pytest.mark.parametrize("task", TASKS)
 def test_episodes_start_on_the_constraints_and_earn_from_0_to_1(task):
     built = environments.make(task, **CHEAP.get(task, {}))

@@ -91,7 +91,8 @@ class GymnasiumVectorEnv(VectorEnv):
         options: of the task's `build`.
 
     Raises:
-        ValueError: JAX has fewer devices, or the copies do not divide over them.
+        ValueError: JAX has fewer devices, the copies do not divide over them, or a horizon is
+            given, which `max_episode_steps` says.
     """
 
     def __init__(
@@ -105,6 +106,7 @@ class GymnasiumVectorEnv(VectorEnv):
         devices: int = 1,
         **options: Any,
     ) -> None:
+        adapters.check_no_horizon(options)
         self.mesh = _line(devices, num_envs)
         environment = make(task, **options)
         limit = environment.horizon if max_episode_steps is None else max_episode_steps
@@ -127,7 +129,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """Starts an episode in every copy, or in those of `options["reset_mask"]`, (n,) of bools.
 
         Args:
-            seed: of all that is drawn from now on; None goes on drawing.
+            seed: of all that is drawn from now on, by those that are reset; None goes on drawing.
             options: `reset_mask`, or none.
 
         Raises:
@@ -148,6 +150,8 @@ class GymnasiumVectorEnv(VectorEnv):
                 f" shape {mask.shape}."
             )
         chosen, running = self._spread(jnp.asarray(mask)), self._running()
+        if seed is not None:  # else each goes on with its own key
+            running = _with_keys(running, chosen, adapters.key_from(self.np_random))
         copies = _restart(self.environment, running, chosen, self.randomize, self.mesh)
         self.copies = dataclasses.replace(copies, done=copies.done & ~chosen)
         return _look(self.environment, self.copies, self.mesh)
@@ -244,3 +248,10 @@ def _line(devices: int, copies: int) -> Mesh | None:
     if copies % devices:
         raise ValueError(f"num_envs={copies} does not divide over {devices} devices.")
     return None if devices == 1 else Mesh(np.array(there[:devices]), ("worlds",))
+
+
+def _with_keys(copies: Copies, chosen: Array, key: Array) -> Copies:
+    """The copies with those keys for the chosen ones, (n,), that `begin` gives to all of them."""
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(chosen)))
+    keys = jnp.where(chosen[:, None], keys, copies.episode.key)
+    return dataclasses.replace(copies, episode=dataclasses.replace(copies.episode, key=keys))
