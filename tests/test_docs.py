@@ -27,6 +27,7 @@ BESIDE = {
     "jaxcon.analysis.front.Run",
     "jaxcon.analysis.front.Limit",
     "jaxcon.analysis.front.LeftOut",
+    "jaxcon.view.animate",
     "jaxcon.view.draw",
     "jaxcon.view.links",
     "jaxcon.view.canvas",
