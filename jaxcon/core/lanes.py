@@ -43,6 +43,13 @@ def plus(x: Lane, y: Lane) -> Lane:
     return x if _is(y, 0) else x + y
 
 
+def minus(x: Lane, y: Lane) -> Lane:
+    """x − y, without an instruction for the Python number 0."""
+    if _is(x, 0):
+        return times(-1, y)
+    return x if _is(y, 0) else x - y
+
+
 def total(terms: Any) -> Lane:
     """The sum of lanes."""
     return functools.reduce(plus, terms, 0.0)
@@ -89,12 +96,12 @@ class Vector:
         """x × y: a vector in space, and in the plane its one component along the normal."""
         if len(self) == 2:
             (a, b), (c, d) = self, other
-            return plus(times(a, d), -times(b, c))
+            return minus(times(a, d), times(b, c))
         (a, b, c), (x, y, z) = self, other
         return Vector(
-            plus(times(b, z), -times(c, y)),
-            plus(times(c, x), -times(a, z)),
-            plus(times(a, y), -times(b, x)),
+            minus(times(b, z), times(c, y)),
+            minus(times(c, x), times(a, z)),
+            minus(times(a, y), times(b, x)),
         )
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
@@ -119,7 +126,7 @@ class Vector:
         return Vector(*(plus(x, y) for x, y in zip(self, other, strict=True)))
 
     def __sub__(self, other: Vector) -> Vector:
-        return self + (-other)
+        return Vector(*(minus(x, y) for x, y in zip(self, other, strict=True)))
 
     def __neg__(self) -> Vector:
         return self.map(lambda x: times(-1, x))
