@@ -60,6 +60,8 @@ def prepare(app, path, parent, content):
         text = re.sub(r"^### ", "## ", content[0], flags=re.MULTILINE)
         for pattern, target in LINKS:
             text = re.sub(pattern, target, text)
+        if parent == "index":  # sections are its neighbours but on the first page
+            text = re.sub(r"\]\(#([\w-]+)\)", r"](guide/\1.md)", text)
         content[0] = text
 
 
