@@ -19,7 +19,6 @@ def inverse(matrix: Array) -> Array:
     For matrices whose leading blocks are regular, such as a positive definite one and what
     complementarity adds to its diagonal blocks.
     """
-
     n = matrix.shape[0]
     places = jnp.arange(n).reshape(-1, *(1,) * (matrix.ndim - 2))
 
