@@ -83,7 +83,8 @@ class Operation:
 def traced(function: Any, args: Sequence[Any]) -> Any:
     """The closed jaxpr of a native function, without what no result needs."""
     closed = function.traced(*((x.shape, x.dtype) for x in args))
-    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, True, instantiate=True)
+    wanted = [True] * len(closed.jaxpr.outvars)
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, wanted, instantiate=True)
     return jex.ClosedJaxpr(jaxpr, closed.consts)
 
 

@@ -52,7 +52,8 @@ def rollout(
         system: a `BodySystem` or `GeneralizedSystem`.
         method: integrator, stabiliser and solver.
         state: the start.
-        controls: None; arrays whose first axis enumerates steps; or a function of the state.
+        controls: None; arrays whose first axis enumerates steps; or a function of the state. Those
+            of NumPy get the dtype of the state.
         dt: h, () [s].
         steps: how many.
         record: (state, info) → what to keep; the whole state unless given. `info` is what the step
