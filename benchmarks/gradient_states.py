@@ -229,7 +229,7 @@ def measure(name: str, dim: int, method: str, dtype: str, n: int, compared: int 
     q, v = (jnp.asarray(x, dtype) for x in (states.q, states.v))
     run = jax.jit(jax.vmap(lambda q, v: both(own, given, q, v, way)))
     forward, reverse, size, finite, status = map(np.asarray, run(q, v))
-    lost = np.asarray(failed(status))
+    lost = np.asarray(failed(jnp.asarray(status)))
     with np.errstate(invalid="ignore", divide="ignore"):
         apart = np.abs(forward - reverse) / np.where(size > 0, size, 1)
     good = np.isfinite(forward) & finite
