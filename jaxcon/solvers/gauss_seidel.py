@@ -12,7 +12,7 @@ from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan
-from jaxcon.solvers.bounded import Bounded, onto_disc, slope
+from jaxcon.solvers.bounded import Bounded, Parts, onto_disc, slope
 from jaxcon.solvers.gauss_jordan import at, put
 
 
@@ -109,7 +109,8 @@ def sweep(problem: Bounded, multipliers: Array, known: Pivots | None = None) -> 
 def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     """The best of multipliers near to the solution and those of some rounds from there.
 
-    A round is a Newton step on the residual, or a sweep where that does not make it smaller.
+    A round is a Newton step on the residual, or, where that does not make it smaller, a sweep,
+    every other time carried on.
 
     Args:
         problem: u = G λ + c and bounds.
@@ -129,12 +130,42 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
         inverse = gauss_jordan.inverse(slope(problem.residual, x))
         new = x - gauss_jordan.apply(inverse, problem.residual(x))
         swept = sweep(problem, x, pivot)
+        swept = jnp.where(count % 2 == 1, carried(problem, x, swept), swept)
         x = jnp.where((problem.worst(new) < problem.worst(x))[None], new, swept)
         best = jnp.where((problem.worst(x) < problem.worst(best))[None], x, best)
         return count + 1, x, best
 
     start = jnp.zeros((), jnp.int32), multipliers, multipliers
     return jax.lax.while_loop(going, once, start)[2]
+
+
+def carried(problem: Bounded, multipliers: Array, swept: Array) -> Array:
+    """A sweep's change of λ carried on until the first one-sided row that it unloads bears nothing.
+
+    Where more rows bear than can be met together, as at the four corners of a face, one has to let
+    go. Newton's matrix is singular there, and sweeps unload it by little at a time.
+
+    Args:
+        problem: u = G λ + c and bounds.
+        multipliers: λ, (n,).
+        swept: λ after a sweep, (n,).
+    """
+    kinds, change = problem.kinds, swept - multipliers
+    here, rate = kinds.split(multipliers), kinds.split(change)
+    lasts = [
+        jnp.where((x > 0) & (d < 0), -x / jnp.where(d < 0, d, -1), jnp.inf)
+        for x, d in ((here.single, rate.single), (here.normal, rate.normal))
+    ]
+    first = jnp.maximum(jnp.min(jnp.concatenate(lasts), axis=0, initial=jnp.inf), 1)
+    far = kinds.split(multipliers + jnp.where(jnp.isfinite(first), first, 1)[None] * change)
+    single, normal = (
+        jnp.where(jnp.isfinite(last) & (last <= first[None]), 0, jnp.maximum(x, 0))
+        for last, x in zip(lasts, (far.single, far.normal), strict=True)
+    )
+    sets = zip(kinds.discs, far.discs, strict=True)
+    discs = tuple(x * disc.of(normal > 0).astype(normal.dtype) for disc, x in sets)
+    box = jnp.clip(far.box, problem.lower, problem.upper)
+    return kinds.join(Parts(single, box, normal, discs))
 
 
 def _rows(problem: Bounded, multipliers: Array, known: Pivots) -> Array:
