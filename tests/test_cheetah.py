@@ -14,7 +14,7 @@ from jaxcon import environments
 from jaxcon.environments.tasks import cheetah
 
 pytest.importorskip("mujoco")
-CHEAP = jc.Method(solver=jc.Sparse(), bounded=jc.GaussSeidel(4))
+CHEAP = jc.Method(solver=jc.Schur(), bounded=jc.GaussSeidel(4))
 EXACT = 1e-9
 
 

@@ -22,13 +22,14 @@ from jaxcon.environments import copies
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks import environment_peers  # noqa: E402
 from benchmarks import environments as benchmark  # noqa: E402
 
 TASKS = list(environments.TASKS)
 CHEAP = {
     "CatRighting": {"method": jc.Method(jc.RATTLE(), solver=jc.Schur())},
     "FiveBarHopper": {"method": jc.Method(solver=jc.Schur())},
-    "HalfCheetah": {"method": jc.Method(solver=jc.Sparse(), bounded=jc.GaussSeidel(2))},
+    "HalfCheetah": {"method": jc.Method(solver=jc.Schur(), bounded=jc.GaussSeidel(2))},
     "StewartBalancing": {"method": jc.Method(solver=jc.Schur())},
 }
 """Options that make a task quicker to compile."""
@@ -415,3 +416,14 @@ def test_the_benchmark_counts_what_it_says():
     assert row.skip == 2
     assert row.resets == 0
     np.testing.assert_allclose(row.share, row.interface / row.bare)
+
+
+def test_a_row_beside_others_counts_what_it_says():
+    case = environment_peers.Case("pole", "gymnasium", "InvertedPendulum-v5", "sync", 2)
+    run = environment_peers.measure(case, enough=0.0, repeats=1)
+    assert (run.copies, run.action, run.steps) == (2, 0.04, 2)
+    assert run.rate.least > 0
+    told = environment_peers.line(case, run)
+    assert told.endswith(f" {0.04 * run.rate.median:.3g} s/s |")
+    assert told.count("|") == environment_peers.HEAD.splitlines()[1].count("|")
+    assert environment_peers.line(case, "fails").count("|") == told.count("|")

@@ -261,8 +261,9 @@ def _flat(
 ) -> tuple[Array, Array]:
     names = [node.name for node in tree.nodes]
     kind = layout.groups[layout.locate(names[0])[0]].kind
-    own = [_inverse(offsets.get(name), qpos.dtype) for name in names]
-    frames = jax.tree.map(lambda *x: jnp.stack(x), *own)
+    zero, upright = jnp.zeros(3, qpos.dtype), jnp.eye(4, dtype=qpos.dtype)[0]
+    own = [offsets.get(name, Pose(zero, upright)) for name in names]
+    frames = jax.vmap(_inverse)(jax.tree.map(lambda *x: jnp.stack(x), *own))
     seen = jax.vmap(lambda motion, frame: motion.seen_from(frame))
     x, y = jax.vmap(kind.coordinates)(seen(tree.motions(qpos, qvel), frames))
     q, v = jnp.zeros(layout.n_q, qpos.dtype), jnp.zeros(layout.n_v, qpos.dtype)
@@ -270,9 +271,7 @@ def _flat(
     return q.at[at_q].set(x), v.at[at_v].set(y)
 
 
-def _inverse(offset: Pose | None, dtype: Any) -> Pose:
+def _inverse(offset: Pose) -> Pose:
     """The principal frame of a link in the user's frame, from the user's in the principal frame."""
-    if offset is None:
-        return Pose(jnp.zeros(3, dtype), jnp.eye(4, dtype=dtype)[0])
     back = quaternion.conjugate(offset.orientation)
     return Pose(-offset.local_direction(offset.position), back)
