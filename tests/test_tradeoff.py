@@ -115,6 +115,18 @@ def test_the_limit_of_stability_is_that_of_the_exact_law():
     assert all(run.dt < exact for run in found.front)
 
 
+def test_a_scene_at_rest_does_not_diverge_by_rounding():
+    """Nothing moves, and float32 has the energy to seven digits only."""
+    down = np.array([math.sin(0.3), -math.cos(0.3)])
+    scene = jc.Scene(dim=2, gravity=G * down)
+    scene.add_particle("bob", mass=1.3, position=1.1 * down)
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    known = {"methods": {"RK4": METHODS["RK4"]}, "dtypes": "float32", "dts": 0.1, "batch": 2}
+    found = jc.tradeoff(*scene.build(), 1.0, **known, gradients=False, progress=False)
+    assert [run.outcome for run in found.runs] == ["ok"]
+    assert found.recommend(error=1e-5).dt == 0.1
+
+
 def test_what_does_not_fit_is_listed_with_its_reason(result):
     refused = [x for x in result.left_out if x.name == "both"]
     assert [x.dtype for x in refused] == ["float64", "float32"]

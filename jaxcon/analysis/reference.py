@@ -25,6 +25,8 @@ GOAL = 1e-13
 GOOD = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Errors, of the size of the motion, up to which a part is compared: the least with which at least
 half of the horizon is, or the largest."""
+REST = 1e-4
+"""Of the energy, what a scene that hardly moves may gain before it counts as diverged."""
 ON = 1e-10
 """φ and φ̇ up to which a start is on its constraints, of 1 + max |q| and 1 + max |v|."""
 
@@ -148,9 +150,10 @@ class Reference:
 
     @property
     def scale(self) -> float:
-        """Of the energy: how much moves or is exchanged [J]."""
-        exchanged = float(np.ptp(self.seen.energy))
-        return max(float(np.max(self.seen.kinetic)), exchanged)
+        """Of the energy: how much moves or is exchanged, or may be rounded away at rest [J]."""
+        energy = self.seen.energy
+        moved = max(float(np.max(self.seen.kinetic)), float(np.ptp(energy)))
+        return max(moved, REST * float(np.max(np.abs(energy))))
 
 
 def started(problem: Problem, observe: Observer) -> tuple[Problem, float]:
