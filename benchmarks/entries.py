@@ -136,6 +136,41 @@ def operations(quick: bool) -> list[Metric]:
     return found
 
 
+@entry("size")
+def size(quick: bool) -> Found:
+    """How operations of a step, and time on a whole run, grow with size for every solver."""
+    from benchmarks import size as study
+
+    if quick:
+        runs = {name: list(study.series("posts", name, 0, 60.0, (10, 40))) for name in study.DIRECT}
+        found = {"posts": runs}
+    else:
+        found = study.measure(study.arguments([]))
+    metrics = []
+    for family, solvers in found.items():
+        for name, rows in solvers.items():
+            for what, tolerance in (("operations", 1.05), ("step", 1.3)):
+                power = study.exponent(rows, what)
+                title = f"{family}, {name}, exponent of {what}"
+                metrics += [] if power is None else [Metric(title, power, "", LOWER, tolerance)]
+    what = "operations" if quick else "step"
+    return Found(tuple(metrics), lambda path: study.picture(found, str(path), what))
+
+
+@entry("needed", GYMNASIUM, MUJOCO)
+def needed(quick: bool) -> list[Metric]:
+    """Rows, operations and time of a step from a particle to a humanoid."""
+    from benchmarks import needed as study
+
+    found = []
+    for name in list(study.SCENES)[: 3 if quick else None]:
+        need = study.measure(name, None if quick else 256)
+        found.append(count(f"{name}, rows", float(need.rows + need.bounded)))
+        found.append(count(f"{name}, operations", need.operations, "operations", 1.05))
+        found += [] if need.step is None else [seconds(f"{name}, step", need.step)]
+    return found
+
+
 @entry("accuracy")
 def accuracy(quick: bool) -> list[Metric]:
     """Violation and error after a second at 2 ms in float32, and MuJoCo's error at that step."""

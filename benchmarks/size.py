@@ -44,6 +44,7 @@ SOLVERS: dict[str, Any] = {
     "Priority": jc.Priority({}),
 }
 DENSE = ("Schur", "Dense", "Priority")
+DIRECT = ("Sparse", "Schur", "Dense")
 AUTO = "auto"
 HELD = 3e9
 """What the matrices of a batch may take [B], with room for the copies of a factorization."""
