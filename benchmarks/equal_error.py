@@ -8,7 +8,8 @@ The cost is that of all cores by world and simulated second, in a batch, without
 table takes the cheapest method of each code at each error, between two steps of one method as a
 straight line in the logarithms has it; a run counts with the larger of its own error and that of
 half its step, so that no error counts that passes through zero. Every motion and code is a stage:
-what is found is written to the file after each, and `--resume` goes on from there.
+what is found is written to the file after each, and `--resume` goes on from there. An error is not
+reached where something else than the step makes it, or a run of one world takes too long.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def lines(motion: Motion, points: Sequence[Point], codes: Sequence[str] = CODES)
         cells = [motion.name, f"{level:.0e} {motion.unit}"]
         for code in CODES:
             price = best(points, code, level)
-            missing = "does not reach it" if code in codes else "not run"
+            missing = "not reached" if code in codes else "not run"
             cells += [shown(price.cost), price.setting] if price else [missing, ""]
             if code != "jaxcon":
                 times = ratio(points, code, level)

@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from benchmarks import targets
+
 HIGHER, LOWER = "higher", "lower"
 FILE = Path(__file__).with_name("baseline.json")
 
@@ -98,6 +100,33 @@ class Entry:
     about: str
     run: Callable[[bool], Found]
     needs: tuple[str, ...] = ()
+
+
+ENTRIES: dict[str, Entry] = {}
+"""By name; `benchmarks.entries` has them all."""
+GYMNASIUM, MUJOCO = "gymnasium", "mujoco"
+SMALL = ("pendulum", "four-bar")
+"""The scenes of a quick run."""
+
+
+def entry(name: str, *needs: str) -> Callable[[Callable[[bool], Any]], Callable[[bool], Any]]:
+    """Enters a function from quick to metrics, or to `Found`; its docstring says what it does."""
+
+    def enters(run: Callable[[bool], Any]) -> Callable[[bool], Any]:
+        def found(quick: bool) -> Found:
+            result = run(quick)
+            return result if isinstance(result, Found) else Found(tuple(result))
+
+        about = (run.__doc__ or "").strip().splitlines()[0]
+        ENTRIES[name] = Entry(name, about, found, needs)
+        return run
+
+    return enters
+
+
+def scenes(quick: bool) -> list[str]:
+    """Of the comparison with other simulators."""
+    return list(SMALL if quick else targets.SCENES)
 
 
 @dataclass(frozen=True)
