@@ -114,7 +114,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=list(targets.SCENES))
     parser.add_argument("--batch", type=int, default=512)
     parser.add_argument("--dtype", default="float32")
-    parser.add_argument("--work", type=int, default=WORK, help="world-steps of a repeat")
+    parser.add_argument("--work", type=int, default=WORK, help="world-steps of a call")
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()

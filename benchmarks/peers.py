@@ -4,7 +4,8 @@
 
 MuJoCo runs `mujoco.rollout` with one thread a core and records nothing. MJX runs jit(vmap(step)) in
 a scan, in a process of its own, so that a compilation that takes too long can be stopped; of
-several batches and settings of XLA the best counts. Worlds differ by the speed of their start.
+several batches and settings of XLA the best counts. MJX is told to solve closed loops by one
+iteration; MuJoCo in C stops after one by itself. Worlds differ by the speed of their start.
 """
 
 from __future__ import annotations
@@ -159,17 +160,31 @@ def mjx_process(
     return MjxRun(batch, flags, Rate(**found["rate"]), found["compile"])
 
 
-def mjx_here(name: str, batch: int, work: int = 20_000, repeats: int = 5) -> dict[str, Any]:
+def mjx_here(name: str, batch: int, repeats: int = 5) -> dict[str, Any]:
     """The same in this process, at one batch: rate, and compile time of one step [s]."""
     model, data = mjx_start(mechanisms.find(name), batch)
-    return mjx_rate(model, data, batch, max(10, work // batch), repeats)
+    return mjx_rate(model, data, batch, None, repeats)
 
 
-def mjx_rate(model: Any, data: Any, batch: int, steps: int, repeats: int = 5) -> dict[str, Any]:
-    """The same of any model of MJX and a batch of its data, over some steps."""
+def mjx_rate(
+    model: Any, data: Any, batch: int, steps: int | None, repeats: int = 5
+) -> dict[str, Any]:
+    """The same of any model of MJX and a batch of its data.
+
+    Args:
+        model: of MJX.
+        data: its worlds.
+        batch: how many.
+        steps: of one call; if None, as many as take about a repeat, at most a thousand.
+        repeats: how many.
+    """
     data = timing.over_devices(data, batch)
     step = jax.vmap(functools.partial(mjx_step(), model))
-    _, seconds = timing.compile_seconds(step, data)
+    compiled, seconds = timing.compile_seconds(step, data)
+    if steps is None:
+        jax.block_until_ready(compiled(data))
+        alone = timing.rate(lambda: compiled(data), 1.0, 1, 0.0).median
+        steps = int(np.clip(timing.SECONDS * alone, 10, 1000))
 
     @jax.jit
     def run(data: Any) -> Any:

@@ -27,7 +27,7 @@ from benchmarks.tables import Row
 from benchmarks.timing import Rate
 
 WORK = 200_000
-"""World-steps of one repeat, about; at least ten steps of all worlds, at most a thousand."""
+"""World-steps of one call, about; at least ten steps of all worlds, at most a thousand."""
 
 
 def run_batch(
@@ -103,7 +103,7 @@ def arguments(given: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--dtypes", type=lambda text: text.split(","), default=["float32"])
     parser.add_argument("--solver", default="Sparse", choices=["Sparse", "Schur"])
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--work", type=int, default=WORK, help="world-steps of a repeat")
+    parser.add_argument("--work", type=int, default=WORK, help="world-steps of a call")
     parser.add_argument("--peers", action="store_true", help="run MuJoCo and MJX too")
     parser.add_argument("--mjx-seconds", type=float, default=240.0, help="limit of a batch of MJX")
     parser.add_argument("--json", type=Path)

@@ -36,13 +36,26 @@ class Rate:
         return f"{self.median / 1e6:.3g} M ({spread})"
 
 
-def rate(run: Callable[[], Any], work: float, repeats: int = 5) -> Rate:
-    """How much work a second a function does that returns arrays or None; it has run before."""
+SECONDS = 0.2
+"""How long a repeat lasts at least, so that neither the clock nor the scheduler decides."""
+
+
+def rate(run: Callable[[], Any], work: float, repeats: int = 5, seconds: float = SECONDS) -> Rate:
+    """How much work a second a function does that returns arrays or None; it has run before.
+
+    Args:
+        run: the function.
+        work: of one call.
+        repeats: how many.
+        seconds: for which a repeat calls it again and again, once at least.
+    """
     rates = []
     for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(run())
-        rates.append(work / (time.perf_counter() - start))
+        calls, spent, start = 0, 0.0, time.perf_counter()
+        while not calls or spent < seconds:
+            jax.block_until_ready(run())
+            calls, spent = calls + 1, time.perf_counter() - start
+        rates.append(work * calls / spent)
     return Rate(float(np.median(rates)), min(rates), max(rates))
 
 
@@ -54,6 +67,19 @@ def compile_seconds(function: Callable[..., Any], *args: Any) -> tuple[Any, floa
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
     return compiled, time.perf_counter() - start
+
+
+def yardstick(repeats: int = 3) -> float:
+    """How long a fixed program of plain JAX takes to compile here, the median of several [s]."""
+
+    def program(x: jax.Array) -> jax.Array:
+        for i in range(50):
+            x = jax.numpy.tanh(x @ x) * (1.0 + 0.01 * i)
+        return x
+
+    start = jax.numpy.eye(8)
+    spent = [compile_seconds(lambda x: program(x), start)[1] for _ in range(repeats)]
+    return float(np.median(spent))
 
 
 def in_process(

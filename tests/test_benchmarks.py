@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,6 @@ from benchmarks import (  # noqa: E402
     equivalence,
     mechanisms,
     native_share,
-    regression,
     residuals,
     roofline,
     stabilisation,
@@ -29,6 +29,7 @@ from benchmarks import (  # noqa: E402
     throughput,
     timing,
 )
+from jaxcon.core import operations  # noqa: E402
 
 SMALL = ("chain-3", "planar-chain-3", "four-bar", "n-four-bar-2", "rope-5", "stewart")
 
@@ -96,6 +97,21 @@ def test_mujoco_simulates_the_same_mechanism(name):
     assert difference.same, difference
 
 
+@pytest.mark.parametrize("name", ["four-bar", "n-four-bar-10", "stewart"])
+def test_mujoco_solves_loops_by_one_iteration(name):
+    """So that it needs no such setting to be as fast as it can."""
+    mujoco = pytest.importorskip("mujoco")
+    model, data = equivalence.model_of(mechanisms.find(name))
+    limited, one = equivalence.model_of(mechanisms.find(name))
+    limited.opt.iterations, limited.opt.ls_iterations = 1, 4
+    assert model.opt.iterations > 1
+    for _ in range(500):
+        mujoco.mj_step(model, data)
+        mujoco.mj_step(limited, one)
+        assert data.solver_niter[0] == 1
+    np.testing.assert_array_equal(one.qpos, data.qpos)
+
+
 def test_the_four_bar_is_the_ready_made_one():
     system, state = mechanisms.find("four-bar").build(jnp.float64)
     expected, start = jc.scenes.four_bar()
@@ -124,9 +140,36 @@ def test_operations_are_counted():
     def looped(x):
         return jax.lax.scan(lambda c, _: (jnp.sin(c), None), x, None, 5)[0].sum()
 
-    assert roofline.count(jax.make_jaxpr(polynomial)(np.ones(8)).jaxpr) == 24
-    assert roofline.count(jax.make_jaxpr(looped)(np.ones(8)).jaxpr) == 48
-    assert roofline.count(jax.make_jaxpr(jnp.dot)(np.ones((2, 3)), np.ones(3)).jaxpr) == 12
+    assert operations.count(jax.make_jaxpr(polynomial)(np.ones(8)).jaxpr) == 24
+    assert operations.count(jax.make_jaxpr(looped)(np.ones(8)).jaxpr) == 48
+    assert operations.count(jax.make_jaxpr(jnp.dot)(np.ones((2, 3)), np.ones(3)).jaxpr) == 12
+
+
+def test_operations_are_counted_once():
+    def repeated(x, y):
+        """Sine and product each once, two sums, and a cosine for nobody."""
+        jnp.cos(x)
+        return x * y + jax.jit(lambda a, b: b * a)(x, y) + jnp.sin(x), jnp.sin(x)
+
+    def looped(x):
+        def body(c, _):
+            return c * x + x * c, None
+
+        return jax.lax.scan(body, x, None, 5)[0]
+
+    def solved(x):
+        def solve(_, b):
+            return b / x + x * x
+
+        return jax.lax.custom_linear_solve(lambda z: x * z, x * x, solve)
+
+    ones = np.ones(8)
+    assert operations.count(jax.make_jaxpr(repeated)(ones, ones).jaxpr) == 4 * 8
+    assert operations.count(jax.make_jaxpr(looped)(ones).jaxpr) == 5 * 2 * 8
+    assert operations.count(jax.make_jaxpr(solved)(ones).jaxpr) == 3 * 8
+
+
+def test_the_operations_of_a_step_are_counted():
     found = roofline.work("pendulum", jc.Method(), np.float32)
     assert 100 < found.operations < 10_000
     assert found.state == (7 + 6 + 1 + 1) * 4
@@ -150,11 +193,15 @@ def test_a_rate_is_measured():
     assert seconds > 0
 
 
-def test_what_fell_is_named():
-    before = {"a": {"over_mujoco": 4.0, "over_peak": 1.0}, "b": {"over_peak": 1.0}}
-    now = {"a": {"over_mujoco": 2.0, "over_peak": 1.0}, "b": {"over_peak": 0.9}, "c": {}}
-    assert regression.slower(before, now, 1.5) == ["a: over_mujoco fell from 4 to 2"]
-    assert not regression.slower(before, now, 2.5)
+def test_a_repeat_calls_until_it_has_lasted_long_enough(monkeypatch):
+    """With a clock by which a call takes 1/16 s."""
+    calls = []
+    monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: len(calls) / 16))
+    for seconds, expected in ((0.25, 4), (0.2, 4), (0.0, 1)):
+        calls.clear()
+        rate = timing.rate(lambda: calls.append(None), 3.0, 2, seconds)
+        assert len(calls) == 2 * expected
+        assert rate.least == rate.most == 48.0
 
 
 @pytest.mark.parametrize("dtype", residuals.LIMIT)

@@ -81,6 +81,14 @@ def test_more_sweeps_miss_less():
     assert left[0] > 3 * left[1] > 9 * left[2]
 
 
+@pytest.mark.parametrize("solver", [jc.GaussSeidel(), jc.InteriorPoint()])
+def test_solvers_write_in_place(solver):
+    """XLA makes a loop over a copy of a scatter, and no kernel can contain it."""
+    problem = problems(Kinds(3, 2, 2, 2), 8, jnp.float64)
+    trace = jax.make_jaxpr(lambda p: solver.solve(p, jnp.zeros_like(p.offset)))(problem)
+    assert "scatter" not in str(trace)
+
+
 @dtypes
 def test_the_laws_by_hand(dtype):
     """One row each: a stop that is hit and one that is left, friction that holds and that slips."""

@@ -7,7 +7,7 @@ import pytest
 from tolerances import IDENTITY
 
 import jaxcon as jc
-from jaxcon.solvers import ordering
+from jaxcon.solvers import graphs
 
 
 def circle(links, radius, dim=2):
@@ -137,7 +137,7 @@ def test_the_heap_finds_what_a_search_finds():
                 graph[int(i)].add(int(j))
                 graph[int(j)].add(int(i))
         distance = {i: int(random.integers(0, 4)) for i in graph}
-        assert ordering.minimum_degree(graph, distance)[0] == searched(graph, distance)
+        assert graphs.minimum_degree(graph, distance)[0] == searched(graph, distance)
 
 
 def searched(neighbours, distance):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon.analysis import memory
 
 DT = 1e-3
 
@@ -155,8 +156,9 @@ def test_violation_is_told_apart_by_its_source():
     assert off.main_source == "initial"
     assert off.sources["initial"] == pytest.approx(0.2, rel=1e-12)
 
+    none = np.zeros((20, 0))  # of the host, and so no choice of float64
     coarse = jc.diagnose(
-        *(lambda s: (s[0], jc.Method(), s[1]))(pendulum(dtype=jnp.float32)), None, 1e-4, 20
+        *(lambda s: (s[0], jc.Method(), s[1]))(pendulum(dtype=jnp.float32)), none, 1e-4, 20
     )
     assert 1e-8 < coarse.sources["round-off"] < 1e-6
 
@@ -241,3 +243,21 @@ def test_rows_that_agree_are_redundant_and_no_conflict():
     report = jc.report(*scene.build())
     assert report.redundant == (("again", 0),)
     assert report.conflicts == {}
+
+
+def test_controls_of_numpy_get_the_precision_of_the_scene(monkeypatch):
+    """In what takes controls as `rollout` does."""
+    scene = jc.Scene(dim=2, dtype=jnp.float32)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    scene.add(jc.ExternalWrench("push", "bob"))
+    system, state = scene.build()
+
+    def traced(step, args, worlds):
+        return len(jax.eval_shape(step, *args))
+
+    monkeypatch.setattr(memory, "_planned", traced)
+    row = np.array([0.0, 0.1])
+    for controls in (np.tile(row, (STEPS, 1)), lambda state: row):
+        assert jc.find_first_failure(system, SCHUR, state, controls, DT, STEPS) is None
+        jc.gradient_memory(system, SCHUR, state, controls if callable(controls) else row)

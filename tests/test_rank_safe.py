@@ -316,3 +316,43 @@ def test_two_drives_that_agree():
 
 def slowly(t, params):
     return 0.3 * t
+
+
+def problem_of(built):
+    """The saddle system of a start under its own forces."""
+    system, state = built
+    rows = linearize(system, state.q, state.v, state.time)
+    force = system.force(state.q, state.v, state.time)
+    return saddle(system, state.q, rows, force, -rows.bias)
+
+
+def beside(problem, factors):
+    """Worlds along last axes, whose numbers are those of one world times a factor."""
+
+    def spread(x):
+        if not isinstance(x, jax.Array) or not jnp.issubdtype(x.dtype, jnp.floating):
+            return x
+        return jnp.stack([x * factor for factor in factors], -1)
+
+    return jax.tree.map(spread, problem)
+
+
+def test_a_world_that_is_not_finite_does_not_make_the_others_iterate(monkeypatch):
+    iterate, rounds = jc.RankSafe._iterated, []
+
+    def seen(self, system):
+        solve = iterate(self, system)
+
+        def told(force, target):
+            jax.debug.callback(lambda: rounds.append(None))
+            return solve(force, target)
+
+        return told
+
+    monkeypatch.setattr(jc.RankSafe, "_iterated", seen)
+    for times in (1, 2):
+        worlds = beside(problem_of(repeated(times)), (1.0, jnp.nan))
+        found = jax.jit(lambda x=worlds: jc.RankSafe(always=True).solve(x))()
+        jax.effects_barrier()
+        assert len(rounds) == times - 1
+        np.testing.assert_array_equal(found.status, [Status.OK, Status.NON_FINITE])

@@ -110,3 +110,32 @@ def test_a_stride_that_does_not_divide(pushed, steps, every):
 def test_controls_of_another_length(pushed, shape):
     with pytest.raises(ValueError, match="controls must have 6 rows.*got shape"):
         jc.rollout(pushed[0], METHOD, pushed[1], jnp.zeros(shape), DT, 6)
+
+
+@pytest.fixture(scope="module")
+def single():
+    """The same in float32, while float64 is on."""
+    scene = jc.Scene(dim=2, dtype=jnp.float32)
+    scene.add_particle("bob", mass=2.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    scene.add(jc.ExternalWrench("push", "bob"))
+    return scene.build()
+
+
+PUSH = np.array([0.3, -0.2])
+GIVEN = {
+    "rows of NumPy": np.tile(PUSH, (6, 1)),
+    "NumPy from a function": lambda state: PUSH,
+    "what JAX makes of numbers": lambda s: jnp.where(jnp.array([True, False]), 0.3, -0.2),
+}
+
+
+@pytest.mark.parametrize("given", GIVEN)
+def test_controls_that_choose_no_precision_get_that_of_the_scene(single, given):
+    system, state = single
+    controls = jnp.tile(jnp.asarray(PUSH, jnp.float32), (6, 1))
+    expected, _ = jc.rollout(system, METHOD, state, controls, DT, 6)
+    found, _ = jc.rollout(system, METHOD, state, GIVEN[given], DT, 6)
+    assert found.v.dtype == jnp.float32
+    assert np.max(np.abs(found.v - jc.rollout(system, METHOD, state, None, DT, 6)[0].v)) > 1e-3
+    np.testing.assert_allclose(found.v, expected.v, rtol=1e-6, atol=1e-6)

@@ -11,7 +11,7 @@ from tolerances import DIFFERENCE
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.dynamics.forward import saddle
-from jaxcon.solvers import ordering
+from jaxcon.solvers import graphs, ordering
 from jaxcon.solvers.saddle import Diagonal, Saddle
 from jaxcon.solvers.sparse import Sparse
 
@@ -148,6 +148,53 @@ def test_levels_of_a_chain_grow_with_its_logarithm():
         assert max(len(step.nodes) for step in steps) >= n // 2 - 1
         counts.append(len(steps))
     assert max(np.diff(counts)) <= 2  # one level more, in which an end has fewer neighbours
+
+
+def test_levels_beside_a_row_that_touches_everything_grow_with_the_logarithm():
+    counts = []
+    for n in (16, 32):
+        system, state = with_a_global_row(n)
+        jacobian = jax.eval_shape(lambda s=system, x=state: linearize(s, x.q, x.v, x.time).jacobian)
+        steps = steps_for(jacobian, order="levels")
+        assert sum(len(step.nodes) for step in steps) == n + 1
+        assert [node.size for node in steps[-1].nodes] == [2]
+        counts.append(len(steps))
+    assert max(np.diff(counts)) <= 2
+
+
+@pytest.mark.parametrize("hubs", [0, 1, 3])
+def test_rounds_beside_hubs_grow_with_the_logarithm(hubs):
+    rounds = []
+    for n in (16, 64, 256, 1024):
+        graph = {i: {i - 1, i + 1} & set(range(n)) for i in range(n)}
+        for hub in range(n, n + hubs):
+            graph[hub] = set(graph)
+            for node in graph[hub]:
+                graph[node].add(hub)
+        order, later = graphs.independent_sets(graph)
+        level = dict.fromkeys(order, 1)
+        for node in order:
+            for other in later[node]:
+                level[other] = max(level[other], level[node] + 1)
+        rounds.append(max(level.values()))
+    assert max(np.diff(rounds)) <= 3
+
+
+def test_levels_beside_a_row_that_touches_everything_solve_it():
+    system, state = with_a_global_row(14)
+    random = np.random.default_rng(8)
+    force, target = (jnp.asarray(random.normal(size=n)) for n in (state.v.size, 16))
+
+    @jax.jit
+    def solutions():
+        rows = linearize(system, state.q, state.v, state.time)
+        problem = saddle(system, state.q, rows, force, target)
+        return [solver.solve(problem) for solver in (Sparse(order="levels"), jc.Dense())]
+
+    (*found, status), (*expected, _) = solutions()
+    assert status == jc.Status.OK
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=1e-12 * np.max(np.abs(y)))
 
 
 def is_batch(step):

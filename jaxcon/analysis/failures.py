@@ -22,7 +22,7 @@ from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
 from jaxcon.simulation.attempt import dynamics_at
 from jaxcon.simulation.method import Memory, Method
-from jaxcon.simulation.step import check_step, step_quietly
+from jaxcon.simulation.step import check_step, controls_in, step_quietly
 from jaxcon.solvers.saddle import Solution
 
 
@@ -87,6 +87,7 @@ def find_first_failure(
         The `Failure`, of the first world where several fail in one step; None where none does.
     """
     batch = state.q.ndim > 1
+    controls = controls if callable(controls) else controls_in(state.q.dtype, controls)
     if not batch:
         state = jax.tree.map(lambda x: x[None], state)
         controls = controls if callable(controls) else jax.tree.map(lambda x: x[None], controls)
@@ -119,7 +120,7 @@ def _replay(
 
     def control(k: Array, state: State) -> PyTree:
         if policy:
-            return jax.vmap(policy)(state)
+            return controls_in(state.q.dtype, jax.vmap(policy)(state))
         return jax.tree.map(lambda x: jnp.asarray(x)[:, k], controls)
 
     def go(carry: Any) -> Array:

@@ -15,7 +15,7 @@ from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.segments import bytes_of
-from jaxcon.simulation.step import check_step, step_quietly
+from jaxcon.simulation.step import check_step, controls_in, step_quietly
 
 BATCHES = 64, 256
 """Sizes that are compiled: what a world takes is in proportion from here on."""
@@ -146,7 +146,8 @@ def gradient_memory(
     policy = control if callable(control) else None
 
     def planned(steps: int, worlds: int) -> int:
-        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), control)
+        one = None if policy else controls_in(state.q.dtype, control)
+        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), one)
 
         def end(moved: tuple[Any, Any], rest: State) -> Any:
             start = dataclasses.replace(rest, q=moved[0], v=moved[1])

@@ -294,9 +294,15 @@ def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def widened(tree: Any) -> Any:
-    """Lanes with a last axis of size 1, for what is done to many right sides at once.
+def widened(tree: Any, worlds: int) -> Any:
+    """Lanes with an axis of size 1 before those of worlds, for many right sides at once.
 
-    Those lie along the last axis, so that memory is contiguous over them even for a single world.
+    Args:
+        tree: lanes, and numbers of each world.
+        worlds: how many trailing axes enumerate worlds.
     """
-    return jax.tree.map(lambda x: x[..., None] if jnp.ndim(x) else x, tree)
+
+    def one(x: Any) -> Any:
+        return jnp.expand_dims(x, jnp.ndim(x) - worlds) if jnp.ndim(x) else x
+
+    return jax.tree.map(one, tree)

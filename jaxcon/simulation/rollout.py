@@ -18,7 +18,7 @@ from jaxcon.simulation.adjoints import EVERY_STEP, Path, check_adjoint
 from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain, stop_failed
 from jaxcon.simulation.stability import warn_if_unstable
-from jaxcon.simulation.step import StepInfo, step_quietly, undo
+from jaxcon.simulation.step import StepInfo, controls_in, step_quietly, undo
 
 FEEDBACK = (
     "controls are a function of the state, and that before a step is not known until the step is"
@@ -77,7 +77,7 @@ def rollout(
     check_adjoint(adjoint)
     warn_if_unstable(method, dt, system, state)
     policy = controls if callable(controls) else None
-    inputs = jnp.arange(steps), None if policy else _rows(controls, steps)
+    inputs = jnp.arange(steps), None if policy else _rows(controls, steps, state.q.dtype)
 
     def one(state: State, given: Any) -> tuple[State, StepInfo]:
         control = contained_policy(policy, state) if policy else given[1]
@@ -94,7 +94,11 @@ def rollout(
 
 def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
     """policy(state), with no gradient in a world where its result is not finite."""
-    function, known, _ = opened(policy, state)  # what it closes over has tangents to be masked
+
+    def own(state: State) -> PyTree:
+        return controls_in(state.q.dtype, policy(state))
+
+    function, known, _ = opened(own, state)  # what it closes over has tangents to be masked
 
     def judged(state: State, constants: Any) -> tuple[PyTree, Any]:
         control = function(constants, state)
@@ -115,8 +119,8 @@ def _integer(what: str, number: Any) -> int:
         ) from error
 
 
-def _rows(controls: PyTree, steps: int) -> PyTree:
-    """The controls as arrays, one row a step."""
+def _rows(controls: PyTree, steps: int, dtype: Any) -> PyTree:
+    """The controls as arrays, one row a step, in the dtype of the scene if they choose none."""
 
     def checked(x: Any) -> Any:
         x = jnp.asarray(x)
@@ -127,4 +131,4 @@ def _rows(controls: PyTree, steps: int) -> PyTree:
             )
         return x
 
-    return jax.tree.map(checked, controls)
+    return jax.tree.map(checked, controls_in(dtype, controls))

@@ -165,9 +165,7 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
                 f"step: control must have shape ({layout.n_u},), got {control.shape};"
                 f" its channels are {list(layout.controls)}."
             )
-    control = jax.tree.map(
-        lambda x: jnp.asarray(x, state.q.dtype) if isinstance(x, np.ndarray | float) else x, control
-    )
+    control = controls_in(state.q.dtype, control)
     for leaf in jax.tree.leaves(control):
         got = getattr(leaf, "dtype", state.q.dtype)
         if jnp.issubdtype(got, jnp.floating) and got != state.q.dtype:
@@ -181,3 +179,19 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
             " state = jc.init(system, method, state.q, state.v)."
         )
     return control
+
+
+def controls_in(dtype: Any, controls: PyTree) -> PyTree:
+    """Controls in the dtype of the scene where they choose none themselves.
+
+    NumPy's arrays choose none, nor do numbers, and what JAX makes of numbers alone (a weak type).
+    """
+
+    def one(x: Any) -> Any:
+        if isinstance(x, jax.Array):
+            free = x.aval.weak_type and jnp.issubdtype(x.dtype, jnp.floating)
+        else:
+            free = isinstance(x, np.ndarray | np.floating | float)
+        return jnp.asarray(x, dtype) if free else x
+
+    return jax.tree.map(one, controls)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxcon.core import checks, native
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.status import Status, first
+from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array
 from jaxcon.solvers.delassus import diagonal
 from jaxcon.solvers.jacobian import Jacobian
@@ -77,11 +77,13 @@ class RankSafe:
 
         def solve(force: Array, target: Array) -> Solution:
             known = direct(force, target)
+            # numbers that are not finite stay so: such a world is not worth the rounds of all
+            settled = independent | failed(known.status)
 
             def rescued() -> Solution:
-                return native.keep(independent, known, self._iterated(system)(force, target))
+                return native.keep(settled, known, self._iterated(system)(force, target))
 
-            return jax.lax.cond(jnp.all(independent), lambda: known, rescued)
+            return jax.lax.cond(jnp.all(settled), lambda: known, rescued)
 
         return solve
 
