@@ -39,7 +39,7 @@ def test_each_begins_with_its_number_and_teaches_by_an_equation():
 def test_notebook_runs(path, tmp_path, pytestconfig):
     notebook = read(path)
     place = {"metadata": {"path": str(tmp_path)}}
-    client = NotebookClient(notebook, timeout=300, kernel_name="python3", resources=place)
+    client = NotebookClient(notebook, timeout=None, kernel_name="python3", resources=place)
     programs = str(pytestconfig.cache.mkdir("jax"))
     client.execute(env=os.environ | {"JAX_COMPILATION_CACHE_DIR": programs})
     cells = code_cells(notebook)
