@@ -1,12 +1,13 @@
 """Actions a second of Gymnasium's vector interface, beside the bare jit(vmap(step)).
 
     python -m benchmarks.environments [--tasks CartPole …] [--copies 4096] [--steps 100]
-        [--repeats 5]
+        [--repeats 5] [--peers] [--peer-seconds 100]
 
 A policy on the device, tanh of a random linear map, acts in both. The interface resets copies that
 are done with fresh keys, flags those that diverge and checks shapes; bare steps do none of it, and
 go on where an episode is over. Repeats alternate, so that both meet the same machine. An action is
-held for several steps of the simulation, which the last column counts.
+held for several steps of the simulation, which the last column counts. With `--peers`, instead,
+copies of ours beside those of Gymnasium and Brax: see `benchmarks/environment_peers.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import timing
+from benchmarks import environment_peers, timing
 from jaxcon import environments
 
 
@@ -49,7 +50,7 @@ def measure(task: str, copies: int, steps: int, repeats: int) -> Row:
     weights = jax.random.normal(jax.random.key(0), (seen.shape[1], envs.action_space.shape[1]))
     policy = jax.jit(lambda x: jnp.tanh(x @ weights.astype(x.dtype)))
     bare_step = jax.jit(lambda env, episode, actions: jax.vmap(env.step)(episode, actions))
-    start = envs.copies.episode
+    start = jax.tree.map(jnp.copy, envs.copies.episode)  # a step of the interface takes its own
     ended = jnp.zeros((), int)
 
     def interface(count: bool = False) -> Any:
@@ -72,9 +73,9 @@ def measure(task: str, copies: int, steps: int, repeats: int) -> Row:
     work, pairs = copies * steps, []
     for _ in range(repeats):
         pairs.append([timing.rate(run, work, 1).median for run in (interface, bare)])
-    rates = np.median(pairs, axis=0)
-    share = np.median([a / b for a, b in pairs])
-    return Row(*map(float, rates), float(share), ended, envs.environment.skip)
+    reached, possible = (float(x) for x in np.median(pairs, axis=0))
+    share = float(np.median([a / b for a, b in pairs]))
+    return Row(reached, possible, share, ended, envs.environment.skip)
 
 
 def main() -> None:
@@ -84,8 +85,13 @@ def main() -> None:
     parser.add_argument("--copies", type=int, default=4096)
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--peers", action="store_true", help="others beside ours")
+    parser.add_argument("--peer-seconds", type=float, default=100.0, help="limit of each of them")
     options = parser.parse_args()
     print(timing.machine())
+    if options.peers:
+        environment_peers.table(options.copies, options.peer_seconds)
+        return
     print(f"| {options.copies} copies | interface [1/s] | bare [1/s] | share | resets | steps |")
     print("|---|---|---|---|---|---|")
     for task in options.tasks:

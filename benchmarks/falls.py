@@ -12,7 +12,7 @@ heavier, at 5 ms.
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,41 @@ SPEED = 1.0
 """Standard deviation of the velocities of joints at the start [m/s, rad/s]."""
 
 
+QUANTILES = (0.5, 0.9, 0.99, 1)
+"""Of the speeds at the end."""
+
+
+class Fallen(NamedTuple):
+    """What became of the walkers.
+
+    Attributes:
+        failed, worlds: how many failed, and of how many.
+        speeds: of those that did not, the largest of each, by `QUANTILES` [m/s, rad/s].
+        depth: the worst of them.
+    """
+
+    failed: int
+    worlds: int
+    speeds: tuple[float, ...]
+    depth: legged.Depth
+
+    def __str__(self) -> str:
+        """The cells of a row."""
+        shown = ", ".join(f"{speed:.1e}" for speed in self.speeds)
+        return f"{self.failed} of {self.worlds} | {shown} | {legged.deep(self.depth)}"
+
+
+class Stood(NamedTuple):
+    """By how much a block of the column has moved [m], and the status of the world."""
+
+    moved: float
+    status: int
+
+    def __str__(self) -> str:
+        """The cell of a row."""
+        return f"{self.moved:.1e} m, status {self.status}"
+
+
 def poses(model: Any, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """qpos and qvel at the start, (count, …)."""
     random, qpos = np.random.default_rng(seed), np.tile(model.qpos0, (count, 1))
@@ -39,7 +74,7 @@ def poses(model: Any, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray
     return qpos, SPEED * random.normal(size=(count, model.nv))
 
 
-def drop(how: str, dtype: str, count: int, seconds: float) -> str:
+def drop(how: str, dtype: str, count: int, seconds: float) -> Fallen:
     """How many worlds fail, and how fast and how deep those that do not end."""
     model = legged.load("walker2d")
     read = jc.from_mjcf(model, dtype=jnp.dtype(dtype))
@@ -60,12 +95,11 @@ def drop(how: str, dtype: str, count: int, seconds: float) -> str:
     status, place, speed = (np.concatenate(x) for x in zip(*ends, strict=True))
     bad = (status != 0) | ~np.isfinite(place).all(1) | ~np.isfinite(speed).all(1)
     speeds = np.abs(speed[~bad]).max(1)
-    deep = legged.depth(model, place[~bad])
-    shown = ", ".join(f"{np.quantile(speeds, x):.1e}" for x in (0.5, 0.9, 0.99, 1))
-    return f"{bad.sum()} of {count} | {shown} | {legged.deep(deep)}"
+    quantiles = tuple(float(np.quantile(speeds, x)) for x in QUANTILES)
+    return Fallen(int(bad.sum()), count, quantiles, legged.depth(model, place[~bad]))
 
 
-def stand(how: str, dtype: str, seconds: float) -> str:
+def stand(how: str, dtype: str, seconds: float) -> Stood:
     """How far a block of the column is from its place at the end [m]."""
     system, state = bounded.column(jnp.dtype(dtype))
     method = jc.Method(bounded=legged.BOUNDED[how])
@@ -75,7 +109,7 @@ def stand(how: str, dtype: str, seconds: float) -> str:
     run = jax.jit(lambda s: jc.rollout(system, method, s, None, dt, steps, every=steps)[0])
     final = run(start)
     moved = float(jnp.max(jnp.abs(final.q - start.q)))
-    return f"{moved:.1e} m, status {int(final.status)}"
+    return Stood(moved, int(final.status))
 
 
 def main() -> None:

@@ -122,6 +122,10 @@ class Subject:
 
     def outcome(self, method: jc.Method, x: dict[str, Any]) -> jax.Array:
         """A number that every coordinate of the final state enters."""
+        return self.weighed(self.final(method, x))
+
+    def final(self, method: jc.Method, x: dict[str, Any]) -> jc.State:
+        """The state after some steps."""
         changes: dict[str, Any] = {}
         for name, field in self.parameters:
             changes.setdefault(name, {})[field] = x[f"{name}.{field}"]
@@ -129,7 +133,10 @@ class Subject:
         q = system.retract(self.state.q, x["position"])
         start = jc.init(system, method, q, x["velocity"], self.state.time)
         dt = jnp.asarray(DT, q.dtype)
-        final, _ = jc.rollout(system, method, start, None, dt, STEPS, record=lambda s, i: None)
+        return jc.rollout(system, method, start, None, dt, STEPS, record=lambda s, i: None)[0]
+
+    def weighed(self, final: jc.State) -> jax.Array:
+        """A sum of all coordinates and velocities."""
         random = np.random.default_rng(0)
         weights = [jnp.asarray(random.normal(size=y.shape), y.dtype) for y in (final.q, final.v)]
         return final.q @ weights[0] + final.v @ weights[1]
@@ -170,8 +177,7 @@ def measure(choice: Choice, scene: str, subject: Subject, compiled: Any = jax.ji
     x, ways = subject.numbers(), directions(subject.numbers())
     exact = slopes(lambda x: subject.outcome(method, x), x, ways, compiled)
     if choice.dtype == "float32":
-        own, method, x, ways = (_single(y) for y in (_Tree(subject), method, x, ways))
-        own = own.subject
+        own, method, x, ways = (single(y) for y in (subject, method, x, ways))
     both = compiled(lambda x, ways: _modes(lambda x: own.outcome(method, x), x, ways))
     forward, reverse = (np.asarray(y, np.float64) for y in both(x, ways))
     scale = np.maximum(np.abs(exact), 1e-2 * np.max(np.abs(exact)))
@@ -180,18 +186,11 @@ def measure(choice: Choice, scene: str, subject: Subject, compiled: Any = jax.ji
     return Row(choice, scene, float(np.max(errors[0])), float(np.max(errors[1])), worst)
 
 
-class _Tree:
-    """A subject as a tree whose floats can be cast."""
-
-    def __init__(self, subject: Subject) -> None:
-        self.subject = subject
-
-
-def _single(tree: Any) -> Any:
-    """The same in float32."""
-    if isinstance(tree, _Tree):
-        s = tree.subject
-        return _Tree(dataclasses.replace(s, system=_single(s.system), state=_single(s.state)))
+def single(tree: Any) -> Any:
+    """The same in float32; of a subject, its scene."""
+    if isinstance(tree, Subject):
+        own = {"system": single(tree.system), "state": single(tree.state)}
+        return dataclasses.replace(tree, **own)
     return jax.tree.map(lambda x: cast(x, jnp.float32) if hasattr(x, "dtype") else x, tree)
 
 
@@ -232,8 +231,8 @@ def broken(subject: Subject, method: jc.Method, worlds: int, seed: int = 0) -> i
 
     States are off the constraints by a tenth, and their velocities are of the order of one.
     """
-    random, one = np.random.default_rng(seed), _single(_Tree(subject)).subject
-    n, method, x = len(one.state.v), _single(method), _single(subject.numbers())
+    random, one = np.random.default_rng(seed), single(subject)
+    n, method, x = len(one.state.v), single(method), single(subject.numbers())
 
     def finite(position: jax.Array, velocity: jax.Array) -> jax.Array:
         moved = x | {"position": position, "velocity": velocity}

@@ -14,6 +14,7 @@ import argparse
 import dataclasses
 import functools
 import json
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ from benchmarks.peers import FLAGS, mjx_start, mjx_step, speeds
 
 SHORT = 100
 """Steps of MJX, and of the comparison with differences."""
+REPEATS, SECONDS = 5, 0.2
+"""Of the timing: how many, and how long each lasts at least."""
 STEP = 3e-2
 """Of the differences, relative."""
 LENGTHS = (100, 1000, 10000)
@@ -42,6 +45,7 @@ class Cost:
 
     Attributes:
         forward, gradient: world-steps a second.
+        ratio: how many rollouts one value and gradient costs, the median of repeats in turn.
         forward_compile, gradient_compile: [s].
         finite: whether every gradient is.
         error: of the sum of gradients along the velocities, against differences over fewer steps.
@@ -49,15 +53,11 @@ class Cost:
 
     forward: float
     gradient: float
+    ratio: float
     forward_compile: float
     gradient_compile: float
     finite: bool
     error: float
-
-    @property
-    def ratio(self) -> float:
-        """How many rollouts one value and gradient costs."""
-        return self.forward / self.gradient
 
     def __str__(self) -> str:
         return (
@@ -79,15 +79,34 @@ def measure(loss: Loss, worlds: jax.Array, steps: int, short: int) -> Cost:
         timing.compile_seconds(f, worlds) for f in (batch, both)
     )
     slope = gradient(worlds)[1]
-    forward(worlds)
+    jax.block_until_ready(forward(worlds))
     work = steps * len(worlds)
+    rates = in_turn([lambda: forward(worlds), lambda: gradient(worlds)], work)
     return Cost(
-        timing.rate(lambda: forward(worlds), work, 3).median,
-        timing.rate(lambda: gradient(worlds), work, 3).median,
+        *np.median(rates, axis=0).tolist(),
+        float(np.median(rates[:, 0] / rates[:, 1])),
         forward_compile,
         gradient_compile,
         bool(jnp.all(jnp.isfinite(slope))),
         error(loss, worlds, short),
+    )
+
+
+def in_turn(runs: list[Callable[[], Any]], work: float) -> np.ndarray:
+    """Rates of functions that have run before, (repeats, functions).
+
+    Each is called as often as fills `SECONDS`, and one after the other in each repeat, so that a
+    machine that becomes slower meanwhile slows them all.
+    """
+    calls = [math.ceil(SECONDS * timing.rate(run, 1.0, 1).median) for run in runs]
+    return np.array(
+        [
+            [
+                timing.rate(lambda run=run, n=n: [run() for _ in range(n)], n * work, 1).median
+                for run, n in zip(runs, calls, strict=True)
+            ]
+            for _ in range(REPEATS)
+        ]
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -53,6 +54,29 @@ class Rod:
 
 
 @dataclass(frozen=True)
+class Solid(Rod):
+    """A rod with a centre of mass and a moment of its own.
+
+    Attributes:
+        heavy_at: (2,) [m].
+        turns_with: about the centre of mass, across the plane [kg m²].
+    """
+
+    heavy_at: Any = (0.0, 0.0)
+    turns_with: float = 0.0
+
+    @property
+    def center(self) -> np.ndarray:
+        """Of mass, (2,) [m]."""
+        return np.array(self.heavy_at)
+
+    @property
+    def moment(self) -> float:
+        """Of inertia about the centre of mass [kg m²]."""
+        return self.turns_with
+
+
+@dataclass(frozen=True)
 class Linkage:
     """Rods, each after its parent, and the hinges that close loops: (rod, rod, point (2,))."""
 
@@ -99,7 +123,12 @@ def collinear(n: int, length: float, mass: float = 1.0, at_end: bool = False) ->
 
 def planar_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
     """Rigid bodies in the plane and a hinge for each rod and loop."""
-    scene, motion = jc.Scene(dim=2, dtype=dtype), linkage.motion()
+    return hinged(jc.Scene(dim=2, dtype=dtype), linkage).build()
+
+
+def hinged(scene: jc.Scene, linkage: Linkage) -> jc.Scene:
+    """A scene of the plane with the bodies and hinges in it: `{rod}_hinge`, `{rod}_{rod}`."""
+    motion = linkage.motion()
     for rod in linkage.rods:
         speed, turning = motion[rod.name]
         scene.add_body(
@@ -114,7 +143,7 @@ def planar_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
         scene.add(jc.Revolute(f"{rod.name}_hinge", rod.parent, rod.name, point=rod.start))
     for first, second, point in linkage.loops:
         scene.add(jc.Revolute(f"{first}_{second}", first, second, point=point))
-    return scene.build()
+    return scene
 
 
 def spatial_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
@@ -150,8 +179,14 @@ def particles_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
     return scene.build()
 
 
-def to_mjcf(linkage: Linkage) -> str:
-    """The rods as trees of hinges in MuJoCo, loops closed by `connect`."""
+def to_mjcf(linkage: Linkage, inside: Mapping[str, str] | None = None) -> str:
+    """The rods as trees of hinges in MuJoCo, loops closed by `connect`.
+
+    Args:
+        linkage: the rods.
+        inside: more text for the inside of a rod, or of `WORLD`, by name.
+    """
+    more = inside or {}
     by_name = {rod.name: rod for rod in linkage.rods}
     children: dict[str, str] = {}
     for rod in reversed(linkage.rods):
@@ -164,11 +199,11 @@ def to_mjcf(linkage: Linkage) -> str:
             mjcf.in_space(rod.center - origin),
             rod.mass,
             np.array([1.0 if rod.at_end else SLENDER, 1.0, 1.0]) * rod.moment,
-            hinge + children.get(rod.name, ""),
+            hinge + more.get(rod.name, "") + children.get(rod.name, ""),
         )
         children[rod.parent] = text + children.get(rod.parent, "")
     equalities = [
         mjcf.connect(first, second, mjcf.in_space(np.subtract(point, by_name[first].center)))
         for first, second, point in linkage.loops
     ]
-    return mjcf.model(children[jc.WORLD], equalities)
+    return mjcf.model(more.get(jc.WORLD, "") + children[jc.WORLD], equalities)

@@ -2,7 +2,7 @@
 
     python -m benchmarks.roofline [--scenes chain-10 …]
 
-What counts as an operation is said in `benchmarks.operations`. The peak is what XLA reaches on
+What counts as an operation is said in `jaxcon.core.operations`. The peak is what XLA reaches on
 fused multiply-adds of an array that lies in the cache, two operations each, spread over all devices
 as the worlds are whose rates it is compared with.
 """
@@ -21,8 +21,8 @@ import numpy as np
 import jaxcon as jc
 from benchmarks import mechanisms, timing
 from benchmarks.mjcf import DT
-from benchmarks.operations import count
 from benchmarks.targets import SCENES
+from jaxcon.core.operations import count
 
 WORLDS = 128
 """In the batch whose step is counted: what worlds share is then shared among so many."""

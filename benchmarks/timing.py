@@ -69,6 +69,19 @@ def compile_seconds(function: Callable[..., Any], *args: Any) -> tuple[Any, floa
     return compiled, time.perf_counter() - start
 
 
+def yardstick(repeats: int = 3) -> float:
+    """How long a fixed program of plain JAX takes to compile here, the median of several [s]."""
+
+    def program(x: jax.Array) -> jax.Array:
+        for i in range(50):
+            x = jax.numpy.tanh(x @ x) * (1.0 + 0.01 * i)
+        return x
+
+    start = jax.numpy.eye(8)
+    spent = [compile_seconds(lambda x: program(x), start)[1] for _ in range(repeats)]
+    return float(np.median(spent))
+
+
 def in_process(
     arguments: list[str], environment: dict[str, str], limit: float, late: str
 ) -> dict[str, Any] | str:

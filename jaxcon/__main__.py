@@ -73,14 +73,15 @@ def run_tradeoff(options: argparse.Namespace) -> int:
     jax.config.update("jax_enable_x64", True)
     from jaxcon.analysis.front import HEAD
     from jaxcon.analysis.tradeoff import tradeoff
+    from jaxcon.core.status import SimulationError
 
+    known = {"budget": options.budget, "batch": options.batch, "file": options.file}
     try:
         system, state = find_scene(options.scene)
-    except ValueError as error:
+        result = tradeoff(system, state, options.seconds, **known)
+    except (ValueError, OSError, SimulationError) as error:
         print(error)
         return 2
-    known = {"budget": options.budget, "batch": options.batch, "file": options.file}
-    result = tradeoff(system, state, options.seconds, **known)
     print(result)
     if options.all:
         print(result.table)

@@ -96,6 +96,46 @@ def draw(system: Any, q: Any, axes: Any = None, **style: Any) -> Any:
     return axes
 
 
+def animate(system: Any, path: Any, interval: float, axes: Any = None, **style: Any) -> Any:
+    """Draws a motion, a frame for each row of a path, in axes that hold all of it.
+
+    Args:
+        system: a `BodySystem`.
+        path: positions, (frames, n_q), such as `trajectory.q` of a rollout.
+        interval: time between frames [s].
+        axes: matplotlib axes, which keep their limits; new ones unless given, outside of pyplot.
+        style: for the lines.
+
+    Returns:
+        matplotlib's `FuncAnimation`: `save("motion.gif", writer="pillow")` writes it, `to_jshtml()`
+        shows it in a notebook. Keep it until then.
+    """
+    from matplotlib.animation import FuncAnimation
+
+    frames = [list(links(system, q).values()) for q in path]
+    own = axes is None
+    axes = canvas(4.0, 3.2, 80).figure.add_subplot() if own else axes
+    first = len(axes.lines)
+    draw(system, path[0], axes, **style)
+    lines, shown = axes.lines[first:], (0, 1 if system.layout.dim == 2 else 2)
+    if own:
+        _hold(axes, np.concatenate([points for frame in frames for points in frame])[:, shown])
+
+    def show(i: int) -> list[Any]:
+        for line, points in zip(lines, frames[i], strict=True):
+            line.set_data(*points[:, shown].T)
+        return lines
+
+    return FuncAnimation(axes.figure, show, len(frames), interval=1000 * interval)
+
+
+def _hold(axes: Any, points: np.ndarray) -> None:
+    """Limits around points (n, 2), a twentieth of the larger side beyond them."""
+    low, high = points.min(0), points.max(0)
+    edge = 0.05 * float(np.max(high - low)) + 1e-3
+    axes.set(xlim=(low[0] - edge, high[0] + edge), ylim=(low[1] - edge, high[1] + edge))
+
+
 def main_job(result: Any, tuning: Any, world: PyTree, step: float, path: str) -> None:
     """One picture: the mechanism through a turn, violation over time, and the loss."""
     plt = pyplot()

@@ -21,8 +21,6 @@ from benchmarks import (  # noqa: E402
     equivalence,
     mechanisms,
     native_share,
-    operations,
-    regression,
     residuals,
     roofline,
     stabilisation,
@@ -31,6 +29,7 @@ from benchmarks import (  # noqa: E402
     throughput,
     timing,
 )
+from jaxcon.core import operations  # noqa: E402
 
 SMALL = ("chain-3", "planar-chain-3", "four-bar", "n-four-bar-2", "rope-5", "stewart")
 
@@ -203,13 +202,6 @@ def test_a_repeat_calls_until_it_has_lasted_long_enough(monkeypatch):
         rate = timing.rate(lambda: calls.append(None), 3.0, 2, seconds)
         assert len(calls) == 2 * expected
         assert rate.least == rate.most == 48.0
-
-
-def test_what_fell_is_named():
-    before = {"a": {"over_mujoco": 4.0, "over_peak": 1.0}, "b": {"over_peak": 1.0}}
-    now = {"a": {"over_mujoco": 2.0, "over_peak": 1.0}, "b": {"over_peak": 0.9}, "c": {}}
-    assert regression.slower(before, now, 1.5) == ["a: over_mujoco fell from 4 to 2"]
-    assert not regression.slower(before, now, 2.5)
 
 
 @pytest.mark.parametrize("dtype", residuals.LIMIT)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.solvers import central_path, gauss_jordan, interior_point
+from jaxcon.solvers import central_path, gauss_jordan, gauss_seidel, interior_point
 from jaxcon.solvers.bounded import Bounded, Kinds
 
 WORLDS = 2000
@@ -81,6 +81,14 @@ def test_more_sweeps_miss_less():
     assert left[0] > 3 * left[1] > 9 * left[2]
 
 
+@pytest.mark.parametrize("solver", [jc.GaussSeidel(), jc.InteriorPoint()])
+def test_solvers_write_in_place(solver):
+    """XLA makes a loop over a copy of a scatter, and no kernel can contain it."""
+    problem = problems(Kinds(3, 2, 2, 2), 8, jnp.float64)
+    trace = jax.make_jaxpr(lambda p: solver.solve(p, jnp.zeros_like(p.offset)))(problem)
+    assert "scatter" not in str(trace)
+
+
 @dtypes
 def test_the_laws_by_hand(dtype):
     """One row each: a stop that is hit and one that is left, friction that holds and that slips."""
@@ -92,6 +100,24 @@ def test_the_laws_by_hand(dtype):
     for solver in (jc.InteriorPoint(), jc.GaussSeidel(sweeps=3)):
         found = solver.solve(problem, jnp.zeros_like(offset))[:, 0]
         np.testing.assert_allclose(found, [1.5, 0.0, -0.5, 2.0], atol=1e-6)
+
+
+def test_one_corner_of_four_lets_go():
+    """A face that slides on four corners cannot close four gaps: three bear, and one is left."""
+    corners = np.array([[x, y, -0.05] for x in (0.2, -0.2) for y in (0.15, -0.15)])
+    jacobian = np.array([[*e, *np.cross(r, e)] for e in np.eye(3)[[2, 0, 1]] for r in corners])
+    weight = np.diag([0.5, 0.5, 0.5, *1 / np.array([0.016, 0.028, 0.042])])
+    velocity = np.array([0.9, 0.5, -1.0, 0.02, -0.03, 0.2])
+    unequal = np.concatenate([1e-4 * np.array([1.0, -1.0, -1.0, 1.0]), np.zeros(8)])
+    numbers = (jacobian @ weight @ jacobian.T, jacobian @ velocity + unequal)
+    none, μ = jnp.zeros((0, 1)), jnp.full((4, 1), 0.5)
+    problem = Bounded(
+        *(jnp.asarray(x)[..., None] for x in numbers), none, none, μ, Kinds(0, 0, 4, 2)
+    )
+    near = jax.jit(jc.GaussSeidel(sweeps=40).solve)(problem, jnp.zeros((12, 1)))
+    found = jax.jit(partial(gauss_seidel.polished, rounds=12))(problem, near)
+    assert missed(problem, found).max() < 1e-14
+    assert np.sum(np.asarray(problem.kinds.split(found).normal) > 0) == 3
 
 
 def test_inverse_without_pivots():

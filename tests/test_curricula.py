@@ -12,7 +12,9 @@ from tolerances import DIFFERENCE
 
 import jaxcon as jc
 from jaxcon import environments
+from jaxcon.core.pytree import pytree
 from jaxcon.environments import exploration
+from jaxcon.environments.tasks.cart_pole import CartPole
 
 
 @pytest.fixture(scope="module")
@@ -191,3 +193,19 @@ def test_a_slow_policy_sets_what_a_fast_controller_follows(cart):
     assert jc.velocity(cart.system, still.state, "cart")[0] > 0.2  # nothing brakes it
     with pytest.raises(ValueError, match="hold must be a whole number from 1"):
         environments.Layered.build(cart, cruise, ("speed",), hold=0)
+
+
+@pytree
+class Passing(CartPole):
+    """Over for one action alone, the third."""
+
+    def terminal(self, episode):
+        return jnp.round(episode.state.time / (self.skip * self.dt)) == 3
+
+
+def test_a_target_ends_where_the_task_is_over_on_the_way(cart):
+    values = {f.name: getattr(cart, f.name) for f in dataclasses.fields(cart)}
+    layered = environments.Layered.build(Passing(**values), cruise, ("speed",), hold=10)
+    episode, outcome = jax.jit(layered.step)(layered.reset(jax.random.key(0)), jnp.array([0.4]))
+    np.testing.assert_allclose(episode.state.time, 3 * cart.skip * cart.dt)
+    assert outcome.terminated

@@ -113,15 +113,30 @@ for f, own in ((loss, {"samples": 8}), (bowl, {"restarts": 4, "spread": 1.0})):
     a, b = (jc.tune(f, jnp.zeros(2), mesh=m, **own) for m in (None, all))
     same((a.params, a.histories), (b.params, b.histories))
 
+scene = jc.Scene(dim=2)
+scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+system, start = scene.build()
+method = jc.Method(stabilizer=jc.Projection(), solver=jc.Sparse())  # rounds until all are done
+start = jc.init(system, method, start.q, start.v)
+swing = jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0])
+apart = jc.shard(worlds(start, 4))
+together = jax.jit(swing).lower(apart).compile()
+assert met(together)
+alone = jax.jit(jc.over_devices(lambda _, batch: swing(batch))).lower(0.0, apart).compile()
+assert met(alone) == {}
+same(alone(0.0, apart), together(apart))
+
 def refused(words, function, *args, **own):
     try:
         function(*args, **own)
-    except ValueError as error:
+    except (ValueError, TypeError) as error:
         assert words in str(error), error
     else:
         raise AssertionError(f"not refused: {words}")
 
 refused("10 worlds does not divide over 4 devices; take 12", jc.shard, jnp.ones(10))
+refused("must be one of JAX, such as", jc.shard, jnp.ones(4), jax.devices())
 refused("over_devices: a batch of 6", jc.over_devices(lambda p, x: x, all), 0.0, jnp.ones(6))
 refused("['t'] of the batch has no first axis", jc.shard, {"t": 1.0, "x": jnp.ones(4)})
 refused("must have as many worlds, got", jc.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})
@@ -131,3 +146,56 @@ refused("samples=7 does not", jc.tune, loss, 0.0, samples=7, key=key, mesh=all)
 
 def test_four_devices_work_apart_and_sum_gradients_once():
     finished(started("-c", FOUR_DEVICES))
+
+
+TWO_DEVICES = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+import numpy as np
+from benchmarks import devices
+from jaxcon import environments
+from jaxcon.environments import vector
+
+def made(count):
+    return environments.GymnasiumVectorEnv("CartPole", 6, 4, devices=count)
+
+def played(envs, start=None):
+    random = np.random.default_rng(0)
+    seen = [envs.reset(seed=3) if start is None else envs.restore(start)]
+    for _ in range(7):
+        seen.append(envs.step(random.uniform(-1, 1, (6, 1))))
+    seen.append(envs.reset(options={"reset_mask": np.arange(6) % 3 == 0}))
+    return seen
+
+def same(x, y):
+    for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
+
+one, two = made(1), made(2)
+found = played(two)
+same(found, played(one))
+assert len(two.copies.episode.state.q.sharding.device_set) == 2
+assert len(found[3][0].sharding.device_set) == 2
+assert np.asarray(found[4][3]).all()  # each began anew on the way
+assert np.any(np.asarray(found[-1][0]) != np.asarray(found[-2][0]))
+kept = two.save()
+same(played(made(2), start=kept), played(made(1), start=kept))
+lowered = vector._advance.lower(
+    two.environment, two.copies, two._spread(np.zeros((6, 1))), "NextStep", None, two.mesh)
+assert devices.exchanges(lowered.compile().as_text()) == {}
+
+def refused(words, *args, **own):
+    try:
+        environments.GymnasiumVectorEnv("CartPole", *args, **own)
+    except ValueError as error:
+        assert words in str(error), error
+    else:
+        raise AssertionError(f"not refused: {words}")
+
+refused("from 1 to the 2 of JAX, got 3", 6, devices=3)
+refused("num_envs=5 does not divide over 2 devices", 5, devices=2)
+"""
+
+
+def test_copies_over_two_devices_get_the_numbers_of_one():
+    finished(started("-c", TWO_DEVICES))

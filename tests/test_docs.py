@@ -5,6 +5,7 @@ import enum
 import importlib
 import inspect
 import re
+import runpy
 from collections import Counter
 from pathlib import Path
 from types import ModuleType
@@ -27,6 +28,7 @@ BESIDE = {
     "jaxcon.analysis.front.Run",
     "jaxcon.analysis.front.Limit",
     "jaxcon.analysis.front.LeftOut",
+    "jaxcon.view.animate",
     "jaxcon.view.draw",
     "jaxcon.view.links",
     "jaxcon.view.canvas",
@@ -188,6 +190,52 @@ def test_every_example_is_on_the_page_of_examples():
     text = (ROOT / "docs" / "examples.md").read_text()
     shown = re.findall(r"{literalinclude} \.\./examples/(\w+)\.py", text)
     assert sorted(shown) == sorted(p.stem for p in (ROOT / "examples").glob("*.py"))
+
+
+def test_every_notebook_is_on_the_page_of_notebooks():
+    text = (ROOT / "docs" / "notebooks.md").read_text()
+    listed = re.findall(r"^notebooks/(\w+)$", text, re.MULTILINE)
+    assert listed == sorted(p.stem for p in (ROOT / "examples" / "notebooks").glob("*.ipynb"))
+
+
+def test_the_gallery_shows_small_pictures_that_its_script_makes():
+    made = runpy.run_path(str(ROOT / "docs" / "gallery.py"))
+    names = {f"{n}.png" for n in made["PICTURES"]} | {f"{n}.gif" for n in made["MOTIONS"]}
+    place = ROOT / "docs" / "gallery"
+    assert {p.name for p in place.iterdir()} == names
+    assert [p.name for p in place.iterdir() if not 1_000 < p.stat().st_size < 200_000] == []
+    shown = re.findall(r"\]\(gallery/([\w.]+)\)", (ROOT / "docs" / "gallery.md").read_text())
+    assert sorted(shown) == sorted(names)
+
+
+def commands():
+    """(file, module, its options) of every `python -m benchmarks…` that a reader is told to run."""
+    files = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "benchmarks" / "RESULTS.md"]
+    for path in [*files, *sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))]:
+        for module, rest in re.findall(r"python -m (benchmarks[\w.]*)([^`\n]*)`", path.read_text()):
+            yield path.name, module, re.findall(r"--[\w-]+", rest)
+
+
+def test_every_command_of_the_benchmarks_that_is_named_exists_with_its_options():
+    found = list(commands())
+    assert len(found) > 20
+    for name, module, options in found:
+        path = ROOT / module.replace(".", "/")
+        path = path / "__main__.py" if path.is_dir() else path.with_suffix(".py")
+        assert path.exists(), f"{name}: python -m {module}"
+        source = path.read_text()
+        for option in options:
+            assert option in source, f"{name}: python -m {module} {option}"
+
+
+def test_links_to_what_is_not_there_are_seen():
+    links = runpy.run_path(str(ROOT / "docs" / "links.py"))
+    here = ROOT.resolve() / "README.md"
+    pages = {here: links["Page"]("<p id='there'><a href='#there'></a></p>")}
+    fine = ("#there", "README.md#there", "CHANGELOG.md", "https://jax.dev/x#y", "docs")
+    bad = ("#gone", "README.md#gone", "NONE.md", "https://nowhere", "mailto:x", "https://a.b/c d")
+    assert [x for x in fine if links["wrong"](x, here, pages)] == []
+    assert [x for x in bad if not links["wrong"](x, here, pages)] == []
 
 
 def test_pages_have_no_programs_of_their_own_that_nothing_runs():

@@ -204,6 +204,19 @@ URDF = """
 """
 
 
+def test_the_map_to_states_hardly_grows_with_the_model():
+    """Links and joints are lanes and turns of a loop."""
+    sizes = []
+    for links in (2, 6):
+        link = '<body pos="0 0 1"><joint axis="0 1 0"/>' + BODY
+        read = jc.from_mjcf(model(links * link + links * "</body>"))
+        still = jnp.zeros(read.tree.size)
+        program = jax.make_jaxpr(lambda q, v, r=read: r.tree.flat(r.system, q, v))(still, still)
+        sizes.append(len(str(program).splitlines()))
+    assert sizes[1] - sizes[0] < 4 * 8  # lines, of links that are put side by side
+    assert sizes[0] > 100
+
+
 def test_urdf():
     """A fixed joint makes one body of two: 2 kg at 0.2 m and 0.5 kg at 0.4 m along z."""
     read = jc.from_mjcf(URDF)

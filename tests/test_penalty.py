@@ -243,6 +243,29 @@ def mixture(**changes: Any):
     return jc.Hybrid(**parts, soft_below=1e-3, **changes)
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_a_rod_without_length_leaves_no_multiplier_to_the_next_step(dtype):
+    """Its row is zero, and what W alone made of it threw the bodies off as soon as they parted."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=dtype)
+    for name, place in (("a", (0.0, 0.0)), ("b", (1.0, 0.0)), ("c", (0.0, 1.0))):
+        scene.add_particle(name, mass=1.0, position=place)
+    scene.add(jc.Distance("rod", "a", "b"))
+    scene.add(jc.Distance("other", jc.WORLD, "c"))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.AugmentedLagrangian(jnp.asarray(100.0, dtype)))
+    q = state.q.at[system.layout.q("b")].set(state.q[system.layout.q("a")])
+    v = state.v.at[system.layout.v("b")].set(jnp.asarray([0.01, 0.02], dtype))
+
+    def along(v):
+        start = jc.init(system, method, q, v)
+        return jc.rollout(system, method, start, None, jnp.asarray(1e-2, dtype), 3)[1]
+
+    path = jax.jit(along)(v)
+    assert np.all(path.status == 0)
+    assert np.max(np.abs(path.v)) < 100.0, "one metre in a step of 10 ms"
+    assert np.max(np.abs(path.v[1])) > 10.0, "once they are apart the rod is felt"
+
+
 def test_a_mixture_is_each_of_its_laws_where_the_violation_is_its_own():
     system, state = oscillator()
     own = {"small": jc.Penalty(1e3, 10.0), "middle": jc.Baumgarte(5.0, 6.0), "all": mixture()}

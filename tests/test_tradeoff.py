@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 
 import jaxcon as jc
 from jaxcon.__main__ import main
-from jaxcon.analysis import reference, sweep
-from jaxcon.analysis.trials import Inputs, Observer, Points, Problem
+from jaxcon.analysis import ledger, reference, sweep
+from jaxcon.analysis.trials import Inputs, Observer, Points, Problem, Trip
 
 G, HORIZON = 9.81, 1.0
 METHODS = {
@@ -115,6 +115,18 @@ def test_the_limit_of_stability_is_that_of_the_exact_law():
     assert all(run.dt < exact for run in found.front)
 
 
+def test_a_scene_at_rest_does_not_diverge_by_rounding():
+    """Nothing moves, and float32 has the energy to seven digits only."""
+    down = np.array([math.sin(0.3), -math.cos(0.3)])
+    scene = jc.Scene(dim=2, gravity=G * down)
+    scene.add_particle("bob", mass=1.3, position=1.1 * down)
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    known = {"methods": {"RK4": METHODS["RK4"]}, "dtypes": "float32", "dts": 0.1, "batch": 2}
+    found = jc.tradeoff(*scene.build(), 1.0, **known, gradients=False, progress=False)
+    assert [run.outcome for run in found.runs] == ["ok"]
+    assert found.recommend(error=1e-5).dt == 0.1
+
+
 def test_what_does_not_fit_is_listed_with_its_reason(result):
     refused = [x for x in result.left_out if x.name == "both"]
     assert [x.dtype for x in refused] == ["float64", "float32"]
@@ -187,6 +199,47 @@ def test_a_chaotic_motion_is_compared_as_far_as_the_reference_is_good():
     assert found.last == round(found.until / 3.0)
     assert found.floor < 1e-3 * found.size
     assert found.error[-1] > 10 * found.floor
+
+
+class Told:
+    """A course whose runs are off by what is told, by part, (10,) or a number."""
+
+    def __init__(self, *off):
+        self.problem = Problem(*free_mass_at_rest(), 1.0, Inputs(10))
+        self.off = iter(off)
+
+    def compile(self):
+        pass
+
+    def go(self, dt, count):
+        t = np.linspace(0.1, 1.0, 10)
+        q = np.stack([1.0 + t, np.zeros(10) + next(self.off)], axis=1)
+        points = Points(q, np.ones((10, 2)), t, np.zeros((10, 0)))
+        return Trip(dt, points, jc.Status.OK, 0.0, 0.0)
+
+
+def free_mass_at_rest():
+    system, state = free_mass()
+    return system, Points.of(jax.device_get(state))
+
+
+def test_a_reference_does_not_trust_two_runs_that_agree_by_chance():
+    course = Told(1e-3, 1e-5 + 5e-9, 1e-5, 0.0, 2e-8, 3e-8, 5e-8, 8e-8)
+    found = reference.make(course, Observer(course.problem), 0.0, 60.0)
+    off = np.abs(found.points.q[1:, 1])
+    assert np.all(off <= 2 * found.error)
+    assert found.floor < 1e-7
+
+
+def test_of_chaotic_runs_those_that_agree_the_longest_are_the_reference():
+    late = np.where(np.arange(10) < 8, 0.0, 1.0)
+    wild = [0.5 + 0.0 * late, -0.4 + 0.0 * late]  # apart by 0.9, less than the others in the end
+    fine = [1e-5 + late, 2e-5 - 0.3 * late, 2e-5 + 1.2 * late, 2e-5 - late]
+    course = Told(*wild, *fine)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(reference, "MOST", reference.FIRST << 5)
+        found = reference.make(course, Observer(course.problem), 0.0, 60.0)
+    assert found.until == 0.8
 
 
 def free_mass():
@@ -266,6 +319,12 @@ def test_a_turn_in_space_counts_as_the_way_of_its_points():
     np.testing.assert_allclose(far, np.hypot(0.5, np.sqrt(0.15) * angle), rtol=1e-12)
 
 
+def test_what_went_far_away_is_infinitely_far_without_a_warning():
+    system, start = free_mass_at_rest()
+    far, _ = reference.Ruler(system, start.q)(start.q[None], np.array([[1e200, -1e200]]))
+    assert far == [math.inf]
+
+
 @pytest.mark.parametrize(
     ("options", "error", "words"),
     [
@@ -280,6 +339,66 @@ def test_a_turn_in_space_counts_as_the_way_of_its_points():
 def test_bad_options_are_named(options, error, words):
     with pytest.raises(error, match=words):
         compare(**options)
+
+
+def test_a_step_asked_for_that_takes_longer_than_the_budget_is_listed():
+    """Ten billion steps; nobody waits for them."""
+    system, state = free_mass()
+    known = {"methods": {"RK4": jc.Method(jc.RK4())}, "batch": 2, "gradients": False}
+    asked = {"dts": (0.1, 1e-10), "dtypes": ("float64",), "budget": 30.0, "progress": False}
+    found = jc.tradeoff(system, state, 1.0, **known, **asked)
+    assert [run.dt for run in found.runs] == [0.1]
+    assert any("each run would take" in x.reason for x in found.left_out)
+    assert str(found)
+
+
+def test_one_step_and_one_precision_need_no_list_and_one_world_no_batch():
+    system, state = free_mass()
+    known = {"methods": {"RK4": jc.Method(jc.RK4())}, "batch": 2, "gradients": False}
+    found = jc.tradeoff(system, state, 1.0, dts=0.1, dtypes="float64", **known, progress=False)
+    assert [(run.dt, run.dtype) for run in found.runs] == [(0.1, "float64")]
+    many = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    with pytest.raises(ValueError, match=r"one world, got a state with q of shape \(2, 2\)"):
+        jc.tradeoff(system, many, 1.0)
+
+
+def test_what_fails_while_it_runs_is_listed_and_the_rest_goes_on(monkeypatch):
+    def short_of_memory(*_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: out of memory")
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    system, state = free_mass()
+    known = {"methods": {"RK4": jc.Method(jc.RK4())}, "batch": 2, "gradients": False}
+    known |= {"dts": (0.1,), "dtypes": ("float64",), "progress": False}
+    monkeypatch.setattr(sweep.Pace, "seconds", short_of_memory)
+    found = jc.tradeoff(system, state, 1.0, **known)
+    assert ["RESOURCE_EXHAUSTED" in x.reason for x in found.left_out] == [True]
+    monkeypatch.setattr(sweep.Sweep, "measure", full)
+    found = jc.tradeoff(system, state, 1.0, **known)
+    assert ["no space left" in x.reason for x in found.left_out] == [True]
+
+
+def test_what_other_code_found_is_not_gone_on_from(result, file, monkeypatch):
+    monkeypatch.setattr(ledger, "code", lambda: "other")
+    with pytest.raises(ValueError, match="not the same: the code of jaxcon"):
+        compare(file=file)
+
+
+def test_the_command_line_says_why_there_is_no_result(capsys, tmp_path):
+    scene = tmp_path / "scene.py"
+    scene.write_text(
+        "import jaxcon as jc\n"
+        "def drop():\n"
+        "    scene = jc.Scene(dim=2)\n"
+        "    scene.add_particle('bob', mass=1.0)\n"
+        "    return scene.build()\n"
+    )
+    assert main(["tradeoff", f"{scene}:drop", "--seconds", "-1"]) == 2
+    assert "horizon" in capsys.readouterr().out
+    assert main(["tradeoff", f"{tmp_path}/none.py:drop"]) == 2
+    assert "none.py" in capsys.readouterr().out
 
 
 def test_a_scene_that_nobody_knows_is_named_by_the_command_line(capsys):

@@ -267,6 +267,24 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(options, tmp_path,
     assert [x.name for x in tmp_path.iterdir()] == ["search.npz"]
 
 
+def test_a_search_that_goes_on_is_judged_where_it_would_have_been(tmp_path, monkeypatch):
+    """At the same ends of chunks, whatever number of steps it was asked for before."""
+    from jaxcon.learning import tuning
+
+    options = {"samples": 2, "key": jax.random.key(2), "optimizer": optax.adam(0.1), "chunk": 10}
+    options["checkpoint"] = tmp_path / "search.npz"
+    jc.tune(noisy, jnp.zeros(2), steps=13, **options)
+    write, seen = tuning.files.write, []
+
+    def written(file, about, found):
+        seen.append(int(found[0].step[0]))
+        write(file, about, found)
+
+    monkeypatch.setattr(tuning.files, "write", written)
+    jc.tune(noisy, jnp.zeros(2), steps=37, **options)
+    assert seen == [20, 30, 37]
+
+
 def test_a_checkpoint_is_refused_by_another_search(tmp_path):
     file = tmp_path / "search.npz"
     data = jnp.array([1.0, 2.0])

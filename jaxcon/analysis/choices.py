@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from jaxcon.analysis.reference import Reference
-from jaxcon.analysis.report import UnitRows, dependent_rows, linearized
 from jaxcon.constraints.rows import layout_of
 from jaxcon.core.precision import cast, precision
+from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
 from jaxcon.simulation.events import Events
 from jaxcon.simulation.generalized_alpha import GeneralizedAlpha
 from jaxcon.simulation.integrators import RK4, Heun, SemiImplicitEuler, turns_in_space

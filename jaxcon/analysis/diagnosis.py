@@ -12,15 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.quantities import angular_momentum, energy, momentum
-from jaxcon.analysis.report import Report, UnitRows, linearized, report
+from jaxcon.analysis.report import Report, report
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.status import MEANING, Status
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.assembly import assemble
+from jaxcon.dynamics.rank import UnitRows, linearized
 from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.stability import instability, largest_stable_rate, parts
+from jaxcon.simulation.stability import default_gains, instability, largest_stable_rate
 from jaxcon.simulation.step import controls_in
 
 WEAK = 1e-2
@@ -118,7 +119,7 @@ def diagnose(
         "round-off": _rounding(system, end),
         **_lost(system, end),
     }
-    gains = _default_gains(method, jnp.asarray(dt, state.q.dtype))
+    gains = default_gains(method, jnp.asarray(dt, state.q.dtype))
     bodies = hasattr(system, "layout")
     return Diagnosis(
         violation=_largest(given),
@@ -130,15 +131,6 @@ def diagnose(
         report=report(system, state),
         trouble=_trouble(system, method, state, end, float(dt)),
     )
-
-
-def _default_gains(method: Method, dt: Array) -> tuple[Array, Array]:
-    """(α, β) of the first feedback in the stabiliser, or of the integrator where there is none."""
-    for part in parts(method.feedback(dt)):
-        fallback = getattr(part, "fallback", None)
-        if fallback is not None:
-            return fallback
-    return method.integrator.default_gains(dt)
 
 
 def _trouble(system: Any, method: Method, state: State, end: State, dt: float) -> tuple[str, ...]:

@@ -120,7 +120,7 @@ def _replay(
 
     def control(k: Array, state: State) -> PyTree:
         if policy:
-            return jax.vmap(lambda s, act=policy: controls_in(s.q.dtype, act(s)))(state)
+            return controls_in(state.q.dtype, jax.vmap(policy)(state))
         return jax.tree.map(lambda x: jnp.asarray(x)[:, k], controls)
 
     def go(carry: Any) -> Array:

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.analysis.report import UnitRows, dependent_rows
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics.rank import UnitRows, dependent_rows
 from jaxcon.model.state import State
 
 

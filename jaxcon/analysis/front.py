@@ -161,6 +161,8 @@ class Tradeoff:
     def recommend(self, *, error: float | None = None, cost: float | None = None) -> Run:
         """The cheapest run of at most this error, or the most accurate one of at most this cost.
 
+        Errors are those up to `until`; a chaotic motion that goes on is another beyond it.
+
         Args:
             error: as of a `Run` [m].
             cost: as of a `Run`, time for a simulated second of one world in the batch [s/s].

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.analysis.report import dependent_rows
 from jaxcon.constraints.rows import layout_of, linearize
 from jaxcon.core.typing import Array
+from jaxcon.dynamics.rank import dependent_rows
 from jaxcon.model.state import State, at
 
 Fields = Callable[[Array], Array]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
+import os
 import re
 import time
 from collections.abc import Iterator
@@ -23,6 +25,8 @@ from jaxcon.core import checkpoint as files
 from jaxcon.simulation.method import Method
 
 OWNER = "tradeoff"
+ROOT = Path(files.__file__).parents[1]
+"""Of the package."""
 SLOWER = 1.3
 """How much longer a piece of work may take than the longest one before it."""
 
@@ -76,8 +80,9 @@ class Ledger:
             ),
             "the horizon": problem.horizon,
             "the batch": batch,
-            "the device": jax.devices()[0].device_kind,
+            "the device": f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores",
             "the version of jax": jax.__version__,
+            "the code of jaxcon": code(),
         }
         found = cls(path, about)
         if path.exists():
@@ -126,6 +131,13 @@ class Ledger:
         known["runs"] = [{k: x for k, x in asdict(run).items() if k != "method"} for run in runs]
         self.contents["units"][wanted.key] = known
         self.save()
+
+
+@functools.cache
+def code() -> str:
+    """A digest of all modules of the package: what other code found is not to be gone on from."""
+    modules = sorted(ROOT.rglob("*.py"))
+    return files.digest(*(f"{path.relative_to(ROOT)}\n{path.read_text()}" for path in modules))
 
 
 class Clock:

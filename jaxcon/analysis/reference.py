@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,8 @@ GOAL = 1e-13
 GOOD = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Errors, of the size of the motion, up to which a part is compared: the least with which at least
 half of the horizon is, or the largest."""
+REST = 1e-4
+"""Of the energy, what a scene that hardly moves may gain before it counts as diverged."""
 ON = 1e-10
 """φ and φ̇ up to which a start is on its constraints, of 1 + max |q| and 1 + max |v|."""
 
@@ -70,6 +72,7 @@ class Ruler:
         with precision(np.float64):
             return cls(observe.system, cast(problem.start.q, np.float64))
 
+    @np.errstate(over="ignore")  # of a run that went far away, which then is infinitely far
     def __call__(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The distance (n,) and the largest angle (n,) [rad] of configurations (n, n_q)."""
         if self.layout is None:
@@ -147,9 +150,10 @@ class Reference:
 
     @property
     def scale(self) -> float:
-        """Of the energy: how much moves or is exchanged [J]."""
-        exchanged = float(np.ptp(self.seen.energy))
-        return max(float(np.max(self.seen.kinetic)), exchanged)
+        """Of the energy: how much moves or is exchanged, or may be rounded away at rest [J]."""
+        energy = self.seen.energy
+        moved = max(float(np.max(self.seen.kinetic)), float(np.ptp(energy)))
+        return max(moved, REST * float(np.max(np.abs(energy))))
 
 
 def started(problem: Problem, observe: Observer) -> tuple[Problem, float]:
@@ -177,7 +181,7 @@ def method_for(system: Any) -> Method:
 
 
 def make(course: Course, observe: Observer, moved: float, seconds: float) -> Reference:
-    """Runs with halved steps until two agree, or time is up.
+    """Runs with halved steps until two agree, or agree no better, or time is up.
 
     Args:
         course: of `method_for` in float64 on the problem from `started`.
@@ -191,17 +195,16 @@ def make(course: Course, observe: Observer, moved: float, seconds: float) -> Ref
     problem = course.problem
     ruler = Ruler.of(observe, problem)
     course.compile()
-    count, spent, best, before = max(1, FIRST // problem.parts), 0.0, None, None
+    count, spent, best, before, idle = max(1, FIRST // problem.parts), 0.0, None, None, 0
     while True:
         trip = course.go(problem.dt(count), count)
         spent += trip.seconds
         if before is not None and not trip.failed and not before.failed:
-            apart = np.maximum.accumulate(ruler(trip.points.q, before.points.q)[0])
-            better = best is None or apart[-1] < best[1][-1]
-            best = (trip, apart, count) if better else best
             size = ruler.size(trip.points.q)
-            small = apart[-1] <= GOAL * size
-            if small or (not better and apart[-1] < GOOD[-1] * size):
+            apart = np.maximum.accumulate(ruler(trip.points.q, before.points.q)[0])
+            best, better = _closer(best, Pair(before, trip, apart, count), size)
+            idle = 0 if better else idle + 1
+            if apart[-1] <= GOAL * size or idle > 1 and apart[-1] < GOOD[-1] * size:
                 break
         count, before = 2 * count, trip
         if count * problem.parts > MOST or spent + 2 * trip.seconds > seconds:
@@ -211,11 +214,37 @@ def make(course: Course, observe: Observer, moved: float, seconds: float) -> Ref
     return _trusted(problem, observe, ruler, best, moved)
 
 
+class Pair(NamedTuple):
+    """Two runs, the finer of so many steps a part, and how far they are apart by each part."""
+
+    coarse: Trip
+    fine: Trip
+    apart: np.ndarray
+    each: int
+
+
+def _closer(best: Pair | None, new: Pair, size: float) -> tuple[Pair, bool]:
+    """The pair that agrees better, of all parts in the mean of the logarithms.
+
+    At the end of a motion that is chaotic any two runs may agree by chance. So may two runs before
+    a third one shows it: the finer of the best pair is then off by what it is from that one, too.
+    """
+    if best is None or _logarithm(new.apart, size) < _logarithm(best.apart, size):
+        return new, True
+    if best.fine is new.coarse:
+        best = best._replace(apart=np.maximum(best.apart, new.apart))
+    return best, False
+
+
+def _logarithm(apart: np.ndarray, size: float) -> float:
+    return float(np.mean(np.log(apart + np.finfo(float).eps * size)))
+
+
 def _trusted(
-    problem: Problem, observe: Observer, ruler: Ruler, best: tuple[Trip, Any, int], moved: float
+    problem: Problem, observe: Observer, ruler: Ruler, best: Pair, moved: float
 ) -> Reference:
     """The reference, with the part of the horizon in which it is good."""
-    trip, apart, count = best
+    _, trip, apart, count = best
     both = zip(problem.start, trip.points, strict=True)
     points = Points(*(np.concatenate([x[None], y]) for x, y in both))
     size = ruler.size(points.q)
@@ -236,7 +265,12 @@ def _trusted(
 def _hopeless(trip: Trip, steps: int) -> str:
     """Why there is no reference."""
     code, when = trip.status, float(trip.points.time[-1])
-    why = MEANING.get(code, "two runs were not finished in the time that there was")
+    if not trip.failed:
+        return (
+            f"tradeoff: the reference needs two runs that agree, and there was time for one of"
+            f" {steps} steps alone; take a shorter horizon, or more of a budget."
+        )
+    why = MEANING.get(code, "its numbers are not finite")
     return (
         f"tradeoff: the reference fails in {steps} steps, {Status(code).name} at {when:.3g} s:"
         f" {why}. Take a horizon that ends before, or see jc.find_first_failure."

@@ -1,23 +1,25 @@
-"""What a scene amounts to: degrees of freedom, rank, redundant rows. Host code, for people."""
+"""What a scene amounts to, and the checklist of a method on it. Host code, for people."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-import jax
 import numpy as np
 
+from jaxcon.analysis import traps
+from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.analysis.memory import Memory, memory
-from jaxcon.constraints.rows import RowLayout, Rows, linearize
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.model.state import State, at
+from jaxcon.analysis.probe import Probe
+from jaxcon.analysis.traps import OFF, TRAPS
+from jaxcon.analysis.work import Work, seconds, work
+from jaxcon.core.status import Status
+from jaxcon.core.typing import PyTree
+from jaxcon.model.state import State
+from jaxcon.simulation.choice import Choice
 from jaxcon.simulation.method import Method
-
-SHARE = 1e-2
-"""Of the largest entry, from which a part that least squares leave is called a conflict."""
-OFF = 1e-4
-"""‖φ‖ [m, rad] from which on a report speaks of it."""
+from jaxcon.simulation.stability import largest_stable_rate
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,15 @@ class Report:
         memory: of a world in a batch [B], where a method was given.
         bounded: names of what has bounded rows, limits, friction and contact, left out of the rest.
         off: names of the constraints with ‖φ‖ above 1e-4; those that hold velocities have no φ.
+        choice: the solver that `Method.auto` takes, and why.
+        work: operations of a step of one world, where a method was given.
+        seconds: what a step of one world takes in a batch on this device [s], where that was asked.
+        gains: α and β of the feedback, and the largest α = β that is stable [1/s], where a method
+            and a step were given.
+        probe: what some steps from the state left open, likewise.
+        warnings: by trap, "gains", "singular", "order", "over-constrained", "start", "nonlinear",
+            "dense" and "iterations", of those in which the scene and the method are; a method is
+            needed, and for some a step.
     """
 
     coordinates: int
@@ -52,6 +63,12 @@ class Report:
     conflicts: dict[str, tuple[float, float, float]] = field(default_factory=dict)
     off: tuple[str, ...] = ()
     bounded: tuple[str, ...] = ()
+    choice: Choice | None = None
+    work: Work | None = None
+    seconds: float | None = None
+    gains: tuple[float, float, float] | None = None
+    probe: Probe | None = None
+    warnings: dict[str, str] = field(default_factory=dict)
 
     def __str__(self) -> str:
         lines = [
@@ -79,8 +96,7 @@ class Report:
                 f"  {name}: {phi:.2e} of φ, {rate:.2e} of φ̇, {bias:.2e} of φ̈"
                 for name, (phi, rate, bias) in self.conflicts.items()
             ]
-        if self.memory:
-            lines.append(str(self.memory))
+        lines += self._of_method()
         lines += [
             f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
             for name, (phi, rate) in self.violation.items()
@@ -90,13 +106,40 @@ class Report:
                 f"off {', '.join(self.off)}: print(jc.assemble(system, state)) takes it to the"
                 " nearest positions that meet them, or names those that cannot be met"
             )
+        lines += [f"warning, {TRAPS[name][0]}: {said}" for name, said in self.warnings.items()]
         return "\n".join(lines)
+
+    def _of_method(self) -> list[str]:
+        """What is said of cost, gains and what is to be expected, and which solver suits."""
+        lines = [str(x) for x in (self.work, self.memory) if x]
+        if self.seconds is not None:
+            lines.append(f"{1e6 * self.seconds:.3g} µs a step of one world on this device")
+        if self.gains:
+            α, β, most = self.gains
+            lines.append(
+                f"gains α = {α:.4g}, β = {β:.4g} 1/s; α = β is stable up to {most:.4g} 1/s here"
+            )
+        if self.probe:
+            code = self.probe.status
+            ended = "" if code == Status.OK else f"; they end as {code.name}"
+            lines.append(
+                f"expected violation: {self.probe.violation:.1e}, the worst |φ| in"
+                f" {self.probe.steps} steps from here, without the first half{ended}"
+            )
+        return [*lines, str(self.choice)] if self.choice and self.choice.efforts else lines
 
 
 def report(
-    system: Any, state: State, method: Method | None = None, control: PyTree = None
+    system: Any,
+    state: State,
+    method: Method | None = None,
+    dt: float | None = None,
+    *,
+    control: PyTree = None,
+    batch: int = 1,
+    timed: bool = False,
 ) -> Report:
-    """Degrees of freedom, rank, redundant and contradicting rows by name, violation, and memory.
+    """The checklist: freedoms, redundancy and condition; with a method, cost, gains and traps.
 
     Rows are compared in the metric of M⁻¹, scaled to unit length; a row counts as dependent where
     the part that earlier rows do not explain is below 1e-9 (float64) or 1e-4 (float32).
@@ -104,118 +147,60 @@ def report(
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
         state: of one world.
-        method: by which the system is to be stepped, for `memory`, which compiles it and takes
-            seconds; None leaves that out.
-        control: for `memory`.
+        method: by which the system is to be stepped, for operations, memory and warnings; memory
+            compiles a step and takes seconds. None leaves these out.
+        dt: h, () [s], for gains, the violation to be expected, which takes some steps, and the
+            warnings that depend on it; None leaves these out.
+        control: of a step of one world, as of `step`.
+        batch: worlds that are to be stepped together, for the choice of a solver and the time.
+        timed: whether to measure the time of a step, with a batch of so many.
 
     Returns:
         A `Report`.
     """
-    system = at(system, state, "jc.report(system, s)")
-    rows, dense_j, dense_m = linearized(system, state)
-    unit = UnitRows(rows.layout, dense_j, dense_m)
-    dependent = dependent_rows(unit.values, unit.tolerance)
-    singular = np.linalg.svd(np.delete(unit.values, dependent, axis=0), compute_uv=False)
-    rank = len(unit.values) - len(dependent)
-    left = [unit.contradicting(x) for x in (rows.residual, rows.rate, rows.bias)]
+    known = Known.of(system, state, method, dt, control, batch)
+    unit, layout = known.unit, known.rows.layout
+    rank = len(unit.values) - len(known.dependent)
+    independent = np.delete(unit.values, known.dependent, axis=0)
+    singular = np.linalg.svd(independent, compute_uv=False)
     violation = {
-        name: (float(rows.violation[name]), float(rows.violation.rate(name)))
-        for name in rows.layout.names
+        name: (float(known.rows.violation[name]), float(known.rows.violation.rate(name)))
+        for name in layout.names
     }
-    return Report(
+    found = Report(
         coordinates=state.q.shape[0],
         velocities=state.v.shape[0],
         rows=len(unit.values),
         rank=rank,
         degrees_of_freedom=state.v.shape[0] - rank,
-        redundant=tuple(unit.owners[i] for i in dependent),
+        redundant=tuple(unit.owners[i] for i in known.dependent),
         condition=float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
         violation=violation,
         off=tuple(
             name
             for name, (size, _) in violation.items()
-            if size > OFF and name not in rows.layout.velocity_level
+            if size > OFF and name not in layout.velocity_level
         ),
-        bounded=tuple(name for group in system.bounds for name in group.names),
-        memory=None if method is None else memory(system, method, state, control),
-        conflicts={
-            name: (left[0].get(name, 0.0), left[1].get(name, 0.0), left[2].get(name, 0.0))
-            for name in rows.layout.names
-            if any(name in part for part in left)
-        },
+        bounded=tuple(name for group in known.system.bounds for name in group.names),
+        conflicts=known.conflicts,
+        choice=known.choice,
     )
+    return found if method is None else _with_method(found, known, timed)
 
 
-class UnitRows:
-    """Rows that take away a freedom, in the metric of M⁻¹ and scaled to unit length.
-
-    J M⁻¹ Jᵀ = Ĵ Ĵᵀ with Ĵ = J L⁻ᵀ and M = L Lᵀ; each row of Ĵ is divided by its length.
-
-    Attributes:
-        owners: (constraint, row in it) of each.
-        values: (rows, n_v).
-        length: of each before it was scaled.
-        tolerance: below which a length counts as zero.
-    """
-
-    def __init__(self, layout: RowLayout, jacobian: Array, mass: Array) -> None:
-        owners = _owners(layout)
-        self.numbers, self.owners = list(owners), list(owners.values())
-        self.tolerance = 1e-9 if jacobian.dtype == np.float64 else 1e-4
-        j = np.asarray(jacobian, np.float64)[self.numbers]
-        factor = np.linalg.cholesky(np.asarray(mass, np.float64))
-        scaled = np.linalg.solve(factor, j.T).T
-        length = np.linalg.norm(scaled, axis=1)
-        self.length = np.where(length > 0, length, 1)
-        self.values = scaled / self.length[:, None]
-
-    def within(self, x: Array, low: float, high: float) -> np.ndarray:
-        """The part of an array by rows (n_c,) in directions with singular values in (low, high].
-
-        These are combinations of rows; −1 … 0 are those that no motion changes.
-        """
-        own = np.asarray(x, np.float64)[self.numbers] / self.length
-        u, s, _ = np.linalg.svd(self.values)
-        s = np.append(s, np.zeros(len(u) - len(s)))
-        chosen = u[:, (low < s) & (s <= high)]
-        return self.length * (chosen @ (chosen.T @ own))
-
-    def contradicting(self, x: Array) -> dict[str, float]:
-        """The norm of what least squares leave of an array by rows (n_c,), by constraint."""
-        left = self.within(x, -1.0, self.tolerance) / self.length
-        size = np.max(np.abs(np.asarray(x)[self.numbers] / self.length), initial=0)
-        bound = max(SHARE * size, self.tolerance)
-        found: dict[str, float] = {}
-        for (name, _), part, length in zip(self.owners, left, self.length, strict=True):
-            if abs(part) > bound:
-                found[name] = float(np.hypot(found.get(name, 0.0), part * length))
-        return found
-
-
-@jax.jit
-def linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
-    """The rows with J and M as arrays."""
-    rows = linearize(system, state.q, state.v, state.time)
-    return rows, rows.jacobian.dense(), system.mass(state.q).dense()
-
-
-def dependent_rows(rows: Array | np.ndarray, tolerance: float) -> list[int]:
-    """Numbers of the unit rows that are combinations of the rows before them (Gram–Schmidt)."""
-    basis = np.zeros((0, rows.shape[1]))
-    dependent = []
-    for i, row in enumerate(np.asarray(rows)):
-        rest = row - basis.T @ (basis @ row)
-        rest = rest - basis.T @ (basis @ rest)
-        size = np.linalg.norm(rest)
-        if size > tolerance:
-            basis = np.vstack([basis, rest / size])
-        else:
-            dependent.append(i)
-    return dependent
-
-
-def _owners(layout: Any) -> dict[int, tuple[str, int]]:
-    """Constraint and row in it, by row number, of the rows that take away a freedom."""
-    holding = [name for name in layout.names if name not in layout.inertial]
-    owned = {int(row): (name, i) for name in holding for i, row in enumerate(layout.rows(name))}
-    return dict(sorted(owned.items()))
+def _with_method(found: Report, known: Known, timed: bool) -> Report:
+    """The same with what belongs to the method."""
+    args = known.system, known.method, known.state, known.control
+    gains = None
+    if known.dt is not None:
+        most = largest_stable_rate(known.method.integrator, known.dt)
+        gains = (*asked_gains(known.method, known.dt), most)
+    return dataclasses.replace(
+        found,
+        memory=memory(*args),
+        work=work(*args),
+        seconds=seconds(*args, known.batch) if timed else None,
+        gains=gains,
+        probe=known.probe,
+        warnings=traps.found(known),
+    )

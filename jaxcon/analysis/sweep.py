@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,6 +31,10 @@ BISECTIONS = 4
 """Of the gap between a stable and an unstable step, on a logarithmic scale."""
 SHARE = 1 / 60
 """Of the budget that one run may take."""
+ASKED = 1 / 4
+"""Of the budget that all runs of a method may take, also at steps that were asked for."""
+FEW = 10
+"""Steps in a part by which the time of a first run is foretold."""
 NO_GAIN = 0.8
 """Of the least error so far: a run above that gains nothing by its shorter step."""
 REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeError)
@@ -83,19 +88,27 @@ class Sweep:
     def measure(self, name: str, method: Method, dtype: str) -> Unit:
         """Runs a method at all steps; one that does not fit the scene says why."""
         try:
-            course, pace = Course(self.problem, method, dtype), Pace(self.batch, method, dtype)
-            compile_side_by_side(course, pace)
+            course, pace = compiled_side_by_side(
+                lambda: Course(self.problem, method, dtype), lambda: Pace(self.batch, method, dtype)
+            )
         except REFUSED as error:
             return Unit(left_out=(LeftOut(name, dtype, first_line(error)),))
+        try:
+            return self._measured(course, pace, name, method)
+        except jax.errors.JaxRuntimeError as error:  # as where memory runs out
+            return Unit(left_out=(LeftOut(name, dtype, first_line(error)),))
+
+    def _measured(self, course: Course, pace: Pace, name: str, method: Method) -> Unit:
+        """Errors first, then costs."""
         runs, why = self._refined(course, name, method)
-        limit = self._limit(course, name, runs)
+        limit = self._limit(course, name, runs) if runs else None
         timed = tuple(
             dataclasses.replace(run, cost=pace.seconds(run.dt) / run.dt, memory=pace.memory)
             if run.ok
             else run
             for run in runs
         )
-        left = (LeftOut(name, dtype, why),) if why else ()
+        left = (LeftOut(name, course.dtype.name, why),) if why else ()
         return Unit(timed, limit, left)
 
     def gradients(self, unit: Unit) -> Unit:
@@ -119,13 +132,14 @@ class Sweep:
     def _refined(self, course: Course, name: str, method: Method) -> tuple[list[Run], str]:
         """Runs with shorter and shorter steps, and why there are no shorter ones."""
         runs: list[Run] = []
-        stalled, least, trip = 0, math.inf, None
+        stalled, least, trip, spent = 0, math.inf, None, 0.0
         for count in self.counts:
             dt = self.problem.dt(count)
-            if trip is not None and self.dts is None:
-                longer = trip.seconds * trip.dt / dt
-                if longer > self.budget * SHARE:
-                    return runs, f"steps from {dt:.3g} s on: each run would take {longer:.2g} s"
+            longer = self._seconds(course, trip, dt, count)
+            spent += longer
+            if spent > self.budget * ASKED or longer > self.budget * SHARE and self.dts is None:
+                return runs, f"steps from {dt:.3g} s on: each run would take {longer:.2g} s"
+            if runs and self.dts is None:
                 if runs[-1].ok and not runs[-1].told:
                     return runs, f"steps from {dt:.3g} s on: the reference tells them no more apart"
                 if stalled > 1:
@@ -135,6 +149,13 @@ class Sweep:
             stalled = stalled + 1 if runs[-1].error > NO_GAIN * least and runs[-1].ok else 0
             least = min(least, runs[-1].error)
         return runs, ""
+
+    def _seconds(self, course: Course, trip: Trip | None, dt: float, count: int) -> float:
+        """How long a run will take, by the one before it or, at steps asked for, by a short one."""
+        if trip is not None:
+            return trip.seconds * trip.dt / dt
+        few = 0 if self.dts is None else min(count, FEW)
+        return course.go(dt, few).seconds * count / few if few else 0.0
 
     def _run(self, trip: Trip, name: str, method: Method, dtype: str) -> Run:
         """What a trip amounts to."""
@@ -182,10 +203,16 @@ class Sweep:
         return Limit(name, course.dtype.name, good, bad)
 
 
-def compile_side_by_side(*programs: Any) -> None:
-    """Compiles several programs at once, each on a core."""
-    with ThreadPoolExecutor(len(programs)) as pool:
-        list(pool.map(lambda program: program.compile(), programs))
+def compiled_side_by_side(*makers: Callable[[], Any]) -> list[Any]:
+    """Programs, each compiled on a core of its own while the next one is traced."""
+    with ThreadPoolExecutor(len(makers)) as pool:
+        programs, begun = [], []
+        for make in makers:
+            programs.append(make())
+            begun.append(pool.submit(programs[-1].compile))
+        for one in begun:
+            one.result()
+    return programs
 
 
 def first_line(error: BaseException) -> str:

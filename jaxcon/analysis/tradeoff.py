@@ -17,7 +17,7 @@ from jaxcon.analysis.ledger import Clock, Ledger, Wanted
 from jaxcon.analysis.sweep import Sweep
 from jaxcon.analysis.trials import Course, Inputs, Observer, Points, Problem
 from jaxcon.core import checks
-from jaxcon.core.ends import bar
+from jaxcon.core.ends import ENDS, bar, words
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State, at
 from jaxcon.simulation.method import Method, check_method
@@ -39,7 +39,7 @@ def tradeoff(
     hold: float | None = None,
     methods: Mapping[str, Method] | None = None,
     dtypes: Sequence[Any] = DTYPES,
-    dts: Sequence[float] | None = None,
+    dts: Sequence[float] | float | None = None,
     batch: int = 256,
     budget: float = 300.0,
     gradients: bool = True,
@@ -68,9 +68,9 @@ def tradeoff(
         hold: the time for which each value of a function is held, of which the horizon is a
             multiple [s].
         methods: by name, the most important first; unless given those that suit the scene.
-        dtypes: precisions, of "float32" and "float64".
-        dts: steps, each shortened until it divides a part of the horizon [s]; unless given a tenth
-            of the horizon, and 1/2, 1/5, 1/10, … of that as long as errors fall.
+        dtypes: precisions, of "float32" and "float64", or one of them.
+        dts: steps, or one, each shortened until it divides a part of the horizon [s]; unless given
+            a tenth of the horizon, and 1/2, 1/5, 1/10, … of that as long as errors fall.
         batch: how many worlds share the device where costs are measured.
         budget: of time [s]. Methods for which it does not last are listed, not run.
         gradients: whether gradients are timed, after all else and those of the front first.
@@ -87,7 +87,14 @@ def tradeoff(
         SimulationError: the scene itself does not get through the horizon, or its start cannot be
             brought onto its constraints.
     """
+    if np.ndim(getattr(state, "q", ())) > 1:
+        raise ValueError(
+            f"tradeoff: takes the start of one world, got a state with q of shape {state.q.shape};"
+            " take one of a batch or a trajectory, jax.tree.map(lambda x: x[0], states)."
+        )
     at(system, state, "jc.tradeoff(system, s, horizon)")
+    dtypes = (dtypes,) if isinstance(dtypes, str) else dtypes
+    dts = (float(dts),) if isinstance(dts, int | float) else dts
     _check(horizon, methods, dtypes, dts, (batch, budget))
     clock, horizon = Clock(budget), float(horizon)
     start = Points(*(np.asarray(x, np.float64) for x in Points.of(state)))
@@ -145,8 +152,8 @@ def _go(
                     with clock.timing("gradients"):
                         ledger[one] = sweep.gradients(ledger[one])
                 shown.update()
-    except KeyboardInterrupt:
-        reason = "interrupted from the keyboard"
+    except ENDS as error:
+        reason = words(error)
     late = [LeftOut(one.name, one.dtype, reason) for one in wanted if one not in ledger]
     for one in _by_use(ledger, wanted) if gradients else ():
         if not ledger[one].differentiated:

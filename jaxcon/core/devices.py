@@ -17,8 +17,10 @@ SHARED, APART = PartitionSpec(), PartitionSpec("worlds")
 def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
     """The same batch with equal parts of its worlds, the first axis, on each device.
 
-    What `jit(vmap(f))` makes of it stays there, and nothing is exchanged. Gradients by numbers that
-    worlds share are sums over all of them: take `over_devices` for these.
+    What `jit(vmap(f))` makes of it stays there. Nothing is exchanged where every step has a fixed
+    number of operations; methods that iterate until all worlds are done, as `Projection`, `RATTLE`,
+    `GeneralizedAlpha` and what solves limits and contacts, ask all devices in every iteration.
+    Gradients by numbers that worlds share are sums over all of them. Take `over_devices` for both.
 
     Several processes, joined by `jax.distributed.initialize`, all give the same batch and keep
     their parts of it. Where it is large, give keys or starts, and make the batch of them in `jit`.
@@ -32,6 +34,7 @@ def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
 
     Raises:
         ValueError: an array has no first axis, or another n; or n does not divide.
+        TypeError: the mesh is none.
     """
     mesh = _line(mesh)
     _check("shard", batch, mesh.size)
@@ -41,9 +44,10 @@ def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
 def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Callable[..., Any]:
     """function(shared, batch), where each device works on its own part of the batch.
 
-    It is good to jit and to differentiate. The derivative by what is shared is summed on each
-    device over the whole motion, and over devices once, at the end: under `jit(grad(vmap(f)))` of a
-    batch from `shard` devices would meet in every step.
+    No device waits for another, also where methods iterate until their worlds are done. It is good
+    to jit and to differentiate. The derivative by what is shared is summed on each device over the
+    whole motion, and over devices once, at the end: under `jit(grad(vmap(f)))` of a batch from
+    `shard` devices would meet in every step.
 
         settled = jc.over_devices(jax.vmap(settle, in_axes=(None, 0)))
         slope = jax.jit(jax.grad(lambda p, worlds: jnp.mean(settled(p, worlds))))
@@ -58,6 +62,7 @@ def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Call
 
     Raises:
         ValueError: as of `shard`, when it is called.
+        TypeError: the mesh is none.
     """
     line = _line(mesh)
     # what is shared stays so without being told apart from what is not in every operation
@@ -77,7 +82,16 @@ def gathered(tree: PyTree, mesh: Mesh) -> PyTree:
 
 
 def _line(mesh: Mesh | None) -> Mesh:
-    """The devices of a mesh along one axis, of worlds; where arrays lie is left to the compiler."""
+    """The devices of a mesh along one axis, of worlds; where arrays lie is left to the compiler.
+
+    Raises:
+        TypeError: it is no mesh.
+    """
+    if not isinstance(mesh, Mesh | None):
+        raise TypeError(
+            "a mesh must be one of JAX, such as jax.make_mesh((2,), ('worlds',)), got"
+            f" {type(mesh).__name__}."
+        )
     devices = np.asarray(jax.devices()) if mesh is None else mesh.devices
     return Mesh(devices.ravel(), ("worlds",))
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import jax
-from tqdm.auto import tqdm
+from tqdm import TqdmWarning
 
 ENDS = (KeyboardInterrupt, OSError, jax.errors.JaxRuntimeError)
 
@@ -19,4 +20,7 @@ def words(error: BaseException) -> str:
 
 def bar(show: bool | None, unit: str = "step", **options: Any) -> Any:
     """A bar of tqdm: in terminals and notebooks where it is None, always, or never."""
+    with warnings.catch_warnings():  # a notebook without ipywidgets has the bar of a terminal
+        warnings.simplefilter("ignore", TqdmWarning)
+        from tqdm.auto import tqdm
     return tqdm(unit=unit, disable=None if show is None else not show, **options)

@@ -28,7 +28,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jaxcon.core.program import Constant, Operation, Program, traced
 from jaxcon.core.typing import Array
 
-WORTH = 4
+WORTH = 3
 """Operations from which it pays to store a value that several kernels need."""
 
 KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}

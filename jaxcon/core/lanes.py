@@ -43,6 +43,13 @@ def plus(x: Lane, y: Lane) -> Lane:
     return x if _is(y, 0) else x + y
 
 
+def minus(x: Lane, y: Lane) -> Lane:
+    """x − y, without an instruction for the Python number 0."""
+    if _is(x, 0):
+        return times(-1, y)
+    return x if _is(y, 0) else x - y
+
+
 def total(terms: Any) -> Lane:
     """The sum of lanes."""
     return functools.reduce(plus, terms, 0.0)
@@ -89,12 +96,12 @@ class Vector:
         """x × y: a vector in space, and in the plane its one component along the normal."""
         if len(self) == 2:
             (a, b), (c, d) = self, other
-            return plus(times(a, d), -times(b, c))
+            return minus(times(a, d), times(b, c))
         (a, b, c), (x, y, z) = self, other
         return Vector(
-            plus(times(b, z), -times(c, y)),
-            plus(times(c, x), -times(a, z)),
-            plus(times(a, y), -times(b, x)),
+            minus(times(b, z), times(c, y)),
+            minus(times(c, x), times(a, z)),
+            minus(times(a, y), times(b, x)),
         )
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
@@ -119,7 +126,7 @@ class Vector:
         return Vector(*(plus(x, y) for x, y in zip(self, other, strict=True)))
 
     def __sub__(self, other: Vector) -> Vector:
-        return self + (-other)
+        return Vector(*(minus(x, y) for x, y in zip(self, other, strict=True)))
 
     def __neg__(self) -> Vector:
         return self.map(lambda x: times(-1, x))
@@ -287,9 +294,15 @@ def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def widened(tree: Any) -> Any:
-    """Lanes with a last axis of size 1, for what is done to many right sides at once.
+def widened(tree: Any, worlds: int) -> Any:
+    """Lanes with an axis of size 1 before those of worlds, for many right sides at once.
 
-    Those lie along the last axis, so that memory is contiguous over them even for a single world.
+    Args:
+        tree: lanes, and numbers of each world.
+        worlds: how many trailing axes enumerate worlds.
     """
-    return jax.tree.map(lambda x: x[..., None] if jnp.ndim(x) else x, tree)
+
+    def one(x: Any) -> Any:
+        return jnp.expand_dims(x, jnp.ndim(x) - worlds) if jnp.ndim(x) else x
+
+    return jax.tree.map(one, tree)

@@ -142,7 +142,7 @@ class Dynamics:
 
     def _impulse(self, rows: BoundRows, law: Any, problem: Saddle, dt: Any, acts: Any) -> Impulse:
         """How bounded rows act, by factors of wide lanes, to which the solver's numbers belong."""
-        wide = dataclasses.replace(self, solver=widened(self.solver))
+        wide = dataclasses.replace(self, solver=widened(self.solver, problem.force.ndim - 1))
         factor = partial(wide._factors, law)
         return Impulse.of(rows, factor, problem, dt, acts, sifts=self._leaves_out(rows))
 

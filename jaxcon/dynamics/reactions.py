@@ -19,6 +19,7 @@ from jaxcon.core.lanes import Vector, widened
 from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan
 from jaxcon.solvers.bounded import Bounded, implicit_multipliers
+from jaxcon.solvers.jacobian import Jacobian
 from jaxcon.solvers.nearest_rows import Nearest
 from jaxcon.solvers.proximal import own_diagonal
 from jaxcon.solvers.saddle import Factored, Saddle, Solution
@@ -29,17 +30,20 @@ class Impulse:
     """How bounded multipliers act within a step, the equality rows being eliminated.
 
     M a = f + Jᵀλ_e + J_bᵀλ and J a + C λ_e = b hold by the factors at hand, so that one solution
-    tells the velocities u = φ̇ + h J_b a that multipliers λ lead to, and n of them G = ∂u/∂λ.
+    tells the velocities u = φ̇ + h J_b a that multipliers λ lead to, and several of them, done at
+    once, G = ∂u/∂λ: those of what each row pulls, or, where there are more rows than velocities,
+    those of a unit force along each velocity, between J_b and J_bᵀ.
 
     Attributes:
         rows: the bounded rows.
-        solve: (f, b) → a and λ_e, for right sides with a last axis of their own, see `widened`.
+        solve: (f, b) → a and λ_e, for right sides with an axis of their own, see `widened`.
         saddle: M and f, of the equality rows.
         target: b, (n_c,).
         dt: h, () [s]; 1 where λ are impulses, and time stands still.
         start: a without them, (n_v,), a constant.
         bare: J_b M⁻¹ J_bᵀ on the diagonal, (n,): what rows would move without the equality rows.
         acts: which rows act, (n,), tangents where their normal does; None for all.
+        answers: a of `probing` forces, (n_v, k, …), a constant; None where that is not known yet.
     """
 
     rows: BoundRows
@@ -50,6 +54,7 @@ class Impulse:
     start: Array
     bare: Array
     acts: Any = None
+    answers: Any = None
 
     @classmethod
     def of(
@@ -72,14 +77,35 @@ class Impulse:
             sifts: whether rows that nothing moves are left out, as `nearest` needs it.
         """
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
-        solve = factor(widened(saddle))
+        solve = factor(widened(saddle, saddle.force.ndim - 1))
         own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts)
         return own._sifted() if sifts else own._begun()
 
     def _begun(self) -> Impulse:
-        """With the a of no multipliers."""
-        start = self.motion(jnp.zeros_like(self.bare)).acceleration
-        return dataclasses.replace(self, start=jax.lax.stop_gradient(start))
+        """With the a of no multipliers, and of `probing` forces."""
+        probing = self._probing()
+        count, *batch = probing.shape[1:]
+        force, target = (
+            jnp.broadcast_to(x[:, None], (len(x), 1, *batch))
+            for x in (self.saddle.force, self.target)
+        )
+        none = jnp.zeros((len(target), count, *batch), target.dtype)
+        forces, targets = (
+            jnp.concatenate(pair, axis=1) for pair in ((force, probing), (target, none))
+        )
+        found = jax.lax.stop_gradient(self.solve(forces, targets).acceleration)
+        return dataclasses.replace(self, start=found[:, 0], answers=found[:, 1:])
+
+    def _by_velocities(self) -> bool:
+        """Whether there are fewer velocities than rows."""
+        return isinstance(self.rows.jacobian, Jacobian) and len(self.start) < len(self.bare)
+
+    def _probing(self) -> Array:
+        """What each row pulls, or a unit along each velocity, (n_v, k, …)."""
+        if not self._by_velocities():
+            return jax.lax.stop_gradient(self.rows.jacobian).columns(self.rows.rate)
+        unit = gauss_jordan.identity(self.start)
+        return jnp.broadcast_to(unit, (*unit.shape[:2], *self.start.shape[1:]))
 
     def _sifted(self) -> Impulse:
         """The same, and of the rows only those act that some multipliers of all rows move.
@@ -91,9 +117,9 @@ class Impulse:
         force, none = self.saddle.force, jnp.zeros_like(self.target)
         pulls = [self._pull(z * numerics.safe_divide(1.0, length)) for z in probes(length)]
         forces = [force, *(jnp.broadcast_to(pull, force.shape) for pull in pulls)]
-        targets = jnp.stack([self.target, none, none], axis=-1)
-        found = self.solve(jnp.stack(forces, axis=-1), targets).acceleration
-        start, *moved = (jax.lax.stop_gradient(found[..., i]) for i in range(3))
+        targets = jnp.stack([self.target, none, none], axis=1)
+        found = self.solve(jnp.stack(forces, axis=1), targets).acceleration
+        start, *moved = (jax.lax.stop_gradient(found[:, i]) for i in range(3))
         rounding = 64 * float(jnp.finfo(force.dtype).eps) * len(length) ** 0.5
         largest = functools.reduce(
             jnp.maximum, (jnp.abs(self.rows.jacobian.apply(a)) for a in moved)
@@ -119,20 +145,23 @@ class Impulse:
         return self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
 
     def matrix(self) -> Array:
-        """G, (n, n), a constant: all columns at once, along the last axis of the right sides."""
-        j = jax.lax.stop_gradient(self.rows.jacobian)
-        force = j.columns(self.rows.rate)
-        none = jnp.zeros((*self.target.shape, force.shape[-1]), force.dtype)
-        u = self.dt[None, ..., None] * j.each(self.solve(force, none).acceleration)
-        return jax.lax.stop_gradient(jnp.moveaxis(u, -1, 1))
+        """G, (n, n), a constant."""
+        j, moved = jax.lax.stop_gradient(self.rows.jacobian), self.answers
+        if moved is None:
+            force = self._probing()
+            none = jnp.zeros((len(self.target), *force.shape[1:]), force.dtype)
+            moved = jax.lax.stop_gradient(self.solve(force, none).acceleration)
+        if self._by_velocities():
+            moved = jnp.swapaxes(j.each(moved), 0, 1)
+        return jax.lax.stop_gradient(self.dt[None, None] * j.each(moved))
 
     def _pull(self, multipliers: Array) -> Array:
         return self.rows.jacobian.transpose(multipliers)
 
     def _alone(self, force: Array, target: Array) -> Solution:
         """The solution for one right side."""
-        found = self.solve(force[..., None], target[..., None])
-        return jax.tree.map(lambda x: x[..., 0], found)
+        a, multipliers, status = self.solve(force[:, None], target[:, None])
+        return Solution(a[:, 0], multipliers[:, 0], status[0])
 
     def moves(self, matrix: Array) -> Array:
         """Whether a row acts and moves at all, (n,).
@@ -204,7 +233,9 @@ class Impulse:
         distance = jnp.where(self.acts, distance, jnp.inf)
         choice = solver.choose(rows.kinds, jax.lax.stop_gradient(distance))
         bare, acts = choice.take(self.bare), choice.take(self.acts)
-        own = dataclasses.replace(self, rows=rows.chosen(choice), bare=bare, acts=acts)
+        own = dataclasses.replace(
+            self, rows=rows.chosen(choice), bare=bare, acts=acts, answers=None
+        )
         known = own.react(solver.solver, None if guess is None else choice.take(guess))
         return dataclasses.replace(
             known, multipliers=choice.put(known.multipliers), gap=rows.gap, layout=rows.layout

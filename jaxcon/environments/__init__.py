@@ -28,6 +28,7 @@ from jaxcon.environments.registry import TASKS, make
 from jaxcon.environments.returns import returns
 from jaxcon.environments.tasks.cart_pole import CartPole
 from jaxcon.environments.tasks.cat import CatRighting
+from jaxcon.environments.tasks.cheetah import HalfCheetah
 from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
@@ -44,6 +45,7 @@ __all__ = [
     "Episode",
     "FiveBarHopper",
     "FourBarTracking",
+    "HalfCheetah",
     "Layered",
     "Outcome",
     "Parking",

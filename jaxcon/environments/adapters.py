@@ -67,6 +67,19 @@ def check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> Non
         raise ValueError(f"reset: unknown options {unknown}; {there}.")
 
 
+def check_no_horizon(options: dict[str, Any]) -> None:
+    """Checks that a time limit comes as Gymnasium's, whose own would go before it unseen.
+
+    Raises:
+        ValueError: it is an option of the task.
+    """
+    if "horizon" in options:
+        raise ValueError(
+            "Gymnasium's time limit is max_episode_steps=, of gymnasium.make and make_vec; got"
+            f" horizon={options['horizon']}."
+        )
+
+
 def key_from(random: np.random.Generator) -> Array:
     """A key of JAX drawn from Gymnasium's generator, as an array that can be saved."""
     return jax.random.PRNGKey(random.integers(2**32, dtype=np.uint32))

@@ -47,6 +47,9 @@ class GymnasiumEnv(gymnasium.Env):
         task: the name of a task, or an environment.
         render_mode: None or "rgb_array".
         options: of the task's `build`.
+
+    Raises:
+        ValueError: a horizon, which `gymnasium.make` takes as `max_episode_steps`.
     """
 
     metadata: dict[str, Any] = {"render_modes": [PICTURES], "render_fps": 50}
@@ -54,6 +57,7 @@ class GymnasiumEnv(gymnasium.Env):
     def __init__(
         self, task: str | Environment, render_mode: str | None = None, **options: Any
     ) -> None:
+        adapters.check_no_horizon(options)
         environment = make(task, **options)
         self.environment = dataclasses.replace(environment, horizon=None)
         self.metadata = adapters.describe(self.environment)

@@ -25,7 +25,7 @@ class Layered(Environment):
 
     The controller is asked before every action of the task below; it may be constrained, as by
     `feasible_action`. Observation, start and end are those of the task below, and the reward is
-    that of the task where a target ends.
+    that of the task where a target ends, or the task is over.
 
     Attributes:
         task: the one below; its system, method and dt are those of this environment.
@@ -79,6 +79,10 @@ class Layered(Environment):
         """As below."""
         return self.task.frame
 
+    def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
+        """As below."""
+        return self.below.window(episode)
+
     def start(self, key: Array) -> tuple[State, PyTree]:
         """As below."""
         return self.below.start(key)
@@ -96,12 +100,13 @@ class Layered(Environment):
         self.below.marks(axes, episode)
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """The controller follows a target for `hold` actions."""
+        """The controller follows a target for `hold` actions, or until the task is over."""
         below = self.below
 
         def follow(now: Episode, _: Any) -> tuple[Episode, Array]:
-            now = below.transition(now, self.controller(below, now, action))
-            return now, now.violation
+            after, over = below.transition(now, self.controller(below, now, action)), below.terminal
+            after = jax.tree.map(lambda a, b: jnp.where(over(now), a, b), now, after)
+            return after, after.violation
 
         last, worst = jax.lax.scan(follow, episode, None, self.hold)
         return dataclasses.replace(last, steps=episode.steps + 1, violation=jnp.max(worst))

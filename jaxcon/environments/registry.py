@@ -9,6 +9,7 @@ from typing import Any
 from jaxcon.environments.environment import Environment
 from jaxcon.environments.tasks.cart_pole import CartPole, double_cart_pole
 from jaxcon.environments.tasks.cat import CatRighting
+from jaxcon.environments.tasks.cheetah import HalfCheetah
 from jaxcon.environments.tasks.four_bar import FourBarTracking
 from jaxcon.environments.tasks.hopper import FiveBarHopper
 from jaxcon.environments.tasks.parking import Parking
@@ -21,6 +22,7 @@ TASKS: dict[str, Callable[..., Environment]] = {
     "DoubleCartPole": double_cart_pole,
     "FiveBarHopper": FiveBarHopper.build,
     "FourBarTracking": FourBarTracking.build,
+    "HalfCheetah": HalfCheetah.build,
     "Parking": Parking.build,
     "RopeSwing": RopeSwing.build,
     "StewartBalancing": StewartBalancing.build,

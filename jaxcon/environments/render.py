@@ -33,10 +33,11 @@ def image(environment: Environment, episode: Episode, onto: Any) -> np.ndarray:
     """
     figure = onto.figure
     figure.clear()
-    axes = figure.add_axes((0, 0, 1, 1), xlim=environment.frame[0], ylim=environment.frame[1])
+    across, up = environment.window(episode)
+    axes = figure.add_axes((0, 0, 1, 1), xlim=across, ylim=up)
     view.draw(environment.system, episode.state.q, axes, label=None)
     environment.marks(axes, episode)
-    axes.set(xlim=environment.frame[0], ylim=environment.frame[1])
+    axes.set(xlim=across, ylim=up)
     axes.axis("off")
     onto.draw()
     return np.asarray(onto.buffer_rgba())[..., :3].copy()

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxcon.core.devices import over_devices, shard
 from jaxcon.core.typing import Array
 from jaxcon.environments import adapters, render
 from jaxcon.environments.adapters import AutoresetMode, VectorEnv, batch_space, gymnasium
@@ -17,10 +21,50 @@ from jaxcon.environments.environment import Environment
 from jaxcon.environments.registry import make
 
 # the environment is an argument, so that all of one structure share what was compiled
-_look = jax.jit(look)
 _begin = jax.jit(begin, static_argnums=(2, 3))
-_advance = jax.jit(advance, static_argnums=(3, 4))
-_restart = jax.jit(restart, static_argnums=3)
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _look(environment: Environment, copies: Copies, mesh: Mesh | None) -> Any:
+    return _apart(look, mesh)(environment, copies)
+
+
+# it gives up the copies it gets, whose memory the new ones take: a tenth of a step of CartPole
+@functools.partial(jax.jit, static_argnums=(3, 4, 5), donate_argnums=1)
+def _advance(
+    environment: Environment,
+    copies: Copies,
+    actions: Array,
+    mode: str,
+    randomize: Randomize | None,
+    mesh: Mesh | None,
+) -> Any:
+    def own(shared: Environment, batch: tuple[Copies, Array]) -> Any:
+        return advance(shared, *batch, mode, randomize)
+
+    return _apart(own, mesh)(environment, (copies, actions))
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4))
+def _restart(
+    environment: Environment,
+    copies: Copies,
+    chosen: Array,
+    randomize: Randomize | None,
+    mesh: Mesh | None,
+) -> Copies:
+    def own(shared: Environment, batch: tuple[Copies, Array]) -> Copies:
+        return restart(shared, *batch, randomize)
+
+    return _apart(own, mesh)(environment, (copies, chosen))
+
+
+def _apart(function: Callable[[Any, Any], Any], mesh: Mesh | None) -> Callable[[Any, Any], Any]:
+    """function(environment, batch), where each device has its own part of the copies.
+
+    So none waits for another, or starts episodes because copies of another are done.
+    """
+    return function if mesh is None else over_devices(function, mesh)
 
 
 class GymnasiumVectorEnv(VectorEnv):
@@ -31,6 +75,8 @@ class GymnasiumVectorEnv(VectorEnv):
     policies that live elsewhere. A copy that diverges, as after an action of NaN, is truncated,
     flagged as `diverged` in the info, and reset like any other.
 
+    `copies` is where they stand, whose arrays the next step takes: `save` keeps them.
+
     Args:
         task: the name of a task, or an environment.
         num_envs: copies.
@@ -40,7 +86,13 @@ class GymnasiumVectorEnv(VectorEnv):
             whose info then has `final_obs` and `final_info`, or only by
             `reset(options={"reset_mask": …})`.
         randomize: (environment, key) → the environment of a copy for an episode.
+        devices: over how many the copies are spread, which must divide them; on a CPU,
+            `jax.config.update("jax_num_cpu_devices", 2)`, before JAX is used, makes two of it.
         options: of the task's `build`.
+
+    Raises:
+        ValueError: JAX has fewer devices, the copies do not divide over them, or a horizon is
+            given, which `max_episode_steps` says.
     """
 
     def __init__(
@@ -51,11 +103,14 @@ class GymnasiumVectorEnv(VectorEnv):
         render_mode: str | None = None,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         randomize: Randomize | None = None,
+        devices: int = 1,
         **options: Any,
     ) -> None:
+        adapters.check_no_horizon(options)
+        self.mesh = _line(devices, num_envs)
         environment = make(task, **options)
         limit = environment.horizon if max_episode_steps is None else max_episode_steps
-        self.environment = dataclasses.replace(environment, horizon=limit)
+        self.environment = self._everywhere(dataclasses.replace(environment, horizon=limit))
         self.randomize, self.num_envs = randomize, num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         kind = {"autoreset_mode": self.autoreset_mode, "jax": True}
@@ -74,7 +129,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """Starts an episode in every copy, or in those of `options["reset_mask"]`, (n,) of bools.
 
         Args:
-            seed: of all that is drawn from now on; None goes on drawing.
+            seed: of all that is drawn from now on, by those that are reset; None goes on drawing.
             options: `reset_mask`, or none.
 
         Raises:
@@ -85,17 +140,21 @@ class GymnasiumVectorEnv(VectorEnv):
         mask = (options or {}).get("reset_mask")
         if mask is None:
             key = adapters.key_from(self.np_random)
-            self.copies, _ = _begin(self.environment, key, self.num_envs, self.randomize)
-            return _look(self.environment, self.copies)
+            copies, _ = _begin(self.environment, key, self.num_envs, self.randomize)
+            self.copies = self._spread(copies)
+            return _look(self.environment, self.copies, self.mesh)
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(
                 f"reset: options['reset_mask'] must be {self.num_envs} bools, got {mask.dtype} of"
                 f" shape {mask.shape}."
             )
-        copies = _restart(self.environment, self._running(), jnp.asarray(mask), self.randomize)
-        self.copies = dataclasses.replace(copies, done=copies.done & ~mask)
-        return _look(self.environment, self.copies)
+        chosen, running = self._spread(jnp.asarray(mask)), self._running()
+        if seed is not None:  # else each goes on with its own key
+            running = _with_keys(running, chosen, adapters.key_from(self.np_random))
+        copies = _restart(self.environment, running, chosen, self.randomize, self.mesh)
+        self.copies = dataclasses.replace(copies, done=copies.done & ~chosen)
+        return _look(self.environment, self.copies, self.mesh)
 
     def step(self, actions: Any) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
         """One action of every copy, (n, number of actions), clipped to −1 to 1.
@@ -107,15 +166,17 @@ class GymnasiumVectorEnv(VectorEnv):
             ValueError: the actions have another shape.
         """
         copies = self._running()
-        if np.shape(actions) != self.action_space.shape:
+        # an array of JAX stays what it is: to ask JAX for it takes a tenth of a step of CartPole
+        actions = actions if isinstance(actions, jax.Array) else np.asarray(actions)
+        if actions.shape != self.action_space.shape:
             raise ValueError(
                 f"{type(self.environment).__name__}: actions must have shape"
-                f" {self.action_space.shape}, got {np.shape(actions)}; the numbers of each are"
+                f" {self.action_space.shape}, got {actions.shape}; the numbers of each are"
                 f" {', '.join(self.environment.actions)}."
             )
-        mode = self.autoreset_mode.value
+        mode, own = self.autoreset_mode.value, self._spread(actions)
         self.copies, outcome = _advance(
-            self.environment, copies, jnp.asarray(actions), mode, self.randomize
+            self.environment, copies, own, mode, self.randomize, self.mesh
         )
         ends = outcome.terminated, outcome.truncated
         return outcome.observation, outcome.reward, *ends, outcome.info
@@ -133,7 +194,7 @@ class GymnasiumVectorEnv(VectorEnv):
         Args:
             saved: from `save`.
         """
-        self.copies = jax.tree.map(jnp.asarray, saved["copies"])
+        self.copies = self._spread(jax.tree.map(jnp.asarray, saved["copies"]))
         self.np_random.bit_generator.state = saved["random"]
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -151,6 +212,16 @@ class GymnasiumVectorEnv(VectorEnv):
         """Lets go of the canvas."""
         self._canvas = None
 
+    def _everywhere(self, environment: Environment) -> Environment:
+        """The environment on every device."""
+        if self.mesh is None:
+            return environment
+        return jax.device_put(environment, NamedSharding(self.mesh, PartitionSpec()))
+
+    def _spread(self, batch: Any) -> Any:
+        """Copies, or what each of them gets, over the devices."""
+        return batch if self.mesh is None else shard(batch, self.mesh)
+
     def _running(self) -> Copies:
         """The copies.
 
@@ -160,3 +231,27 @@ class GymnasiumVectorEnv(VectorEnv):
         if self.copies is None:
             raise gymnasium.error.ResetNeeded("call reset before step, save or render.")
         return self.copies
+
+
+def _line(devices: int, copies: int) -> Mesh | None:
+    """The devices, or None where there is only one.
+
+    Raises:
+        ValueError: JAX has fewer, or the copies do not divide over them.
+    """
+    there = jax.devices()
+    if not 1 <= devices <= len(there):
+        raise ValueError(
+            f"devices must be from 1 to the {len(there)} of JAX, got {devices}; on a CPU,"
+            ' jax.config.update("jax_num_cpu_devices", …) makes more, before JAX is used.'
+        )
+    if copies % devices:
+        raise ValueError(f"num_envs={copies} does not divide over {devices} devices.")
+    return None if devices == 1 else Mesh(np.array(there[:devices]), ("worlds",))
+
+
+def _with_keys(copies: Copies, chosen: Array, key: Array) -> Copies:
+    """The copies with those keys for the chosen ones, (n,), that `begin` gives to all of them."""
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(chosen)))
+    keys = jnp.where(chosen[:, None], keys, copies.episode.key)
+    return dataclasses.replace(copies, episode=dataclasses.replace(copies.episode, key=keys))

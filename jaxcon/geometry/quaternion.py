@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
-from jaxcon.core.lanes import Matrix, Vector, componentwise, plus, times
+from jaxcon.core.lanes import Matrix, Vector, componentwise, minus, plus, times
 from jaxcon.core.typing import Array, Lane
 
 IDENTITY = Vector(1.0, 0.0, 0.0, 0.0)
@@ -32,7 +32,7 @@ def multiply(p: Any, q: Any) -> Any:
     scalar, vector = split(p)
     other, direction = split(q)
     turned = direction * scalar + vector * other + vector.cross(direction)
-    return Vector(plus(times(scalar, other), times(-1, vector.dot(direction))), *turned)
+    return Vector(minus(times(scalar, other), vector.dot(direction)), *turned)
 
 
 @componentwise
@@ -80,7 +80,7 @@ def rotation(q: Vector) -> Matrix:
     wx, wy, wz = times(w, x), times(w, y), times(w, z)
 
     def diagonal(a: Lane, b: Lane) -> Lane:
-        return plus(1.0, times(-2.0, plus(a, b)))
+        return minus(1.0, times(2.0, plus(a, b)))
 
     def twice(a: Lane, b: Lane, sign: int) -> Lane:
         return times(2.0, plus(a, times(sign, b)))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
@@ -37,6 +39,14 @@ class Scalar(NamedTuple):
     at: Coordinate
 
 
+class Numbers(NamedTuple):
+    """Of joints: ids (n,), and where their coordinates begin in qpos and qvel, (n, 1)."""
+
+    id: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+
+
 @pytree
 class Tree:
     """The links of a model and how MuJoCo's coordinates move them.
@@ -59,36 +69,53 @@ class Tree:
     scalars: tuple[Scalar, ...] = static()
     size: int = static()
 
-    def poses(self, qpos: Array) -> list[Pose]:
-        """Of the frame of every link: its parent's, its offset, and its joints one by one."""
-        poses: list[Pose] = []
-        for i, node in enumerate(self.nodes):
-            pose = Pose(self.positions[i], self.turns[i])
-            if node.parent >= 0:
-                above = poses[node.parent]
-                turn = quaternion.multiply(above.orientation, pose.orientation)
-                pose = Pose(above.point(pose.position), turn)
-            for joint in node.joints:
-                pose = self._moved(pose, joint, qpos)
-            poses.append(pose)
-        return poses
+    def poses(self, qpos: Array) -> Pose:
+        """Of the frames of all links, (links, …): a link's parent's, its offset, and its joints.
 
-    def _moved(self, pose: Pose, joint: LinkJoint, qpos: Array) -> Pose:
-        """The frame of a link after one of its joints; hinges and balls turn it about a point."""
-        if joint.kind == "free":
-            turn = quaternion.normalize(qpos[joint.q + 3 : joint.q + 7])
-            return Pose(qpos[joint.q : joint.q + 3], turn)
-        point, axis = self.points[joint.id], self.axes[joint.id]
-        if joint.kind == "slide":
-            travel = qpos[joint.q] - self.reference[joint.q]
-            return Pose(pose.position + pose.direction(axis) * travel, pose.orientation)
-        if joint.kind == "ball":
-            own = quaternion.normalize(qpos[joint.q : joint.q + 4])
-        else:
-            own = quaternion.exp(axis * (qpos[joint.q] - self.reference[joint.q]))
-        turned = Pose(pose.position, quaternion.multiply(pose.orientation, own))
-        anchor = pose.point(point)
-        return Pose(anchor - turned.direction(point), turned.orientation)
+        One move after the other in a scan, so that a program does not grow with the model.
+        """
+        order, bases, ends = _moves(self.nodes)
+        steps, turns = (jnp.concatenate(x)[order] for x in zip(*self._moved(qpos), strict=True))
+        upright = jnp.zeros((len(order) + 1, 4), qpos.dtype).at[:, 0].set(1)
+
+        def move(frames: tuple[Array, Array], now: Any) -> tuple[tuple[Array, Array], None]:
+            i, base, step, turn = now
+            places, orientations = frames
+            above = Pose(places[base], orientations[base])
+            place, turned = above.point(step), quaternion.multiply(above.orientation, turn)
+            return (places.at[i].set(place), orientations.at[i].set(turned)), None
+
+        world = jnp.zeros((len(order) + 1, 3), qpos.dtype), upright
+        numbers = jnp.arange(1, len(order) + 1)
+        (places, orientations), _ = jax.lax.scan(move, world, (numbers, bases, steps, turns))
+        return Pose(places[ends], orientations[ends])
+
+    def _moved(self, qpos: Array) -> list[tuple[Array, Array]]:
+        """Step (n, 3) and turn (n, 4) of each move in the frame before it: links, then `KINDS`."""
+        slide, hinge, ball, free = (self._joints(kind) for kind in KINDS)
+        travel = self.axes[slide.id] * (qpos - self.reference)[slide.q]
+        upright = jnp.zeros((len(travel), 4), qpos.dtype).at[:, 0].set(1)
+        angle = self.axes[hinge.id] * (qpos - self.reference)[hinge.q]
+        turned = quaternion.normalize(qpos[ball.q + np.arange(4)].T)
+        flown = quaternion.normalize(qpos[free.q + np.arange(3, 7)].T)
+        return [
+            (self.positions, self.turns),
+            (travel, upright),
+            self._about(hinge.id, quaternion.exp(angle.T)),
+            self._about(ball.id, turned),
+            (qpos[free.q + np.arange(3)], flown.T),
+        ]
+
+    def _about(self, joints: np.ndarray, turn: Array) -> tuple[Array, Array]:
+        """Turns (4, n) of joints about their points."""
+        point = self.points[joints]
+        return point - quaternion.rotate(turn, point.T).T, turn.T
+
+    def _joints(self, kind: str) -> Numbers:
+        """The joints of a kind."""
+        own = _of_kind(self.nodes, kind)
+        ids, q, v = (np.array([getattr(j, x) for j in own], int) for x in ("id", "q", "v"))
+        return Numbers(ids, q[:, None], v[:, None])
 
     def check(self, qpos: Array) -> None:
         """Checks three hinges of one link, where qpos is concrete.
@@ -117,34 +144,27 @@ class Tree:
     def rates(self, qpos: Array, qvel: Array) -> Array:
         """q̇pos, (nq,): qvel, with the quaternions of ball and free joints by ½ q ⊗ ω."""
         slopes = jnp.zeros_like(qpos)
-        for joint in (joint for node in self.nodes for joint in node.joints):
+        for kind in ("slide", "hinge"):
+            own = self._joints(kind)
+            slopes = slopes.at[own.q].set(qvel[own.v])
+        for joint in (*_of_kind(self.nodes, "free"), *_of_kind(self.nodes, "ball")):
             q, v = joint.q, joint.v
             if joint.kind == "free":
                 slopes = slopes.at[q : q + 3].set(qvel[v : v + 3])
                 q, v = q + 3, v + 3
-            if joint.kind in ("free", "ball"):
-                turning = quaternion.derivative(qpos[q : q + 4], qvel[v : v + 3])
-                slopes = slopes.at[q : q + 4].set(turning)
-            else:
-                slopes = slopes.at[q].set(qvel[v])
+            turning = quaternion.derivative(qpos[q : q + 4], qvel[v : v + 3])
+            slopes = slopes.at[q : q + 4].set(turning)
         return slopes
 
-    def motions(self, qpos: Array, qvel: Array) -> list[Motion]:
-        """Of the frame of every link; ω = 2 q* ⊗ q̇."""
-        poses, slopes = jax.jvp(self.poses, (qpos,), (self.rates(qpos, qvel),))
-        return [_motion(*pair) for pair in zip(poses, slopes, strict=True)]
+    def motions(self, qpos: Array, qvel: Array) -> Motion:
+        """Of the frames of all links, (links, …); ω = 2 q* ⊗ q̇."""
+        pose, slope = jax.jvp(self.poses, (qpos,), (self.rates(qpos, qvel),))
+        spin = quaternion.multiply(quaternion.conjugate(pose.orientation.T), slope.orientation.T)
+        return Motion(pose.position, pose.orientation, slope.position, 2 * spin[1:].T)
 
     def flat(self, system: Any, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        """q and v of the system."""
-        q = jnp.zeros(system.layout.n_q, qpos.dtype)
-        v = jnp.zeros(system.layout.n_v, qpos.dtype)
-        for node, motion in zip(self.nodes, self.motions(qpos, qvel), strict=True):
-            group, _ = system.layout.locate(node.name)
-            own = motion.seen_from(_inverse(system.offsets.get(node.name)))
-            x, y = system.layout.groups[group].kind.coordinates(own)
-            q = q.at[system.layout.q(node.name)].set(x)
-            v = v.at[system.layout.v(node.name)].set(y)
-        return q, v
+        """q and v of the system, all of whose links are of one kind; compiled as one."""
+        return _flat(self, system.layout, system.offsets, qpos, qvel)
 
     def turns_of(self, system: Any, qpos: Array) -> Any:
         """What a state at qpos remembers of the joints whose turns are counted."""
@@ -204,15 +224,54 @@ class Tree:
             yield list(scalars), list(ends)
 
 
-def _motion(pose: Pose, slope: Pose) -> Motion:
-    """From a pose and its derivative in time."""
-    spin = quaternion.multiply(quaternion.conjugate(pose.orientation), slope.orientation)
-    return Motion(pose.position, pose.orientation, slope.position, 2 * spin[1:])
+KINDS = ("slide", "hinge", "ball", "free")
+"""Of joints, in the order in which `Tree._moved` has them."""
 
 
-def _inverse(offset: Pose | None) -> Pose | None:
-    """The principal frame in the user's frame, from the user's in the principal frame."""
-    if offset is None:
-        return None
+def _of_kind(nodes: tuple[Node, ...], kind: str) -> list[LinkJoint]:
+    """The joints of a kind."""
+    return [joint for node in nodes for joint in node.joints if joint.kind == kind]
+
+
+def _moves(nodes: tuple[Node, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The moves from frame to frame: into each link, then along each of its joints.
+
+    Returns:
+        Which move of `Tree._moved` comes when, and the frame from which each begins, (moves,)
+        each, where 0 is the world and i + 1 what move i leads to; and that of each link, (links,).
+    """
+    joints = [joint for kind in KINDS for joint in _of_kind(nodes, kind)]
+    numbers = {joint.id: len(nodes) + i for i, joint in enumerate(joints)}
+    order: list[int] = []
+    bases: list[int] = []
+    ends: list[int] = []
+    for i, node in enumerate(nodes):
+        order.append(i)
+        bases.append(0 if node.parent < 0 else ends[node.parent])
+        for joint in node.joints:
+            bases.append(0 if joint.kind == "free" else len(order))
+            order.append(numbers[joint.id])
+        ends.append(len(order))
+    return np.array(order), np.array(bases), np.array(ends)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _flat(
+    tree: Tree, layout: Any, offsets: dict[str, Pose], qpos: Array, qvel: Array
+) -> tuple[Array, Array]:
+    names = [node.name for node in tree.nodes]
+    kind = layout.groups[layout.locate(names[0])[0]].kind
+    zero, upright = jnp.zeros(3, qpos.dtype), jnp.eye(4, dtype=qpos.dtype)[0]
+    own = [offsets.get(name, Pose(zero, upright)) for name in names]
+    frames = jax.vmap(_inverse)(jax.tree.map(lambda *x: jnp.stack(x), *own))
+    seen = jax.vmap(lambda motion, frame: motion.seen_from(frame))
+    x, y = jax.vmap(kind.coordinates)(seen(tree.motions(qpos, qvel), frames))
+    q, v = jnp.zeros(layout.n_q, qpos.dtype), jnp.zeros(layout.n_v, qpos.dtype)
+    at_q, at_v = (np.stack([where(n) for n in names]) for where in (layout.q, layout.v))
+    return q.at[at_q].set(x), v.at[at_v].set(y)
+
+
+def _inverse(offset: Pose) -> Pose:
+    """The principal frame of a link in the user's frame, from the user's in the principal frame."""
     back = quaternion.conjugate(offset.orientation)
     return Pose(-offset.local_direction(offset.position), back)

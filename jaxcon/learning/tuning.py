@@ -134,7 +134,9 @@ def tune(
     compiled = lowered.compile()
 
     def advance(search: Search) -> Any:
-        return compiled(search, limit, for_samples)
+        # chunks, at whose ends samples are judged, end where they would have without a break
+        ahead = (int(jnp.max(search.step)) // chunk + 1) * chunk
+        return compiled(search, jnp.asarray(min(ahead, steps), jnp.int32), for_samples)
 
     found, broken = _loop(advance, found, steps, save, progress, bool(samples))
     return result(space, found[0], found[1], broken)

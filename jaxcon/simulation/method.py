@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from jaxcon.constraints.bounds import count_bounds
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import PyTree
+from jaxcon.model.state import State
+from jaxcon.simulation.choice import choose
 from jaxcon.simulation.integrators import SemiImplicitEuler
 from jaxcon.simulation.stability import stable_rate
 from jaxcon.solvers.interior_point import InteriorPoint
@@ -61,6 +63,41 @@ class Method:
     recovery: Any = None
     bounded: Any = InteriorPoint()
     events: Any = None
+
+    @classmethod
+    def auto(
+        cls,
+        system: Any,
+        state: State,
+        batch: int = 1,
+        platform: str | None = None,
+        **parts: Any,
+    ) -> Method:
+        """The method with the solver that suits a system, by its structure; `report` says why.
+
+        Where M is diagonal, elimination along the structure is taken; where rows meet so closely
+        that it would be too long a program or takes more than matrices do, these; and iterations
+        where both are twenty times dearer, or do not fit into memory. Where M is not diagonal,
+        the Schur complement. Around it `RankSafe`, where constraints close loops or depend on each
+        other in this state. The same system, state and arguments give the same method.
+
+        Args:
+            system: a `BodySystem`, `GeneralizedSystem` or `Vakonomic`.
+            state: of one world, with known numbers, not traced.
+            batch: worlds that are to be stepped together, whose matrices must fit into memory.
+            platform: "cpu", "gpu" or "tpu", where it is to run; None for that of JAX.
+            parts: integrator, stabiliser and others, which are taken as they are.
+
+        Returns:
+            A plain `Method`.
+
+        Raises:
+            TypeError: the state is traced, or a part has an unknown name.
+            ValueError: the state does not belong to the system, or the batch is no count.
+        """
+        if "solver" not in parts:
+            parts["solver"] = choose(system, state, batch, platform).solver
+        return cls(**parts)
 
     def init(self, system: Any, q: Any, v: Any) -> PyTree:
         """What a state remembers for the method: a `Memory`, or () where there is nothing."""

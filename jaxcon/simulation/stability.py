@@ -104,6 +104,20 @@ def _first_unstable(method: Any, h: float, system: Any, state: Any) -> str | Non
     return None
 
 
+def default_gains(method: Any, dt: Any) -> tuple[Any, Any]:
+    """(α, β) of the first feedback in the stabiliser, or of the integrator where there is none.
+
+    Args:
+        method: whose stabiliser takes them where none are given.
+        dt: h, () [s].
+    """
+    for part in parts(method.feedback(dt)):
+        fallback = getattr(part, "fallback", None)
+        if fallback is not None:
+            return fallback
+    return method.integrator.default_gains(dt)
+
+
 def parts(stabilizer: Any) -> list[Any]:
     """A stabiliser and those that it consists of."""
     nested = (getattr(stabilizer, name, None) for name in ("others", "feedback", "small", "middle"))

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.lanes import plus, times, total
+from jaxcon.core.lanes import minus, plus, times, total
 from jaxcon.core.typing import Lane
 
 Block = list[list[Lane]]
@@ -24,11 +24,6 @@ def freeze(x: Any) -> Any:
         return jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf
 
     return jax.tree.map(one, x)
-
-
-def minus(x: Lane, y: Lane) -> Lane:
-    """x − y."""
-    return plus(x, times(-1, y))
 
 
 def ldl(a: Block, least: list[Lane] | None = None) -> Block:

@@ -135,25 +135,39 @@ def stiffness(problem: Bounded, point: Point) -> Array:
     """D = −∂u/∂λ along which products stay, (n, n)."""
     kinds, x = problem.kinds, point.primal
     boxes = point.low / point.below + point.high / point.above
-    total = _on_diagonal(jnp.concatenate([point.single / x.single, boxes, point.normal / x.normal]))
-    more = kinds.size - len(total)
-    if not more:
-        return total
-    total = jnp.pad(total, [(0, more)] * 2 + [(0, 0)] * (total.ndim - 2))
+    own = jnp.concatenate([point.single / x.single, boxes, point.normal / x.normal])
+    blocks = {(0, 0): own}
     sets = zip(kinds.discs, kinds.starts, cones(kinds, point), strict=False)
     for disc, start, cone in sets:
-        count, rank = disc.count, disc.rank
         one, none = jnp.ones_like(cone.normal), jnp.zeros_like(cone.normal)
-        columns = [(kinds.normal + disc.first, _slip_rate(cone, one, _zero(cone.tail)))]
-        columns += [
-            (start + i * count, _slip_rate(cone, none, _axis(cone.tail, i))) for i in range(rank)
-        ]
-        for j in range(rank):
-            row = start + j * count
-            for column, rate in columns:
-                block = _on_diagonal(rate.components[j])
-                total = total.at[row : row + count, column : column + count].add(-block)
-    return total
+        places = [start + i * disc.count for i in range(disc.rank)]
+        rates = [_slip_rate(cone, none, _axis(cone.tail, i)) for i in range(disc.rank)]
+        columns = [*zip(places, rates, strict=True)]
+        columns.append((kinds.normal + disc.first, _slip_rate(cone, one, _zero(cone.tail))))
+        for column, rate in columns:
+            blocks |= {(r, column): -c for r, c in zip(places, rate.components, strict=True)}
+    return _assembled(blocks, kinds.size)
+
+
+def _assembled(blocks: dict[tuple[int, int], Array], n: int) -> Array:
+    """The matrix (n, n) of diagonal blocks by their first row and column, zero elsewhere."""
+    rows = []
+    for row in sorted({row for row, _ in blocks}):
+        known = sorted(
+            ((c, x) for (r, c), x in blocks.items() if r == row), key=lambda pair: pair[0]
+        )
+        parts, end = [], 0
+        for column, block in known:
+            parts += [_nothing(block, column - end), _on_diagonal(block)]
+            end = column + len(block)
+        parts.append(_nothing(known[0][1], n - end))
+        rows.append(jnp.concatenate(parts, axis=1))
+    return jnp.concatenate(rows)
+
+
+def _nothing(like: Array, columns: int) -> Array:
+    """Zeros (n, columns, …) beside a diagonal block of n rows."""
+    return jnp.zeros((len(like), columns, *like.shape[1:]), like.dtype)
 
 
 def asked(kinds: Kinds, point: Point, aim: Target) -> Parts:

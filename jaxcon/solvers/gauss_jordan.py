@@ -19,20 +19,32 @@ def inverse(matrix: Array) -> Array:
     For matrices whose leading blocks are regular, such as a positive definite one and what
     complementarity adds to its diagonal blocks.
     """
+    n = matrix.shape[0]
+    places = jnp.arange(n).reshape(-1, *(1,) * (matrix.ndim - 2))
 
     def eliminate(k: Any, a: Array) -> Array:
-        row, column = a[k], a[:, k]
-        pivot = 1 / row[k]
-        scaled = (row * pivot[None]).at[k].set(pivot)
-        rest = a.at[:, k].set(0) - column[:, None] * scaled[None]
-        return rest.at[k].set(scaled)
+        row, column, here = at(a, k), at(a, k, 1), places == k
+        pivot = 1 / at(row, k)
+        scaled = jnp.where(here, pivot[None], row * pivot[None])
+        rest = jnp.where(here[None], 0, a) - column[:, None] * scaled[None]
+        return jnp.where(here[:, None], scaled[None], rest)
 
-    n = matrix.shape[0]
     if n > UNROLLED:
         return jax.lax.fori_loop(0, n, eliminate, matrix)
     for k in range(n):
         matrix = eliminate(k, matrix)
     return matrix
+
+
+def at(x: Array, i: Any, axis: int = 0) -> Array:
+    """The i-th along an axis, i being known when tracing or not."""
+    pick = jax.lax.index_in_dim if isinstance(i, int) else jax.lax.dynamic_index_in_dim
+    return pick(x, i, axis, keepdims=False)
+
+
+def put(x: Array, value: Array, i: Any) -> Array:
+    """With another i-th entry; a write in place, which `x.at[i].set(value)` is not to XLA."""
+    return jax.lax.dynamic_update_index_in_dim(x, value, i, 0)
 
 
 def apply(matrix: Array, x: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,8 @@ from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan
-from jaxcon.solvers.bounded import Bounded, onto_disc, slope
+from jaxcon.solvers.bounded import Bounded, Parts, onto_disc, slope
+from jaxcon.solvers.gauss_jordan import at, put
 
 
 @pytree
@@ -48,21 +49,68 @@ class GaussSeidel:
 
     def solve(self, problem: Bounded, start: Array) -> Array:
         """λ, (n,), from a first guess (n,)."""
-        return jax.lax.fori_loop(0, self.sweeps, lambda _, x: sweep(problem, x), start)
+        known = pivots(problem)
+        return jax.lax.fori_loop(0, self.sweeps, lambda _, x: sweep(problem, x, known), start)
 
 
-def sweep(problem: Bounded, multipliers: Array) -> Array:
+class Pivots(NamedTuple):
+    """What multipliers add to their own velocities, by what is solved at once.
+
+    Attributes:
+        rows: of one-sided rows and boxes, one each.
+        lower, upper: their bounds.
+        normal: of contacts.
+        discs: by disc, the larger eigenvalue of the block of each contact.
+    """
+
+    rows: Array
+    lower: Array
+    upper: Array
+    normal: Array
+    discs: tuple[Array, ...]
+
+
+def pivots(problem: Bounded) -> Pivots:
+    """The same for all sweeps."""
+    kinds, own = problem.kinds, problem.kinds.split(gauss_jordan.diagonal(problem.matrix))
+    free = jnp.zeros((kinds.single, *problem.lower.shape[1:]), problem.lower.dtype)
+    tiny = float(jnp.finfo(problem.matrix.dtype).tiny) ** 0.5  # below it a row does not move itself
+    largest = []
+    for disc, start, diagonal in zip(kinds.discs, kinds.starts, own.discs, strict=False):
+        most = diagonal[0] if len(diagonal) else own.normal
+        if len(diagonal) == 2:
+            (a, c), b = diagonal, _across(problem.matrix, start, disc.count)
+            most = (a + c) / 2 + jnp.sqrt(((a - c) / 2) ** 2 + b * b)
+        largest.append(jnp.maximum(most, tiny))
+    return Pivots(
+        problem.diagonal()[: kinds.normal],
+        jnp.concatenate([free, problem.lower]),
+        jnp.concatenate([free + jnp.inf, problem.upper]),
+        jnp.maximum(own.normal, tiny),
+        tuple(largest),
+    )
+
+
+def _across(matrix: Array, start: int, count: int) -> Array:
+    """Between the two rows of each contact of a disc, (count,)."""
+    block = matrix[start : start + count, start + count : start + 2 * count]
+    return gauss_jordan.diagonal(block)
+
+
+def sweep(problem: Bounded, multipliers: Array, known: Pivots | None = None) -> Array:
     """Each row and each contact solved once, with all others held."""
-    x = _contacts(problem, _rows(problem, multipliers))
+    known = pivots(problem) if known is None else known
+    x = _contacts(problem, _rows(problem, multipliers, known), known)
     for i in range(len(problem.kinds.turning)):
-        x = _turning(problem, i, x)
+        x = _turning(problem, i, x, known)
     return x
 
 
 def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     """The best of multipliers near to the solution and those of some rounds from there.
 
-    A round is a Newton step on the residual, or a sweep where that does not make it smaller.
+    A round is a Newton step on the residual, or, where that does not make it smaller, a sweep,
+    every other time carried on.
 
     Args:
         problem: u = G λ + c and bounds.
@@ -71,7 +119,7 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     """
     rounding = 16 * float(jnp.finfo(multipliers.dtype).eps)
     terms = jnp.sum(jnp.abs(problem.matrix * multipliers[None]), axis=1) + jnp.abs(problem.offset)
-    enough = rounding * jnp.max(terms, axis=0)
+    enough, pivot = rounding * jnp.max(terms, axis=0), pivots(problem)
 
     def going(known: tuple[Any, Array, Array]) -> Array:
         count, _, best = known
@@ -81,7 +129,8 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
         count, x, best = known
         inverse = gauss_jordan.inverse(slope(problem.residual, x))
         new = x - gauss_jordan.apply(inverse, problem.residual(x))
-        swept = sweep(problem, x)
+        swept = sweep(problem, x, pivot)
+        swept = jnp.where(count % 2 == 1, carried(problem, x, swept), swept)
         x = jnp.where((problem.worst(new) < problem.worst(x))[None], new, swept)
         best = jnp.where((problem.worst(x) < problem.worst(best))[None], x, best)
         return count + 1, x, best
@@ -90,24 +139,49 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     return jax.lax.while_loop(going, once, start)[2]
 
 
-def _rows(problem: Bounded, multipliers: Array) -> Array:
+def carried(problem: Bounded, multipliers: Array, swept: Array) -> Array:
+    """A sweep's change of λ carried on until the first one-sided row that it unloads bears nothing.
+
+    Where more rows bear than can be met together, as at the four corners of a face, one has to let
+    go. Newton's matrix is singular there, and sweeps unload it by little at a time.
+
+    Args:
+        problem: u = G λ + c and bounds.
+        multipliers: λ, (n,).
+        swept: λ after a sweep, (n,).
+    """
+    kinds, change = problem.kinds, swept - multipliers
+    here, rate = kinds.split(multipliers), kinds.split(change)
+    lasts = [
+        jnp.where((x > 0) & (d < 0), -x / jnp.where(d < 0, d, -1), jnp.inf)
+        for x, d in ((here.single, rate.single), (here.normal, rate.normal))
+    ]
+    first = jnp.maximum(jnp.min(jnp.concatenate(lasts), axis=0, initial=jnp.inf), 1)
+    far = kinds.split(multipliers + jnp.where(jnp.isfinite(first), first, 1)[None] * change)
+    single, normal = (
+        jnp.where(jnp.isfinite(last) & (last <= first[None]), 0, jnp.maximum(x, 0))
+        for last, x in zip(lasts, (far.single, far.normal), strict=True)
+    )
+    sets = zip(kinds.discs, far.discs, strict=True)
+    discs = tuple(x * disc.of(normal > 0).astype(normal.dtype) for disc, x in sets)
+    box = jnp.clip(far.box, problem.lower, problem.upper)
+    return kinds.join(Parts(single, box, normal, discs))
+
+
+def _rows(problem: Bounded, multipliers: Array, known: Pivots) -> Array:
     """One-sided rows and boxes, one after the other."""
-    kinds, scale = problem.kinds, problem.diagonal()
-    if not kinds.normal:
+    if not problem.kinds.normal:
         return multipliers
-    free = jnp.zeros((kinds.single, *problem.lower.shape[1:]), multipliers.dtype)
-    lower = jnp.concatenate([free, problem.lower])
-    upper = jnp.concatenate([free + jnp.inf, problem.upper])
 
     def one(i: Any, x: Array) -> Array:
-        new = x[i] - _velocity(problem, i, x) / scale[i]
-        return x.at[i].set(jnp.clip(new, lower[i], upper[i]))
+        new = at(x, i) - _velocity(problem, i, x) / at(known.rows, i)
+        return put(x, jnp.clip(new, at(known.lower, i), at(known.upper, i)), i)
 
-    return jax.lax.fori_loop(0, kinds.normal, one, multipliers)
+    return jax.lax.fori_loop(0, problem.kinds.normal, one, multipliers)
 
 
-def _contacts(problem: Bounded, multipliers: Array) -> Array:
-    """Contacts, one after the other."""
+def _contacts(problem: Bounded, multipliers: Array, known: Pivots) -> Array:
+    """Contacts, one after the other: the normal, and tangents by what it then is."""
     kinds = problem.kinds
     if not kinds.contacts:
         return multipliers
@@ -115,49 +189,37 @@ def _contacts(problem: Bounded, multipliers: Array) -> Array:
     def one(i: Any, x: Array) -> Array:
         n = kinds.normal + i
         rows = [n + (1 + j) * kinds.contacts for j in range(kinds.tangents)]
-        stiffness = jnp.maximum(problem.matrix[n, n], _tiny(problem))
-        normal = jnp.maximum(x[n] - _velocity(problem, n, x) / stiffness, 0)
-        return _disc(problem, rows, problem.friction[i] * normal, x.at[n].set(normal))
+        normal = jnp.maximum(at(x, n) - _velocity(problem, n, x) / at(known.normal, i), 0)
+        change = normal - at(x, n)
+        slips = [_velocity(problem, j, x) + at(at(problem.matrix, j), n) * change for j in rows]
+        radius = at(problem.friction, i) * normal
+        return _disc(rows, slips, at(known.discs[0], i), radius, put(x, normal, n))
 
     return jax.lax.fori_loop(0, kinds.contacts, one, multipliers)
 
 
-def _turning(problem: Bounded, which: int, multipliers: Array) -> Array:
+def _turning(problem: Bounded, which: int, multipliers: Array, known: Pivots) -> Array:
     """Resistance to rolling or spinning, contact by contact."""
     kinds = problem.kinds
     disc, start, most = kinds.turning[which], kinds.starts[1 + which], problem.resistance[which]
 
     def one(i: Any, x: Array) -> Array:
         rows = [start + j * disc.count + i for j in range(disc.rank)]
-        return _disc(problem, rows, most[i] * x[kinds.normal + disc.first + i], x)
+        slips = [_velocity(problem, j, x) for j in rows]
+        radius = at(most, i) * at(x, kinds.normal + disc.first + i)
+        return _disc(rows, slips, at(known.discs[1 + which], i), radius, x)
 
     return jax.lax.fori_loop(0, disc.count, one, multipliers)
 
 
-def _disc(problem: Bounded, rows: list[Any], radius: Array, x: Array) -> Array:
+def _disc(rows: list[Any], slips: list[Array], pivot: Array, radius: Array, x: Array) -> Array:
     """λ with that of one disc solved, all others held."""
-    most = jnp.maximum(_largest(problem, rows), _tiny(problem))
-    tangent = Vector(*(x[j] - _velocity(problem, j, x) / most for j in rows))
+    tangent = Vector(*(at(x, j) - u / pivot for j, u in zip(rows, slips, strict=True)))
     for j, y in zip(rows, onto_disc(tangent, radius), strict=True):
-        x = x.at[j].set(y)
+        x = put(x, y, j)
     return x
 
 
 def _velocity(problem: Bounded, i: Any, multipliers: Array) -> Array:
     """uᵢ, by world."""
-    return jnp.sum(problem.matrix[i] * multipliers, axis=0) + problem.offset[i]
-
-
-def _largest(problem: Bounded, rows: list[Any]) -> Array:
-    """The larger eigenvalue of a block of one or two rows."""
-    g = problem.matrix
-    if len(rows) == 1:
-        return g[rows[0], rows[0]]
-    a, b, c = (g[i, j] for i, j in ((rows[0], rows[0]), (rows[0], rows[1]), (rows[1], rows[1])))
-    return (a + c) / 2 + jnp.sqrt(((a - c) / 2) ** 2 + b * b)
-
-
-def _tiny(problem: Bounded) -> Array:
-    """Below it a row does not move itself, by world."""
-    dtype = problem.matrix.dtype
-    return float(jnp.finfo(dtype).tiny) ** 0.5 + 0 * problem.offset[0]
+    return jnp.sum(at(problem.matrix, i) * multipliers, axis=0) + at(problem.offset, i)

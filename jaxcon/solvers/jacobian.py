@@ -114,14 +114,14 @@ class Jacobian:
         return jnp.concatenate([x for x in lanes if x.shape[0]])
 
     def columns(self, like: Array) -> Array:
-        """Jᵀ as right sides (n_v, …, n_c) for lanes like (n_c, …)."""
-        n = self.shape[0]
-        unit = jnp.eye(n, dtype=like.dtype).reshape(n, *(1,) * (like.ndim - 1), n)
-        return widened(self).transpose(jnp.broadcast_to(unit, (*like.shape, n)))
+        """Jᵀ as right sides (n_v, n_c, …) for lanes like (n_c, …)."""
+        n, batch = self.shape[0], like.shape[1:]
+        unit = jnp.eye(n, dtype=like.dtype).reshape(n, n, *(1,) * len(batch))
+        return widened(self, len(batch)).transpose(jnp.broadcast_to(unit, (n, n, *batch)))
 
     def each(self, v: Array) -> Array:
-        """J v of many v (n_v, …, k), (n_c, …, k)."""
-        return widened(self).apply(v)
+        """J v of many v (n_v, k, …), (n_c, k, …)."""
+        return widened(self, v.ndim - 2).apply(v)
 
     def only(self, kept: np.ndarray, like: Array) -> Jacobian:
         """J with rows of zeros where they are not kept, (n_c,); `like` has the axes of a lane."""
@@ -157,27 +157,25 @@ class Jacobian:
 
 @pytree
 class Gathered:
-    """J of rows that are not the same in each world, its columns first: Jᵀ (n_v, …, n)."""
+    """J of rows that are not the same in each world, its columns first: Jᵀ (n_v, n, …)."""
 
     transposed: Array
 
     def apply(self, v: Array) -> Array:
         """J v, (n,)."""
-        return jnp.moveaxis(jnp.sum(self.transposed * v[..., None], axis=0), -1, 0)
+        return jnp.sum(self.transposed * v[:, None], axis=0)
 
     def transpose(self, multipliers: Array) -> Array:
         """Jᵀ λ, (n_v,)."""
-        return jnp.sum(self.transposed * jnp.moveaxis(multipliers, 0, -1)[None], axis=-1)
+        return jnp.sum(self.transposed * multipliers[None], axis=1)
 
     def columns(self, like: Array) -> Array:
-        """Jᵀ as right sides (n_v, …, n) for lanes like (n, …)."""
-        shape = (len(self.transposed), *like.shape[1:], len(like))
-        return jnp.broadcast_to(self.transposed, shape)
+        """Jᵀ as right sides (n_v, n, …) for lanes like (n, …)."""
+        return jnp.broadcast_to(self.transposed, (len(self.transposed), *like.shape))
 
     def each(self, v: Array) -> Array:
-        """J v of many v (n_v, …, k), (n, …, k)."""
-        every = jnp.sum(self.transposed[..., None] * v[..., None, :], axis=0)
-        return jnp.moveaxis(every, -2, 0)
+        """J v of many v (n_v, k, …), (n, k, …)."""
+        return jnp.sum(self.transposed[:, :, None] * v[:, None], axis=0)
 
 
 def _chosen(kept: np.ndarray, like: Array, lane: Lane) -> Lane:

@@ -110,8 +110,8 @@ class Choice:
         return jnp.take_along_axis(x, self.rows, axis=0)
 
     def columns(self, x: Array) -> Array:
-        """Of an array (m, …, n), (m, …, k)."""
-        return jnp.take_along_axis(x, jnp.moveaxis(self.rows, 0, -1)[None], axis=-1)
+        """Of an array (m, n, …), (m, k, …)."""
+        return jnp.take_along_axis(x, self.rows[None], axis=1)
 
     def contacts(self, x: Array) -> Array:
         """Of numbers of each contact."""

@@ -15,7 +15,15 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
-from jaxcon.solvers.proximal import RankSafe, conflicts, proximal, remainder, row_weights, scaled
+from jaxcon.solvers.proximal import (
+    RankSafe,
+    conflicts,
+    own_diagonal,
+    proximal,
+    remainder,
+    row_weights,
+    scaled,
+)
 from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
 from jaxcon.stabilization.gains import check_gains, column
@@ -104,7 +112,9 @@ class AugmentedLagrangian(Unstabilized):
         weight = row_weights(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
-        solution = rounds(system.force, system.target, start)
+        acts = _acts(system)  # of the others W alone would make λ, huge, for the next step to feel
+        target, start = (jnp.where(acts, x, 0) for x in (system.target, start))
+        solution = rounds(system.force, target, start)
         if not system.loops:
             return solution
         left = remainder(system, system.target, solution)
@@ -131,3 +141,9 @@ class AugmentedLagrangian(Unstabilized):
     ) -> Any:
         """As the feedback does."""
         return self.feedback.correct(system, solver, before, state, memory.feedback, dt)
+
+
+def _acts(system: Saddle) -> Array:
+    """Which rows have a direction or compliance; those of a distance without length have none."""
+    own = own_diagonal(system.mass, system.jacobian, system.target.ndim - 1)
+    return (own if system.compliance is None else own + system.compliance) != 0

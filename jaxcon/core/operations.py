@@ -1,4 +1,4 @@
-"""Arithmetic operations counted from a jaxpr, each distinct value once.
+"""Arithmetic of a traced function, counted from its jaxpr, each distinct value once.
 
 Each arithmetic operation on a floating-point number counts as one, whether it is an addition, a
 division or a sine; data movement, comparisons and integers count as none. What is computed twice
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -24,11 +24,36 @@ ELEMENTWISE = frozenset(COUNTED.split())
 REDUCTIONS = frozenset({"reduce_sum", "reduce_max", "reduce_min", "reduce_prod", "cumsum"})
 COMMUTING = frozenset({"add", "mul", "max", "min"})
 
+Branch = Callable[[Iterable[float]], float]
 
-def count(jaxpr: Any) -> float:
-    """Arithmetic operations of a jaxpr, those of inner ones included."""
-    values = Values()
+
+def count(jaxpr: Any, branch: Branch = max) -> float:
+    """Arithmetic operations of a jaxpr, those of inner ones included.
+
+    Args:
+        jaxpr: to be counted.
+        branch: which of the branches of a conditional counts: max, or min for the cheapest.
+    """
+    values = Values(branch)
     return values.evaluate(jaxpr, [values.fresh() for _ in jaxpr.invars])[0]
+
+
+def instructions(jaxpr: Any) -> int:
+    """Equations of a jaxpr, those of inner ones in the place of what holds them; loops once."""
+    total = 0
+    for equation in jaxpr.eqns:
+        inner = list(inside(equation))
+        total += sum(map(instructions, inner)) if inner else 1
+    return total
+
+
+def primitives(jaxpr: Any) -> set[str]:
+    """Names of the primitives of a jaxpr, those of inner ones included."""
+    found: set[str] = set()
+    for equation in jaxpr.eqns:
+        found.add(equation.primitive.name)
+        found = found.union(*map(primitives, inside(equation)))
+    return found
 
 
 class Values:
@@ -39,10 +64,12 @@ class Values:
     within it values are distinct from those outside.
 
     Attributes:
+        branch: as of `count`.
         known: the numbers of the results, by what they are computed from.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, branch: Branch) -> None:
+        self.branch = branch
         self.known: dict[Any, list[int]] = {}
         self.numbers = itertools.count()
 
@@ -81,7 +108,7 @@ class Values:
         if key in self.known:
             return 0.0, self.known[key]
         self.known[key] = [self.fresh() for _ in equation.outvars]
-        return operations(equation), self.known[key]
+        return operations(equation, self.branch), self.known[key]
 
     def literal(self, x: Any) -> int:
         """A number written into the program."""
@@ -101,10 +128,7 @@ def called_by(equation: Any, inputs: list[int]) -> tuple[Any, list[int]] | None:
         before = lengths.matvec + lengths.vecmat
         constants = inputs[before : before + lengths.solve]
         return params["jaxprs"].solve.jaxpr, constants + inputs[sum(lengths) :]
-    if name == "native":
-        shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
-        return jax.make_jaxpr(params["fun"])(*shapes).jaxpr, inputs
-    inner = [] if name in ("scan", "while", "cond") else list(jaxprs(params))
+    inner = [] if name in ("scan", "while", "cond") else list(inside(equation))
     whole = len(inner) == 1 and len(inner[0].invars) == len(inputs)
     return (inner[0], inputs) if whole else None
 
@@ -119,23 +143,32 @@ def parameters(equation: Any) -> Any:
     return params
 
 
-def operations(equation: Any) -> float:
-    """Of one equation; a loop of unknown length counts as one round, a choice as the longest."""
+def operations(equation: Any, branch: Branch = max) -> float:
+    """Of one equation; a loop of unknown length counts as one round."""
     name, params = equation.primitive.name, equation.params
     if name == "scan":
-        return params["length"] * count(params["jaxpr"].jaxpr)
+        return params["length"] * count(params["jaxpr"].jaxpr, branch)
     if name == "cond":
-        return max(count(branch.jaxpr) for branch in params["branches"])
-    inner = list(jaxprs(params))
-    return sum(map(count, inner)) if inner else arithmetic(equation)
+        return branch(count(part.jaxpr, branch) for part in params["branches"])
+    inner = list(inside(equation))
+    return sum(count(x, branch) for x in inner) if inner else arithmetic(equation)
 
 
-def jaxprs(params: dict[str, Any]) -> Iterator[Any]:
-    """Those among the parameters of an equation that it evaluates."""
+def inside(equation: Any) -> Iterator[Any]:
+    """The jaxprs that an equation evaluates; none where it is an instruction."""
+    name, params = equation.primitive.name, equation.params
+    if name == "custom_linear_solve":  # runs its solver; the matrix is only for derivatives
+        yield params["jaxprs"].solve.jaxpr
+        return
+    if name == "native":
+        shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
+        yield jax.make_jaxpr(params["fun"])(*shapes).jaxpr
+        return
     for value in params.values():
-        closed = getattr(value, "jaxpr", value)
-        if hasattr(closed, "eqns"):
-            yield closed
+        for part in value if isinstance(value, tuple) else (value,):
+            closed = getattr(part, "jaxpr", part)
+            if hasattr(closed, "eqns"):
+                yield closed
 
 
 def arithmetic(equation: Any) -> float:
@@ -157,6 +190,9 @@ def arithmetic(equation: Any) -> float:
         return result.size * result.shape[-1] / 3
     if name == "lu":
         return 2 * result.size * result.shape[-1] / 3
+    if name == "eigh":  # Golub and Van Loan, Matrix Computations (2013), section 8.3
+        vectors = max(equation.outvars, key=lambda x: x.aval.size).aval
+        return 9 * vectors.size * vectors.shape[-1]
     if name == "triangular_solve":
         return result.size * equation.invars[0].aval.shape[-1]
     return result.size if name in ELEMENTWISE else 0.0

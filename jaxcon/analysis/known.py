@@ -1,0 +1,140 @@
+"""What is known of a scene and a method before it is judged. Host code."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.analysis.probe import Probe, probe
+from jaxcon.constraints.rows import Rows
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics.assembly import assemble
+from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
+from jaxcon.model.state import State, at
+from jaxcon.simulation.choice import Choice, choose
+from jaxcon.simulation.method import Method
+from jaxcon.simulation.stability import default_gains, parts
+
+ASIDE = 0.05
+"""How far a configuration is moved to see whether rows depend on each other there, too."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """A scene at a state, and a method on it.
+
+    Attributes:
+        system: as its state remembers it.
+        state: of one world.
+        method: by which it is to be stepped.
+        dt: h [s]; None where it is not known.
+        control: of a step, or None.
+        batch: worlds that are to be stepped together.
+        rows: linearized.
+        mass: M, (n_v, n_v).
+        jacobian: J, (n_c, n_v).
+    """
+
+    system: Any
+    state: State
+    method: Method
+    dt: float | None
+    control: PyTree
+    batch: int
+    rows: Rows
+    mass: Array
+    jacobian: Array
+
+    @classmethod
+    def of(
+        cls,
+        system: Any,
+        state: State,
+        method: Method | None = None,
+        dt: Any = None,
+        control: PyTree = None,
+        batch: int = 1,
+    ) -> Known:
+        """The same from what a user gives."""
+        system = at(system, state, "jc.report(system, s)")
+        rows, jacobian, mass = linearized(system, state)
+        h = None if dt is None else float(dt)
+        return cls(system, state, method or Method(), h, control, batch, rows, mass, jacobian)
+
+    @cached_property
+    def unit(self) -> UnitRows:
+        """The rows at unit length."""
+        return UnitRows(self.rows.layout, self.jacobian, self.mass)
+
+    @cached_property
+    def dependent(self) -> list[int]:
+        """Numbers of the unit rows that depend on those before them."""
+        return dependent_rows(self.unit.values, self.unit.tolerance)
+
+    @cached_property
+    def conflicts(self) -> dict[str, tuple[float, float, float]]:
+        """What least squares leave of φ, φ̇ and γ, of the constraints where they leave any."""
+        rows = self.rows
+        left = [self.unit.contradicting(x) for x in (rows.residual, rows.rate, rows.bias)]
+        return {
+            name: (left[0].get(name, 0.0), left[1].get(name, 0.0), left[2].get(name, 0.0))
+            for name in rows.layout.names
+            if any(name in part for part in left)
+        }
+
+    @cached_property
+    def choice(self) -> Choice:
+        """The solver that `Method.auto` takes."""
+        return choose(self.system, self.state, self.batch, dependent=len(self.dependent))
+
+    @cached_property
+    def probe(self) -> Probe | None:
+        """What some steps leave open; None where the step is not known."""
+        if self.dt is None:
+            return None
+        return probe(self.system, self.method, self.state, self.control, self.dt)
+
+    @cached_property
+    def passing(self) -> bool:
+        """Whether fewer rows depend on each other beside this position, where it can be left."""
+        _, s, vt = np.linalg.svd(self.unit.values)
+        free = vt[int(np.sum(s > self.unit.tolerance)) :]
+        if not self.dependent or not len(free):
+            return False
+        along = self.velocities(np.random.default_rng(0).normal(size=len(free)) @ free)
+        moved = assemble(self.system, self.moved(ASIDE * along / np.max(np.abs(along))))
+        if int(moved.status):
+            return False
+        rows, jacobian, mass = linearized(self.system, moved.state)
+        unit = UnitRows(rows.layout, jacobian, mass)
+        return len(dependent_rows(unit.values, unit.tolerance)) < len(self.dependent)
+
+    def velocities(self, x: np.ndarray) -> np.ndarray:
+        """A displacement (n_v,) from one in the metric in which rows have unit length."""
+        return np.linalg.solve(np.linalg.cholesky(np.asarray(self.mass, np.float64)).T, x)
+
+    def moved(self, step: np.ndarray) -> State:
+        """The state at q ⊕ Δ, Δ (n_v,)."""
+        move = jnp.asarray(step, self.state.q.dtype)
+        return dataclasses.replace(self.state, q=_retract(self.system, self.state.q, move))
+
+
+@jax.jit
+def _retract(system: Any, q: Array, step: Array) -> Array:
+    return system.retract(q, step)
+
+
+def asked_gains(method: Method, dt: float) -> tuple[float, float]:
+    """(α, β) of the first feedback that has numbers for all rows, or of those without gains."""
+    for part in parts(method.feedback(jnp.asarray(dt))):
+        pair = [getattr(part, name, None) for name in ("alpha", "beta")]
+        if all(x is not None and not isinstance(x, dict) and np.ndim(x) == 0 for x in pair):
+            return float(pair[0]), float(pair[1])  # type: ignore[arg-type]
+    α, β = default_gains(method, jnp.asarray(dt))
+    return float(α), float(β)

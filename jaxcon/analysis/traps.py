@@ -1,0 +1,252 @@
+"""The traps of constrained dynamics, and whether a scene and a method are in one (chapter 3.11)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.analysis.known import Known, asked_gains
+from jaxcon.dynamics.rank import linearized
+from jaxcon.simulation.choice import several, words
+from jaxcon.simulation.method import Method
+from jaxcon.simulation.stability import instability, parts
+from jaxcon.solvers.conjugate_gradients import ConjugateGradients
+from jaxcon.solvers.gauss_seidel import GaussSeidel
+from jaxcon.solvers.priority import Lexicographic
+from jaxcon.solvers.proximal import RankSafe
+
+OFF = 1e-4
+"""‖φ‖ [m, rad] from which on a report speaks of it."""
+MOVING = 1e-3
+"""‖φ̇‖ or ‖ψ‖ [m/s, rad/s] from which on it speaks of that."""
+WEAK = 1e-2
+"""Singular value of n unit rows, times n, below which a direction is nearly lost."""
+CURVED = 0.1
+"""Of φ, what one linear correction may leave before the way is called curved."""
+SUDDEN = 0.5
+"""h β from which on feedback takes an error away in about one step."""
+DEARER = 3.0
+"""How many times the operations of elimination are worth a word."""
+MANY = 12
+"""Rows from which on that matters."""
+
+
+def found(known: Known) -> dict[str, str]:
+    """Warnings by trap, of those of `TRAPS` in which the scene or the method is."""
+    told = ((name, test(known)) for name, (_, test) in TRAPS.items())
+    return {name: words for name, words in told if words}
+
+
+def gains(known: Known) -> str | None:
+    """Trap 1: feedback or springs that the step cannot follow."""
+    if known.dt is None:
+        return None
+    return instability(known.method, known.dt, known.system, known.state)
+
+
+def singular(known: Known) -> str | None:
+    """Trap 2: a position in which rows lose their rank, or nearly do."""
+    if known.dependent:
+        if not known.passing:
+            return None
+        names = _names(known, known.dependent)
+        return (
+            f"rows of {names} depend on others here, but not beside this position: it is singular."
+            f" Its forces are not unique, and the motion may branch. {_taken(known)}"
+        )
+    if not len(known.unit.values):
+        return None
+    u, s, _ = np.linalg.svd(known.unit.values)
+    n, least = len(u), s[-1] if len(s) == len(u) else 0.0
+    eps = float(jnp.finfo(known.state.q.dtype).eps)
+    shares = 1 / np.maximum(np.diag(np.linalg.pinv(known.unit.values @ known.unit.values.T)), 1)
+    if least > WEAK / n and np.min(shares) > 10 * n * eps:
+        return None
+    names = _names(known, [int(i) for i in np.argsort(-np.abs(u[:, -1]))[:2]])
+    return (
+        f"rows of {names} nearly depend on others: a force along them hardly moves anything, so"
+        f" that forces are up to {1 / max(least, eps):.1g} times as large as elsewhere, and so are"
+        " the errors of rounding. Move away from this position, or take RankSafe(…) and float64."
+    )
+
+
+def order(known: Known) -> str | None:
+    """Trap 3: what is left depends on the order in which rows are taken."""
+    swept = getattr(known.method.bounded, "solver", known.method.bounded)
+    if not isinstance(swept, GaussSeidel) or known.probe is None or not known.system.bounds:
+        return None
+    if not known.probe.missed > float(jnp.finfo(known.state.q.dtype).eps) ** 0.5:
+        return None
+    return (
+        f"GaussSeidel takes bounded rows one after the other, and {swept.sweeps} sweeps leave"
+        f" {known.probe.missed:.1g} m/s of their laws open: the result depends on the order in"
+        " which elements were added. Take more sweeps, or InteriorPoint(), which takes all rows at"
+        " once; joints are always taken at once."
+    )
+
+
+def overconstrained(known: Known) -> str | None:
+    """Trap 4: more rows than are needed, or rows that contradict each other."""
+    if known.conflicts:
+        return (
+            f"{', '.join(known.conflicts)} contradict each other: no motion meets all of them."
+            " Leave one out, correct its numbers, or rank them by jc.Priority."
+        )
+    if not known.dependent or known.passing:
+        return None
+    count, names = len(known.dependent), _names(known, known.dependent)
+    return (
+        f"{several(count, 'row')} of {names} repeat what others say. The motion is right, but how"
+        " forces are shared among these rows is not determined: take joints with fewer rows if"
+        f" you need them. {_taken(known)}"
+    )
+
+
+def start(known: Known) -> str | None:
+    """Trap 5: a start off the constraints."""
+    layout, off, moving, slips = known.rows.layout, [], [], []
+    violation, h = known.rows.violation, known.dt or 0.0
+    for name in layout.names:
+        if name in layout.inertial:
+            continue
+        drift = h * float(np.linalg.norm(np.asarray(known.rows.bias)[layout.rows(name)]))
+        fast = float(violation.rate(name)) > MOVING + drift  # v may be half a step old
+        if name in layout.velocity_level:
+            slips += [name] if fast else []
+        elif float(violation[name]) > OFF:
+            off.append(name)
+        elif fast:
+            moving.append(name)
+    said = []
+    if off:
+        said.append(f"{', '.join(off)} are not closed (φ ≠ 0)")
+    if moving:
+        said.append(f"the velocities tear at {', '.join(moving)} (φ̇ ≠ 0)")
+    if off or moving:
+        said = [" and ".join(said) + ": begin with jc.assemble(system, state).state"]
+    if slips:
+        said.append(f"{', '.join(slips)} slip at the start, which feedback lets decay")
+    return "; ".join(said) + "." if said else None
+
+
+def curved(known: Known) -> str | None:
+    """Trap 6: one linear correction of an error for which the constraints are too curved."""
+    φ = np.asarray(known.rows.residual, np.float64)
+    if known.dt is None or not np.max(np.abs(φ), initial=0) > OFF or not _linear(known):
+        return None
+    own = φ[known.unit.numbers] / known.unit.length
+    x = np.linalg.lstsq(known.unit.values, -own, rcond=known.unit.tolerance)[0]
+    there = known.moved(known.velocities(x))
+    left = np.asarray(linearized(known.system, there)[0].residual)
+    share = np.linalg.norm(left) / np.linalg.norm(φ)
+    if share < CURVED:
+        return None
+    return (
+        f"one linear correction of this start leaves {100 * share:.0f} % of the error, since the"
+        " constraints are curved; the method makes it in about one step. Begin with"
+        " jc.assemble(system, state).state, or take Projection(), which iterates, or gentle gains"
+        " such as Baumgarte.critical(rate=50.0)."
+    )
+
+
+def dense(known: Known) -> str | None:
+    """Trap 7: dense matrices where J is sparse."""
+    efforts, name = known.choice.efforts, type(_innermost(known.method.solver)).__name__
+    if name not in ("Dense", "Schur") or "Sparse" not in efforts or known.rows.layout.size < MANY:
+        return None
+    ratio = efforts[name].operations / efforts["Sparse"].operations
+    if ratio < DEARER:
+        return None
+    return (
+        f"{name}() fills a matrix with zeros: each joint touches two bodies only. Elimination along"
+        f" the structure takes {ratio:.0f} times fewer operations: {words(known.choice.solver)}."
+    )
+
+
+def iterations(known: Known) -> str | None:
+    """Trap 8: more iterations than bring anything."""
+    solver = _innermost(known.method.solver)
+    if isinstance(solver, ConjugateGradients) and (said := _swept(known, solver.iterations)):
+        return said
+    for part, field, enough in _counted(known.method):
+        if getattr(part, field) > enough:
+            return (
+                f"{type(part).__name__}({field}={getattr(part, field)}) repeats what {enough} or"
+                " fewer usually do, in every step; a shorter step with fewer of them is better for"
+                " the same time."
+            )
+    return None
+
+
+def _swept(known: Known, rounds: int) -> str | None:
+    """The same of conjugate gradients."""
+    n, efforts, better = known.rows.layout.size, known.choice.efforts, words(known.choice.solver)
+    if 0 < 2 * n + 10 < rounds:
+        return (
+            f"ConjugateGradients makes {rounds} iterations for {several(n, 'row')}, and is done"
+            f" after about as many as there are rows: take iterations={n + 5}, or {better}."
+        )
+    if "Sparse" not in efforts or n < MANY:
+        return None
+    share = rounds / ConjugateGradients().iterations
+    ratio = share * efforts["ConjugateGradients"].operations / efforts["Sparse"].operations
+    if ratio < DEARER:
+        return None
+    return (
+        f"{rounds} iterations of ConjugateGradients take {ratio:.0f} times the operations of"
+        f" elimination, which is exact: {better}."
+    )
+
+
+TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
+    "gains": ("gains too large for the step", gains),
+    "singular": ("singular position", singular),
+    "order": ("the order of rows matters", order),
+    "over-constrained": ("more rows than freedoms to take", overconstrained),
+    "start": ("inconsistent start", start),
+    "nonlinear": ("one linear step is not enough", curved),
+    "dense": ("dense matrices", dense),
+    "iterations": ("too many iterations", iterations),
+}
+"""By name: the trap in words, and how it is found."""
+
+
+def _counted(method: Method) -> list[tuple[Any, str, int]]:
+    """Parts of a method that repeat something in every step, and how often is enough."""
+    swept = getattr(method.bounded, "solver", method.bounded)
+    found = [(method.solver, "rounds", 5), (swept, "sweeps", 100)]
+    found += [(p, "iterations", 5) for p in parts(method.stabilizer) if hasattr(p, "stiffness")]
+    return [(part, field, enough) for part, field, enough in found if hasattr(part, field)]
+
+
+def _innermost(solver: Any) -> Any:
+    """The solver inside others."""
+    while hasattr(solver, "solver"):
+        solver = solver.solver
+    return solver
+
+
+def _linear(known: Known) -> bool:
+    """Whether the method makes one linear correction of a start that is off."""
+    stabilizer = known.method.stabilizer
+    if "position" in stabilizer.corrects:
+        return getattr(stabilizer, "iterations", 1) == 1
+    return asked_gains(known.method, known.dt or 0.0)[1] * (known.dt or 0.0) > SUDDEN
+
+
+def _taken(known: Known) -> str:
+    """What the solver makes of dependent rows."""
+    solver = known.method.solver
+    safe = isinstance(solver, ConjugateGradients | Lexicographic)
+    safe |= isinstance(solver, RankSafe) and (known.rows.layout.loops or solver.always)
+    if safe or getattr(solver, "tikhonov", None) is not None:
+        return f"{type(solver).__name__} takes them as they are."
+    return f"{words(solver)} refuses them as SINGULAR: take {words(known.choice.solver)}."
+
+
+def _names(known: Known, rows: list[int]) -> str:
+    """The constraints of some unit rows, each once."""
+    return ", ".join(dict.fromkeys(known.unit.owners[i][0] for i in rows))

@@ -1,0 +1,197 @@
+"""What a scene does not have, its step does not contain: no operation, no loop, no number."""
+
+import functools
+import re
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from jaxcon.core.operations import count, primitives
+from jaxcon.simulation.step import contained_step
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import needed  # noqa: E402
+
+PLAIN = jc.Method(solver=jc.Sparse())
+
+
+def jaxpr_of(system, state, method=PLAIN):
+    """Of a step, with every number of the system among its arguments."""
+    layout = system.layout
+    state = jc.init(system, method, state.q, state.v)
+    control = jnp.zeros(layout.n_u) if layout.n_u else None
+    args = (system, state, control, jnp.asarray(1e-3))
+    return jax.make_jaxpr(lambda x, s, u, h: contained_step(x, method, s, u, h))(*args).jaxpr
+
+
+def text(jaxpr):
+    """As it is printed, without addresses in memory."""
+    return re.sub(r"0x[0-9a-f]+", "", str(jaxpr))
+
+
+def arm(*elements):
+    """A body of the plane on a hinge, and more."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("arm", mass=1.0, inertia=0.1, position=(0.5, 1.0))
+    for element in (jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 1.0)), *elements):
+        scene.add(element)
+    return scene.build()
+
+
+def floor(**kind):
+    """A contact of a ball around the arm's end."""
+    return jc.PlaneContact("floor", jc.WORLD, "arm", radius=0.1, center=(0.5, 0.0), **kind)
+
+
+FEATURES = {  # what has it, what is like it without, and primitives that come with it alone
+    "contact": (lambda: arm(floor()), arm, {"while"}),
+    "limit": (lambda: arm(jc.Limit("stop", "hinge", -1.0, 1.0)), arm, {"while"}),
+    "friction of joints": (lambda: arm(jc.JointFriction("rub", "hinge", 0.1)), arm, {"while"}),
+    "rate motor": (lambda: arm(jc.RateMotor("turn", "hinge", 0.1)), arm, {"while"}),
+    "spring": (
+        lambda: arm(jc.Spring("spring", jc.WORLD, "arm", stiffness=5.0, point_a=(2.0, 2.0))),
+        arm,
+        {"sqrt"},
+    ),
+    "joint spring": (lambda: arm(jc.JointSpring("spring", "hinge", 2.0)), arm, set()),
+    "actuator": (lambda: arm(jc.PositionServo("servo", "hinge", 2.0)), arm, set()),
+    "motor": (lambda: arm(jc.Motor("motor", "hinge")), arm, set()),
+    "rotor": (lambda: arm(jc.Armature("rotor", "hinge", 0.1)), arm, set()),
+    "friction of contacts": (
+        lambda: arm(floor(friction=0.5)),
+        lambda: arm(floor()),
+        set(),
+    ),
+    "rolling resistance": (
+        lambda: arm(floor(friction=0.5, rolling=1e-3)),
+        lambda: arm(floor(friction=0.5)),
+        set(),
+    ),
+    "restitution": (lambda: arm(floor(restitution=0.5)), lambda: arm(floor()), set()),
+}
+
+
+@pytest.mark.parametrize("name", FEATURES)
+def test_a_feature_brings_code_and_takes_it_away(name):
+    """With it there are more operations; without it none of what came with it."""
+    own, bare, marks = FEATURES[name]
+    with_, without = jaxpr_of(*own()), jaxpr_of(*bare())
+    assert count(with_) > count(without)
+    assert marks <= primitives(with_) - primitives(without)
+
+
+SPRING = functools.partial(jc.JointSpring, "spring", "hinge", 2.0)
+METHODS = {  # of a method, and a scene on which it has nothing to do
+    "events": (jc.Method(solver=jc.Sparse(), events=jc.Events()), arm),
+    "bounded": (jc.Method(solver=jc.Sparse(), bounded=jc.GaussSeidel(7)), arm),
+    "trapezoidal torque": (
+        jc.Method(jc.SemiImplicitEuler(gyroscopic="trapezoidal"), solver=jc.Sparse()),
+        lambda: arm(SPRING()),
+    ),
+    "rank": (jc.Method(), arm),  # of a tree, whose rows cannot depend on each other
+}
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_method_leaves_nothing_where_it_has_nothing_to_do(name):
+    method, scene = METHODS[name]
+    assert text(jaxpr_of(*scene(), method)) == text(jaxpr_of(*scene()))
+
+
+def test_a_projection_is_there_where_it_was_asked_for():
+    projected = jc.Method(stabilizer=jc.Projection(), solver=jc.Sparse())
+    own, plain = jaxpr_of(*arm(), projected), jaxpr_of(*arm())
+    assert "while" in primitives(own) - primitives(plain)
+    split = jc.Method(solver=jc.Sparse(), events=jc.Events())
+    stopped = arm(jc.Limit("stop", "hinge", -1.0, 1.0))
+    assert count(jaxpr_of(*stopped, split)) > 2 * count(jaxpr_of(*stopped))
+
+
+def test_what_was_built_before_leaves_nothing():
+    """Every feature at once in between."""
+    before = text(jaxpr_of(*arm()))
+    every = [floor(friction=0.5), jc.Limit("stop", "hinge", -1.0, 1.0), SPRING()]
+    jaxpr_of(*arm(*every, jc.Motor("motor", "hinge")))
+    assert text(jaxpr_of(*arm())) == before
+
+
+def force_of(scene):
+    """The jaxpr of f."""
+    system, state = scene.build()
+    return jax.make_jaxpr(system.force)(state.q, state.v, state.time).jaxpr
+
+
+def test_gyroscopic_torque_is_that_of_bodies_that_turn_in_space():
+    """Gravity alone is one product by axis; ω × Iω reads the velocities, and has six more."""
+    free, body, plane = jc.Scene(), jc.Scene(), jc.Scene(dim=2)
+    free.add_particle("bob", mass=1.0)
+    body.add_body("top", mass=1.0, inertia=(1.0, 2.0, 3.0))
+    plane.add_body("disc", mass=1.0, inertia=1.0)
+    assert count(force_of(body)) > count(force_of(free))
+    for scene in (free, plane):
+        products = [e for e in force_of(scene).eqns if e.primitive.name == "mul"]
+        assert len(products) == scene.dim
+
+
+MODEL = """<mujoco>{option}<worldbody>{ground}
+  <body name="arm" pos="0 0 1"><joint name="swing" axis="0 1 0" {joint}/>
+    <geom type="capsule" fromto="0 0 0 0.5 0 0" size="0.02"/></body></worldbody>{more}</mujoco>"""
+GROUND = '<geom type="plane" size="1 1 1"/>'
+
+
+def read(joint="", ground="", option="", more="", ignore=()):
+    """What a model of MuJoCo becomes."""
+    text = MODEL.format(joint=joint, ground=ground, option=option, more=more)
+    return jc.from_mjcf(text, ignore).system
+
+
+def flag(name):
+    """Something that a model turns off."""
+    return f'<option><flag {name}="disable"/></option>'
+
+
+LIMITED = 'limited="true" range="-30 30"'
+REMOVED = {  # a model with the feature, and the same where it is turned off in some way
+    "contact ignored": ({"ground": GROUND}, {"ignore": ("contact",)}),
+    "contact disabled": ({"ground": GROUND}, {"option": flag("contact")}),
+    "limit ignored": ({"joint": LIMITED}, {"ignore": ("limit",)}),
+    "limit disabled": ({"joint": LIMITED}, {"option": flag("limit")}),
+    "limit off": ({"joint": LIMITED}, {"joint": 'limited="false" range="-30 30"'}),
+    "friction": ({"joint": 'frictionloss="0.1"'}, {"joint": 'frictionloss="0"'}),
+    "friction disabled": ({"joint": 'frictionloss="0.1"'}, {"option": flag("frictionloss")}),
+    "spring": ({"joint": 'stiffness="1"'}, {"joint": 'stiffness="0"'}),
+    "damping": ({"joint": 'damping="1"'}, {"joint": 'damping="0"'}),
+    "armature": ({"joint": 'armature="0.1"'}, {"joint": 'armature="0"'}),
+}
+
+
+@pytest.mark.parametrize("name", REMOVED)
+def test_what_a_model_turns_off_is_not_in_its_system(name):
+    """Structures are equal, choices included: a step is a function of these and of shapes."""
+    pytest.importorskip("mujoco")
+    own, changes = REMOVED[name]
+    with_, off, never = read(**own), read(**own | changes), read()
+    structure = jax.tree.structure
+    assert structure(off) == structure(never)
+    assert structure(with_) != structure(never)
+    shapes = [[np.shape(x) for x in jax.tree.leaves(s)] for s in (off, never)]
+    assert shapes[0] == shapes[1]
+
+
+def test_scenes_need_more_the_more_they_have():
+    """Of the study, those that are small."""
+    found = [needed.measure(name, None) for name in ("particle", "rod", "planar pendulum")]
+    assert [(x.positions, x.velocities, x.rows, x.bounded) for x in found] == [
+        (2, 2, 0, 0),
+        (2, 2, 1, 0),
+        (3, 3, 2, 0),
+    ]
+    assert found[0].operations < found[1].operations < found[2].operations
+    assert found[0].operations < 50
+    assert "| rod | 2 | 2 | 1 | 0 |" in needed.line(found[1])

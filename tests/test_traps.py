@@ -1,0 +1,197 @@
+"""Each trap of the chapter is warned of in a scene that is in it, and not in others."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_auto import rope
+from test_report import four_bar
+
+import jaxcon as jc
+from jaxcon.analysis.known import Known
+from jaxcon.analysis.traps import TRAPS, found
+
+DT = 1e-3
+
+
+def bob(*elements, position=(1.0, 0.0), velocity=(0.0, 0.0), dtype=None):
+    """A particle in the plane under constraints."""
+    scene = jc.Scene(dim=2, dtype=dtype)
+    scene.add_particle("bob", mass=1.0, position=position, velocity=velocity)
+    for element in elements:
+        scene.add(element)
+    return scene.build()
+
+
+def rod(name="rod", point=(0.0, 0.0), length=None):
+    """From a point of the world."""
+    return jc.Distance(name, jc.WORLD, "bob", length=length, point_a=point)
+
+
+def flat():
+    """A parallelogram of rods, all along one line: there its three rows have rank 2."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("a", mass=1.0, position=(1.0, 0.0))
+    scene.add_particle("b", mass=1.0, position=(2.0, 0.0))
+    scene.add(jc.Distance("left", jc.WORLD, "a", point_a=(0.0, 0.0)))
+    scene.add(jc.Distance("top", "a", "b"))
+    scene.add(jc.Distance("right", jc.WORLD, "b", point_a=(1.0, 0.0)))
+    return scene.build()
+
+
+def straight():
+    """Three cranks with a coupler of two rods, and a third along both: a row too many anywhere."""
+    scene = jc.Scene(dim=2)
+    for i, name in enumerate("abc"):
+        scene.add_particle(name, mass=1.0, position=(i, 1.0))
+        scene.add(jc.Distance(f"crank {name}", jc.WORLD, name, point_a=(float(i), 0.0)))
+    for pair in ("ab", "bc", "ac"):
+        scene.add(jc.Distance(pair, *pair))
+    return scene.build()
+
+
+def hung(load=100.0):
+    """Ropes that hold a load by light beads: sweeps are slow where it is heavy."""
+    scene = jc.Scene(dim=2)
+    for i in range(3):
+        scene.add_particle(f"p{i}", mass=load if i == 2 else 0.1, position=(0.0, -i - 1.0))
+        first = {"point_a": (0.0, 0.0)} if i == 0 else {}
+        above = f"p{i - 1}" if i else jc.WORLD
+        scene.add(jc.Rope(f"rope{i}", above, f"p{i}", length=1.0, **first))
+    return scene.build()
+
+
+def skate():
+    """A blade that slips at the start."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("skate", mass=60.0, inertia=2.0, velocity=(3.0, 0.5))
+    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    return scene.build()
+
+
+def far():
+    """Two rods that meet at (½, √¾), seen from close to the line between their ends."""
+    return bob(rod(length=1.0), rod("other", (1.0, 0.0), 1.0), position=(0.5, 0.1))
+
+
+def with_(**parts):
+    """A method."""
+    return jc.Method(**parts)
+
+
+GENTLE = jc.Baumgarte.critical(rate=50.0)
+SWEEPS = jc.GaussSeidel(sweeps=2)
+SPARSE = {"solver": jc.Sparse()}
+CASES = {  # scene, method, the traps in which they are, and a word of what is said
+    "pendulum": (lambda: bob(rod()), with_(), (), ""),
+    "four-bar": (lambda: four_bar(2), with_(), (), ""),
+    "rope": (lambda: rope(14), with_(), (), ""),
+    "gains": (
+        lambda: bob(rod()),
+        with_(stabilizer=jc.Baumgarte.critical(rate=5e3)),
+        ("gains",),
+        "unstable at dt=0.001",
+    ),
+    "nearly": (
+        lambda: bob(rod(), rod("near", (0.0, 1e-3))),
+        with_(),
+        ("singular",),
+        "nearly depend",
+    ),
+    "passes": (flat, with_(), ("singular",), "RankSafe takes them"),
+    "stops": (flat, with_(**SPARSE), ("singular",), "refuses them as SINGULAR"),
+    "sweeps": (hung, with_(bounded=SWEEPS), ("order",), "2 sweeps leave"),
+    "at once": (hung, with_(), (), ""),
+    "twice": (lambda: bob(rod(), rod("again")), with_(), ("over-constrained",), "again"),
+    "straight": (straight, with_(), ("over-constrained",), "1 row of"),
+    "stops there": (straight, with_(**SPARSE), ("over-constrained",), "refuses them"),
+    "contrary": (
+        lambda: bob(rod(length=1.0), rod("again", length=1.1), position=(1.05, 0.0)),
+        with_(stabilizer=GENTLE),
+        ("over-constrained", "start"),
+        "contradict",
+    ),
+    "open": (lambda: bob(rod(length=1.05)), with_(), ("start",), "not closed"),
+    "torn": (lambda: bob(rod(), velocity=(0.5, 1.0)), with_(), ("start",), "velocities tear"),
+    "slips": (skate, with_(), ("start",), "slip at the start"),
+    "curved": (far, with_(), ("start", "nonlinear"), "one linear correction"),
+    "once": (
+        far,
+        with_(stabilizer=jc.Projection(iterations=1)),
+        ("start", "nonlinear"),
+        "one linear correction",
+    ),
+    "iterated": (far, with_(stabilizer=jc.Projection()), ("start",), "jc.assemble"),
+    "gentle": (far, with_(stabilizer=GENTLE), ("start",), "jc.assemble"),
+    "dense": (lambda: rope(14), with_(solver=jc.Dense()), ("dense",), "fewer operations: Sparse()"),
+    "few rows": (lambda: rope(3), with_(solver=jc.Dense()), (), ""),
+    "swept": (
+        lambda: bob(rod()),
+        with_(solver=jc.ConjugateGradients()),
+        ("iterations",),
+        "100 iterations for 1 row,",
+    ),
+    "swept rope": (
+        lambda: rope(14),
+        with_(solver=jc.ConjugateGradients(iterations=30)),
+        ("iterations",),
+        "times the operations",
+    ),
+    "sweeps on": (
+        lambda: hung(0.1),
+        with_(bounded=jc.GaussSeidel(sweeps=5000)),
+        ("iterations",),
+        "sweeps=5000",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_trap_is_seen_where_it_is(name):
+    scene, method, expected, words = CASES[name]
+    known = Known.of(*scene(), method, DT)
+    said = found(known)
+    assert set(said) == set(expected), said
+    assert words in " ".join(said.values())
+
+
+def test_each_trap_of_the_chapter_is_there():
+    assert set(TRAPS) == {name for _, _, names, _ in CASES.values() for name in names}
+    assert len(TRAPS) == 8
+
+
+def test_float32_is_no_trap():
+    known = Known.of(*bob(rod(), dtype=jnp.float32), jc.Method(), DT)
+    assert found(known) == {}
+    assert np.isfinite(known.probe.violation)
+
+
+def test_without_a_step_nothing_is_said_of_it():
+    wild = with_(stabilizer=jc.Baumgarte.critical(rate=5e3))
+    known = Known.of(*bob(rod()), wild)
+    assert known.probe is None
+    assert "gains" not in found(known)
+
+
+def test_a_report_is_a_checklist():
+    system, state = bob(rod())
+    wild = with_(stabilizer=jc.Baumgarte.critical(rate=5e3), solver=jc.Dense())
+    report = jc.report(system, state, wild, DT, timed=True)
+    assert report.gains[:2] == (5e3, 5e3)
+    assert report.gains[2] == pytest.approx((2 * np.sqrt(2) - 2) / DT)
+    assert set(report.warnings) == {"gains"}
+    assert report.seconds > 0
+    text = str(report)
+    for words in (
+        "1 degrees of freedom",
+        "operations a step",
+        "memory of a world",
+        "µs a step of one world",
+        "gains α = 5000, β = 5000 1/s; α = β is stable up to 828.4 1/s here",
+        "expected violation: ",
+        "jc.Method.auto takes Sparse(): constraints, 1 row, close no loop",
+        "warning, gains too large for the step: Baumgarte gains",
+    ):
+        assert words in text
+    calm = jc.report(system, state)
+    assert calm.warnings == {}
+    assert calm.work is calm.gains is calm.probe is calm.seconds is None
