@@ -109,8 +109,8 @@ def sweep(problem: Bounded, multipliers: Array, known: Pivots | None = None) -> 
 def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     """The best of multipliers near to the solution and those of some rounds from there.
 
-    A round is a Newton step on the residual, or, where that does not make it smaller, a sweep,
-    every other time carried on.
+    A round is a Newton step on the residual, or a sweep where that does not make it smaller. Where
+    this does not suffice, as many rounds go on from the best, with every other sweep carried on.
 
     Args:
         problem: u = G λ + c and bounds.
@@ -123,14 +123,16 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
 
     def going(known: tuple[Any, Array, Array]) -> Array:
         count, _, best = known
-        return (count < rounds) & jnp.any(problem.worst(best) > enough)
+        return (count < 2 * rounds) & jnp.any(problem.worst(best) > enough)
 
     def once(known: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
         count, x, best = known
+        x = jnp.where(count == rounds, best, x)
         inverse = gauss_jordan.inverse(slope(problem.residual, x))
         new = x - gauss_jordan.apply(inverse, problem.residual(x))
         swept = sweep(problem, x, pivot)
-        swept = jnp.where(count % 2 == 1, carried(problem, x, swept), swept)
+        farther = (count >= rounds) & (count % 2 == 1)
+        swept = jnp.where(farther, carried(problem, x, swept), swept)
         x = jnp.where((problem.worst(new) < problem.worst(x))[None], new, swept)
         best = jnp.where((problem.worst(x) < problem.worst(best))[None], x, best)
         return count + 1, x, best

@@ -44,7 +44,8 @@ class InteriorPoint:
     Attributes:
         iterations: how many at most; worlds that have converged wait for the others.
         polish: rounds at the end, at most, of Newton steps on the laws themselves: the boundary of
-            a cone is where two numbers agree, so that rounding ends the path before it.
+            a cone is where two numbers agree, so that rounding ends the path before it; then as
+            many in which one of several contacts lets go that cannot all bear.
         smoothing: the width of smoothed corners of the laws, for the derivative only [m/s, rad/s].
 
     References:
