@@ -221,7 +221,7 @@ def training(quick: bool) -> Found:
     known = [(a, task) for a in study.ALGORITHMS for task in a.settings]
     if quick:
         algorithm, task = known[0]
-        short = {task: algorithm.settings[task]._replace(updates=20)}
+        short = {task: algorithm.settings[task]._replace(updates=5)}
         known = [(dataclasses.replace(algorithm, settings=short), task)]
     seeds = [0] if quick else [0, 1, 2, 3, 4]
     rows = [study.measure(algorithm, task, seeds, 900.0) for algorithm, task in known]
@@ -260,7 +260,7 @@ def gradient_states(quick: bool) -> list[Metric]:
     found, n = [], 40 if quick else 250
     scenes = list(study.SCENES)[: 1 if quick else None]
     with jax.enable_x64(True):
-        for name, dim, method, dtype in study.choices(scenes, False):
+        for name, dim, method, dtype in list(study.choices(scenes, False))[: 1 if quick else None]:
             row = study.measure(name, dim, method, dtype, n, 0 if quick else 8)
             title = f"{name}, {dim}, {method}, {dtype}"
             found.append(count(f"{title}, not finite", row.broken))
