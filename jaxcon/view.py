@@ -114,7 +114,10 @@ def animate(system: Any, path: Any, interval: float, axes: Any = None, **style: 
 
     frames = [list(links(system, q).values()) for q in path]
     own = axes is None
-    axes = canvas(4.0, 3.2, 80).figure.add_subplot() if own else axes
+    if own:
+        figure = canvas(4.0, 3.2, 80).figure
+        figure.set_layout_engine("constrained")
+        axes = figure.add_subplot()
     first = len(axes.lines)
     draw(system, path[0], axes, **style)
     lines, shown = axes.lines[first:], (0, 1 if system.layout.dim == 2 else 2)

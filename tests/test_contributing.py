@@ -34,7 +34,19 @@ def pendulum(length=1.0, dtype=None):
 
 def test_there_is_one_program_for_each_kind_of_part():
     assert list(SECTIONS) == ["joint", "stabiliser", "integrator", "solver", "environment"]
-    assert len(re.findall("```python", TEXT)) == len(SECTIONS)
+    assert len(re.findall("```python", TEXT)) == len(SECTIONS) + 1  # and that of a study
+
+
+def test_the_study_is_entered_under_its_name_and_finds_its_numbers(monkeypatch):
+    from benchmarks import entries
+
+    monkeypatch.setattr(entries, "ENTRIES", {})
+    code = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)[-1]
+    exec(code, {"__name__": "study"})  # noqa: S102
+    (study,) = entries.ENTRIES.values()
+    assert study.name == "my_study"
+    assert study.about == "What it measures, in a sentence."
+    assert [metric.value for metric in study.run(True).metrics] == [0.5, 1e-9]
 
 
 def test_the_joint_lets_a_pin_slide_and_turn_in_a_slot():
