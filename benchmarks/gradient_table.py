@@ -28,6 +28,9 @@ from jaxcon.analysis.differences import ridders
 from jaxcon.scenes import four_bar
 
 DT, STEPS = 1e-2, 3
+LONG = 2e-2
+"""Step of generalized-α [s], whose multipliers are told by positions: it multiplies their rounding
+by 1/h²."""
 STABILIZERS = {
     "none": jc.Unstabilized(),
     "Baumgarte": jc.Baumgarte(),
@@ -132,7 +135,8 @@ class Subject:
         system = self.system.with_params(changes) if changes else self.system
         q = system.retract(self.state.q, x["position"])
         start = jc.init(system, method, q, x["velocity"], self.state.time)
-        dt = jnp.asarray(DT, q.dtype)
+        long = isinstance(method.integrator, jc.GeneralizedAlpha)
+        dt = jnp.asarray(LONG if long else DT, q.dtype)
         return jc.rollout(system, method, start, None, dt, STEPS, record=lambda s, i: None)[0]
 
     def weighed(self, final: jc.State) -> jax.Array:

@@ -38,12 +38,12 @@ def test_there_is_one_program_for_each_kind_of_part():
 
 
 def test_the_study_is_entered_under_its_name_and_finds_its_numbers(monkeypatch):
-    from benchmarks import entries
+    from benchmarks import suite
 
-    monkeypatch.setattr(entries, "ENTRIES", {})
+    monkeypatch.setattr(suite, "ENTRIES", {})
     code = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)[-1]
     exec(code, {"__name__": "study"})  # noqa: S102
-    (study,) = entries.ENTRIES.values()
+    (study,) = suite.ENTRIES.values()
     assert study.name == "my_study"
     assert study.about == "What it measures, in a sentence."
     assert [metric.value for metric in study.run(True).metrics] == [0.5, 1e-9]

@@ -156,14 +156,16 @@ class Bounded:
     def released(self, multipliers: Array) -> Array:
         """λ with none of what rounding, or the end of a path, leaves to a contact that opens.
 
-        However little that is, it would hold in the derivative what does not slip.
+        However little that is, it would hold in the derivative what does not slip. Nor does
+        rounding leave a row that only pushes a pull.
         """
         ahead = multipliers - self.velocity(multipliers) / self.diagonal()
-        here, bears = self.kinds.split(multipliers), self.kinds.split(ahead).normal > 0
+        here = self.kinds.split(multipliers)
+        bears = (self.kinds.split(ahead).normal > 0) & (here.normal > 0)
         sets = zip(self.kinds.discs, here.discs, strict=True)
         discs = tuple(x * disc.of(bears).astype(ahead.dtype) for disc, x in sets)
-        normal = jnp.where(bears, here.normal, 0)
-        return self.kinds.join(here._replace(normal=normal, discs=discs))
+        single, normal = jnp.maximum(here.single, 0), jnp.where(bears, here.normal, 0)
+        return self.kinds.join(here._replace(single=single, normal=normal, discs=discs))
 
     def diagonal(self) -> Array:
         """What a multiplier adds to the velocity of its own row, (n,).
