@@ -120,7 +120,8 @@ def _replay(
 
     def control(k: Array, state: State) -> PyTree:
         if policy:
-            return controls_in(state.q.dtype, jax.vmap(policy)(state))
+            act: Callable[[State], PyTree] = policy
+            return jax.vmap(lambda s: controls_in(s.q.dtype, act(s)))(state)
         return jax.tree.map(lambda x: jnp.asarray(x)[:, k], controls)
 
     def go(carry: Any) -> Array:
