@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -246,6 +247,8 @@ def main() -> None:
     parser.add_argument("--without-mjx", action="store_true")
     parser.add_argument("--seconds", type=float, default=1.0, help="limit of a run of one world")
     given = parser.parse_args()
+    # else factorizations of a batch take all threads and wait in them for one of their own
+    os.environ.setdefault("PJRT_NPROC", str(4 * timing.cores()))
     timing.use_all_cores()
     print(timing.machine())
     print(HEAD)
