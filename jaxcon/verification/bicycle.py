@@ -137,6 +137,6 @@ def stability_speeds(p: dict[str, np.ndarray], g: float) -> list[float]:
 
 
 def _real(polynomial: Any) -> np.ndarray:
-    """The positive real roots."""
-    roots = polynomial.roots()
+    """The positive real roots; a highest coefficient that is rounding would make one far away."""
+    roots = polynomial.trim(1e-12 * np.max(np.abs(polynomial.coef))).roots()
     return roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-6)].real
