@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +62,8 @@ def seconds(
     arguments = ["benchmarks.compile_time", "--here", name, "--program", program]
     arguments += ["--batch", str(batch), "--solver", options.solver]
     arguments += ["--one-device"] if options.one_device else []
-    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
-    environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()
+    environment = timing.with_flags(flags)
+    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     found = timing.in_process(arguments, environment, options.limit, "over")
     return found if isinstance(found, str) else found["seconds"]
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import os
 import re
 from collections import Counter
 from collections.abc import Callable
@@ -104,11 +103,10 @@ def measure(name: str, batch: int, work: int, repeats: int = 5) -> Scaling:
 
 def elsewhere(name: str, devices: int, given: argparse.Namespace) -> Scaling | str:
     """The same in a process that has so many devices, or why there is nothing."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} {FORCED}={devices}".strip()
     options = ["--batch", str(given.batch), "--work", str(given.work)]
     found = timing.in_process(
         ["benchmarks.devices", "--here", name, *options],
-        os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},
+        timing.with_flags(f"{FORCED}={devices}") | {"JAX_PLATFORMS": "cpu"},
         LIMIT,
         "does not compile and run in",
     )

@@ -70,11 +70,9 @@ def measure(task: str, copies: int, steps: int, repeats: int) -> Row:
 
     jax.block_until_ready((interface(), bare()))  # compiled
     ended = interface(count=True)  # apart: three more operations on the device would be timed
-    work, pairs = copies * steps, []
-    for _ in range(repeats):
-        pairs.append([timing.rate(run, work, 1).median for run in (interface, bare)])
-    reached, possible = (float(x) for x in np.median(pairs, axis=0))
-    share = float(np.median([a / b for a, b in pairs]))
+    rates = timing.in_turn((interface, bare), copies * steps, repeats)
+    reached, possible = (float(x) for x in np.median(rates, axis=0))
+    share = float(np.median(rates[:, 0] / rates[:, 1]))
     return Row(reached, possible, share, ended, envs.environment.skip)
 
 

@@ -14,8 +14,6 @@ import argparse
 import dataclasses
 import functools
 import json
-import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -31,8 +29,6 @@ from benchmarks.peers import FLAGS, mjx_start, mjx_step, speeds
 
 SHORT = 100
 """Steps of MJX, and of the comparison with differences."""
-REPEATS, SECONDS = 5, 0.2
-"""Of the timing: how many, and how long each lasts at least."""
 STEP = 3e-2
 """Of the differences, relative."""
 LENGTHS = (100, 1000, 10000)
@@ -81,7 +77,7 @@ def measure(loss: Loss, worlds: jax.Array, steps: int, short: int) -> Cost:
     slope = gradient(worlds)[1]
     jax.block_until_ready(forward(worlds))
     work = steps * len(worlds)
-    rates = in_turn([lambda: forward(worlds), lambda: gradient(worlds)], work)
+    rates = timing.in_turn([lambda: forward(worlds), lambda: gradient(worlds)], work)
     return Cost(
         *np.median(rates, axis=0).tolist(),
         float(np.median(rates[:, 0] / rates[:, 1])),
@@ -89,24 +85,6 @@ def measure(loss: Loss, worlds: jax.Array, steps: int, short: int) -> Cost:
         gradient_compile,
         bool(jnp.all(jnp.isfinite(slope))),
         error(loss, worlds, short),
-    )
-
-
-def in_turn(runs: list[Callable[[], Any]], work: float) -> np.ndarray:
-    """Rates of functions that have run before, (repeats, functions).
-
-    Each is called as often as fills `SECONDS`, and one after the other in each repeat, so that a
-    machine that becomes slower meanwhile slows them all.
-    """
-    calls = [math.ceil(SECONDS * timing.rate(run, 1.0, 1).median) for run in runs]
-    return np.array(
-        [
-            [
-                timing.rate(lambda run=run, n=n: [run() for _ in range(n)], n * work, 1).median
-                for run, n in zip(runs, calls, strict=True)
-            ]
-            for _ in range(REPEATS)
-        ]
     )
 
 
@@ -164,8 +142,8 @@ def peer(name: str, batch: int, limit: float) -> list[str]:
     rows = []
     for flags in FLAGS:
         given = ["benchmarks.gradients", "--mjx", name, "--batch", str(batch)]
-        own = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
-        found = timing.in_process(given, own, limit, "does not compile and run in")
+        late = "does not compile and run in"
+        found = timing.in_process(given, timing.with_flags(flags), limit, late)
         shown = found if isinstance(found, str) else Cost(**found)
         rows.append(f"| {name} | MJX {flags} | {shown} |")
     return rows

@@ -11,6 +11,7 @@ numbers of steps; their repeats alternate, so that a machine that slows down slo
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -98,14 +99,16 @@ def measure(name: str, batch: int, dtype: Any, work: int = WORK, repeats: int = 
             timing.compile_seconds(make(system, method, steps), start)[0]
             for make, start in zip((plain, by_hand), starts, strict=True)
         ]
-        rates: tuple[list[float], list[float]] = ([], [])
-        for i in range(repeats + 1):
-            for run, start, found in zip(runs, starts, rates, strict=True):
-                rate = timing.rate(lambda r=run, s=start: r(s), batch * steps, 1)
-                found.extend([rate.median] if i else [])  # the first warms up
-    ratios = np.asarray(rates[0]) / np.asarray(rates[1])
-    spread = float(ratios.min()), float(np.median(ratios)), float(ratios.max())
-    return Share(name, *(Rate(float(np.median(x)), min(x), max(x)) for x in rates), spread)
+        calls = [functools.partial(*pair) for pair in zip(runs, starts, strict=True)]
+        rates = timing.in_turn(calls, batch * steps, repeats + 1)[1:]  # the first warms up
+    ratios = rates[:, 0] / rates[:, 1]
+    plain_rate, by_hand_rate, share = map(spread, (*rates.T, ratios))
+    return Share(name, Rate(*plain_rate), Rate(*by_hand_rate), (share[1], share[0], share[2]))
+
+
+def spread(x: np.ndarray) -> tuple[float, float, float]:
+    """Median, least and most."""
+    return float(np.median(x)), float(np.min(x)), float(np.max(x))
 
 
 def main() -> None:

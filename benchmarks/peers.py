@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import os
 import time
 from dataclasses import dataclass
 from typing import Any
@@ -153,8 +152,8 @@ def mjx_process(
 ) -> MjxRun | str:
     """One run in a process of its own, or why there is none."""
     arguments = [module, "--mjx", name, "--batch", str(batch)]
-    environment = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
-    found = timing.in_process(arguments, environment, limit, "does not compile and run in")
+    late = "does not compile and run in"
+    found = timing.in_process(arguments, timing.with_flags(flags), limit, late)
     if isinstance(found, str):
         return f"batch {batch}" + (f" with {flags}" if flags else "") + f" {found}"
     return MjxRun(batch, flags, Rate(**found["rate"]), found["compile"])

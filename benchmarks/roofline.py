@@ -20,12 +20,8 @@ import numpy as np
 
 import jaxcon as jc
 from benchmarks import mechanisms, timing
-from benchmarks.mjcf import DT
 from benchmarks.targets import SCENES
-from jaxcon.core.operations import count
-
-WORLDS = 128
-"""In the batch whose step is counted: what worlds share is then shared among so many."""
+from jaxcon.analysis import work as analysis
 
 
 @dataclass(frozen=True)
@@ -45,9 +41,7 @@ def work(name: str, method: jc.Method, dtype: Any) -> Work:
     """Of a step of a mechanism."""
     with jax.enable_x64(np.dtype(dtype) == np.float64):
         system, state = mechanisms.find(name).build(dtype)
-        worlds = jax.tree.map(lambda x: jax.ShapeDtypeStruct((WORLDS, *x.shape), x.dtype), state)
-        step = jax.vmap(lambda s: jc.step(system, method, s, None, DT)[0])
-        operations = count(jax.make_jaxpr(step)(worlds).jaxpr) / WORLDS
+        operations = analysis.work(system, method, state).operations
     return Work(operations, sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state)))
 
 

@@ -9,7 +9,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,14 @@ def rate(run: Callable[[], Any], work: float, repeats: int = 5, seconds: float =
             calls, spent = calls + 1, time.perf_counter() - start
         rates.append(work * calls / spent)
     return Rate(float(np.median(rates)), min(rates), max(rates))
+
+
+def in_turn(runs: Sequence[Callable[[], Any]], work: float, repeats: int = 5) -> np.ndarray:
+    """Rates of functions that have run before, (repeats, functions).
+
+    One after the other in each repeat, so that a machine that becomes slower slows them all.
+    """
+    return np.array([[rate(run, work, 1).median for run in runs] for _ in range(repeats)])
 
 
 def compile_seconds(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
@@ -108,6 +116,11 @@ def in_process(
     except subprocess.CalledProcessError as error:
         return f"fails: {(error.stderr.strip().splitlines() or ['?'])[-1]}"
     return json.loads(done.stdout.splitlines()[-1])
+
+
+def with_flags(flags: str) -> dict[str, str]:
+    """The environment of this process with more flags for XLA."""
+    return os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
 
 
 def cores() -> int:

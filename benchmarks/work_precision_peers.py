@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import functools
 import json
-import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -223,8 +222,7 @@ def _elsewhere(
         file = Path(folder) / "found.json"
         given = ["benchmarks.work_precision_peers", "--mjx", motion.name, "--file", str(file)]
         given += ["--errors"] if errors else []
-        own = os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
-        ended = timing.in_process(given, own, limit, "is not done in")
+        ended = timing.in_process(given, timing.with_flags(flags), limit, "is not done in")
         found = json.loads(file.read_text()) if file.exists() else {}
     said = f"MJX, {motion.name}, {flags or 'default'}: {ended}" if isinstance(ended, str) else ""
     return found, said

@@ -22,7 +22,7 @@ from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
 from jaxcon.simulation.attempt import dynamics_at
 from jaxcon.simulation.method import Memory, Method
-from jaxcon.simulation.step import check_step, controls_in, step_quietly
+from jaxcon.simulation.step import check_step, controls_in, policy_in, step_quietly
 from jaxcon.solvers.saddle import Solution
 
 
@@ -120,8 +120,7 @@ def _replay(
 
     def control(k: Array, state: State) -> PyTree:
         if policy:
-            act: Callable[[State], PyTree] = policy
-            return jax.vmap(lambda s: controls_in(s.q.dtype, act(s)))(state)
+            return jax.vmap(policy_in(policy))(state)
         return jax.tree.map(lambda x: jnp.asarray(x)[:, k], controls)
 
     def go(carry: Any) -> Array:

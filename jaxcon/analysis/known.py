@@ -103,7 +103,7 @@ class Known:
     @cached_property
     def passing(self) -> bool:
         """Whether fewer rows depend on each other beside this position, where it can be left."""
-        _, s, vt = np.linalg.svd(self.unit.values)
+        _, s, vt = self.unit.svd
         free = vt[int(np.sum(s > self.unit.tolerance)) :]
         if not self.dependent or not len(free):
             return False

@@ -59,7 +59,7 @@ def singular(known: Known) -> str | None:
         )
     if not len(known.unit.values):
         return None
-    u, s, _ = np.linalg.svd(known.unit.values)
+    u, s, _ = known.unit.svd
     n, least = len(u), s[-1] if len(s) == len(u) else 0.0
     eps = float(jnp.finfo(known.state.q.dtype).eps)
     shares = 1 / np.maximum(np.diag(np.linalg.pinv(known.unit.values @ known.unit.values.T)), 1)

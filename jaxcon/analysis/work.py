@@ -71,8 +71,10 @@ def seconds(
         batch: worlds.
     """
     shapes = _batch(system, method, state, control, batch)
-    known = jax.tree.map(jnp.asarray, (state, check_step(system, method, state, control)))
-    args = jax.tree.map(lambda x, s: jnp.broadcast_to(x, s.shape), known, shapes)
+    one = state, check_step(system, method, state, control)
+    args = jax.tree.map(
+        lambda x, s: jnp.broadcast_to(jnp.asarray(x, s.dtype), s.shape), one, shapes
+    )
     run = jax.jit(_many(system, method)).lower(*args).compile()
 
     def elapsed(times: int) -> float:

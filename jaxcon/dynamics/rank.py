@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -38,13 +39,19 @@ class UnitRows:
         self.length = np.where(length > 0, length, 1)
         self.values = scaled / self.length[:, None]
 
+    @cached_property
+    def svd(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """U, the singular values and Vᵀ of the values."""
+        u, s, vt = np.linalg.svd(self.values)
+        return u, s, vt
+
     def within(self, x: Array, low: float, high: float) -> np.ndarray:
         """The part of an array by rows (n_c,) in directions with singular values in (low, high].
 
         These are combinations of rows; −1 … 0 are those that no motion changes.
         """
         own = np.asarray(x, np.float64)[self.numbers] / self.length
-        u, s, _ = np.linalg.svd(self.values)
+        u, s, _ = self.svd
         s = np.append(s, np.zeros(len(u) - len(s)))
         chosen = u[:, (low < s) & (s <= high)]
         return self.length * (chosen @ (chosen.T @ own))

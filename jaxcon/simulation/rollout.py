@@ -18,7 +18,7 @@ from jaxcon.simulation.adjoints import EVERY_STEP, Path, check_adjoint
 from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain, stop_failed
 from jaxcon.simulation.stability import warn_if_unstable
-from jaxcon.simulation.step import StepInfo, controls_in, step_quietly, undo
+from jaxcon.simulation.step import StepInfo, controls_in, policy_in, step_quietly, undo
 
 FEEDBACK = (
     "controls are a function of the state, and that before a step is not known until the step is"
@@ -95,11 +95,8 @@ def rollout(
 
 def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
     """policy(state), with no gradient in a world where its result is not finite."""
-
-    def own(state: State) -> PyTree:
-        return controls_in(state.q.dtype, policy(state))
-
-    function, known, _ = opened(own, state)  # what it closes over has tangents to be masked
+    # what it closes over has tangents to be masked
+    function, known, _ = opened(policy_in(policy), state)
 
     def judged(state: State, constants: Any) -> tuple[PyTree, Any]:
         control = function(constants, state)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -179,6 +180,11 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
             " state = jc.init(system, method, state.q, state.v)."
         )
     return control
+
+
+def policy_in(policy: Callable[[State], PyTree]) -> Callable[[State], PyTree]:
+    """A policy whose controls are in the dtype of the scene; see `controls_in`."""
+    return lambda state: controls_in(state.q.dtype, policy(state))
 
 
 def controls_in(dtype: Any, controls: PyTree) -> PyTree:
