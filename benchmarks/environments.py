@@ -5,9 +5,10 @@
 
 A policy on the device, tanh of a random linear map, acts in both. The interface resets copies that
 are done with fresh keys, flags those that diverge and checks shapes; bare steps do none of it, and
-go on where an episode is over. Repeats alternate, so that both meet the same machine. An action is
-held for several steps of the simulation, which the last column counts. With `--peers`, instead,
-copies of ours beside those of Gymnasium and Brax: see `benchmarks/environment_peers.py`.
+go on where an episode is over. Repeats alternate, so that both meet the same machine, and bare
+steps begin where the interface has come to, so that both meet the same states. An action is held
+for several steps of the simulation, which the last column counts. With `--peers`, instead, copies
+of ours beside those of Gymnasium and Brax: see `benchmarks/environment_peers.py`.
 """
 
 from __future__ import annotations
@@ -50,19 +51,18 @@ def measure(task: str, copies: int, steps: int, repeats: int) -> Row:
     weights = jax.random.normal(jax.random.key(0), (seen.shape[1], envs.action_space.shape[1]))
     policy = jax.jit(lambda x: jnp.tanh(x @ weights.astype(x.dtype)))
     bare_step = jax.jit(lambda env, episode, actions: jax.vmap(env.step)(episode, actions))
-    start = jax.tree.map(jnp.copy, envs.copies.episode)  # a step of the interface takes its own
-    ended = jnp.zeros((), int)
 
     def interface(count: bool = False) -> Any:
-        x, ended = seen, 0
+        nonlocal seen
+        ended = 0
         for _ in range(steps):
-            x, _, terminated, truncated, _ = envs.step(policy(x))
+            seen, _, terminated, truncated, _ = envs.step(policy(seen))
             if count:
                 ended += int(jnp.sum(terminated | truncated))
-        return ended if count else x
+        return ended if count else seen
 
     def bare() -> Any:
-        episode, x = start, seen
+        episode, x = envs.copies.episode, seen
         for _ in range(steps):
             episode, outcome = bare_step(envs.environment, episode, policy(x))
             x = outcome.observation

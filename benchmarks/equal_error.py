@@ -216,6 +216,7 @@ def measure(record: Record, motion: Motion, codes: Sequence[str], limit: float =
     """
     runs = own.Runs(motion)
     record.run(f"{motion.name}, jaxcon", runs.all(limit))
+    record.notes += [f"{motion.name}, {label}: {why}" for label, why in runs.refused.items()]
     best_ones = chosen(record.points(motion.name))
     record.run(f"{motion.name}, jaxcon's batches", runs.again(best_ones))
     if "MuJoCo C" in codes:

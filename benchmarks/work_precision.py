@@ -207,6 +207,7 @@ class Runs:
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
         self.made: dict[str, Ours] = {}
+        self.refused: dict[str, str] = {}
         self.known = {
             label_of(form, name, dtype): (form, name, dtype)
             for form in motion.forms
@@ -221,14 +222,19 @@ class Runs:
         return self.made[label]
 
     def all(self, limit: float, labels: Sequence[str] | None = None) -> Iterator[list[Point]]:
-        """The runs of each method, all of one batch.
+        """The runs of each method, all of one batch; why there are none is in `refused`.
 
         Args:
             limit: of a run of one world [s].
             labels: of the methods, all unless given.
         """
         for label in labels or self.known:
-            yield self.of(label).points(limit)
+            try:
+                made = self.of(label)
+            except ValueError as reason:
+                self.refused[label] = str(reason)
+                continue
+            yield made.points(limit)
 
     def again(
         self, points: Sequence[Point], batches: Sequence[int] = OTHERS
