@@ -120,13 +120,14 @@ def test_one_corner_of_four_lets_go():
     assert np.sum(np.asarray(problem.kinds.split(found).normal) > 0) == 3
 
 
-def test_inverse_without_pivots():
+@pytest.mark.parametrize("n", [3, 7, 50])
+def test_inverse_without_pivots(n):
     rng = np.random.default_rng(0)
-    half = rng.normal(size=(7, 7, 5))
-    matrix = np.einsum("ikb,jkb->ijb", half, half) + 0.1 * np.eye(7)[..., None]
+    half = rng.normal(size=(n, n, 5))
+    matrix = np.einsum("ikb,jkb->ijb", half, half) + 0.1 * np.eye(n)[..., None]
     found = gauss_jordan.inverse(jnp.asarray(matrix))
     unit = np.einsum("ijb,jkb->ikb", matrix, found)
-    np.testing.assert_allclose(unit, np.eye(7)[..., None] + 0 * unit, atol=1e-9)
+    np.testing.assert_allclose(unit, np.eye(n)[..., None] + 0 * unit, atol=1e-9)
 
 
 def test_zero_rows_do_nothing():

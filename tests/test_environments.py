@@ -395,6 +395,23 @@ def test_whoever_is_chosen_starts_as_its_key_says(share):
     same(after.state.q[~chosen], start.episode.state.q[~chosen])
 
 
+def test_copies_that_are_simulated_by_lots_move_as_all_at_once(monkeypatch):
+    environment = environments.make("CartPole")
+    start, _ = copies.begin(environment, jax.random.key(0), 6)
+    actions = jnp.linspace(-1.0, 1.0, 6)[:, None]
+
+    def places(lot, x):
+        monkeypatch.setattr(environments.Environment, "lot", lot)
+        return copies.simulate(environment, start, x).state.q
+
+    whole, lots = places(6, actions), places(3, actions)
+    np.testing.assert_allclose(lots, whole, rtol=1e-6, atol=1e-6)
+    slopes = (jax.grad(lambda x, n=n: jnp.sum(places(n, x)[:, 0]))(actions) for n in (6, 3))
+    np.testing.assert_allclose(*slopes, rtol=1e-5)
+    sizes = [copies.lot(count, 128) for count in (100, 128, 1000, 4096, 4099)]
+    assert sizes == [None, None, 125, 128, None]
+
+
 def test_restarts_are_differentiated():
     """A copy that starts anew does not depend on where it was; the others do."""
     environment = environments.make("CartPole")

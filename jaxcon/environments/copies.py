@@ -79,7 +79,7 @@ def advance(
     Returns:
         The copies, and the outcome of each, (n, …).
     """
-    after = over(environment, copies, "transition", actions)
+    after = simulate(environment, copies, actions)
     reward, terminated, truncated = over(environment, copies, "judge", actions, after)
     stepped = dataclasses.replace(copies, episode=after, done=terminated | truncated)
     if mode == "NextStep":
@@ -146,6 +146,40 @@ def _start(
         return world.reset(key), world
 
     return jax.vmap(one)(keys)
+
+
+def simulate(environment: Environment, copies: Copies, actions: Array) -> Episode:
+    """The episodes of all copies after an action.
+
+    On a CPU one lot of copies follows the other: many leave its cache in each of the operations
+    that a step consists of, and are then 1.3 to 7 times slower.
+
+    Args:
+        environment: of all of them.
+        copies: where they stand.
+        actions: (n, number of actions).
+    """
+    size = lot(len(copies.done), environment.lot)
+    if size is None or jax.default_backend() != "cpu":
+        return over(environment, copies, "transition", actions)
+
+    def apart(x: Array) -> Array:
+        return x.reshape(-1, size, *x.shape[1:])
+
+    lots = jax.tree.map(apart, (copies, actions))
+    after = jax.lax.map(lambda own: over(environment, own[0], "transition", own[1]), lots)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), after)
+
+
+def lot(count: int, most: int) -> int | None:
+    """How many of so many copies are simulated at once; None for all.
+
+    The most that divide them, since a last lot of its own would be compiled for itself.
+    """
+    if count <= most:
+        return None
+    sizes = range(most, most // 4, -1)
+    return next((size for size in sizes if count % size == 0), None)
 
 
 def look(environment: Environment, copies: Copies) -> tuple[Array, dict[str, Array]]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -86,6 +86,7 @@ class Environment:
         dt: h of a step of the simulation, () [s].
         skip: how many of these an action is held for.
         horizon: actions until an episode is truncated; None, and it is not.
+        lot: of many copies on a CPU, about how many are simulated at once; of a class.
     """
 
     system: Any
@@ -93,6 +94,7 @@ class Environment:
     dt: Array
     skip: int = static()
     horizon: int | None = static()
+    lot: ClassVar[int] = 128
 
     @property
     def dtype(self) -> Any:

@@ -12,7 +12,7 @@ from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan
-from jaxcon.solvers.bounded import Bounded, Parts, onto_disc, slope
+from jaxcon.solvers.bounded import Bounded, Parts, onto_disc
 from jaxcon.solvers.gauss_jordan import at, put
 
 
@@ -128,7 +128,7 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     def once(known: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
         count, x, best = known
         x = jnp.where(count == rounds, best, x)
-        inverse = gauss_jordan.inverse(slope(problem.residual, x))
+        inverse = gauss_jordan.inverse(problem.slope(x))
         new = x - gauss_jordan.apply(inverse, problem.residual(x))
         swept = sweep(problem, x, pivot)
         farther = (count >= rounds) & (count % 2 == 1)
