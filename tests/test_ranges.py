@@ -58,3 +58,21 @@ def test_what_is_in_range_is_taken(system):
 def test_a_known_number_is_checked_within_a_traced_function(system):
     with pytest.raises(ValueError, match="friction must be zero or more"):
         jax.eval_shape(lambda: system.with_params({"floor": {"friction": -0.1}}).gravity)
+
+
+def test_a_negative_friction_that_is_traced_is_none():
+    """It would push along the slip, and so would what resists rolling."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("disc", mass=1.0, inertia=0.01, position=(0.0, 0.1), velocity=(1.0, 0.0))
+    touch = {"radius": 0.1, "friction": 0.4, "rolling": 0.01}
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "disc", **touch))
+    system, state = scene.build()
+    method = jc.Method(bounded=jc.GaussSeidel(5, warm=False))
+
+    def end(friction, rolling):
+        changed = system.with_params({"floor": {"friction": friction, "rolling": rolling}})
+        return jc.rollout(changed, method, state, None, 2e-3, 20)[0].v
+
+    v = jax.jit(jax.vmap(end))(jnp.asarray([-0.4, 0.4]), jnp.asarray([-0.01, -0.01]))
+    sliding = 1 - 0.4 * 9.81 * 0.04
+    assert jnp.allclose(v, jnp.asarray([[1.0, 0.0, 0.0], [sliding, 0.0, -10 * (1 - sliding)]]))
