@@ -7,6 +7,7 @@ follow from that alone (`touching`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -204,7 +205,6 @@ class Touches(Elements):
     """Ropes or contacts of one class, `law`, between bodies of the same kinds."""
 
     law: Any = static(default=None)
-    check_numbers = staticmethod(check_ranges)
 
     def bounds(self, snapshot: Any, control: Any, dt: Any) -> BoundSet:
         """The rows at one instant, and what a step of dt wants of them."""
@@ -217,6 +217,10 @@ class Touches(Elements):
         law = "contact" if "friction" in p else "single"
         each = None if points is None else points[0].shape[1]
         return BoundSet(law, tuple(rows), places, points=each, **asked)
+
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the numbers of one element, by field."""
+        check_ranges(name, numbers)
 
 
 def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]:

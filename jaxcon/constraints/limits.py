@@ -5,6 +5,7 @@ Each class describes one element on a joint's coordinate θ, an angle over turns
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -194,7 +195,6 @@ class Bounds(Elements):
     law: Any = static(default=None)
     along: JointCoordinate = static(default=None)  # type: ignore[assignment]
     starts: tuple[int, ...] = static(default=())
-    check_numbers = staticmethod(check_ranges)
 
     def bounds(self, snapshot: Any, control: Any, dt: Any) -> BoundSet:
         """The rows at one instant, and what a step of dt wants of them."""
@@ -202,6 +202,10 @@ class Bounds(Elements):
             self.params, self.along.read(snapshot), self._control(control), dt
         )
         return BoundSet(self.law.law, (row,), self.places, **asked)
+
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the numbers of one element, by field."""
+        check_ranges(name, numbers)
 
     def _control(self, control: Any) -> Lane:
         """The element's own channels."""

@@ -129,9 +129,7 @@ class Outlook:
         return dataclasses.replace(self, **both)
 
 
-def look(
-    rows: BoundRows, acceleration: Array, q: Array, dt: Array, slips: bool = False
-) -> Outlook:
+def look(rows: BoundRows, acceleration: Array, q: Array, dt: Array, slips: bool = False) -> Outlook:
     """Which rows are open when a part begins.
 
     Args:

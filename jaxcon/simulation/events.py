@@ -61,8 +61,8 @@ class Events:
 
     A row that closes and opens again within one step is not seen, nor the first of two crossings by
     the nearest row. Soft stops and contacts, friction in joints and motors are forces, and split
-    nothing. A step costs three or four plain ones, and one in which some world of a batch has an impact as
-    many more as tries are needed to find it.
+    nothing. A step costs three or four plain ones, and one in which some world of a batch has an
+    impact as many more as tries are needed to find it.
 
     Attributes:
         splits: how many impacts a step may have.
