@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,8 +20,8 @@ Randomize = Callable[[Environment, Array], Environment]
 MODES = ("NextStep", "SameStep", "Disabled")
 """When a copy that is done is reset, by the names that Gymnasium gives them."""
 
-PARTS, LEAST_PART = 16, 64
-"""Few copies are a part of so many, or so few."""
+PARTS, LEAST_PART = (16, 4, 1), 64
+"""By which parts of all copies they are started, and how many at least."""
 
 
 @pytree
@@ -103,8 +104,8 @@ def restart(
 ) -> Copies:
     """The copies with those that are chosen, (n,), at the start of a new episode.
 
-    As few starts are computed as that takes: none while no copy is chosen, a sixteenth of n while
-    few are, otherwise n. There is no loop, so that both modes of differentiation go through.
+    Few starts are computed where few are chosen: none, or as many as the smallest of `PARTS` of
+    all copies that holds them. There is no loop, so that both modes of differentiation go through.
 
     Args:
         environment: of all of them.
@@ -113,23 +114,18 @@ def restart(
         randomize: as of `begin`.
     """
     count = chosen.shape[0]
-    size = min(count, max(LEAST_PART, -(-count // PARTS)))
-    old = copies.episode, copies.world
+    sizes = sorted({min(count, max(LEAST_PART, -(-count // part))) for part in PARTS})
+    old, so_far = (copies.episode, copies.world), jnp.cumsum(chosen)
 
-    def few() -> tuple[Episode, PyTree]:
-        index = jnp.nonzero(chosen, size=size, fill_value=count)[0]  # beyond the last: dropped
+    def started(size: int) -> tuple[Episode, PyTree]:
+        wanted = jnp.arange(1, size + 1)
+        index = jnp.searchsorted(so_far, wanted, method="scan_unrolled")  # n where there is none
         fresh = _start(environment, old[0].key.at[index].get(mode="clip"), randomize)
         return jax.tree.map(lambda x, y: x.at[index].set(y, mode="drop"), old, fresh)
 
-    def many() -> tuple[Episode, PyTree]:
-        def keep(x: Array, y: Array) -> Array:
-            return jnp.where(chosen.reshape(-1, *(1,) * (x.ndim - 1)), y, x)
-
-        return jax.tree.map(keep, old, _start(environment, old[0].key, randomize))
-
-    wanted = jnp.sum(chosen)
-    case = (wanted > 0).astype(int) + (wanted > size).astype(int)
-    episode, world = jax.lax.switch(case, (lambda: old, few, many))
+    cases = [lambda: old, *(functools.partial(started, size) for size in sizes)]
+    case = jnp.sum(so_far[-1:] > jnp.asarray([0, *sizes[:-1]]))
+    episode, world = jax.lax.switch(case, cases)
     return Copies(episode, copies.done, world)
 
 
