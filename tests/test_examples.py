@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import jaxcon as jc
@@ -34,8 +35,14 @@ TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 
 
 @pytest.mark.parametrize("page", [p for p in TEXTS if blocks(p)], ids=lambda p: p.stem)
-def test_programs_of_the_readme_and_the_guide_run_page_by_page(page):
+def test_programs_of_the_readme_and_the_guide_run_page_by_page(page, capsys):
     names = ran(page)
+    if page.stem == "README":  # the first that it prints is what its comment says
+        said = re.search(r"print\(.*# (\[.*?\])", page.read_text())
+        assert said
+        found, known = capsys.readouterr().out.splitlines()[0], said[1]
+        both = [np.fromstring(text.strip("[]"), sep=" ") for text in (found, known)]
+        np.testing.assert_allclose(*both, atol=1e-3)
     if page.stem == "control":  # its policy balances its pole
         upright = jc.orientation(names["system"], names["final"], "pole")
         assert abs(float(upright)) < 0.02

@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 import jaxcon as jc
 from jaxcon.__main__ import main
 from jaxcon.analysis import ledger, reference, sweep
+from jaxcon.analysis.front import LeftOut
 from jaxcon.analysis.listing import table
 from jaxcon.analysis.trials import Inputs, Observer, Points, Problem, Trip
 
@@ -198,6 +199,17 @@ def test_the_table_names_its_numbers_above_them(result):
     )
     lost = dataclasses.replace(run, outcome="NON_FINITE at 0.5 s")
     assert str(lost).endswith("diverged, NON_FINITE at 0.5 s")
+
+
+def test_a_result_without_runs_says_so_in_words_and_in_its_picture(result, tmp_path):
+    late = [LeftOut("RK4", dtype, "no time") for dtype in ("float64", "float32")]
+    empty = dataclasses.replace(result, runs=(), limits=(), left_out=tuple(late), seconds=61.0)
+    assert "empty: no method was run in 61 s" in str(empty)
+    assert str(empty).endswith("left out:\n  no time:\n    RK4, float64, float32")
+    empty.plot(tmp_path / "diagram.png")
+    assert (tmp_path / "diagram.png").stat().st_size > 5_000
+    with pytest.raises(ValueError, match="no method was run"):
+        empty.recommend(error=1e-3)
 
 
 def made(horizon):

@@ -175,9 +175,7 @@ class Tradeoff:
             raise ValueError("recommend: give either error= [m] or cost= [s/s].")
         front = self.front
         if not front:
-            raise ValueError(
-                "recommend: no run was both stable and timed; print the result to see why."
-            )
+            raise ValueError(f"recommend: {self.without}.")
         if error is not None and error < self.floor:
             raise ValueError(
                 f"recommend: an error of {error:.2g} cannot be told, as the reference itself may be"
@@ -248,7 +246,7 @@ class Tradeoff:
 
     def __str__(self) -> str:
         lines = [*self.about, "", "the front, each with the least error up to its cost:"]
-        lines += [*table(self.front), "", *LEGEND]
+        lines += [*table(self.front), "", *LEGEND] if self.front else [f"    empty: {self.without}"]
         lines += ["", "all methods (`result.table` has every run):"]
         limits = {(x.name, x.dtype): x for x in self.limits}
         for key, runs in self.grouped.items():
@@ -260,8 +258,29 @@ class Tradeoff:
             if bad:
                 lines.append(f"    diverged at {', '.join(bad)}")
         if self.left_out:
-            lines += ["", "left out:", *(f"  {x}" for x in self.left_out)]
+            lines += ["", "left out:"]
+        for reason, names in self.excuses.items():
+            lines += [f"  {reason}:", *(f"    {name}" for name in names)]
         return "\n".join(lines)
+
+    @property
+    def excuses(self) -> dict[str, list[str]]:
+        """By reason what was left out, each method with its precisions."""
+        found: dict[str, dict[str, list[str]]] = {}
+        for x in self.left_out:
+            found.setdefault(x.reason, {}).setdefault(x.name, []).append(x.dtype)
+        return {
+            reason: [", ".join(filter(None, [name, *dtypes])) for name, dtypes in own.items()]
+            for reason, own in found.items()
+        }
+
+    @property
+    def without(self) -> str:
+        """Why there is no front."""
+        if self.runs:
+            return "no run was both stable and timed; `result.table` says why"
+        spent = f"no method was run in {self.seconds:.0f} s"
+        return f"{spent}; `result.left_out` says why, and a larger budget= may help"
 
 
 def front_of(runs: Iterable[Run]) -> tuple[Run, ...]:
