@@ -123,10 +123,12 @@ def find_scene(name: str) -> Any:
             system, state = built
         except (TypeError, ValueError):
             raise ValueError(
-                f"{function} in {file} must return (system, state), as scene.build() does, and"
-                f" returned a {type(built).__name__}."
+                f"{function} in {file} must return (system, state), as scene.build() does, and not"
+                f" {type(built).__name__}."
             ) from None
         return system, state
+    if name.endswith(".py"):
+        raise ValueError(f"{name} may have several scenes; say {name}:function.")
     if Path(name).suffix in (".xml", ".urdf", ".mjcf"):
         return from_mjcf(name)
     if name not in SCENES:

@@ -443,6 +443,8 @@ def test_the_command_line_says_what_it_cannot_use_before_it_begins(capsys, tmp_p
     assert main(["tradeoff", f"{scene}:nothing"]) == 2
     assert "nothing in" in (said := capsys.readouterr().out)
     assert "must return (system, state)" in said
+    assert main(["tradeoff", str(scene)]) == 2
+    assert "scene.py:function" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["tradeoff", "four_bar", "--picture", f"{tmp_path}/none/diagram.png"])
     assert "there is no folder for" in capsys.readouterr().err
