@@ -36,10 +36,11 @@ autodoc_preserve_defaults = True
 autodoc_class_signature = "mixed"
 
 LINKS = (
-    (r"\]\((?:\.\./\.\./)?examples\)", "](#examples)"),
+    (r"\]\((?:\.\./\.\./)?examples\)", "](/examples.md)"),
     (r"\]\((?:\.\./\.\./)?examples/(\w+)\.py\)", r"](#example-\1)"),
     (r"\]\((?:\.\./\.\./)?examples/notebooks\)", "](/notebooks.md)"),
     (r"\]\((?:\.\./\.\./)?benchmarks/RESULTS\.md", "](/benchmarks.md"),
+    (r"\]\(benchmarks/(\w+\.png)\)", r"](../benchmarks/\1)"),
     (r"\]\(CONTRIBUTING\.md", "](/contributing.md"),
     (r"\]\(docs/", "](/"),
 )
