@@ -86,7 +86,6 @@ class Environment:
         dt: h of a step of the simulation, () [s].
         skip: how many of these an action is held for.
         horizon: actions until an episode is truncated; None, and it is not.
-        lot: of many copies on a CPU, about how many are simulated at once; of a class.
     """
 
     system: Any
@@ -95,6 +94,7 @@ class Environment:
     skip: int = static()
     horizon: int | None = static()
     lot: ClassVar[int] = 128
+    """Of many copies on a CPU, how many are simulated at once, at most."""
 
     @property
     def dtype(self) -> Any:
