@@ -144,9 +144,9 @@ def test_ridders_takes_away_every_even_power():
     assert np.all(uncertainty < 1e-11)
 
 
-def swing(height):
+def swing(height, dtype=None):
     """A bob on a rod of 1 m, hanging or upright."""
-    scene = jc.Scene(dim=2)
+    scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("bob", mass=1.0, position=(0.0, height))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     return scene.build()
@@ -166,6 +166,16 @@ def test_an_inverted_pendulum_falls_as_its_exponent_says():
     np.testing.assert_allclose(growth.horizon(), reach, rtol=1e-3)
     assert growth.horizon(1e-3) < growth.time[-1] < growth.horizon()
     assert "useless beyond" in str(growth)
+
+
+def test_growth_is_told_as_far_as_the_precision_reaches():
+    """Its square is beyond float32 from 2e19 on."""
+    system, state = swing(1.0, jnp.float32)
+    growth = jc.gradient_growth(system, jc.Method(), state, None, jnp.float32(2e-2), 2000)
+    np.testing.assert_allclose(growth.exponent, np.sqrt(9.81), rtol=1e-3)
+    assert np.max(growth.growth[np.isfinite(growth.growth)]) > 1e36
+    assert not np.isfinite(growth.growth[-1])
+    assert growth.horizon() < 6.0
 
 
 def test_a_hanging_pendulum_has_no_horizon():

@@ -569,6 +569,11 @@ def test_what_does_not_fit_is_refused_in_words():
     nodes = {"x": jnp.ones(3), "v": jnp.ones(3)}
     with pytest.raises(ValueError, match="3 nodes the data must have a first axis"):
         jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes=nodes)
+    for x in (np.ones(4, int), np.ones(3), 1.0):  # whole numbers would be rounded to at each step
+        with pytest.raises(
+            ValueError, match=r"nodes must be .* float64 \(4,\), (int64|float64) \("
+        ):
+            jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes={"v": np.ones(4), "x": x})
 
 
 @pytest.fixture(scope="module")

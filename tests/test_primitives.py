@@ -4,6 +4,8 @@ Along q̇ = N(q) v with v constant: φ̇ = ∂φ/∂q N v + ∂φ/∂t, J = ∂�
 themselves are held against formulas written here, with matrices.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -322,6 +324,27 @@ def test_a_distance_of_zero_has_no_direction_and_is_finite(dim):
     derivatives = (rows, jax.jacfwd(rows), jax.jacrev(rows))
     for leaf in jax.tree.leaves([f(jnp.zeros(dim)) for f in derivatives]):
         assert jnp.all(jnp.isfinite(leaf))
+
+
+@pytest.mark.parametrize("stabilizer", [jc.Baumgarte, jc.AdaptiveBaumgarte])
+def test_a_rod_flung_far_away_has_its_derivative_in_float32(stabilizer):
+    """As from next to a distance of zero: what is divided must not be multiplied first."""
+
+    def slope(dtype):
+        scene = jc.Scene(dim=2, dtype=dtype)
+        scene.add_particle("a", mass=1.0, position=(1.0, 0.0))
+        scene.add(jc.Distance("rod", jc.WORLD, "a"))
+        system, state = scene.build()
+        method = jc.Method(stabilizer=stabilizer(dtype(20.0), dtype(20.0)))
+
+        def motion(q):
+            moved = dataclasses.replace(state, q=q, v=jnp.array([0.0, 3e9], dtype))
+            return jc.forward_dynamics(system, moved, None, method, dtype(1e-2)).acceleration
+
+        q, way = (jnp.array(x, dtype) for x in ([6e8, 0.0], [6e21, 1e21]))
+        return jax.jit(lambda q, way: jax.jvp(motion, (q,), (way,))[1])(q, way)
+
+    np.testing.assert_allclose(slope(jnp.float32), slope(jnp.float64), rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -367,6 +367,10 @@ def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_search(tmp_pa
         ({"bounds": {"b": (0, 1), "b/*": (0, 1)}}, "meant by each of"),
         ({"restarts": 2}, "give key="),
         ({"restarts": 2, "key": jax.random.key(0)}, "give spread="),
+        (
+            {"restarts": 2, "spread": np.nan, "key": jax.random.key(0)},
+            "spread must be zero or more",
+        ),
         ({"steps": 0}, "whole number from 1"),
         ({"patience": 0}, "patience must be a whole number from 1"),
         ({"patience": 5, "tolerance": np.nan}, "tolerance must be zero or more and finite"),

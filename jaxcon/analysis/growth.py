@@ -130,21 +130,29 @@ def gradient_growth(
 
     def along(move: Array) -> tuple[Array, Array]:
         _, moved, code = jax.jvp(path, (jnp.zeros_like(move),), (move,), has_aux=True)
-        return jnp.sum(moved**2, axis=-1), code
+        return moved, code
 
     tangents = jnp.asarray(moves.T, state.q.dtype)
-    squares, codes = jax.jit(jax.vmap(along))(tangents)
+    moved, codes = jax.jit(jax.vmap(along))(tangents)
     if failed(code := codes[0]):
         raise ValueError(
             f"gradient_growth: the rollout fails, {Status(int(code)).name}, and derivatives end"
             " there; `find_first_failure` names the step and the term."
         )
-    squares = np.asarray(squares, np.float64)
-    growth = np.sqrt(np.sum(squares, axis=0) / np.sum(squares[:, 0]))
+    squares = np.sum(np.asarray(moved, np.float64) ** 2, axis=(0, 2))
+    growth = np.sqrt(squares / squares[0])
     time = float(dt) * every * np.arange(len(growth))
-    half = len(growth) // 2
-    exponent = float(np.polyfit(time[half:], np.log(growth[half:]), 1)[0])
-    return GradientGrowth(time, growth, exponent, float(jnp.finfo(state.q.dtype).eps))
+    return GradientGrowth(
+        time, growth, _exponent(time, growth), float(jnp.finfo(state.q.dtype).eps)
+    )
+
+
+def _exponent(time: np.ndarray, growth: np.ndarray) -> float:
+    """Of the second half of what is a number, and neither nothing any more [1/s]."""
+    told = np.isfinite(growth) & (growth > 0)
+    time, size = time[told], np.log(growth[told])
+    half = len(time) // 2
+    return float(np.polyfit(time[half:], size[half:], 1)[0])
 
 
 def _allowed(system: Any, state: State) -> np.ndarray:

@@ -82,10 +82,12 @@ def distance(p: Point, r: Point, length: Lane) -> Row:
     """‖r − p‖ − l; at ‖r − p‖ = 0 the row has no direction and is zero."""
     d, ḋ = r.position - p.position, r.velocity - p.velocity
     span = numerics.norm(d)
-    n = d * numerics.safe_divide(1.0, span)
+    inverse = numerics.safe_divide(1.0, span)
+    n = d * inverse
     speed = n.dot(ḋ)
     across = ḋ.dot(ḋ) - speed * speed
-    bias = n.dot(r.bias - p.bias) + numerics.safe_divide(across, span)
+    # the derivative of a quotient would multiply this by that of the span, beyond float32
+    bias = n.dot(r.bias - p.bias) + across * inverse
     return Row(span - length, speed, bias, (-p.pull(n), r.pull(n)))
 
 

@@ -191,6 +191,7 @@ def identify(
     file = None if checkpoint is None else files.path(checkpoint, "identify")
     for x in jax.tree.leaves(noise):
         checks.positive("identify", "noise", x)
+    _check_nodes(nodes)
     space = space_of(params, positive, bounds, "identify")
     own = space.encode(params)
     batch = scattered(space, own, restarts, spread, key, "identify")
@@ -205,6 +206,22 @@ def identify(
     best = found[int(np.argmin(ends))]
     assert best is not None
     return _report(problem, best.fit, best.noise, continuity, ends)
+
+
+def _check_nodes(nodes: PyTree) -> None:
+    """Checks that there is one first guess for each stretch.
+
+    Raises:
+        ValueError: they are no arrays of real numbers with one first axis.
+    """
+    leaves = [jnp.asarray(x) for x in jax.tree.leaves(nodes)]
+    real = all(x.ndim and jnp.issubdtype(x.dtype, jnp.floating) for x in leaves)
+    if not real or len({x.shape[:1] for x in leaves}) > 1:
+        given = [f"{x.dtype} {x.shape}" for x in leaves]
+        raise ValueError(
+            "identify: nodes must be arrays of floating numbers with one first axis of stretches,"
+            f" got {', '.join(given)}."
+        )
 
 
 def _ignore() -> None:

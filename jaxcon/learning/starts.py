@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.learning.leaves import Space, by_name
 
@@ -27,10 +28,12 @@ def scattered(
         owner: for errors.
 
     Raises:
-        ValueError: several starts at one place.
+        ValueError: a deviation that is none, or several starts at one place.
     """
     values = spread if isinstance(spread, Mapping) else {"*": spread}
     widths = by_name(values, space.names, 0.0, f"{owner}: spread")
+    for width in widths:
+        checks.positive(owner, "spread", width, strictly=False)
     batch = [jnp.broadcast_to(x, (restarts, *x.shape)) for x in y]
     if restarts == 1:
         return tuple(batch)

@@ -59,7 +59,8 @@ class AdaptiveBaumgarte(Baumgarte):
         floor = by_row(self.floor, AdaptiveBaumgarte.floor, rows, "AdaptiveBaumgarte")
         size = by_row(self.size, AdaptiveBaumgarte.size, rows, "AdaptiveBaumgarte")
         square = squares(rows.residual / size, rows.layout)
-        grown = floor + (1 - floor) * square / (1 + square)
+        # of ∞/∞ there would be no derivative where x² is beyond float32, as next to a singular spot
+        grown = 1 - (1 - floor) / (1 + square)
         return jnp.where(column(rows.layout.holonomic, rows), grown, 1)
 
 
