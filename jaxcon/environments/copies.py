@@ -115,16 +115,16 @@ def restart(
     """
     count = chosen.shape[0]
     sizes = sorted({min(count, max(LEAST_PART, -(-count // part))) for part in PARTS})
-    old, so_far = (copies.episode, copies.world), jnp.cumsum(chosen)
+    old = copies.episode, copies.world
 
     def started(size: int) -> tuple[Episode, PyTree]:
-        wanted = jnp.arange(1, size + 1)
-        index = jnp.searchsorted(so_far, wanted, method="scan_unrolled")  # n where there is none
+        so_far, which = jnp.cumsum(chosen), jnp.arange(1, size + 1)
+        index = jnp.searchsorted(so_far, which, method="scan_unrolled")  # n beyond the last
         fresh = _start(environment, old[0].key.at[index].get(mode="clip"), randomize)
         return jax.tree.map(lambda x, y: x.at[index].set(y, mode="drop"), old, fresh)
 
     cases = [lambda: old, *(functools.partial(started, size) for size in sizes)]
-    case = jnp.sum(so_far[-1:] > jnp.asarray([0, *sizes[:-1]]))
+    case = jnp.sum(jnp.sum(chosen) > jnp.asarray([0, *sizes[:-1]]))
     episode, world = jax.lax.switch(case, cases)
     return Copies(episode, copies.done, world)
 
