@@ -120,6 +120,24 @@ def test_one_corner_of_four_lets_go():
     assert np.sum(np.asarray(problem.kinds.split(found).normal) > 0) == 3
 
 
+def test_a_contact_that_jams_is_solved():
+    """Friction presses it into the floor by more than the normal lifts it: G_nn < μ |G_nt|."""
+    matrix = [[0.217, 0.00182, 0.0111], [0.00182, 0.000418, 0.000805], [0.0111, 0.000805, 0.0049]]
+    none = jnp.zeros((0, 1))
+    problem = Bounded(
+        jnp.asarray(matrix)[..., None],
+        jnp.asarray([-0.178, -0.00805, 0.73])[:, None],
+        none,
+        none,
+        jnp.full((1, 1), 0.6),
+        Kinds(1, 0, 1, 1),
+    )
+    assert 0.6 * matrix[1][2] > matrix[1][1]
+    found = jax.jit(jc.InteriorPoint().solve)(problem, jnp.zeros((3, 1)))
+    assert missed(problem, found).max() < 1e-9
+    assert np.all(np.asarray(found)[:2] > 0)
+
+
 @pytest.mark.parametrize("n", [3, 7, 50])
 def test_inverse_without_pivots(n):
     rng = np.random.default_rng(0)
