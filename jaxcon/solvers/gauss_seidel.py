@@ -15,7 +15,6 @@ from jaxcon.solvers import gauss_jordan
 from jaxcon.solvers.bounded import Bounded, Parts, onto_disc
 from jaxcon.solvers.gauss_jordan import at, put
 
-
 MUCH = 1000
 """Times what rounding leaves."""
 
