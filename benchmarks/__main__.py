@@ -86,6 +86,11 @@ def arguments(given: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--compare", type=Path, nargs="?", const=suite.FILE, metavar="BASELINE")
     parser.add_argument("--update", action="store_true", help="rewrite the baseline")
     asked = parser.parse_args(given)
+    wanted = asked.compare if not asked.update else None
+    if wanted and not wanted.exists():
+        parser.error(f"there is no baseline {wanted}; --update --compare {wanted} writes one")
+    if asked.json and not asked.json.absolute().parent.is_dir():
+        parser.error(f"there is no folder for {asked.json}")
     if strange := suite.unknown(asked.names, ENTRIES):
         parser.error(f"unknown are {strange}; known are {list(ENTRIES)}")
     return asked
@@ -95,23 +100,32 @@ def main(given: list[str] | None = None) -> int:
     """Runs what is asked for; 1 where something failed or got worse."""
     asked = arguments(given)
     if asked.list:
-        print("\n".join(f"{name:16s} {entry.about}" for name, entry in ENTRIES.items()))
+        print("\n".join(f"{name:18s} {entry.about}" for name, entry in ENTRIES.items()))
         return 0
     file = asked.compare or suite.FILE
     baseline, begin = Baseline.read(file), time.perf_counter()
     folder = asked.json.absolute().parent if asked.json else None
     found = run(asked.names or list(ENTRIES), asked.quick, baseline, folder)
-    print(f"{len(found)} benchmarks in {time.perf_counter() - begin:.0f} s, {timing.machine()}")
+    print(f"{len(found)} benchmarks in {time.perf_counter() - begin:.0f} s: {longest(found)}")
+    print(timing.machine())
     if asked.json:
         save(found, asked.quick, asked.json)
+    failed = [name for name, outcome in found.items() if outcome.failed]
     if asked.update:
         baseline.updated(size_of(asked.quick), found, timing.machine()).write(file)
         print(f"wrote {file}")
-        return 0
+        return int(bool(failed))
     said = baseline.worse(size_of(asked.quick), found)
-    failed = [name for name, outcome in found.items() if outcome.failed]
     print("\n".join(said) or "nothing got worse than it may")
+    if new := [name for name in found if not baseline.of(size_of(asked.quick), name)]:
+        print(f"{file.name} has nothing to compare with of {', '.join(new)}")
     return int(bool(failed or (said and asked.compare)))
+
+
+def longest(found: dict[str, Outcome]) -> str:
+    """Which entries took the most time, in words."""
+    names = sorted(found, key=lambda name: -found[name].seconds)[:3]
+    return ", ".join(f"{name} {found[name].seconds:.0f} s" for name in names)
 
 
 if __name__ == "__main__":

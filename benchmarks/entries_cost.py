@@ -57,7 +57,7 @@ def equal_error(quick: bool) -> Found:
 
     names = ("pendulum",) if quick else tuple(motions.MOTIONS)
     record, codes = study.Record.of(None, False), study.CODES if has_mujoco() else ("jaxcon",)
-    found = []
+    found, drawn = [], []
     for name in names:
         motion = motions.MOTIONS[name]()
         if quick:
@@ -65,6 +65,7 @@ def equal_error(quick: bool) -> Found:
         else:
             study.measure(record, motion, codes)
         points = record.points(name)
+        drawn.append((motion, points))
         for level in study.LEVELS[::2]:
             price = study.best(points, "jaxcon", level)
             found += [seconds(f"{name}, {level:.0e} {motion.unit}", price.cost)] if price else []
@@ -72,7 +73,6 @@ def equal_error(quick: bool) -> Found:
                 times = study.ratio(points, code, level)
                 title = f"{name}, {level:.0e} {motion.unit}, {code} over jaxcon"
                 found += [Metric(title, times, tolerance=2.0)] if times else []
-    drawn = {name: record.points(name) for name in names}
     return Found(tuple(found), lambda path: study.draw(drawn, path))
 
 

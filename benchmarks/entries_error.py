@@ -260,9 +260,11 @@ def gradient_states(quick: bool) -> list[Metric]:
     found, n = [], 40 if quick else 250
     scenes = list(study.SCENES)[: 1 if quick else None]
     with jax.enable_x64(True):
-        for name, dim, method, dtype in list(study.choices(scenes, False))[: 1 if quick else None]:
-            row = study.measure(name, dim, method, dtype, n, 0 if quick else 8)
-            title = f"{name}, {dim}, {method}, {dtype}"
+        for choice in list(study.choices(scenes, False))[: 1 if quick else None]:
+            row = study.of_first(*choice, n, 0 if quick else 8)
+            if row is None:
+                continue
+            title = f"{row.scene}, {row.dim}, {row.method}, {row.dtype}"
             found.append(count(f"{title}, not finite", row.broken))
             found.append(count(f"{title}, modes apart", row.beyond))
             found.append(count(f"{title}, off", row.off))

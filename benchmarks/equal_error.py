@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import timing
+from benchmarks import pictures, timing
 from benchmarks import work_precision as own
 from benchmarks import work_precision_peers as peers
 from benchmarks.accuracy import has_mujoco
@@ -35,6 +35,8 @@ from benchmarks.work_precision import Point
 LEVELS = tuple(10.0**-n for n in range(2, 9))
 """Errors at which costs are compared [m] or [rad]."""
 CODES = ("jaxcon", "MuJoCo C", "MJX")
+SHOWN = np.logspace(-1, -9, 81)
+"""Errors at which a picture shows the least costs."""
 
 
 @dataclass(frozen=True)
@@ -123,29 +125,35 @@ def shown(seconds: float) -> str:
     return f"{1e6 * seconds:.3g} µs"
 
 
-def draw(found: dict[str, list[Point]], picture: Path) -> None:
+def draw(found: Sequence[tuple[Motion, Sequence[Point]]], picture: Path) -> None:
     """Error by cost, a panel for each motion: every run, and the least cost of each code."""
     from jaxcon import view
 
-    pyplot = view.pyplot()
-    size = {"figsize": (5.5 * len(found), 4.5), "squeeze": False, "layout": "constrained"}
-    figure, panels = pyplot.subplots(1, len(found), **size)
-    levels = np.logspace(-1, -9, 81)
-    for (name, points), axes in zip(found.items(), panels[0], strict=True):
-        for i, code in enumerate(CODES):
-            mine = [point for point in points if point.code == code]
-            for runs in curves(mine).values():
-                pairs = [(point.cost, point.error) for point in runs if point.error < np.inf]
-                axes.plot(*zip(*pairs, strict=True), color=f"C{i}", lw=0.7, alpha=0.35)
-            least = [(price.cost, x) for x in levels if (price := best(mine, code, x))]
-            if least:
-                axes.plot(*zip(*least, strict=True), color=f"C{i}", lw=2.5, label=code)
-        axes.set(xscale="log", yscale="log", ylim=(1e-10, 1), title=name)
-        axes.set(xlabel="all cores, for a simulated second of a world [s]")
-    panels[0][0].set(ylabel="error at the end [m], [rad]")
-    panels[0][0].legend()
-    figure.savefig(picture, dpi=110)
-    pyplot.close(figure)
+    across = min(2, len(found))
+    rows = -(-len(found) // across)
+    size = {"figsize": (4.6 * across, 3.6 * rows), "squeeze": False, "layout": "constrained"}
+    figure, panels = view.pyplot().subplots(rows, across, **size)
+    for axes, (motion, points) in zip(panels.flat, found, strict=False):
+        panel(axes, motion, points)
+    for axes in panels.flat[len(found) :]:
+        axes.set_axis_off()
+    panels[0][0].legend(title="thick: its cheapest method", fontsize=8, title_fontsize=8)
+    pictures.save(figure, picture)
+
+
+def panel(axes: Any, motion: Motion, points: Sequence[Point]) -> None:
+    """One motion on logarithmic axes, whose runs are thin and the best of a code thick."""
+    for i, code in enumerate(CODES):
+        mine = [point for point in points if point.code == code]
+        for runs in curves(mine).values():
+            pairs = [(point.cost, point.error) for point in runs if point.error < np.inf]
+            axes.plot(*np.reshape(pairs, (-1, 2)).T, color=f"C{i}", lw=0.7, alpha=0.35)
+        least = [(price.cost, x) for x in SHOWN if (price := best(mine, code, x))]
+        axes.plot(*np.reshape(least, (-1, 2)).T, color=f"C{i}", lw=2.5, label=code)
+    axes.set(xscale="log", yscale="log", ylim=(1e-10, 1), title=motion.name)
+    axes.set(ylabel=f"error after {motion.seconds:g} s [{motion.unit}]")
+    axes.set(xlabel="time of all cores for a simulated\nsecond of one world [s]")
+    axes.grid(alpha=0.3)
 
 
 @dataclass
@@ -254,15 +262,17 @@ def main() -> None:
     print(timing.machine())
     print(HEAD)
     record = Record.of(given.json, given.resume)
+    drawn = []
     codes = [code for code in CODES if code != "MJX" or not given.without_mjx]
     codes = codes if has_mujoco() else codes[:1]
     for name in given.motions:
         motion = MOTIONS[name]()
         measure(record, motion, codes, given.seconds)
-        print("\n".join(lines(motion, record.points(name), codes)), flush=True)
+        drawn.append((motion, record.points(name)))
+        print("\n".join(lines(motion, drawn[-1][1], codes)), flush=True)
     print("\n".join(f"- {stage}: {x:.0f} s" for stage, x in record.seconds.items()))
     print("\n".join(record.notes))
-    draw({name: record.points(name) for name in given.motions}, given.picture)
+    draw(drawn, given.picture)
 
 
 if __name__ == "__main__":

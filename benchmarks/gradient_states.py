@@ -283,14 +283,32 @@ def admitted(name: str, dim: int, methods: list[str]) -> list[str]:
     return found
 
 
-def choices(scenes: Any, product: bool) -> Iterator[tuple[str, int, str, str]]:
-    """Scene, dimension, method and precision; methods in turn, or all."""
+def choices(scenes: Any, product: bool) -> Iterator[tuple[str, int, list[str], str]]:
+    """Scene, dimension, methods of which the first that takes it is meant, and precision.
+
+    Methods come in turn, or each by itself. Some refuse a scene only when a step is traced.
+    """
     turn = itertools.count()
     for name, dim in scenes:
         methods = admitted(name, dim, list(METHODS))
         for dtype in DTYPES:
-            own = methods if product else [methods[next(turn) % len(methods)]]
-            yield from ((name, dim, method, dtype) for method in own)
+            first = next(turn) % len(methods)
+            in_turn = [methods[first:] + methods[:first]]
+            yield from (
+                (name, dim, x, dtype) for x in ([[y] for y in methods] if product else in_turn)
+            )
+
+
+def of_first(
+    name: str, dim: int, methods: list[str], dtype: str, n: int, compared: int
+) -> Row | None:
+    """The row of the first method that does not refuse the scene; None where all do."""
+    for method in methods:
+        try:
+            return measure(name, dim, method, dtype, n, compared)
+        except ValueError as reason:
+            print(f"{name}, {dim}, {method}: {reason}", flush=True)
+    return None
 
 
 def main() -> None:
@@ -308,7 +326,9 @@ def main() -> None:
     total = collections.Counter[str]()
     print("| scene | | method | precision | states | failed | not finite | modes apart | beyond |")
     for choice in every:
-        row = measure(*choice, each, given.compared)
+        row = of_first(*choice, each, given.compared)
+        if row is None:
+            continue
         print(row, flush=True)
         whole = ("states", "failed", "broken", "beyond", "compared", "undecided", "off")
         total.update({what: getattr(row, what) for what in whole})

@@ -36,14 +36,15 @@ autodoc_preserve_defaults = True
 autodoc_class_signature = "mixed"
 
 LINKS = (
-    (r"\]\(examples\)", "](#examples)"),
-    (r"\]\(examples/(\w+)\.py\)", r"](#example-\1)"),
-    (r"\]\(benchmarks/RESULTS\.md", "](/benchmarks.md"),
+    (r"\]\((?:\.\./\.\./)?examples\)", "](/examples.md)"),
+    (r"\]\((?:\.\./\.\./)?examples/(\w+)\.py\)", r"](#example-\1)"),
+    (r"\]\((?:\.\./\.\./)?examples/notebooks\)", "](/notebooks.md)"),
+    (r"\]\((?:\.\./\.\./)?benchmarks/RESULTS\.md", "](/benchmarks.md"),
+    (r"\]\(benchmarks/(\w+\.png)\)", r"](../benchmarks/\1)"),
     (r"\]\(CONTRIBUTING\.md", "](/contributing.md"),
-    (r"\]\(examples/notebooks\)", "](/notebooks.md)"),
-    (r"\]\(docs/gallery/", "](/gallery/"),
+    (r"\]\(docs/", "](/"),
 )
-"""Files that the README points to, and where they are among these pages."""
+"""Files that the README and the guide point to, and where they are among these pages."""
 
 os.environ.setdefault(  # the notebooks compile much and run little, as the tests do
     "XLA_FLAGS",
@@ -54,15 +55,23 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / "docs" / "_build" 
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 
-def prepare(app, path, parent, content):
-    """The README's links as links between pages, its sections one level up: each is a page."""
+def linked(text):
+    """A text whose links are between pages."""
+    for pattern, target in LINKS:
+        text = re.sub(pattern, target, text)
+    return text
+
+
+def prepare_readme(app, path, parent, content):
+    """Called for each file that a page includes."""
     if path.name == "README.md":
-        text = re.sub(r"^### ", "## ", content[0], flags=re.MULTILINE)
-        for pattern, target in LINKS:
-            text = re.sub(pattern, target, text)
-        if parent == "index":  # sections are its neighbours but on the first page
-            text = re.sub(r"\]\(#([\w-]+)\)", r"](guide/\1.md)", text)
-        content[0] = text
+        content[0] = linked(content[0])
+
+
+def prepare_page(app, name, source):
+    """Called for each page."""
+    if name.startswith("guide/"):
+        source[0] = linked(source[0])
 
 
 def bring_notebooks():
@@ -79,4 +88,5 @@ def bring_notebooks():
 def setup(app):
     """Called by Sphinx."""
     bring_notebooks()
-    app.connect("include-read", prepare)
+    app.connect("include-read", prepare_readme)
+    app.connect("source-read", prepare_page)

@@ -31,6 +31,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verify.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
     _add_tradeoff(commands)
     options = parser.parse_args(arguments)
+    for path in (getattr(options, name, None) for name in ("picture", "json", "file")):
+        if path and not Path(path).absolute().parent.is_dir():
+            parser.error(f"there is no folder for {path}")
     if options.command == "verify":
         return run_verify(options.cases, options.json)
     if options.command == "tradeoff":
@@ -71,7 +74,6 @@ def run_tradeoff(options: argparse.Namespace) -> int:
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from jaxcon.analysis.front import HEAD
     from jaxcon.analysis.tradeoff import tradeoff
     from jaxcon.core.status import SimulationError
 
@@ -95,7 +97,7 @@ def run_tradeoff(options: argparse.Namespace) -> int:
         if most is not None:
             try:
                 chosen = result.recommend(**{what: most})
-                print(f"\nat most {most:g} in {what}:\n{HEAD}\n{chosen}")
+                print(f"\nat most {most:g} in {what}: {chosen}")
             except ValueError as error:
                 print(error)
                 return 1
@@ -116,7 +118,17 @@ def find_scene(name: str) -> Any:
         made = runpy.run_path(file).get(function)
         if made is None:
             raise ValueError(f"{file} has no function {function}.")
-        return made()
+        built = made()
+        try:
+            system, state = built
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"{function} in {file} must return (system, state), as scene.build() does, and not"
+                f" {type(built).__name__}."
+            ) from None
+        return system, state
+    if name.endswith(".py"):
+        raise ValueError(f"{name} may have several scenes; say {name}:function.")
     if Path(name).suffix in (".xml", ".urdf", ".mjcf"):
         return from_mjcf(name)
     if name not in SCENES:

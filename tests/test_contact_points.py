@@ -8,6 +8,8 @@ from tolerances import DIFFERENCE
 
 import jaxcon as jc
 from jaxcon.constraints.bounds import linearize_bounds
+from jaxcon.constraints.contact import nearest
+from jaxcon.core.lanes import Vector
 
 H = 1e-3
 
@@ -181,6 +183,7 @@ def test_gradients_by_the_size_of_a_box():
         (jc.BoxContact("b", jc.WORLD, "dot", size=SIZE), "'dot' is a particle"),
         (jc.PlaneContact("b", jc.WORLD, "crate", damping=1.0), "'b': damping is of a soft stop"),
         (jc.PlaneContact("b", jc.WORLD, "dot", center=np.zeros((2, 3))), "a particle is one"),
+        (jc.PlaneContact("b", "dot", "crate"), "'b': it needs an orientation, but 'dot'"),
         (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((2, 2))), r"shape \(2, 3\)"),
         (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((0, 3))), r"shape \(1, 3\)"),
     ],
@@ -216,3 +219,13 @@ def test_corners_take_a_quaternion_of_any_length():
     np.testing.assert_allclose(twice, once, atol=1e-15)
     lengths = np.linalg.norm(once - np.mean(once, axis=0)[None], axis=1)
     np.testing.assert_allclose(lengths, np.linalg.norm(SIZE) / 2, rtol=1e-14)
+
+
+def test_parallel_capsules_touch_in_the_middle_of_what_faces():
+    """At an end of it, one that lies on the other would rock; else at the two nearest ends."""
+    starts, ends = np.array([8.0, -1.0, 3.0, 11.0]), np.array([9.0, 1.0, 2.0, 12.0])
+    lanes = (0.0 * starts, 10.0 + 0.0 * starts, starts, ends)
+    corners = [Vector(jnp.asarray(x), jnp.full(4, float(i > 1))) for i, x in enumerate(lanes)]
+    x, y = nearest(*corners)
+    np.testing.assert_allclose(x[0], [8.5, 0.5, 2.5, 10.0], atol=1e-15)
+    np.testing.assert_allclose(y[0], [8.5, 0.5, 2.5, 11.0], atol=1e-15)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from gymnasium.envs.functional_jax_env import FunctionalJaxEnv
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers.vector import JaxToNumpy, RecordEpisodeStatistics
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
@@ -28,7 +29,7 @@ from benchmarks import environments as benchmark  # noqa: E402
 TASKS = list(environments.TASKS)
 CHEAP = {
     "CatRighting": {"method": jc.Method(jc.RATTLE(), solver=jc.Schur())},
-    "FiveBarHopper": {"method": jc.Method(solver=jc.Schur())},
+    "FiveBarHopper": {"method": jc.Method(solver=jc.Schur(), bounded=jc.GaussSeidel(2))},
     "HalfCheetah": {"method": jc.Method(solver=jc.Schur(), bounded=jc.GaussSeidel(2))},
     "StewartBalancing": {"method": jc.Method(solver=jc.Schur())},
 }
@@ -76,6 +77,11 @@ def test_a_time_limit_is_gymnasiums():
         gymnasium.make("jaxcon/CartPole-v0", horizon=50)
     with pytest.raises(ValueError, match="max_episode_steps"):
         gymnasium.make_vec("jaxcon/CartPole-v0", num_envs=2, horizon=50)
+    assert many(max_episode_steps=-1).environment.horizon is None  # of which Gymnasium makes none
+    with pytest.raises(ValueError, match="max_episode_steps must be a whole number from 1, got 0"):
+        many(max_episode_steps=0)
+    with pytest.raises(ValueError, match="num_envs must be a whole number from 1, got 2.5"):
+        many(2.5)
 
 
 def test_a_seed_is_that_of_the_copies_that_a_mask_resets():
@@ -203,6 +209,30 @@ def test_many_copies_refuse_what_are_no_actions():
     envs.reset(seed=0)
     with pytest.raises(ValueError, match=r"shape \(4, 1\), got \(4,\)"):
         envs.step(np.zeros(4))
+    with pytest.raises(ValueError, match="could not convert string to float"):
+        envs.step([["left"]] * 4)
+
+
+def test_what_was_saved_elsewhere_is_refused():
+    envs, one = many(), single().unwrapped
+    envs.reset(seed=0)
+    one.reset(seed=0)
+    with pytest.raises(ValueError, match=r"episode\.state\.q as float64\(4, 6\), and .*\(3, 6\)"):
+        many(3).restore(envs.save())
+    with pytest.raises(ValueError, match="another task, precision or number of copies"):
+        single("Parking").unwrapped.restore(one.save())
+
+
+def test_gymnasiums_wrappers_see_arrays_of_numpy():
+    """Episodes of three actions, and a fourth by which they begin anew."""
+    envs = RecordEpisodeStatistics(JaxToNumpy(many(max_episode_steps=3)))
+    envs.reset(seed=0)
+    seen = [envs.step(action) for action in pushes(8)]
+    assert isinstance(seen[0][0], np.ndarray)
+    for end in (2, 6):
+        found = seen[end][4]["episode"]
+        np.testing.assert_array_equal(found["l"], 3)
+        np.testing.assert_allclose(found["r"], sum(x[1] for x in seen[end - 2 : end + 1]))
 
 
 def test_unknown_names_and_options_are_told():
@@ -224,8 +254,10 @@ def test_unknown_names_and_options_are_told():
         envs.step(np.zeros((4, 1)))
     with pytest.raises(ValueError, match="render_mode must be None or 'rgb_array'"):
         environments.GymnasiumEnv("CartPole", render_mode="ansi")
+    before = envs.np_random.bit_generator.state
     with pytest.raises(ValueError, match="4 bools, got float64"):
-        envs.reset(options={"reset_mask": np.ones(4)})
+        envs.reset(seed=3, options={"reset_mask": np.ones(4)})
+    assert envs.np_random.bit_generator.state == before
 
 
 def test_time_is_up_for_one_copy_and_for_many():
@@ -381,18 +413,35 @@ else:
     assert result.returncode == 0, result.stderr
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.7, 1.0])
-def test_whoever_is_chosen_starts_as_its_key_says(share):
-    """Starts are computed in parts of some of the copies; the first two of these need one part."""
-    environment, count = environments.make("CartPole"), 150
-    begin = jax.jit(copies.begin, static_argnums=(2,))
-    start, _ = begin(environment, jax.random.key(0), count)
-    chosen = np.random.default_rng(1).random(count) < share
-    after = jax.jit(copies.restart)(environment, start, jnp.asarray(chosen)).episode
-    expected = jax.jit(jax.vmap(environment.reset))(start.episode.key)
-    np.testing.assert_allclose(after.state.q[chosen], expected.state.q[chosen], rtol=1e-14)
-    assert np.all(after.state.q[chosen, 0] != start.episode.state.q[chosen, 0])
-    same(after.state.q[~chosen], start.episode.state.q[~chosen])
+def test_whoever_is_chosen_starts_as_its_key_says():
+    """None, and up to each of the numbers of starts that are computed, of which there are three."""
+    environment, count = environments.make("CartPole"), 400
+    start, _ = jax.jit(copies.begin, static_argnums=(2,))(environment, jax.random.key(0), count)
+    expected = jax.jit(jax.vmap(environment.reset))(start.episode.key).state.q
+    restart, order = jax.jit(copies.restart), np.random.default_rng(1).permutation(count)
+    for number in (0, 1, 64, 65, 100, 101, 400):
+        chosen = order < number
+        after = restart(environment, start, jnp.asarray(chosen)).episode.state.q
+        np.testing.assert_allclose(after[chosen], expected[chosen], rtol=1e-14)
+        assert np.all(after[chosen, 0] != start.episode.state.q[chosen, 0])
+        same(after[~chosen], start.episode.state.q[~chosen])
+
+
+def test_copies_that_are_simulated_by_lots_move_as_all_at_once(monkeypatch):
+    environment = environments.make("CartPole")
+    start, _ = copies.begin(environment, jax.random.key(0), 6)
+    actions = jnp.linspace(-1.0, 1.0, 6)[:, None]
+
+    def places(lot, x):
+        monkeypatch.setattr(environments.Environment, "lot", lot)
+        return copies.simulate(environment, start, x).state.q
+
+    whole, lots = places(6, actions), places(3, actions)
+    np.testing.assert_allclose(lots, whole, rtol=1e-6, atol=1e-6)
+    slopes = (jax.grad(lambda x, n=n: jnp.sum(places(n, x)[:, 0]))(actions) for n in (6, 3))
+    np.testing.assert_allclose(*slopes, rtol=1e-5)
+    sizes = [copies.lot(count, 128) for count in (100, 128, 1000, 4096, 4099)]
+    assert sizes == [None, None, 125, 128, None]
 
 
 def test_restarts_are_differentiated():

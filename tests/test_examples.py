@@ -1,4 +1,4 @@
-"""The README and the examples run as they stand."""
+"""The README, the guide and the examples run as they stand."""
 
 import os
 import re
@@ -7,7 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+import jaxcon as jc
 
 ROOT = Path(__file__).parents[1]
 
@@ -16,23 +19,42 @@ QUICK = {name: ["--updates", "1"] for name in ("learn_apg", "learn_ppo")}
 """Arguments of examples that take minutes without them."""
 
 
-def blocks(file: str) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / file).read_text(), re.DOTALL)
+def blocks(path: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
 
 
-def test_readme_code_runs_in_order():
-    code = blocks("README.md")
-    assert len(code) >= 4
+def ran(path: Path) -> dict:
+    """The names of a page after its programs, one after the other and after nothing else."""
     names: dict = {}
-    for block in code:
+    for block in blocks(path):
         exec(block, names)  # noqa: S102
-    assert names["path"].q.shape[0] == 2000
-    assert abs(float(names["angles"][-1])) < 0.02  # the policy of the README balances its pole
+    return names
+
+
+TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", [p for p in TEXTS if blocks(p)], ids=lambda p: p.stem)
+def test_programs_of_the_readme_and_the_guide_run_page_by_page(page, capsys):
+    names = ran(page)
+    if page.stem == "README":  # the first that it prints is what its comment says
+        said = re.search(r"print\(.*# (\[.*?\])", page.read_text())
+        assert said
+        found, known = capsys.readouterr().out.splitlines()[0], said[1]
+        both = [np.fromstring(text.strip("[]"), sep=" ") for text in (found, known)]
+        np.testing.assert_allclose(*both, atol=1e-3)
+    if page.stem == "control":  # its policy balances its pole
+        upright = jc.orientation(names["system"], names["final"], "pole")
+        assert abs(float(upright)) < 0.02
+
+
+def test_every_page_of_the_guide_has_a_program():
+    assert [p.stem for p in TEXTS if not blocks(p)] == ["index"]
 
 
 def test_readme_opens_with_ten_lines_and_two_commands():
     readme = (ROOT / "README.md").read_text()
-    lines = [line for line in blocks("README.md")[0].splitlines() if line]
+    lines = [line for line in blocks(ROOT / "README.md")[0].splitlines() if line]
     assert len(lines) == 10
     commands = re.findall(r"```sh\n(.*?)\n```", readme, re.DOTALL)
     assert [c.count("\n") for c in commands] == [0, 0]

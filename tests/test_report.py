@@ -125,6 +125,21 @@ def test_a_skate_that_slips_is_where_it_may_be():
     assert "off rod: print(jc.assemble(system, state))" in str(report)
 
 
+def test_what_a_report_cannot_take_is_named():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    with pytest.raises(TypeError, match=r"jc.Method\(jc.RK4\(\)\), got RungeKutta"):
+        jc.report(system, state, jc.RK4(), 1e-3)
+    for wrong in (-1e-3, "1 ms"):
+        with pytest.raises(ValueError, match="report: dt"):
+            jc.report(system, state, jc.Method(), wrong)
+    scene.add(jc.Distance("stub", jc.WORLD, "bob", point_a=(1.0, 0.0)))
+    with pytest.raises(ValueError, match="'stub': the distance of its points, as no length is"):
+        scene.build()
+
+
 def test_without_constraints():
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0)

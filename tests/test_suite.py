@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import benchmarks  # noqa: E402
 from benchmarks import __main__ as command  # noqa: E402
-from benchmarks import equal_error, motions, suite  # noqa: E402
+from benchmarks import equal_error, motions, pictures, suite  # noqa: E402
 from benchmarks import work_precision as runs  # noqa: E402
 from benchmarks import work_precision_peers as peers  # noqa: E402
 from benchmarks.entries import ENTRIES  # noqa: E402
@@ -176,6 +176,43 @@ def test_the_cheapest_method_of_each_code_is_compared():
     assert "| 3 |" in rows[0]
     assert "not reached" in rows[-1]
     assert "not run" in rows[0]
+
+
+def test_what_cannot_be_compared_is_said(fakes, tmp_path, capsys):
+    none, base = str(tmp_path / "none.json"), str(tmp_path / "baseline.json")
+    for wrong in (["--compare", none], ["--json", f"{tmp_path}/none/out.json"]):
+        with pytest.raises(SystemExit):
+            command.main(["fast", *wrong])
+        assert "there is no" in capsys.readouterr().err
+    assert command.main(["fast", "breaks", "--update", "--compare", base]) == 1
+    assert Baseline.read(Path(base)).of("full", "fast") == {"ratio": 4.0}
+    assert command.main(["fast", "--quick", "--compare", base]) == 0
+    assert "baseline.json has nothing to compare with of fast" in capsys.readouterr().out
+
+
+def test_the_picture_of_equal_error_is_small_and_says_what_is_on_its_axes(tmp_path, monkeypatch):
+    """From made-up runs of as many methods as a study has."""
+    errors, kept = 10.0 ** -np.arange(12), {}
+    runs_of = [
+        line(0.5 * errors, 1e-6 * (1 + i) * 10**j, f"method {i}", code)
+        for j, code in enumerate(equal_error.CODES)
+        for i in range(8)
+    ]
+    points = [point for runs in runs_of for point in runs]
+    plain = pictures.save
+    monkeypatch.setattr(pictures, "save", lambda f, path: (kept.update(figure=f), plain(f, path)))
+    found = [(make(), points) for make in motions.MOTIONS.values()]
+    equal_error.draw([*found[:3], (found[3][0], line([INF, INF]))], tmp_path / "picture.png")
+    assert 5_000 < (tmp_path / "picture.png").stat().st_size < 80_000
+    panels = kept["figure"].axes
+    assert [axes.get_title() for axes in panels] == list(motions.MOTIONS)
+    for axes, (motion, _) in zip(panels, found, strict=True):
+        assert axes.get_xscale() == axes.get_yscale() == "log"
+        assert axes.get_ylabel().endswith(f"[{motion.unit}]")
+        assert axes.get_xlabel().endswith("[s]")
+    thick = [x for x in panels[0].get_lines() if x.get_label() in equal_error.CODES]
+    cheapest = [x.get_xdata()[np.argmin(np.abs(x.get_ydata() - 1e-3))] for x in thick]
+    np.testing.assert_allclose(np.divide(cheapest[1:], cheapest[:-1]), 10.0, rtol=1e-6)
 
 
 def test_steps_are_halved_until_they_no_longer_matter():

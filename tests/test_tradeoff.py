@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ from scipy.integrate import solve_ivp
 import jaxcon as jc
 from jaxcon.__main__ import main
 from jaxcon.analysis import ledger, reference, sweep
+from jaxcon.analysis.front import LeftOut
+from jaxcon.analysis.listing import table
 from jaxcon.analysis.trials import Inputs, Observer, Points, Problem, Trip
 
 G, HORIZON = 9.81, 1.0
@@ -174,6 +177,39 @@ def test_the_diagram_and_the_file_of_figures(result, tmp_path):
     found = json.loads(result.to_json(tmp_path / "figures.json"))
     assert len(found["runs"]) == len(result.runs)
     assert len(result.table.splitlines()) == len(result.runs) + 1
+
+
+def test_the_table_names_its_numbers_above_them(result):
+    lines = result.table.splitlines()
+    places = [m.end() for m in re.finditer(r"error|angle|violation|energy|cost|alone", lines[0])]
+    shown = {(run.name, run.dtype, f"{run.dt:.3g}"): run for run in result.runs}
+    for line in lines[1:]:
+        name, dtype, dt = re.split(r"  +", line)[:3]
+        run = shown.pop((name, dtype, dt))
+        assert line[: places[0]].endswith(f"{run.error:.2e}")
+        assert line[: places[4]].endswith(f"{run.cost:.2e}")
+    assert not shown
+    for unit in ("[m, or of q]", "[rad]", "[J]", "one world [s]", "[B]"):
+        assert unit in str(result)
+    run = result.front[0]
+    assert f"h = {run.dt:.3g} s: error {run.error:.2g}, violation" in str(run)
+    late = dataclasses.replace(run, gradient=math.nan, name="a" * 60, told=False)
+    assert re.search(
+        rf"^a{{60}}  .* <{run.error:.2e} .* - ", "\n".join(table([late])), re.MULTILINE
+    )
+    lost = dataclasses.replace(run, outcome="NON_FINITE at 0.5 s")
+    assert str(lost).endswith("diverged, NON_FINITE at 0.5 s")
+
+
+def test_a_result_without_runs_says_so_in_words_and_in_its_picture(result, tmp_path):
+    late = [LeftOut("RK4", dtype, "no time") for dtype in ("float64", "float32")]
+    empty = dataclasses.replace(result, runs=(), limits=(), left_out=tuple(late), seconds=61.0)
+    assert "empty: no method was run in 61 s" in str(empty)
+    assert str(empty).endswith("left out:\n  no time:\n    RK4, float64, float32")
+    empty.plot(tmp_path / "diagram.png")
+    assert (tmp_path / "diagram.png").stat().st_size > 5_000
+    with pytest.raises(ValueError, match="no method was run"):
+        empty.recommend(error=1e-3)
 
 
 def made(horizon):
@@ -399,6 +435,19 @@ def test_the_command_line_says_why_there_is_no_result(capsys, tmp_path):
     assert "horizon" in capsys.readouterr().out
     assert main(["tradeoff", f"{tmp_path}/none.py:drop"]) == 2
     assert "none.py" in capsys.readouterr().out
+
+
+def test_the_command_line_says_what_it_cannot_use_before_it_begins(capsys, tmp_path):
+    scene = tmp_path / "scene.py"
+    scene.write_text("def nothing():\n    return None\n")
+    assert main(["tradeoff", f"{scene}:nothing"]) == 2
+    assert "nothing in" in (said := capsys.readouterr().out)
+    assert "must return (system, state)" in said
+    assert main(["tradeoff", str(scene)]) == 2
+    assert "scene.py:function" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["tradeoff", "four_bar", "--picture", f"{tmp_path}/none/diagram.png"])
+    assert "there is no folder for" in capsys.readouterr().err
 
 
 def test_a_scene_that_nobody_knows_is_named_by_the_command_line(capsys):

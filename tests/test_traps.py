@@ -182,16 +182,19 @@ def test_a_report_is_a_checklist():
     assert report.seconds > 0
     text = str(report)
     for words in (
-        "1 degrees of freedom",
+        "1 degree of freedom",
         "operations a step",
         "memory of a world",
         "µs a step of one world",
-        "gains α = 5000, β = 5000 1/s; α = β is stable up to 828.4 1/s here",
+        "gains α = 5000, β = 5000 1/s; at this ratio β is stable up to 828.4 1/s",
         "expected violation: ",
         "jc.Method.auto takes Sparse(): constraints, 1 row, close no loop",
         "warning, gains too large for the step: Baumgarte gains",
     ):
         assert words in text
+    α, β, most = jc.report(system, state, with_(), DT).gains  # x² + 2x = 4 for x = hβ, α = β/2
+    assert α / β == pytest.approx(0.5)
+    assert β < most == pytest.approx((np.sqrt(5) - 1) / DT)
     calm = jc.report(system, state)
     assert calm.warnings == {}
     assert calm.work is calm.gains is calm.probe is calm.seconds is None

@@ -38,6 +38,11 @@ def draw(result: Any, onto: Any = None) -> Any:
     axes.plot(x, y, color="0.8", lw=8, zorder=0, label="front")
     axes.axhline(result.floor, color="0.5", ls=":", label="error of the reference")
     axes.plot([], [], color="k", marker="x", ls="", label="diverged")
+    if not result.front:  # a logarithmic axis needs a number
+        axes.set(xlim=(1e-6, 1.0), ylim=(1e-12, 1.0))
+        axes.text(
+            0.5, 0.5, "no run was both stable and timed", transform=axes.transAxes, ha="center"
+        )
     axes.set(xscale="log", yscale="log", xlabel="time for a simulated second of a world [s]")
     axes.set(ylabel="error [m]", title=f"{result.horizon:g} s, {result.batch} worlds")
     axes.legend(fontsize=7)

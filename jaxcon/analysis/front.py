@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from jaxcon.analysis.diagram import draw
+from jaxcon.analysis.listing import LEGEND, table
 from jaxcon.simulation.method import Method
 
 OK = "ok"
 """Of a run that neither failed nor left its bounds."""
-COLUMNS = ("error", "angle", "violation", "energy", "cost", "alone", "gradient", "memory")
 
 
 @dataclass(frozen=True)
@@ -71,18 +71,16 @@ class Run:
         return values | dict.fromkeys(bad)
 
     def __str__(self) -> str:
-        head = f"{self.name:48s} {self.dtype}  h = {self.dt:<8.3g}"
+        head = f"{self.name}, {self.dtype}, h = {self.dt:.3g} s"
         if not self.ok:
-            return f"{head} diverged: {self.outcome}"
-        below = " " if self.told else "<"
-        figures = "".join(f"{getattr(self, key):10.2e}" for key in COLUMNS[1:])
-        return f"{head}{below}{self.error:8.2e}{figures}  {self.note}".rstrip()
-
-
-HEAD = f"{'method':48s} {'precision':9s}{'h [s]':12s}" + "".join(
-    f"{words:>10s}"
-    for words in ("error", "angle", "violation", "energy", "cost", "alone", "gradient", "memory")
-)
+            return f"{head}: diverged, {self.outcome}"
+        costs = "" if math.isnan(self.cost) else f"; {self.cost:.3g} s for a simulated second"
+        below = "" if self.told else "<"
+        note = f"; {self.note}" if self.note else ""
+        return (
+            f"{head}: error {below}{self.error:.2g}, violation {self.violation:.2g},"
+            f" energy off by {self.energy:.2g} J{costs}{note}"
+        )
 
 
 @dataclass(frozen=True)
@@ -177,9 +175,7 @@ class Tradeoff:
             raise ValueError("recommend: give either error= [m] or cost= [s/s].")
         front = self.front
         if not front:
-            raise ValueError(
-                "recommend: no run was both stable and timed; print the result to see why."
-            )
+            raise ValueError(f"recommend: {self.without}.")
         if error is not None and error < self.floor:
             raise ValueError(
                 f"recommend: an error of {error:.2g} cannot be told, as the reference itself may be"
@@ -221,10 +217,7 @@ class Tradeoff:
     @property
     def table(self) -> str:
         """Every run, by method."""
-        lines = [HEAD]
-        for runs in self.grouped.values():
-            lines += map(str, runs)
-        return "\n".join(lines)
+        return "\n".join(table([run for runs in self.grouped.values() for run in runs]))
 
     def to_json(self, path: str | Path | None = None) -> str:
         """Everything but the methods themselves as JSON, also written to a path where one is given.
@@ -252,8 +245,8 @@ class Tradeoff:
         return text
 
     def __str__(self) -> str:
-        lines = [*self.about, "", "the front, each with the least error up to its cost:", HEAD]
-        lines += map(str, self.front)
+        lines = [*self.about, "", "the front, each with the least error up to its cost:"]
+        lines += [*table(self.front), "", *LEGEND] if self.front else [f"    empty: {self.without}"]
         lines += ["", "all methods (`result.table` has every run):"]
         limits = {(x.name, x.dtype): x for x in self.limits}
         for key, runs in self.grouped.items():
@@ -265,8 +258,29 @@ class Tradeoff:
             if bad:
                 lines.append(f"    diverged at {', '.join(bad)}")
         if self.left_out:
-            lines += ["", "left out:", *(f"  {x}" for x in self.left_out)]
+            lines += ["", "left out:"]
+        for reason, names in self.excuses.items():
+            lines += [f"  {reason}:", *(f"    {name}" for name in names)]
         return "\n".join(lines)
+
+    @property
+    def excuses(self) -> dict[str, list[str]]:
+        """By reason what was left out, each method with its precisions."""
+        found: dict[str, dict[str, list[str]]] = {}
+        for x in self.left_out:
+            found.setdefault(x.reason, {}).setdefault(x.name, []).append(x.dtype)
+        return {
+            reason: [", ".join(filter(None, [name, *dtypes])) for name, dtypes in own.items()]
+            for reason, own in found.items()
+        }
+
+    @property
+    def without(self) -> str:
+        """Why there is no front."""
+        if self.runs:
+            return "no run was both stable and timed; `result.table` says why"
+        spent = f"no method was run in {self.seconds:.0f} s"
+        return f"{spent}; `result.left_out` says why, and a larger budget= may help"
 
 
 def front_of(runs: Iterable[Run]) -> tuple[Run, ...]:

@@ -13,12 +13,13 @@ import numpy as np
 
 from jaxcon.analysis.probe import Probe, probe
 from jaxcon.constraints.rows import Rows
+from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.assembly import assemble
 from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
 from jaxcon.model.state import State, at
 from jaxcon.simulation.choice import Choice, choose
-from jaxcon.simulation.method import Method
+from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.stability import default_gains, parts
 
 ASIDE = 0.05
@@ -63,6 +64,10 @@ class Known:
     ) -> Known:
         """The same from what a user gives."""
         system = at(system, state, "jc.report(system, s)")
+        if method is not None:
+            check_method(method)
+        if dt is not None:
+            checks.positive("report", "dt", dt)
         rows, jacobian, mass = linearized(system, state)
         h = None if dt is None else float(dt)
         return cls(system, state, method or Method(), h, control, batch, rows, mass, jacobian)

@@ -17,7 +17,7 @@ from jaxcon.analysis.work import Work, seconds, work
 from jaxcon.core.status import Status
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
-from jaxcon.simulation.choice import Choice
+from jaxcon.simulation.choice import Choice, several
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import largest_stable_rate
 
@@ -43,8 +43,8 @@ class Report:
         choice: the solver that `Method.auto` takes, and why.
         work: operations of a step of one world, where a method was given.
         seconds: what a step of one world takes in a batch on this device [s], where that was asked.
-        gains: α and β of the feedback, and the largest α = β that is stable [1/s], where a method
-            and a step were given.
+        gains: α and β of the feedback, and the largest β that is stable at their ratio [1/s], where
+            a method and a step were given.
         probe: what some steps from the state left open, likewise.
         warnings: by trap, "gains", "singular", "order", "over-constrained", "start", "nonlinear",
             "dense" and "iterations", of those in which the scene and the method are; a method is
@@ -74,7 +74,7 @@ class Report:
         lines = [
             f"{self.coordinates} coordinates, {self.velocities} velocities",
             f"{self.rows} constraint rows of rank {self.rank}: "
-            f"{self.degrees_of_freedom} degrees of freedom",
+            f"{several(self.degrees_of_freedom, 'degree')} of freedom",
             f"condition of the independent rows: {self.condition:.2g}",
         ]
         if self.bounded:
@@ -117,7 +117,8 @@ class Report:
         if self.gains:
             α, β, most = self.gains
             lines.append(
-                f"gains α = {α:.4g}, β = {β:.4g} 1/s; α = β is stable up to {most:.4g} 1/s here"
+                f"gains α = {α:.4g}, β = {β:.4g} 1/s; at this ratio β is stable up to"
+                f" {most:.4g} 1/s"
             )
         if self.probe:
             code = self.probe.status
@@ -157,6 +158,10 @@ def report(
 
     Returns:
         A `Report`.
+
+    Raises:
+        TypeError: something else than a system, a state and a method.
+        ValueError: a step that is not positive, or shapes that are not those of the system.
     """
     known = Known.of(system, state, method, dt, control, batch)
     unit, layout = known.unit, known.rows.layout
@@ -193,8 +198,9 @@ def _with_method(found: Report, known: Known, timed: bool) -> Report:
     args = known.system, known.method, known.state, known.control
     gains = None
     if known.dt is not None:
-        most = largest_stable_rate(known.method.integrator, known.dt)
-        gains = (*asked_gains(known.method, known.dt), most)
+        α, β = asked_gains(known.method, known.dt)
+        ratio = α / β if β > 0 else 1.0
+        gains = (α, β, largest_stable_rate(known.method.integrator, known.dt, ratio))
     return dataclasses.replace(
         found,
         memory=memory(*args),

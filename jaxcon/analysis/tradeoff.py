@@ -140,9 +140,10 @@ def _go(
     reason, share = NO_TIME, RUNS_SHARE if gradients else 1.0
     try:
         with shown:
-            for one in wanted:
+            for i, one in enumerate(wanted):
                 shown.set_postfix_str(f"{one.name}, {one.dtype}")
-                if one not in ledger and clock.lasts("runs", share):
+                # the first gets all there is, as without any run there is nothing to say
+                if one not in ledger and clock.lasts("runs", share if i else 1.0):
                     with clock.timing("runs"):
                         ledger[one] = sweep.measure(one.name, one.method, one.dtype)
                 shown.update()

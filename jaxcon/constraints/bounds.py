@@ -134,7 +134,7 @@ class BoundRows:
             target=choice.take(self.target),
             compliance=choice.take(self.compliance),
             friction=choice.contacts(self.friction),
-            jacobian=Gathered(choice.columns(self.jacobian.columns(self.rate))),
+            jacobian=Gathered(self.jacobian.pulls(choice.places().astype(self.rate.dtype))),
             bounce=bounce,
             travel=travel,
             kinds=choice.kinds,

@@ -7,6 +7,7 @@ follow from that alone (`touching`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +16,10 @@ import jax.numpy as jnp
 from jaxcon.constraints.bounds import BoundSet
 from jaxcon.constraints.joints import stretched, unit_vector
 from jaxcon.constraints.limits import one_sided, stop
+from jaxcon.constraints.pairs import check_oriented
 from jaxcon.constraints.point_sets import given_points, own_points, spread, spread_place
 from jaxcon.constraints.primitives import Row, distance
+from jaxcon.constraints.ranges import check_ranges
 from jaxcon.constraints.touching import MATERIAL, Touch, material, touching
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector
@@ -215,9 +218,15 @@ class Touches(Elements):
         each = None if points is None else points[0].shape[1]
         return BoundSet(law, tuple(rows), places, points=each, **asked)
 
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the numbers of one element, by field."""
+        check_ranges(name, numbers)
+
 
 def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]:
-    """The nearest points of the segments pq and rs; of parallel ones, that of the middle of pq.
+    """The nearest points of the segments pq and rs; of parallel ones, the middle of what faces.
+
+    Where they do not face each other at all, the two ends that are nearest.
 
     References:
         Ericson, Real-Time Collision Detection (2005), section 5.1.9.
@@ -229,14 +238,20 @@ def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]
     tiny = 16 * float(jnp.finfo(jnp.result_type(*p)).eps)
     crossing = apart > tiny * a * e
     x = jnp.clip(numerics.safe_divide(b * f - c * e, jnp.where(crossing, apart, 0)), 0, 1)
-    x = jnp.where(crossing, x, 0.5)
+    facing = [jnp.clip(numerics.safe_divide(end, a), 0, 1) for end in (-c, b - c)]
+    x = jnp.where(crossing, x, (facing[0] + facing[1]) / 2)
     y = jnp.clip(numerics.safe_divide(b * x + f, e), 0, 1)
     x = jnp.clip(numerics.safe_divide(b * y - c, a), 0, 1)
     return p + u * x, r + w * y
 
 
 def plane(element: Any, a: Pose) -> dict[str, Array]:
-    """The normal and the point of a plane in the frame of its body."""
+    """The normal and the point of a plane in the frame of its body.
+
+    Raises:
+        ValueError: the body is a particle.
+    """
+    check_oriented(element, a)
     dim, dtype = a.position.shape[0], a.position.dtype
     given = (0.0,) * (dim - 1) + (1.0,) if element.normal is None else element.normal
     normal = unit_vector(element, "normal", given, a)

@@ -13,6 +13,7 @@ from jaxcon.constraints.custom import CustomOnBodies, CustomOnCoordinates
 from jaxcon.constraints.limits import one_sided, stop
 from jaxcon.constraints.point_sets import spread_place
 from jaxcon.constraints.primitives import Row
+from jaxcon.constraints.ranges import check_ranges
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, Lane, PyTree
@@ -79,6 +80,7 @@ class OneSided:
         own, name = dict(changes.get(self.law.name, {})), self.law.name
         params = own.pop("params", self.params)
         new = {k: replace_at(f"{name}.{k}", self.numbers[k], 0, x) for k, x in own.items()}
+        check_ranges(name, own)
         return dataclasses.replace(self, params=params, numbers=self.numbers | new)
 
     def bounds(self: Any, snapshot: Any, control: Any, dt: Any) -> BoundSet:

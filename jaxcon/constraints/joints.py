@@ -321,7 +321,12 @@ def stretched(element: Any, a: Pose, b: Pose) -> dict[str, Array]:
     """
     start = own_point(element, "point_a", element.point_a, a)
     end = own_point(element, "point_b", element.point_b, b)
-    length = numerics.norm(end - start) if element.length is None else element.length
-    length = checks.number(label(element), "length", length, a.position.dtype)
-    checks.positive(label(element), "length", length)
+    length, what = element.length, "length"
+    if length is None:
+        length, what = (
+            numerics.norm(end - start),
+            "the distance of its points, as no length is given,",
+        )
+    length = checks.number(label(element), what, length, a.position.dtype)
+    checks.positive(label(element), what, length)
     return {"anchor_a": a.local_point(start), "anchor_b": b.local_point(end), "length": length}

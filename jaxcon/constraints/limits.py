@@ -5,6 +5,7 @@ Each class describes one element on a joint's coordinate θ, an angle over turns
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.bounds import BoundSet
 from jaxcon.constraints.primitives import Row
+from jaxcon.constraints.ranges import check_ends, check_ranges
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import take
 from jaxcon.core.pytree import pytree, static
@@ -74,11 +76,7 @@ class Limit:
         upper = checks.number(
             label(self), "upper", far if self.upper is None else self.upper, dtype
         )
-        if checks.is_concrete((lower, upper)) and not lower < upper:
-            raise ValueError(
-                f"{label(self)}: lower must be below upper, got {float(lower)} and"
-                f" {float(upper)}; what does not move at all is a Fixed joint or a Drive."
-            )
+        check_ends(label(self), lower, upper)
         return {"lower": lower, "upper": upper} | stop(self, dtype)
 
     @staticmethod
@@ -205,6 +203,10 @@ class Bounds(Elements):
         )
         return BoundSet(self.law.law, (row,), self.places, **asked)
 
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the numbers of one element, by field."""
+        check_ranges(name, numbers)
+
     def _control(self, control: Any) -> Lane:
         """The element's own channels."""
         return take(control, self.starts) if self.starts and control is not None else 0.0
@@ -264,11 +266,7 @@ def stop(element: Any, dtype: Any) -> dict[str, Array]:
     if element.stiffness is not None:
         numbers |= {"stiffness": element.stiffness, "damping": element.damping}
     result = {what: checks.number(owner, what, x, dtype) for what, x in numbers.items()}
-    for what, x in result.items():
-        checks.positive(owner, what, x, strictly=what in ("stiffness", "recovery"))
-    e = result.get("restitution", 0.0)
-    if checks.is_concrete(e) and e > 1:
-        raise ValueError(f"{owner}: restitution must lie in 0 to 1, got {element.restitution}.")
+    check_ranges(owner, result)
     return result
 
 

@@ -49,13 +49,19 @@ def touching(p: dict[str, Any], touch: Touch, dt: Any) -> tuple[list[Row], dict[
     if "friction" not in p:
         return [first], asked
     tangents = across(touch.normal)
-    asked = asked | {"friction": p["friction"]}
+    asked = asked | {"friction": resisting(p["friction"])}
     if "rolling" in p:
         rolls = tuple(turning(touch.a, touch.b, u) for u in tangents)
-        asked |= {"rolling": p["rolling"], "rolls": rolls}
+        asked |= {"rolling": resisting(p["rolling"]), "rolls": rolls}
     if "spinning" in p:
-        asked |= {"spinning": p["spinning"], "spins": (turning(touch.a, touch.b, touch.normal),)}
+        spins = (turning(touch.a, touch.b, touch.normal),)
+        asked |= {"spinning": resisting(p["spinning"]), "spins": spins}
     return [first, *(along(*points, u) for u in tangents)], asked
+
+
+def resisting(coefficient: Lane) -> Lane:
+    """A coefficient of friction; a negative one, which only a traced one can be, is none."""
+    return jnp.where(coefficient < 0, 0, coefficient)
 
 
 def turning(a: Any, b: Any, u: Vector) -> Row:

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.bounds import BoundRows
+from jaxcon.core import numerics
+from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 
@@ -24,6 +26,9 @@ SHORTEST = 1e-6
 
 ROUNDING = 64
 """What rounding makes of a gap, in spacings of 1 + max |q|."""
+
+SLIPS = 1e-3
+"""The least slip that can end, as a share of what accelerations make of a speed in a step."""
 
 
 @pytree
@@ -58,6 +63,41 @@ class Part:
 
 
 @pytree
+class Sliding:
+    """Contacts that slide when a part begins.
+
+    Attributes:
+        speed: of the slip, (contacts,) [m/s]; zero where nothing slides.
+        way: its direction, a Vector of (contacts,).
+    """
+
+    speed: Array
+    way: Vector
+
+    @classmethod
+    def of(cls, rows: BoundRows, open_: Array, bend: Array, rounding: Array, dt: Array) -> Sliding:
+        """Those of closed contacts; what cannot be told from rolling is none."""
+        kinds, near = rows.kinds, rows.gap <= jnp.maximum(bend, rounding[None])
+        slip, speeds = kinds.split(rows.rate).discs[0], kinds.split(bend).normal
+        speed = numerics.norm(slip)
+        fast = speed * dt[None] > SLIPS * speeds + rounding[None]
+        slides = kinds.split(near & ~open_).normal & fast
+        way = slip * numerics.safe_divide(1.0, speed)
+        return cls(jnp.where(slides, speed, 0), way)
+
+    def clearance(self, rows: BoundRows, multipliers: Array) -> Array:
+        """What is left of the slip at the end of a part, (contacts,); negative where it has ended.
+
+        There friction λ_t has not been needed in full: with d the direction of the slip and v₀ its
+        speed, d·u − v₀ (1 + d·λ_t/μλ_n) goes through zero when the slip ends, with one slope.
+        """
+        here, given = rows.kinds.split(rows.rate), rows.kinds.split(multipliers)
+        used = numerics.safe_divide(self.way.dot(given.discs[0]), rows.friction * given.normal)
+        spare = jnp.where(given.normal > 0, 1 + used, 0)
+        return self.way.dot(here.discs[0]) - self.speed * spare
+
+
+@pytree
 class Outlook:
     """What is to be expected of rows in a part.
 
@@ -67,6 +107,7 @@ class Outlook:
         rounding: what rounding makes of a gap, ().
         open: which rows are open, (n,).
         arriving: which of these are closed already, but move on, (n,).
+        sliding: contacts that slide; None where their end is not asked for.
     """
 
     gap: Array
@@ -75,9 +116,20 @@ class Outlook:
     rounding: Array
     open: Array
     arriving: Array
+    sliding: Sliding | None = None
+
+    def watched(self, dt: Array) -> Outlook:
+        """The same of gaps and, behind them, of slips that end, see `Sliding.clearance`."""
+        if self.sliding is None:
+            return self
+        speed = self.sliding.speed
+        more = {"gap": dt[None] * speed, "rate": 0 * speed, "open": speed > 0}
+        more |= {"bend": 0 * speed, "arriving": jnp.zeros_like(more["open"])}
+        both = {name: jnp.concatenate([getattr(self, name), x]) for name, x in more.items()}
+        return dataclasses.replace(self, **both)
 
 
-def look(rows: BoundRows, acceleration: Array, q: Array, dt: Array) -> Outlook:
+def look(rows: BoundRows, acceleration: Array, q: Array, dt: Array, slips: bool = False) -> Outlook:
     """Which rows are open when a part begins.
 
     Args:
@@ -85,6 +137,7 @@ def look(rows: BoundRows, acceleration: Array, q: Array, dt: Array) -> Outlook:
         acceleration: a without bounded rows, (n_v,).
         q: positions, (n_q,).
         dt: h, () [s].
+        slips: whether contacts that slide are looked for, too.
     """
     size = 1 + jnp.max(jnp.abs(q), axis=0)
     rounding = ROUNDING * float(jnp.finfo(q.dtype).eps) * size
@@ -92,7 +145,8 @@ def look(rows: BoundRows, acceleration: Array, q: Array, dt: Array) -> Outlook:
     rests = resting(rows, bend, rounding, dt)
     open_ = mask(rows.ends, rows) & ~rests & (rows.gap >= -rounding[None])
     arriving = open_ & (rows.gap <= rounding[None]) & (rows.rate < 0)
-    return Outlook(rows.gap, rows.rate, bend, rounding, open_, arriving)
+    sliding = Sliding.of(rows, open_, bend, rounding, dt) if slips and rows.kinds.contacts else None
+    return Outlook(rows.gap, rows.rate, bend, rounding, open_, arriving, sliding)
 
 
 def resting(rows: BoundRows, bend: Array, rounding: Array, dt: Array) -> Array:

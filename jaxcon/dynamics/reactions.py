@@ -267,8 +267,10 @@ class Impulse:
         linear = work(more, mean) + work(multipliers, change) / 2
         square = work(more, change) / 2
         room = jnp.maximum(-start, 0)
-        inner = numerics.safe_sqrt(linear * linear + 4 * square * room)
-        most = numerics.safe_divide(2 * room, linear + inner)
+        inner = jnp.abs(linear) + numerics.safe_sqrt(linear * linear + 4 * square * room)
+        # two forms of one root, each where it subtracts nothing
+        few, many = numerics.safe_divide(2 * room, inner), numerics.safe_divide(inner, 2 * square)
+        most = jnp.where(linear > 0, few, many)
         rounding = 64 * float(jnp.finfo(free.dtype).eps)
         gains = start + linear + square > rounding * work(jnp.abs(more), jnp.abs(mean))
         return jnp.where(gains & (start + linear + square > start), jnp.clip(most, 0, 1), 1)

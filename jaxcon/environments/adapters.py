@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Environment
 
@@ -41,7 +42,7 @@ def action_space(environment: Environment) -> spaces.Box:
 
 def describe(environment: Environment) -> dict[str, Any]:
     """Gymnasium's metadata: the pictures, and how many of them make a second."""
-    rate = round(1 / (float(environment.dt) * environment.skip))
+    rate = max(round(1 / (float(environment.dt) * environment.skip)), 1)
     return {"render_modes": [PICTURES], "render_fps": rate}
 
 
@@ -78,6 +79,44 @@ def check_no_horizon(options: dict[str, Any]) -> None:
             "Gymnasium's time limit is max_episode_steps=, of gymnasium.make and make_vec; got"
             f" horizon={options['horizon']}."
         )
+
+
+def time_limit(steps: int | None, own: int | None) -> int | None:
+    """The horizon of `max_episode_steps`, which is None for that of the task and −1 for none.
+
+    Raises:
+        ValueError: it is another number, and no count.
+    """
+    if steps is None:
+        return own
+    if steps == -1:
+        return None
+    checks.count("VectorEnv", "max_episode_steps", steps)
+    return steps
+
+
+def check_saved(saved: Any, like: Any) -> None:
+    """Checks that what is to be restored has the arrays that are expected.
+
+    Args:
+        saved: a pytree of arrays.
+        like: the shapes and dtypes of such a tree.
+
+    Raises:
+        ValueError: it has others.
+    """
+
+    def arrays(tree: Any) -> dict[str, str]:
+        leaves = jax.tree_util.tree_leaves_with_path(tree)
+        return {jax.tree_util.keystr(path): f"{x.dtype}{x.shape}" for path, x in leaves}
+
+    found, wanted = arrays(saved), arrays(like)
+    for name in [*wanted, *found]:
+        if found.get(name) != wanted.get(name):
+            raise ValueError(
+                "restore: what was saved is of another task, precision or number of copies: it has"
+                f" {name} as {found.get(name)}, and {wanted.get(name)} is expected."
+            )
 
 
 def key_from(random: np.random.Generator) -> Array:

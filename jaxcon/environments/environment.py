@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -93,6 +93,8 @@ class Environment:
     dt: Array
     skip: int = static()
     horizon: int | None = static()
+    lot: ClassVar[int] = 128
+    """Of many copies on a CPU, how many are simulated at once, at most."""
 
     @property
     def dtype(self) -> Any:

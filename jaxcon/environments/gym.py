@@ -106,7 +106,10 @@ class GymnasiumEnv(gymnasium.Env):
         return np.array(outcome.observation), float(outcome.reward), *ends, in_words(outcome.info)
 
     def save(self) -> dict[str, Any]:
-        """Where the episode stands and what will be drawn next, as arrays of numpy to keep."""
+        """Where the episode stands and what will be drawn next, as arrays of numpy to keep.
+
+        Actions are counted by `gymnasium.make`'s wrapper for its time limit, which this is not of.
+        """
         return {
             "episode": jax.tree.map(np.array, self._running()),
             "random": self.np_random.bit_generator.state,
@@ -117,7 +120,12 @@ class GymnasiumEnv(gymnasium.Env):
 
         Args:
             saved: from `save`.
+
+        Raises:
+            ValueError: it is of another task or precision.
         """
+        key = jax.ShapeDtypeStruct((2,), np.uint32)
+        adapters.check_saved(saved["episode"], _reset.eval_shape(self.environment, key))
         self.episode = jax.tree.map(jnp.asarray, saved["episode"])
         self.np_random.bit_generator.state = saved["random"]
 

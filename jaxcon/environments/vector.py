@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxcon.core import checks
 from jaxcon.core.devices import over_devices, shard
 from jaxcon.core.typing import Array
 from jaxcon.environments import adapters, render
@@ -80,7 +81,8 @@ class GymnasiumVectorEnv(VectorEnv):
     Args:
         task: the name of a task, or an environment.
         num_envs: copies.
-        max_episode_steps: actions until an episode is truncated; the task's unless given.
+        max_episode_steps: actions until an episode is truncated; the task's unless given, and as
+            many as it takes for Gymnasium's −1.
         render_mode: None or "rgb_array".
         autoreset_mode: when a copy that is done is reset: on the next step (default), on the same,
             whose info then has `final_obs` and `final_info`, or only by
@@ -91,8 +93,8 @@ class GymnasiumVectorEnv(VectorEnv):
         options: of the task's `build`.
 
     Raises:
-        ValueError: JAX has fewer devices, the copies do not divide over them, or a horizon is
-            given, which `max_episode_steps` says.
+        ValueError: a number that is no count, JAX has fewer devices, the copies do not divide over
+            them, or a horizon is given, which `max_episode_steps` says.
     """
 
     def __init__(
@@ -107,9 +109,10 @@ class GymnasiumVectorEnv(VectorEnv):
         **options: Any,
     ) -> None:
         adapters.check_no_horizon(options)
+        checks.count("VectorEnv", "num_envs", num_envs)
         self.mesh = _line(devices, num_envs)
         environment = make(task, **options)
-        limit = environment.horizon if max_episode_steps is None else max_episode_steps
+        limit = adapters.time_limit(max_episode_steps, environment.horizon)
         self.environment = self._everywhere(dataclasses.replace(environment, horizon=limit))
         self.randomize, self.num_envs = randomize, num_envs
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -136,20 +139,24 @@ class GymnasiumVectorEnv(VectorEnv):
             ValueError: unknown options, or a mask of another shape.
         """
         adapters.check_options(options, ("reset_mask",))
-        super().reset(seed=seed)
         mask = (options or {}).get("reset_mask")
-        if mask is None:
-            key = adapters.key_from(self.np_random)
-            copies, _ = _begin(self.environment, key, self.num_envs, self.randomize)
-            self.copies = self._spread(copies)
-            return _look(self.environment, self.copies, self.mesh)
-        mask = np.asarray(mask)
+        if mask is not None:
+            return self._reset_some(np.asarray(mask), seed)
+        super().reset(seed=seed)
+        key = adapters.key_from(self.np_random)
+        copies, _ = _begin(self.environment, key, self.num_envs, self.randomize)
+        self.copies = self._spread(copies)
+        return _look(self.environment, self.copies, self.mesh)
+
+    def _reset_some(self, mask: np.ndarray, seed: int | None) -> tuple[Array, dict[str, Any]]:
+        """As `reset` of the copies of a mask; one that is refused leaves the generator alone."""
         if mask.shape != (self.num_envs,) or mask.dtype != bool:
             raise ValueError(
                 f"reset: options['reset_mask'] must be {self.num_envs} bools, got {mask.dtype} of"
                 f" shape {mask.shape}."
             )
         chosen, running = self._spread(jnp.asarray(mask)), self._running()
+        super().reset(seed=seed)
         if seed is not None:  # else each goes on with its own key
             running = _with_keys(running, chosen, adapters.key_from(self.np_random))
         copies = _restart(self.environment, running, chosen, self.randomize, self.mesh)
@@ -163,11 +170,12 @@ class GymnasiumVectorEnv(VectorEnv):
             actions: (n, number of actions).
 
         Raises:
-            ValueError: the actions have another shape.
+            ValueError: the actions have another shape, or are no numbers.
         """
         copies = self._running()
         # an array of JAX stays what it is: to ask JAX for it takes a tenth of a step of CartPole
-        actions = actions if isinstance(actions, jax.Array) else np.asarray(actions)
+        if not isinstance(actions, jax.Array):
+            actions = np.asarray(actions, self.environment.dtype)
         if actions.shape != self.action_space.shape:
             raise ValueError(
                 f"{type(self.environment).__name__}: actions must have shape"
@@ -193,7 +201,13 @@ class GymnasiumVectorEnv(VectorEnv):
 
         Args:
             saved: from `save`.
+
+        Raises:
+            ValueError: it is of another task, precision or number of copies.
         """
+        key = jax.ShapeDtypeStruct((2,), np.uint32)
+        like, _ = _begin.eval_shape(self.environment, key, self.num_envs, self.randomize)
+        adapters.check_saved(saved["copies"], like)
         self.copies = self._spread(jax.tree.map(jnp.asarray, saved["copies"]))
         self.np_random.bit_generator.state = saved["random"]
 

@@ -73,11 +73,17 @@ class Elements:
         """The elements with other numbers; `changes` by name and field."""
         params = dict(self.params)
         for i, name in enumerate(self.names):
-            for field, value in changes.get(name, {}).items():
+            given = changes.get(name, {})
+            for field, value in given.items():
                 params[field] = replace_at(
                     f"{name}.{field}", params[field], i, value, field in self.endless
                 )
+            if given:
+                self.check_numbers(name, self.get(i) | dict(given))
         return dataclasses.replace(self, params=params)
+
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the numbers of one element, by field, where some of them are changed."""
 
     def select(self, indices: tuple[int, ...]) -> Any:
         """Some of the elements."""

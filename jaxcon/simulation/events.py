@@ -60,14 +60,17 @@ class Events:
     ½ h |J||a|. There a ball that bounces ever lower comes to lie, within one step of when it would.
 
     A row that closes and opens again within one step is not seen, nor the first of two crossings by
-    the nearest row. Soft stops and contacts, friction and motors are forces, and split nothing. A
-    step costs three or four plain ones, and one in which some world of a batch has an impact as
-    many more as tries are needed to find it.
+    the nearest row. Soft stops and contacts, friction in joints and motors are forces, and split
+    nothing. A step costs three or four plain ones, and one in which some world of a batch has an
+    impact as many more as tries are needed to find it.
 
     Attributes:
         splits: how many impacts a step may have.
         iterations: tries at s*, at most; secants, and bisection where they leave what is known to
             enclose it. Some four are enough where φ bends little in a step.
+        slips: whether a step is split, too, where a contact that slides comes to rest. Friction is
+            one force over a part of a step, so that without it the place where a block stops is
+            right to second order beside Runge–Kutta methods, and its derivatives to first.
 
     References:
         Kong, Payne, Zhu and Johnson, Saltation matrices: the essential tool for linearizing hybrid
@@ -78,15 +81,18 @@ class Events:
 
     splits: int = static(default=1)
     iterations: int = static(default=12)
+    slips: bool = static(default=False)
 
     def check(self) -> None:
         """Checks the numbers.
 
         Raises:
-            ValueError: there are no splits or no iterations.
+            ValueError: there are no splits or no iterations, or slips is neither true nor false.
         """
         checks.count("Events", "splits", self.splits)
         checks.count("Events", "iterations", self.iterations)
+        if not isinstance(self.slips, bool):
+            raise ValueError(f"Events: slips must be True or False, got {self.slips!r}.")
 
     def attempt(self, system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
         """(new state, info) and the status of a step, split at impacts."""
@@ -222,7 +228,15 @@ class World:
     def outlook(self, state: State) -> Outlook:
         """What is to be expected from here on."""
         free = self.dynamics(state).unbounded(state.q, state.v, state.time)
-        return look(self.rows(state), free, state.q, self.dt)
+        return look(self.rows(state), free, state.q, self.dt, self.method.events.slips)
+
+    def clearances(self, outlook: Outlook, passed: Passed) -> Array:
+        """What is left of gaps at the end of a part, and then, times h, of slips."""
+        rows = self.rows(passed.state)
+        if outlook.sliding is None:
+            return rows.gap
+        slips = outlook.sliding.clearance(rows, passed.impulses.multipliers)
+        return jnp.concatenate([rows.gap, self.dt[None] * slips])
 
     def go(self, progress: Progress, awaited: Array) -> tuple[Progress, tuple[StepInfo, Impact]]:
         """As far as the next impact, if it is awaited, and else as far as the step leads."""
@@ -232,36 +246,36 @@ class World:
         outlook, awaited = still.outlook(at), active & awaited
 
         def gaps(s: Array) -> Array:
-            return still.rows(still.part(at, Part(s, outlook.open, awaited)).state).gap
+            return still.clearances(outlook, still.part(at, Part(s, outlook.open, awaited)))
 
-        found = Search(gaps, outlook, most, awaited, self.method.events.iterations).run()
+        watched, tries = outlook.watched(still.dt), self.method.events.iterations
+        found = Search(gaps, watched, most, awaited, tries).run()
+        hit = found.happens & (found.row < len(outlook.gap))
         time = jnp.where(found.happens, found.here, length)
         least = outlook.rounding / jnp.where(still.dt > 0, still.dt, 1)
-        given = (self, state, outlook.open, awaited, found.row)
+        given = (self, state, outlook, awaited, found.row)
         passed, time = Arrival(flow, gap_of)(given, time, found.happens, least)
         there = dataclasses.replace(passed.state, memory=state.memory)
-        struck = Struck(outlook, chosen(found.row, outlook.open), found.happens)
-        jump, impulses = jax.lax.cond(
-            jnp.any(found.happens), strike, no_strike, self, there, struck
-        )
+        struck = Struck(outlook, chosen(found.row, outlook.open), hit)
+        jump, impulses = jax.lax.cond(jnp.any(hit), strike, no_strike, self, there, struck)
         final = keep(found.happens, dataclasses.replace(there, v=there.v + jump), passed.state)
         code = status.first(progress.code, passed.code)
         new = progress._replace(state=final, left=length - time, active=found.happens, code=code)
         new = new.beyond(passed.impulses).beyond(impulses)
-        told = Impact(found.happens, state.time + time, found.row)
+        told = Impact(hit, state.time + time, jnp.where(hit, found.row, 0))
         return keep(active, new, progress), (passed.seen, told)
 
 
 def flow(given: Any, s: Array) -> Passed:
     """F(x, s)."""
-    world, state, open_, awaited, _ = given
-    return world.part(state, Part(s, open_, awaited))
+    world, state, outlook, awaited, _ = given
+    return world.part(state, Part(s, outlook.open, awaited))
 
 
 def gap_of(given: Any, passed: Passed) -> Array:
     """φ of the row that arrives."""
-    world, *_, row = given
-    gaps = world.rows(passed.state).gap
+    world, _, outlook, _, row = given
+    gaps = world.clearances(outlook, passed)
     return jnp.sum(jnp.where(chosen(row, gaps), gaps, 0), axis=0)
 
 

@@ -149,6 +149,25 @@ class Bounded:
         live = (self.lower, self.upper, self.coefficients)
         return laws(self.kinds, self.diagonal(), multipliers, self.velocity(multipliers), live)
 
+    def slope(self, multipliers: Array, width: Any = None) -> Array:
+        """∂(residual)/∂λ, (n, n), a little regularised; `width` as of `laws`.
+
+        A law takes from u its own rows alone, so that a column of G goes through it like a vector.
+        """
+        scale = self.diagonal()
+        live = (self.lower, self.upper, self.coefficients)
+        share = float(jnp.finfo(multipliers.dtype).eps) ** 0.75
+        every = gauss_jordan.identity(multipliers)
+
+        def law(x: Array, u: Array) -> Array:
+            return laws(self.kinds, scale, x, u, live, width)
+
+        def along(direction: Array, column: Array) -> Array:
+            here = multipliers, self.velocity(multipliers)
+            return jax.jvp(law, here, (jnp.broadcast_to(direction, column.shape), column))[1]
+
+        return jax.vmap(along, (1, 1), 1)(every, self.matrix) + share * every
+
     def worst(self, multipliers: Array) -> Array:
         """max |residual|, by world."""
         return jnp.max(jnp.abs(self.residual(multipliers) * self.diagonal()), axis=0)
@@ -261,10 +280,7 @@ def implicit_multipliers(
         return laws(kinds, scale, x, velocity(x), live, corner)
 
     def prepared() -> tuple[roots.Operator, roots.Operator]:
-        fixed = jax.lax.stop_gradient(live)
-        known = gauss_jordan.inverse(
-            slope(lambda x: laws(kinds, scale, x, problem.velocity(x), fixed, corner), multipliers)
-        )
+        known = gauss_jordan.inverse(problem.slope(multipliers, corner))
         return partial(gauss_jordan.apply, known), partial(
             gauss_jordan.apply, jnp.swapaxes(known, 0, 1)
         )
@@ -277,14 +293,3 @@ def implicit_multipliers(
 
 ROUNDS = 3
 """Of refinement of a derivative, whose matrix is inverted without pivoting."""
-
-
-def slope(function: Any, x: Array) -> Array:
-    """f′(x) (n, n, …) of a function by lanes, a little regularised."""
-    share = float(jnp.finfo(x.dtype).eps) ** 0.75
-    every = gauss_jordan.identity(x)
-
-    def along(direction: Array) -> Array:
-        return jax.jvp(function, (x,), (jnp.broadcast_to(direction, x.shape),))[1]
-
-    return jax.vmap(along, out_axes=1)(every) + share * every

@@ -11,29 +11,53 @@ from jaxcon.core.typing import Array
 
 UNROLLED = 4
 """Up to so many rows there is no loop."""
+LARGE, BLOCK = 48, 4
+"""From so many rows on, so many are eliminated at once: reading and writing the matrix, which
+leaves the fastest cache, then costs more than their order."""
 
 
 def inverse(matrix: Array) -> Array:
-    """A⁻¹ (n, n, …) by Gauss–Jordan elimination in place, without pivoting.
+    """A⁻¹ (n, n, …) by Gauss–Jordan elimination in place, by blocks, without pivoting.
 
     For matrices whose leading blocks are regular, such as a positive definite one and what
     complementarity adds to its diagonal blocks.
     """
-    n = matrix.shape[0]
-    places = jnp.arange(n).reshape(-1, *(1,) * (matrix.ndim - 2))
+    n = len(matrix)
+    if n <= UNROLLED:
+        for k in range(n):
+            matrix = _exchanged(matrix, k, k)
+        return matrix
+    if n < LARGE:
+        return jax.lax.fori_loop(0, n, lambda k, a: _exchanged(a, k, k), matrix)
+    whole, rest = divmod(n, BLOCK)
+    matrix = jax.lax.fori_loop(0, whole, lambda k, a: _eliminated(a, k * BLOCK, BLOCK), matrix)
+    return _eliminated(matrix, n - rest, rest) if rest else matrix
 
-    def eliminate(k: Any, a: Array) -> Array:
-        row, column, here = at(a, k), at(a, k, 1), places == k
-        pivot = 1 / at(row, k)
-        scaled = jnp.where(here, pivot[None], row * pivot[None])
-        rest = jnp.where(here[None], 0, a) - column[:, None] * scaled[None]
-        return jnp.where(here[:, None], scaled[None], rest)
 
-    if n > UNROLLED:
-        return jax.lax.fori_loop(0, n, eliminate, matrix)
-    for k in range(n):
-        matrix = eliminate(k, matrix)
-    return matrix
+def _eliminated(matrix: Array, first: Any, count: int) -> Array:
+    """The matrix with x and b of A x = b exchanged in some rows."""
+    rows = jax.lax.dynamic_slice_in_dim(matrix, first, count, 0)
+    # a loop, whose result XLA does not compute again for every row of the matrix
+    rows = jax.lax.fori_loop(0, count, lambda i, a: _exchanged(a, i, first + i), rows)
+    place = _places(matrix)
+    rest = jnp.where((place >= first) & (place < first + count), 0, matrix)
+    for i in range(count):
+        rest = rest - at(matrix, first + i, 1)[:, None] * rows[i][None]
+    return jax.lax.dynamic_update_slice_in_dim(rest, rows, first, 0)
+
+
+def _exchanged(rows: Array, i: Any, k: Any) -> Array:
+    """Some rows of A with x and b exchanged in one of them, the i-th here and the k-th of A."""
+    row, column, here = at(rows, i), at(rows, k, 1), _places(rows) == k
+    pivot = 1 / at(row, k)
+    scaled = jnp.where(here, pivot[None], row * pivot[None])
+    rest = jnp.where(here[None], 0, rows) - column[:, None] * scaled[None]
+    return put(rest, scaled, i)
+
+
+def _places(rows: Array) -> Array:
+    """Numbers of the columns, (n, …)."""
+    return jnp.arange(rows.shape[1]).reshape(-1, *(1,) * (rows.ndim - 2))
 
 
 def at(x: Array, i: Any, axis: int = 0) -> Array:

@@ -85,6 +85,8 @@ class InteriorPoint:
 
         _, point = jax.lax.while_loop(going, once, (jnp.zeros((), jnp.int32), center(scaled)))
         known = scaled.kinds.join(point.primal) * scale * size
+        led = problem.worst(known) < problem.worst(0 * known)  # not where rounding led it astray
+        known = jnp.where(led[None], known, 0)
         return problem.released(polished(problem, known, self.polish))
 
 

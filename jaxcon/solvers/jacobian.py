@@ -117,7 +117,11 @@ class Jacobian:
         """Jᵀ as right sides (n_v, n_c, …) for lanes like (n_c, …)."""
         n, batch = self.shape[0], like.shape[1:]
         unit = jnp.eye(n, dtype=like.dtype).reshape(n, n, *(1,) * len(batch))
-        return widened(self, len(batch)).transpose(jnp.broadcast_to(unit, (n, n, *batch)))
+        return self.pulls(jnp.broadcast_to(unit, (n, n, *batch)))
+
+    def pulls(self, multipliers: Array) -> Array:
+        """Jᵀ λ of many λ (n_c, k, …), (n_v, k, …)."""
+        return widened(self, multipliers.ndim - 2).transpose(multipliers)
 
     def each(self, v: Array) -> Array:
         """J v of many v (n_v, k, …), (n_c, k, …)."""

@@ -109,10 +109,6 @@ class Choice:
         """Of an array (n, …), (k, …)."""
         return jnp.take_along_axis(x, self.rows, axis=0)
 
-    def columns(self, x: Array) -> Array:
-        """Of an array (m, n, …), (m, k, …)."""
-        return jnp.take_along_axis(x, self.rows[None], axis=1)
-
     def contacts(self, x: Array) -> Array:
         """Of numbers of each contact."""
         normals = self.kinds.split(self.rows).normal - self.whole.normal

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -68,6 +68,7 @@ class HalfCheetah(Environment):
         real-time learning to run, ICANNGA (2009).
     """
 
+    lot: ClassVar[int] = 32
     tree: Tree
     joints: tuple[str, ...] = static()
     turning: tuple[bool, ...] = static()

@@ -1,0 +1,29 @@
+"""Pictures that are small enough to be kept beside the text."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+from jaxcon import view
+
+COLORS = 48
+"""Of a picture; lines and their edges need no more."""
+
+
+def save(figure: Any, path: Path, dpi: float = 100.0) -> None:
+    """Writes a figure of lines as a PNG of few colours, and closes it.
+
+    Args:
+        figure: of matplotlib.
+        path: of the picture.
+        dpi: dots per inch.
+    """
+    from PIL import Image
+
+    with io.BytesIO() as buffer:
+        figure.savefig(buffer, format="png", dpi=dpi)
+        image = Image.open(buffer).convert("RGB")
+    image.quantize(COLORS, dither=Image.Dither.NONE).save(path, format="png", optimize=True)
+    view.pyplot().close(figure)

@@ -1,0 +1,44 @@
+"""What the numbers of bounded elements may be, when they are built and when they are changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from jaxcon.core import checks
+
+POSITIVE = ("stiffness", "recovery", "size")
+NOT_NEGATIVE = (
+    *("restitution", "damping", "friction", "rolling", "spinning"),
+    *("most", "rate", "radius", "radius_a", "radius_b"),
+)
+
+
+def check_ranges(owner: str, numbers: Mapping[str, Any]) -> None:
+    """Checks the numbers of a bounded element by their fields, as far as they are known.
+
+    Raises:
+        ValueError: one is out of range, or a lower end is not below the upper one.
+    """
+    for fields, strictly in ((POSITIVE, True), (NOT_NEGATIVE, False)):
+        for field in fields:
+            if field in numbers:
+                checks.positive(owner, field, numbers[field], strictly)
+    e = numbers.get("restitution", 0.0)
+    if checks.is_concrete(e) and e > 1:
+        raise ValueError(f"{owner}: restitution must lie in 0 to 1, got {float(e):g}.")
+    if "lower" in numbers:
+        check_ends(owner, numbers["lower"], numbers["upper"])
+
+
+def check_ends(owner: str, lower: Any, upper: Any) -> None:
+    """Checks that there is something between two stops.
+
+    Raises:
+        ValueError: there is nothing.
+    """
+    if checks.is_concrete((lower, upper)) and not lower < upper:
+        raise ValueError(
+            f"{owner}: lower must be below upper, got {float(lower)} and {float(upper)}; what does"
+            " not move at all is a Fixed joint or a Drive."
+        )

@@ -1,0 +1,62 @@
+"""Coulomb's law where it is at its limits: a block that is pulled, and Painlevé's rod."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from jaxcon.verification import references
+
+FORMS = {case["id"]: case for case in references.load("contact_closed_forms")["cases"]}
+G = 9.81
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_a_block_stays_until_it_is_pulled_hard_enough(dtype):
+    case = FORMS["block_pulled"]
+    scene = jc.Scene(dim=2, dtype=dtype)
+    scene.add_particle("block", mass=2.0, position=(0.0, 0.0))
+    scene.add(jc.Force("pull", "block", (1.0, 0.0)))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "block", friction=0.5))
+    system, state = scene.build()
+
+    def speed(pull):
+        changed = system.with_params({"pull": {"force": jnp.stack([pull, 0 * pull])}})
+        final, _ = jc.rollout(changed, jc.Method(), state, None, jnp.asarray(1e-3, dtype), 20)
+        return final.v[0]
+
+    pulls = jnp.asarray([0.999 * case["F_limit"], 1.001 * case["F_limit"], 15.0], dtype)
+    want = 0.02 * np.array([0.0, 0.001 * case["F_limit"] / 2, case["acceleration_at_F_15"]])
+    tight = 1e-12 if dtype == jnp.float64 else 1e-5
+    np.testing.assert_allclose(jax.jit(jax.vmap(speed))(pulls), want, atol=tight)
+
+
+def test_a_rod_that_cannot_slide_jams():
+    """Painlevé's: where p < 0 no force lets the tip slide on; an impulse stops it, without gain."""
+    case = FORMS["painleve_rod"]
+    scene = jc.Scene(dim=2)
+    scene.add_body("rod", mass=1.0, inertia=1 / 3, position=(-1.0, 0.0), velocity=(2.0, 0.0))
+    scene.add(jc.PlaneContact("tip", jc.WORLD, "rod", center=(0.0, 0.0), friction=1.0))
+    system, state = scene.build()
+
+    def once(angle, friction):
+        changed = system.with_params({"tip": {"friction": friction}})
+        q = jnp.stack([-jnp.cos(angle), jnp.sin(angle), -angle])
+        start = dataclasses.replace(state, q=q)
+        new, info = jc.step(changed, jc.Method(), start, None, 1e-3)
+        gain = jc.energy(changed, new).total - jc.energy(changed, start).total
+        slip = new.v[0] + jnp.sin(angle) * new.v[2]
+        return info.reactions["tip"], info.reactions.residual, gain, slip
+
+    angles, frictions = jnp.asarray([np.pi / 3, np.arctan(2.0)]), jnp.asarray([1.0, 1.5])
+    forces, residual, gain, slip = jax.jit(jax.vmap(once))(angles, frictions)
+    np.testing.assert_allclose(residual, 0.0, atol=1e-12)
+    np.testing.assert_allclose(forces[0, 0], G / case["p_at_theta_60deg_mu_1"], rtol=1e-9)
+    assert float(slip[0]) > 1.9
+    np.testing.assert_allclose(slip[1], 0.0, atol=1e-12)
+    assert float(gain[1]) < -0.1
+    assert np.all(gain < 0)
+    assert 0.1 < np.abs(forces[1, 1]) < 1.5 * forces[1, 0]
