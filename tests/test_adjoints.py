@@ -141,6 +141,16 @@ def test_a_failed_world_has_no_gradient_and_the_others_do_not_notice():
     np.testing.assert_allclose(got(shared), jax.jit(jax.grad(alone))(shared), rtol=1e-11)
 
 
+@pytest.mark.parametrize("integrator", [jc.SemiImplicitEuler(), jc.Heun()])
+def test_the_derivative_by_h_exists_where_h_is_zero(integrator):
+    """It is the velocity."""
+
+    def place(h):
+        return jc.step(SYSTEM, jc.Method(integrator), STATE, None, h)[0].q
+
+    np.testing.assert_allclose(jax.jacfwd(place)(0.0), STATE.v, atol=1e-12)
+
+
 def free(steps, adjoint):
     """A free particle pushed along a line: dq_T/dv_0, dq_T/du, and the same of all q."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))

@@ -138,7 +138,7 @@ class SemiImplicitEuler(Explicit):
         the precision, where a metre's rounding makes 0.1 m/s²; in float32 this acts below 1.1 ms.
         """
         precision = float(jnp.finfo(jnp.result_type(dt)).eps)
-        beta = jnp.minimum(1.0 / dt, (0.1 / precision) ** 0.5)
+        beta = 1.0 / jnp.maximum(dt, (precision / 0.1) ** 0.5)  # with a derivative at h = 0
         return beta / 2, beta
 
     def growth(self, alpha: float, beta: float, dt: float) -> float:
@@ -220,7 +220,7 @@ class RungeKutta(Explicit):
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = β = 10 /s, and less where h is so large that 0.4/h is below it."""
-        rate = jnp.minimum(10.0, 0.4 / dt)
+        rate = 0.4 / jnp.maximum(dt, 0.04)
         return rate, rate
 
     def growth(self, alpha: float, beta: float, dt: float) -> float:
