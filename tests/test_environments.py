@@ -432,15 +432,18 @@ def test_copies_that_are_simulated_by_lots_move_as_all_at_once(monkeypatch):
     start, _ = copies.begin(environment, jax.random.key(0), 6)
     actions = jnp.linspace(-1.0, 1.0, 6)[:, None]
 
-    def places(lot, x):
-        monkeypatch.setattr(environments.Environment, "lot", lot)
+    def places(count, x):
+        monkeypatch.setattr(environments.CartPole, "at_once", count)
         return copies.simulate(environment, start, x).state.q
 
+    programs = (str(jax.make_jaxpr(functools.partial(places, n))(actions)) for n in (6, 3))
+    once, lot_by_lot = (program.count("scan[") for program in programs)
+    assert lot_by_lot == once + 1
     whole, lots = places(6, actions), places(3, actions)
     np.testing.assert_allclose(lots, whole, rtol=1e-6, atol=1e-6)
     slopes = (jax.grad(lambda x, n=n: jnp.sum(places(n, x)[:, 0]))(actions) for n in (6, 3))
     np.testing.assert_allclose(*slopes, rtol=1e-5)
-    sizes = [copies.lot(count, 128) for count in (100, 128, 1000, 4096, 4099)]
+    sizes = [copies.size_of_lot(count, 128) for count in (100, 128, 1000, 4096, 4099)]
     assert sizes == [None, None, 125, 128, None]
 
 

@@ -155,7 +155,7 @@ def simulate(environment: Environment, copies: Copies, actions: Array) -> Episod
         copies: where they stand.
         actions: (n, number of actions).
     """
-    size = lot(len(copies.done), environment.lot)
+    size = size_of_lot(len(copies.done), environment.at_once)
     if size is None or jax.default_backend() != "cpu":
         return over(environment, copies, "transition", actions)
 
@@ -167,7 +167,7 @@ def simulate(environment: Environment, copies: Copies, actions: Array) -> Episod
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), after)
 
 
-def lot(count: int, most: int) -> int | None:
+def size_of_lot(count: int, most: int) -> int | None:
     """How many of so many copies are simulated at once; None for all.
 
     The most that divide them, since a last lot of its own would be compiled for itself.

@@ -93,7 +93,7 @@ class Environment:
     dt: Array
     skip: int = static()
     horizon: int | None = static()
-    lot: ClassVar[int] = 128
+    at_once: ClassVar[int] = 128
     """Of many copies on a CPU, how many are simulated at once, at most."""
 
     @property

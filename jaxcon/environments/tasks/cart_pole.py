@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,7 @@ class CartPole(Environment):
         Tassa et al., DeepMind Control Suite (2018), cart-pole swing-up, for the form of the reward.
     """
 
+    at_once: ClassVar[int] = 512
     lengths: Array
 
     @classmethod

@@ -68,7 +68,7 @@ class HalfCheetah(Environment):
         real-time learning to run, ICANNGA (2009).
     """
 
-    lot: ClassVar[int] = 32
+    at_once: ClassVar[int] = 32
     tree: Tree
     joints: tuple[str, ...] = static()
     turning: tuple[bool, ...] = static()

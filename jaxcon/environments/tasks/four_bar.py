@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -64,6 +64,7 @@ class FourBarTracking(Environment):
         lengths: of ground, crank, coupler and rocker, (4,) [m].
     """
 
+    at_once: ClassVar[int] = 512
     lengths: Array
 
     @classmethod

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
@@ -44,6 +44,8 @@ class Parking(Environment):
     of the place along x and y; it is over when the blade leaves the lot, 6 m from the place along
     x or y.
     """
+
+    at_once: ClassVar[int] = 512
 
     @classmethod
     def build(
