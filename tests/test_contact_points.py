@@ -229,3 +229,20 @@ def test_parallel_capsules_touch_in_the_middle_of_what_faces():
     x, y = nearest(*corners)
     np.testing.assert_allclose(x[0], [8.5, 0.5, 2.5, 10.0], atol=1e-15)
     np.testing.assert_allclose(y[0], [8.5, 0.5, 2.5, 11.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel(60)], ids=str)
+def test_a_box_rests_on_a_slope_in_single_precision(solver):
+    """Corners 0.1 m above the floor, far from acting, do not blur what holds those that rest."""
+    down = 9.81 * np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
+    scene = jc.Scene(dim=3, gravity=tuple(down), dtype=jnp.float32)
+    scene.add_body("box", inertia=jc.inertia.box(1.0, (0.2, 0.2, 0.1)), position=(0.0, 0.0, 0.05))
+    holding = 1.001 * np.tan(0.3)
+    floor = jc.BoxContact("floor", jc.WORLD, "box", size=(0.2, 0.2, 0.1), friction=holding)
+    scene.add(floor)
+    system, state = scene.build()
+    method = jc.Method(bounded=solver)
+    state = jc.init(system, method, state.q, state.v)
+    go = jax.jit(lambda s: jc.rollout(system, method, s, None, 2e-3, 500)[0])
+    crept = np.abs(np.asarray(go(state).q - state.q)).max()
+    assert crept < 5e-5

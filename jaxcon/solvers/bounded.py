@@ -104,6 +104,17 @@ class Kinds:
         rows = itertools.chain(*parts.discs)
         return jnp.concatenate([parts.single, parts.box, parts.normal, *rows])
 
+    def largest(self, x: Array) -> Array:
+        """Of rows (n, …) that obey a law together, what is largest: normal and slip, or turning."""
+        parts = self.split(x)
+        slip, *turning = parts.discs
+        most = functools.reduce(jnp.maximum, slip, parts.normal)
+        discs = [slip.map(lambda _: most)]
+        for disc in turning:
+            own = functools.reduce(jnp.maximum, disc)
+            discs.append(disc.map(lambda _, x=own: x))
+        return self.join(parts._replace(normal=most, discs=tuple(discs)))
+
 
 class Parts(NamedTuple):
     """Lanes of the rows of each law: (single,), (boxes,), (contacts,), and a Vector by disc."""
@@ -168,9 +179,13 @@ class Bounded:
 
         return jax.vmap(along, (1, 1), 1)(every, self.matrix) + share * every
 
+    def missed(self, multipliers: Array) -> Array:
+        """|residual| as velocities, (n,)."""
+        return jnp.abs(self.residual(multipliers) * self.diagonal())
+
     def worst(self, multipliers: Array) -> Array:
-        """max |residual|, by world."""
-        return jnp.max(jnp.abs(self.residual(multipliers) * self.diagonal()), axis=0)
+        """The largest that is missed, by world."""
+        return jnp.max(self.missed(multipliers), axis=0)
 
     def released(self, multipliers: Array) -> Array:
         """λ with none of what rounding, or the end of a path, leaves to a contact that opens.
@@ -193,14 +208,7 @@ class Bounded:
         rolling or spinning, whose unit is another.
         """
         own = gauss_jordan.diagonal(self.matrix)
-        parts = self.kinds.split(own)
-        slip, *turning = parts.discs
-        most = functools.reduce(jnp.maximum, slip, parts.normal)
-        discs = [slip.map(lambda _: most)]
-        for disc in turning:
-            largest = functools.reduce(jnp.maximum, disc)
-            discs.append(disc.map(lambda _, x=largest: x))
-        joint = self.kinds.join(parts._replace(normal=most, discs=tuple(discs)))
+        joint = self.kinds.largest(own)
         largest = jnp.max(own, axis=0)[None]
         moves = joint > float(jnp.finfo(own.dtype).eps) ** 2 * largest
         return jnp.where(moves, joint, jnp.where(largest > 0, largest, 1))
