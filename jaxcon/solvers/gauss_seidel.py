@@ -127,9 +127,11 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     enough, pivot = rounding * problem.kinds.largest(terms), pivots(problem)
 
     def going(known: tuple[Any, Array, Array]) -> Array:
-        count, _, best = known
+        return (known[0] < 5 * rounds) & jnp.any(unmet(known[0], known[2]))
+
+    def unmet(count: Any, best: Array) -> Array:
         much = jnp.where(count < 2 * rounds, 1, MUCH) * enough
-        return (count < 5 * rounds) & jnp.any(problem.missed(best) > much)
+        return jnp.any(problem.missed(best) > much, axis=0)
 
     def once(known: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
         count, x, best = known
@@ -140,8 +142,8 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
         farther = (count >= rounds) & (count < 2 * rounds) & (count % 2 == 1)
         swept = jnp.where(farther, carried(problem, x, swept), swept)
         x = jnp.where((problem.worst(new) < problem.worst(x))[None], new, swept)
-        best = jnp.where((problem.worst(x) < problem.worst(best))[None], x, best)
-        return count + 1, x, best
+        closer = (problem.worst(x) < problem.worst(best)) & unmet(count, best)  # others are done
+        return count + 1, x, jnp.where(closer[None], x, best)
 
     start = jnp.zeros((), jnp.int32), multipliers, multipliers
     return jax.lax.while_loop(going, once, start)[2]
