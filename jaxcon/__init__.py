@@ -132,6 +132,7 @@ from jaxcon.model.actuators import (
 from jaxcon.model.coordinates import TurnCounter
 from jaxcon.model.elastic import Bending, Flexure
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
+from jaxcon.model.inertial import restate
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
 from jaxcon.simulation.adjoints import Checkpoints, Discounted, EveryStep, Truncated
@@ -338,6 +339,7 @@ __all__ = [
     "quaternion",
     "raise_for_status",
     "report",
+    "restate",
     "rod",
     "rollout",
     "rope",
