@@ -175,7 +175,7 @@ def restate(state: State, before: Any, after: Any) -> State:
     if getattr(after, "layout", None) != before.layout:
         raise ValueError("restate: the systems must have the same bodies in the same order.")
     q, v = state.q, state.v
-    for name in before.offsets.keys() | after.offsets.keys():
+    for name in before.offsets | after.offsets:
         group = before.layout.groups[before.layout.locate(name)[0]]
         offset = after.offsets.get(name)
         motion = before.motion(name, state.q, state.v)
