@@ -363,3 +363,41 @@ def test_systems_of_other_bodies_have_other_states():
     one, other = scenes.build("mixed-3d"), scenes.build("mixed-2d")
     with pytest.raises(ValueError, match="the same bodies in the same order"):
         jc.restate(one.state, one.system, other.system)
+
+
+def test_a_recording_under_known_forces_tells_all_ten():
+    """A body thrown and pushed at a point of its frame, seen with noise; θ within its errors."""
+    scene = jc.Scene(dim=3)
+    scene.add_body("stone", mass=1.0, inertia=(0.1, 0.1, 0.1), angular_velocity=(1.0, 2.0, -1.0))
+    scene.add(jc.ExternalWrench("push", "stone", point=(0.0, 0.0, 0.0)))
+    system, state = scene.build()
+    random = np.random.default_rng(7)
+    pushes = jnp.asarray(random.normal(size=(80, 6)) * np.repeat([3.0, 0.5], 3))
+    method = jc.Method(integrator=jc.RK4())
+
+    def seen(theta):
+        body = system.with_params({"stone": {"inertia": inertia.from_log_cholesky(theta)}})
+        start = jc.restate(state, system, body)
+
+        def look(s, info):
+            motion = body.motion("stone", s.q, s.v)
+            return jnp.concatenate([motion.position, motion.rotation[0], motion.rotation[1]])
+
+        return jc.rollout(body, method, start, pushes, 0.02, 80, record=look)[1]
+
+    solid = inertia.from_tensor(
+        1.5, jnp.asarray(random_tensor(random)), jnp.array([0.1, -0.05, 0.2])
+    )
+    truth = inertia.log_cholesky(solid)
+    data = np.asarray(jax.jit(seen)(truth)) + 1e-3 * random.normal(size=(80, 9))
+    guess = inertia.log_cholesky(inertia.box(1.0, (0.9, 1.0, 1.1)))
+    found = jc.identify(seen, guess, data, noise=1e-3)
+    assert found.untold == []
+    assert abs(found.noise - 1) < 0.1
+    assert np.all(np.abs(found.params - truth) < 4 * found.errors)
+
+
+def random_tensor(random):
+    """Of a body of about a metre."""
+    axes, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    return axes @ np.diag([0.12, 0.2, 0.25]) @ axes.T
