@@ -20,8 +20,8 @@ Ends, friction and contact: Limit, RateLimit, RateMotor, JointFriction, Rope, Pl
     CapsuleContact, BoxContact, HeightFieldContact, box_corners; Inequality of one's own.
 Forces: Spring, JointSpring, JointDamper, Bending, Flexure, ExternalWrench, CustomForce, Force;
     Motor, PositionServo, VelocityServo, AffineActuator; TurnCounter.
-Simulation: init, step, rollout, forward_dynamics, assemble, and shard and over_devices; State,
-    StepInfo, Solution, Assembly.
+Simulation: init, step, rollout, forward_dynamics, assemble, restate, and shard and over_devices;
+    State, StepInfo, Solution, Assembly.
 Methods: Method of an integrator (SemiImplicitEuler, Heun, RK4, RungeKutta, ExplicitEuler, RATTLE,
     GeneralizedAlpha), a stabiliser (Baumgarte, AdaptiveBaumgarte, SlidingWindowBaumgarte, PID,
     Projection, Tolerance, Penalty, AugmentedLagrangian, Hybrid, Unstabilized), a solver (RankSafe,

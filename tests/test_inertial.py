@@ -96,14 +96,15 @@ def contacts_scene():
 def gaps(system, state):
     """φ and φ̇ of every bounded row."""
     snapshot = system.snapshot(state.q, state.v, state.time)
-    sets = [group.bounds(snapshot, None, 1e-3) for group in system.bounds]
+    sets = [group.bounds(snapshot, None, jnp.asarray(1e-3)) for group in system.bounds]
     return [(row.value, row.rate) for rows in sets for row in rows.rows[:1]]
 
 
 def test_what_touches_stays_where_it_is_on_its_body():
     system, state = contacts_scene()
     changed = with_random_solids(system)
-    close(gaps(changed, jc.restate(state, system, changed)), gaps(system, state))
+    got, expected = gaps(changed, jc.restate(state, system, changed)), gaps(system, state)
+    close(got, expected, 1e-8)  # the nearest point of a height field is found by a descent
 
 
 def test_forces_do_the_same_work():

@@ -8,7 +8,6 @@ import scenes
 
 import jaxcon as jc
 
-
 LINK = {"mass": 1.5, "inertia": 0.4}
 
 

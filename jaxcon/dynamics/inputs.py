@@ -9,8 +9,9 @@ import jax.numpy as jnp
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
-from jaxcon.geometry import inertia, quaternion
+from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.geometry.solid import resolve_inertia, resolve_mass
 from jaxcon.model.bodies import Particle, PlanarRigid, SpatialRigid
 
 
@@ -62,9 +63,9 @@ def resolve(body: BodyInput, dim: int, dtype: Any) -> Resolved:
     if body.fixed:
         return Resolved(None, motion, None, None, None)
     if not body.rigid:
-        mass = inertia.resolve_mass(_label(body), body.mass, dtype)
+        mass = resolve_mass(_label(body), body.mass, dtype)
         return Resolved(Particle(dim), motion, mass, None, None)
-    solid = inertia.resolve(_label(body), body.mass, body.inertia, dim, dtype)
+    solid = resolve_inertia(_label(body), body.mass, body.inertia, dim, dtype)
     kind = PlanarRigid() if dim == 2 else SpatialRigid()
     if solid.center is None and solid.axes is None:
         return Resolved(kind, motion, solid.mass, solid.moments, None)
@@ -73,7 +74,7 @@ def resolve(body: BodyInput, dim: int, dtype: Any) -> Resolved:
         center = checks.number(_label(body), "inertia.center", solid.center, dtype, (dim,))
     own = Pose(center)
     if dim == 3:
-        axes = quaternion.IDENTITY.stack() if solid.axes is None else solid.axes
+        axes = jnp.eye(4, dtype=dtype)[0] if solid.axes is None else solid.axes
         own = Pose(center, axes.astype(dtype))
     return Resolved(kind, motion.seen_from(own), solid.mass, solid.moments, own.inverse)
 

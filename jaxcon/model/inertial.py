@@ -14,14 +14,17 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.lanes import Lane, Vector
 from jaxcon.core.typing import Array
-from jaxcon.geometry import inertia, quaternion
+from jaxcon.geometry import quaternion
+from jaxcon.geometry.inertia import Inertia
 from jaxcon.geometry.pose import Pose
+from jaxcon.geometry.solid import resolve_inertia, resolve_mass
 from jaxcon.model.elements import Elements, Grid, element_at, side_by_side
 from jaxcon.model.forces import CustomForces
 from jaxcon.model.layout import Layout, Place
@@ -91,18 +94,16 @@ def changed(
     """
     owner, dtype = f"body '{name}'", known["mass"].dtype
     if "center" not in known:
-        mass = checks.number(f"particle '{name}'", "mass", given["mass"], dtype)
-        checks.positive(f"particle '{name}'", "mass", mass)
-        return Changed(mass, None, None, None)
+        return Changed(resolve_mass(f"particle '{name}'", given["mass"], dtype), None, None, None)
     dim = len(known["center"])
-    whole = isinstance(given.get("inertia"), inertia.Inertia)
+    whole = isinstance(given.get("inertia"), Inertia)
     if whole and len(given) > 1:
         raise ValueError(
             f"{owner}: an Inertia brings mass, centre and axes; give it alone, without"
             f" {sorted(set(given) - {'inertia'})}."
         )
     mass = None if whole else given.get("mass", known["mass"])
-    solid = inertia.resolve(owner, mass, given.get("inertia", known["inertia"]), dim, dtype)
+    solid = resolve_inertia(owner, mass, given.get("inertia", known["inertia"]), dim, dtype)
     if solid.axes is not None and "axes" in given:
         raise ValueError(f"{owner}: a tensor has axes of its own; give it, or axes and moments.")
     if whole:
@@ -193,7 +194,7 @@ def _axes(
     if solid.axes is not None:
         axes = solid.axes
     elif whole:
-        axes = quaternion.IDENTITY.stack()
+        axes = jnp.eye(4, dtype=axes.dtype)[0]
     elif "axes" in given:
         axes = checks.number(owner, "axes", given["axes"], axes.dtype, (4,))
         checks.nonzero(owner, "axes", axes)
@@ -204,7 +205,7 @@ def _identity(moments: Array) -> Pose:
     """The user's frame where it is the principal one."""
     if moments.ndim == 0:
         return Pose(jnp.zeros(2, moments.dtype))
-    return Pose(jnp.zeros(3, moments.dtype), quaternion.IDENTITY.stack().astype(moments.dtype))
+    return Pose(jnp.zeros(3, moments.dtype), jnp.eye(4, dtype=moments.dtype)[0])
 
 
 def _same(x: Any, y: Any) -> bool:
@@ -225,7 +226,7 @@ def _side(place: Place, shifts: Mapping[str, Pose], layout: Layout) -> Shift | N
     position = [jnp.zeros_like(like) if x is None else x.position for x in own]
     if all(x.orientation is None for x in known):
         return Shift(Vector.of(side_by_side(position)), None)
-    one = quaternion.IDENTITY.stack().astype(like.dtype)
+    one = jnp.eye(4, dtype=like.dtype)[0]
     turn = [one if x is None or x.orientation is None else x.orientation for x in own]
     return Shift(Vector.of(side_by_side(position)), Vector.of(side_by_side(turn)))
 
@@ -240,7 +241,7 @@ def _moved(field: str, x: Any, sides: list[Shift | None], side: int) -> Any:
         return x
     if isinstance(x, Grid):
         lanes = Vector(*(x.values[..., i] for i in range(x.values.shape[-1])))
-        wide = Shift(*(None if y is None else y.map(lambda z: z[:, None]) for y in own))
+        wide = jax.tree.map(lambda lane: lane[:, None], own)
         return Grid(jnp.stack(tuple(_fixed(word, lanes, wide)), axis=-1))
     return _fixed(word, x, own)
 
