@@ -143,8 +143,8 @@ def in_process(family: str, name: str, batch: int, limit: float) -> list[dict[st
     found = [json.loads(line) for line in lines if line.startswith("{") and line.endswith("}")]
     if stopped:
         reached = {row["n"] for row in found}
-        later = [n for n in FAMILIES[family].sizes if n not in reached]
-        found.append({"n": later[0] if later else 0, "stopped": stopped})
+        later = [n for n in FAMILIES[family].sizes if n not in reached]  # none if it only ends late
+        found += [{"n": later[0], "stopped": stopped}] if later else []
     return found
 
 

@@ -20,8 +20,8 @@ Ends, friction and contact: Limit, RateLimit, RateMotor, JointFriction, Rope, Pl
     CapsuleContact, BoxContact, HeightFieldContact, box_corners; Inequality of one's own.
 Forces: Spring, JointSpring, JointDamper, Bending, Flexure, ExternalWrench, CustomForce, Force;
     Motor, PositionServo, VelocityServo, AffineActuator; TurnCounter.
-Simulation: init, step, rollout, forward_dynamics, assemble, and shard and over_devices; State,
-    StepInfo, Solution, Assembly.
+Simulation: init, step, rollout, forward_dynamics, assemble, restate, and shard and over_devices;
+    State, StepInfo, Solution, Assembly.
 Methods: Method of an integrator (SemiImplicitEuler, Heun, RK4, RungeKutta, ExplicitEuler, RATTLE,
     GeneralizedAlpha), a stabiliser (Baumgarte, AdaptiveBaumgarte, SlidingWindowBaumgarte, PID,
     Projection, Tolerance, Penalty, AugmentedLagrangian, Hybrid, Unstabilized), a solver (RankSafe,
@@ -132,6 +132,7 @@ from jaxcon.model.actuators import (
 from jaxcon.model.coordinates import TurnCounter
 from jaxcon.model.elastic import Bending, Flexure
 from jaxcon.model.forces import CustomForce, ExternalWrench, Force, Spring
+from jaxcon.model.inertial import restate
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import Energy, State
 from jaxcon.simulation.adjoints import Checkpoints, Discounted, EveryStep, Truncated
@@ -338,6 +339,7 @@ __all__ = [
     "quaternion",
     "raise_for_status",
     "report",
+    "restate",
     "rod",
     "rollout",
     "rope",

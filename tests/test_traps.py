@@ -60,6 +60,16 @@ def hung(load=100.0):
     return scene.build()
 
 
+def crowd():
+    """Particles that lie on a rough floor: two bounded rows each."""
+    scene = jc.Scene(dim=2)
+    for i in range(24):
+        scene.add_particle(f"p{i}", mass=1.0, position=(float(i), 0.0))
+        scene.add(jc.PlaneContact(f"floor{i}", jc.WORLD, f"p{i}", friction=0.3))
+    scene.add(jc.Distance("rod", "p0", "p1"))
+    return scene.build()
+
+
 def skate():
     """A blade that slips at the start."""
     scene = jc.Scene(dim=2)
@@ -123,6 +133,8 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
     "iterated": (far, with_(stabilizer=jc.Projection()), ("start",), "jc.assemble"),
     "gentle": (far, with_(stabilizer=GENTLE), ("start",), "jc.assemble"),
     "dense": (lambda: rope(14), with_(solver=jc.Dense()), ("dense",), "fewer operations: Sparse()"),
+    "many contacts": (crowd, with_(), ("dense",), "a matrix of 48 bounded rows"),
+    "many swept": (crowd, with_(bounded=jc.GaussSeidel()), (), ""),
     "few rows": (lambda: rope(3), with_(solver=jc.Dense()), (), ""),
     "swept": (
         lambda: bob(rod()),

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.known import Known, asked_gains
+from jaxcon.constraints.bounds import count_bounds
 from jaxcon.dynamics.rank import linearized
 from jaxcon.simulation.choice import several, words
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import instability, parts
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.gauss_seidel import GaussSeidel
+from jaxcon.solvers.interior_point import InteriorPoint
 from jaxcon.solvers.priority import Lexicographic
 from jaxcon.solvers.proximal import RankSafe
 
@@ -32,6 +34,8 @@ DEARER = 3.0
 """How many times the operations of elimination are worth a word."""
 MANY = 12
 """Rows from which on that matters."""
+PRESSED = 48
+"""Bounded rows from which on the interior point takes most of a step."""
 
 
 def found(known: Known) -> dict[str, str]:
@@ -153,7 +157,14 @@ def curved(known: Known) -> str | None:
 
 
 def dense(known: Known) -> str | None:
-    """Trap 7: dense matrices where J is sparse."""
+    """Trap 7: dense matrices where J is sparse, or where few of many contacts touch."""
+    size = count_bounds(known.system, known.state.q, known.state.v)
+    if isinstance(known.method.bounded, InteriorPoint) and size >= PRESSED:
+        return (
+            f"InteriorPoint() inverts a matrix of {size} bounded rows in each of its rounds. Take"
+            " bounded=GaussSeidel(), whose sweeps do not, or jc.Nearest(jc.InteriorPoint(),"
+            " contacts=8) where only few act at a time."
+        )
     efforts, name = known.choice.efforts, type(_innermost(known.method.solver)).__name__
     if name not in ("Dense", "Schur") or "Sparse" not in efforts or known.rows.layout.size < MANY:
         return None

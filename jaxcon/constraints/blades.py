@@ -44,6 +44,7 @@ class KnifeEdge:
     normal: Any = None
     center: Any = None
     oriented = True
+    in_b = ("edge",)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The plane in a, the point and the edge in b."""

@@ -55,6 +55,7 @@ class BoxContact:
     recovery: Any = 0.1
     framed = True
     optional = ("friction", "restitution")
+    in_b = point_sets.AXES
 
     def attach(self, a: Pose, b: Pose, own_a: Pose, own_b: Pose) -> dict[str, Array]:
         """The plane in the frame of a, the box in that of b, and the material."""

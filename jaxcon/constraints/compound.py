@@ -37,6 +37,7 @@ class Freedoms:
     slides: int
     hinges: int
     ball: bool
+    in_b = gimbal.IN_B
 
     @property
     def coordinates(self) -> dict[str, str]:

@@ -22,6 +22,9 @@ from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import Array, Lane
 from jaxcon.geometry.pose import Pose
 
+IN_B = ("axis_2", "first_2", "second_2")
+"""What two axes keep in the second body."""
+
 
 def attach_two(axes: list[Array], a: Pose, b: Pose) -> dict[str, Array]:
     """Both axes, and in each body the directions between which the other one's axis turns."""

@@ -112,6 +112,7 @@ class RollingCylinder:
     point: Any = None
     oriented = True
     dims = (3,)
+    in_b = ("axis",)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The plane in a, the centre and the axis in b, and the radius."""
@@ -163,6 +164,7 @@ class RollingDisc:
     point: Any = None
     oriented = True
     turns = True
+    in_b = ("axis",)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The plane in a, the centre and in space the axis in b, and the radius."""

@@ -41,6 +41,7 @@ class Twist:
     oriented = True
     dims = (3,)
     coordinates = MappingProxyType({"twist": "rotation"})
+    in_b = ("axis",)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The axis in b, and the orientation of b in a."""

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
-from jaxcon.geometry import inertia as solids
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.geometry.solid import resolve_inertia, resolve_mass
 from jaxcon.model.bodies import Particle, PlanarRigid, SpatialRigid
 
 
@@ -64,22 +63,20 @@ def resolve(body: BodyInput, dim: int, dtype: Any) -> Resolved:
     if body.fixed:
         return Resolved(None, motion, None, None, None)
     if not body.rigid:
-        return Resolved(Particle(dim), motion, _mass(body, body.mass, dtype), None, None)
-    solid = _solid(body, dim, dtype)
-    mass = _mass(body, solid.mass, dtype)
+        mass = resolve_mass(_label(body), body.mass, dtype)
+        return Resolved(Particle(dim), motion, mass, None, None)
+    solid = resolve_inertia(_label(body), body.mass, body.inertia, dim, dtype)
     kind = PlanarRigid() if dim == 2 else SpatialRigid()
     if solid.center is None and solid.axes is None:
-        return Resolved(kind, motion, mass, solid.moments, None)
+        return Resolved(kind, motion, solid.mass, solid.moments, None)
     center = jnp.zeros(dim, dtype)
     if solid.center is not None:
         center = checks.number(_label(body), "inertia.center", solid.center, dtype, (dim,))
-    own = Pose(center, solid.axes if dim == 3 else jnp.zeros((), dtype))
-    if dim == 2:
-        return Resolved(kind, motion.seen_from(own), mass, solid.moments, Pose(-center, None))
-    axes = quaternion.IDENTITY.stack().astype(dtype) if own.orientation is None else own.orientation
-    own = Pose(center, axes.astype(dtype))
-    offset = Pose(-own.local_direction(center), quaternion.conjugate(own.orientation))
-    return Resolved(kind, motion.seen_from(own), mass, solid.moments, offset)
+    own = Pose(center)
+    if dim == 3:
+        axes = jnp.eye(4, dtype=dtype)[0] if solid.axes is None else solid.axes
+        own = Pose(center, axes.astype(dtype))
+    return Resolved(kind, motion.seen_from(own), solid.mass, solid.moments, own.inverse)
 
 
 def _motion(body: BodyInput, dim: int, dtype: Any) -> Motion:
@@ -103,46 +100,6 @@ def _motion(body: BodyInput, dim: int, dtype: Any) -> Motion:
     turn = given("quaternion", body.orientation, (1.0, 0.0, 0.0, 0.0), (4,))
     checks.nonzero(_label(body), "quaternion", turn)
     return Motion(position, quaternion.normalize(turn), velocity, spin)
-
-
-def _solid(body: BodyInput, dim: int, dtype: Any) -> solids.Inertia:
-    """The inertia with moments as an array, whatever form the user gave."""
-    given = body.inertia
-    if isinstance(given, solids.Inertia):
-        if body.mass is not None:
-            raise ValueError(f"{_label(body)}: give mass= or an Inertia, not both.")
-    elif given is None:
-        raise ValueError(f"{_label(body)}: inertia is needed; a body without one is a particle.")
-    elif dim == 3 and jnp.asarray(given).shape == (3, 3):
-        given = solids.from_tensor(
-            body.mass, checks.number(_label(body), "inertia", given, dtype, (3, 3))
-        )
-    else:
-        if dim == 2 and np.ndim(given):
-            raise ValueError(
-                f"{_label(body)}: inertia must have shape () in the plane, about the normal through"
-                f" the centre of mass, got {np.shape(given)}; of principal moments give the third."
-            )
-        given = solids.Inertia(body.mass, given)
-    moments = given.moments
-    if dim == 2 and jnp.asarray(moments).shape == (3,):
-        moments = moments[2]
-    moments = checks.number(_label(body), "inertia", moments, dtype, () if dim == 2 else (3,))
-    checks.positive(_label(body), "inertia", moments)
-    if dim == 3:
-        solids.check_triangle(_label(body), moments)
-    return solids.Inertia(given.mass, moments, given.center, given.axes)
-
-
-def _mass(body: BodyInput, mass: Any, dtype: Any) -> Array:
-    if mass is None:
-        raise ValueError(
-            f"{_label(body)}: a mass is needed; mass=, or of a body an inertia that brings it, such"
-            " as jc.inertia.box(mass, size)."
-        )
-    value = checks.number(_label(body), "mass", mass, dtype)
-    checks.positive(_label(body), "mass", value)
-    return value
 
 
 def _label(body: BodyInput) -> str:

@@ -110,8 +110,9 @@ def jitter(
 ) -> Environment:
     """The environment with noise of N(0, σ²) added to some of its numbers: C + N(0, σ²).
 
-    Noise on anchors or lengths moves what the constraints ask for by as much, and an episode begins
-    as far off them: the default feedback takes that back within a step, at a speed of σ/h.
+    Noise on anchors, lengths or centres of mass moves what the constraints ask for by as much, and
+    an episode begins as far off them: the default feedback takes that back within a step, at a
+    speed of σ/h.
 
     Args:
         environment: `environment.system.params` lists its numbers.

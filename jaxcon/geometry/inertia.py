@@ -147,6 +147,55 @@ def from_tensor(mass: Any, tensor: Any, center: Any = None) -> Inertia:
     return Inertia(mass, moments, center, quaternion.from_matrix(axes))
 
 
+def from_log_cholesky(theta: Any) -> Inertia:
+    """The body of ten free numbers, every choice of which is one that can exist.
+
+    With θ = (α, d₁, d₂, d₃, s₁₂, s₂₃, s₁₃, t₁, t₂, t₃), mass m = e^{2α}, centre of mass t and
+
+        Σ = m V Vᵀ,   V = [[e^{d₁}, s₁₂, s₁₃], [0, e^{d₂}, s₂₃], [0, 0, e^{d₃}]],   I = tr(Σ) 1 − Σ,
+
+    Σ being the second moments of mass about the centre and I the tensor there: m, every moment and
+    the triangle inequality are positive whatever θ, which is what a fit by gradient wants.
+
+    Args:
+        theta: (10,).
+
+    Raises:
+        ValueError: another shape.
+
+    References:
+        Rucker, Wensing, Smooth Parameterization of Rigid-Body Inertia, IEEE Robotics and Automation
+        Letters 7 (2022).
+    """
+    theta = jnp.asarray(theta)
+    if theta.shape != (10,):
+        raise ValueError(f"inertia: theta must have shape (10,), got {theta.shape}.")
+    α, d1, d2, d3, s12, s23, s13 = theta[:7]
+    zero = jnp.zeros_like(α)
+    rows = ((jnp.exp(d1), s12, s13), (zero, jnp.exp(d2), s23), (zero, zero, jnp.exp(d3)))
+    v = jnp.stack([jnp.stack(row) for row in rows])
+    mass = jnp.exp(2 * α)
+    spread = mass * (v @ v.T)
+    return from_tensor(mass, jnp.trace(spread) * jnp.eye(3, dtype=v.dtype) - spread, theta[7:])
+
+
+def log_cholesky(body: Inertia) -> Array:
+    """The ten numbers (10,) of a body in space, as `from_log_cholesky` takes them.
+
+    Args:
+        body: whose moments satisfy the triangle inequality strictly: it is not flat.
+    """
+    moments = jnp.asarray(body.moments, jnp.result_type(float, *body.moments))
+    axes = jnp.eye(4, dtype=moments.dtype)[0] if body.axes is None else body.axes
+    turn = quaternion.matrix(axes.astype(moments.dtype))
+    along = jnp.sum(moments) / 2 - moments
+    share = turn @ (along[:, None] * turn.T) / body.mass
+    v = jnp.linalg.cholesky(share[::-1, ::-1])[::-1, ::-1]
+    center = jnp.zeros(3) if body.center is None else jnp.asarray(body.center)
+    free = jnp.stack([jnp.log(body.mass) / 2, *jnp.log(jnp.diagonal(v)), v[0, 1], v[1, 2], v[0, 2]])
+    return jnp.concatenate([free.astype(moments.dtype), center.astype(moments.dtype)])
+
+
 @jax.custom_jvp
 def principal_axes(tensor: Array) -> tuple[Array, Array]:
     """I = A diag(moments) Aᵀ with A a rotation.

@@ -69,6 +69,27 @@ class Pose:
         """
         return world if self.orientation is None else self.rotation.T @ world
 
+    def then(self, other: Pose) -> Pose:
+        """In the world, a frame that is given in this one.
+
+        Args:
+            other: of that frame in this one; without an orientation it is not turned.
+        """
+        position, turn = self.point(other.position), self.orientation
+        if turn is None or other.orientation is None:
+            return Pose(position, other.orientation if turn is None else turn)
+        if self.position.shape[0] == 2:
+            return Pose(position, turn + other.orientation)
+        return Pose(position, quaternion.multiply(turn, other.orientation))
+
+    @property
+    def inverse(self) -> Pose:
+        """The world as seen from this frame."""
+        position = -self.local_direction(self.position)
+        if self.orientation is None or self.position.shape[0] == 2:
+            return Pose(position, None if self.orientation is None else -self.orientation)
+        return Pose(position, quaternion.conjugate(self.orientation))
+
 
 @pytree
 class WorldPose(Pose):

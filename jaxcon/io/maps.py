@@ -263,15 +263,9 @@ def _flat(
     kind = layout.groups[layout.locate(names[0])[0]].kind
     zero, upright = jnp.zeros(3, qpos.dtype), jnp.eye(4, dtype=qpos.dtype)[0]
     own = [offsets.get(name, Pose(zero, upright)) for name in names]
-    frames = jax.vmap(_inverse)(jax.tree.map(lambda *x: jnp.stack(x), *own))
+    frames = jax.vmap(lambda pose: pose.inverse)(jax.tree.map(lambda *x: jnp.stack(x), *own))
     seen = jax.vmap(lambda motion, frame: motion.seen_from(frame))
     x, y = jax.vmap(kind.coordinates)(seen(tree.motions(qpos, qvel), frames))
     q, v = jnp.zeros(layout.n_q, qpos.dtype), jnp.zeros(layout.n_v, qpos.dtype)
     at_q, at_v = (np.stack([where(n) for n in names]) for where in (layout.q, layout.v))
     return q.at[at_q].set(x), v.at[at_v].set(y)
-
-
-def _inverse(offset: Pose) -> Pose:
-    """The principal frame of a link in the user's frame, from the user's in the principal frame."""
-    back = quaternion.conjugate(offset.orientation)
-    return Pose(-offset.local_direction(offset.position), back)

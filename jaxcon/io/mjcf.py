@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
@@ -24,6 +24,7 @@ from jaxcon.io.maps import Node, Scalar, Tree
 from jaxcon.io.passive import passive
 from jaxcon.io.refusals import left_out, refuse
 from jaxcon.model.coordinates import TurnCounter
+from jaxcon.model.inertial import restate
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
 
@@ -68,6 +69,19 @@ class MujocoModel:
 
     def __iter__(self) -> Iterator[Any]:
         return iter((self.system, self.start))
+
+    def with_params(self, changes: Mapping[str, Any]) -> MujocoModel:
+        """The same model with other numbers of its system, and its start restated.
+
+        Args:
+            changes: as of `BodySystem.with_params`; links lie as MuJoCo's bodies do.
+
+        Raises:
+            ValueError: an unknown name or field, a wrong shape, or a value out of range.
+        """
+        system = self.system.with_params(changes)
+        start = restate(self.start, self.system, system)
+        return dataclasses.replace(self, system=system, start=start)
 
     def state(self, qpos: Any, qvel: Any, time: Any = 0.0) -> State:
         """The state at MuJoCo's coordinates; pure: jit, vmap and differentiate it.

@@ -109,6 +109,7 @@ class Flexure:
     bending: Any
     twisting: Any = 0.0
     straight: bool = False
+    by_principal_axes = True
 
     @property
     def bodies(self) -> tuple[str, ...]:

@@ -10,23 +10,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core import checks
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
 from jaxcon.geometry.pose import Motion, Pose
+from jaxcon.model import params
 from jaxcon.model.bodies import rest
 from jaxcon.model.coordinates import JointCoordinate, count
-from jaxcon.model.elements import element_at, replace_at
 from jaxcon.model.frames import WorldFrame
 from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal, Solution
-
-POSITIVE = {"mass", "inertia", "length"}
-NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
-"""Fields whose values are checked where they are known."""
 
 
 @pytree
@@ -254,77 +249,30 @@ class BodySystem:
     def params(self) -> dict[str, Any]:
         """Numbers by name: `gravity`, and for each body, constraint and force its fields.
 
-        Not among them is where the centre of mass and the principal axes of a body lie (`offsets`),
-        nor where a fixed body is: build the scene inside the differentiated function for these.
+        A rigid body has `mass`, `inertia` (moments about its centre of mass), `center` (of mass, in
+        the frame in which the body was given) and in space `axes` (principal to that frame, a unit
+        quaternion). Where a fixed body is is not among them: build the scene inside the
+        differentiated function for it.
         """
-        result: dict[str, Any] = {"gravity": self.gravity}
-        for group, properties in zip(self.layout.groups, self.inertia, strict=True):
-            for i, name in enumerate(group.names):
-                fields = {"mass": properties.mass[i]}
-                if properties.moments is not None:
-                    fields["inertia"] = element_at(properties.moments, i)
-                result[name] = fields
-        for element in (*self.constraints, *self.forces, *self.bounds):
-            result.update({name: element.get(i) for i, name in enumerate(element.names)})
-        return result
+        return params.read(self)
 
     def with_params(self, changes: Mapping[str, Any]) -> BodySystem:
         """The same system with other numbers; nothing is retraced by it.
 
+        A mass changed alone leaves the inertia as it is. `inertia` of a body in space may also be a
+        tensor (3, 3) about its centre of mass, in the frame in which it was given, or an `Inertia`
+        in place of all four. Where `center` or `axes` change, points and axes of joints stay where
+        they are on the body, and a state of this system becomes one of the new by `jc.restate`;
+        anchors changed beside them are given in the new principal frame. A body whose frames
+        coincided has two then, which is one new trace.
+
         Args:
             changes: as `params`, as much of it as changes: `{"rod": {"length": 2.0}}`.
-
-        A mass changed alone leaves the inertia as it is.
 
         Raises:
             ValueError: an unknown name or field, a wrong shape, or a value out of range.
         """
-        known = self.params
-        for name, fields in changes.items():
-            if name not in known:
-                raise ValueError(f"with_params: '{name}' is unknown; known are {list(known)}.")
-            if name == "gravity":
-                continue
-            if not isinstance(fields, Mapping):
-                raise ValueError(
-                    f"with_params: give '{name}' as a mapping of its fields"
-                    f" {sorted(known[name])}, got {fields!r}."
-                )
-            if unknown := set(fields) - set(known[name]):
-                owners = (group for group in self.bounds if name in group.names)
-                why = "".join(group.why_without(unknown) for group in owners)
-                raise ValueError(
-                    f"'{name}' has no {sorted(unknown)}, it has {sorted(known[name])}.{why}"
-                )
-            for field in fields.keys() & POSITIVE | fields.keys() & NOT_NEGATIVE:
-                shape = known[name][field].shape
-                owner, given = f"{name}.{field}", fields[field]
-                value = checks.number(owner, "the new value", given, self.gravity.dtype, shape)
-                checks.positive(name, field, value, strictly=field in POSITIVE)
-        gravity = self.gravity
-        if "gravity" in changes:
-            shape = (self.layout.dim,)
-            gravity = checks.number("gravity", "it", changes["gravity"], gravity.dtype, shape)
-            checks.finite("gravity", "it", changes["gravity"])
-        return dataclasses.replace(
-            self,
-            gravity=gravity,
-            inertia=tuple(
-                _with_inertia(p, g.names, changes)
-                for g, p in zip(self.layout.groups, self.inertia, strict=True)
-            ),
-            constraints=tuple(element.set(changes) for element in self.constraints),
-            forces=tuple(element.set(changes) for element in self.forces),
-            bounds=tuple(element.set(changes) for element in self.bounds),
-        )
-
-
-def _with_inertia(p: MassProperties, names: tuple[str, ...], changes: Mapping[str, Any]) -> Any:
-    fields = {"mass": p.mass, "inertia": p.moments}
-    for i, name in enumerate(names):
-        for field, value in changes.get(name, {}).items():
-            fields[field] = replace_at(f"{name}.{field}", fields[field], i, value)
-    return MassProperties(fields["mass"], fields["inertia"])
+        return params.replaced(self, changes)
 
 
 def _join(groups: list[Vector], like: Array) -> Array:

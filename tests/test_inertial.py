@@ -1,0 +1,404 @@
+"""All ten inertial parameters, changed after the build: the body moves as one built with them.
+
+What elements fix to a body stays where it is on it, so that every φ and φ̇ at the same place and
+motion of the bodies is what it was; forces do the same work; and accelerations are those of closed
+forms, of MuJoCo, and of a scene that was built so.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from tolerances import DERIVATIVE, DIFFERENCE, ROUND_OFF
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize
+from jaxcon.geometry import inertia
+
+
+def random_solid(random, dim, dtype="float64"):
+    """Mass, centre of mass and inertia of a body that can exist."""
+    center = jnp.asarray(0.3 * random.normal(size=dim), dtype)
+    mass = jnp.asarray(random.uniform(0.5, 2.0), dtype)
+    if dim == 2:
+        return {"mass": mass, "inertia": jnp.asarray(random.uniform(0.5, 1.0), dtype)} | {
+            "center": center
+        }
+    spread = random.normal(size=(3, 3))
+    second = spread @ spread.T
+    tensor = jnp.asarray(np.trace(second) * np.eye(3) - second, dtype)
+    return {"mass": mass, "inertia": tensor, "center": center}
+
+
+def with_random_solids(system, seed=0):
+    """The system with other numbers for every rigid body."""
+    random = np.random.default_rng(seed)
+    dim, dtype = system.layout.dim, system.gravity.dtype
+    rigid = [name for name in system.layout.bodies if "center" in system.params[name]]
+    return system.with_params({name: random_solid(random, dim, dtype) for name in rigid})
+
+
+def user_motions(system, state):
+    """Where every body's own frame is and how it moves."""
+    return [system.motion(name, state.q, state.v) for name in system.layout.bodies]
+
+
+def close(got, expected, tolerance=DERIVATIVE):
+    scale = 1 + max(float(jnp.max(jnp.abs(x))) for x in jax.tree.leaves(expected))
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(x, y, atol=tolerance * scale, rtol=0)
+
+
+PLACES = [f"part{i}-{d}d-{t}" for d, n in scenes.PARTS.items() for i in range(n) for t in ("loop",)]
+
+
+@pytest.mark.parametrize("name", [*PLACES, "mixed-2d", "mixed-3d"])
+def test_what_is_fixed_to_a_body_stays_where_it_is_on_it(name):
+    built = scenes.build(name)
+    changed = with_random_solids(built.system)
+    state = jc.restate(built.off, built.system, changed)
+    assert float(jnp.max(jnp.abs(state.q - built.off.q))) > 0.01
+    close(user_motions(changed, state), user_motions(built.system, built.off))
+    before, after = norms(built.system, built.off), norms(changed, state)
+    close(after, before)
+
+
+def norms(system, state):
+    """‖φ‖ and ‖φ̇‖ of every constraint but momenta, which are not of the place of a body."""
+    rows = jax.jit(linearize)(system, state.q, state.v, state.time)
+    return {
+        name: [jnp.linalg.norm(x[rows.layout.rows(name)]) for x in (rows.residual, rows.rate)]
+        for name in rows.layout.names
+        if "momentum" not in name
+    }
+
+
+def contacts_scene():
+    """Every element that has bounded multipliers between bodies, with points of its own."""
+    random = np.random.default_rng(1)
+    scene = jc.Scene(dim=3)
+    for name in ("first", "second", "third"):
+        scenes.add_random_body(scene, name, random)
+    points = random.normal(size=(6, 3))
+    field = {"heights": random.normal(size=(5, 4)), "size": (4.0, 3.0), "center": points[:4]}
+    box = {"size": (0.3, 0.4, 0.5), "point": points[0], "normal": (0.2, 0.1, 1.0)}
+    ends = {"segment_a": points[:2], "segment_b": points[2:4], "radius_a": 0.1, "radius_b": 0.2}
+    scene.add(jc.PlaneContact("ball", "first", "second", center=points[1], point=points[2]))
+    scene.add(jc.PlaneContact("points", "second", "first", center=points, friction=0.3))
+    scene.add(jc.BoxContact("box", "second", "third", friction=0.2, **box))
+    scene.add(jc.HeightFieldContact("ground", "third", "first", **field))
+    scene.add(jc.CapsuleContact("capsules", "first", "third", **ends))
+    scene.add(jc.Rope("rope", "first", "second", point_a=points[4], point_b=points[5], length=0.5))
+    return scene.build()
+
+
+def gaps(system, state):
+    """φ and φ̇ of every bounded row."""
+    snapshot = system.snapshot(state.q, state.v, state.time)
+    sets = [group.bounds(snapshot, None, jnp.asarray(1e-3)) for group in system.bounds]
+    return [(row.value, row.rate) for rows in sets for row in rows.rows[:1]]
+
+
+def test_what_touches_stays_where_it_is_on_its_body():
+    system, state = contacts_scene()
+    changed = with_random_solids(system)
+    got, expected = gaps(changed, jc.restate(state, system, changed)), gaps(system, state)
+    close(got, expected, 1e-8)  # the nearest point of a height field is found by a descent
+
+
+def test_forces_do_the_same_work():
+    """f·v of springs and bending, of a force at a point and of a wrench; gravity is another."""
+    random = np.random.default_rng(2)
+    scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
+    for name in ("first", "second", "third"):
+        scenes.add_random_body(scene, name, random)
+    p = random.normal(size=(7, 3))
+    scene.add(jc.Spring("spring", "first", "second", 3.0, 0.2, 0.5, point_a=p[0], point_b=p[1]))
+    ends = {"point_a": p[2], "point_b": p[3], "point_c": p[4]}
+    scene.add(jc.Bending("strip", "first", "second", "third", 2.0, **ends))
+    scene.add(jc.Force("wind", "third", force=(1.0, 2.0, 3.0), point=p[5]))
+    scene.add(jc.ExternalWrench("push", "second", point=p[6]))
+    system, state = scene.build()
+    changed = with_random_solids(system)
+    after, control = jc.restate(state, system, changed), jnp.asarray(random.normal(size=6))
+    power = system.applied(state.q, state.v, state.time, control) @ state.v
+    same = changed.applied(after.q, after.v, after.time, control) @ after.v
+    np.testing.assert_allclose(same, power, rtol=DERIVATIVE)
+    close(jc.energy(changed, after).potential, jc.energy(system, state).potential)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_body_pinned_off_its_centre_swings_as_the_closed_form_says(dtype):
+    """θ̈ = −m g d cos θ / (I + m d²) of a bar that leaves the level with its centre at d."""
+    scene = jc.Scene(dim=2, dtype=dtype)
+    scene.add_body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    scene.add(jc.Revolute("pin", jc.WORLD, "bar", point=(0.0, 0.0)))
+    system, level = scene.build()
+
+    @jax.jit
+    def turning(mass, moment, center):
+        changed = system.with_params(
+            {"bar": {"mass": mass, "inertia": moment, "center": jnp.stack([center, 0 * center])}}
+        )
+        state = jc.restate(level, system, changed)
+        found = jc.forward_dynamics(changed, state, None, jc.Method(), 1e-3)
+        return found.acceleration[2]
+
+    def closed(mass, moment, center):
+        d = 0.5 + center
+        return -mass * 9.81 * d / (moment + mass * d**2)
+
+    given = tuple(jnp.asarray(x, dtype) for x in (1.3, 0.2, 0.25))
+    tolerance = ROUND_OFF[np.dtype(dtype)]
+    np.testing.assert_allclose(turning(*given), closed(*given), rtol=10 * tolerance)
+    slopes, expected = (jax.grad(f, argnums=(0, 1, 2))(*given) for f in (turning, closed))
+    np.testing.assert_allclose(slopes, expected, rtol=100 * tolerance)
+    at_zero = (*given[:2], jnp.zeros((), dtype))
+    np.testing.assert_allclose(
+        jax.grad(turning, argnums=2)(*at_zero), jax.grad(closed, argnums=2)(*at_zero), rtol=1e-4
+    )
+
+
+def spinning():
+    scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
+    scene.add_body("stone", mass=1.0, inertia=(1.0, 1.0, 1.0), angular_velocity=(0.3, -0.5, 0.8))
+    return scene.build()
+
+
+def turned(system, state, params):
+    """ω̇ in the frame of the body as given, of a body that turns freely."""
+    changed = system.with_params({"stone": params})
+    after = jc.restate(state, system, changed)
+    a = jc.forward_dynamics(changed, after, None, jc.Method(), 1e-3).acceleration
+    return jc.quaternion.rotate(changed.params["stone"]["axes"], a[3:])
+
+
+def euler(tensor, ω):
+    """I ω̇ = −ω × I ω."""
+    return jnp.linalg.solve(tensor, -jnp.cross(ω, tensor @ ω))
+
+
+def test_a_free_body_turns_as_eulers_equation_says():
+    system, state = spinning()
+    tensor = random_solid(np.random.default_rng(3), 3)["inertia"]
+    ω = state.v[3:]
+    got = jax.jit(lambda x: turned(system, state, {"inertia": x}))
+    np.testing.assert_allclose(got(tensor), euler(tensor, ω), rtol=DERIVATIVE)
+    close(jax.jacfwd(got)(tensor), symmetric(jax.jacfwd(euler)(tensor, ω)), 1e-8)
+
+
+def symmetric(slope):
+    """A derivative by a matrix as one by its symmetric part."""
+    return (slope + slope.swapaxes(-1, -2)) / 2
+
+
+@pytest.mark.parametrize("by", ["axes", "inertia", "center", "mass"])
+def test_derivatives_of_a_ball_are_finite_and_right(by):
+    """Where every axis is principal, none of them matters."""
+    system, state = spinning()
+    known = system.params["stone"]["axes" if by == "axes" else by]
+    slope = jax.jit(jax.jacrev(lambda x: turned(system, state, {by: x})))(known)
+    assert jnp.all(jnp.isfinite(slope))
+    if by != "inertia":
+        np.testing.assert_allclose(slope, jnp.zeros_like(slope), atol=1e-12)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_it_is_the_body_that_a_scene_is_built_with(dim):
+    """All four at once by an `Inertia`, beside a scene with it from the start."""
+    given = random_solid(np.random.default_rng(4), dim)
+    moments, axes = given["inertia"], None
+    if dim == 3:
+        solid = inertia.from_tensor(given["mass"], given["inertia"])
+        moments, axes = solid.moments, solid.axes
+    solid = inertia.Inertia(given["mass"], moments, given["center"], axes)
+
+    def build(**body):
+        scene = jc.Scene(dim=dim)
+        scene.add_body("link", position=jnp.arange(1.0, dim + 1), **body)
+        axis = None if dim == 2 else (0.0, 1.0, 1.0)
+        scene.add(jc.Revolute("hinge", jc.WORLD, "link", point=jnp.ones(dim), axis=axis))
+        return scene.build()
+
+    plain, state = build(mass=1.0, inertia=1.0 if dim == 2 else (1.0, 1.5, 2.0))
+    wanted, begin = build(inertia=solid)
+    got = plain.with_params({"link": {"inertia": solid}})
+    assert jax.tree.structure(got) == jax.tree.structure(wanted)
+    close(jax.tree.leaves(got), jax.tree.leaves(wanted))
+    close(jc.restate(state, plain, got), begin)
+    back = got.with_params({"link": plain.params["link"]})
+    close(back.constraints[0].params, plain.constraints[0].params)
+
+
+def test_a_loop_closes_again_and_the_way_is_differentiable():
+    """Energy at assembly by the coupler's centre of mass: m g is its slope upwards."""
+    from jaxcon.scenes import four_bar
+
+    system, state = four_bar()
+
+    def potential(center):
+        changed = system.with_params({"coupler": {"center": center}})
+        moved = jc.restate(state, system, changed)
+        closed = jc.assemble(changed, moved, hold="crank").state
+        return jc.energy(changed, closed).potential
+
+    center = jnp.asarray([0.1, -0.2])
+    slope = jax.jit(jax.grad(potential))(center)
+    turn = jc.orientation(system, state, "coupler")
+    mass = system.params["coupler"]["mass"]
+    expected = mass * 9.81 * jnp.stack([jnp.sin(turn), jnp.cos(turn)])
+    np.testing.assert_allclose(slope, expected, rtol=DIFFERENCE)
+
+
+def test_links_of_a_model_of_mujoco_move_as_there():
+    """MuJoCo's own links with another mass, centre, axes and moments."""
+    mujoco = pytest.importorskip("mujoco")
+    model = mujoco.MjModel.from_xml_string(ARM)
+    read = jc.from_mjcf(model)
+    random, changes = np.random.default_rng(5), {}
+    for i in range(1, model.nbody):
+        given = random_solid(random, 3)
+        changes[model.body(i).name] = given
+        moments, axes = np.linalg.eigh(given["inertia"])
+        axes[:, 2] *= np.linalg.det(axes)
+        model.body_mass[i], model.body_ipos[i] = given["mass"], given["center"]
+        model.body_inertia[i] = moments
+        mujoco.mju_mat2Quat(model.body_iquat[i], axes.ravel())
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    data.qpos[:] = random.normal(size=model.nq)
+    data.qpos[1:5] /= np.linalg.norm(data.qpos[1:5])
+    data.qvel[:] = random.normal(size=model.nv)
+    mujoco.mj_forward(model, data)
+    changed = read.with_params(changes)
+    state = changed.state(jnp.asarray(data.qpos), jnp.asarray(data.qvel))
+    close(changed.qpos(state), data.qpos)
+    method = jc.Method(jc.RK4(), jc.Unstabilized(), jc.Dense())
+    a = jc.forward_dynamics(changed.system, state, jnp.zeros(0), method, 1e-3).acceleration
+    close(changed.qacc(state, a), data.qacc, 1e-8)
+    close(changed.qpos(changed.start), read.qpos(read.start))
+
+
+ARM = """<mujoco><worldbody>
+  <body name="upper" pos="0 0 1"><joint type="hinge" axis="0 1 0.2"/>
+    <geom type="box" size=".1 .05 .3" contype="0" conaffinity="0"/>
+    <body name="middle" pos="0.1 0 0.5"><joint type="ball"/>
+      <geom type="box" size=".1 .05 .2" pos="0 0 .1" contype="0" conaffinity="0"/>
+      <body name="hand" pos="0 0.2 0.3"><joint type="slide" axis="1 0 1"/>
+        <geom type="sphere" size=".1" contype="0" conaffinity="0"/>
+      </body></body></body>
+</worldbody></mujoco>"""
+
+
+def test_every_choice_of_ten_numbers_is_a_body():
+    random = np.random.default_rng(6)
+    for scale in (0.1, 1.0, 3.0):
+        theta = jnp.asarray(scale * random.normal(size=10))
+        body = inertia.from_log_cholesky(theta)
+        first, second, third = np.sort(body.moments)
+        assert float(body.mass) > 0
+        assert first > 0
+        assert first + second > third * (1 - 1e-12)
+        np.testing.assert_allclose(inertia.log_cholesky(body), theta, rtol=1e-6, atol=1e-6)
+    with pytest.raises(ValueError, match=r"\(10,\)"):
+        inertia.from_log_cholesky(jnp.zeros(9))
+
+
+def test_a_box_has_the_ten_numbers_of_its_integrals():
+    """Σ of a box is diagonal, m b²/12 along each edge b."""
+    edges = np.array([0.3, 0.5, 0.9])
+    theta = inertia.log_cholesky(inertia.box(2.5, tuple(edges)))
+    expected = [np.log(2.5) / 2, *np.log(edges**2 / 12) / 2, 0, 0, 0, 0, 0, 0]
+    np.testing.assert_allclose(theta, expected, atol=1e-12)
+
+
+def test_a_state_without_other_frames_stays_what_it_is():
+    built = scenes.build("mixed-3d")
+    heavier = built.system.with_params({"first": {"mass": 3.0}})
+    close(jc.restate(built.state, built.system, heavier), built.state, 1e-15)
+
+
+def rod_scene():
+    scene = jc.Scene(dim=3)
+    jc.rod(scene, "rod", np.linspace((0, 0, 0), (1, 0, 0), 3), 1.0, radius=0.01, bending=1.0)
+    return scene.build()
+
+
+BAD = [
+    ({"inertia": inertia.sphere(1.0, 0.1), "mass": 2.0}, "give it alone, without \\['mass'\\]"),
+    ({"inertia": np.eye(3), "axes": (1.0, 0.0, 0.0, 0.0)}, "a tensor has axes of its own"),
+    ({"inertia": np.diag([1.0, 1.0, 3.0])}, "triangle"),
+    ({"inertia": (1.0, 1.0, 3.0)}, "body 'first'.*triangle"),
+    ({"inertia": (1.0, 1.0)}, "body 'first': inertia must have shape"),
+    ({"center": (1.0, 1.0)}, "body 'first': center must have shape"),
+    ({"center": (1.0, np.nan, 1.0)}, "body 'first': center must be finite"),
+    ({"axes": (0.0, 0.0, 0.0, 0.0)}, "body 'first': axes must have a length"),
+    ({"mass": -1.0}, "body 'first': mass must be positive"),
+]
+
+
+@pytest.mark.parametrize(("fields", "words"), BAD)
+def test_a_body_that_cannot_be_is_refused(fields, words):
+    built = scenes.build("mixed-3d")
+    with pytest.raises(ValueError, match=words):
+        built.system.with_params({"first": fields})
+
+
+def test_a_particle_has_a_mass_alone():
+    built = scenes.build("mixed-3d")
+    with pytest.raises(ValueError, match="'bob' has no \\['center'\\], it has \\['mass'\\]"):
+        built.system.with_params({"bob": {"center": (0.0, 0.0, 0.0)}})
+    with pytest.raises(ValueError, match="particle 'bob': mass must be positive"):
+        built.system.with_params({"bob": {"mass": 0.0}})
+
+
+def test_what_goes_by_principal_axes_says_so():
+    system, _ = rod_scene()
+    name = next(n for n in system.layout.bodies if "center" in system.params[n])
+    with pytest.raises(ValueError, match="principal axes of their bodies, which must not turn"):
+        system.with_params({name: {"axes": (1.0, 1.0, 0.0, 0.0)}})
+
+
+def test_systems_of_other_bodies_have_other_states():
+    one, other = scenes.build("mixed-3d"), scenes.build("mixed-2d")
+    with pytest.raises(ValueError, match="the same bodies in the same order"):
+        jc.restate(one.state, one.system, other.system)
+
+
+def test_a_recording_under_known_forces_tells_all_ten():
+    """A body thrown and pushed at a point of its frame, seen with noise; θ within its errors."""
+    scene = jc.Scene(dim=3)
+    scene.add_body("stone", mass=1.0, inertia=(0.1, 0.1, 0.1), angular_velocity=(1.0, 2.0, -1.0))
+    scene.add(jc.ExternalWrench("push", "stone", point=(0.0, 0.0, 0.0)))
+    system, state = scene.build()
+    random = np.random.default_rng(7)
+    pushes = jnp.asarray(random.normal(size=(80, 6)) * np.repeat([3.0, 0.5], 3))
+    method = jc.Method(integrator=jc.RK4())
+
+    def seen(theta):
+        body = system.with_params({"stone": {"inertia": inertia.from_log_cholesky(theta)}})
+        start = jc.restate(state, system, body)
+
+        def look(s, info):
+            motion = body.motion("stone", s.q, s.v)
+            return jnp.concatenate([motion.position, motion.rotation[0], motion.rotation[1]])
+
+        return jc.rollout(body, method, start, pushes, 0.02, 80, record=look)[1]
+
+    solid = inertia.from_tensor(
+        1.5, jnp.asarray(random_tensor(random)), jnp.array([0.1, -0.05, 0.2])
+    )
+    truth = inertia.log_cholesky(solid)
+    data = np.asarray(jax.jit(seen)(truth)) + 1e-3 * random.normal(size=(80, 9))
+    guess = inertia.log_cholesky(inertia.box(1.0, (0.9, 1.0, 1.1)))
+    found = jc.identify(seen, guess, data, noise=1e-3)
+    assert found.untold == []
+    assert abs(found.noise - 1) < 0.1
+    assert np.all(np.abs(found.params - truth) < 4 * found.errors)
+
+
+def random_tensor(random):
+    """Of a body of about a metre."""
+    axes, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    return axes @ np.diag([0.12, 0.2, 0.25]) @ axes.T
