@@ -5,7 +5,6 @@ Each class describes one element on a joint's coordinate θ, an angle over turns
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,13 +12,13 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.bounds import BoundSet
 from jaxcon.constraints.primitives import Row
-from jaxcon.constraints.ranges import check_ends, check_ranges
+from jaxcon.constraints.ranges import Ranged, check_ends, check_ranges
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import take
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.elements import Elements, label
+from jaxcon.model.elements import label
 
 RECOVERED = 0.2
 """The part of a penetration that a step takes back."""
@@ -189,10 +188,9 @@ class RateLimit:
 
 
 @pytree
-class Bounds(Elements):
+class Bounds(Ranged):
     """Elements of one class, `law`, along one coordinate of joints of one group."""
 
-    law: Any = static(default=None)
     along: JointCoordinate = static(default=None)  # type: ignore[assignment]
     starts: tuple[int, ...] = static(default=())
 
@@ -202,10 +200,6 @@ class Bounds(Elements):
             self.params, self.along.read(snapshot), self._control(control), dt
         )
         return BoundSet(self.law.law, (row,), self.places, **asked)
-
-    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
-        """Checks the numbers of one element, by field."""
-        check_ranges(name, numbers)
 
     def _control(self, control: Any) -> Lane:
         """The element's own channels."""

@@ -6,12 +6,25 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxcon.core import checks
+from jaxcon.core.pytree import pytree, static
+from jaxcon.model.elements import Elements
 
 POSITIVE = ("stiffness", "recovery", "size")
 NOT_NEGATIVE = (
     *("restitution", "damping", "friction", "rolling", "spinning"),
     *("most", "rate", "radius", "radius_a", "radius_b"),
 )
+
+
+@pytree
+class Ranged(Elements):
+    """Bounded elements of one class, `law`."""
+
+    law: Any = static(default=None)
+
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the numbers of one element, by field."""
+        check_ranges(name, numbers)
 
 
 def check_ranges(owner: str, numbers: Mapping[str, Any]) -> None:
