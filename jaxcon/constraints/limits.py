@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.bounds import BoundSet
 from jaxcon.constraints.primitives import Row
-from jaxcon.constraints.ranges import Ranged, check_ends, check_ranges
+from jaxcon.constraints.ranges import Ranged, check_ends, check_ranges, not_negative
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import take
 from jaxcon.core.pytree import pytree, static
@@ -184,7 +184,7 @@ class RateLimit:
         side = jnp.where(row.rate > 0, -1.0, 1.0).astype(row.rate.dtype)
         pulls = tuple(pull * side for pull in row.pulls)
         own = Row(0.0, side * row.rate, 0.0, pulls, holonomic=False)
-        return own, {"target": -p["rate"]}
+        return own, {"target": -not_negative(p["rate"])}
 
 
 @pytree
@@ -208,7 +208,8 @@ class Bounds(Ranged):
 
 def saturating(p: dict[str, Any], row: Row, rate: Lane) -> tuple[Row, dict[str, Any]]:
     """θ̇ = rate as far as −τ ≤ λ ≤ τ suffices."""
-    asked = {"target": rate, "lower": -p["most"], "upper": p["most"]}
+    largest = not_negative(p["most"])
+    asked = {"target": rate, "lower": -largest, "upper": largest}
     return row._replace(value=0.0, holonomic=False), asked
 
 
@@ -234,7 +235,7 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
         return row, asked
     # λ = −k (φ + h u) − c u behind the gap, as u + C λ = u* with the stiffness of both over a step;
     # before it is closed, both act on the travel beyond it alone, u + φ/h
-    both = h * p["stiffness"] + p["damping"]
+    both = h * p["stiffness"] + not_negative(p["damping"])
     behind = -p["stiffness"] * row.value / both
     soft = jnp.where(row.value > 0, closing, behind)
     return row, asked | {"target": soft, "compliance": 1 / both}
