@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.solvers import central_path, gauss_jordan, gauss_seidel, interior_point
+from jaxcon.solvers import central_path, gauss_jordan, interior_point, polish
 from jaxcon.solvers.bounded import Bounded, Kinds
 
 WORLDS = 2000
@@ -115,7 +115,7 @@ def test_one_corner_of_four_lets_go():
         *(jnp.asarray(x)[..., None] for x in numbers), none, none, μ, Kinds(0, 0, 4, 2)
     )
     near = jax.jit(jc.GaussSeidel(sweeps=40).solve)(problem, jnp.zeros((12, 1)))
-    found = jax.jit(partial(gauss_seidel.polished, rounds=12))(problem, near)
+    found = jax.jit(partial(polish.polished, rounds=12))(problem, near)
     assert missed(problem, found).max() < 1e-14
     assert np.sum(np.asarray(problem.kinds.split(found).normal) > 0) == 3
 

@@ -76,3 +76,61 @@ def test_a_negative_friction_that_is_traced_is_none():
     v = jax.jit(jax.vmap(end))(jnp.asarray([-0.4, 0.4]), jnp.asarray([-0.01, -0.01]))
     sliding = 1 - 0.4 * 9.81 * 0.04
     assert jnp.allclose(v, jnp.asarray([[1.0, 0.0, 0.0], [sliding, 0.0, -10 * (1 - sliding)]]))
+
+
+def slid(element, changes, controls=None):
+    """φ and φ̇ of 2 kg on a rail that start at 1 m/s, over three seconds; numbers are traced."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("slide", mass=2.0, inertia=1.0, velocity=(1.0, 0.0))
+    scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
+    scene.add(element)
+    system, state = scene.build()
+
+    @jax.jit
+    def run(changes):
+        changed = system.with_params({"it": changes})
+        last, path = jc.rollout(changed, jc.Method(), state, controls, 2e-3, 1500)
+        return path.q[:, 0], path.v[:, 0], last.status
+
+    x, v, status = run(jax.tree.map(jnp.asarray, changes))
+    assert status == jc.Status.OK
+    return x, v
+
+
+@pytest.mark.parametrize(
+    ("element", "changes", "speed"),
+    [
+        (jc.JointFriction("it", "rail", 1.0), {"most": -1.0}, 1.0),
+        (jc.RateMotor("it", "rail", 1.0), {"most": -1.0}, 1.0),
+        (jc.RateLimit("it", "rail", 0.5), {"rate": -0.5}, 0.0),
+    ],
+    ids=["friction", "motor", "rate"],
+)
+def test_negative_traced_bounds_are_zero(element, changes, speed):
+    """A friction of −1 N would push with 1 N, and a limit of −0.5 m/s turn the motion round."""
+    controls = jnp.zeros((1500, 1)) if isinstance(element, jc.RateMotor) else None
+    v = slid(element, changes, controls)[1]
+    assert jnp.allclose(v, speed, atol=1e-12)
+
+
+def test_negative_traced_damping_is_none():
+    """It would add energy without end."""
+    v = slid(jc.Limit("it", "rail", upper=0.1, stiffness=100.0, damping=1.0), {"damping": -5.0})[1]
+    none = jc.Limit("it", "rail", upper=0.1, stiffness=100.0)
+    assert jnp.allclose(v, slid(none, {"stiffness": 100.0})[1], atol=1e-12)
+    assert jnp.max(jnp.abs(v)) < 1 + 1e-12
+
+
+def test_a_traced_restitution_above_one_adds_no_energy():
+    v = slid(jc.Limit("it", "rail", -0.1, 0.1, restitution=0.5), {"restitution": 2.0})[1]
+    assert jnp.allclose(jnp.abs(v), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("changes", [{"lower": 0.2}, {"lower": 0.2, "upper": -0.2}])
+def test_traced_stops_that_have_crossed_hold_what_is_between_them(changes):
+    """About their middle, no faster than what has passed a stop comes back."""
+    x, v = slid(jc.Limit("it", "rail", -0.1, 0.1, recovery=0.3), changes)
+    middle = (changes["lower"] + changes.get("upper", 0.1)) / 2
+    assert jnp.max(jnp.abs(v)) <= 1.0 + 1e-12
+    assert jnp.max(jnp.abs(x[750:] - middle)) < 0.3 * 2e-3 + 1e-12  # a step's way
+    assert jnp.max(jnp.abs(v[750:])) < 0.3 + 1e-12

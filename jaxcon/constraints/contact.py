@@ -7,7 +7,6 @@ follow from that alone (`touching`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,14 +18,14 @@ from jaxcon.constraints.limits import one_sided, stop
 from jaxcon.constraints.pairs import check_oriented
 from jaxcon.constraints.point_sets import given_points, own_points, spread, spread_place
 from jaxcon.constraints.primitives import Row, distance
-from jaxcon.constraints.ranges import check_ranges
+from jaxcon.constraints.ranges import Ranged
 from jaxcon.constraints.touching import MATERIAL, Touch, material, touching
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import Elements, label, own_point
+from jaxcon.model.elements import label, own_point
 
 
 @dataclass(frozen=True)
@@ -201,10 +200,8 @@ class CapsuleContact:
 
 
 @pytree
-class Touches(Elements):
+class Touches(Ranged):
     """Ropes or contacts of one class, `law`, between bodies of the same kinds."""
-
-    law: Any = static(default=None)
 
     def bounds(self, snapshot: Any, control: Any, dt: Any) -> BoundSet:
         """The rows at one instant, and what a step of dt wants of them."""
@@ -217,10 +214,6 @@ class Touches(Elements):
         law = "contact" if "friction" in p else "single"
         each = None if points is None else points[0].shape[1]
         return BoundSet(law, tuple(rows), places, points=each, **asked)
-
-    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
-        """Checks the numbers of one element, by field."""
-        check_ranges(name, numbers)
 
 
 def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]:

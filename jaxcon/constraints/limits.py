@@ -5,7 +5,6 @@ Each class describes one element on a joint's coordinate θ, an angle over turns
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,13 +12,13 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.bounds import BoundSet
 from jaxcon.constraints.primitives import Row
-from jaxcon.constraints.ranges import check_ends, check_ranges
+from jaxcon.constraints.ranges import Ranged, check_ends, check_ranges, not_negative
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import take
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.elements import Elements, label
+from jaxcon.model.elements import label
 
 RECOVERED = 0.2
 """The part of a penetration that a step takes back."""
@@ -185,14 +184,13 @@ class RateLimit:
         side = jnp.where(row.rate > 0, -1.0, 1.0).astype(row.rate.dtype)
         pulls = tuple(pull * side for pull in row.pulls)
         own = Row(0.0, side * row.rate, 0.0, pulls, holonomic=False)
-        return own, {"target": -p["rate"]}
+        return own, {"target": -not_negative(p["rate"])}
 
 
 @pytree
-class Bounds(Elements):
+class Bounds(Ranged):
     """Elements of one class, `law`, along one coordinate of joints of one group."""
 
-    law: Any = static(default=None)
     along: JointCoordinate = static(default=None)  # type: ignore[assignment]
     starts: tuple[int, ...] = static(default=())
 
@@ -203,10 +201,6 @@ class Bounds(Elements):
         )
         return BoundSet(self.law.law, (row,), self.places, **asked)
 
-    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
-        """Checks the numbers of one element, by field."""
-        check_ranges(name, numbers)
-
     def _control(self, control: Any) -> Lane:
         """The element's own channels."""
         return take(control, self.starts) if self.starts and control is not None else 0.0
@@ -214,7 +208,8 @@ class Bounds(Elements):
 
 def saturating(p: dict[str, Any], row: Row, rate: Lane) -> tuple[Row, dict[str, Any]]:
     """θ̇ = rate as far as −τ ≤ λ ≤ τ suffices."""
-    asked = {"target": rate, "lower": -p["most"], "upper": p["most"]}
+    largest = not_negative(p["most"])
+    asked = {"target": rate, "lower": -largest, "upper": largest}
     return row._replace(value=0.0, holonomic=False), asked
 
 
@@ -240,7 +235,7 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
         return row, asked
     # λ = −k (φ + h u) − c u behind the gap, as u + C λ = u* with the stiffness of both over a step;
     # before it is closed, both act on the travel beyond it alone, u + φ/h
-    both = h * p["stiffness"] + p["damping"]
+    both = h * p["stiffness"] + not_negative(p["damping"])
     behind = -p["stiffness"] * row.value / both
     soft = jnp.where(row.value > 0, closing, behind)
     return row, asked | {"target": soft, "compliance": 1 / both}

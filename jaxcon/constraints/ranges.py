@@ -5,13 +5,29 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
+
 from jaxcon.core import checks
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Lane
+from jaxcon.model.elements import Elements
 
 POSITIVE = ("stiffness", "recovery", "size")
 NOT_NEGATIVE = (
     *("restitution", "damping", "friction", "rolling", "spinning"),
     *("most", "rate", "radius", "radius_a", "radius_b"),
 )
+
+
+@pytree
+class Ranged(Elements):
+    """Bounded elements of one class, `law`."""
+
+    law: Any = static(default=None)
+
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the numbers of one element, by field."""
+        check_ranges(name, numbers)
 
 
 def check_ranges(owner: str, numbers: Mapping[str, Any]) -> None:
@@ -42,3 +58,8 @@ def check_ends(owner: str, lower: Any, upper: Any) -> None:
             f"{owner}: lower must be below upper, got {float(lower)} and {float(upper)}; what does"
             " not move at all is a Fixed joint or a Drive."
         )
+
+
+def not_negative(x: Lane) -> Lane:
+    """A coefficient that only takes energy out; a negative one, as a traced one can be, is none."""
+    return jnp.where(x < 0, 0, x)

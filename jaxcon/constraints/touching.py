@@ -13,6 +13,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.limits import one_sided, stop
 from jaxcon.constraints.primitives import Row
+from jaxcon.constraints.ranges import not_negative
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector, perpendicular
 from jaxcon.core.typing import Array, Lane
@@ -49,19 +50,14 @@ def touching(p: dict[str, Any], touch: Touch, dt: Any) -> tuple[list[Row], dict[
     if "friction" not in p:
         return [first], asked
     tangents = across(touch.normal)
-    asked = asked | {"friction": resisting(p["friction"])}
+    asked = asked | {"friction": not_negative(p["friction"])}
     if "rolling" in p:
         rolls = tuple(turning(touch.a, touch.b, u) for u in tangents)
-        asked |= {"rolling": resisting(p["rolling"]), "rolls": rolls}
+        asked |= {"rolling": not_negative(p["rolling"]), "rolls": rolls}
     if "spinning" in p:
         spins = (turning(touch.a, touch.b, touch.normal),)
-        asked |= {"spinning": resisting(p["spinning"]), "spins": spins}
+        asked |= {"spinning": not_negative(p["spinning"]), "spins": spins}
     return [first, *(along(*points, u) for u in tangents)], asked
-
-
-def resisting(coefficient: Lane) -> Lane:
-    """A coefficient of friction; a negative one, which only a traced one can be, is none."""
-    return jnp.where(coefficient < 0, 0, coefficient)
 
 
 def turning(a: Any, b: Any, u: Vector) -> Row:

@@ -12,11 +12,8 @@ from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan
-from jaxcon.solvers.bounded import Bounded, Parts, onto_disc
+from jaxcon.solvers.bounded import Bounded, onto_disc
 from jaxcon.solvers.gauss_jordan import at, put
-
-MUCH = 1000
-"""Times what rounding leaves."""
 
 
 @pytree
@@ -107,75 +104,6 @@ def sweep(problem: Bounded, multipliers: Array, known: Pivots | None = None) -> 
     for i in range(len(problem.kinds.turning)):
         x = _turning(problem, i, x, known)
     return x
-
-
-def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
-    """The best of multipliers near to the solution and those of some rounds from there.
-
-    A round is a Newton step on the residual, or a sweep where that does not make it smaller. Where
-    this does not suffice, as many rounds go on from the best, with every other sweep carried on;
-    where they leave much, as where a contact jams, three times as many begin at zero.
-
-    Args:
-        problem: u = G λ + c and bounds.
-        multipliers: λ, (n,).
-        rounds: how many.
-    """
-    rounding = 16 * float(jnp.finfo(multipliers.dtype).eps)
-    terms = jnp.sum(jnp.abs(problem.matrix * multipliers[None]), axis=1) + jnp.abs(problem.offset)
-    # by row: a corner high above the floor has a large u, and says nothing of those that rest
-    enough, pivot = rounding * problem.kinds.largest(terms), pivots(problem)
-
-    def going(known: tuple[Any, Array, Array]) -> Array:
-        return (known[0] < 5 * rounds) & jnp.any(unmet(known[0], known[2]))
-
-    def unmet(count: Any, best: Array) -> Array:
-        much = jnp.where(count < 2 * rounds, 1, MUCH) * enough
-        return jnp.any(problem.missed(best) > much, axis=0)
-
-    def once(known: tuple[Any, Array, Array]) -> tuple[Any, Array, Array]:
-        count, x, best = known
-        x = jnp.where(count == rounds, best, jnp.where(count == 2 * rounds, 0, x))
-        inverse = gauss_jordan.inverse(problem.slope(x))
-        new = x - gauss_jordan.apply(inverse, problem.residual(x))
-        swept = sweep(problem, x, pivot)
-        farther = (count >= rounds) & (count < 2 * rounds) & (count % 2 == 1)
-        swept = jnp.where(farther, carried(problem, x, swept), swept)
-        x = jnp.where((problem.worst(new) < problem.worst(x))[None], new, swept)
-        closer = (problem.worst(x) < problem.worst(best)) & unmet(count, best)  # others are done
-        return count + 1, x, jnp.where(closer[None], x, best)
-
-    start = jnp.zeros((), jnp.int32), multipliers, multipliers
-    return jax.lax.while_loop(going, once, start)[2]
-
-
-def carried(problem: Bounded, multipliers: Array, swept: Array) -> Array:
-    """A sweep's change of λ carried on until the first one-sided row that it unloads bears nothing.
-
-    Where more rows bear than can be met together, as at the four corners of a face, one has to let
-    go. Newton's matrix is singular there, and sweeps unload it by little at a time.
-
-    Args:
-        problem: u = G λ + c and bounds.
-        multipliers: λ, (n,).
-        swept: λ after a sweep, (n,).
-    """
-    kinds, change = problem.kinds, swept - multipliers
-    here, rate = kinds.split(multipliers), kinds.split(change)
-    lasts = [
-        jnp.where((x > 0) & (d < 0), -x / jnp.where(d < 0, d, -1), jnp.inf)
-        for x, d in ((here.single, rate.single), (here.normal, rate.normal))
-    ]
-    first = jnp.maximum(jnp.min(jnp.concatenate(lasts), axis=0, initial=jnp.inf), 1)
-    far = kinds.split(multipliers + jnp.where(jnp.isfinite(first), first, 1)[None] * change)
-    single, normal = (
-        jnp.where(jnp.isfinite(last) & (last <= first[None]), 0, jnp.maximum(x, 0))
-        for last, x in zip(lasts, (far.single, far.normal), strict=True)
-    )
-    sets = zip(kinds.discs, far.discs, strict=True)
-    discs = tuple(x * disc.of(normal > 0).astype(normal.dtype) for disc, x in sets)
-    box = jnp.clip(far.box, problem.lower, problem.upper)
-    return kinds.join(Parts(single, box, normal, discs))
 
 
 def _rows(problem: Bounded, multipliers: Array, known: Pivots) -> Array:

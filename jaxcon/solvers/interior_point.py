@@ -26,7 +26,7 @@ from jaxcon.solvers.central_path import (
     stiffness,
     unmet,
 )
-from jaxcon.solvers.gauss_seidel import polished
+from jaxcon.solvers.polish import polished
 
 NEAREST = 0.99
 """Of the way to the boundary, the most that a step goes."""
@@ -85,8 +85,6 @@ class InteriorPoint:
 
         _, point = jax.lax.while_loop(going, once, (jnp.zeros((), jnp.int32), center(scaled)))
         known = scaled.kinds.join(point.primal) * scale * size
-        led = problem.worst(known) < problem.worst(0 * known)  # not where rounding led it astray
-        known = jnp.where(led[None], known, 0)
         return problem.released(polished(problem, known, self.polish))
 
 
