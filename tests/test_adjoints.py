@@ -208,6 +208,20 @@ def test_states_kept_grow_as_a_root(steps, levels):
     assert sum(kept(steps, sizes)) <= levels * (steps ** (1 / levels) + 1)
 
 
+@pytest.mark.parametrize(
+    ("steps", "levels", "expected"),
+    [(1000, 2, (40,)), (1000, 3, (100, 10)), (300, 2, (20,)), (500, 3, (50, 10)), (997, 2, (32,))],
+)
+def test_segments_are_whole_where_that_keeps_hardly_more(steps, levels, expected):
+    """A prime number has no whole segments; elsewhere no step has a condition in it."""
+    adjoint = jc.Checkpoints(levels=levels)
+    assert adjoint.sizes(steps, STATE) == expected
+    program = jax.make_jaxpr(
+        lambda s: jc.rollout(SYSTEM, METHOD, s, None, 1e-2, steps, adjoint=adjoint)
+    )
+    assert (" cond[" in str(program(STATE))) == (steps == 997)
+
+
 def test_a_budget_takes_as_few_levels_as_it_can():
     own = sum(x.nbytes for x in jax.tree.leaves(STATE))
 
@@ -215,7 +229,8 @@ def test_a_budget_takes_as_few_levels_as_it_can():
         return jc.Checkpoints(budget=states * own).sizes(1000, STATE)
 
     assert sizes(1000) == ()
-    assert sizes(999) == sizes(64) == (32,)
+    assert sizes(999) == sizes(65) == (40,)
+    assert sizes(64) == (32,)
     assert sizes(63) == (100, 10)
     assert jc.Checkpoints(budget=own).sizes(0, STATE) == ()
     with pytest.raises(ValueError, match=r"budget=40 bytes.*least"):

@@ -22,7 +22,7 @@ from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
-from jaxcon.simulation.segments import bytes_of, equal_levels, kept, nested, split
+from jaxcon.simulation.segments import bytes_of, equal_levels, kept, nested, split, whole_levels
 
 
 @dataclass(frozen=True)
@@ -137,9 +137,10 @@ class Checkpoints:
         if self.budget is None:
             levels = 2 if self.levels is None else self.levels
             checks.count("Checkpoints", "levels", levels)
-            return equal_levels(steps, levels)
+            return whole_levels(steps, levels)
         own = bytes_of(state)
-        choices = [equal_levels(steps, n) for n in range(1, steps.bit_length() + 2)]
+        levels = range(1, steps.bit_length() + 2)
+        choices = [f(steps, n) for n in levels for f in (whole_levels, equal_levels)]
         for sizes in choices:
             if sum(kept(steps, sizes)) * own <= self.budget:
                 return sizes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,6 +12,9 @@ import jax.numpy as jnp
 
 from jaxcon.core.typing import PyTree
 
+MORE = 1.25
+"""How many times the states may be kept for segments that are all whole."""
+
 
 def equal_levels(steps: int, levels: int) -> tuple[int, ...]:
     """Segments of n^(L−1), …, n steps, n the L-th root of their number rounded up."""
@@ -18,6 +22,25 @@ def equal_levels(steps: int, levels: int) -> tuple[int, ...]:
     while root**levels < steps:
         root += 1
     return tuple(root**i for i in range(levels - 1, 0, -1))
+
+
+def whole_levels(steps: int, levels: int) -> tuple[int, ...]:
+    """Nearly the same, but divisors of each other and of the number of steps.
+
+    A last segment that is shorter takes a condition in every step, which fuses with nothing. Where
+    no such divisors keep hardly more states, the segments are those of `equal_levels`.
+    """
+    equal, whole, length = equal_levels(steps, levels), [], steps
+    for size in equal:
+        length = min(_divisors(length), key=lambda n: abs(math.log(n / size)))
+        whole.append(length)
+    return tuple(whole) if sum(kept(steps, whole)) <= MORE * sum(kept(steps, equal)) else equal
+
+
+def _divisors(n: int) -> list[int]:
+    """Of a number, itself among them."""
+    small = [i for i in range(1, math.isqrt(n) + 1) if n % i == 0]
+    return [*small, *(n // i for i in small)]
 
 
 def kept(steps: int, sizes: Sequence[int]) -> tuple[int, ...]:
