@@ -52,7 +52,9 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     terms = problem.matrix * start.multipliers[None]
     terms = jnp.sum(jnp.abs(terms), axis=1) + jnp.abs(problem.offset)
     # by row: a corner high above the floor has a large u, and says nothing of those that rest
-    enough = 16 * float(jnp.finfo(terms.dtype).eps) * problem.kinds.largest(terms)
+    # what rounding leaves of a sum of n terms grows like √n
+    share = min(max(8.0, 2.3 * len(terms) ** 0.5), 16.0) * float(jnp.finfo(terms.dtype).eps)
+    enough = share * problem.kinds.largest(terms)
 
     def unmet(count: Any, best: Tried) -> Array:
         much = jnp.where(count < 2 * rounds, 1, MUCH) * enough
