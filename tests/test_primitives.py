@@ -14,6 +14,7 @@ import scenes
 from tolerances import DERIVATIVE, DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
+from jaxcon.constraints import primitives
 from jaxcon.constraints.rows import linearize
 
 
@@ -365,3 +366,22 @@ def test_derivatives_of_rows_at_the_identity_are_finite(kind):
 
     for leaf in jax.tree.leaves(jax.jit(jax.jacrev(rows))(state.q)):
         assert jnp.all(jnp.isfinite(leaf))
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-11, 1e-10, 1e-6, 0.1])
+def test_an_angle_has_derivatives_close_to_its_axis_in_float32(radius):
+    """θ, θ̇ and γ of atan2 by (c, s, ċ, ṡ), against float64; on the axis itself they are zero."""
+
+    def angle(x):
+        c, s = (primitives.Row(x[i], x[i + 2], 0 * x[i], (x[i], x[i])) for i in (0, 1))
+        row = primitives.bearing(c, s)
+        return jnp.stack([row.value, row.rate, row.bias])
+
+    def derivatives(dtype):
+        x = jnp.asarray([0.6 * radius, -0.8 * radius, 1e-3, 2e-3], dtype)
+        return [np.asarray(d(angle)(x), np.float64) for d in (jax.jacfwd, jax.jacrev)]
+
+    for got, expected in zip(derivatives("float32"), derivatives("float64"), strict=True):
+        assert np.all(np.isfinite(got))
+        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4 * np.max(np.abs(expected)))
+        assert radius > 0 or not np.any(got)

@@ -143,10 +143,11 @@ def bearing(c: Row, s: Row) -> Row:
     """θ = atan2(s, c) of two rows, in [−π, π].
 
     θ̇ = (c ṡ − s ċ)/(c² + s²), and its own rate without a is
-    (c s̈ − s c̈)/(c² + s²) − 2 θ̇ (c ċ + s ṡ)/(c² + s²).
+    (c s̈ − s c̈)/(c² + s²) − 2 θ̇ (c ċ + s ṡ)/(c² + s²). It is divided by the root of c² + s² twice:
+    the derivative of 1/(c² + s²) overflows in float32 where the root is below 1e-10.
     """
-    weight = numerics.safe_divide(1.0, c.value * c.value + s.value * s.value)
-    along, across = c.value * weight, s.value * weight
+    inverse = numerics.safe_divide(1.0, numerics.norm(Vector(c.value, s.value)))
+    along, across = c.value * inverse * inverse, s.value * inverse * inverse
     rate = along * s.rate - across * c.rate
     radial = along * c.rate + across * s.rate
     bias = along * s.bias - across * c.bias - 2 * rate * radial
