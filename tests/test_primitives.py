@@ -368,7 +368,7 @@ def test_derivatives_of_rows_at_the_identity_are_finite(kind):
         assert jnp.all(jnp.isfinite(leaf))
 
 
-@pytest.mark.parametrize("radius", [0.0, 1e-11, 1e-10, 1e-6, 0.1])
+@pytest.mark.parametrize("radius", [0.0, 1e-10, 1e-8, 1e-6, 0.1])
 def test_an_angle_has_derivatives_close_to_its_axis_in_float32(radius):
     """θ, θ̇ and γ of atan2 by (c, s, ċ, ṡ), against float64; on the axis itself they are zero."""
 

@@ -144,7 +144,7 @@ def bearing(c: Row, s: Row) -> Row:
 
     θ̇ = (c ṡ − s ċ)/(c² + s²), and its own rate without a is
     (c s̈ − s c̈)/(c² + s²) − 2 θ̇ (c ċ + s ṡ)/(c² + s²). It is divided by the root of c² + s² twice:
-    the derivative of 1/(c² + s²) overflows in float32 where the root is below 1e-10.
+    the derivative of 1/(c² + s²) would overflow in float32 where the root is 1e-10.
     """
     inverse = numerics.safe_divide(1.0, numerics.norm(Vector(c.value, s.value)))
     along, across = c.value * inverse * inverse, s.value * inverse * inverse
