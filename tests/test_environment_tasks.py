@@ -242,6 +242,22 @@ def test_a_cat_lands_on_its_feet_without_angular_momentum():
     assert np.abs(total).max() < 1e-13
 
 
+def test_no_muscles_fold_the_cat_double():
+    """The most that torques bring in is in time with the bend: where it grows, and with all."""
+    cat = environments.make("CatRighting", dtype="float32")
+
+    def act(episode, _):
+        rates = cat.bend(episode)[1][1:]
+        episode = cat.act(episode, jnp.where(rates < 0, -1.0, 1.0).astype("float32"))
+        return episode, (jnp.linalg.norm(cat.bend(episode)[0]), episode.state.status)
+
+    starts = jax.vmap(cat.reset)(jax.random.split(jax.random.key(0), 8))
+    run = jax.jit(jax.vmap(lambda s: jax.lax.scan(act, s, None, length=54)[1]))
+    bend, status = run(starts)
+    assert not np.any(status)
+    assert 2.0 < np.max(bend) < 2.8
+
+
 def pump(seen):
     """Up where the body passes below the point, down where it turns, until it swings high enough.
 

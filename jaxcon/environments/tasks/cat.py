@@ -21,12 +21,16 @@ SIDES = (("front", 1.0), ("rear", -1.0))
 def spine(front: jc.Motion, rear: jc.Motion, t: Array, u: Array, params: Any) -> tuple:
     """The torque of the back on the rear half, and its opposite on the front one, (6,) each.
 
-    In the frame of the front half its muscles give τ u about y and z, its elasticity −2 k tan β/2
-    against the bend β: k β while that is small, and no torque folds the back double.
+    In the frame of the front half its muscles give τ u about y and z, its elasticity −2 k s with
+    s = n tan β/2 for the bend β about n: k β while that is small. Its damping −c (s·ω) s takes out
+    what muscles that work in time with the bend bring in, so that no torques fold the back double,
+    and leaves a bend that runs round the spine alone.
     """
     relative = turn_between(front.orientation, rear.orientation)
+    bending = jc.quaternion.rotate(relative, rear.angular_velocity) - front.angular_velocity
     muscles = jnp.append(jnp.zeros((), u.dtype), params["torque"] * u)
-    own = muscles - 2 * params["stiffness"] * relative[1:] / relative[0]
+    s = relative[1:] / relative[0]
+    own = muscles - (2 * params["stiffness"] + params["damping"] * jnp.dot(s, bending)) * s
     torque = front.rotation @ own
     zero = jnp.zeros_like(torque)
     return jnp.concatenate([zero, -torque]), jnp.concatenate([zero, torque])
@@ -71,6 +75,7 @@ class CatRighting(Environment):
         stiffness: Any = 6.0,
         height: Any = 1.6,
         *,
+        damping: Any = 0.2,
         dt: Any = 2e-3,
         skip: int = 5,
         horizon: int | None = 100,
@@ -84,6 +89,7 @@ class CatRighting(Environment):
             torque: the largest of the back about each axis [N m].
             stiffness: k of the back [N m/rad].
             height: of the centre of mass at the start [m].
+            damping: c of the back, of its bend, none while it is straight [N m s/rad].
             dt: h [s].
             skip: steps of h an action is held for.
             horizon: actions until an episode is truncated, or None.
@@ -99,7 +105,7 @@ class CatRighting(Environment):
             scene.add_body(name, mass=mass, inertia=moments, position=middle)
         axis = (1.0, 0.0, 0.0)
         scene.add(jc.ConstantVelocity("waist", "front", "rear", np.zeros(3), axis))
-        numbers = {"torque": torque, "stiffness": stiffness}
+        numbers = {"torque": torque, "stiffness": stiffness, "damping": damping}
         params = {name: jnp.asarray(x, scene.dtype) for name, x in numbers.items()}
         scene.add(jc.CustomForce("spine", ("front", "rear"), spine, params, controls=2))
         system, _ = scene.build()
