@@ -13,8 +13,13 @@ import scenes
 from tolerances import DERIVATIVE, DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
+from jaxcon.constraints.couplings import Couplings
 from jaxcon.constraints.rows import linearize
+from jaxcon.core.lanes import Vector
 from jaxcon.geometry import inertia
+from jaxcon.model.elements import Elements, Grid
+from jaxcon.model.forces import CustomForces
+from jaxcon.model.inertial import DIRECTIONS, POINTS
 
 
 def random_solid(random, dim, dtype="float64"):
@@ -65,13 +70,79 @@ def test_what_is_fixed_to_a_body_stays_where_it_is_on_it(name):
 
 
 def norms(system, state):
-    """‖φ‖ and ‖φ̇‖ of every constraint but momenta, which are not of the place of a body."""
-    rows = jax.jit(linearize)(system, state.q, state.v, state.time)
-    return {
+    """‖φ‖ and ‖φ̇‖ of every constraint but momenta, which are not of the place of a body.
+
+    And every coordinate of its joints, with its rate.
+    """
+    rows, read = jax.jit(lambda: (linearize(system, *place(state)), coordinates(system, state)))()
+    found = {
         name: [jnp.linalg.norm(x[rows.layout.rows(name)]) for x in (rows.residual, rows.rate)]
         for name in rows.layout.names
         if "momentum" not in name
     }
+    return found | read
+
+
+def place(state):
+    return state.q, state.v, state.time
+
+
+def coordinates(system, state):
+    """Of every joint that has some, by joint and name."""
+    pairs = [
+        (name, coordinate)
+        for group in system.constraints
+        if not isinstance(group, Couplings)
+        for name in group.names
+        for coordinate in getattr(getattr(group, "joint", None), "coordinates", ())
+        if system.layout.dim == 3 or coordinate != "y"  # of a point on a line of the plane
+    ]
+    return {
+        f"{name}.{key}": [f(system, state, name, key) for f in (jc.coordinate, jc.coordinate_rate)]
+        for name, key in pairs
+    }
+
+
+def elements():
+    """All groups of elements between bodies of the joints' table, contacts and forces."""
+    for name in [f"all-{dim}d-between" for dim in (2, 3)]:
+        yield from scenes.build(name).system.constraints
+    for system in (contacts_scene()[0], pushed_scene()[0], twisted()[0]):
+        yield from (*system.constraints, *system.forces, *system.bounds)
+
+
+PLAIN = {"force", "value", "size", "heights", "coefficients", "parts", "relaxed"}
+"""First words of fields of several numbers that are no point or direction of a body."""
+
+
+def test_every_field_of_several_numbers_is_known_by_its_name():
+    seen = set()
+    for group in elements():
+        if isinstance(group, Elements) and not isinstance(group, CustomForces):
+            for field, x in group.params.items():
+                if isinstance(x, Vector | Grid):
+                    seen.add(field.partition("_")[0])
+    assert seen <= POINTS | DIRECTIONS | PLAIN | {"orientation"}
+    assert seen >= POINTS | DIRECTIONS
+
+
+def twisted():
+    """A twist, which has no rows, and what reads it."""
+    scene = jc.Scene()
+    random = np.random.default_rng(8)
+    for name in ("first", "second"):
+        scenes.add_random_body(scene, name, random)
+    scene.add(jc.Twist("twist", "first", "second", axis=(1.0, 2.0, 0.5)))
+    scene.add(jc.JointSpring("coil", "twist", stiffness=2.0))
+    return scene.build()
+
+
+def test_a_twist_reads_what_it_did():
+    system, state = twisted()
+    changed = with_random_solids(system)
+    after = jc.restate(state, system, changed)
+    close(coordinates(changed, after), coordinates(system, state))
+    assert len(coordinates(system, state)) == 1
 
 
 def contacts_scene():
@@ -107,8 +178,8 @@ def test_what_touches_stays_where_it_is_on_its_body():
     close(got, expected, 1e-8)  # the nearest point of a height field is found by a descent
 
 
-def test_forces_do_the_same_work():
-    """f·v of springs and bending, of a force at a point and of a wrench; gravity is another."""
+def pushed_scene():
+    """Forces between bodies, at points of their own."""
     random = np.random.default_rng(2)
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
     for name in ("first", "second", "third"):
@@ -119,9 +190,15 @@ def test_forces_do_the_same_work():
     scene.add(jc.Bending("strip", "first", "second", "third", 2.0, **ends))
     scene.add(jc.Force("wind", "third", force=(1.0, 2.0, 3.0), point=p[5]))
     scene.add(jc.ExternalWrench("push", "second", point=p[6]))
-    system, state = scene.build()
+    return scene.build()
+
+
+def test_forces_do_the_same_work():
+    """f·v of springs and bending, of a force at a point and of a wrench; gravity is another."""
+    system, state = pushed_scene()
     changed = with_random_solids(system)
-    after, control = jc.restate(state, system, changed), jnp.asarray(random.normal(size=6))
+    control = jnp.asarray(np.random.default_rng(3).normal(size=6))
+    after = jc.restate(state, system, changed)
     power = system.applied(state.q, state.v, state.time, control) @ state.v
     same = changed.applied(after.q, after.v, after.time, control) @ after.v
     np.testing.assert_allclose(same, power, rtol=DERIVATIVE)
@@ -356,8 +433,61 @@ def test_a_particle_has_a_mass_alone():
 def test_what_goes_by_principal_axes_says_so():
     system, _ = rod_scene()
     name = next(n for n in system.layout.bodies if "center" in system.params[n])
-    with pytest.raises(ValueError, match="principal axes of their bodies, which must not turn"):
+    with pytest.raises(ValueError, match=f"'{name}' has no .*axes"):
         system.with_params({name: {"axes": (1.0, 1.0, 0.0, 0.0)}})
+    with pytest.raises(ValueError, match="principal axes of their bodies, which must not turn"):
+        system.with_params({name: {"inertia": jnp.diag(jnp.asarray([3.0, 1.0, 2.5]))}})
+    same = jax.jit(system.with_params)(system.params)  # numbers of which nothing is known
+    close(same.forces[0].params, system.forces[0].params)
+
+
+def shape(tree):
+    return jax.tree.structure(tree)
+
+
+@pytest.mark.parametrize("build", [rod_scene, lambda: (scenes.build("mixed-3d").system, None)])
+def test_a_traced_mass_leaves_frames_and_structure_alone(build):
+    """Under jit too, where no number is known: what is not given has not moved."""
+    system, _ = build()
+    name = next(n for n in system.layout.bodies if "center" in system.params[n])
+
+    def heavier(system, mass):
+        return system.with_params({name: {"mass": mass}})
+
+    inside, outside = jax.jit(lambda m: heavier(system, m))(2.0), heavier(system, 2.0)
+    given = jax.jit(heavier)(system, 2.0)
+    assert shape(inside) == shape(given) == shape(outside) == shape(system)
+    jax.tree.map(np.testing.assert_array_equal, inside.constraints, system.constraints)
+    jax.tree.map(np.testing.assert_array_equal, given.forces, system.forces)
+    last, _ = jax.lax.scan(lambda s, m: (heavier(s, m), None), system, jnp.arange(1.0, 4.0))
+    assert last.params[name]["mass"] == 3.0
+
+
+def test_a_known_tensor_beside_a_traced_mass():
+    system, _ = spinning()
+    tensor = random_solid(np.random.default_rng(9), 3)["inertia"]
+    got = jax.jit(lambda m: system.with_params({"stone": {"mass": m, "inertia": 1.0 * tensor}}))
+    close(got(2.0).params, system.with_params({"stone": {"mass": 2.0, "inertia": tensor}}).params)
+
+
+def test_an_inertia_without_a_centre_in_single_precision():
+    scene = jc.Scene(dtype="float32")
+    scene.add_body("stone", inertia=inertia.Inertia(1.0, (1.0, 1.0, 1.0), (0.1, 0.2, 0.3)))
+    system, _ = scene.build()
+    round_one = system.with_params({"stone": {"inertia": inertia.sphere(2.0, 0.5)}})
+    np.testing.assert_array_equal(round_one.params["stone"]["center"], (0, 0, 0))
+    np.testing.assert_array_equal(round_one.params["stone"]["axes"], (1, 0, 0, 0))
+
+
+def test_what_a_method_remembers_is_not_of_the_new_frames():
+    system, state = spinning()
+    method = jc.Method(jc.GeneralizedAlpha(), jc.Unstabilized())
+    state = jc.init(system, method, state.q, state.v)
+    turned = system.with_params({"stone": {"axes": (1.0, 1.0, 0.0, 0.0)}})
+    after = jc.restate(state, system, turned)
+    with pytest.raises((TypeError, ValueError), match="init"):
+        jc.step(turned, method, after, None, 1e-3)
+    assert jc.restate(state, system, system.with_params({"stone": {"mass": 2.0}})).memory != ()
 
 
 def test_systems_of_other_bodies_have_other_states():

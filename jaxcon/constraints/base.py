@@ -54,6 +54,11 @@ class Joint(Protocol):
     counted over turns, "m", or "rotation" where the rate is the derivative of no coordinate), and
     `coordinate(name, p, a, b)`, the row of one. Joints of one class that move in different ways
     also have `kind`, a hashable value which then stands for the class.
+
+    What `attach` keeps of a body goes along with it by its name: points are called anchor, start or
+    end, directions axis, first, second, normal, travel or edge, and the orientation of b in a is
+    `orientation`. A last word b says that it is of the second body; `in_b` names the fields that
+    are without saying so.
     """
 
     name: str

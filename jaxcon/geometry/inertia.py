@@ -240,8 +240,9 @@ def _check(solid: str, **values: Any) -> None:
 
 
 def _check_tensor(tensor: Array, moments: Array) -> None:
-    if float(jnp.max(jnp.abs(tensor - tensor.T))) > 1e-6 * float(jnp.max(jnp.abs(tensor))):
-        raise ValueError(f"inertia: the tensor must be symmetric, got {tensor.tolist()}.")
+    known = np.asarray(tensor)
+    if np.max(np.abs(known - known.T)) > 1e-6 * np.max(np.abs(known)):
+        raise ValueError(f"inertia: the tensor must be symmetric, got {known.tolist()}.")
     checks.positive("inertia", "the principal moments", moments)
     check_triangle("inertia", moments)
 

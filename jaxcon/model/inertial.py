@@ -104,18 +104,15 @@ def changed(
         )
     mass = None if whole else given.get("mass", known["mass"])
     solid = resolve_inertia(owner, mass, given.get("inertia", known["inertia"]), dim, dtype)
-    if solid.axes is not None and "axes" in given:
-        raise ValueError(f"{owner}: a tensor has axes of its own; give it, or axes and moments.")
-    if whole:
-        given = {"center": jnp.zeros(dim) if solid.center is None else solid.center}
-    center = checks.number(owner, "center", given.get("center", known["center"]), dtype, (dim,))
-    checks.finite(owner, "center", center)
-    axes = _axes(owner, solid, whole, given, known) if dim == 3 else None
-    moves = not _same(center, known["center"])
-    turns = dim == 3 and not _same(axes, known["axes"])
+    given = _placed(owner, solid, given, _identity(solid.moments) if whole else None)
+    moves = "center" in given and not _same(given["center"], known["center"])
+    turns = "axes" in given and not _same(given["axes"], known["axes"])
     if not moves and not turns:
         return Changed(solid.mass, solid.moments, offset, None)
-    own = Pose(center, None if axes is None else quaternion.normalize(axes))
+    center = checks.number(owner, "center", given.get("center", known["center"]), dtype, (dim,))
+    checks.finite(owner, "center", center)
+    axes = known.get("axes")
+    own = Pose(center, quaternion.normalize(given["axes"]) if turns else axes)
     shift = own if offset is None else offset.then(own)
     shift = shift if turns else Pose(shift.position)
     return Changed(solid.mass, solid.moments, own.inverse, shift)
@@ -147,7 +144,7 @@ def moved(element: Any, shifts: Mapping[str, Pose], layout: Layout) -> Any:
         )
     in_b = getattr(law, "in_b", ())
     params = {
-        field: _moved(field, x, sides, 1 if field in in_b else SIDES.get(field[-1:], 0))
+        field: _moved(field, x, sides, 1 if field in in_b else _side_of(field))
         for field, x in element.params.items()
     }
     return dataclasses.replace(element, params=params)
@@ -166,7 +163,8 @@ def restate(state: State, before: Any, after: Any) -> State:
         after: the same with other numbers (`BodySystem.with_params`).
 
     Returns:
-        The state of `after`. A method's memory begins anew with `jc.init`.
+        The state of `after`. What a method remembers is of the old frames and left out: one with a
+        memory takes `jc.init(after, method, s.q, s.v, s.time, s.turns)` of the state s.
 
     Raises:
         TypeError, ValueError: the state is not one of `before`, or the systems differ in more than
@@ -175,37 +173,57 @@ def restate(state: State, before: Any, after: Any) -> State:
     before = at(before, state)
     if getattr(after, "layout", None) != before.layout:
         raise ValueError("restate: the systems must have the same bodies in the same order.")
-    q, v = state.q, state.v
-    for name in before.offsets | after.offsets:
+    q, v, offsets = state.q, state.v, before.offsets
+    others = [n for n in offsets | after.offsets if offsets.get(n) is not after.offsets.get(n)]
+    for name in others:
         group = before.layout.groups[before.layout.locate(name)[0]]
         offset = after.offsets.get(name)
         motion = before.motion(name, state.q, state.v)
         motion = motion.seen_from(None if offset is None else offset.inverse)
         x, y = group.kind.coordinates(motion)
         q, v = q.at[before.layout.q(name)].set(x), v.at[before.layout.v(name)].set(y)
-    return dataclasses.replace(state, q=q, v=v)
+    return dataclasses.replace(state, q=q, v=v, memory=() if others else state.memory)
 
 
-def _axes(
-    owner: str, solid: Any, whole: bool, given: Mapping[str, Any], known: Mapping[str, Any]
-) -> Array:
-    """Principal axes in the user's frame, (4,): of the tensor, as given, or as they are."""
-    axes = known["axes"]
+def _placed(
+    owner: str, solid: Inertia, given: Mapping[str, Any], default: Pose | None
+) -> dict[str, Any]:
+    """What is given of where a body's principal frame is in the user's: `center`, `axes`.
+
+    Args:
+        owner: what errors begin with.
+        solid: with a centre and axes where the inertia brings them.
+        given: by field.
+        default: both where an `Inertia` leaves them out; None where the body keeps its own.
+
+    Raises:
+        ValueError: axes twice, or no quaternion.
+    """
+    dtype, space = solid.moments.dtype, solid.moments.ndim > 0
+    place = {} if "center" not in given else {"center": given["center"]}
+    if default is not None:
+        place["center"] = default.position if solid.center is None else solid.center
+    if not space:
+        return place
+    if solid.axes is not None and "axes" in given:
+        raise ValueError(f"{owner}: a tensor has axes of its own; give it, or axes and moments.")
     if solid.axes is not None:
-        axes = solid.axes
-    elif whole:
-        axes = jnp.eye(4, dtype=axes.dtype)[0]
+        place["axes"] = solid.axes.astype(dtype)
+    elif default is not None:
+        place["axes"] = default.orientation
     elif "axes" in given:
-        axes = checks.number(owner, "axes", given["axes"], axes.dtype, (4,))
+        axes = checks.number(owner, "axes", given["axes"], dtype, (4,))
         checks.nonzero(owner, "axes", axes)
-    return axes.astype(known["axes"].dtype)
+        place["axes"] = axes
+    return place
 
 
 def _identity(moments: Array) -> Pose:
-    """The user's frame where it is the principal one."""
+    """The user's frame where it is the principal one; known also while a function is traced."""
+    dtype = moments.dtype
     if moments.ndim == 0:
-        return Pose(jnp.zeros(2, moments.dtype))
-    return Pose(jnp.zeros(3, moments.dtype), jnp.eye(4, dtype=moments.dtype)[0])
+        return Pose(np.zeros(2, dtype))
+    return Pose(np.zeros(3, dtype), np.eye(4, dtype=dtype)[0])
 
 
 def _same(x: Any, y: Any) -> bool:
@@ -244,6 +262,11 @@ def _moved(field: str, x: Any, sides: list[Shift | None], side: int) -> Any:
         wide = jax.tree.map(lambda lane: lane[:, None], own)
         return Grid(jnp.stack(tuple(_fixed(word, lanes, wide)), axis=-1))
     return _fixed(word, x, own)
+
+
+def _side_of(field: str) -> int:
+    """The body in whose frame a field is, by its last word."""
+    return SIDES.get(field.rpartition("_")[2], 0)
 
 
 def _fixed(word: str, x: Vector, shift: Shift) -> Vector:

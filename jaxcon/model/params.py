@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from jaxcon.core import checks
@@ -15,15 +15,36 @@ NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
 """Fields of elements whose values are checked where they are known."""
 
 
-def read(system: Any) -> dict[str, Any]:
-    """`gravity`, and the fields of each body, constraint and force by its name."""
+def read(system: Any, only: Collection[str] | None = None) -> dict[str, Any]:
+    """`gravity`, and the fields of each body, constraint and force by its name.
+
+    Args:
+        system: a `BodySystem`.
+        only: the names that are wanted; None for all.
+    """
     result: dict[str, Any] = {"gravity": system.gravity}
-    for group, properties in zip(system.layout.groups, system.inertia, strict=True):
-        for i, name in enumerate(group.names):
-            result[name] = inertial.numbers(properties, i, system.offsets.get(name))
+    held = _held(system)
+    for name in system.layout.bodies:
+        if only is None or name in only:
+            fields, _ = _body(system, name)
+            result[name] = {k: x for k, x in fields.items() if k != "axes" or name not in held}
     for element in (*system.constraints, *system.forces, *system.bounds):
-        result.update({name: element.get(i) for i, name in enumerate(element.names)})
+        for i, name in enumerate(element.names):
+            if only is None or name in only:
+                result[name] = element.get(i)
     return result
+
+
+def _held(system: Any) -> set[str]:
+    """The bodies whose principal axes cannot turn, as elements go by them."""
+    return {
+        system.layout.groups[place.group].names[i]
+        for element in system.forces
+        if getattr(getattr(element, "law", None), "by_principal_axes", False)
+        for place in element.places
+        if place.group is not None
+        for i in place.indices
+    }
 
 
 def replaced(system: Any, changes: Mapping[str, Any]) -> Any:
@@ -32,7 +53,7 @@ def replaced(system: Any, changes: Mapping[str, Any]) -> Any:
     Raises:
         ValueError: an unknown name or field, a wrong shape, or a value out of range.
     """
-    known = read(system)
+    known = read(system, changes)
     for name, fields in changes.items():
         _check(system, known, name, fields)
     gravity = system.gravity
@@ -41,7 +62,7 @@ def replaced(system: Any, changes: Mapping[str, Any]) -> Any:
         gravity = checks.number("gravity", "it", changes["gravity"], gravity.dtype, shape)
         checks.finite("gravity", "it", changes["gravity"])
     bodies = {
-        name: inertial.changed(name, fields, known[name], system.offsets.get(name))
+        name: inertial.changed(name, fields, *_body(system, name))
         for name, fields in changes.items()
         if name in system.layout.places and fields
     }
@@ -63,6 +84,12 @@ def replaced(system: Any, changes: Mapping[str, Any]) -> Any:
     )
 
 
+def _body(system: Any, name: str) -> tuple[dict[str, Any], Any]:
+    """The inertial parameters of a body, and its offset."""
+    (group, i), offset = system.layout.locate(name), system.offsets.get(name)
+    return inertial.numbers(system.inertia[group], i, offset), offset
+
+
 def _with_inertia(properties: Any, names: tuple[str, ...], bodies: Mapping[str, Any]) -> Any:
     """The mass properties of a group, where some of its bodies are changed."""
     fields = {"mass": properties.mass, "moments": properties.moments}
@@ -79,8 +106,10 @@ def _check(system: Any, known: Mapping[str, Any], name: str, fields: Any) -> Non
     Raises:
         ValueError: an unknown name or field, or a value out of range.
     """
+    if name in system.fixed:
+        raise ValueError(f"with_params: '{name}' is fixed to the world and has no numbers.")
     if name not in known:
-        raise ValueError(f"with_params: '{name}' is unknown; known are {list(known)}.")
+        raise ValueError(f"with_params: '{name}' is unknown; known are {list(read(system))}.")
     if name == "gravity":
         return
     if not isinstance(fields, Mapping):

@@ -251,8 +251,8 @@ class BodySystem:
 
         A rigid body has `mass`, `inertia` (moments about its centre of mass), `center` (of mass, in
         the frame in which the body was given) and in space `axes` (principal to that frame, a unit
-        quaternion). Where a fixed body is is not among them: build the scene inside the
-        differentiated function for it.
+        quaternion), but for the links of a `Flexure`, which goes by them. Where a fixed body is is
+        not among them: build the scene inside the differentiated function for it.
         """
         return params.read(self)
 
@@ -261,10 +261,10 @@ class BodySystem:
 
         A mass changed alone leaves the inertia as it is. `inertia` of a body in space may also be a
         tensor (3, 3) about its centre of mass, in the frame in which it was given, or an `Inertia`
-        in place of all four. Where `center` or `axes` change, points and axes of joints stay where
-        they are on the body, and a state of this system becomes one of the new by `jc.restate`;
-        anchors changed beside them are given in the new principal frame. A body whose frames
-        coincided has two then, which is one new trace.
+        in place of all four. Where `center` or `axes` are given, points and axes of joints stay
+        where they are on the body, also those at its old centre of mass, and a state of this system
+        becomes one of the new by `jc.restate`; anchors changed beside them are given in the new
+        principal frame. A body whose frames coincided has two then, which is one new trace.
 
         Args:
             changes: as `params`, as much of it as changes: `{"rod": {"length": 2.0}}`.
