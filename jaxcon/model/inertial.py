@@ -220,10 +220,9 @@ def _placed(
 
 def _identity(moments: Array) -> Pose:
     """The user's frame where it is the principal one; known also while a function is traced."""
-    dtype = moments.dtype
-    if moments.ndim == 0:
-        return Pose(np.zeros(2, dtype))
-    return Pose(np.zeros(3, dtype), np.eye(4, dtype=dtype)[0])
+    dim = 2 if moments.ndim == 0 else 3
+    origin: Any = np.zeros(dim, moments.dtype)
+    return Pose(origin, None if dim == 2 else np.eye(4, dtype=moments.dtype)[0])
 
 
 def _same(x: Any, y: Any) -> bool:
