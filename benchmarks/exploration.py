@@ -4,7 +4,7 @@
 
 `CartPole` by PPO as in `examples/learn_ppo.py`, on a short track: an episode is over where the cart
 is 1 m from the middle. "free": as it is. "feasible": what the policy wants, noise and all, goes
-through `feasible_action` with the limits ±x ± T v ≤ X: the cart always could stop. "layered": the
+through `feasible_action` with the limits ±(x + T v) ≤ X: the cart always could stop. "layered": the
 policy sets the speed of the cart, for five actions each, and a controller follows it.
 A crash is an episode that ends at the end of the track. Returns are means of 64 episodes without
 noise, of 500 at most; of layers, whose episodes have a fifth of the actions, five times that.

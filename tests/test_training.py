@@ -21,7 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "examples")]
 import learn_apg  # noqa: E402
 import learn_ppo  # noqa: E402
 
-from benchmarks import curricula, training  # noqa: E402
+from benchmarks import curricula, exploration, training  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -124,6 +124,25 @@ def test_arms_of_the_study_are_what_they_are_called():
     np.testing.assert_allclose((low, middle, high), [1.66e3, 5.05e4, 9.93e4], rtol=0.01)
     fading = curricula.ARMS["hard, σ = 10 mm exp(−t/τ)"].noise
     np.testing.assert_allclose([fading(0.0), fading(0.25)], [1e-2, 1e-2 / np.e])
+
+
+def test_a_cart_that_is_pushed_to_the_end_of_its_track_stops_where_limits_say():
+    """With all the force there is, either way, for a second and a half."""
+    arms = exploration.arms()
+
+    def pushed(name, push):
+        def act(episode, _):
+            episode = arms[name].transition(episode, push[None])
+            return episode, (arms[name].terminal(episode), arms[name].cart(episode)[0])
+
+        return jax.lax.scan(act, arms[name].reset(jax.random.key(0)), None, 75)[1]
+
+    pushes = jnp.array([1.0, -1.0])
+    over, _ = jax.jit(jax.vmap(functools.partial(pushed, "free")))(pushes)
+    assert over.any(axis=1).all()
+    over, x = jax.jit(jax.vmap(functools.partial(pushed, "feasible")))(pushes)
+    assert not over.any()
+    np.testing.assert_allclose(x[:, -1], exploration.KEPT * pushes, atol=0.03)
 
 
 @pytest.mark.filterwarnings("ignore")  # of what Brax imports
