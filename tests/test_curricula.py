@@ -81,6 +81,8 @@ def test_numbers_vary_within_their_shares_and_by_copy(cart):
     assert abs(np.corrcoef(found[1], np.ravel(found[2]))[0, 1]) < 0.2
     with pytest.raises(ValueError, match="'pole1' has no 'length', it has"):
         environments.vary(cart, jax.random.key(0), {"pole1": {"length": 0.1}})
+    with pytest.raises(ValueError, match=r"'gravity' has no numbers; .* \['cart', 'pivot1', "):
+        environments.vary(cart, jax.random.key(0), {"gravity": {"y": 0.1}})
     with pytest.raises(ValueError, match="'pole9' has no numbers"):
         environments.vary(cart, jax.random.key(0), {"pole9": {"mass": 0.1}})
 
@@ -174,6 +176,26 @@ def test_actions_and_noise_are_taken_as_far_as_limits_allow(cart):
     np.testing.assert_allclose(action, 1.0, atol=1e-6)  # as far as actions go
 
 
+def test_limits_are_kept_in_whichever_unit_they_are(cart):
+    """A push moves the cart by 1.5 mm at most, also in single precision."""
+    world = environments.make("CartPole", skip=1, dtype="float32")
+    episode = world.reset(jax.random.key(0))
+    start = episode.state.q[:1]
+
+    @jax.jit
+    def held(unit):
+        def limits(episode):
+            return unit * (episode.state.q[:1] - start - 5e-4)
+
+        action = environments.feasible_action(world, episode, jnp.ones(1, "float32"), limits)
+        return action[0], world.transition(episode, action).state.q[0] - start[0]
+
+    for unit in (1e-4, 1.0, 1e4):
+        action, moved = held(jnp.float32(unit))
+        assert -1 < action < 0.9
+        np.testing.assert_allclose(moved, 5e-4, atol=1e-6)
+
+
 def cruise(environment, episode, target):
     """A cart at up to 1 m/s either way."""
     speed = jc.velocity(environment.system, episode.state, "cart")[0]
@@ -209,3 +231,22 @@ def test_a_target_ends_where_the_task_is_over_on_the_way(cart):
     episode, outcome = jax.jit(layered.step)(layered.reset(jax.random.key(0)), jnp.array([0.4]))
     np.testing.assert_allclose(episode.state.time, 3 * cart.skip * cart.dt)
     assert outcome.terminated
+
+
+@pytree
+class Racing(CartPole):
+    """Its reward is the mean speed over an action, as that of the half-cheetah."""
+
+    def reward(self, before, action, after):
+        came, went = (episode.state.q[0] for episode in (before, after))
+        return (went - came) / (self.skip * self.dt)
+
+
+def test_a_reward_by_time_is_over_the_time_of_a_target(cart):
+    values = {f.name: getattr(cart, f.name) for f in dataclasses.fields(cart)}
+    layered = environments.Layered.build(Racing(**values), cruise, ("speed",), hold=10)
+    start = layered.reset(jax.random.key(0))
+    episode, outcome = jax.jit(layered.step)(start, jnp.array([0.4]))
+    seconds = 10 * cart.skip * cart.dt
+    moved = episode.state.q[0] - start.state.q[0]
+    np.testing.assert_allclose(outcome.reward, moved / seconds, rtol=1e-12)

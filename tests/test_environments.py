@@ -242,6 +242,17 @@ def test_unknown_names_and_options_are_told():
         environments.make("CartPolo")
     with pytest.raises(TypeError, match="its options are lengths, masses"):
         environments.make("CartPole", length=1.0)
+    with pytest.raises(ValueError, match="CartPole: skip must be a whole number from 1, got 0"):
+        environments.make("CartPole", skip=0)
+    with pytest.raises(ValueError, match="horizon must be a whole number from 1, got -3"):
+        environments.make("CartPole", horizon=-3)
+    for wrong in ({"masses": (0.3, 0.3)}, {"lengths": 0.6}, {"lengths": (), "masses": ()}):
+        with pytest.raises(ValueError, match="lengths and masses must be as many, one for each"):
+            environments.make("CartPole", **wrong)
+    with pytest.raises(ValueError, match=r"lengths must have shape \(4,\), got \(3,\)"):
+        environments.make("FourBarTracking", lengths=(1.0, 0.3, 0.9))
+    whole = environments.make("FourBarTracking", lengths=(4, 1, 3, 3))  # not what dt is to be
+    assert whole.dt == 5e-3
     with pytest.raises(ValueError, match="built already"):
         environments.make(environments.make("CartPole"), cart=2.0)
     env, envs = single().unwrapped, many()
@@ -292,6 +303,15 @@ def test_when_copies_are_reset_is_a_choice():
     observation, _ = envs.reset(options={"reset_mask": mask})
     assert np.asarray(envs.copies.episode.steps).tolist() == np.where(mask, 0, before).tolist()
     assert np.all(np.abs(np.asarray(observation)[mask, 0]) < 0.1)
+
+
+def test_a_mode_that_is_unknown_is_told():
+    """The enumeration of Gymnasium's is none of the names, and would never have reset a copy."""
+    environment = environments.make("CartPole")
+    start, _ = copies.begin(environment, jax.random.key(0), 2)
+    for mode in ("next_step", gymnasium.vector.AutoresetMode.NEXT_STEP):
+        with pytest.raises(ValueError, match="mode must be one of NextStep, SameStep, Disabled"):
+            environments.advance(environment, start, jnp.zeros((2, 1)), mode)
 
 
 def heavier(environment, key):

@@ -3,6 +3,8 @@
 import dataclasses
 import functools
 import importlib
+import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -19,7 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "examples")]
 import learn_apg  # noqa: E402
 import learn_ppo  # noqa: E402
 
-from benchmarks import curricula, training  # noqa: E402
+from benchmarks import curricula, exploration, training  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -124,6 +126,25 @@ def test_arms_of_the_study_are_what_they_are_called():
     np.testing.assert_allclose([fading(0.0), fading(0.25)], [1e-2, 1e-2 / np.e])
 
 
+def test_a_cart_that_is_pushed_to_the_end_of_its_track_stops_where_limits_say():
+    """With all the force there is, either way, for a second and a half."""
+    arms = exploration.arms()
+
+    def pushed(name, push):
+        def act(episode, _):
+            episode = arms[name].transition(episode, push[None])
+            return episode, (arms[name].terminal(episode), arms[name].cart(episode)[0])
+
+        return jax.lax.scan(act, arms[name].reset(jax.random.key(0)), None, 75)[1]
+
+    pushes = jnp.array([1.0, -1.0])
+    over, _ = jax.jit(jax.vmap(functools.partial(pushed, "free")))(pushes)
+    assert over.any(axis=1).all()
+    over, x = jax.jit(jax.vmap(functools.partial(pushed, "feasible")))(pushes)
+    assert not over.any()
+    np.testing.assert_allclose(x[:, -1], exploration.KEPT * pushes, atol=0.03)
+
+
 @pytest.mark.filterwarnings("ignore")  # of what Brax imports
 def test_brax_sees_the_same_episodes(cart):
     pytest.importorskip("brax")
@@ -145,6 +166,64 @@ def test_brax_sees_the_same_episodes(cart):
     np.testing.assert_array_equal(state.obs, first.obs)
     assert not jnp.any(state.metrics["diverged"])
     assert jnp.all(step(state, jnp.full((2, 1), jnp.nan)).done)
+
+
+@pytest.mark.filterwarnings("ignore")  # of what Brax imports
+def test_brax_draws_worlds_for_its_copies(cart):
+    pytest.importorskip("brax")
+    from brax.envs.wrappers.training import wrap
+
+    keys = jax.random.split(jax.random.PRNGKey(1), 2)
+
+    def drawn(world):
+        worlds = jax.vmap(lambda k: environments.vary(world, k, {"cart": {"mass": 0.5}}))(keys)
+        return worlds, jax.tree.map(lambda _: 0, worlds)
+
+    wrapped = wrap(environments.BraxEnv(cart), episode_length=3, randomization_fn=drawn)
+    push = jnp.ones((2, 1))
+    state = jax.jit(wrapped.step)(jax.jit(wrapped.reset)(keys), push)
+    worlds, _ = drawn(cart)
+    started = jax.vmap(lambda world, key: world.reset(key))(worlds, keys)
+    _, outcome = jax.jit(jax.vmap(lambda w, e, a: w.step(e, a)))(worlds, started, push)
+    np.testing.assert_allclose(state.obs, outcome.observation, rtol=1e-9, atol=1e-12)
+    masses = worlds.system.params["cart"]["mass"]
+    assert abs(masses[0] - masses[1]) > 0.05
+
+
+TRAINED_BY_BRAX = """
+import importlib, jax, jax.numpy as jnp
+if not hasattr(jax, "device_put_replicated"):  # which Brax 0.14.2 still calls
+    copied = lambda x, n: jnp.stack([jnp.asarray(x)] * n)
+    jax.device_put_replicated = lambda tree, on: jax.tree.map(lambda x: copied(x, len(on)), tree)
+from jaxcon import environments
+
+own = {
+    "sac": {"min_replay_size": 16, "max_replay_size": 64, "grad_updates_per_step": 1},
+    "ppo": {"unroll_length": 4, "num_minibatches": 2, "num_updates_per_batch": 1},
+}
+for name, options in own.items():
+    train, seen = importlib.import_module(f"brax.training.agents.{name}.train").train, []
+    train(
+        environment=environments.BraxEnv("CartPole", skip=1), num_timesteps=64, episode_length=8,
+        num_envs=4, num_eval_envs=2, num_evals=2, batch_size=8, **options,
+        progress_fn=lambda _, metrics: seen.append(metrics))
+    before, after = (float(x["eval/episode_reward"]) for x in seen)
+    losses = [float(x) for what, x in seen[1].items() if what.endswith("loss")]
+    print(name, before, after, losses)
+    assert losses and all(jnp.isfinite(x) for x in losses), losses
+    assert 0 < before < 8 and 0 < after < 8 and before != after, (before, after)
+    assert seen[1]["eval/episode_diverged"] == 0
+"""
+
+
+def test_what_trains_on_brax_trains_on_ours():
+    """A few updates, of which nobody learns; in single precision, as Brax has it."""
+    pytest.importorskip("brax")
+    own = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    program = [sys.executable, "-W", "ignore", "-c", TRAINED_BY_BRAX]
+    pipes = {"capture_output": True, "text": True, "cwd": ROOT}
+    result = subprocess.run(program, env=own | {"JAX_PLATFORMS": "cpu"}, timeout=400, **pipes)
+    assert result.returncode == 0, result.stderr
 
 
 def test_without_brax_there_is_a_hint(monkeypatch):

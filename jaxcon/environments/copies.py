@@ -79,7 +79,12 @@ def advance(
 
     Returns:
         The copies, and the outcome of each, (n, …).
+
+    Raises:
+        ValueError: an unknown mode.
     """
+    if mode not in MODES:
+        raise ValueError(f"advance: mode must be one of {', '.join(MODES)}, got {mode!r}.")
     after = simulate(environment, copies, actions)
     reward, terminated, truncated = over(environment, copies, "judge", actions, after)
     stepped = dataclasses.replace(copies, episode=after, done=terminated | truncated)

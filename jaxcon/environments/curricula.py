@@ -147,7 +147,8 @@ def _check_names(wanted: Sequence[tuple[str, str]], known: Mapping[str, Any]) ->
         ValueError: one is not.
     """
     for name, field in wanted:
-        if name not in known or name == "gravity":
-            raise ValueError(f"'{name}' has no numbers; those that have are {sorted(known)}.")
+        if not isinstance(known.get(name), Mapping):
+            named = sorted(x for x, fields in known.items() if isinstance(fields, Mapping))
+            raise ValueError(f"'{name}' has no numbers; those that have are {named}.")
         if field not in known[name]:
             raise ValueError(f"'{name}' has no {field!r}, it has {sorted(known[name])}.")

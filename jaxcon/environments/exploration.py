@@ -38,7 +38,8 @@ def feasible_action(
     """The action nearest to a wanted one, plus noise, after which the limits are kept.
 
     The limits are linearized along the wanted action. Where no action keeps them all, they are
-    missed by least squares. It is differentiable in the action, the noise and the environment.
+    missed by least squares, each in the unit of |c| + |∇c|; two that are opposite make an equality.
+    It is differentiable in the action, the noise and the environment.
 
     Args:
         environment: which acts.
@@ -60,11 +61,25 @@ def feasible_action(
         return limits(environment.act(episode, a))  # unclipped: a clip has no slope
 
     # forward mode: there are few actions
-    value, slope = after(at), jax.jacfwd(after)(at)
+    value, slope = scaled(after(at), jax.jacfwd(after)(at))
     eye = jnp.eye(len(at), dtype=at.dtype)
     rows = jnp.concatenate([slope, eye, -eye])
     bounds = jnp.concatenate([slope @ at - value, jnp.ones(2 * len(at), at.dtype)])
     return jnp.clip(project(wanted, rows, bounds), -1, 1)
+
+
+def scaled(value: Array, slope: Array) -> tuple[Array, Array]:
+    """Limits and their slopes in units of their own, in which a row is |∇c| + |c| = 1.
+
+    A millimetre for a whole action would else be given up before a thousandth of the action is.
+
+    Args:
+        value: c, (m,).
+        slope: ∇c, (m, k).
+    """
+    size = jax.lax.stop_gradient(jnp.sum(jnp.abs(slope), axis=1) + jnp.abs(value))
+    size = jnp.where(size > 0, size, 1)
+    return value / size, slope / size[:, None]
 
 
 def project(x: Array, rows: Array, bounds: Array) -> Array:

@@ -112,6 +112,6 @@ class Layered(Environment):
         return dataclasses.replace(last, steps=episode.steps + 1, violation=jnp.max(worst))
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """As below, for what the controller does where it has come to."""
-        below = self.below
-        return below.reward(before, below.allowed(self.controller(below, after, action)), after)
+        """As below over the time of a target, for what the controller does where it has come to."""
+        own = self.below.allowed(self.controller(self.below, after, action))
+        return dataclasses.replace(self.below, skip=self.skip).reward(before, own, after)

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+from jaxcon.core import checks
 from jaxcon.environments.environment import Environment
 from jaxcon.environments.tasks.cart_pole import CartPole, double_cart_pole
 from jaxcon.environments.tasks.cat import CatRighting
@@ -38,7 +39,8 @@ def make(task: str | Environment, **options: Any) -> Environment:
         options: numbers and choices of the task's `build`.
 
     Raises:
-        ValueError: an unknown task, or options for an environment that is already built.
+        ValueError: an unknown task, options for an environment that is already built, or a skip or
+            a horizon that is no whole number from 1.
         TypeError: an option that the task does not have.
     """
     if isinstance(task, Environment):
@@ -55,7 +57,11 @@ def make(task: str | Environment, **options: Any) -> Environment:
     except TypeError as error:
         known = list(inspect.signature(TASKS[task]).parameters)
         raise TypeError(f"task {task}: {error}; its options are {', '.join(known)}.") from error
-    return TASKS[task](**options)
+    built = TASKS[task](**options)
+    checks.count(task, "skip", built.skip)
+    if built.horizon is not None:
+        checks.count(task, "horizon", built.horizon)
+    return built
 
 
 def horizon(task: str) -> int:

@@ -73,12 +73,20 @@ class CartPole(Environment):
             horizon: actions until an episode is truncated, or None.
             method: of the simulation.
             dtype: of every number.
+
+        Raises:
+            ValueError: other than one length and one mass for each of at least one pole.
         """
         scene = jc.Scene(dim=2, dtype=dtype)
+        lengths, masses = (jnp.asarray(x, scene.dtype) for x in (lengths, masses))
+        if lengths.shape != masses.shape or lengths.ndim != 1 or not lengths.size:
+            raise ValueError(
+                "CartPole: lengths and masses must be as many, one for each pole, got shapes"
+                f" {lengths.shape} and {masses.shape}."
+            )
         scene.add_body("cart", mass=cart, inertia=1.0)
         scene.add(jc.Prismatic("rail", jc.WORLD, "cart", axis=(1.0, 0.0)))
         scene.add(jc.Motor("push", "rail", gear=force))
-        lengths, masses = (jnp.asarray(x, scene.dtype) for x in (lengths, masses))
         below, foot = "cart", jnp.zeros((), scene.dtype)
         for i, name in enumerate(pole_names(len(lengths))):
             length, mass = lengths[i], masses[i]

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 import jaxcon as jc
+from jaxcon.core import checks
 from jaxcon.core.numerics import wrap
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
@@ -92,8 +93,13 @@ class FourBarTracking(Environment):
             horizon: actions until an episode is truncated, or None.
             method: of the simulation.
             dtype: of every number.
+
+        Raises:
+            ValueError: other than four lengths or three masses.
         """
-        lengths, masses = jnp.asarray(lengths, dtype), jnp.asarray(masses, dtype)
+        dtype = checks.chosen_dtype(lengths, masses) if dtype is None else dtype
+        lengths = checks.number("FourBarTracking", "lengths", lengths, dtype, (4,))
+        masses = checks.number("FourBarTracking", "masses", masses, dtype, (3,))
         motor = jc.Motor("drive", "ground_crank", gear=torque)
         system, _ = four_bar(lengths, masses, rate=0.0, elements=(motor,))
         method = jc.Method(solver=jc.Sparse()) if method is None else method
