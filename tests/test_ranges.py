@@ -134,3 +134,32 @@ def test_traced_stops_that_have_crossed_hold_what_is_between_them(changes):
     assert jnp.max(jnp.abs(v)) <= 1.0 + 1e-12
     assert jnp.max(jnp.abs(x[750:] - middle)) < 0.3 * 2e-3 + 1e-12  # a step's way
     assert jnp.max(jnp.abs(v[750:])) < 0.3 + 1e-12
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_a_soft_stop_without_stiffness_and_damping_is_none(dtype):
+    """What passes it goes on; numbers of zero, below zero, or all but zero have a derivative."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=dtype)
+    scene.add_body("slide", mass=2.0, inertia=1.0, position=(0.1, 0.0), velocity=(1.0, 0.0))
+    scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0), point=(0.0, 0.0)))
+    scene.add(jc.Limit("it", "rail", upper=-0.05, stiffness=100.0, damping=1.0))
+    system, state = scene.build()
+
+    def speed(numbers):
+        changed = system.with_params({"it": {"stiffness": numbers[0], "damping": numbers[1]}})
+        return jc.step(changed, jc.Method(), state, None, jnp.asarray(2e-3, dtype))[0].v[0]
+
+    numbers = [[-100.0, -1.0], [-100.0, 0.0], [0.0, 0.0], [1e-30, 0.0]]
+    found = jax.jit(jax.vmap(jax.value_and_grad(speed)))(jnp.asarray(numbers, dtype))
+    assert jnp.allclose(found[0], 1.0, atol=1e-7)
+    assert jnp.all(jnp.isfinite(found[1]))
+
+
+@pytest.mark.parametrize(
+    ("upper", "changes"), [(0.1001, {"restitution": -0.5}), (-0.05, {"recovery": -0.1})]
+)
+def test_a_negative_traced_restitution_or_recovery_lets_nothing_in(upper, changes):
+    stop = jc.Limit("it", "rail", upper=upper, restitution=0.5)
+    x, v = slid(stop, {"restitution": 0.0} | changes)
+    assert jnp.max(x) < max(upper, 0) + 1e-12
+    assert jnp.allclose(v[-1], 0.0, atol=1e-12)

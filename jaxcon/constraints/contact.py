@@ -73,6 +73,7 @@ class PlaneContact:
     """A ball of a body, or with radius zero a point of it, on a plane of another; or several.
 
     λ of one ball is (1 + tangents,), that of k balls (k, 1 + tangents).
+    A capsule touches a plane by the two balls at the ends of its axis, `center` of shape (2, dim).
 
     Attributes:
         name: unique in the scene.

@@ -222,23 +222,28 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
     """
     h = dt[None]
     closing = numerics.safe_divide(-row.value, h)
-    back = jnp.minimum(RECOVERED * closing, p["recovery"])
+    back = jnp.minimum(RECOVERED * closing, not_negative(p["recovery"]))
     target = jnp.where(row.value > 0, closing, back)
     asked = {"target": target}
     if "restitution" in p:
+        e = not_negative(p["restitution"])
         arrives = (row.rate < 0) & (row.value + h * row.rate <= 0)
-        leaves = -p["restitution"] * row.rate
-        left = leaves - p["restitution"] * numerics.safe_divide(jnp.maximum(row.value, 0), h)
+        leaves = -e * row.rate
+        left = leaves - e * numerics.safe_divide(jnp.maximum(row.value, 0), h)
         asked["bounce"] = jnp.where(arrives, jnp.maximum(leaves - target, 0), 0)
         asked["travel"] = jnp.where(arrives, left, 0)
     if "stiffness" not in p:
         return row, asked
     # λ = −k (φ + h u) − c u behind the gap, as u + C λ = u* with the stiffness of both over a step;
     # before it is closed, both act on the travel beyond it alone, u + φ/h
-    both = h * p["stiffness"] + not_negative(p["damping"])
-    behind = -p["stiffness"] * row.value / both
-    soft = jnp.where(row.value > 0, closing, behind)
-    return row, asked | {"target": soft, "compliance": 1 / both}
+    k = not_negative(p["stiffness"])
+    both = h * k + not_negative(p["damping"])
+    # without both there is no stop; up to here the derivative of 1/both is finite
+    both = jnp.where(both > float(jnp.finfo(both.dtype).tiny) ** (1 / 3), both, 0)
+    behind = numerics.safe_divide(-k * row.value, both)
+    soft = jnp.where(both > 0, jnp.where(row.value > 0, closing, behind), 0)
+    row = row._replace(pulls=tuple(pull * (both > 0).astype(both.dtype) for pull in row.pulls))
+    return row, asked | {"target": soft, "compliance": numerics.safe_divide(1.0, both)}
 
 
 def stop(element: Any, dtype: Any) -> dict[str, Array]:
