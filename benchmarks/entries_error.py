@@ -252,6 +252,20 @@ def curricula(quick: bool) -> Found:
     return Found(tuple(found), lambda path: study.draw({algorithm: rows}, str(path)))
 
 
+@entry("exploration")
+def exploration(quick: bool) -> list[Metric]:
+    """Feasible exploration and layered control in learning by trial: returns and crashes."""
+    from benchmarks import exploration as study
+
+    found = []
+    for name in ["feasible"] if quick else study.ARMS:
+        rows = study.measure(name, [0] if quick else [0, 1, 2, 3, 4], 3 if quick else 100)
+        _, last, crashes = np.mean(rows, axis=0)
+        found.append(Metric(f"{name}, return", float(last), "", HIGHER, 2.0))
+        found.append(Metric(f"{name}, crashes", float(crashes), "", LOWER, 2.0, floor=0.05))
+    return found
+
+
 @entry("gradient_states")
 def gradient_states(quick: bool) -> list[Metric]:
     """Derivatives in very many states, also at singular spots: those not finite or not right."""

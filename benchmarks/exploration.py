@@ -83,8 +83,8 @@ def arms() -> dict[str, Any]:
 @functools.partial(jax.jit, static_argnums=1)
 def update(environment: Any, setting: Any, learner: Any) -> tuple[Any, jax.Array]:
     """One update; and of the episodes that end in it, how many crash and how many there are."""
-    _, samples = learn_ppo.collect(environment, setting, learner, None)
-    learner, _ = learn_ppo.update(environment, setting, learner)
+    learner, samples = learn_ppo.collect(environment, setting, learner, None)
+    learner = learn_ppo.learn(setting, learner, samples)
     return learner, jnp.stack([samples.terminated.sum(), samples.ended.sum()])
 
 
@@ -103,22 +103,28 @@ def train(environment: Any, setting: Any, seed: int) -> tuple[float, float, floa
     return *found, float(ends[0] / ends[1])
 
 
+ARMS = ("free", "feasible", "layered")
+
+
+def measure(name: str, seeds: list[int], updates: int) -> np.ndarray:
+    """What `train` finds of an arm, a row for each seed; returns are of the bare actions."""
+    setting = learn_ppo.SETTINGS["CartPole"]._replace(updates=updates)
+    rows = np.array([train(arms()[name], setting, seed) for seed in seeds])
+    return rows * np.array([HOLD, HOLD, 1.0]) if name == "layered" else rows
+
+
 def main() -> None:
     """Prints a row for each way to train: mean and extremes of the seeds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2, 3, 4])
     parser.add_argument("--updates", type=int, default=100)
-    parser.add_argument("--arms", nargs="*", default=["free", "feasible", "layered"])
+    parser.add_argument("--arms", nargs="*", choices=ARMS, default=ARMS)
     given = parser.parse_args()
-    setting = learn_ppo.SETTINGS["CartPole"]._replace(updates=given.updates)
     print(timing.machine())
     print("| actions | return, a third of the way | return | crashes, of episodes |")
     print("|---|---|---|---|", flush=True)
     for name in given.arms:
-        scale = HOLD if name == "layered" else 1
-        environment = arms()[name]
-        trials = np.array([train(environment, setting, seed) for seed in given.seeds])
-        trials[:, :2] *= scale
+        trials = measure(name, given.seeds, given.updates)
         cells = [f"{x.mean():.3g} ({x.min():.3g} to {x.max():.3g})" for x in trials.T]
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
 

@@ -176,17 +176,22 @@ def improve(setting: Setting, learner: Learner, data: tuple) -> Learner:
     return learner._replace(params=params, adam=adam, key=key)
 
 
-def update(environment: Any, setting: Setting, learner: Learner, randomize: Any = None) -> tuple:
-    """Collects a window of all copies and improves by it; also the mean reward."""
+def learn(setting: Setting, learner: Learner, samples: Sample) -> Learner:
+    """The learner improved by a window of all copies."""
     seen = learner.seen
-    learner, samples = collect(environment, setting, learner, randomize)
     x, after = (jax.vmap(jax.vmap(seen.normalize))(z) for z in (samples.x, samples.after))
     expected = jax.vmap(jax.vmap(functools.partial(value, learner.params)))
     now = expected(x)
     gain = advantages(setting, now, expected(after), samples)
     data = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), (x, samples, gain, now + gain))
     learner = improve(setting, learner, data)
-    return learner._replace(seen=seen.also(samples.x)), jnp.mean(samples.reward)
+    return learner._replace(seen=seen.also(samples.x))
+
+
+def update(environment: Any, setting: Setting, learner: Learner, randomize: Any = None) -> tuple:
+    """Collects a window of all copies and improves by it; also the mean reward."""
+    learner, samples = collect(environment, setting, learner, randomize)
+    return learn(setting, learner, samples), jnp.mean(samples.reward)
 
 
 PPO = Algorithm("ppo", SETTINGS, begin, update, policy)
