@@ -8,7 +8,8 @@ and put into its range. MuJoCo's collision detection says how deep geoms are in 
 and in each other at any time; MuJoCo's own simulation, with its soft contacts and its integrator,
 ends where it ends. How they fall is chaotic: heights compare, postures need not. With `--rates`
 MuJoCo runs a batch of the same falls on all cores, and MJX in processes of its own, both with
-Newton's method and Euler's.
+Newton's method and Euler's, and one fall of MJX tells how deep its contacts are. Joints drift here
+alone: in the coordinates of both peers there is nothing that could.
 """
 
 from __future__ import annotations
@@ -66,6 +67,7 @@ class Drop(NamedTuple):
         rates: world-steps a second by batch.
         healthy: whether no step failed.
         depth: along the path.
+        drift: the largest |φ| of the joints along the path [m, rad].
         height: of the torso at the end [m].
         speed: the largest entry of qvel at the end.
     """
@@ -75,6 +77,7 @@ class Drop(NamedTuple):
     rates: dict[int, float]
     healthy: bool
     depth: Depth
+    drift: float
     height: float
     speed: float
 
@@ -149,7 +152,9 @@ def dropped(read: jc.MujocoModel, model: Any, bounded: Any, batches: list[int]) 
         assert healthy.all(), f"{(~healthy).sum()} of {batch} worlds fail"
     path = np.asarray(jax.jit(jax.vmap(read.qpos))(states), np.float64)
     rows, qvel = count_bounds(system, first.q, first.v), np.asarray(read.qvel(final))
-    found = depth(model, path), torso(model, path[-1]), float(np.abs(qvel).max())
+    drift = jax.jit(jax.vmap(lambda state: jnp.abs(jc.violation(system, state).position)))(states)
+    lost = float(np.max(drift, initial=0))
+    found = depth(model, path), lost, torso(model, path[-1]), float(np.abs(qvel).max())
     return Drop(rows, times, rates, int(final.status) == 0, *found)
 
 
@@ -169,11 +174,22 @@ def begun(read: jc.MujocoModel, method: jc.Method, qpos: Any) -> jc.State:
 
 
 class Peer(NamedTuple):
-    """MuJoCo's end of the same fall: height of the torso [m], the largest of qvel, and depth."""
+    """A peer's end of the same fall: height of the torso [m], the largest of qvel, and depth."""
 
     height: float
     speed: float
     depth: Depth
+
+    @classmethod
+    def of(cls, model: Any, path: list[Any], qvel: Any) -> Peer:
+        """That of a path of qpos."""
+        speed = float(np.abs(qvel).max())
+        return cls(torso(model, path[-1]), speed, depth(model, np.array(path, np.float64)))
+
+    def line(self, name: str, who: str, dtype: str) -> str:
+        """A row of the table."""
+        end = f"{self.height:.3f} m | {self.speed:.1e} |"
+        return f"| {name} | {who} | {dtype} | | | | {deep(self.depth)} | | {end}"
 
 
 def simulated(model: Any) -> Peer:
@@ -185,8 +201,22 @@ def simulated(model: Any) -> Peer:
     for _ in range(STEPS // EVERY):
         mujoco.mj_step(model, data, EVERY)
         path.append(data.qpos.copy())
-    speed = float(np.abs(data.qvel).max())
-    return Peer(torso(model, path[-1]), speed, depth(model, np.array(path)))
+    return Peer.of(model, path, data.qvel)
+
+
+def simulated_by_mjx(name: str) -> Peer:
+    """The same fall in MJX, as it is timed."""
+    from mujoco import mjx
+
+    model, path = falling(name), []
+    put, step = mjx.put_model(model), jax.jit(peers.mjx_step())
+    data = mjx.make_data(model)
+    data = data.replace(qpos=jnp.asarray(start(model), data.qpos.dtype))
+    for count in range(1, STEPS + 1):
+        data = step(put, data)
+        if count % EVERY == 0:
+            path.append(np.asarray(data.qpos))
+    return Peer.of(model, path, data.qvel)
 
 
 def falling(name: str) -> Any:
@@ -223,8 +253,8 @@ def mjx_here(name: str, batch: int) -> dict[str, Any]:
 
 
 HEAD = """
-| model | bounded | dtype | rows | compile | steps/s | floor, limbs, stops | height | speed |
-|---|---|---|---|---|---|---|---|---|"""
+| model | bounded | dtype | rows | compile | steps/s | floor, limbs, stops | drift | height | qvel |
+|---|---|---|---|---|---|---|---|---|---|"""
 
 
 def line(name: str, how: str, dtype: str, drop: Drop) -> str:
@@ -232,7 +262,17 @@ def line(name: str, how: str, dtype: str, drop: Drop) -> str:
     times = ", ".join(f"{x:.0f} s" for x in drop.compile.values())
     rates = ", ".join(f"{rate:.3g} ({batch})" for batch, rate in drop.rates.items())
     height = f"{drop.height:.3f} m" if drop.healthy else "a step failed"
-    cells = (name, how, dtype, drop.rows, times, rates, deep(drop.depth), height)
+    cells = (
+        name,
+        how,
+        dtype,
+        drop.rows,
+        times,
+        rates,
+        deep(drop.depth),
+        f"{drop.drift:.1e}",
+        height,
+    )
     return "| " + " | ".join(map(str, cells)) + f" | {drop.speed:.1e} |"
 
 
@@ -252,11 +292,15 @@ def main() -> None:
     parser.add_argument("--rates", action="store_true", help="run batches of MuJoCo and MJX too")
     parser.add_argument("--mjx-seconds", type=float, default=400.0, help="limit of a batch of MJX")
     parser.add_argument("--mjx", metavar="MODEL", help="MJX alone, here, as JSON")
+    parser.add_argument("--mjx-fall", metavar="MODEL", help="a fall of MJX, here, as a row")
     parser.add_argument("--batch", type=int, default=256, help="worlds of MJX alone")
     asked = parser.parse_args()
     if asked.mjx:
         timing.use_all_cores()
         print(json.dumps(mjx_here(asked.mjx, asked.batch)))
+        return
+    if asked.mjx_fall:
+        print(simulated_by_mjx(asked.mjx_fall).line(asked.mjx_fall, "MJX", "float32"))
         return
     timing.use_all_cores()
     jax.config.update("jax_enable_x64", True)
@@ -268,17 +312,15 @@ def main() -> None:
             for how in asked.bounded:
                 drop = dropped(read, model, BOUNDED[how], asked.batches)
                 print(line(name, how, dtype, drop), flush=True)
-        peer = simulated(model)
-        print(
-            f"| {name} | MuJoCo | float64 | | | | {deep(peer.depth)} | {peer.height:.3f} m"
-            f" | {peer.speed:.1e} |",
-            flush=True,
-        )
+        print(simulated(model).line(name, "MuJoCo", "float64"), flush=True)
         if asked.rates:
             batches = tuple(b for b in asked.batches if b > 1)
             print(f"MuJoCo in C, all cores: {mujoco_rate(name, max(batches))} steps/s")
             other = peers.mjx(name, batches, asked.mjx_seconds, "benchmarks.legged")
-            print(f"MJX: {other} steps/s; {other.notes}", flush=True)
+            print(
+                f"MJX: {other} steps/s; {other.notes}; its depths by `--mjx-fall {name}`",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":
