@@ -23,6 +23,9 @@ import jaxcon as jc
 from jaxcon.constraints.curves import Curves
 from jaxcon.constraints.rows import linearize
 
+linearized = jax.jit(linearize)
+"""The rows of a scene at a state, by the program that was compiled when the scene was made."""
+
 
 @dataclass(frozen=True)
 class Site:
@@ -554,7 +557,7 @@ def finish(
 
 def allowed(system: Any, state: jc.State, v: jax.Array) -> jax.Array:
     """The velocities nearest to v, in the metric of M, that the constraints allow."""
-    rows = jax.jit(linearize)(system, state.q, v, state.time)
+    rows = linearized(system, state.q, v, state.time)
     j = np.asarray(rows.jacobian.dense(), np.float64)
     lift = np.linalg.solve(np.asarray(system.mass(state.q).dense(), np.float64), j.T)
     change = lift @ np.linalg.solve(j @ lift, np.asarray(rows.rate, np.float64))

@@ -10,7 +10,6 @@ import scenes
 from tolerances import DIFFERENCE, IDENTITY
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
 from jaxcon.scenes import CRANK_ROCKER, four_bar, four_bar_poses
 
 random = np.random.default_rng(0)
@@ -145,7 +144,7 @@ def test_it_is_the_nearest():
     rough = state.q + 0.3 * np.random.default_rng(3).normal(size=9)
     mass = system.mass(state.q).values
     found = jc.assemble(system, rough)
-    j = linearize(system, found.q, found.v, found.state.time).jacobian.dense()
+    j = scenes.linearized(system, found.q, found.v, found.state.time).jacobian.dense()
     pull = mass * (found.q - rough)
     left = pull - j.T @ np.linalg.lstsq(j.T, pull, rcond=None)[0]
     np.testing.assert_allclose(left, 0, atol=1e-10)

@@ -4,7 +4,6 @@ import pytest
 import scenes
 from tolerances import IDENTITY
 
-from jaxcon.constraints.rows import linearize
 from jaxcon.core.lanes import Vector
 from jaxcon.solvers.jacobian import Block, Columns, Jacobian
 
@@ -70,7 +69,7 @@ def test_no_rows():
 @pytest.mark.parametrize("name", ["all-2d-loop", "core-3d-loop", *scenes.OTHERS])
 def test_products_are_those_of_the_dense_matrix(name):
     built = scenes.build(name)
-    rows = linearize(built.system, built.off.q, built.off.v, built.off.time)
+    rows = scenes.linearized(built.system, built.off.q, built.off.v, built.off.time)
     dense = np.asarray(rows.jacobian.dense())
     random = scenes.seeded(name, "jacobian")
     v, multipliers = random.normal(size=dense.shape[1]), random.normal(size=dense.shape[0])

@@ -133,7 +133,7 @@ def turn(system, q, v):
 def solved(dim, variant):
     """By joint and moment: a and Jᵀλ of its two bodies, (2, d), and the joint's own J."""
     system, state = build(dim, variant)
-    rows = linearize(system, state.q, state.v, state.time).layout
+    rows = scenes.linearized(system, state.q, state.v, state.time).layout
     result = {}
     for when, (q, v, t) in zip(("at assembly", "elsewhere"), moments(dim), strict=True):
         q, v = turn(system, q, v) if variant.turned else (q, v)

@@ -9,7 +9,6 @@ import scenes
 from tolerances import IDENTITY
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
 
 IDEAL = jc.Method(stabilizer=jc.Unstabilized())
 
@@ -182,7 +181,7 @@ def test_a_particle_has_no_orientation():
 
 def test_violation_by_name():
     built = scenes.build("mixed-2d")
-    rows = linearize(built.system, built.off.q, built.off.v, built.off.time)
+    rows = scenes.linearized(built.system, built.off.q, built.off.v, built.off.time)
     violation = jc.violation(built.system, built.off)
     index = rows.layout.rows("hinge")
     np.testing.assert_allclose(violation["hinge"], np.linalg.norm(rows.residual[index]))

@@ -25,7 +25,7 @@ def pieces(name):
     """The scene, its rows, the numbers of the joint, and the motions of its bodies off it."""
     built = scenes.build(name)
     s = built.off
-    rows = linearize(built.system, s.q, s.v, s.time)
+    rows = scenes.linearized(built.system, s.q, s.v, s.time)
     a, b = (built.system.principal_motion(body, s.q, s.v) for body in ("first", "second"))
     return rows, built.system.params["joint"], a, b
 

@@ -10,7 +10,6 @@ import scenes
 from tolerances import DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
 from jaxcon.core.lanes import Vector
 from jaxcon.dynamics.forward import saddle
 from jaxcon.solvers.jacobian import Block, Columns, Jacobian
@@ -34,7 +33,7 @@ def problem(name, dtype="float64"):
     """The saddle system of a scene off its constraints, with a random right side."""
     built = scenes.build(name, dtype)
     s, random = built.off, scenes.seeded(name, "solvers")
-    rows = linearize(built.system, s.q, s.v, s.time)
+    rows = scenes.linearized(built.system, s.q, s.v, s.time)
     force = jnp.asarray(random.normal(size=s.v.shape), dtype)
     target = jnp.asarray(random.normal(size=rows.bias.shape), dtype)
     return saddle(built.system, s.q, rows, force, target)

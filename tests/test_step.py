@@ -10,7 +10,6 @@ import scenes
 from tolerances import IDENTITY
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
 
 FREE = jc.Method(stabilizer=jc.Unstabilized())
 
@@ -110,7 +109,7 @@ def test_pendulum_forces_by_hand(solver):
 def test_feedback_makes_errors_decay_as_they_should(name):
     """J a + γ = −2α φ̇ − β² φ, with gains by number, by row and by name."""
     built = scenes.build(name)
-    rows = linearize(built.system, built.off.q, built.off.v, built.off.time)
+    rows = scenes.linearized(built.system, built.off.q, built.off.v, built.off.time)
     size, names = rows.layout.size, rows.layout.names
     by_name = (dict.fromkeys(names, 3.0), dict.fromkeys(names, 5.0))
     by_row = (np.full(size, 3.0), np.full(size, 5.0))
@@ -123,7 +122,7 @@ def test_feedback_makes_errors_decay_as_they_should(name):
 
 def test_gains_by_name_leave_the_others_to_the_fallback():
     built = scenes.build("mixed-2d")
-    rows = linearize(built.system, built.off.q, built.off.v, built.off.time)
+    rows = scenes.linearized(built.system, built.off.q, built.off.v, built.off.time)
     stabilizer = jc.Baumgarte({"rod": 3.0}, {"rod": 3.0}, fallback=(7.0, 7.0))
     a = jc.forward_dynamics(
         built.system, built.off, None, jc.Method(stabilizer=stabilizer), 1e-3
