@@ -88,11 +88,19 @@ def arguments(given: list[str] | None) -> argparse.Namespace:
     asked = parser.parse_args(given)
     wanted = asked.compare if not asked.update else None
     if wanted and not wanted.exists():
+        if str(wanted) in ENTRIES:
+            parser.error(f"--compare takes the file of a baseline; name {wanted} before it")
         parser.error(f"there is no baseline {wanted}; --update --compare {wanted} writes one")
     if asked.json and not asked.json.absolute().parent.is_dir():
         parser.error(f"there is no folder for {asked.json}")
+    if asked.json and asked.json.is_dir():
+        parser.error(f"{asked.json} is a folder; name a file in it")
     if strange := suite.unknown(asked.names, ENTRIES):
         parser.error(f"unknown are {strange}; known are {list(ENTRIES)}")
+    try:
+        asked.baseline = Baseline.read(asked.compare or suite.FILE)
+    except ValueError as error:
+        parser.error(str(error))
     return asked
 
 
@@ -103,7 +111,7 @@ def main(given: list[str] | None = None) -> int:
         print("\n".join(f"{name:18s} {entry.about}" for name, entry in ENTRIES.items()))
         return 0
     file = asked.compare or suite.FILE
-    baseline, begin = Baseline.read(file), time.perf_counter()
+    baseline, begin = asked.baseline, time.perf_counter()
     folder = asked.json.absolute().parent if asked.json else None
     found = run(asked.names or list(ENTRIES), asked.quick, baseline, folder)
     print(f"{len(found)} benchmarks in {time.perf_counter() - begin:.0f} s: {longest(found)}")

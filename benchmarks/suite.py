@@ -162,8 +162,15 @@ class Baseline:
 
     @classmethod
     def read(cls, file: Path) -> Baseline:
-        """From a file; empty where there is none."""
-        return cls(**json.loads(file.read_text())) if file.exists() else cls()
+        """From a file; empty where there is none.
+
+        Raises:
+            ValueError: the file is no baseline.
+        """
+        try:
+            return cls(**json.loads(file.read_text())) if file.exists() else cls()
+        except (ValueError, TypeError):
+            raise ValueError(f"{file} is no baseline, as --update --compare FILE writes") from None
 
     def write(self, file: Path) -> None:
         """To a file."""

@@ -23,8 +23,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = parser.add_subparsers(dest="command")
     demo = commands.add_parser("demo", help="simulate linkages and tune gains (the default)")
     for target in (parser, demo):
-        target.add_argument("--copies", type=int, default=1024, help="number of linkages")
-        target.add_argument("--seconds", type=float, default=5.0, help="simulated seconds")
+        target.add_argument("--copies", type=whole, default=1024, help="number of linkages")
+        target.add_argument("--seconds", type=positive, default=5.0, help="simulated seconds")
         target.add_argument("--picture", default="jaxcon.png", help="where to write the picture")
     verify = commands.add_parser("verify", help="compare with reference cases")
     verify.add_argument("cases", nargs="*", help="names of cases; all unless given")
@@ -34,11 +34,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for path in (getattr(options, name, None) for name in ("picture", "json", "file")):
         if path and not Path(path).absolute().parent.is_dir():
             parser.error(f"there is no folder for {path}")
+        if path and Path(path).is_dir():
+            parser.error(f"{path} is a folder; name a file in it")
     if options.command == "verify":
         return run_verify(options.cases, options.json)
     if options.command == "tradeoff":
         return run_tradeoff(options)
     return run_demo(options.copies, options.seconds, options.picture)
+
+
+def positive(text: str) -> float:
+    """A number that is positive and finite, of an option."""
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be positive and finite, got {text}")
+    return number
+
+
+def whole(text: str) -> int:
+    """A whole number from 1, of an option."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number from 1, got {text}")
+    return number
 
 
 def run_demo(copies: int, seconds: float, picture: str) -> int:
@@ -58,11 +76,11 @@ def _add_tradeoff(commands: Any) -> None:
         help="a name from jaxcon.scenes, a model of MuJoCo (.xml, .urdf), or file.py:function,"
         " which returns (system, state)",
     )
-    command.add_argument("--seconds", type=float, default=1.0, help="simulated seconds")
-    command.add_argument("--error", type=float, help="recommend for at most this error [m]")
-    command.add_argument("--cost", type=float, help="recommend for at most this cost [s/s]")
-    command.add_argument("--budget", type=float, default=300.0, help="seconds that it may take")
-    command.add_argument("--batch", type=int, default=256, help="worlds that share the device")
+    command.add_argument("--seconds", type=positive, default=1.0, help="simulated seconds")
+    command.add_argument("--error", type=positive, help="recommend for at most this error [m]")
+    command.add_argument("--cost", type=positive, help="recommend for at most this cost [s/s]")
+    command.add_argument("--budget", type=positive, default=300.0, help="seconds that it may take")
+    command.add_argument("--batch", type=whole, default=256, help="worlds that share the device")
     command.add_argument("--file", metavar="FILE", help="goes on from there if interrupted")
     command.add_argument("--picture", help="where to write the work-precision diagram")
     command.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
@@ -115,6 +133,8 @@ def find_scene(name: str) -> Any:
 
     file, _, function = name.rpartition(":")
     if file.endswith(".py"):
+        if not Path(file).is_file():
+            raise ValueError(f"there is no file {file}.")
         made = runpy.run_path(file).get(function)
         if made is None:
             raise ValueError(f"{file} has no function {function}.")

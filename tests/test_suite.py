@@ -180,10 +180,17 @@ def test_the_cheapest_method_of_each_code_is_compared():
 
 def test_what_cannot_be_compared_is_said(fakes, tmp_path, capsys):
     none, base = str(tmp_path / "none.json"), str(tmp_path / "baseline.json")
-    for wrong in (["--compare", none], ["--json", f"{tmp_path}/none/out.json"]):
+    (other := tmp_path / "other.json").write_text('{"machine": {}}')
+    for words, wrong in {
+        "there is no baseline": ["--compare", none],
+        "name fast before it": ["--compare", "fast"],
+        "other.json is no baseline": ["--compare", str(other)],
+        "there is no folder": ["--json", f"{tmp_path}/none/out.json"],
+        "is a folder": ["--json", str(tmp_path)],
+    }.items():
         with pytest.raises(SystemExit):
             command.main(["fast", *wrong])
-        assert "there is no" in capsys.readouterr().err
+        assert words in capsys.readouterr().err
     assert command.main(["fast", "breaks", "--update", "--compare", base]) == 1
     assert Baseline.read(Path(base)).of("full", "fast") == {"ratio": 4.0}
     assert command.main(["fast", "--quick", "--compare", base]) == 0

@@ -422,19 +422,19 @@ def test_what_other_code_found_is_not_gone_on_from(result, file, monkeypatch):
         compare(file=file)
 
 
-def test_the_command_line_says_why_there_is_no_result(capsys, tmp_path):
-    scene = tmp_path / "scene.py"
-    scene.write_text(
-        "import jaxcon as jc\n"
-        "def drop():\n"
-        "    scene = jc.Scene(dim=2)\n"
-        "    scene.add_particle('bob', mass=1.0)\n"
-        "    return scene.build()\n"
-    )
-    assert main(["tradeoff", f"{scene}:drop", "--seconds", "-1"]) == 2
-    assert "horizon" in capsys.readouterr().out
-    assert main(["tradeoff", f"{tmp_path}/none.py:drop"]) == 2
-    assert "none.py" in capsys.readouterr().out
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--seconds", "-1"], "--seconds: must be positive and finite, got -1"),
+        (["--error", "nan"], "--error: must be positive and finite, got nan"),
+        (["--cost", "0"], "--cost: must be positive and finite, got 0"),
+        (["--batch", "0"], "--batch: must be a whole number from 1, got 0"),
+    ],
+)
+def test_the_command_line_refuses_a_number_before_it_begins(options, words, capsys):
+    with pytest.raises(SystemExit):
+        main(["tradeoff", "four_bar", *options])
+    assert words in capsys.readouterr().err
 
 
 def test_the_command_line_says_what_it_cannot_use_before_it_begins(capsys, tmp_path):
@@ -445,9 +445,14 @@ def test_the_command_line_says_what_it_cannot_use_before_it_begins(capsys, tmp_p
     assert "must return (system, state)" in said
     assert main(["tradeoff", str(scene)]) == 2
     assert "scene.py:function" in capsys.readouterr().out
+    assert main(["tradeoff", f"{tmp_path}/none.py:drop"]) == 2
+    assert f"there is no file {tmp_path}/none.py" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         main(["tradeoff", "four_bar", "--picture", f"{tmp_path}/none/diagram.png"])
     assert "there is no folder for" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["tradeoff", "four_bar", "--json", str(tmp_path)])
+    assert "is a folder" in capsys.readouterr().err
 
 
 def test_a_scene_that_nobody_knows_is_named_by_the_command_line(capsys):
