@@ -26,6 +26,7 @@ BESIDE = {
     "jaxcon.model.layout.Layout",
     "jaxcon.constraints.rows.Violation",
     "jaxcon.analysis.front.Run",
+    "jaxcon.analysis.gradients.LeafGradient",
     "jaxcon.analysis.front.Limit",
     "jaxcon.analysis.front.LeftOut",
     "jaxcon.view.animate",

@@ -35,6 +35,9 @@ def violation(system: Any, state: State) -> Violation:
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
         state: where, of one world.
+
+    Returns:
+        A `Violation`: by name the norm of φ [m, rad], with `rate` that of φ̇ [m/s, rad/s].
     """
     system = at(system, state, "jc.violation(system, s)")
     return linearize(system, state.q, state.v, state.time).violation

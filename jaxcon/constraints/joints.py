@@ -51,7 +51,13 @@ class Coincident:
 
 @dataclass(frozen=True)
 class Spherical(Coincident):
-    """A ball joint in space: two points stay together, every turn is free (3 rows)."""
+    """A ball joint in space: two points stay together, every turn is free (3 rows).
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        point: the middle of the ball, world frame at assembly, (3,) [m].
+    """
 
     dims = (3,)
 

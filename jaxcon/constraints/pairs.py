@@ -245,7 +245,14 @@ class Planar(Parallel):
 
 @dataclass(frozen=True)
 class SphericalSpherical(Distance):
-    """A massless rod with a ball at each end, in space: `Distance` by its other name, 1 row."""
+    """A massless rod with a ball at each end, in space: `Distance` by its other name, 1 row.
+
+    Attributes:
+        name: unique in the scene.
+        body_a, body_b: names, or `WORLD`.
+        length: l > 0 [m]; the distance at assembly unless given.
+        point_a, point_b: world points at assembly, (3,) [m]; the centres of mass unless given.
+    """
 
     dims = (3,)
 

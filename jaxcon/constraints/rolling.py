@@ -14,9 +14,6 @@ their own bodies are constant in the world too, so that at constant v
 
 The row of the contact has a φ; those of the slip have none and are never part of a position
 projection. The wrench of an element is read at c; its force is that of the contact.
-
-References:
-    Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972), chapter I.
 """
 
 from __future__ import annotations
@@ -42,7 +39,8 @@ from jaxcon.model.frames import Direction, Point
 class RollingSphere:
     """A ball rolls on a plane without slip and may spin about the normal: 3 rows, in space.
 
-    φ = n·(c − p) − r, and ψ = 0 along both tangents with ρ = −r n.
+    φ = n·(c − p) − r, and along both tangents t of the plane ψ = t·(ċ − v_a(c)) + Ω·(ρ × t), the
+    slip at the contact c + ρ, ρ = −r n, with Ω = ω_b − ω_a.
 
     Attributes:
         name: unique in the scene.
@@ -53,6 +51,9 @@ class RollingSphere:
             z unless given.
         center: c, world frame at assembly, (3,) [m]; the ball's centre of mass unless given.
         point: p, world frame at assembly, (3,) [m]; where they touch at assembly unless given.
+
+    References:
+        Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972), chapter I.
     """
 
     name: str
@@ -100,6 +101,9 @@ class RollingCylinder:
         center: c, on the axis, world frame at assembly, (3,) [m]; the cylinder's centre of mass
             unless given.
         point: p, world frame at assembly, (3,) [m]; where they touch at assembly unless given.
+
+    References:
+        Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972), chapter I.
     """
 
     name: str
@@ -152,6 +156,9 @@ class RollingDisc:
             the world unless given.
         center: c, world frame at assembly, (dim,) [m]; the disc's centre of mass unless given.
         point: p, world frame at assembly, (dim,) [m]; where they touch at assembly unless given.
+
+    References:
+        Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972), chapter I.
     """
 
     name: str

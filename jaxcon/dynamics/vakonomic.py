@@ -1,21 +1,4 @@
-"""The variational equations of rows of velocities, beside the physical ones (chapter 3.8.2).
-
-The physical (d'Alembert) equations let the forces of ψ = A v + b = 0 do no virtual work. The
-variational ones ask that ∫ L + μ·ψ dt be stationary, as if the rows belonged to the Lagrangian, and
-so give the motion the momentum p = Aᵀμ besides its own. With q̇ = N(q) v, Hamel's equations are
-
-    M a = f + J_hᵀλ − Aᵀμ̇ + Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v p,       A a = −γ,
-
-where d/dt follows the motion and ad*_v p is p_ω × ω on every body in space and nothing elsewhere.
-It is the physical saddle system with one more force, the curvature dθ(·, v) of the form θ = μ·A
-(and what depends on time), and μ̇ = −λ. That force vanishes for every μ where ψ is the rate of a φ:
-then both motions are the same. Rows that have a φ stay physical.
-
-References:
-    Arnold, Kozlov, Neishtadt, Mathematical Aspects of Classical and Celestial Mechanics (2006),
-    section 1.4.
-    Bloch, Nonholonomic Mechanics and Control (2003), sections 1.3 and 5.2.
-"""
+"""The variational equations of rows of velocities, beside the physical ones (chapter 3.8.2)."""
 
 from __future__ import annotations
 
@@ -40,12 +23,29 @@ from jaxcon.solvers.saddle import Diagonal, Full, Mass, Solution
 class Vakonomic:
     """A system under the variational equations; `vakonomic` makes one.
 
+    The physical (d'Alembert) equations let the forces of ψ = A v + b = 0 do no virtual work. The
+    variational ones ask that ∫ L + μ·ψ dt be stationary, as if the rows belonged to the Lagrangian,
+    and so give the motion the momentum p = Aᵀμ besides its own. With q̇ = N(q) v, Hamel's equations
+    are
+
+        M a = f + J_hᵀλ − Aᵀμ̇ + Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v p,       A a = −γ,
+
+    where d/dt follows the motion and ad*_v p is p_ω × ω on every body in space and nothing
+    elsewhere. It is the physical saddle system with one more force, the curvature dθ(·, v) of the
+    form θ = μ·A (and what depends on time), and μ̇ = −λ. That force vanishes for every μ where ψ is
+    the rate of a φ: then both motions are the same. Rows that have a φ stay physical.
+
     Its velocities are (v, μ), the μ of every row without a φ behind those of the system; positions
     are the system's. It is stepped, batched and differentiated like any other system.
 
     Attributes:
         system: the physical one, a `BodySystem` or `GeneralizedSystem`.
         rows: which rows belong to which constraint, and which have no φ.
+
+    References:
+        Arnold, Kozlov, Neishtadt, Mathematical Aspects of Classical and Celestial Mechanics (2006),
+            section 1.4.
+        Bloch, Nonholonomic Mechanics and Control (2003), sections 1.3 and 5.2.
     """
 
     system: Any

@@ -109,6 +109,7 @@ class Motion(Pose):
     """A pose and its rate of change.
 
     Attributes:
+        position, orientation: as of `Pose`.
         velocity: of the frame's origin, world frame, (2,) or (3,) [m/s].
         angular_velocity: () in the plane, (3,) in the body frame in space [rad/s]; None for a
             particle.

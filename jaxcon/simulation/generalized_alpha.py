@@ -1,20 +1,4 @@
-"""Generalized-α: implicit, second order, for stiff forces and extreme ratios of masses.
-
-With unknowns v̇⁺ and λ⁺ a step of length h solves, at its end,
-
-    M v̇⁺ = f(q⁺, v⁺, t⁺) + Jᵀλ⁺,    φ(q⁺, t⁺) = 0,    ψ(q⁺, v⁺, t⁺) = 0,    J v̇⁺ + C λ⁺ = b,
-
-of which the last is for rows with compliance, such as rotors. Accelerations are averaged,
-
-    (1 − α_m) a⁺ + α_m a = (1 − α_f) v̇⁺ + α_f v̇,
-    q⁺ = q ⊕ h (v + h ((½ − β) a + β a⁺)),    v⁺ = v + h ((1 − γ) a + γ a⁺).
-
-References:
-    Arnold, Brüls, Convergence of the generalized-α scheme for constrained mechanical systems,
-    Multibody System Dynamics 18 (2007).
-    Brüls, Cardona, Arnold, Lie group generalized-α time integration of constrained flexible
-    multibody systems, Mechanism and Machine Theory 48 (2012).
-"""
+"""Generalized-α: implicit, second order, for stiff forces and extreme ratios of masses."""
 
 from __future__ import annotations
 
@@ -50,7 +34,16 @@ class GeneralizedAlpha:
     method needs steps as short as the fastest vibration: here such a vibration is damped. There is
     no feedback: `Baumgarte()` without gains means nothing, as `Unstabilized()` does.
 
-    The equations above leave φ̇ of order h². It is brought to zero by the smallest change of v in
+    With unknowns v̇⁺ and λ⁺ a step of length h solves, at its end,
+
+        M v̇⁺ = f(q⁺, v⁺, t⁺) + Jᵀλ⁺,    φ(q⁺, t⁺) = 0,    ψ(q⁺, v⁺, t⁺) = 0,    J v̇⁺ + C λ⁺ = b,
+
+    of which the last is for rows with compliance, such as rotors. Accelerations are averaged,
+
+        (1 − α_m) a⁺ + α_m a = (1 − α_f) v̇⁺ + α_f v̇,
+        q⁺ = q ⊕ h (v + h ((½ − β) a + β a⁺)),    v⁺ = v + h ((1 − γ) a + γ a⁺).
+
+    These equations leave φ̇ of order h². It is brought to zero by the smallest change of v in
     the metric of M, as without it light links between heavy ends start to shake where ρ > 0.7. Then
     the λ of the equations is of first order only, and `info` has a and λ as they are at the end of
     the step, by `solver` from q and v there.
@@ -68,6 +61,12 @@ class GeneralizedAlpha:
             loops, and 0 elsewhere.
         iterations: of Newton's method, each with a new matrix.
         projects: whether φ̇ is brought to zero.
+
+    References:
+        Arnold, Brüls, Convergence of the generalized-α scheme for constrained mechanical systems,
+            Multibody System Dynamics 18 (2007).
+        Brüls, Cardona, Arnold, Lie group generalized-α time integration of constrained flexible
+            multibody systems, Mechanism and Machine Theory 48 (2012).
     """
 
     rho: Any = 0.9

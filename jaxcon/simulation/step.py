@@ -131,7 +131,10 @@ def forward_dynamics(
         dt: h, () [s], on which default gains depend.
 
     Returns:
-        acceleration (n_v,), multipliers (n_c,), status ().
+        acceleration (n_v,) [m/s², rad/s²], multipliers (n_c,) [N, N·m], status ().
+
+    Raises:
+        ValueError: shapes or dtypes disagree (at trace time).
     """
     control = check_step(system, method, state, control)
     h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
