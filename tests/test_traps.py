@@ -1,5 +1,7 @@
 """Each trap of the chapter is warned of in a scene that is in it, and not in others."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from test_report import four_bar
 
 import jaxcon as jc
 from jaxcon.analysis.known import Known
+from jaxcon.analysis.probe import Probe
 from jaxcon.analysis.traps import TRAPS, found
 
 DT = 1e-3
@@ -78,6 +81,16 @@ def skate():
     return scene.build()
 
 
+def weight():
+    """Ten tonnes that hang by a gram, so that both rods pull at the gram alone."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("light", mass=1e-3, position=(0.0, -1.0))
+    scene.add_particle("heavy", mass=1e4, position=(0.0, -2.0))
+    scene.add(jc.Distance("upper", jc.WORLD, "light"))
+    scene.add(jc.Distance("lower", "light", "heavy"))
+    return scene.build()
+
+
 def far():
     """Two rods that meet at (½, √¾), seen from close to the line between their ends."""
     return bob(rod(length=1.0), rod("other", (1.0, 0.0), 1.0), position=(0.5, 0.1))
@@ -105,8 +118,9 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
         lambda: bob(rod(), rod("near", (0.0, 1e-3))),
         with_(),
         ("singular",),
-        "nearly depend",
+        "Move away from this position",
     ),
+    "masses": (weight, with_(), ("singular",), "not by their position but by the masses"),
     "passes": (flat, with_(), ("singular",), "RankSafe takes them"),
     "stops": (flat, with_(**SPARSE), ("singular",), "refuses them as SINGULAR"),
     "sweeps": (hung, with_(bounded=SWEEPS), ("order",), "2 sweeps leave"),
@@ -204,6 +218,9 @@ def test_a_report_is_a_checklist():
         "warning, gains too large for the step: Baumgarte gains",
     ):
         assert words in text
+    fails = dataclasses.replace(report, probe=Probe(32, 0.0, 0.0, jc.Status.SINGULAR))
+    assert "32 steps from here fail, SINGULAR: the constraint rows are dependent" in str(fails)
+    assert "expected violation" not in str(fails)
     α, β, most = jc.report(system, state, with_(), DT).gains  # x² + 2x = 4 for x = hβ, α = β/2
     assert α / β == pytest.approx(0.5)
     assert β < most == pytest.approx((np.sqrt(5) - 1) / DT)

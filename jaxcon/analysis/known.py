@@ -78,6 +78,20 @@ class Known:
         return UnitRows(self.rows.layout, self.jacobian, self.mass)
 
     @cached_property
+    def even(self) -> UnitRows:
+        """The same if all bodies had one mass and kept their radii of gyration."""
+        if not hasattr(self.system, "inertia"):
+            return self.unit
+        groups = tuple(
+            dataclasses.replace(
+                p, mass=p.mass / p.mass, moments=jax.tree.map(lambda x, m=p.mass: x / m, p.moments)
+            )
+            for p in self.system.inertia
+        )
+        mass = dataclasses.replace(self.system, inertia=groups).mass(self.state.q).dense()
+        return UnitRows(self.rows.layout, self.jacobian, mass)
+
+    @cached_property
     def dependent(self) -> list[int]:
         """Numbers of the unit rows that depend on those before them."""
         return dependent_rows(self.unit.values, self.unit.tolerance)

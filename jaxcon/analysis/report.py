@@ -14,7 +14,7 @@ from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.probe import Probe
 from jaxcon.analysis.traps import OFF, TRAPS
 from jaxcon.analysis.work import Work, seconds, work
-from jaxcon.core.status import Status
+from jaxcon.core.status import MEANING, Status
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.choice import Choice, several
@@ -122,11 +122,17 @@ class Report:
             )
         if self.probe:
             code = self.probe.status
-            ended = "" if code == Status.OK else f"; they end as {code.name}"
-            lines.append(
-                f"expected violation: {self.probe.violation:.1e}, the worst |φ| in"
-                f" {self.probe.steps} steps from here, without the first half{ended}"
-            )
+            if Status.OK < code < Status.CONFLICT:
+                lines.append(
+                    f"{self.probe.steps} steps from here fail, {code.name}:"
+                    f" {MEANING[code].split(';')[0]}"
+                )
+            else:
+                ended = "" if code == Status.OK else f"; they end as {code.name}"
+                lines.append(
+                    f"expected violation: {self.probe.violation:.1e}, the worst |φ| in"
+                    f" {self.probe.steps} steps from here, without the first half{ended}"
+                )
         return [*lines, str(self.choice)] if self.choice and self.choice.efforts else lines
 
 

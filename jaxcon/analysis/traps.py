@@ -52,7 +52,7 @@ def gains(known: Known) -> str | None:
 
 
 def singular(known: Known) -> str | None:
-    """Trap 2: a position in which rows lose their rank, or nearly do."""
+    """Trap 2: a position, or masses, in which rows lose their rank, or nearly do."""
     if known.dependent:
         if not known.passing:
             return None
@@ -63,17 +63,25 @@ def singular(known: Known) -> str | None:
         )
     if not len(known.unit.values):
         return None
-    u, s, _ = known.unit.svd
-    n, least = len(u), s[-1] if len(s) == len(u) else 0.0
+    u, _, _ = known.unit.svd
+    n, least = len(u), known.unit.least
     eps = float(jnp.finfo(known.state.q.dtype).eps)
     shares = 1 / np.maximum(np.diag(np.linalg.pinv(known.unit.values @ known.unit.values.T)), 1)
     if least > WEAK / n and np.min(shares) > 10 * n * eps:
         return None
     names = _names(known, [int(i) for i in np.argsort(-np.abs(u[:, -1]))[:2]])
+    if known.even.least > WEAK / n:
+        return (
+            f"rows of {names} nearly depend on others, not by their position but by the masses:"
+            " something light holds something heavy, shakes faster than most steps can follow, and"
+            " what the heavy one adds is lost in rounding. Give the light one more mass, or take"
+            " GeneralizedAlpha(), which damps this shaking, and float64."
+        )
     return (
         f"rows of {names} nearly depend on others: a force along them hardly moves anything, so"
         f" that forces are up to {1 / max(least, eps):.1g} times as large as elsewhere, and so are"
-        " the errors of rounding. Move away from this position, or take RankSafe(…) and float64."
+        " the errors of rounding. Move away from this position, or take float64 and RankSafe(),"
+        " the solver of a Method that names none."
     )
 
 
@@ -214,7 +222,7 @@ def _swept(known: Known, rounds: int) -> str | None:
 
 TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
     "gains": ("gains too large for the step", gains),
-    "singular": ("singular position", singular),
+    "singular": ("rows that are singular, or nearly", singular),
     "order": ("the order of rows matters", order),
     "over-constrained": ("more rows than freedoms to take", overconstrained),
     "start": ("inconsistent start", start),

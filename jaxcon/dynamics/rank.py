@@ -45,6 +45,12 @@ class UnitRows:
         u, s, vt = np.linalg.svd(self.values)
         return u, s, vt
 
+    @property
+    def least(self) -> float:
+        """The least singular value, by rows; 0 where there are more rows than velocities."""
+        u, s, _ = self.svd
+        return float(s[-1]) if len(s) == len(u) else 0.0
+
     def within(self, x: Array, low: float, high: float) -> np.ndarray:
         """The part of an array by rows (n_c,) in directions with singular values in (low, high].
 

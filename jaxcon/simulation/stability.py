@@ -160,7 +160,7 @@ def _words(
     ratio = a / b if b else 1.0
     limit = largest_stable_rate(integrator, h, ratio)
     ratio_of = f"At this damping ratio ({ratio:.3g}) the largest stable rate"
-    return f"{text} {ratio_of} is {limit:.6g} 1/s."
+    return f"{text} {ratio_of} is {limit:.6g} 1/s: take no more, or a smaller dt."
 
 
 def unstable_spring(
