@@ -185,6 +185,13 @@ def test_each_trap_of_the_chapter_is_there():
     assert len(TRAPS) == 8
 
 
+def test_a_method_that_remembers_needs_no_state_of_its_own():
+    system, state = bob(rod())
+    report = jc.report(system, state, with_(stabilizer=jc.SlidingWindowBaumgarte()), DT)
+    assert report.probe.status == jc.Status.OK
+    assert "gains" not in str(dataclasses.replace(report, gains=(0.0, 0.0, np.inf), choice=None))
+
+
 def test_float32_is_no_trap():
     known = Known.of(*bob(rod(), dtype=jnp.float32), jc.Method(), DT)
     assert found(known) == {}

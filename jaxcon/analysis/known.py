@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.analysis.probe import Probe, probe
+from jaxcon.analysis.probe import Probe, begun, probe
 from jaxcon.constraints.rows import Rows
 from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
@@ -66,6 +66,7 @@ class Known:
         system = at(system, state, "jc.report(system, s)")
         if method is not None:
             check_method(method)
+            state = begun(system, method, state)
         if dt is not None:
             checks.positive("report", "dt", dt)
         rows, jacobian, mass = linearized(system, state)

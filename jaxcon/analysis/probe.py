@@ -48,11 +48,16 @@ def probe(system: Any, method: Method, state: State, control: PyTree, dt: float)
         control: as of `step`, or None.
         dt: h [s].
     """
-    turns = state.turns if jax.tree.leaves(state.turns) else None
-    start = init(system, method, state.q, state.v, state.time, turns)
+    start = begun(system, method, state)
     end, (off, missed) = _run(method, system, start, control, jnp.asarray(dt, state.q.dtype))
     later = np.asarray(off)[STEPS // 2 :]
     return Probe(STEPS, float(np.max(later)), float(np.max(missed)), Status(int(end.status)))
+
+
+def begun(system: Any, method: Method, state: State) -> State:
+    """The state with the memory of a method as at a start; that of another one is forgotten."""
+    turns = state.turns if jax.tree.leaves(state.turns) else None
+    return init(system, method, state.q, state.v, state.time, turns)
 
 
 @jax.jit

@@ -114,7 +114,7 @@ class Report:
         lines = [str(x) for x in (self.work, self.memory) if x]
         if self.seconds is not None:
             lines.append(f"{1e6 * self.seconds:.3g} µs a step of one world on this device")
-        if self.gains:
+        if self.gains and any(self.gains[:2]):
             α, β, most = self.gains
             lines.append(
                 f"gains α = {α:.4g}, β = {β:.4g} 1/s; at this ratio β is stable up to"
@@ -153,7 +153,7 @@ def report(
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
-        state: of one world.
+        state: of one world; what it remembers of a method is left out.
         method: by which the system is to be stepped, for operations, memory and warnings; memory
             compiles a step and takes seconds. None leaves these out.
         dt: h, () [s], for gains, the violation to be expected, which takes some steps, and the
