@@ -218,7 +218,7 @@ def _weighted(f: Callable[[Any], PyTree], results: list[Any], random: Any) -> Ca
 
 def _is_floating(x: Any) -> bool:
     """Whether it has real numbers, and not none of them."""
-    return bool(jnp.issubdtype(jnp.result_type(x), jnp.floating) and np.prod(np.shape(x)) > 0)
+    return bool(checks.is_floating(x) and np.prod(np.shape(x)) > 0)
 
 
 def _directions(leaf: Array, count: int, random: Any) -> Array:
