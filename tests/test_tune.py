@@ -91,6 +91,15 @@ def test_bounds_of_positive_leaves_hold_to_the_last_bit_and_let_go_again():
     np.testing.assert_allclose(slope[0], bound)
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_a_positive_leaf_stays_positive_however_far_it_is_thrown(dtype):
+    def square(x):
+        return 1e5 * x**2
+
+    found = jc.tune(square, jnp.ones((), dtype), positive=True, steps=3, optimizer=optax.sgd(1.0))
+    assert 0 < found.params < 1e-30
+
+
 def test_a_start_stops_where_the_loss_falls_no_more():
     found = jc.tune(bowl, BOWL, steps=500, positive="a", patience=15, tolerance=1e-3)
     assert found.steps < 400

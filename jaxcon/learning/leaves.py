@@ -217,8 +217,8 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
         raise ValueError(
             f"{what} needs bounds (low, high), numbers or arrays {start.shape}, got {pair!r}."
         ) from error
-    if log:
-        low = jnp.maximum(low, 0)
+    if log:  # below this exp may round to zero
+        low = jnp.maximum(low, jnp.minimum(start, jnp.finfo(start.dtype).tiny))
     if not np.all(np.asarray(low) <= np.asarray(high)):
         raise ValueError(f"{what} needs bounds (low, high) with low ≤ high, got {pair!r}.")
     if not np.all((np.asarray(low) <= start) & (start <= np.asarray(high))):
