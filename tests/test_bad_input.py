@@ -246,7 +246,7 @@ MISTAKES = {
     ),
     "tensor that is not symmetric": (
         lambda: body(inertia=[[1, 1, 0], [0, 1, 0], [0, 0, 1]]),
-        ["symmetric"],
+        ["body 'arm'", "symmetric"],
     ),
     "tensor that is not definite": (
         lambda: body(inertia=np.diag([1.0, 1.0, -1.0])),

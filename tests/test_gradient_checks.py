@@ -88,9 +88,9 @@ def test_the_coarsest_of_mixed_numbers_says_what_differences_can_tell(coarse):
 
 def test_leaves_that_are_no_floating_numbers_are_left_as_they_are():
     def power(x):
-        return sum(x["a"] ** i for i in range(1, x["n"]))
+        return sum(x["a"].astype(x["dtype"]) ** i for i in range(1, x["n"]))
 
-    assert jc.check_gradients(power, {"a": 1.3, "n": 4}).ok
+    assert jc.check_gradients(power, {"a": 1.3, "n": 4, "dtype": "float64"}).ok
 
 
 def half_differentiable(x):
@@ -134,6 +134,8 @@ def test_nothing_to_differentiate_by():
         jc.check_gradients(lambda x: 1.0 * x, 3)
     with pytest.raises(ValueError, match="f returns no floating number"):
         jc.check_gradients(lambda x: jnp.round(x).astype(int), 1.3)
+    with pytest.raises(ValueError, match="tolerance must be positive"):
+        jc.check_gradients(jnp.sin, 1.3, tolerance=0.0)
 
 
 def test_ridders_takes_away_every_even_power():
@@ -203,3 +205,5 @@ def test_no_freedom_is_refused():
     system, state = scene.build()
     with pytest.raises(ValueError, match="no freedom"):
         jc.gradient_growth(system, jc.Method(), state, None, 1e-2, 10)
+    with pytest.raises(ValueError, match="dt must be positive"):
+        jc.gradient_growth(system, jc.Method(), state, None, 0.0, 10)

@@ -566,7 +566,16 @@ def test_what_does_not_fit_is_refused_in_words():
         jc.identify(ringing, GUESS, recorded(0.0), noise=0.0)
     with pytest.raises(ValueError, match=r"noise of shapes \[\(300, 1\)\] must broadcast"):
         jc.identify(wave, {"a": 1.0, "b": 0.0}, WAVE, noise=np.full((300, 1), 0.01))
+    with pytest.raises(ValueError, match=r"noise of shapes \[\(\)\] .* in their structure"):
+        jc.identify(wave, {"a": 1.0, "b": 0.0}, WAVE, noise={"c": 1.0})
     nodes = {"x": jnp.ones(3), "v": jnp.ones(3)}
+    # these would otherwise be compared with a node number by number, or be shared among its numbers
+    ends = {"0 .., 1 ..": lambda n: (n["v"], n["x"]), "an array ..": lambda n: n["x"]}
+    for words, end in ends.items():
+        with pytest.raises(ValueError, match=f"an end like a node, v .., x .*returns is {words}"):
+            jc.identify(lambda p, n, e=end: (p * n["x"], e(n)), 3.0, np.ones(3), nodes=nodes)
+    with pytest.raises(ValueError, match="returns is nothing"):
+        jc.identify(lambda p, n: p * n["x"], 3.0, np.ones(3), nodes=nodes)
     with pytest.raises(ValueError, match="3 nodes the data must have a first axis"):
         jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes=nodes)
     for x in (np.ones(4, int), np.ones(3), 1.0):  # whole numbers would be rounded to at each step

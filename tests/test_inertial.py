@@ -405,7 +405,9 @@ def rod_scene():
 BAD = [
     ({"inertia": inertia.sphere(1.0, 0.1), "mass": 2.0}, "give it alone, without \\['mass'\\]"),
     ({"inertia": np.eye(3), "axes": (1.0, 0.0, 0.0, 0.0)}, "a tensor has axes of its own"),
-    ({"inertia": np.diag([1.0, 1.0, 3.0])}, "triangle"),
+    ({"inertia": np.diag([1.0, 1.0, 3.0])}, "body 'first': principal moments .* triangle"),
+    ({"inertia": np.eye(3) + np.eye(3, k=1)}, "body 'first': the tensor must be symmetric"),
+    ({"inertia": "thin"}, "body 'first': inertia must be numbers or an Inertia, got 'thin'"),
     ({"inertia": (1.0, 1.0, 3.0)}, "body 'first'.*triangle"),
     ({"inertia": (1.0, 1.0)}, "body 'first': inertia must have shape"),
     ({"center": (1.0, 1.0)}, "body 'first': center must have shape"),

@@ -136,6 +136,7 @@ def test_a_batch_of_systems():
         ({"hinge": {"anchor_b": (jnp.nan, 0.0)}}, ["hinge.anchor_b", "finite", "nan"]),
         ({"coil": {"rest": jnp.inf}}, ["coil.rest", "finite", "inf"]),
         ({"gravity": (0.0, jnp.inf)}, ["gravity", "finite", "inf"]),
+        ("link", ["with_params: give a mapping", "'link'"]),
     ],
 )
 def test_changes_that_do_not_fit(changes, words):

@@ -91,6 +91,15 @@ def test_bounds_of_positive_leaves_hold_to_the_last_bit_and_let_go_again():
     np.testing.assert_allclose(slope[0], bound)
 
 
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+def test_a_positive_leaf_stays_positive_however_far_it_is_thrown(dtype):
+    def square(x):
+        return 1e5 * x**2
+
+    found = jc.tune(square, jnp.ones((), dtype), positive=True, steps=3, optimizer=optax.sgd(1.0))
+    assert 0 < found.params < 1e-30
+
+
 def test_a_start_stops_where_the_loss_falls_no_more():
     found = jc.tune(bowl, BOWL, steps=500, positive="a", patience=15, tolerance=1e-3)
     assert found.steps < 400
@@ -362,6 +371,7 @@ def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_search(tmp_pa
         ({"positive": "q"}, "there is no leaf 'q'"),
         ({"positive": "b"}, "'b/c' is to stay positive"),
         ({"positive": 3}, "must be bools or names"),
+        ({"positive": {"q": True}}, "positive must have the structure of the parameters"),
         ({"bounds": {"a": (2.0, 4.0)}}, "'a' must start within its bounds"),
         ({"bounds": {"a": 2.0}}, "needs bounds"),
         ({"bounds": {"b": (0, 1), "b/*": (0, 1)}}, "meant by each of"),
@@ -370,6 +380,10 @@ def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_search(tmp_pa
         (
             {"restarts": 2, "spread": np.nan, "key": jax.random.key(0)},
             "spread must be zero or more",
+        ),
+        (  # which would otherwise be one for each start
+            {"restarts": 2, "spread": np.ones(2), "key": jax.random.key(0)},
+            r"broadcasts to the shape \(\) of 'b/c', got \(2,\)",
         ),
         ({"steps": 0}, "whole number from 1"),
         ({"patience": 0}, "patience must be a whole number from 1"),
@@ -399,6 +413,9 @@ def test_a_loss_must_be_a_scalar_and_parameters_numbers():
     for whole in (3, np.int64(3), np.array([3])):
         with pytest.raises(ValueError, match="'stiffness' is a whole number.*write it as a float"):
             jc.tune(lambda p: p["stiffness"], {"stiffness": whole, "damping": 0.1})
+    for other in ("rod", "float32", jnp.sum):  # the second is the name of a dtype
+        with pytest.raises(ValueError, match="'name' is .* and no number; leave it out"):
+            jc.tune(lambda p: p["x"], {"x": 1.0, "name": other})
     with pytest.raises(ValueError, match="must be finite"):
         jc.tune(lambda x: x, jnp.nan)
 

@@ -153,6 +153,8 @@ def check_gradients(
         Ridders, Accurate computation of F'(x) and F'(x)F''(x), Adv. Eng. Softw. 4 (1982).
     """
     checks.count("check_gradients", "directions", directions)
+    if tolerance is not None:
+        checks.positive("check_gradients", "tolerance", tolerance)
     random = np.random.default_rng(seed)
     named = [(_name(path), leaf) for path, leaf in jax.tree.leaves_with_path(x)]
     floating = [i for i, (_, leaf) in enumerate(named) if _is_floating(leaf)]
@@ -218,7 +220,7 @@ def _weighted(f: Callable[[Any], PyTree], results: list[Any], random: Any) -> Ca
 
 def _is_floating(x: Any) -> bool:
     """Whether it has real numbers, and not none of them."""
-    return bool(jnp.issubdtype(jnp.result_type(x), jnp.floating) and np.prod(np.shape(x)) > 0)
+    return bool(checks.is_floating(x) and np.prod(np.shape(x)) > 0)
 
 
 def _directions(leaf: Array, count: int, random: Any) -> Array:

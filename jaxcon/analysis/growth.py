@@ -104,6 +104,7 @@ def gradient_growth(
         ValueError: the constraints leave no freedom, the rollout fails, or what `rollout` refuses.
     """
     checks.count("gradient_growth", "steps", steps, 4)
+    checks.positive("gradient_growth", "dt", dt)
     moves = _allowed(at(system, state), state)
     n = moves.shape[1]
     if n == 0:

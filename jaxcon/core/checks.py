@@ -18,6 +18,11 @@ def is_concrete(x: Any) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
 
 
+def is_floating(x: Any) -> bool:
+    """Whether a leaf is a real number, or an array of such; a name of a dtype is none."""
+    return isinstance(x, float) or jnp.issubdtype(getattr(x, "dtype", bool), jnp.floating)
+
+
 def chosen_dtype(*trees: Any) -> Any:
     """The dtype of the first floating array of JAX in them, else that in use.
 

@@ -141,9 +141,14 @@ def from_tensor(mass: Any, tensor: Any, center: Any = None) -> Inertia:
     tensor = jnp.asarray(tensor)
     if tensor.shape != (3, 3):
         raise ValueError(f"inertia: the tensor must have shape (3, 3), got {tensor.shape}.")
+    return of_tensor("inertia", mass, tensor, center)
+
+
+def of_tensor(owner: str, mass: Any, tensor: Array, center: Any = None) -> Inertia:
+    """The same of a tensor (3, 3) in words of its owner, with which errors begin."""
     moments, axes = principal_axes(tensor)
     if checks.is_concrete(tensor):
-        _check_tensor(tensor, moments)
+        _check_tensor(owner, tensor, moments)
     return Inertia(mass, moments, center, quaternion.from_matrix(axes))
 
 
@@ -239,12 +244,12 @@ def _check(solid: str, **values: Any) -> None:
         checks.positive(solid, what, value)
 
 
-def _check_tensor(tensor: Array, moments: Array) -> None:
+def _check_tensor(owner: str, tensor: Array, moments: Array) -> None:
     known = np.asarray(tensor)
     if np.max(np.abs(known - known.T)) > 1e-6 * np.max(np.abs(known)):
-        raise ValueError(f"inertia: the tensor must be symmetric, got {known.tolist()}.")
-    checks.positive("inertia", "the principal moments", moments)
-    check_triangle("inertia", moments)
+        raise ValueError(f"{owner}: the tensor must be symmetric, got {known.tolist()}.")
+    checks.positive(owner, "the principal moments", moments)
+    check_triangle(owner, moments)
 
 
 def check_triangle(owner: str, moments: Any) -> None:

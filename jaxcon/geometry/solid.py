@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
-from jaxcon.geometry.inertia import Inertia, check_triangle, from_tensor
+from jaxcon.geometry.inertia import Inertia, check_triangle, of_tensor
 
 
 def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> Inertia:
@@ -31,8 +31,10 @@ def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> 
             raise ValueError(f"{owner}: give mass= or an Inertia, not both.")
     elif given is None:
         raise ValueError(f"{owner}: inertia is needed; a body without one is a particle.")
+    elif isinstance(given, str):
+        raise ValueError(f"{owner}: inertia must be numbers or an Inertia, got {given!r}.")
     elif dim == 3 and jnp.asarray(given).shape == (3, 3):
-        given = from_tensor(mass, checks.number(owner, "inertia", given, dtype, (3, 3)))
+        given = of_tensor(owner, mass, checks.number(owner, "inertia", given, dtype, (3, 3)))
     else:
         if dim == 2 and np.ndim(given):
             raise ValueError(

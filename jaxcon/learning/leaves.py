@@ -110,7 +110,7 @@ def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
             f"{owner}: the parameters are traced; {owner} is host code around a program of its own."
             " Call it outside of jit, vmap and grad, and map over worlds in the loss."
         )
-    _check_whole(names, leaves, owner)
+    _check_numbers(names, leaves, owner)
     free = [is_searched(x) for x in leaves]
     if not any(free):
         raise ValueError(f"{owner}: there is no floating number among the parameters {names}.")
@@ -125,15 +125,20 @@ def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
     return Space(fixed, low, high, structure, own, tuple(logs[i] for i in searched))
 
 
-def _check_whole(names: list[str], leaves: list[Any], owner: str) -> None:
-    """Checks that no whole number was written where a real one is meant.
+def _check_numbers(names: list[str], leaves: list[Any], owner: str) -> None:
+    """Checks that there are numbers, and no whole one was written where a real one is meant.
 
     Those that JAX holds, such as the status of a state, are parts of trees that nobody wrote.
 
     Raises:
-        ValueError: there is one.
+        ValueError: there is something else.
     """
     for name, x in zip(names, leaves, strict=True):
+        if not isinstance(x, complex | int | float | np.generic | np.ndarray | jax.Array):
+            raise ValueError(
+                f"{owner}: '{name}' is {x!r} and no number; leave it out of the parameters, and"
+                " close over it."
+            )
         written = isinstance(x, int | np.integer | np.ndarray) and not isinstance(x, bool)
         if written and jnp.issubdtype(jnp.result_type(x), jnp.integer):
             what = f"'{name}'" if name else "the parameter"
@@ -145,7 +150,7 @@ def _check_whole(names: list[str], leaves: list[Any], owner: str) -> None:
 
 def is_searched(leaf: Any) -> bool:
     """Whether a leaf has floating numbers."""
-    return bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
+    return checks.is_floating(leaf)
 
 
 def by_name(values: Mapping[str, Any], names: Iterable[str], default: Any, owner: str) -> list[Any]:
@@ -181,7 +186,13 @@ def _flags(positive: Any, params: PyTree, names: list[str], owner: str) -> list[
         return by_name(dict.fromkeys(chosen, True), names, False, f"{owner}: positive")
     if not all(isinstance(x, bool | np.bool_) for x in chosen):
         raise ValueError(f"{owner}: positive must be bools or names of leaves, got {positive!r}.")
-    return [bool(x) for x in jax.tree.leaves(jax.tree.broadcast(positive, params))]
+    try:
+        return [bool(x) for x in jax.tree.leaves(jax.tree.broadcast(positive, params))]
+    except ValueError as error:
+        raise ValueError(
+            f"{owner}: positive must have the structure of the parameters, or of their first"
+            f" levels, got {positive!r} for {names}; or give names of leaves."
+        ) from error
 
 
 def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Array, Array]:
@@ -206,8 +217,8 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
         raise ValueError(
             f"{what} needs bounds (low, high), numbers or arrays {start.shape}, got {pair!r}."
         ) from error
-    if log:
-        low = jnp.maximum(low, 0)
+    if log:  # below this exp may round to zero
+        low = jnp.maximum(low, jnp.minimum(start, jnp.finfo(start.dtype).tiny))
     if not np.all(np.asarray(low) <= np.asarray(high)):
         raise ValueError(f"{what} needs bounds (low, high) with low ≤ high, got {pair!r}.")
     if not np.all((np.asarray(low) <= start) & (start <= np.asarray(high))):

@@ -12,6 +12,7 @@ import numpy as np
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.learning.leaves import Space, by_name
+from jaxcon.learning.losses import fits
 
 
 def scattered(
@@ -23,17 +24,23 @@ def scattered(
         space: of the parameters.
         y: the start.
         restarts: how many, the one given included.
-        spread: standard deviation of y, a number or a mapping from names.
+        spread: standard deviation of y, a number or a mapping from names; or arrays that broadcast
+            to the shape of a leaf.
         key: of random numbers.
         owner: for errors.
 
     Raises:
-        ValueError: a deviation that is none, or several starts at one place.
+        ValueError: a deviation that is none or of another shape, or several starts at one place.
     """
     values = spread if isinstance(spread, Mapping) else {"*": spread}
     widths = by_name(values, space.names, 0.0, f"{owner}: spread")
-    for width in widths:
+    for name, width, x in zip(space.names, widths, y, strict=True):
         checks.positive(owner, "spread", width, strictly=False)
+        if not fits(np.shape(width), x.shape):
+            raise ValueError(
+                f"{owner}: spread must be a number, or an array that broadcasts to the shape"
+                f" {x.shape} of '{name}', got {np.shape(width)}."
+            )
     batch = [jnp.broadcast_to(x, (restarts, *x.shape)) for x in y]
     if restarts == 1:
         return tuple(batch)
@@ -43,7 +50,8 @@ def scattered(
         )
     keys = jax.random.split(key, len(batch))
     noise = [
-        jax.random.normal(k, x.shape, x.dtype).at[0].set(0) * jnp.asarray(w, x.dtype)
+        jax.random.normal(k, x.shape, x.dtype).at[0].set(0)
+        * jnp.broadcast_to(jnp.asarray(w, x.dtype), x.shape)
         for k, x, w in zip(keys, batch, widths, strict=True)
     ]
     return jax.vmap(space.clip)(tuple(map(jnp.add, batch, noise)))

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.learning.least_squares import Precision
 from jaxcon.learning.leaves import Space
-from jaxcon.learning.losses import misfit
+from jaxcon.learning.losses import described, misfit
 
 
 @dataclass(frozen=True)
@@ -70,13 +70,15 @@ class Stretches:
                 f"identify: with {stretches} nodes the data must have a first axis of as many"
                 f" stretches, got shapes {shapes}."
             )
-        noise = jax.tree.broadcast(1.0 if self.noise is None else self.noise, data)
+        noise = 1.0 if self.noise is None else self.noise
         try:
+            noise = jax.tree.broadcast(noise, data)
             noise = jax.tree.map(lambda w, x: np.broadcast_to(w, x.shape), noise, data)
         except ValueError as error:
             given = [np.shape(w) for w in jax.tree.leaves(noise)]
             raise ValueError(
-                f"identify: noise of shapes {given} must broadcast with the data, {shapes}."
+                f"identify: noise of shapes {given} must broadcast with the data, {shapes}, in"
+                " their structure."
             ) from error
         if self.given is None:
             return jax.tree.map(lambda x: x[None], (data, noise))
@@ -214,14 +216,26 @@ class Stretches:
         return jax.jit(jax.vmap(jax.vmap(along), (0, None, None)))
 
     def _stretch(self, x: Array, data: PyTree, noise: PyTree) -> tuple[Array, Array]:
-        """Residuals and the end of one stretch."""
+        """Residuals and the end of one stretch.
+
+        Raises:
+            ValueError: with nodes, there is no end like a node.
+        """
         p = self.scale.size
         params, end = self.space.decode(self.space.split(x[:p] * self.scale)), ()
         if self.given is None:
             predicted = self.simulate(params)
         else:
             first = jax.tree.map(lambda node: node[0], self.given)
-            predicted, end = self.simulate(params, ravel_pytree(first)[1](x[p:]))
+            found = self.simulate(params, ravel_pytree(first)[1](x[p:]))
+            predicted, end = (
+                found if isinstance(found, tuple | list) and len(found) == 2 else (found, ())
+            )
+            if described(end) != described(first):
+                raise ValueError(
+                    "identify: with nodes simulate must return predictions and an end like a node,"
+                    f" {described(first)}; the end that it returns is {described(end)}."
+                )
         return ravel_pytree(misfit(predicted, data, noise))[0], ravel_pytree(end)[0]
 
 

@@ -53,6 +53,8 @@ def replaced(system: Any, changes: Mapping[str, Any]) -> Any:
     Raises:
         ValueError: an unknown name or field, a wrong shape, or a value out of range.
     """
+    if not isinstance(changes, Mapping):
+        raise ValueError(f"with_params: give a mapping of names to changes, got {changes!r}.")
     known = read(system, changes)
     for name, fields in changes.items():
         _check(system, known, name, fields)
