@@ -1,5 +1,7 @@
 """Contacts without friction, and bodies that touch at several points."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -219,6 +221,102 @@ def test_corners_take_a_quaternion_of_any_length():
     np.testing.assert_allclose(twice, once, atol=1e-15)
     lengths = np.linalg.norm(once - np.mean(once, axis=0)[None], axis=1)
     np.testing.assert_allclose(lengths, np.linalg.norm(SIZE) / 2, rtol=1e-14)
+
+
+def test_a_capsule_lies_on_both_ends():
+    """What each bears, by the moments about a centre of mass that is not in the middle.
+
+    From a gap of φ both ends leave with u* = −φ/h, or come out by a fifth of it and at 0.1 m/s at
+    most: N₁ + N₂ = N = m (g + u*/h). With a lever of r + φ/2 the friction of what slides loads the
+    end in front, 2 l N₂ = N (l + d) + μ N (r + φ/2).
+    """
+    mass, half, radius, off, μ = 2.0, 0.5, 0.1, 0.2, 0.3
+    scene = jc.Scene(dim=2)
+    scene.add_body("capsule", mass=mass, inertia=0.2, position=(off, radius))
+    ends = ((-half, radius), (half, radius))
+    floor = jc.PlaneContact("floor", jc.WORLD, "capsule", radius, ends, friction=μ)
+    scene.add(floor)
+    system, state = scene.build()
+    gap = np.array([2e-6, 0.0, -1e-4, -1e-2, -1e-4])
+    wanted = np.array([-2e-3, 0.0, 0.02, 0.1, 0.02])
+    speed = np.array([0.0, 0.0, 0.0, 0.0, 1.0])
+
+    def step(gap, speed):
+        start = dataclasses.replace(state, q=state.q.at[1].add(gap), v=state.v.at[0].set(speed))
+        new, info = jc.step(system, jc.Method(), start, None, H)
+        return new.v, info.reactions["floor"], info.reactions.gap
+
+    v, forces, gaps = jax.jit(jax.vmap(step))(gap, speed)
+    both = mass * (9.81 + wanted / H)
+    rub = μ * both * (speed > 0)
+    front = (both * (half + off) + rub * (radius + gap / 2)) / (2 * half)
+    np.testing.assert_allclose(gaps[:, :2], gap[:, None] + np.zeros(2), atol=1e-15)
+    np.testing.assert_allclose(forces[..., 0], np.stack([both - front, front], 1), rtol=1e-9)
+    np.testing.assert_allclose(np.abs(forces[..., 1].sum(axis=1)), rub, atol=1e-7)
+    after = np.stack([speed - H * rub / mass, wanted, 0 * gap], 1)
+    np.testing.assert_allclose(v, after, atol=1e-11)
+
+
+@pytest.mark.parametrize("order", [1, -1], ids=["capsule first", "ball first"])
+def test_a_ball_hits_a_capsule_in_the_plane(order):
+    """Beside it, and beyond either end: the gap, where it is hit, and impulse and friction.
+
+    With x halfway in the gap and K the mobility of the two bodies there, F = λ (n − μ t) for a slip
+    along t, and n·K F h = −φ/h − n·u.
+    """
+    m, μ, radii = np.array([3.0, 0.5]), 0.2, np.array([0.1, 0.15])
+    inertia, apart = np.array([0.4, 0.006]), 1e-4
+    along = np.array([np.cos(0.4), np.sin(0.4)])
+    across = np.array([-along[1], along[0]])
+    middle = np.array([0.3, -0.2])
+    ends = middle + np.array([-0.4, 0.6])[:, None] * along
+    beyond = (along + across) / np.sqrt(2)
+    feet = np.stack([middle + 0.25 * along, ends[1], ends[0]])
+    normals = np.stack([across, beyond, -along])
+    balls = feet + (radii.sum() + apart) * normals
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("capsule", mass=m[0], inertia=inertia[0], position=middle)
+    scene.add_body("ball", mass=m[1], inertia=inertia[1], position=balls[0])
+    shapes = [("capsule", radii[0], ends), ("ball", radii[1], None)][::order]
+    named = zip("ab", shapes, strict=True)
+    given = {f"{k}_{s}": x for s, own in named for k, x in zip(FIELDS, own, strict=True)}
+    scene.add(jc.CapsuleContact("touch", **given, friction=μ))
+    system, state = scene.build()
+    places = {name: np.array(range(6))[system.layout.q(name)] for name in ("capsule", "ball")}
+    before = {"capsule": np.array([0.1, -0.2, 0.5]), "ball": np.array([0.0, 0.0, 9.0])}
+
+    def step(ball, speed):
+        q = state.q.at[places["ball"][:2]].set(ball)
+        v = state.v.at[places["capsule"]].set(before["capsule"])
+        v = v.at[places["ball"]].set(speed)
+        start = dataclasses.replace(state, q=q, v=v)
+        new, info = jc.step(system, jc.Method(), start, None, H)
+        return new.v, info.reactions["touch"], info.reactions.gap[0]
+
+    speeds = np.concatenate([-2 * normals, np.full((3, 1), before["ball"][2])], axis=1)
+    found, forces, gaps = jax.jit(jax.vmap(step))(balls, speeds)
+    np.testing.assert_allclose(gaps, apart, atol=1e-14)
+    for i, n in enumerate(normals):
+        place = feet[i] + (radii[0] + apart / 2) * n
+        arms = [place - middle, place - balls[i]]
+        turns = [np.array([-arm[1], arm[0]]) for arm in arms]
+        motions = [before["capsule"], speeds[i]]
+        slip = np.diff(
+            [v[:2] + v[2] * turn for v, turn in zip(motions, turns, strict=True)], axis=0
+        )[0]
+        t = slip - n * (n @ slip)
+        pull = n - μ * t / np.linalg.norm(t)
+        moved = sum(pull / m[k] + turns[k] * (turns[k] @ pull) / inertia[k] for k in (0, 1))
+        impulse = (-apart / H - n @ slip) / (n @ moved)
+        assert abs(t @ slip) > impulse * abs(t @ moved)  # it slides to the end
+        np.testing.assert_allclose(H * forces[i, 0], impulse, rtol=1e-9)
+        np.testing.assert_allclose(H * abs(forces[i, 1]), μ * impulse, rtol=1e-9)
+        for k, (name, sign) in enumerate((("capsule", -1), ("ball", 1))):
+            change = sign * impulse * np.array([*pull / m[k], turns[k] @ pull / inertia[k]])
+            np.testing.assert_allclose(found[i, places[name]], motions[k] + change, atol=1e-11)
+
+
+FIELDS = ("body", "radius", "segment")
 
 
 def test_parallel_capsules_touch_in_the_middle_of_what_faces():

@@ -106,8 +106,12 @@ def test_on_rough_ground_the_search_ends_where_the_way_is_level():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_an_inclined_field_is_a_plane(dim):
-    """A rough ball bounces and rolls over it and beyond its edge as on the plane, to rounding."""
+@pytest.mark.parametrize("shape", ["ball", "box"])
+def test_an_inclined_field_is_a_plane(dim, shape):
+    """What is rough bounces, rolls and slides over it and beyond its edge as on the plane.
+
+    A ball, and a box on its corners.
+    """
     turn = -0.5 if dim == 2 else np.array([np.cos(0.2), np.sin(0.2), 0.0, 0.0])
     pose = jc.Pose(jnp.zeros(dim), jnp.asarray(turn))
     slope = np.array([-0.3, 0.1])[: dim - 1]
@@ -115,7 +119,10 @@ def test_an_inclined_field_is_a_plane(dim):
     heights = slope[0] * line if dim == 2 else slope[0] * line[:, None] + slope[1] * line[None]
     up = np.asarray(pose.direction(jnp.asarray([*-slope, 1.0])))
     middle = np.array([0.1, -0.2, 0.3])[-dim:]
-    touch = {"radius": 0.1, "friction": 0.3, "restitution": 0.5}
+    start = middle + 0.12 * up / np.linalg.norm(up)
+    corners = jc.box_corners((0.16, 0.12, 0.1)[:dim], start)
+    own = {"radius": 0.1} if shape == "ball" else {"center": corners}
+    touch = {"friction": 0.3, "restitution": 0.5} | own
     size = 1.0 if dim == 2 else (1.0, 1.0)
     place = {"position": middle, "orientation": turn}
     ends = []
@@ -126,11 +133,11 @@ def test_an_inclined_field_is_a_plane(dim):
         scene = jc.Scene(dim=dim)
         inertia = 0.004 if dim == 2 else jc.inertia.sphere(1.0, 0.1)
         mass = {"mass": 1.0} if dim == 2 else {}
-        start = middle + 0.12 * up / np.linalg.norm(up)
         scene.add_body("ball", inertia=inertia, position=start, **mass)
         scene.add(floor)
         ends.append(rolling(*scene.build(), 120)(5e-3))
     assert float(jnp.abs(ends[0].q[-1, :dim] - middle).max()) > 0.5
+    assert float(jnp.abs(ends[0].v[:, dim:]).max()) > 1.0  # the ground turned it
     np.testing.assert_allclose(ends[1].q, ends[0].q, atol=1e-12)
 
 
