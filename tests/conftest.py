@@ -22,13 +22,15 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_configure(config):
-    """Lets the workers, and the next run, share what was compiled, and collects garbage rarely.
+    """Lets all that tests start, and the next run, share what was compiled; keeps garbage longer.
 
     Tracing makes millions of objects, which a collector at its usual pace looks through again and
     again: a fifth of the time.
     """
     gc.set_threshold(200_000, 50, 100)
-    jax.config.update("jax_compilation_cache_dir", str(config.cache.mkdir("jax")))
+    programs = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+    jax.config.update("jax_compilation_cache_dir", programs)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
