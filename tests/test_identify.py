@@ -205,6 +205,17 @@ def test_a_wall_of_what_is_no_number_is_no_convergence():
     assert "not finite around the last point" in found.stopped
 
 
+def test_data_that_are_met_exactly_are_known_to_rounding():
+    """Numbers that are their own prediction leave no residual at all."""
+    data = np.array([1.0, 2.0, 4.0, 8.0])
+    found = jc.identify(lambda a: a * jnp.asarray(data), jnp.asarray(1.0), data)
+    rounding = np.finfo(float).eps * np.linalg.norm(data) / 2
+    assert found.params == 1
+    np.testing.assert_allclose(found.noise, rounding)
+    np.testing.assert_allclose(found.errors, rounding / np.linalg.norm(data))
+    assert found.condition == 1
+
+
 def test_no_degree_of_freedom_tells_no_noise():
     """Two numbers and two parameters; with a known noise the errors are known."""
     X, data = np.array([[1.0, 1.0], [2.0, 1.0]]), np.array([1.1, 1.9])

@@ -110,10 +110,15 @@ class Stretches:
         return np.append(low, -none), np.append(high, none)
 
     @property
-    def least(self) -> float:
-        """What rounding makes of each number that was seen; 1 where all are 0."""
+    def rounding(self) -> float:
+        """What rounding makes of each number that was seen."""
         spacing = float(jnp.finfo(self.scale.dtype).eps)
-        return spacing * self.size / max(self.observed, 1) ** 0.5 or 1.0
+        return spacing * self.size / max(self.observed, 1) ** 0.5
+
+    @property
+    def least(self) -> float:
+        """The same, or 1 where all are 0."""
+        return self.rounding or 1.0
 
     def typical(self, residual: np.ndarray) -> float:
         """The root mean square of residuals of the data, no less than rounding makes them."""
