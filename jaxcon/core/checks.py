@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, PyTree
 
 
 def is_concrete(x: Any) -> bool:
@@ -145,3 +145,18 @@ def finite(owner: str, what: str, x: Any) -> None:
         values = _values(owner, what, x)
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{owner}: {what} must be finite, got {values.tolist()}.")
+
+
+def described(tree: PyTree) -> str:
+    """The shapes of arrays by name."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    if [path for path, _ in leaves] == [()]:
+        return f"an array {jnp.shape(leaves[0][1])}"
+    shapes = {jax.tree_util.keystr(path, simple=True, separator="/"): x for path, x in leaves}
+    return ", ".join(f"{name} {jnp.shape(x)}" for name, x in shapes.items()) or "nothing"
+
+
+def fits(shape: tuple[int, ...], into: tuple[int, ...]) -> bool:
+    """Whether an array broadcasts to a shape, and that shape to none larger."""
+    pairs = zip(reversed(shape), reversed(into), strict=False)
+    return len(shape) <= len(into) and all(n in (1, m) for n, m in pairs)

@@ -123,7 +123,7 @@ def capsule(mass: Any, radius: Any, length: Any) -> Inertia:
     return Inertia(mass, (across, across, along))
 
 
-def from_tensor(mass: Any, tensor: Any, center: Any = None) -> Inertia:
+def from_tensor(mass: Any, tensor: Any, center: Any = None, owner: str = "inertia") -> Inertia:
     """From a full tensor (3, 3) about the centre of mass, by its principal axes.
 
     It is differentiable also where principal moments coincide (`principal_axes`): to 1e-6 in
@@ -133,6 +133,7 @@ def from_tensor(mass: Any, tensor: Any, center: Any = None) -> Inertia:
         mass: () [kg].
         tensor: symmetric, (3, 3) [kg m²].
         center: centre of mass in the same frame, (3,) [m]; the origin unless given.
+        owner: what messages begin with.
 
     Raises:
         ValueError: not 3×3, not symmetric, not positive definite, or against the triangle
@@ -140,12 +141,7 @@ def from_tensor(mass: Any, tensor: Any, center: Any = None) -> Inertia:
     """
     tensor = jnp.asarray(tensor)
     if tensor.shape != (3, 3):
-        raise ValueError(f"inertia: the tensor must have shape (3, 3), got {tensor.shape}.")
-    return of_tensor("inertia", mass, tensor, center)
-
-
-def of_tensor(owner: str, mass: Any, tensor: Array, center: Any = None) -> Inertia:
-    """The same of a tensor (3, 3) in words of its owner, with which errors begin."""
+        raise ValueError(f"{owner}: the tensor must have shape (3, 3), got {tensor.shape}.")
     moments, axes = principal_axes(tensor)
     if checks.is_concrete(tensor):
         _check_tensor(owner, tensor, moments)

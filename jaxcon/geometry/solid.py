@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
-from jaxcon.geometry.inertia import Inertia, check_triangle, of_tensor
+from jaxcon.geometry.inertia import Inertia, check_triangle, from_tensor
 
 
 def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> Inertia:
@@ -34,7 +34,8 @@ def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> 
     elif isinstance(given, str):
         raise ValueError(f"{owner}: inertia must be numbers or an Inertia, got {given!r}.")
     elif dim == 3 and jnp.asarray(given).shape == (3, 3):
-        given = of_tensor(owner, mass, checks.number(owner, "inertia", given, dtype, (3, 3)))
+        tensor = checks.number(owner, "inertia", given, dtype, (3, 3))
+        given = from_tensor(mass, tensor, owner=owner)
     else:
         if dim == 2 and np.ndim(given):
             raise ValueError(

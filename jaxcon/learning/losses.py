@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
-from jaxcon.core import numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import Energy
@@ -59,20 +59,20 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
     given = [jnp.shape(x) for x in jax.tree.leaves(reference)]
     if jax.tree.structure(path) != jax.tree.structure(reference) or shapes != given:
         raise ValueError(
-            f"what is simulated, {described(path)}, must have the structure and shapes of what it"
-            f" is compared with, {described(reference)}."
+            f"what is simulated, {checks.described(path)}, must have the structure and shapes of"
+            f" what it is compared with, {checks.described(reference)}."
         )
     try:
         widths = jax.tree.broadcast(scale, path)
     except ValueError as error:
         raise ValueError(
-            f"a scale must have the structure of what it scales, {described(path)}, or of its first"
-            f" levels, got {described(scale)}."
+            f"a scale must have the structure of what it scales, {checks.described(path)}, or of"
+            f" its first levels, got {checks.described(scale)}."
         ) from error
 
     def off(x: Any, wanted: Any, width: Any) -> Array:
         shape, own = jnp.shape(x), jnp.shape(width)
-        if not fits(own, shape):
+        if not checks.fits(own, shape):
             raise ValueError(
                 f"a scale of shape {own} does not broadcast to what it scales, {shape}."
             )
@@ -164,18 +164,3 @@ def unless_failed(x: PyTree, state: Any) -> PyTree:
         return jnp.where(lost, jnp.nan, y)
 
     return jax.tree.map(one, x)
-
-
-def described(tree: PyTree) -> str:
-    """The shapes of arrays by name."""
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    if [path for path, _ in leaves] == [()]:
-        return f"an array {jnp.shape(leaves[0][1])}"
-    shapes = {jax.tree_util.keystr(path, simple=True, separator="/"): x for path, x in leaves}
-    return ", ".join(f"{name} {jnp.shape(x)}" for name, x in shapes.items()) or "nothing"
-
-
-def fits(shape: tuple[int, ...], into: tuple[int, ...]) -> bool:
-    """Whether an array broadcasts to a shape, and that shape to none larger."""
-    pairs = zip(reversed(shape), reversed(into), strict=False)
-    return len(shape) <= len(into) and all(n in (1, m) for n, m in pairs)

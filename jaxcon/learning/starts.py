@@ -12,7 +12,6 @@ import numpy as np
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.learning.leaves import Space, by_name
-from jaxcon.learning.losses import fits
 
 
 def scattered(
@@ -36,7 +35,7 @@ def scattered(
     widths = by_name(values, space.names, 0.0, f"{owner}: spread")
     for name, width, x in zip(space.names, widths, y, strict=True):
         checks.positive(owner, "spread", width, strictly=False)
-        if not fits(np.shape(width), x.shape):
+        if not checks.fits(np.shape(width), x.shape):
             raise ValueError(
                 f"{owner}: spread must be a number, or an array that broadcasts to the shape"
                 f" {x.shape} of '{name}', got {np.shape(width)}."

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
+from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.learning.least_squares import Precision
 from jaxcon.learning.leaves import Space
-from jaxcon.learning.losses import described, misfit
+from jaxcon.learning.losses import misfit
 
 
 @dataclass(frozen=True)
@@ -236,10 +237,11 @@ class Stretches:
             predicted, end = (
                 found if isinstance(found, tuple | list) and len(found) == 2 else (found, ())
             )
-            if described(end) != described(first):
+            if checks.described(end) != checks.described(first):
                 raise ValueError(
                     "identify: with nodes simulate must return predictions and an end like a node,"
-                    f" {described(first)}; the end that it returns is {described(end)}."
+                    f" {checks.described(first)}; the end that it returns is"
+                    f" {checks.described(end)}."
                 )
         return ravel_pytree(misfit(predicted, data, noise))[0], ravel_pytree(end)[0]
 
