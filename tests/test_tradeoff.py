@@ -388,6 +388,19 @@ def test_a_step_asked_for_that_takes_longer_than_the_budget_is_listed():
     assert str(found)
 
 
+def test_the_first_gradient_is_not_begun_where_it_may_outlast_the_budget():
+    """Which compiles for longer than anything before it; a second one is as long as the first."""
+    clock = ledger.Clock(300.0)
+    assert clock.lasts("runs")
+    clock.longest["runs"] = 36.0
+    assert clock.lasts("runs")
+    clock.begin -= 183.0
+    assert clock.lasts("runs")
+    assert not clock.lasts("gradients")
+    clock.longest["gradients"] = 80.0
+    assert clock.lasts("gradients")
+
+
 def test_one_step_and_one_precision_need_no_list_and_one_world_no_batch():
     system, state = free_mass()
     known = {"methods": {"RK4": jc.Method(jc.RK4())}, "batch": 2, "gradients": False}

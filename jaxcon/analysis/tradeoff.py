@@ -27,7 +27,7 @@ NO_TIME = "no time was left of the budget"
 REFERENCE_SHARE = 0.1
 """Of the budget that the runs of the reference may take."""
 RUNS_SHARE = 0.7
-"""Of the budget after which none but gradients are begun, where these are asked for."""
+"""Of the budget after which none but gradients are begun, where the rest lasts for one."""
 
 
 def tradeoff(
@@ -137,13 +137,15 @@ def _go(
     """Measures what is wanted, and then gradients; says what there was no time for."""
     gradients, progress = options
     shown = bar(progress, total=len(wanted) * (1 + gradients), desc="tradeoff", unit="method")
-    reason, share = NO_TIME, RUNS_SHARE if gradients else 1.0
+    reason = NO_TIME
     try:
         with shown:
             for i, one in enumerate(wanted):
                 shown.set_postfix_str(f"{one.name}, {one.dtype}")
+                kept = gradients and clock.asks("gradients") < (1 - RUNS_SHARE) * clock.budget
                 # the first gets all there is, as without any run there is nothing to say
-                if one not in ledger and clock.lasts("runs", share if i else 1.0):
+                share = RUNS_SHARE if kept and i else 1.0
+                if one not in ledger and clock.lasts("runs", share):
                     with clock.timing("runs"):
                         ledger[one] = sweep.measure(one.name, one.method, one.dtype)
                 shown.update()
