@@ -98,7 +98,8 @@ def arguments(given: list[str] | None) -> argparse.Namespace:
     if strange := suite.unknown(asked.names, ENTRIES):
         parser.error(f"unknown are {strange}; known are {list(ENTRIES)}")
     try:
-        asked.baseline = Baseline.read(asked.compare or suite.FILE)
+        asked.file = asked.compare or suite.FILE
+        asked.baseline = Baseline.read(asked.file)
     except ValueError as error:
         parser.error(str(error))
     return asked
@@ -110,7 +111,6 @@ def main(given: list[str] | None = None) -> int:
     if asked.list:
         print("\n".join(f"{name:18s} {entry.about}" for name, entry in ENTRIES.items()))
         return 0
-    file = asked.compare or suite.FILE
     baseline, begin = asked.baseline, time.perf_counter()
     folder = asked.json.absolute().parent if asked.json else None
     found = run(asked.names or list(ENTRIES), asked.quick, baseline, folder)
@@ -120,13 +120,13 @@ def main(given: list[str] | None = None) -> int:
         save(found, asked.quick, asked.json)
     failed = [name for name, outcome in found.items() if outcome.failed]
     if asked.update:
-        baseline.updated(size_of(asked.quick), found, timing.machine()).write(file)
-        print(f"wrote {file}")
+        baseline.updated(size_of(asked.quick), found, timing.machine()).write(asked.file)
+        print(f"wrote {asked.file}")
         return int(bool(failed))
     said = baseline.worse(size_of(asked.quick), found)
     print("\n".join(said) or "nothing got worse than it may")
     if new := [name for name in found if not baseline.of(size_of(asked.quick), name)]:
-        print(f"{file.name} has nothing to compare with of {', '.join(new)}")
+        print(f"{asked.file.name} has nothing to compare with of {', '.join(new)}")
     return int(bool(failed or (said and asked.compare)))
 
 

@@ -19,6 +19,7 @@ from jaxcon.constraints.bounds import BoundRows, linearize_bounds
 from jaxcon.constraints.rows import linearize
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector
+from jaxcon.core.status import failed
 
 
 class Laws(NamedTuple):
@@ -113,7 +114,7 @@ def moved(system: Any, state: Any, rows: BoundRows) -> jax.Array:
 
 
 def measure(name: str, dtype: Any, solver: Any, worlds: int) -> Laws:
-    """By how much the laws are missed at random states, (worlds,) each."""
+    """By how much the laws are missed at random states, (worlds,) each; ∞ where a step failed."""
     build, drawn = SCENES[name]
     system, state = build(dtype)
     bare = dataclasses.replace(system, bounds=())
@@ -127,7 +128,8 @@ def measure(name: str, dtype: Any, solver: Any, worlds: int) -> Laws:
         free, _ = jc.step(bare, method, alone, None, h)
         speed, energy = jnp.max(jnp.abs(start.v)), jc.energy(system, start).kinetic
         size = speed, h * moved(system, start, rows), energy
-        return judged(rows, info.reactions.multipliers, (free.v, new.v), size)
+        found = judged(rows, info.reactions.multipliers, (free.v, new.v), size)
+        return jax.tree.map(lambda x: jnp.where(failed(new.status), jnp.inf, x), found)
 
     run = jax.jit(jax.vmap(one))
     keys = jax.random.split(jax.random.PRNGKey(0), worlds)

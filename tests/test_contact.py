@@ -158,6 +158,28 @@ def test_a_box_topples_beyond_its_corner(slope):
     assert tilt > 0.05 if slope > 1 else tilt < 1e-6
 
 
+def test_what_is_missed_over_random_states_of_a_box():
+    """Laws, cone and the direction of friction: 2,000 boxes thrown into the floor."""
+    system, state = box(0.4, 0.5)
+    method = jc.Method()
+
+    def thrown(key):
+        place, speed = (jax.random.normal(k, (6,)) for k in jax.random.split(key))
+        q = system.retract(state.q, 3e-3 * place)
+        new, info = jc.step(system, method, dataclasses.replace(state, q=q, v=speed), None, 2e-3)
+        every = jnp.stack([info.reactions[f"{k}"] for k in range(4)])
+        return every, info.reactions.residual, jnp.max(jnp.abs(speed)), new.status
+
+    keys = jax.random.split(jax.random.PRNGKey(1), 2000)
+    every, missed, speed, status = map(np.asarray, jax.jit(jax.vmap(thrown))(keys))
+    assert np.all(status == 0)
+    normal, slip = every[..., 0], np.linalg.norm(every[..., 1:], axis=-1)
+    assert np.mean(normal > 0) > 0.2
+    assert np.all(normal >= 0)
+    assert np.all(slip <= 0.5 * normal * (1 + 1e-9) + 1e-9)
+    assert np.mean(missed / speed > 1e-8) < 1e-3
+
+
 def test_no_impact_adds_energy():
     """Rods that fall on a rough floor: without a cap, one in eight of them would gain.
 

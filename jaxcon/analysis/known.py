@@ -19,7 +19,7 @@ from jaxcon.dynamics.assembly import assemble
 from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
 from jaxcon.model.state import State, at
 from jaxcon.simulation.choice import Choice, choose
-from jaxcon.simulation.method import Method, check_method
+from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import default_gains, parts
 
 ASIDE = 0.05
@@ -64,14 +64,14 @@ class Known:
     ) -> Known:
         """The same from what a user gives."""
         system = at(system, state, "jc.report(system, s)")
-        if method is not None:
-            check_method(method)
-            state = begun(system, method, state)
         if dt is not None:
             checks.positive("report", "dt", dt)
+        own = method or Method()
+        if method is not None or dt is not None:
+            state = begun(system, own, state)
         rows, jacobian, mass = linearized(system, state)
         h = None if dt is None else float(dt)
-        return cls(system, state, method or Method(), h, control, batch, rows, mass, jacobian)
+        return cls(system, state, own, h, control, batch, rows, mass, jacobian)
 
     @cached_property
     def unit(self) -> UnitRows:
@@ -85,7 +85,9 @@ class Known:
             return self.unit
         groups = tuple(
             dataclasses.replace(
-                p, mass=p.mass / p.mass, moments=jax.tree.map(lambda x, m=p.mass: x / m, p.moments)
+                p,
+                mass=jnp.ones_like(p.mass),
+                moments=jax.tree.map(lambda x, m=p.mass: x / m, p.moments),
             )
             for p in self.system.inertia
         )

@@ -44,12 +44,11 @@ def probe(system: Any, method: Method, state: State, control: PyTree, dt: float)
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
         method: integrator, stabiliser and solver.
-        state: of one world; what it remembers of another method is forgotten.
+        state: of one world, as `begun` gives it.
         control: as of `step`, or None.
         dt: h [s].
     """
-    start = begun(system, method, state)
-    end, (off, missed) = _run(method, system, start, control, jnp.asarray(dt, state.q.dtype))
+    end, (off, missed) = _run(method, system, state, control, jnp.asarray(dt, state.q.dtype))
     later = np.asarray(off)[STEPS // 2 :]
     return Probe(STEPS, float(np.max(later)), float(np.max(missed)), Status(int(end.status)))
 

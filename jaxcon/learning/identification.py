@@ -253,7 +253,7 @@ def _report(
     unit = np.where(space.logarithms, 1, np.maximum(np.abs(fit.z[:p]), 1))
     s, V = told(J[:, :p][:, free], J[:, p:], unit[free], precision)
     if problem.noise is None:
-        left = max(left, problem.rounding / own)  # of data that are met exactly, too
+        left = float(np.maximum(left, problem.rounding / own))  # of data that are met exactly, too
         with np.errstate(divide="ignore"):
             s = np.where(s > 0, s / left, 0)
     y = space.split(jnp.asarray(fit.z[:p] * scale, problem.scale.dtype))

@@ -222,28 +222,32 @@ class Stretches:
         return jax.jit(jax.vmap(jax.vmap(along), (0, None, None)))
 
     def _stretch(self, x: Array, data: PyTree, noise: PyTree) -> tuple[Array, Array]:
-        """Residuals and the end of one stretch.
-
-        Raises:
-            ValueError: with nodes, there is no end like a node.
-        """
+        """Residuals and the end of one stretch."""
         p = self.scale.size
         params, end = self.space.decode(self.space.split(x[:p] * self.scale)), ()
         if self.given is None:
             predicted = self.simulate(params)
         else:
-            first = jax.tree.map(lambda node: node[0], self.given)
-            found = self.simulate(params, ravel_pytree(first)[1](x[p:]))
-            predicted, end = (
-                found if isinstance(found, tuple | list) and len(found) == 2 else (found, ())
-            )
-            if checks.described(end) != checks.described(first):
-                raise ValueError(
-                    "identify: with nodes simulate must return predictions and an end like a node,"
-                    f" {checks.described(first)}; the end that it returns is"
-                    f" {checks.described(end)}."
-                )
+            predicted, end = self._onward(params, x[p:])
         return ravel_pytree(misfit(predicted, data, noise))[0], ravel_pytree(end)[0]
+
+    def _onward(self, params: PyTree, node: Array) -> tuple[PyTree, PyTree]:
+        """Predictions from a node on, and the end.
+
+        Raises:
+            ValueError: there is no end like a node.
+        """
+        first = jax.tree.map(lambda x: x[0], self.given)
+        found = self.simulate(params, ravel_pytree(first)[1](node))
+        both = isinstance(found, tuple | list) and len(found) == 2
+        predicted, end = found if both else (found, ())
+        wanted, got = checks.described(first), checks.described(end)
+        if got != wanted:
+            raise ValueError(
+                "identify: with nodes simulate must return predictions and an end like a node,"
+                f" {wanted}; the end that it returns is {got}."
+            )
+        return predicted, end
 
 
 def _placed(by_r: np.ndarray, by_end: np.ndarray, p: int) -> np.ndarray:
