@@ -129,6 +129,30 @@ def test_derivatives_are_differences_and_batches_are_loops():
     np.testing.assert_allclose(together, [run(r, 1.0) for r in radii], rtol=1e-12)
 
 
+def apart(a, b, t, params):
+    """The square of a distance, whose derivative vanishes with it."""
+    gap = b.position - a.position
+    return (gap @ gap - params)[None]
+
+
+def test_a_tangent_is_finite_where_a_row_hardly_moves_anything():
+    """G is 1e-20 there, and 1/G² beyond float32, which zero times must not make NaN."""
+
+    def tangents(dtype):
+        scene = jc.Scene(dim=2, dtype=dtype)
+        for name in ("a", "b"):
+            scene.add_body(name, mass=1.0, inertia=0.8)
+        scene.add(jc.Inequality(apart, ("a", "b"), "law", jnp.asarray(1.0, dtype)))
+        system, state = scene.build()
+        step = lambda q: jc.step(system, jc.Method(), dataclasses.replace(state, q=q), None, 0.01)  # noqa: E731
+        near = state.q.at[system.layout.q("b")[0]].set(2e-10)
+        return np.asarray(jax.jit(jax.jacfwd(lambda q: step(q)[0].v))(near), float)
+
+    found, exact = tangents("float32"), tangents("float64")
+    size = np.max(np.abs(exact))
+    np.testing.assert_allclose(found / size, exact / size, atol=1e-5)
+
+
 def test_it_goes_with_events_and_with_the_nearest_rows():
     system, state = fall()
     methods = (

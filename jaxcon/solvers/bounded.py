@@ -281,11 +281,13 @@ def implicit_multipliers(
         width: of smoothed corners [m/s, rad/s]; None leaves them sharp.
     """
     kinds, scale = problem.kinds, problem.diagonal()
-    # the width is a choice of the derivative, and has none itself
-    corner = None if width is None else jax.lax.stop_gradient(jnp.asarray(width, scale.dtype)[None])
+    corner = None if width is None else jnp.asarray(width, scale.dtype)[None]
 
     def law(x: Array) -> Array:
-        return laws(kinds, scale, x, velocity(x), live, corner)
+        # g and the width are choices, without derivatives of their own; said inside, as a root
+        # gives all that its function closes over a tangent, and 0·(1/g²) is NaN where 1/g² overflows
+        fixed, smooth = jax.lax.stop_gradient((scale, corner))
+        return laws(kinds, fixed, x, velocity(x), live, smooth)
 
     def prepared() -> tuple[roots.Operator, roots.Operator]:
         known = gauss_jordan.inverse(problem.slope(multipliers, corner))
