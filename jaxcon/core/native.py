@@ -42,8 +42,8 @@ class Native:
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
         self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
-        self.tangent = functools.lru_cache(maxsize=64)(self._tangent)
-        self.transposed = functools.lru_cache(maxsize=64)(self._transposed)
+        self.tangent = functools.lru_cache(maxsize=64)(functools.partial(Tangent, self))
+        self.transposed = functools.lru_cache(maxsize=64)(functools.partial(Transposed, self))
         self.part = functools.lru_cache(maxsize=64)(functools.partial(Part, self))
         self.among = functools.lru_cache(maxsize=64)(self._among)
 
@@ -87,52 +87,76 @@ class Native:
             )
         return closed
 
-    def _tangent(self, moved: tuple[bool, ...]) -> Native:
-        """(x, ẋ of the moved arguments) → the tangents of the floating results."""
-        n = len(moved)
 
-        def tangent(*args: Array) -> list[Array]:
-            primals, tangents = list(args[:n]), []
-            places = [i for i in range(n) if moved[i]]
-            for i, x in zip(places, args[n:], strict=True):
-                shape = jnp.broadcast_shapes(x.shape, primals[i].shape)
-                primals[i] = jnp.broadcast_to(primals[i], shape)
-                tangents.append(jnp.broadcast_to(x, shape))
+class Tangent(Native):
+    """(x, ẋ of the moved arguments) → the tangents of the floating results."""
 
-            def along(*xs: Array) -> list[Array]:
-                replaced = dict(zip(places, xs, strict=True))
-                results = self(*(replaced.get(i, primals[i]) for i in range(n)))
-                return [y for y in results if jnp.issubdtype(y.dtype, jnp.inexact)]
+    def __init__(self, whole: Native, moved: tuple[bool, ...]) -> None:
+        super().__init__(self._along)
+        self.whole, self.count = whole, len(moved)
+        self.places = [i for i, flag in enumerate(moved) if flag]
 
-            return jax.jvp(along, [primals[i] for i in places], tangents)[1]
+    def shapes(self, args: Sequence[Array]) -> list[Any]:
+        """Those of the floating results, as the whole has been traced already."""
+        given = list(args[: self.count])
+        for i, x in zip(self.places, args[self.count :], strict=True):
+            shape = jnp.broadcast_shapes(x.shape, given[i].shape)
+            given[i] = jax.ShapeDtypeStruct(shape, given[i].dtype)
+        return list(filter(is_real, self.whole.shapes(given)))
 
-        return Native(tangent)
+    def _along(self, *args: Array) -> list[Array]:
+        primals, tangents = list(args[: self.count]), []
+        for i, x in zip(self.places, args[self.count :], strict=True):
+            shape = jnp.broadcast_shapes(x.shape, primals[i].shape)
+            primals[i] = jnp.broadcast_to(primals[i], shape)
+            tangents.append(jnp.broadcast_to(x, shape))
 
-    def _transposed(self, linear: tuple[bool, ...], avals: Any, rank: int) -> Native:
-        """(the other arguments, ȳ) → cotangents of the arguments in which it is linear.
+        def along(*xs: Array) -> list[Array]:
+            replaced = dict(zip(self.places, xs, strict=True))
+            results = self.whole(*(replaced.get(i, x) for i, x in enumerate(primals)))
+            return list(filter(is_real, results))
 
-        Args:
-            linear: in which arguments.
-            avals: their shapes and dtypes without the batch axes that are added later.
-            rank: of the first ȳ without these.
-        """
-        n = len(linear)
-        places = [i for i in range(n) if linear[i]]
-        others = [i for i in range(n) if not linear[i]]
+        return jax.jvp(along, [primals[i] for i in self.places], tangents)[1]
 
-        def transposed(*args: Array) -> list[Array]:
-            batch = batch_of(args, args[len(others)].ndim - rank)
-            fixed = dict(zip(others, args[: len(others)], strict=True))
-            cotangents = spread(list(args[len(others) :]), batch)
 
-            def along(*xs: Array) -> list[Array]:
-                replaced = fixed | dict(zip(places, xs, strict=True))
-                return spread(self(*(replaced[i] for i in range(n))), batch)
+class Transposed(Native):
+    """(the other arguments, ȳ) → cotangents of the arguments in which a function is linear.
 
-            inputs = [jnp.zeros((*shape, *batch), dtype) for shape, dtype in avals]
-            return list(jax.vjp(along, *inputs)[1](cotangents))
+    Attributes:
+        whole: the function.
+        linear: in which arguments.
+        avals: their shapes and dtypes without the batch axes that are added later.
+        rank: of the first ȳ without these.
+    """
 
-        return Native(transposed)
+    def __init__(self, whole: Native, linear: tuple[bool, ...], avals: Any, rank: int) -> None:
+        super().__init__(self._back)
+        self.whole, self.linear, self.avals, self.rank = whole, linear, avals, rank
+        self.fixed = linear.count(False)
+
+    def shapes(self, args: Sequence[Array]) -> list[Any]:
+        """Those of the arguments in which it is linear."""
+        return [ShapedArray(x.shape, x.dtype) for x in self._arguments(args)]
+
+    def _arguments(self, args: Sequence[Array]) -> list[Any]:
+        """Shapes and dtypes of the arguments in which it is linear."""
+        batch = self._batch(args)
+        return [jax.ShapeDtypeStruct((*shape, *batch), dtype) for shape, dtype in self.avals]
+
+    def _batch(self, args: Sequence[Array]) -> tuple[int, ...]:
+        added = args[self.fixed].ndim - self.rank
+        return jnp.broadcast_shapes(*(x.shape[x.ndim - added :] for x in args))
+
+    def _back(self, *args: Array) -> list[Array]:
+        batch, given = self._batch(args), args[: self.fixed]
+
+        def along(*xs: Array) -> list[Array]:
+            moving, fixed = iter(xs), iter(given)
+            merged = (next(moving) if flag else next(fixed) for flag in self.linear)
+            return spread(self.whole(*merged), batch)
+
+        cotangents = spread(list(args[self.fixed :]), batch)
+        return list(jax.linear_transpose(along, *self._arguments(args))(cotangents))
 
 
 class Part(Native):
@@ -142,8 +166,15 @@ class Part(Native):
         super().__init__(self._chosen)
         self.whole, self.wanted = whole, wanted
 
+    def shapes(self, args: Sequence[Array]) -> list[Any]:
+        """Those of the wanted results."""
+        return self._among_wanted(self.whole.shapes(args))
+
     def _chosen(self, *args: Array) -> list[Array]:
-        return [y for y, flag in zip(self.whole(*args), self.wanted, strict=True) if flag]
+        return self._among_wanted(self.whole(*args))
+
+    def _among_wanted(self, results: Sequence[Any]) -> list[Any]:
+        return [y for y, flag in zip(results, self.wanted, strict=True) if flag]
 
     def _traced(self, *avals: Any) -> Any:
         closed = self.whole.traced(*avals)
@@ -222,6 +253,11 @@ def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
     return mapped
 
 
+def is_real(x: Any) -> bool:
+    """Whether it is of floating numbers, which have derivatives."""
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
 def batch_of(tree: PyTree, rank: int) -> tuple[int, ...]:
     """The shape of the `rank` trailing batch axes over all arrays of a tree."""
     shapes = (x.shape[x.ndim - rank :] for x in jax.tree.leaves(tree) if isinstance(x, jax.Array))
@@ -269,9 +305,7 @@ def _jvp(primals: Any, tangents: Any, *, fun: Native) -> Any:
     given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
     moving = iter(native_p.bind(*primals, *given, fun=fun.tangent(moved)))
     return results, [
-        next(moving)
-        if jnp.issubdtype(y.dtype, jnp.inexact)
-        else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
+        next(moving) if is_real(y) else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
         for y in results
     ]
 
