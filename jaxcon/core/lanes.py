@@ -70,14 +70,18 @@ class Vector:
         if isinstance(x, Vector):
             return x
         if isinstance(x, jax.Array):
-            return cls(*(jax.lax.index_in_dim(x, i, keepdims=False) for i in range(x.shape[0])))
+            return cls(*(jnp.squeeze(row, 0) for row in jax.lax.split(x, (1,) * x.shape[0])))
         return cls(*x)
 
     @classmethod
     def of_rows(cls, x: Array, start: int, components: int, elements: int) -> Vector:
-        """From rows of an array: those of all elements for each component, from `start` on."""
-        places = (start + i * elements for i in range(components))
-        return cls(*(jax.lax.slice_in_dim(x, i, i + elements) for i in places))
+        """From rows of an array: those of all elements for each component, from `start` on.
+
+        They are split at once, since the transpose of that is one concatenation, and that of slices
+        as many padded arrays and their sum.
+        """
+        rest = len(x) - start - components * elements
+        return cls(*jax.lax.split(x, (start, *(elements,) * components, rest))[1:-1])
 
     def stack(self) -> Array:
         """The array with the components along the first axis."""

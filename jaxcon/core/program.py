@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -210,6 +211,9 @@ class Program:
         if name in REDUCTIONS and _leading(params["axes"], equation.invars[0].aval.shape):
             fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
             return self._inline_closed(jax.make_jaxpr(fold)(equation.invars[0].aval), args)
+        if name == "split":
+            parts = functools.partial(slices, params["sizes"], params["axis"])
+            return self._inline_closed(jax.make_jaxpr(parts)(equation.invars[0].aval), args)
         if name == "scan":
             jaxpr, plain = self._inner(params["jaxpr"])
             return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain)
@@ -256,6 +260,13 @@ def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -
     return functools.reduce(operation, waiting, x[0])
 
 
+def slices(sizes: Sequence[int], axis: int, x: Array) -> list[Array]:
+    """The parts of these sizes along an axis, one by one, so that kernels read through them."""
+    ends = itertools.accumulate(sizes)
+    pairs = zip(ends, sizes, strict=True)
+    return [jax.lax.slice_in_dim(x, end - size, end, axis=axis) for end, size in pairs]
+
+
 def _leading(axes: Any, shape: tuple[int, ...]) -> bool:
     """Whether these are the first axes, none of them empty."""
     return tuple(axes) == tuple(range(len(axes))) and all(shape[: len(axes)])
@@ -277,6 +288,8 @@ def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
         power = power.value
     if isinstance(power, int | float | np.generic) and power == 0:
         return [Constant(np.ones(aval.shape, aval.dtype))]
+    if name == "pad" and not any(map(any, equation.params["padding_config"])):
+        return [args[0]]
     if name == "select_n" and all(x is args[1] or x == args[1] for x in args[2:]):
         return [args[1]]
     if name == "select_n" and isinstance(args[0], Constant) and jnp.shape(args[0].value) == ():

@@ -284,8 +284,9 @@ def implicit_multipliers(
     corner = None if width is None else jnp.asarray(width, scale.dtype)[None]
 
     def law(x: Array) -> Array:
-        # g and the width are choices, without derivatives of their own; said inside, as a root
-        # gives all that its function closes over a tangent, and 0·(1/g²) is NaN where 1/g² overflows
+        # g and the width are choices, without derivatives of their own. That is said in here, since
+        # a root gives a tangent to all that its function closes over, and where 1/g² overflows the
+        # product of it with a tangent of zero is NaN
         fixed, smooth = jax.lax.stop_gradient((scale, corner))
         return laws(kinds, fixed, x, velocity(x), live, smooth)
 
