@@ -31,10 +31,11 @@ from jaxcon.constraints.base import Joints, RowSet, gather
 from jaxcon.constraints.joints import anchors
 from jaxcon.constraints.pairs import check_oriented
 from jaxcon.constraints.primitives import Row
-from jaxcon.core import checks, native
+from jaxcon.core import checks
 from jaxcon.core.lanes import Vector, plus, times, total
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import per_world
 from jaxcon.geometry.pose import Pose
 from jaxcon.model.elements import label
 
@@ -97,7 +98,7 @@ class Curves(Joints):
         """φ, φ̇, J and γ at one instant."""
         along = self.place(snapshot)
         x, ẋ = (Vector(*(getattr(r, f) for r in along)).stack()[:, 0] for f in ("value", "rate"))
-        derivatives = native.per_world(self._derivatives, snapshot.q.ndim - 1)
+        derivatives = per_world(self._derivatives, snapshot.q.ndim - 1)
         found = zip(*derivatives(x, ẋ, self.given), strict=True)
         rows = [chain(g, ġ, bend, gradient, along) for g, ġ, bend, gradient in found]
         return gather(snapshot, self.places, rows)

@@ -13,10 +13,11 @@ import numpy as np
 
 from jaxcon.constraints import autodiff
 from jaxcon.constraints.base import RowSet
-from jaxcon.core import checks, native
+from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import per_world
 from jaxcon.model.generalized import WHOLE
 from jaxcon.model.layout import Place
 
@@ -125,7 +126,7 @@ class Custom:
     def linearized(self, snapshot: Any) -> tuple[Array, Array, Array, tuple[Array, ...]]:
         """φ, φ̇, γ (m,) and ∂φ̇/∂v by bodies (m, d), batches behind."""
         given = (snapshot.system, self, snapshot.q, snapshot.v, snapshot.t)
-        return native.per_world(_numbers, snapshot.q.ndim - 1)(*given)
+        return per_world(_numbers, snapshot.q.ndim - 1)(*given)
 
     def problem(self, snapshot: Any) -> tuple[Any, Any, Any, Any]:
         """q and v as lists, q̇ = N(q) v, and the function as call(q, v, t)."""

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.base import RowSet, gather
-from jaxcon.core import native
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import per_world
 from jaxcon.model.coordinates import JointCoordinate
 from jaxcon.model.layout import Place
 
@@ -68,7 +68,7 @@ class Drives:
     def rows(self, snapshot: Any) -> RowSet:
         """φ = θ − θ*(t), φ̇ = θ̇ − θ̇*, γ = γ_θ − θ̈*, by two nested derivatives of the motion."""
         row = self.along.read(snapshot)
-        motion = native.per_world(self._motion, snapshot.q.ndim - 1)
+        motion = per_world(self._motion, snapshot.q.ndim - 1)
         target, rate, bias = (x[None] for x in motion(snapshot.t, self.params))
         error = self.along.difference(snapshot, row, target)
         row = row._replace(value=error, rate=row.rate - rate, bias=row.bias - bias)

@@ -23,9 +23,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core import native
 from jaxcon.core.lanes import Matrix, Vector, total
 from jaxcon.core.typing import Array
+from jaxcon.core.worlds import lift, per_world
 
 LEAST = 4
 """Heights along each axis."""
@@ -88,7 +88,7 @@ class Surface:
             x = values
             for axis, (_, orders) in enumerate(along):
                 w = orders[axes.count(axis)]
-                x = total(native.lift(w[k], x[k]) * x[k] for k in range(LEAST))
+                x = total(lift(w[k], x[k]) * x[k] for k in range(LEAST))
             for axis in axes:
                 x = x / steps[axis]
             return x
@@ -146,7 +146,7 @@ class Surface:
                 index.append(start.reshape(*(1,) * axes, -1) + steps)
             return heights.at[tuple(index)].get(mode="clip")
 
-        return native.per_world(one, starts[0].ndim - 1)(self.heights, *starts)
+        return per_world(one, starts[0].ndim - 1)(self.heights, *starts)
 
 
 def _weights(u: Array, count: int) -> tuple[Array, tuple[Vector, Vector, Vector]]:

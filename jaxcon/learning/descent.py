@@ -16,10 +16,10 @@ from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
 from jaxcon.core.devices import over_devices
-from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import keep
 from jaxcon.learning.leaves import Space
 from jaxcon.simulation.recovery import contain
 

@@ -13,10 +13,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core import checks, native, numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector, times, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
+from jaxcon.core.worlds import per_world
 from jaxcon.geometry.pose import Pose
 from jaxcon.model.elements import Elements, own_point
 from jaxcon.model.layout import Place
@@ -244,7 +245,7 @@ class CustomForces(Elements):
         start, stop = self.channel
         own = control[start:stop] if control is not None and stop > start else None
         given = (snapshot.system, self.params, snapshot.q, snapshot.v, snapshot.t, own)
-        wrenches = native.per_world(self._wrenches, rank)(*given)
+        wrenches = per_world(self._wrenches, rank)(*given)
         for place, wrench, name in zip(self.places, wrenches, self.bodies, strict=True):
             if place.group is None:  # the world takes up any force
                 continue

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
-from jaxcon.core.native import keep, lift
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import keep, lift
 from jaxcon.dynamics.parts import Outlook
 
 

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jaxcon.constraints.bound_layout import BoundLayout, Reactions
 from jaxcon.constraints.bounds import BoundRows, has_ends
 from jaxcon.core import checks, numerics, status
-from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import Outlook, Part, Struck, look
 from jaxcon.model.state import State, recall
 from jaxcon.simulation.arrival import Arrival, Search

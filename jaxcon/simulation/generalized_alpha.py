@@ -11,10 +11,10 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, layout_of, linearize
 from jaxcon.core import checks, status
-from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
+from jaxcon.core.worlds import keep
 from jaxcon.dynamics.forward import Dynamics, saddle
 from jaxcon.dynamics.vakonomic import Vakonomic
 from jaxcon.model.state import State

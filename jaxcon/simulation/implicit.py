@@ -21,9 +21,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, linearize
-from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
+from jaxcon.core.worlds import per_world
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
 from jaxcon.solvers import lu
@@ -147,7 +147,7 @@ def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
 
     def solve(linear: Any, right: Array) -> tuple[Array, Array]:
         columns = matrix(linear, right)
-        return native.per_world(_solve, right.ndim - 1)(columns, right, inertia)
+        return per_world(_solve, right.ndim - 1)(columns, right, inertia)
 
     def newton(residual: Any, guess: Array) -> tuple[Array, tuple[Array, Array]]:
         def improve(known: Any, _: None) -> tuple[Any, None]:

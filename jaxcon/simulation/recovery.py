@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.native import keep, lift, spread
 from jaxcon.core.pytree import Parts
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import keep, lift, spread
 
 
 def contain(function: Callable[..., Any], args: PyTree) -> Any:

@@ -11,10 +11,10 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
-from jaxcon.core.native import keep
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import keep
 from jaxcon.model.state import State
 from jaxcon.simulation.recovery import contain
 from jaxcon.stabilization.baumgarte import Law, check_stabilizer

@@ -12,10 +12,10 @@ from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero
 
 from jaxcon.core import checks, numerics
 from jaxcon.core.closures import opened
-from jaxcon.core.native import keep
 from jaxcon.core.pytree import Parts, pytree, static
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import keep
 from jaxcon.model.state import State
 from jaxcon.simulation.adjoints import Path
 

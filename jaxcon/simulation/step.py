@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks, native, status
-from jaxcon.core.native import keep
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import batch_of, keep, per_world, spread
 from jaxcon.model.state import State, at, recall
 from jaxcon.simulation.attempt import StepInfo, attempt, dynamics_at
 from jaxcon.simulation.initialize import check_dtype
@@ -74,10 +74,10 @@ def contained_step(
 ) -> tuple[State, StepInfo]:
     """One step of worlds along trailing axes; those that fail stop, with their gradients."""
     if not hasattr(system, "layout") and state.q.ndim > 1:
-        one = native.per_world(contained_step, state.q.ndim - 1)
+        one = per_world(contained_step, state.q.ndim - 1)
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
-    whole = native.spread(state, native.batch_of(args, state.q.ndim - 1))
+    whole = spread(state, batch_of(args, state.q.ndim - 1))
     args = (system, method, whole, control, dt)
     if method.recovery is None:
         return contain(_step, args)[0]
@@ -144,10 +144,10 @@ def forward_dynamics(
 def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Solution:
     """Of worlds along trailing axes."""
     if not hasattr(system, "layout") and state.q.ndim > 1:
-        one = native.per_world(_dynamics, state.q.ndim - 1)
+        one = per_world(_dynamics, state.q.ndim - 1)
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
-    state = native.spread(state, native.batch_of(args, state.q.ndim - 1))
+    state = spread(state, batch_of(args, state.q.ndim - 1))
     dynamics = dynamics_at(system, method, state, control, dt)
     return dynamics(state.q, state.v, state.time)[0]
 

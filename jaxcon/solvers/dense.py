@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 
-from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
+from jaxcon.core.worlds import per_world
 from jaxcon.solvers import lu
 from jaxcon.solvers.saddle import Factored, Saddle, Solution, free_motion, judge
 
@@ -31,8 +31,8 @@ class Dense:
         if not system.target.size:
             return free_motion(system)
         rank = system.target.ndim - 1
-        known = native.per_world(_factor, rank)(system)
-        return lambda force, target: native.per_world(_solve, rank)(known, force, target)
+        known = per_world(_factor, rank)(system)
+        return lambda force, target: per_world(_solve, rank)(known, force, target)
 
 
 def _factor(system: Saddle) -> lu.Factored:

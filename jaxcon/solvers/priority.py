@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core import checks, native, numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, first
 from jaxcon.core.typing import Array
+from jaxcon.core.worlds import per_world
 from jaxcon.solvers.saddle import Factored, Mass, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import delassus
 
@@ -130,10 +131,10 @@ class Lexicographic:
             for x, y in zip(given, usual, strict=True)
         )
         rounding = system.target.shape[0] * float(jnp.finfo(dtype).eps)
-        known = native.per_world(partial(_factor, parts), rank)(
+        known = per_world(partial(_factor, parts), rank)(
             system, jnp.maximum(cutoff, rounding), damping
         )
-        solve = native.per_world(partial(_solve, parts), rank)
+        solve = per_world(partial(_solve, parts), rank)
         return lambda force, target: solve(known, force, target, conflict)
 
     def _parts(self, system: Saddle) -> tuple[np.ndarray, ...]:

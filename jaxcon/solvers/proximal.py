@@ -8,10 +8,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core import checks, native
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array
+from jaxcon.core.worlds import keep, per_world
 from jaxcon.solvers.delassus import diagonal
 from jaxcon.solvers.jacobian import Jacobian
 from jaxcon.solvers.saddle import Diagonal, Factored, Mass, Saddle, Solution
@@ -81,7 +82,7 @@ class RankSafe:
             settled = independent | failed(known.status)
 
             def rescued() -> Solution:
-                return native.keep(settled, known, self._iterated(system)(force, target))
+                return keep(settled, known, self._iterated(system)(force, target))
 
             return jax.lax.cond(jnp.all(settled), lambda: known, rescued)
 
@@ -173,7 +174,7 @@ def own_diagonal(mass: Mass, jacobian: Jacobian, worlds: int) -> Array:
     """
     if isinstance(mass, Diagonal):
         return diagonal(jacobian, 1 / mass.diagonal)
-    return native.per_world(_diagonal, worlds)(mass, jacobian)
+    return per_world(_diagonal, worlds)(mass, jacobian)
 
 
 def _diagonal(mass: Mass, jacobian: Jacobian) -> Array:

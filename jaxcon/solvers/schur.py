@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core import native
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
+from jaxcon.core.worlds import per_world
 from jaxcon.solvers.saddle import Factored, Mass, Saddle, Solution, free_motion, judge
 
 
@@ -42,8 +42,8 @@ class Schur:
         if not system.target.size:
             return free_motion(system)
         rank = system.target.ndim - 1
-        known = native.per_world(_factor, rank)(system, self.tikhonov)
-        return lambda force, target: native.per_world(_solve, rank)(known, force, target)
+        known = per_world(_factor, rank)(system, self.tikhonov)
+        return lambda force, target: per_world(_solve, rank)(known, force, target)
 
 
 @pytree

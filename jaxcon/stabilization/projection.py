@@ -13,10 +13,10 @@ import numpy as np
 
 from jaxcon.constraints.rows import RowLayout, Rows, linearize
 from jaxcon.core import checks, numerics, status
-from jaxcon.core.native import lift
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import lift
 from jaxcon.dynamics.forward import saddle
 from jaxcon.model.state import State
 from jaxcon.solvers import roots
