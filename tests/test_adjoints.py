@@ -201,6 +201,19 @@ def test_a_cut_stops_what_is_not_finite():
     assert jax.grad(value)(0.0) == 0.0
 
 
+def test_no_steps_lead_nowhere_whatever_is_kept():
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+    for adjoint in (DEFAULT, jc.Checkpoints(), jc.Checkpoints(levels=3), jc.Reversible()):
+        method = jc.Method(jc.RATTLE()) if isinstance(adjoint, jc.Reversible) else jc.Method()
+        start = jc.init(system, method, state.q, state.v)
+        final, path = jc.rollout(system, method, start, None, 1e-2, 0, adjoint=adjoint)
+        np.testing.assert_array_equal(final.q, start.q)
+        assert path.q.shape == (0, 2)
+
+
 @pytest.mark.parametrize("steps", [1, 2, 10, 100, 1000, 4097])
 @pytest.mark.parametrize("levels", [1, 2, 3])
 def test_states_kept_grow_as_a_root(steps, levels):
@@ -248,6 +261,8 @@ def test_a_budget_takes_as_few_levels_as_it_can():
         (jc.Checkpoints(segments=3, budget=9), ValueError, "exclude each other"),
         (jc.Checkpoints(levels=3, segments=3), ValueError, "exclude each other"),
         (jc.Checkpoints(segments=[2]), ValueError, "as a tuple"),
+        (jc.Checkpoints(segments=()), ValueError, "as a tuple of one number or more"),
+        (jc.Checkpoints(budget="1MB"), ValueError, "budget must be a whole number"),
         (jc.Truncated(0), ValueError, "steps must be a whole number"),
         (jc.Discounted(-0.5), ValueError, "factor must be zero or more"),
         (jc.Discounted(1.5), ValueError, "factor must be from 0 to 1"),

@@ -146,6 +146,16 @@ def test_ridders_takes_away_every_even_power():
     assert np.all(uncertainty < 1e-11)
 
 
+def test_differences_know_what_rounding_makes_of_them():
+    """Of noise that no spacing of f foretells, as of many steps of a rollout."""
+    steps, random = 0.1 * 0.5 ** np.arange(10), np.random.default_rng(0)
+    noise = 1e-5 * random.normal(size=(2000, 10)) / steps
+    best, uncertainty = ridders(2.0 + 3 * steps**2 - steps**4 + noise)
+    off = np.abs(best - 2.0)
+    assert np.mean(off > 4 * uncertainty) < 1e-2
+    assert np.median(uncertainty) < 10 * np.median(off)
+
+
 def swing(height, dtype=None):
     """A bob on a rod of 1 m, hanging or upright."""
     scene = jc.Scene(dim=2, dtype=dtype)

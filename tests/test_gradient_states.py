@@ -27,6 +27,12 @@ def test_a_thousand_states_have_finite_derivatives_of_both_modes(choice):
     assert (row.compared > row.undecided) == (choice[-1] == "float64"), row
 
 
+def test_a_ball_that_hardly_leaves_its_plane_has_finite_derivatives():
+    """Restitution weighs works of 1e-20 J there, and one over their squares is beyond float32."""
+    row = gradient_states.measure("ball on a plane", 3, "projection", "float32", 486, 0)
+    assert row.broken == 0, row
+
+
 def drag(a, b, t, u, p):
     """A force of finite size, whose derivative is not where the gap has no length."""
     gap = b.position - a.position

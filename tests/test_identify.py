@@ -62,6 +62,15 @@ def test_the_direction_that_data_do_not_tell_is_named(noise):
     np.testing.assert_allclose(found.params["size"], found.params["gain"], rtol=1e-6)  # as at start
 
 
+def test_what_is_masked_was_not_seen():
+    time = np.linspace(0, 1, 20)
+    data = np.ma.masked_array(2 * time, mask=np.arange(20) == 3)
+    data.data[3] = 50.0
+    found = jc.identify(lambda p: p * time, 1.0, data)
+    np.testing.assert_allclose(found.params, 2.0, rtol=1e-7)
+    assert found.observed == 19
+
+
 def test_errors_are_those_of_linear_least_squares():
     """σ² (XᵀX)⁻¹, in the units of the parameters."""
     X = np.random.default_rng(1).normal(size=(50, 3))
@@ -579,6 +588,11 @@ def test_what_does_not_fit_is_refused_in_words():
         jc.identify(wave, {"a": 1.0, "b": 0.0}, WAVE, noise=np.full((300, 1), 0.01))
     with pytest.raises(ValueError, match=r"noise of shapes \[\(\)\] .* in their structure"):
         jc.identify(wave, {"a": 1.0, "b": 0.0}, WAVE, noise={"c": 1.0})
+    for data in (np.ones(3, complex), np.ones(3, bool), "hello"):
+        with pytest.raises(ValueError, match="data must be real numbers"):
+            jc.identify(lambda p: p * jnp.ones(3), 1.0, data)
+    with pytest.raises(ValueError, match="nodes={} hold no array; leave them out"):
+        jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes={})
     nodes = {"x": jnp.ones(3), "v": jnp.ones(3)}
     # these would otherwise be compared with a node number by number, or be shared among its numbers
     ends = {"0 .., 1 ..": lambda n: (n["v"], n["x"]), "an array ..": lambda n: n["x"]}

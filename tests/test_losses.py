@@ -45,6 +45,8 @@ def test_tracking_says_what_does_not_fit():
         jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})
     with pytest.raises(ValueError, match=r"scale of shape \(4, 1\).*\(3, 1\)"):
         jc.losses.tracking(jnp.ones((3, 1)), np.zeros((3, 1)), np.ones((4, 1)))
+    with pytest.raises(ValueError, match="reference is NaN throughout"):
+        jc.losses.tracking({"tip": jnp.ones(3)}, {"tip": np.full(3, np.nan)})
     with pytest.raises(ValueError, match="structure"):
         jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"toe": np.zeros((3, 2))})
 

@@ -135,3 +135,7 @@ def test_memory_of_gradients_is_foretold_and_grows_as_a_root():
         300, 1000, jc.Checkpoints()
     )
     assert f"{memory.state} B by checkpoint" in str(memory)
+    with pytest.raises(ValueError, match="worlds must be a whole number from 1, got 1.5"):
+        memory.of(1.5, 10)
+    with pytest.raises(ValueError, match="steps must be a whole number from 0, got -3"):
+        memory.of(64, -3)

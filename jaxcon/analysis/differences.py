@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import jax
@@ -56,18 +57,44 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Each column of Neville's table takes away the next even power of the step. The entry that
     differs least from the two that it is made of is taken for the best. That one may owe it to
-    chance, and so the fourth least of these differences says how exact it is.
+    chance, and so the fourth least of these differences says how exact it is. Nor is an entry more
+    exact than `scatter` lets it be.
 
     Args:
         slopes: (directions, levels), from the largest step on.
     """
-    column, entries, apart = slopes, [], []
-    for power in range(1, slopes.shape[1]):
-        factor = 4.0**power
-        after = (factor * column[:, 1:] - column[:, :-1]) / (factor - 1)
-        apart += [np.maximum(np.abs(after - column[:, 1:]), np.abs(after - column[:, :-1]))]
-        entries, column = [*entries, after], after
-    table, spread = np.concatenate(entries, axis=1), np.concatenate(apart, axis=1)
+    columns = neville(slopes)
+    apart = [
+        np.maximum(np.abs(after - before[:, 1:]), np.abs(after - before[:, :-1]))
+        for before, after in itertools.pairwise(columns)
+    ]
+    table, spread = np.concatenate(columns[1:], axis=1), np.concatenate(apart, axis=1)
+    spread = np.maximum(spread, scatter(slopes))
     order = np.argsort(np.where(np.isfinite(spread), spread, np.inf), axis=1)
     pick = [np.take_along_axis(x, order, axis=1) for x in (table, spread)]
     return pick[0][:, 0], pick[1][:, 3]
+
+
+def neville(slopes: np.ndarray) -> list[np.ndarray]:
+    """The columns of Neville's table: (directions, levels), (directions, levels − 1) and so on."""
+    columns = [slopes]
+    for power in range(1, slopes.shape[1]):
+        factor, last = 4.0**power, columns[-1]
+        columns.append((factor * last[:, 1:] - last[:, :-1]) / (factor - 1))
+    return columns
+
+
+def scatter(slopes: np.ndarray) -> np.ndarray:
+    """What rounding makes of each entry of Neville's table after its first column, (directions, n).
+
+    The entries of the third column with the smallest steps tell it: by h⁶ they differ less than by
+    the rounding of f over the step, which doubles as steps are halved.
+
+    Args:
+        slopes: (directions, levels), from the largest step on.
+    """
+    columns, unit = neville(slopes), neville(np.diag(2.0 ** np.arange(slopes.shape[1])))
+    between = np.linalg.norm(np.diff(unit[2], axis=1), axis=0)
+    last = (np.diff(columns[2], axis=1) / between)[:, -3:]
+    own = np.sqrt(np.mean(last**2, axis=1, keepdims=True))
+    return own * np.concatenate([np.linalg.norm(x, axis=0) for x in unit[1:]])

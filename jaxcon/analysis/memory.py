@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
@@ -109,7 +110,12 @@ class GradientMemory:
             worlds: of the batch.
             steps: of the rollout.
             adjoint: as of `rollout`.
+
+        Raises:
+            ValueError: worlds or steps are no whole numbers, or too few.
         """
+        checks.count("gradient memory", "worlds", worlds)
+        checks.count("gradient memory", "steps", steps, 0)
         check_adjoint(adjoint)
         *checkpoints, last = adjoint.kept(steps, self.start)
         own = self.working + sum(checkpoints) * self.state + last * self.step

@@ -78,9 +78,14 @@ def settled(function: Any, args: Sequence[Array]) -> list[Array]:
         function: with `traced`, its closed jaxpr for arguments of some shapes.
         args: its arguments.
     """
-    if os.environ.get("JAXCON_STAGES") == "off":
+    if not staged():
         return function(*args)
     return Stages(traced(function, args))(*args)
+
+
+def staged() -> bool:
+    """Whether functions are cut into stages, rather than left to the compiler as they are."""
+    return os.environ.get("JAXCON_STAGES") != "off"
 
 
 class Stages:

@@ -272,6 +272,8 @@ def _in_stages(*args: Array, fun: Native) -> list[Array]:
     time of compiling them and makes the vectorized code no faster.
     """
     lanes = [jnp.expand_dims(x, -1) for x in args]
+    if not fusion.staged():
+        return squeezed(*fun(*lanes))
     # were it inlined, XLA would copy the results to move the batch to the front
     return fusion.uninlined(squeezed, fusion.settled(fun, lanes))
 

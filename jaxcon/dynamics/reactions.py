@@ -268,12 +268,14 @@ class Impulse:
         square = work(more, change) / 2
         room = jnp.maximum(-start, 0)
         inner = jnp.abs(linear) + numerics.safe_sqrt(linear * linear + 4 * square * room)
-        # two forms of one root, each where it subtracts nothing
-        few, many = numerics.safe_divide(2 * room, inner), numerics.safe_divide(inner, 2 * square)
-        most = jnp.where(linear > 0, few, many)
         rounding = 64 * float(jnp.finfo(free.dtype).eps)
         gains = start + linear + square > rounding * work(jnp.abs(more), jnp.abs(mean))
-        return jnp.where(gains & (start + linear + square > start), jnp.clip(most, 0, 1), 1)
+        gains, grows = gains & (start + linear + square > start), linear > 0
+        # two forms of one root, each where it subtracts nothing, and nothing where none is asked:
+        # of work that is nearly nothing a quotient has a derivative beyond float32
+        few = 2 * room / jnp.where(gains & grows, inner, 1)
+        many = inner / jnp.where(gains & ~grows, 2 * square, 1)
+        return jnp.where(gains, jnp.clip(jnp.where(grows, few, many), 0, 1), 1)
 
 
 def probes(like: Array) -> list[Array]:

@@ -151,8 +151,8 @@ def identify(
             its end, in the structure of a node. Trouble on the way should show as NaN
             (`losses.unless_failed`).
         params: the start; leaves as of `tune`.
-        data: what was recorded, in the structure of the predictions, NaN where nothing was seen;
-            with nodes an axis of stretches comes first.
+        data: what was recorded, in the structure of the predictions, NaN or masked where nothing
+            was seen; with nodes an axis of stretches comes first.
         noise: standard deviation of the data, a number or a pytree whose leaves broadcast to those
             of the data; estimated from what remains unless given.
         positive: as of `tune`.
@@ -192,6 +192,7 @@ def identify(
     for x in jax.tree.leaves(noise):
         checks.positive("identify", "noise", x)
     _check_nodes(nodes)
+    data = jax.tree.map(recorded, data)
     space = space_of(params, positive, bounds, "identify")
     own = space.encode(params)
     batch = scattered(space, own, restarts, spread, key, "identify")
@@ -215,6 +216,8 @@ def _check_nodes(nodes: PyTree) -> None:
         ValueError: they are no arrays of real numbers with one first axis.
     """
     leaves = [jnp.asarray(x) for x in jax.tree.leaves(nodes)]
+    if nodes is not None and not leaves:
+        raise ValueError(f"identify: nodes={nodes!r} hold no array; leave them out to have none.")
     real = all(x.ndim and jnp.issubdtype(x.dtype, jnp.floating) for x in leaves)
     if not real or len({x.shape[:1] for x in leaves}) > 1:
         given = [f"{x.dtype} {x.shape}" for x in leaves]
@@ -222,6 +225,22 @@ def _check_nodes(nodes: PyTree) -> None:
             "identify: nodes must be arrays of floating numbers with one first axis of stretches,"
             f" got {', '.join(given)}."
         )
+
+
+def recorded(x: Any) -> Any:
+    """Data of real numbers, NaN where they are masked.
+
+    Raises:
+        ValueError: they are none.
+    """
+    kind = np.asarray(x).dtype
+    if kind.kind not in "fiu" and not jnp.issubdtype(kind, jnp.floating):
+        raise ValueError(
+            f"identify: data must be real numbers, NaN where nothing was seen, got {kind}."
+        )
+    if not isinstance(x, np.ma.MaskedArray):
+        return x
+    return x.astype(kind if kind.kind == "f" else float).filled(np.nan)
 
 
 def _ignore() -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Violation
 from jaxcon.core import checks, numerics
@@ -34,8 +35,12 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
             levels, that broadcast with it.
 
     Raises:
-        ValueError: path and reference differ in structure or shape, or the scale has more numbers.
+        ValueError: path and reference differ in structure or shape, the scale has more numbers, or
+            the reference is NaN throughout.
     """
+    known = [x for x in jax.tree.leaves(reference) if jnp.size(x)]
+    if known and checks.is_concrete(known) and all(np.all(np.isnan(x)) for x in known):
+        raise ValueError("tracking: the reference is NaN throughout: there is nothing to track.")
     off = jax.tree.leaves(misfit(path, reference, scale))
     means = [
         jnp.sum(x * x) / jnp.maximum(jnp.sum(~jnp.isnan(wanted), dtype=x.dtype), 1)

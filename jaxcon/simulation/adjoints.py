@@ -138,6 +138,7 @@ class Checkpoints:
             levels = 2 if self.levels is None else self.levels
             checks.count("Checkpoints", "levels", levels)
             return whole_levels(steps, levels)
+        checks.count("Checkpoints", "budget", self.budget)
         own = bytes_of(state)
         levels = range(1, steps.bit_length() + 2)
         choices = [f(steps, n) for n in levels for f in (whole_levels, equal_levels)]
@@ -229,8 +230,10 @@ def check_adjoint(adjoint: Any) -> None:
 
 def _given(segments: int | tuple[int, ...]) -> tuple[int, ...]:
     """The lengths of segments as the user gave them, checked."""
-    if isinstance(segments, list):
-        raise ValueError(f"Checkpoints: give segments as a tuple, {tuple(segments)}.")
+    if isinstance(segments, list) or segments == ():
+        raise ValueError(
+            f"Checkpoints: give segments as a tuple of one number or more, got {segments}."
+        )
     sizes = segments if isinstance(segments, tuple) else (segments,)
     for size in sizes:
         checks.count("Checkpoints", "segments", size)

@@ -30,6 +30,8 @@ def whole_levels(steps: int, levels: int) -> tuple[int, ...]:
     A last segment that is shorter takes a condition in every step, which fuses with nothing. Where
     no such divisors keep hardly more states, the segments are those of `equal_levels`.
     """
+    if steps < 1:
+        return ()
     equal, whole, length = equal_levels(steps, levels), [], steps
     for size in equal:
         length = min(_divisors(length), key=lambda n: abs(math.log(n / size)))
