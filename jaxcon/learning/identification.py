@@ -240,7 +240,7 @@ def recorded(x: Any) -> Any:
         )
     if not isinstance(x, np.ma.MaskedArray):
         return x
-    return x.astype(kind if kind.kind == "f" else float).filled(np.nan)
+    return np.ma.filled(x.astype(kind if kind.kind == "f" else float), np.nan)
 
 
 def _ignore() -> None:
