@@ -138,6 +138,15 @@ def test_nothing_to_differentiate_by():
         jc.check_gradients(jnp.sin, 1.3, tolerance=0.0)
 
 
+def test_what_is_no_function_of_x_is_refused():
+    with pytest.raises(TypeError, match="f must be a function of x, got 3"):
+        jc.check_gradients(3, 1.3)
+    with pytest.raises(TypeError, match=r"called as f\(x\), which it does not take"):
+        jc.check_gradients(lambda x, y: x * y, 1.3)
+    with pytest.raises(ValueError, match="seed must be a whole number from 0"):
+        jc.check_gradients(jnp.sin, 1.3, seed=-1)
+
+
 def test_ridders_takes_away_every_even_power():
     steps = 0.1 * 0.5 ** np.arange(10)
     slopes = 2.0 + np.stack([3 * steps**2 - steps**4, np.sin(steps) * steps])

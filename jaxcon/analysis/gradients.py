@@ -148,11 +148,14 @@ def check_gradients(
 
     Raises:
         ValueError: x or f has no floating numbers.
+        TypeError: f is no function, or one of other arguments.
 
     References:
         Ridders, Accurate computation of F'(x) and F'(x)F''(x), Adv. Eng. Softw. 4 (1982).
     """
+    checks.takes("check_gradients", "f", f, ("x",))
     checks.count("check_gradients", "directions", directions)
+    checks.count("check_gradients", "seed", seed, 0)
     if tolerance is not None:
         checks.positive("check_gradients", "tolerance", tolerance)
     random = np.random.default_rng(seed)

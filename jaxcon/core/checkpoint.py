@@ -21,7 +21,10 @@ def path(file: str | Path, owner: str) -> Path:
 
     Raises:
         ValueError: nothing can be written there.
+        TypeError: it is no path.
     """
+    if not isinstance(file, str | os.PathLike):
+        raise TypeError(f"{owner}: checkpoint must be the path of a file, got {file!r}.")
     file = Path(file)
     folder = file.parent
     if not folder.is_dir() or not os.access(folder, os.W_OK) or file.is_dir():

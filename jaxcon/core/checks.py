@@ -3,6 +3,7 @@
 Shapes and dtypes are checked always; values only where they are concrete, since a tracer has none.
 """
 
+import inspect
 from typing import Any
 
 import jax
@@ -145,6 +146,32 @@ def finite(owner: str, what: str, x: Any) -> None:
         values = _values(owner, what, x)
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{owner}: {what} must be finite, got {values.tolist()}.")
+
+
+def takes(owner: str, what: str, function: Any, given: tuple[str, ...], why: str = "") -> None:
+    """Checks that a user's function can be called with so many arguments.
+
+    Args:
+        owner: that calls it.
+        what: the function is.
+        function: as it was given.
+        given: what it is called with, in words.
+        why: it is called so.
+
+    Raises:
+        TypeError: it is no function, or one of other arguments.
+    """
+    if not callable(function):
+        raise TypeError(f"{owner}: {what} must be a function of {given[0]}, got {function!r}.")
+    try:
+        inspect.signature(function).bind(*given)
+    except TypeError as error:
+        raise TypeError(
+            f"{owner}: {what} is called as {what}({', '.join(given)}){why}, which it does not take:"
+            f" {error}."
+        ) from error
+    except ValueError:  # a function without a signature
+        return
 
 
 def described(tree: PyTree) -> str:

@@ -179,6 +179,7 @@ def identify(
         ValueError: predictions, data and noise do not fit, unknown names, a start out of its
             bounds, residuals that are finite at no start, or a checkpoint of another search, or
             where none can be written.
+        TypeError: `simulate` is no function, or one of other arguments.
 
     References:
         Bock, Recent advances in parameter identification techniques for ODE (1983).
@@ -192,6 +193,8 @@ def identify(
     for x in jax.tree.leaves(noise):
         checks.positive("identify", "noise", x)
     _check_nodes(nodes)
+    given = ("params",) if nodes is None else ("params", "node")
+    checks.takes("identify", "simulate", simulate, given, " with nodes" * (nodes is not None))
     data = jax.tree.map(recorded, data)
     space = space_of(params, positive, bounds, "identify")
     own = space.encode(params)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 import operator
 from collections.abc import Callable
 from pathlib import Path
@@ -243,15 +242,7 @@ def _check(
         )
     check_key(key, bool(samples) or restarts > 1, "tune")
     given = ("params", "key")[: 1 + bool(samples)]
-    try:
-        inspect.signature(loss).bind(*given)
-    except TypeError as error:
-        raise TypeError(
-            f"tune: the loss is called as loss({', '.join(given)}) with samples={samples}, which it"
-            f" does not take: {error}."
-        ) from error
-    except ValueError:  # a function without a signature
-        return
+    checks.takes("tune", "loss", loss, given, f" with samples={samples}")
 
 
 def _check_mesh(mesh: Mesh | None, samples: int, restarts: int) -> None:
@@ -259,7 +250,10 @@ def _check_mesh(mesh: Mesh | None, samples: int, restarts: int) -> None:
 
     Raises:
         ValueError: they do not.
+        TypeError: it is no mesh.
     """
+    if mesh is not None and not isinstance(mesh, Mesh):
+        raise TypeError(f"tune: mesh must be one of jax.sharding.Mesh, got {mesh!r}.")
     what, count = ("samples", samples) if samples else ("restarts", restarts)
     if mesh is not None and count % mesh.size:
         raise ValueError(
