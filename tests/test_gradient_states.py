@@ -1,8 +1,10 @@
 """Derivatives in many states, singular ones among them: none is NaN, and none is wrong."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -31,6 +33,24 @@ def test_a_ball_that_hardly_leaves_its_plane_has_finite_derivatives():
     """Restitution weighs works of 1e-20 J there, and one over their squares is beyond float32."""
     row = gradient_states.measure("ball on a plane", 3, "projection", "float32", 486, 0)
     assert row.broken == 0, row
+
+
+@pytest.mark.parametrize("integrator", [jc.RATTLE(), jc.GeneralizedAlpha(0.9)], ids=repr)
+def test_steps_of_hardly_any_length_have_finite_tangents_in_single_precision(integrator):
+    """Their equations are divided by h or h², whose derivatives are beyond float32."""
+    scene = jc.Scene(dim=2, dtype=jnp.float32)
+    scene.add_particle("bob", mass=2.0, position=(1.0, 0.0), velocity=(0.0, 0.5))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, start = scene.build()
+    method, dt = jc.Method(integrator), jnp.float32(1e-13)
+    start = jc.init(system, method, start.q, start.v)
+
+    def speed(share):
+        state = dataclasses.replace(start, v=share * start.v)
+        return jc.step(system, method, state, None, dt)[0].v[1]
+
+    slope = jax.jit(jax.jacfwd(speed))(jnp.float32(1.0))
+    np.testing.assert_allclose(slope, 0.5, rtol=1e-5)
 
 
 def drag(a, b, t, u, p):

@@ -90,6 +90,7 @@ class Equations:
         guess: where x is sought: what it was a step ago.
         scheme: the coefficients.
         inertia: the diagonal of M at the start, (n_v,).
+        weights: 1/κβh² and 1/κγh.
     """
 
     def __init__(
@@ -97,6 +98,8 @@ class Equations:
     ) -> None:
         self.dynamics, self.state, self.known = dynamics, state, known
         self.scheme, self.soft = scheme, soft
+        # outside of the root, which gives h a tangent of zeros, and 0/h² may be no number
+        self.weights = 1 / scheme.reach, 1 / scheme.push
         self.guess = jnp.concatenate([known.acceleration, known.multipliers])
         self.inertia = dynamics.system.mass(state.q).diagonal
 
@@ -127,8 +130,8 @@ class Equations:
     def closed(self, rows: Rows, acceleration: Array, multipliers: Array) -> Array:
         """φ/κβh², ψ/κγh, or J v̇⁺ + C λ⁺ + γ where there is compliance, (n_c,)."""
         holonomic = rows.layout.holonomic.reshape(-1, *(1,) * (multipliers.ndim - 1))
-        scaled = rows.residual / self.scheme.reach, rows.rate / self.scheme.push
-        hard = jnp.where(holonomic, *scaled)
+        positions, velocities = self.weights
+        hard = jnp.where(holonomic, rows.residual * positions, rows.rate * velocities)
         hard = hard if self.soft is None else hard + self.soft * multipliers
         if rows.compliance is None:
             return hard

@@ -163,6 +163,8 @@ class _Drift:
     ) -> None:
         self.system, self.q, self.rows, self.momentum = dynamics.system, state.q, rows, momentum
         self.h, self.time = dt[None], state.time + dt
+        # outside of the root, which gives h a tangent of zeros, and 0/h² may be no number
+        self.per_step = numerics.safe_divide(jnp.ones_like(self.h), self.h)
         problem = saddle(self.system, self.q, rows, momentum, rows.rate)
         self.solve: Factored = dynamics.solver.factor(problem)
 
@@ -175,7 +177,7 @@ class _Drift:
         moved = system.retract(self.q, step)
         φ = linearize(system, moved, jnp.zeros_like(v), self.time).residual
         balance = momentum - self.rows.jacobian.transpose(pull) - self.momentum
-        return jnp.concatenate([balance, numerics.safe_divide(φ, self.h)])
+        return jnp.concatenate([balance, φ * self.per_step])
 
     def iterate(self, iterations: int, stopped: Array) -> Any:
         """Quasi-Newton from a start: z, and by how much V changed at last."""

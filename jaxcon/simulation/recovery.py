@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import compress
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 from jaxcon.core.pytree import Parts
 from jaxcon.core.status import failed
@@ -36,16 +38,24 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
 
     contained = jax.custom_jvp(call)
 
-    @contained.defjvp
-    def _(primals: Any, tangents: Any) -> Any:
+    def along(primals: Any, tangents: Any) -> Any:
         floats, others = primals
+        moved = [type(x) is not SymbolicZero for x in tangents[0]]
         batch = jax.eval_shape(call, floats, others)[1].shape
         # a tangent shared by worlds must be masked in each of them
-        full, moved = spread(floats, batch), spread(tangents[0], batch)
-        output, pushforward = jax.linearize(lambda x: call(x, others), full)
-        healthy = ~failed(output[1])
-        return output, _mask(healthy, pushforward(_mask(healthy, moved)))
+        start, given = (spread(list(compress(x, moved)), batch) for x in (floats, tangents[0]))
 
+        def of_moved(xs: list[Array]) -> Any:
+            replaced = iter(xs)
+            merged = [next(replaced) if flag else x for x, flag in zip(floats, moved, strict=True)]
+            return call(merged, others)
+
+        output, pushforward = jax.linearize(of_moved, start)
+        healthy = ~failed(output[1])
+        return output, _mask(healthy, pushforward(_mask(healthy, given)))
+
+    # what does not move is left out: a tangent of zeros is work too, and by 1/h² may be NaN
+    contained.defjvp(along, symbolic_zeros=True)
     return contained(*parts.split(args))
 
 
