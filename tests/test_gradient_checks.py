@@ -147,6 +147,15 @@ def test_what_is_no_function_of_x_is_refused():
         jc.check_gradients(jnp.sin, 1.3, seed=-1)
 
 
+@pytest.mark.parametrize("levels", [6, 7, 8])
+def test_ridders_sees_past_a_kink_within_the_larger_steps(levels):
+    steps = 0.1 * 0.5 ** np.arange(levels)
+    kinks = np.geomspace(steps[-4], steps[0], 100)[:, None]
+    slopes = 2.0 + steps**2 - 3 * steps**4 + 5 * np.maximum(steps - kinks, 0) / steps
+    best, _ = ridders(slopes)
+    np.testing.assert_allclose(best, 2, atol=1e-9)
+
+
 def test_ridders_takes_away_every_even_power():
     steps = 0.1 * 0.5 ** np.arange(10)
     slopes = 2.0 + np.stack([3 * steps**2 - steps**4, np.sin(steps) * steps])

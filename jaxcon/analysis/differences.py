@@ -57,8 +57,8 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     Each column of Neville's table takes away the next even power of the step. The entry that
     differs least from the two that it is made of is taken for the best. That one may owe it to
-    chance, and so the fourth least of these differences says how exact it is. Nor is an entry more
-    exact than `scatter` lets it be.
+    chance, and so the fourth least of these differences says how exact it is, or its `scatter`
+    where that is more. It does not choose: a kink within the larger steps scatters all.
 
     Args:
         slopes: (directions, levels), from the largest step on.
@@ -69,10 +69,11 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         for before, after in itertools.pairwise(columns)
     ]
     table, spread = np.concatenate(columns[1:], axis=1), np.concatenate(apart, axis=1)
-    spread = np.maximum(spread, scatter(slopes))
     order = np.argsort(np.where(np.isfinite(spread), spread, np.inf), axis=1)
-    pick = [np.take_along_axis(x, order, axis=1) for x in (table, spread)]
-    return pick[0][:, 0], pick[1][:, 3]
+    best, fourth = order[:, :1], order[:, 3:4]
+    value, rounding = (np.take_along_axis(x, best, axis=1) for x in (table, scatter(slopes)))
+    doubt = np.maximum(np.take_along_axis(spread, fourth, axis=1), rounding)
+    return value[:, 0], doubt[:, 0]
 
 
 def neville(slopes: np.ndarray) -> list[np.ndarray]:
