@@ -12,6 +12,7 @@ import pytest
 import scenes
 
 import jaxcon as jc
+from jaxcon.core import checks
 
 
 def scene(dim=3, **options):
@@ -708,3 +709,10 @@ def test_what_is_done_for_a_batch_names_what_was_called(call):
     }.get(call, (system, many))
     with pytest.raises(ValueError, match=rf"jax.vmap\(lambda s: jc.{call}\(system, "):
         getattr(jc, call)(*given)
+
+
+def test_of_many_numbers_only_the_first_wrong_one_is_shown():
+    masses = np.ones((5, 4))
+    masses[2, 3] = -1.0
+    with pytest.raises(ValueError, match=r"got -1.0 at \[2, 3\] of an array \(5, 4\)\.$"):
+        checks.positive("body 'a'", "mass", masses)

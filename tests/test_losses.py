@@ -106,3 +106,21 @@ def test_a_failed_world_has_no_loss():
     rows = jc.losses.unless_failed({"each": jnp.ones((2, 3)), "mean": one}, batch)
     np.testing.assert_array_equal(np.isnan(rows["each"]), [[False] * 3, [True] * 3])
     assert jnp.isnan(rows["mean"])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: jc.losses.unless_failed(1.0, 2.0), "state must be the state .* got float"),
+        (
+            lambda: jc.losses.mean_violation(np.ones(3), 0.1),
+            "off must be info.violation .* ndarray",
+        ),
+        (lambda: jc.losses.energy_drift(np.ones(3)), r"energy must be jc.energy\(.* got ndarray"),
+        (lambda: jc.losses.weighted({"a": np.ones(3)}, {"a": 1}), r"term 'a' .* got shape \(3,\)"),
+    ],
+    ids=["state", "violation", "energy", "term"],
+)
+def test_what_is_of_another_kind_is_named(call, message):
+    with pytest.raises((TypeError, ValueError), match=message):
+        call()

@@ -65,6 +65,8 @@ def test_an_optimum_beyond_a_bound_is_left_for_the_bound_itself():
 
     found = jc.tune(watched, BOWL, steps=30, bounds={"b": (-1.0, 1.5)}, optimizer=optax.adam(0.3))
     assert found.params["b"]["c"] == found.aux == 1.5
+    assert found.bounded == ("b/c",)
+    assert "b/c = 1.5, on its bound" in str(found)
     assert max(seen) == 1.5  # reached and never passed
     assert min(seen) >= -1.0
 

@@ -13,6 +13,9 @@ from jax.core import Tracer
 
 from jaxcon.core.typing import Array, PyTree
 
+FEW = 12
+"""Numbers that a message shows whole."""
+
 
 def is_concrete(x: Any) -> bool:
     """Whether every leaf has a value now."""
@@ -72,7 +75,8 @@ def positive(owner: str, what: str, x: Any, strictly: bool = True) -> None:
         good = (values > 0) if strictly else (values >= 0)
         if not np.all(good & np.isfinite(values)):
             bound = "positive" if strictly else "zero or more"
-            raise ValueError(f"{owner}: {what} must be {bound} and finite, got {values.tolist()}.")
+            found = _shown(values, good & np.isfinite(values))
+            raise ValueError(f"{owner}: {what} must be {bound} and finite, got {found}.")
 
 
 def amount(owner: str, what: str, x: Any, dtype: Any) -> Array:
@@ -94,8 +98,10 @@ def between(owner: str, what: str, x: Any, low: float, high: float) -> None:
     """
     if is_concrete(x):
         values = _values(owner, what, x)
-        if not np.all((values >= low) & (values <= high)):
-            raise ValueError(f"{owner}: {what} must lie between {low} and {high}, got {x}.")
+        good = (values >= low) & (values <= high)
+        if not np.all(good):
+            found = _shown(values, good)
+            raise ValueError(f"{owner}: {what} must lie between {low} and {high}, got {found}.")
 
 
 def _values(owner: str, what: str, x: Any) -> np.ndarray:
@@ -111,6 +117,14 @@ def _values(owner: str, what: str, x: Any) -> np.ndarray:
     if not any(jnp.issubdtype(values.dtype, kind) for kind in (jnp.floating, jnp.integer)):
         raise ValueError(f"{owner}: {what} must be a real number, got {x!r}.")
     return values.astype(float)
+
+
+def _shown(values: np.ndarray, good: np.ndarray) -> str:
+    """Numbers in words: all where they are few, else the first that is not good and its place."""
+    if values.size <= FEW:
+        return str(values.tolist())
+    place = tuple(int(i) for i in np.argwhere(~good)[0])
+    return f"{values[place]} at {list(place)} of an array {values.shape}"
 
 
 def count(owner: str, what: str, x: Any, least: int = 1) -> None:
@@ -145,7 +159,8 @@ def finite(owner: str, what: str, x: Any) -> None:
     if is_concrete(x):
         values = _values(owner, what, x)
         if not np.all(np.isfinite(values)):
-            raise ValueError(f"{owner}: {what} must be finite, got {values.tolist()}.")
+            found = _shown(values, np.isfinite(values))
+            raise ValueError(f"{owner}: {what} must be finite, got {found}.")
 
 
 def takes(owner: str, what: str, function: Any, given: tuple[str, ...], why: str = "") -> None:

@@ -22,7 +22,7 @@ from jaxcon.constraints.rows import Violation
 from jaxcon.core import checks, numerics
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.model.state import Energy
+from jaxcon.model.state import Energy, State
 
 
 def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
@@ -117,7 +117,9 @@ def mean_violation(off: Violation, dt: Any) -> Array:
 
     Raises:
         ValueError: the scene has no rows.
+        TypeError: it is no `Violation`.
     """
+    _check("mean_violation", "off", off, Violation, "info.violation of the recorded steps")
     if not off.position.size:
         raise ValueError("losses: the scene has no constraints that could be violated.")
     return jnp.mean(off.position**2) + jnp.mean((dt * off.velocity) ** 2)
@@ -129,7 +131,11 @@ def energy_drift(energy: Energy, scale: Any = None) -> Array:
     Args:
         energy: of each recorded state, its first axis time.
         scale: [J]; the largest kinetic energy unless given: give one where nothing may move.
+
+    Raises:
+        TypeError: it is no `Energy`.
     """
+    _check("energy_drift", "energy", energy, Energy, "jc.energy(system, state) of recorded states")
     scale = jnp.max(energy.kinetic) if scale is None else scale
     change = (energy.total - energy.total[:1]) / scale
     return numerics.safe_sqrt(jnp.mean(change**2))
@@ -143,10 +149,16 @@ def weighted(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> tuple[An
         weights: numbers by the same names.
 
     Raises:
-        ValueError: terms and weights have other names.
+        ValueError: terms and weights have other names, or a term is no single number.
     """
     if set(terms) != set(weights):
         raise ValueError(f"weights {sorted(weights)} must be named as terms {sorted(terms)}.")
+    for name, x in terms.items():
+        if jnp.shape(x):
+            raise ValueError(
+                f"weighted: term '{name}' must be one number, got shape {jnp.shape(x)}; take a mean"
+                " or a sum of it."
+            )
     return sum((weights[name] * x for name, x in terms.items()), start=0.0), dict(terms)
 
 
@@ -160,7 +172,11 @@ def unless_failed(x: PyTree, state: Any) -> PyTree:
         x: a loss, or predictions. Of a batch, what has its axes first is NaN for the worlds that
             failed; what does not, such as a mean over worlds, is NaN if one of them has.
         state: the final one, of a world or a batch.
+
+    Raises:
+        TypeError: it is no `State`.
     """
+    _check("unless_failed", "state", state, State, "the state in which a rollout ended")
     bad = failed(state.status)
 
     def one(y: Any) -> Array:
@@ -169,3 +185,13 @@ def unless_failed(x: PyTree, state: Any) -> PyTree:
         return jnp.where(lost, jnp.nan, y)
 
     return jax.tree.map(one, x)
+
+
+def _check(owner: str, what: str, x: Any, kind: type, meant: str) -> None:
+    """Checks that an argument is what a rollout gave.
+
+    Raises:
+        TypeError: it is of another type.
+    """
+    if not isinstance(x, kind):
+        raise TypeError(f"losses.{owner}: {what} must be {meant}, got {type(x).__name__}.")

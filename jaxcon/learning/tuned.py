@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
-from jaxcon.core.typing import PyTree
+from jaxcon.core.typing import Array, PyTree
 from jaxcon.learning.descent import Search, Stop
 from jaxcon.learning.leaves import Space
 
@@ -37,6 +37,7 @@ class Tuned:
         steps: how many that start took.
         refused: how many of these were taken back, their loss or its gradient not being finite.
         stopped: why it took no more, in words.
+        bounded: the names of leaves that lie on a bound, with one of their numbers at least.
     """
 
     params: PyTree
@@ -48,6 +49,7 @@ class Tuned:
     steps: int
     refused: int
     stopped: str
+    bounded: tuple[str, ...] = ()
 
     @property
     def table(self) -> dict[str, str]:
@@ -65,7 +67,9 @@ class Tuned:
         finite = self.history[np.isfinite(self.history)]
         first = f", from {finite[0]:.4g}" if finite.size else ""
         lines = [f"loss {self.loss:.4g}{first}, after {self.steps} steps: {self.stopped}"]
-        lines += [f"  {name} = {x}" for name, x in self.table.items()]
+        own = {name or "the parameter" for name in self.bounded}
+        ends = {name: ", on its bound" if name in own else "" for name in self.table}
+        lines += [f"  {name} = {x}{ends[name]}" for name, x in self.table.items()]
         if len(self.histories) > 1:
             lines.append(f"the best of {len(self.histories)} starts")
         if self.lost:
@@ -111,14 +115,21 @@ def result(space: Space, search: Search, losses: np.ndarray, broken: str) -> Tun
         steps=taken,
         refused=int(one.refused),
         stopped=broken if broken and stop == Stop.RUNNING else reason,
+        bounded=_bounded(space, one.best.y),
     )
+
+
+def _bounded(space: Space, y: tuple[Array, ...]) -> tuple[str, ...]:
+    """The names of leaves that lie on a bound."""
+    ends = zip(space.names, y, *space.limits, strict=True)
+    return tuple(name for name, z, low, high in ends if np.any((z <= low) | (z >= high)))
 
 
 def _late(history: np.ndarray) -> str:
     """What the second half of the steps says of whether they were enough, in words."""
     finite = history[np.isfinite(history)]
     if finite.size < 4:
-        return " before it converged"
+        return " before it converged: too few to tell more; ask for more"
     least = np.minimum.accumulate(finite)
     whole, late = least[0] - least[-1], least[finite.size // 2] - least[-1]
     if late <= LATE * whole:
