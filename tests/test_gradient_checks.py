@@ -1,5 +1,7 @@
 """What tells users whether their gradients are right, and how far they reach."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +36,29 @@ def test_a_wrong_leaf_is_named_and_the_others_are_not():
     np.testing.assert_allclose(bad.error, 1e-4 / 2.0001, rtol=1e-6)
     np.testing.assert_allclose(bad.reverse / bad.difference, 2.0001 / 2, rtol=1e-9)
     assert "wrong: the modes differ by" in str(check)
-    assert "DISAGREES" in str(bad)
+    assert "DISAGREES, both modes are off" in str(bad)
+    assert str(check).startswith("gradients to 6.1e-06: wrong for ['wrong']\n")
+
+
+def test_the_mode_that_is_off_is_named():
+    leaf = jc.check_gradients(jnp.square, 3.0).leaves[0]
+    for name, words in (("reverse", "reverse mode is off"), ("forward", "forward mode is off")):
+        own = dataclasses.replace(leaf, **{name: 1.1 * getattr(leaf, name)})
+        assert f"DISAGREES, {words}: reverse" in str(own)
+
+
+@pytest.mark.parametrize(
+    ("f", "x", "message"),
+    [
+        (jnp.square, jnp.nan, "check_gradients: x must be finite, got nan"),
+        (lambda x: x["a"], {"a": jnp.inf}, "check_gradients: x.a must be finite, got inf"),
+        (jnp.log, -1.0, "f is not finite at x"),
+    ],
+    ids=["x", "leaf", "f"],
+)
+def test_where_nothing_is_finite_there_is_nothing_to_check(f, x, message):
+    with pytest.raises(ValueError, match=message):
+        jc.check_gradients(f, x)
 
 
 def test_empty_leaves_and_results_are_left_out():

@@ -591,6 +591,11 @@ def test_what_does_not_fit_is_refused_in_words():
     for data in (np.ones(3, complex), np.ones(3, bool), "hello"):
         with pytest.raises(ValueError, match="data must be real numbers"):
             jc.identify(lambda p: p * jnp.ones(3), 1.0, data)
+    for data in (None, {}):
+        with pytest.raises(ValueError, match=f"data hold no array, got {data}"):
+            jc.identify(wave, {"a": 1.0, "b": 0.0}, data)
+    with pytest.raises(ValueError, match="nodes must be finite, got"):
+        jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes=np.full((4, 2), np.nan))
     with pytest.raises(TypeError, match="simulate must be a function of params, got None"):
         jc.identify(None, 1.0, np.ones(3))
     with pytest.raises(TypeError, match=r"called as simulate\(params\), which it does not take"):

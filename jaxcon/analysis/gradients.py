@@ -80,9 +80,23 @@ class LeafGradient:
         apart = np.maximum(*(np.abs(x - self.difference) for x in (self.reverse, self.forward)))
         i = int(np.argmax(apart / self.scale))  # argmax finds NaN first
         return (
-            f"; DISAGREES: reverse {self.reverse[i]:.9g}, forward {self.forward[i]:.9g},"
-            f" differences {self.difference[i]:.9g}"
+            f"; DISAGREES, {self._culprit()}: reverse {self.reverse[i]:.9g},"
+            f" forward {self.forward[i]:.9g}, differences {self.difference[i]:.9g}"
         )
+
+    def _culprit(self) -> str:
+        """Which modes the differences speak against, in words."""
+        gaps = (
+            np.abs(x - self.difference) - self.uncertainty for x in (self.reverse, self.forward)
+        )
+        reverse, forward = (
+            not self._largest(np.maximum(gap, 0.0)) <= self.tolerance for gap in gaps
+        )
+        if reverse and forward:
+            return "both modes are off"
+        if reverse or forward:
+            return f"{'reverse' if reverse else 'forward'} mode is off"
+        return "the modes are apart"
 
 
 @dataclass(frozen=True)
@@ -113,7 +127,10 @@ class GradientCheck:
         return tuple(leaf.name for leaf in self.leaves if not leaf.ok)
 
     def __str__(self) -> str:
-        verdict = "right" if self.ok else f"not proven for {list(self.wrong)}"
+        off = [leaf.name for leaf in self.leaves if not leaf.agrees]
+        open_ = [leaf.name for leaf in self.leaves if leaf.agrees and leaf.undecided]
+        found = {"wrong for": off, "undecided for": open_}
+        verdict = ", ".join(f"{what} {names}" for what, names in found.items() if names) or "right"
         head = f"gradients to {self.tolerance:.1e}: {verdict}"
         return "\n".join([head, *(f"  {leaf}" for leaf in self.leaves)])
 
@@ -147,7 +164,7 @@ def check_gradients(
         The `GradientCheck`.
 
     Raises:
-        ValueError: x or f has no floating numbers.
+        ValueError: x or f has no floating numbers, or some that are not finite.
         TypeError: f is no function, or one of other arguments.
 
     References:
@@ -170,6 +187,8 @@ def check_gradients(
         return f(structure.unflatten([chosen.get(i, leaf) for i, leaf in enumerate(given)]))
 
     here = [jnp.asarray(given[i]) for i in floating]
+    for i, leaf in zip(floating, here, strict=True):
+        checks.finite("check_gradients", f"x.{named[i][0]}" if named[i][0] != "x" else "x", leaf)
     results = [y for y in jax.tree.leaves(jax.eval_shape(at, here)) if _is_floating(y)]
     if not results:
         raise ValueError("check_gradients: f returns no floating number to differentiate.")
@@ -178,6 +197,8 @@ def check_gradients(
     found, size = _three_ways(_weighted(at, results, random), here, ways, eps)
     allowed = eps ** (1 / 3) if tolerance is None else tolerance
     hidden = unseen(eps) * size / allowed
+    if not np.isfinite(size):
+        raise ValueError("check_gradients: f is not finite at x: it has no derivative there.")
     leaves = []
     for i, leaf, result in zip(floating, here, found, strict=True):
         scale = _scale(result, hidden, leaf.size <= directions)

@@ -195,6 +195,8 @@ def identify(
     _check_nodes(nodes)
     given = ("params",) if nodes is None else ("params", "node")
     checks.takes("identify", "simulate", simulate, given, " with nodes" * (nodes is not None))
+    if not jax.tree.leaves(data):
+        raise ValueError(f"identify: data hold no array, got {data!r}.")
     data = jax.tree.map(recorded, data)
     space = space_of(params, positive, bounds, "identify")
     own = space.encode(params)
@@ -216,7 +218,7 @@ def _check_nodes(nodes: PyTree) -> None:
     """Checks that there is one first guess for each stretch.
 
     Raises:
-        ValueError: they are no arrays of real numbers with one first axis.
+        ValueError: they are no arrays of real and finite numbers with one first axis.
     """
     leaves = [jnp.asarray(x) for x in jax.tree.leaves(nodes)]
     if nodes is not None and not leaves:
@@ -228,6 +230,7 @@ def _check_nodes(nodes: PyTree) -> None:
             "identify: nodes must be arrays of floating numbers with one first axis of stretches,"
             f" got {', '.join(given)}."
         )
+    checks.finite("identify", "nodes", leaves and np.concatenate([np.ravel(x) for x in leaves]))
 
 
 def recorded(x: Any) -> Any:
