@@ -262,7 +262,7 @@ def test_a_budget_takes_as_few_levels_as_it_can():
         (jc.Checkpoints(levels=3, segments=3), ValueError, "exclude each other"),
         (jc.Checkpoints(segments=[2]), ValueError, "as a tuple"),
         (jc.Checkpoints(segments=()), ValueError, "as a tuple of one number or more"),
-        (jc.Checkpoints(budget="1MB"), ValueError, "budget must be a whole number"),
+        (jc.Checkpoints(budget="1MB"), ValueError, "budget must be a real number"),
         (jc.Truncated(0), ValueError, "steps must be a whole number"),
         (jc.Discounted(-0.5), ValueError, "factor must be zero or more"),
         (jc.Discounted(1.5), ValueError, "factor must be from 0 to 1"),

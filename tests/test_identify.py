@@ -598,7 +598,7 @@ def test_what_does_not_fit_is_refused_in_words():
         jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes=np.full((4, 2), np.nan))
     with pytest.raises(TypeError, match="simulate must be a function of params, got None"):
         jc.identify(None, 1.0, np.ones(3))
-    with pytest.raises(TypeError, match=r"called as simulate\(params\), which it does not take"):
+    with pytest.raises(TypeError, match=r"called as simulate\(params\), and does not accept that"):
         jc.identify(oscillate, 3.0, np.ones((4, 20)))
     with pytest.raises(TypeError, match="checkpoint must be the path of a file, got 3"):
         jc.identify(wave, {"a": 1.0, "b": 0.0}, WAVE, checkpoint=3)

@@ -58,7 +58,8 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Each column of Neville's table takes away the next even power of the step. The entry that
     differs least from the two that it is made of is taken for the best. That one may owe it to
     chance, and so the fourth least of these differences says how exact it is, or its `scatter`
-    where that is more. It does not choose: a kink within the larger steps scatters all.
+    where that is more. `scatter` does not choose the entry, since a kink within the larger steps
+    makes it large for all of them.
 
     Args:
         slopes: (directions, levels), from the largest step on.
@@ -71,7 +72,8 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     table, spread = np.concatenate(columns[1:], axis=1), np.concatenate(apart, axis=1)
     order = np.argsort(np.where(np.isfinite(spread), spread, np.inf), axis=1)
     best, fourth = order[:, :1], order[:, 3:4]
-    value, rounding = (np.take_along_axis(x, best, axis=1) for x in (table, scatter(slopes)))
+    noise = np.nan_to_num(scatter(slopes), nan=np.inf)
+    value, rounding = (np.take_along_axis(x, best, axis=1) for x in (table, noise))
     doubt = np.maximum(np.take_along_axis(spread, fourth, axis=1), rounding)
     return value[:, 0], doubt[:, 0]
 
@@ -88,8 +90,9 @@ def neville(slopes: np.ndarray) -> list[np.ndarray]:
 def scatter(slopes: np.ndarray) -> np.ndarray:
     """What rounding makes of each entry of Neville's table after its first column, (directions, n).
 
-    The entries of the third column with the smallest steps tell it: by h⁶ they differ less than by
-    the rounding of f over the step, which doubles as steps are halved.
+    Rounding of f over the step is taken for independent noise of size σ 2ᵏ in the slope k, and what
+    Neville's table makes of that is known. σ is told by the differences of the third column at the
+    smallest steps, where the motion itself, of the order h⁶, adds less.
 
     Args:
         slopes: (directions, levels), from the largest step on.

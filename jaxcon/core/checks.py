@@ -182,8 +182,8 @@ def takes(owner: str, what: str, function: Any, given: tuple[str, ...], why: str
         inspect.signature(function).bind(*given)
     except TypeError as error:
         raise TypeError(
-            f"{owner}: {what} is called as {what}({', '.join(given)}){why}, which it does not take:"
-            f" {error}."
+            f"{owner}: {what} is called as {what}({', '.join(given)}){why}, and does not accept"
+            f" that: {error}."
         ) from error
     except ValueError:  # a function without a signature
         return

@@ -121,7 +121,7 @@ class Tangent(Native):
 
 
 class Transposed(Native):
-    """(the other arguments, ȳ) → cotangents of the arguments in which a function is linear.
+    """(the other arguments first, then ȳ) → cotangents of those in which a function is linear.
 
     Attributes:
         whole: the function.

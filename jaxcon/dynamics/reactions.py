@@ -266,13 +266,15 @@ class Impulse:
         start = work(multipliers, mean)
         linear = work(more, mean) + work(multipliers, change) / 2
         square = work(more, change) / 2
-        room = jnp.maximum(-start, 0)
-        inner = jnp.abs(linear) + numerics.safe_sqrt(linear * linear + 4 * square * room)
         rounding = 64 * float(jnp.finfo(free.dtype).eps)
         gains = start + linear + square > rounding * work(jnp.abs(more), jnp.abs(mean))
         gains, grows = gains & (start + linear + square > start), linear > 0
-        # two forms of one root, each where it subtracts nothing, and nothing where none is asked:
-        # of work that is nearly nothing a quotient has a derivative beyond float32
+        # a common factor leaves the root as it is, and squares of small works beyond float32
+        size = functools.reduce(jnp.maximum, map(jnp.abs, (start, linear, square)))
+        size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1))
+        room, linear, square = jnp.maximum(-start, 0) / size, linear / size, square / size
+        inner = jnp.abs(linear) + numerics.safe_sqrt(linear * linear + 4 * square * room)
+        # two forms of one root, each where it subtracts nothing, and none where none is asked
         few = 2 * room / jnp.where(gains & grows, inner, 1)
         many = inner / jnp.where(gains & ~grows, 2 * square, 1)
         return jnp.where(gains, jnp.clip(jnp.where(grows, few, many), 0, 1), 1)

@@ -39,6 +39,8 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
             the reference is NaN throughout.
     """
     known = [x for x in jax.tree.leaves(reference) if jnp.size(x)]
+    if any(not jnp.issubdtype(jnp.result_type(x), jnp.number) for x in known):
+        raise ValueError("tracking: the reference must be numbers, NaN where nobody knows.")
     if known and checks.is_concrete(known) and all(np.all(np.isnan(x)) for x in known):
         raise ValueError("tracking: the reference is NaN throughout: there is nothing to track.")
     off = jax.tree.leaves(misfit(path, reference, scale))

@@ -112,7 +112,7 @@ class Checkpoints:
 
     levels: int | None = static(default=None)
     segments: int | tuple[int, ...] | None = static(default=None)
-    budget: int | None = static(default=None)
+    budget: float | None = static(default=None)
 
     def scan(self, path: Path) -> tuple[State, PyTree]:
         """The final state and the record of a path."""
@@ -138,7 +138,7 @@ class Checkpoints:
             levels = 2 if self.levels is None else self.levels
             checks.count("Checkpoints", "levels", levels)
             return whole_levels(steps, levels)
-        checks.count("Checkpoints", "budget", self.budget)
+        checks.positive("Checkpoints", "budget", self.budget)
         own = bytes_of(state)
         levels = range(1, steps.bit_length() + 2)
         choices = [f(steps, n) for n in levels for f in (whole_levels, equal_levels)]
