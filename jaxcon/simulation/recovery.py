@@ -39,18 +39,13 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     contained = jax.custom_jvp(call)
 
     def along(primals: Any, tangents: Any) -> Any:
-        floats, others = primals
         moved = [type(x) is not SymbolicZero for x in tangents[0]]
-        batch = jax.eval_shape(call, floats, others)[1].shape
+        moving = parts.among(moved)
+        start, fixed = moving.split(parts.merge(*primals))
+        batch = jax.eval_shape(call, *primals)[1].shape
         # a tangent shared by worlds must be masked in each of them
-        start, given = (spread(list(compress(x, moved)), batch) for x in (floats, tangents[0]))
-
-        def of_moved(xs: list[Array]) -> Any:
-            replaced = iter(xs)
-            merged = [next(replaced) if flag else x for x, flag in zip(floats, moved, strict=True)]
-            return call(merged, others)
-
-        output, pushforward = jax.linearize(of_moved, start)
+        start, given = spread(start, batch), spread(list(compress(tangents[0], moved)), batch)
+        output, pushforward = jax.linearize(lambda x: function(*moving.merge(x, fixed)), start)
         healthy = ~failed(output[1])
         return output, _mask(healthy, pushforward(_mask(healthy, given)))
 
