@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import PyTree
@@ -94,7 +95,8 @@ class GradientMemory:
         state: what a checkpoint keeps of one world [B].
         step: what the derivative of a step needs of one world, beside parameters [B].
         working: what one world needs at any length [B].
-        shared: what does not grow with the batch [B].
+        shared: what grows neither with the batch nor with the steps [B]; the numbers of the steps
+            come on top.
     """
 
     start: State
@@ -119,7 +121,7 @@ class GradientMemory:
         check_adjoint(adjoint)
         *checkpoints, last = adjoint.kept(steps, self.start)
         own = self.working + sum(checkpoints) * self.state + last * self.step
-        return self.shared + worlds * own
+        return self.shared + _numbers(steps) + worlds * own
 
     def __str__(self) -> str:
         return (
@@ -165,14 +167,20 @@ def gradient_memory(
     small, large = (planned(SHORT, worlds) for worlds in BATCHES)
     longer = planned(LONGER, BATCHES[0])
     own = (large - small) / (BATCHES[1] - BATCHES[0])
-    step = (longer - small) / (LONGER - SHORT) / BATCHES[0]
+    added = longer - small - _numbers(LONGER - SHORT)
+    step = added / (LONGER - SHORT) / BATCHES[0]
     start = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
-    shared = small - own * BATCHES[0]
+    shared = small - _numbers(SHORT) - own * BATCHES[0]
     return GradientMemory(start, bytes_of(state), step, own - SHORT * step, shared)
 
 
 def nothing(state: State, info: Any) -> None:
     """Recorded of a step."""
+
+
+def _numbers(steps: int) -> int:
+    """What the numbers of the steps take, which a rollout counts once for all worlds [B]."""
+    return steps * np.dtype(jnp.result_type(int)).itemsize
 
 
 def _planned(step: Any, args: PyTree, worlds: int) -> int:
