@@ -183,6 +183,11 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    """The public names, without what the module itself imports."""
+    return [*__all__, "environments", "__version__", "__doc__"]
+
+
 __all__ = [
     "BoxContact",
     "CapsuleContact",

@@ -100,6 +100,8 @@ def test_the_library_keeps_its_hands_off(path):
 
 def test_every_public_name_exists_and_says_what_it_is():
     assert sorted(set(jc.__all__)) == sorted(jc.__all__)
+    shown = {name for name in dir(jc) if not name.startswith("__")}
+    assert shown == {*jc.__all__, "environments"} - {"__version__"}
     for name in jc.__all__:
         thing = getattr(jc, name)
         assert name == "WORLD" or inspect.getdoc(thing), name

@@ -1,6 +1,7 @@
 """What tells users whether their gradients are right, and how far they reach."""
 
 import dataclasses
+import operator
 
 import jax
 import jax.numpy as jnp
@@ -160,6 +161,10 @@ def test_nothing_to_differentiate_by():
         jc.check_gradients(lambda x: jnp.round(x).astype(int), 1.3)
     with pytest.raises(ValueError, match="tolerance must be positive"):
         jc.check_gradients(jnp.sin, 1.3, tolerance=0.0)
+
+
+def test_a_function_that_does_not_tell_its_arguments_is_taken():
+    assert jc.check_gradients(operator.itemgetter("x"), {"x": 1.3}).ok
 
 
 def test_what_is_no_function_of_x_is_refused():

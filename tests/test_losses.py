@@ -40,7 +40,19 @@ def test_tracking_is_the_mean_of_squares_by_quantity_and_scale():
     np.testing.assert_allclose(slope["angle"][2], 0.25)
 
 
+def test_what_is_masked_is_not_tracked():
+    seen = np.ma.masked_array([1.0, 99.0, 1.0], [False, True, False])
+    path = jnp.array([1.0, 2.0, 3.0])
+    known = np.array([1.0, np.nan, 1.0])
+    assert jc.losses.tracking(path, seen) == jc.losses.tracking(path, known) == 2.0
+    assert jax.jit(jc.losses.tracking)(path, known) == 2.0
+    whole = np.ma.masked_array([1, 99, 1], [False, True, False])
+    assert jc.losses.tracking(path, whole) == 2.0
+
+
 def test_tracking_says_what_does_not_fit():
+    with pytest.raises(ValueError, match="tracking: reference must be real numbers.*got bool"):
+        jc.losses.tracking(jnp.ones(3), np.ones(3, bool))
     with pytest.raises(ValueError, match="tip .3, 2.*tip .4, 2."):
         jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})
     with pytest.raises(ValueError, match=r"scale of shape \(4, 1\).*\(3, 1\)"):

@@ -390,11 +390,22 @@ def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_search(tmp_pa
         ({"steps": 0}, "whole number from 1"),
         ({"patience": 0}, "patience must be a whole number from 1"),
         ({"patience": 5, "tolerance": np.nan}, "tolerance must be zero or more and finite"),
+        ({"tolerance": 1e-3}, "tolerance=0.001 .* give patience="),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_words(options, what):
     with pytest.raises(ValueError, match=what):
         jc.tune(bowl, BOWL, **options)
+
+
+def test_an_optimizer_that_loses_its_way_is_named():
+    """After three steps its own are not finite, while loss and gradient are."""
+    lost = optax.scale_by_schedule(lambda count: jnp.where(count < 3, -0.1, jnp.nan))
+    found = jc.tune(lambda x: (x - 1.0) ** 2, 0.0, optimizer=lost, steps=20)
+    assert found.stopped.startswith("the optimizer's step from the last point is not finite")
+    np.testing.assert_allclose(found.history, (0.8 ** np.arange(4)) ** 2)
+    np.testing.assert_allclose(found.params, 1 - 0.8**3)
+    assert found.refused == 0
 
 
 def test_a_loss_must_be_a_scalar_and_parameters_numbers():
@@ -414,6 +425,10 @@ def test_a_loss_must_be_a_scalar_and_parameters_numbers():
         jc.tune(jnp.sum, jnp.zeros(2), mesh=3)
     with pytest.raises(TypeError, match="optimizer must be a transformation of optax"):
         jc.tune(jnp.sum, jnp.zeros(2), optimizer=optax.adam)
+    with pytest.raises(TypeError, match="forward must be True or False, got 'yes'"):
+        jc.tune(jnp.sum, jnp.zeros(2), forward="yes")
+    with pytest.raises(ValueError, match="2 leaves of the parameters are named 'a/b'"):
+        jc.tune(lambda p: p["a/b"], {"a": {"b": 1.0}, "a/b": 2.0})
     with pytest.raises(ValueError, match="no floating number"):
         jc.tune(lambda x: 0.0, {"n": jnp.asarray(3)})
     for whole in (3, np.int64(3), np.array([3])):

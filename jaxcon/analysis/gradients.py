@@ -45,8 +45,7 @@ class LeafGradient:
     @property
     def error(self) -> float:
         """By how much the differences do beyond their own uncertainty, from the worse mode."""
-        apart = [np.abs(x - self.difference) for x in (self.forward, self.reverse)]
-        return self._largest(np.maximum(np.maximum(*apart) - self.uncertainty, 0.0))
+        return self._beyond(self.forward, self.reverse)
 
     @property
     def undecided(self) -> bool:
@@ -62,6 +61,11 @@ class LeafGradient:
     def ok(self) -> bool:
         """Whether they agree and the differences could tell."""
         return self.agrees and not self.undecided
+
+    def _beyond(self, *modes: np.ndarray) -> float:
+        """By how much the worst of these differs from the differences beyond their uncertainty."""
+        apart = np.maximum.reduce([np.abs(x - self.difference) for x in modes])
+        return self._largest(np.maximum(apart - self.uncertainty, 0.0))
 
     def _largest(self, x: np.ndarray) -> float:
         return float(np.max(np.abs(x) / self.scale))
@@ -86,12 +90,8 @@ class LeafGradient:
 
     def _culprit(self) -> str:
         """Which modes the differences speak against, in words."""
-        gaps = (
-            np.abs(x - self.difference) - self.uncertainty for x in (self.reverse, self.forward)
-        )
-        reverse, forward = (
-            not self._largest(np.maximum(gap, 0.0)) <= self.tolerance for gap in gaps
-        )
+        modes = self.reverse, self.forward
+        reverse, forward = (not self._beyond(mode) <= self.tolerance for mode in modes)
         if reverse and forward:
             return "both modes are off"
         if reverse or forward:
@@ -197,8 +197,6 @@ def check_gradients(
     found, size = _three_ways(_weighted(at, results, random), here, ways, eps)
     allowed = eps ** (1 / 3) if tolerance is None else tolerance
     hidden = unseen(eps) * size / allowed
-    if not np.isfinite(size):
-        raise ValueError("check_gradients: f is not finite at x: it has no derivative there.")
     leaves = []
     for i, leaf, result in zip(floating, here, found, strict=True):
         scale = _scale(result, hidden, leaf.size <= directions)
@@ -259,7 +257,11 @@ def _directions(leaf: Array, count: int, random: Any) -> Array:
 
 
 def _three_ways(of: Any, at: list[Array], ways: list[Array], eps: float) -> tuple[list[Any], float]:
-    """By leaf: reverse, forward, difference, uncertainty, by direction; and the size of f."""
+    """By leaf: reverse, forward, difference, uncertainty, by direction; and the size of f.
+
+    Raises:
+        ValueError: that is not finite.
+    """
     counts = [len(way) for way in ways]
     total, ends = sum(counts), np.cumsum(counts)
     # every direction moves one leaf and leaves the others
@@ -271,8 +273,10 @@ def _three_ways(of: Any, at: list[Array], ways: list[Array], eps: float) -> tupl
     def value(x: list[Array]) -> Array:
         return of(x)[0]
 
-    forward = jax.jit(jax.vmap(lambda move: jax.jvp(value, (at,), (move,))[1]))(moves)
     gradient, size = jax.jit(jax.grad(of, has_aux=True))(at)
+    if not np.isfinite(size):
+        raise ValueError("check_gradients: f is not finite at x: it has no derivative there.")
+    forward = jax.jit(jax.vmap(lambda move: jax.jvp(value, (at,), (move,))[1]))(moves)
     pairs = zip(ways, gradient, strict=True)
     reverse = [np.asarray(w.reshape(len(w), -1), np.float64) @ np.ravel(g) for w, g in pairs]
     apart = differences(value, at, moves, eps)

@@ -72,10 +72,9 @@ def positive(owner: str, what: str, x: Any, strictly: bool = True) -> None:
     """
     if is_concrete(x):
         values = _values(owner, what, x)
-        good = (values > 0) if strictly else (values >= 0)
-        if not np.all(good & np.isfinite(values)):
-            bound = "positive" if strictly else "zero or more"
-            found = _shown(values, good & np.isfinite(values))
+        good = np.isfinite(values) & ((values > 0) if strictly else (values >= 0))
+        if not np.all(good):
+            bound, found = "positive" if strictly else "zero or more", _shown(values, good)
             raise ValueError(f"{owner}: {what} must be {bound} and finite, got {found}.")
 
 
@@ -158,9 +157,26 @@ def finite(owner: str, what: str, x: Any) -> None:
     """
     if is_concrete(x):
         values = _values(owner, what, x)
-        if not np.all(np.isfinite(values)):
-            found = _shown(values, np.isfinite(values))
+        good = np.isfinite(values)
+        if not np.all(good):
+            found = _shown(values, good)
             raise ValueError(f"{owner}: {what} must be finite, got {found}.")
+
+
+def recorded(owner: str, what: str, x: Any) -> Any:
+    """Real numbers, NaN where they are masked.
+
+    Raises:
+        ValueError: they are none.
+    """
+    kind = x.dtype if isinstance(x, jax.Array) else np.asarray(x).dtype
+    if kind.kind not in "fiu" and not jnp.issubdtype(kind, jnp.floating):
+        raise ValueError(
+            f"{owner}: {what} must be real numbers, NaN where nothing was seen, got {kind}."
+        )
+    if not isinstance(x, np.ma.MaskedArray):
+        return x
+    return np.ma.filled(x.astype(kind if kind.kind == "f" else float), np.nan)
 
 
 def takes(owner: str, what: str, function: Any, given: tuple[str, ...], why: str = "") -> None:

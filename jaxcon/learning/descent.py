@@ -35,6 +35,7 @@ class Stop(IntEnum):
     RUNNING = 0
     STALLED = 1
     NOT_FINITE = 2
+    LED_NOWHERE = 3
 
 
 @pytree
@@ -164,9 +165,7 @@ class Descent:
     def step(self, search: Search, key: Any) -> tuple[Search, Array]:
         """One step, and the loss before it; where that is not finite, back to where it was."""
         (loss, seen), slope = self.slope(search.y, key)
-        good = jnp.isfinite(loss)
-        for x in jax.tree.leaves(slope):
-            good &= jnp.all(jnp.isfinite(x))
+        good = jnp.isfinite(loss) & _all_finite(slope)
         # optax counts on promotion, whatever the rest of a program is held to
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             update, memory = self.optimizer.update(
@@ -182,13 +181,16 @@ class Descent:
             lambda y, u: y + share.astype(y.dtype) * u.astype(y.dtype), search.y, update
         )
         moved = self.space.clip(ahead)
+        led = _all_finite(moved)
         stop = jnp.where(share < SMALLEST, Stop.NOT_FINITE, Stop.RUNNING)
-        y, memory = keep(good, (moved, memory), search.last)
+        stop = jnp.where(good & ~led, Stop.LED_NOWHERE, stop)
+        here = search.y, search.memory
+        y, memory = keep(good, keep(led, (moved, memory), here), search.last)
         new = dataclasses.replace(
             search,
             y=y,
             memory=memory,
-            last=keep(good, (search.y, search.memory), search.last),
+            last=keep(good, here, search.last),
             share=share,
             step=search.step + 1,
             refused=search.refused + (~good).astype(search.refused.dtype),
@@ -223,6 +225,14 @@ class Descent:
         stop = jnp.where(stalled, Stop.STALLED, search.stop).astype(search.stop.dtype)
         mark = jnp.where(progress, best.loss, search.mark)
         return dataclasses.replace(search, best=best, mark=mark, since=since, stop=stop)
+
+
+def _all_finite(tree: PyTree) -> Array:
+    """Whether every number is."""
+    good = jnp.ones((), bool)
+    for x in jax.tree.leaves(tree):
+        good &= jnp.all(jnp.isfinite(x))
+    return good
 
 
 def split(result: Any) -> tuple[Array, PyTree]:

@@ -197,7 +197,7 @@ def identify(
     checks.takes("identify", "simulate", simulate, given, " with nodes" * (nodes is not None))
     if not jax.tree.leaves(data):
         raise ValueError(f"identify: data hold no array, got {data!r}.")
-    data = jax.tree.map(recorded, data)
+    data = jax.tree.map(lambda x: checks.recorded("identify", "data", x), data)
     space = space_of(params, positive, bounds, "identify")
     own = space.encode(params)
     batch = scattered(space, own, restarts, spread, key, "identify")
@@ -231,22 +231,6 @@ def _check_nodes(nodes: PyTree) -> None:
             f" got {', '.join(given)}."
         )
     checks.finite("identify", "nodes", leaves and np.concatenate([np.ravel(x) for x in leaves]))
-
-
-def recorded(x: Any) -> Any:
-    """Data of real numbers, NaN where they are masked.
-
-    Raises:
-        ValueError: they are none.
-    """
-    kind = np.asarray(x).dtype
-    if kind.kind not in "fiu" and not jnp.issubdtype(kind, jnp.floating):
-        raise ValueError(
-            f"identify: data must be real numbers, NaN where nothing was seen, got {kind}."
-        )
-    if not isinstance(x, np.ma.MaskedArray):
-        return x
-    return np.ma.filled(x.astype(kind if kind.kind == "f" else float), np.nan)
 
 
 def _ignore() -> None:

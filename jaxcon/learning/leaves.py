@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from typing import Any
@@ -105,6 +106,9 @@ def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
     found, structure = jax.tree_util.tree_flatten_with_path(params)
     names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in found]
     leaves = [x for _, x in found]
+    for name, times in Counter(names).items():
+        if times > 1:
+            raise ValueError(f"{owner}: {times} leaves of the parameters are named '{name}'.")
     if not checks.is_concrete(leaves):
         raise TypeError(
             f"{owner}: the parameters are traced; {owner} is host code around a program of its own."

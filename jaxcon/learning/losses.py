@@ -30,17 +30,16 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
 
     Args:
         path: arrays of chosen quantities.
-        reference: the same as they should be; NaN where nobody knows.
+        reference: the same as they should be; NaN or masked where nobody knows.
         scale: of each quantity: a number, or numbers in the structure of the path, or of its first
             levels, that broadcast with it.
 
     Raises:
         ValueError: path and reference differ in structure or shape, the scale has more numbers, or
-            the reference is NaN throughout.
+            the reference is NaN throughout or of no real numbers.
     """
+    reference = jax.tree.map(lambda x: checks.recorded("tracking", "reference", x), reference)
     known = [x for x in jax.tree.leaves(reference) if jnp.size(x)]
-    if any(not jnp.issubdtype(jnp.result_type(x), jnp.number) for x in known):
-        raise ValueError("tracking: the reference must be numbers, NaN where nobody knows.")
     if known and checks.is_concrete(known) and all(np.all(np.isnan(x)) for x in known):
         raise ValueError("tracking: the reference is NaN throughout: there is nothing to track.")
     off = jax.tree.leaves(misfit(path, reference, scale))

@@ -16,6 +16,8 @@ REASONS = {
     Stop.STALLED: "the loss fell no more",
     Stop.NOT_FINITE: "the loss or its gradient is not finite around the last point, however short"
     " the step",
+    Stop.LED_NOWHERE: "the optimizer's step from the last point is not finite, though the loss and"
+    " its gradient are",
 }
 
 

@@ -105,6 +105,12 @@ def tune(
     """
     counts = _counts(steps=steps, samples=samples, restarts=restarts, chunk=chunk)
     steps, samples, restarts, chunk = counts
+    if tolerance and patience is None:
+        raise ValueError(
+            f"tune: tolerance={tolerance} is what progress is within so many steps: give patience=."
+        )
+    if not isinstance(forward, bool):
+        raise TypeError(f"tune: forward must be True or False, got {forward!r}.")
     patience = NEVER if patience is None else _counts(patience=patience)[0]
     _check(loss, optimizer, key, samples, restarts, tolerance)
     _check_mesh(mesh, samples, restarts)

@@ -98,7 +98,7 @@ class Equations:
     ) -> None:
         self.dynamics, self.state, self.known = dynamics, state, known
         self.scheme, self.soft = scheme, soft
-        # outside of the root, which gives h a tangent of zeros, and 0/h² may be no number
+        # made before the root, see `roots.implicit`
         self.weights = 1 / scheme.reach, 1 / scheme.push
         self.guess = jnp.concatenate([known.acceleration, known.multipliers])
         self.inertia = dynamics.system.mass(state.q).diagonal

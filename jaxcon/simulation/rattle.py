@@ -163,7 +163,7 @@ class _Drift:
     ) -> None:
         self.system, self.q, self.rows, self.momentum = dynamics.system, state.q, rows, momentum
         self.h, self.time = dt[None], state.time + dt
-        # outside of the root, which gives h a tangent of zeros, and 0/h² may be no number
+        # made before the root, see `roots.implicit`
         self.per_step = numerics.safe_divide(jnp.ones_like(self.h), self.h)
         problem = saddle(self.system, self.q, rows, momentum, rows.rate)
         self.solve: Factored = dynamics.solver.factor(problem)

@@ -284,9 +284,7 @@ def implicit_multipliers(
     corner = None if width is None else jnp.asarray(width, scale.dtype)[None]
 
     def law(x: Array) -> Array:
-        # g and the width are choices, without derivatives of their own. That is said in here, since
-        # a root gives a tangent to all that its function closes over, and where 1/g² overflows the
-        # product of it with a tangent of zero is NaN
+        # choices without a derivative, which is stopped in here, see `roots.implicit`
         fixed, smooth = jax.lax.stop_gradient((scale, corner))
         return laws(kinds, fixed, x, velocity(x), live, smooth)
 

@@ -33,6 +33,10 @@ def implicit(
     f′(x) ẋ = y is solved by rounds of ẋ ← ẋ + P (y − f′(x) ẋ), which converges as an iteration
     x ← x − P f(x) does near its end, and so is its transpose.
 
+    A root gives a tangent to all that f closes over, of zeros where that does not move. Where f has
+    no finite derivative by it, as 1/h² has none at h = 0, zero times that is NaN: such factors are
+    made before f, or, if they are choices without a derivative, have it stopped inside f.
+
     Args:
         function: f, (n, …) → (n, …).
         start: (n, …).
