@@ -1,11 +1,12 @@
 """What a gradient costs: value and gradient of a rollout beside the rollout, and beside MJX.
 
-    python -m benchmarks.gradients [--scenes chain-10 four-bar] [--steps 1000] [--mjx-seconds 240]
+    python -m benchmarks.gradients [--scenes chain-10 four-bar] [--steps 1000] [--seconds 240]
 
 A batch under plain `vmap` on one device, float32, the gradient of Σ q² at the end by the velocities
 of the start. Peak memory is what XLA plans. Whether a gradient is right is judged over fewer steps,
-by central differences along the velocities: over a thousand, that of a chain is beyond float32. MJX
-runs in a process of its own, each of its steps a checkpoint, which is its fastest.
+by central differences along the velocities: over a thousand, that of a chain is beyond float32.
+Each row is a process of its own, which compiles the rollout and then its gradient. Each step of MJX
+is a checkpoint, which is its fastest.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ SHORT = 100
 STEP = 3e-2
 """Of the differences, relative."""
 LENGTHS = (100, 1000, 10000)
+MJX = "MJX"
 ADJOINTS = {"every step": jc.EveryStep(), "checkpoints": jc.Checkpoints()}
 
 
@@ -137,16 +139,21 @@ def planned(name: str, adjoint: Any, batch: int, steps: int) -> int:
     return plan.temp_size_in_bytes  # type: ignore[union-attr]
 
 
-def peer(name: str, batch: int, limit: float) -> list[str]:
-    """A row of the table for each setting of XLA, or why there is none."""
-    rows = []
-    for flags in FLAGS:
-        given = ["benchmarks.gradients", "--mjx", name, "--batch", str(batch)]
-        late = "does not compile and run in"
-        found = timing.in_process(given, timing.with_flags(flags), limit, late)
-        shown = found if isinstance(found, str) else Cost(**found)
-        rows.append(f"| {name} | MJX {flags} | {shown} |")
-    return rows
+def alone(name: str, way: str, batch: int, steps: int) -> Cost:
+    """The cost of a row, here: of ours by an adjoint, or of MJX."""
+    if way == MJX:
+        return measure(*mjx(name, batch), SHORT, SHORT)
+    return measure(*ours(name, ADJOINTS[way], batch), steps, SHORT)
+
+
+def row(name: str, way: str, given: argparse.Namespace, flags: str = "") -> str:
+    """A row of the table, from a process of its own, or why there is none."""
+    numbers = ["--batch", str(given.batch), "--steps", str(given.steps)]
+    call = ["benchmarks.gradients", "--alone", name, way, *numbers]
+    late = "does not compile and run in"
+    found = timing.in_process(call, timing.with_flags(flags), given.seconds, late)
+    shown = found if isinstance(found, str) else Cost(**found)
+    return f"| {name} | {way} {flags} | {shown} |"
 
 
 def arguments() -> argparse.Namespace:
@@ -155,27 +162,26 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--scenes", nargs="*", default=["chain-10", "four-bar"])
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--mjx-seconds", type=float, default=240.0, help="0 leaves MJX out")
-    parser.add_argument("--mjx", metavar="SCENE", help="MJX alone, here, as JSON")
+    parser.add_argument("--seconds", type=float, default=240.0, help="at most, of each row")
+    parser.add_argument("--alone", metavar=("SCENE", "WAY"), nargs=2, help="one row, here, as JSON")
     return parser.parse_args()
 
 
 def main() -> None:
     """Prints the tables."""
     given = arguments()
-    if given.mjx:
-        print(json.dumps(dataclasses.asdict(measure(*mjx(given.mjx, given.batch), SHORT, SHORT))))
+    if given.alone:
+        cost = alone(*given.alone, given.batch, given.steps)
+        print(json.dumps(dataclasses.asdict(cost)))
         return
     print(timing.machine())
-    print("| scene | | forward | value and gradient | times | compile | compile | finite | error |")
+    head = "forward | value and gradient | times | compile | with gradient | finite | error"
+    print(f"| scene | | {head} |")
     for name in given.scenes:
-        for adjoint in ADJOINTS:
-            loss, worlds = ours(name, ADJOINTS[adjoint], given.batch)
-            print(
-                f"| {name} | {adjoint} | {measure(loss, worlds, given.steps, SHORT)} |", flush=True
-            )
-        if given.mjx_seconds:
-            print("\n".join(peer(name, given.batch, given.mjx_seconds)), flush=True)
+        for way in ADJOINTS:
+            print(row(name, way, given), flush=True)
+        for flags in FLAGS:
+            print(row(name, MJX, given, flags), flush=True)
     print("| scene | | steps | memory |")
     for name in given.scenes:
         for adjoint, steps in ((a, n) for a in ADJOINTS for n in LENGTHS):

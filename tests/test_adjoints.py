@@ -266,6 +266,7 @@ def test_a_budget_takes_as_few_levels_as_it_can():
         (jc.Truncated(0), ValueError, "steps must be a whole number"),
         (jc.Discounted(-0.5), ValueError, "factor must be zero or more"),
         (jc.Discounted(1.5), ValueError, "factor must be from 0 to 1"),
+        (jc.Discounted(np.array([0.5, 0.9])), ValueError, r"one number, got shape \(2,\)"),
     ],
 )
 def test_what_is_no_adjoint_is_refused(adjoint, error, match):

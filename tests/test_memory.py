@@ -91,6 +91,8 @@ def test_control_is_that_of_a_step():
     system, state = scene.build()
     control = [1.0] * system.layout.n_u
     assert jc.memory(system, jc.Method(), state, control).working > 0
+    with pytest.raises(ValueError, match=r"control must have shape .*got a dict with push \(2,\)"):
+        jc.memory(system, jc.Method(), state, {"push": np.zeros(2)})
     with pytest.raises(ValueError, match="control must have shape"):
         jc.memory(system, jc.Method(), state, [*control, 1.0])
 

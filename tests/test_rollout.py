@@ -110,6 +110,8 @@ def test_a_stride_that_does_not_divide(pushed, steps, every):
 def test_controls_of_another_length(pushed, shape):
     with pytest.raises(ValueError, match="controls must have 6 rows.*got shape"):
         jc.rollout(pushed[0], METHOD, pushed[1], jnp.zeros(shape), DT, 6)
+    with pytest.raises(TypeError, match="controls must be None, arrays by step, or a function"):
+        jc.rollout(pushed[0], METHOD, pushed[1], "none", DT, 6)
 
 
 @pytest.fixture(scope="module")

@@ -197,6 +197,11 @@ class Discounted:
     def scan(self, path: Path) -> tuple[State, PyTree]:
         """The final state and the record of a path."""
         checks.positive("Discounted", "factor", self.factor, strictly=False)
+        if jnp.shape(self.factor):
+            raise ValueError(
+                f"Discounted: factor must be one number, got shape {jnp.shape(self.factor)}; map"
+                " over several with jax.vmap."
+            )
         if checks.is_concrete(self.factor) and np.any(np.asarray(self.factor) > 1):
             raise ValueError(f"Discounted: factor must be from 0 to 1, got {self.factor}.")
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.errors import TracerIntegerConversionError
 
 from jaxcon.core.closures import opened
@@ -121,6 +122,11 @@ def _rows(controls: PyTree, steps: int, dtype: Any) -> PyTree:
     """The controls as arrays, one row a step, in the dtype of the scene if they choose none."""
 
     def checked(x: Any) -> Any:
+        if not isinstance(x, jax.Array | np.ndarray | int | float):
+            raise TypeError(
+                f"rollout: controls must be None, arrays by step, or a function of the state, got"
+                f" {controls!r}."
+            )
         x = jnp.asarray(x)
         if x.ndim == 0 or x.shape[0] != steps:
             raise ValueError(

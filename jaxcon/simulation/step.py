@@ -161,14 +161,8 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
     at(system, state, "jc.step(system, method, s, control, dt)")
     check_method(method)
     layout = getattr(system, "layout", None)
-    if layout is not None:
-        if control is not None and not isinstance(control, jax.Array):
-            control = jnp.asarray(control, state.q.dtype)
-        if control is not None and control.shape != (layout.n_u,):
-            raise ValueError(
-                f"step: control must have shape ({layout.n_u},), got {control.shape};"
-                f" its channels are {list(layout.controls)}."
-            )
+    if layout is not None and control is not None:
+        control = _channels(layout, control, state.q.dtype)
     control = controls_in(state.q.dtype, control)
     for leaf in jax.tree.leaves(control):
         got = getattr(leaf, "dtype", state.q.dtype)
@@ -183,6 +177,25 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
             " state = jc.init(system, method, state.q, state.v)."
         )
     return control
+
+
+def _channels(layout: Any, control: Any, dtype: Any) -> Array:
+    """The control of a `BodySystem` as one array.
+
+    Raises:
+        ValueError: it is none of numbers, or of another length.
+    """
+    try:
+        array = control if isinstance(control, jax.Array) else jnp.asarray(control, dtype)
+        got = str(array.shape)
+    except (TypeError, ValueError):
+        array, got = None, f"a {type(control).__name__} with {checks.described(control)}"
+    if array is None or array.shape != (layout.n_u,):
+        raise ValueError(
+            f"step: control must have shape ({layout.n_u},), got {got}; its channels (name, first,"
+            f" end) are {list(layout.controls)}."
+        )
+    return array
 
 
 def policy_in(policy: Callable[[State], PyTree]) -> Callable[[State], PyTree]:
