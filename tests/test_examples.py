@@ -46,6 +46,17 @@ def test_programs_of_the_readme_and_the_guide_run_page_by_page(page, capsys):
     if page.stem == "control":  # its policy balances its pole
         upright = jc.orientation(names["system"], names["final"], "pole")
         assert abs(float(upright)) < 0.02
+    if page.stem == "tune":  # a search by lines finds both numbers, and so does Adam in time
+
+        def loss(p):
+            return jc.losses.tracking(names["height"](p), names["seen"])
+
+        slow = jc.tune(loss, names["guess"], positive=True, steps=500)
+        for tuned, close in ((names["tuned"], 1e-3), (slow, 1e-2)):
+            found = tuned.params["spring"]
+            np.testing.assert_allclose([found["stiffness"], found["damping"]], [8, 1], rtol=close)
+        for name, (x, error) in names["cut"].table.items():
+            assert abs(x - {"spring/stiffness": 8, "spring/damping": 1}[name]) < 3 * error
 
 
 def test_every_page_of_the_guide_has_a_program():
