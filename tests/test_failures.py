@@ -1,6 +1,8 @@
 """One world fails: it says so and stops, the others do not notice, nor do their gradients."""
 
 import dataclasses
+import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -280,3 +282,38 @@ def test_a_policy_that_fails_in_one_world_does_not_spoil_the_others():
 
     sick, healthy = jnp.array([1.0, -1.0, 2.0]), jnp.array([1.0, 2.0])
     np.testing.assert_allclose(gradient(sick), gradient(healthy), rtol=1e-12)
+
+
+def test_second_derivatives_are_those_of_the_worlds_that_do_not_fail():
+    """Through every order of both modes, by numbers that all worlds share."""
+    s = jc.Scene(dim=2)
+    s.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    s.add(jc.Distance("rod", jc.WORLD, "bob"))
+    s.add(jc.Spring("spring", jc.WORLD, "bob", stiffness=5.0, point_a=(0.0, 1.0)))
+    system, state = s.build()
+    whole = np.array([[0.0, 0.1], [np.nan, 0.0], [0.0, -0.2], [1e200, 0.0]])
+
+    def total(shared, starts):
+        own = system.with_params({"spring": {"stiffness": shared[0]}, "bob": {"mass": shared[2]}})
+
+        def one(v):
+            begin = dataclasses.replace(state, v=v)
+            final, _ = jc.rollout(own, jc.Method(), begin, None, shared[1], 3)
+            value = jnp.sum(final.q * final.v) + jnp.sum(final.q**3)
+            return jnp.where(final.status == jc.Status.OK, value, 0.0), final.status
+
+        values, status = jax.vmap(one)(starts)
+        return jnp.sum(values), status
+
+    shared = jnp.array([5.0, 1e-2, 1.0])
+    assert list(total(shared, whole)[1] == jc.Status.OK) == [True, False, True, False]
+
+    def value(starts, shared):
+        return total(shared, starts)[0]
+
+    alone = jax.jit(jax.hessian(functools.partial(value, whole[::2])))(shared)
+    assert np.max(np.abs(alone)) > 1e-3
+    modes = jax.jacfwd, jax.jacrev
+    for one, two in itertools.product(modes, modes):
+        found = jax.jit(two(one(functools.partial(value, whole))))(shared)
+        np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-12)

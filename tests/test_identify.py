@@ -49,6 +49,38 @@ def test_a_recording_with_gaps_gives_parameters_noise_and_errors():
     assert abs(again.noise - 1) < 1e-5
 
 
+@pytest.mark.parametrize("start", [(20.0, 0.05), (100.0, 30.0), (1000.0, 0.01)])
+def test_a_far_start_does_not_lead_out_of_all_numbers(start):
+    """A step without reach by these logarithms went to 1e-300, where data seem to tell nothing."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    spring = {"stiffness": 5.0, "damping": 0.3, "point_a": (0.0, 1.0)}
+    scene.add(jc.Spring("spring", jc.WORLD, "bob", **spring))
+    system, state = scene.build()
+
+    def height(p):
+        own, record = system.with_params({"spring": p}), lambda s, i: s.q[1]
+        last, y = jc.rollout(own, jc.Method(), state, None, 1e-2, 60, record=record)
+        return jc.losses.unless_failed(y, last)
+
+    seen = height({"stiffness": 8.0, "damping": 1.0})
+    guess = dict(zip(("stiffness", "damping"), start, strict=True))
+    found = jc.identify(height, guess, seen, positive=True)
+    assert found.stopped == "converged"
+    np.testing.assert_allclose([found.params[x] for x in guess], [8.0, 1.0], rtol=1e-9)
+    assert not found.untold
+
+
+def test_what_is_beyond_all_numbers_is_not_tried_and_has_an_infinite_error():
+    space = space_of({"x": np.float32(2.0)}, True, None, "identify")
+    for end in space.limits[0] + space.limits[1]:
+        assert 0 < space.decode((end,))["x"] < np.inf
+    ones = np.ones(9, np.float32)
+    found = jc.identify(lambda p: p["x"] * ones / 1e30, {"x": np.float32(1.0)}, ones, positive=True)
+    assert not np.isnan(found.errors["x"])
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.05])
 def test_the_direction_that_data_do_not_tell_is_named(noise):
     found = jc.identify(ringing, GUESS, recorded(noise), positive=POSITIVE)

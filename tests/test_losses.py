@@ -46,12 +46,13 @@ def test_what_is_masked_is_not_tracked():
     known = np.array([1.0, np.nan, 1.0])
     assert jc.losses.tracking(path, seen) == jc.losses.tracking(path, known) == 2.0
     assert jax.jit(jc.losses.tracking)(path, known) == 2.0
+    np.testing.assert_array_equal(jc.losses.misfit(path, seen), [0.0, 0.0, 2.0])
     whole = np.ma.masked_array([1, 99, 1], [False, True, False])
     assert jc.losses.tracking(path, whole) == 2.0
 
 
 def test_tracking_says_what_does_not_fit():
-    with pytest.raises(ValueError, match="tracking: reference must be real numbers.*got bool"):
+    with pytest.raises(ValueError, match="a reference must be real numbers.*got bool"):
         jc.losses.tracking(jnp.ones(3), np.ones(3, bool))
     with pytest.raises(ValueError, match="tip .3, 2.*tip .4, 2."):
         jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})

@@ -100,9 +100,17 @@ def _slope(run):
     return (run(DT + 1e-6).sum() - run(DT - 1e-6).sum()) / 2e-6
 
 
-@pytest.mark.parametrize(("steps", "every"), [(5, 2), (4, 0), (-1, 1), (3, 6)])
-def test_a_stride_that_does_not_divide(pushed, steps, every):
-    with pytest.raises(ValueError, match=f"every={every} must divide steps={steps}"):
+@pytest.mark.parametrize(
+    ("steps", "every", "what"),
+    [
+        (5, 2, "every=2 must divide steps=5"),
+        (3, 6, "every=6 must divide steps=3"),
+        (4, 0, "every must be a whole number from 1, got 0"),
+        (-1, 1, "steps must be a whole number from 0, got -1"),
+    ],
+)
+def test_a_stride_that_does_not_divide(pushed, steps, every, what):
+    with pytest.raises(ValueError, match=what):
         jc.rollout(*pushed[:1], METHOD, pushed[1], None, DT, steps, every=every)
 
 
@@ -112,6 +120,22 @@ def test_controls_of_another_length(pushed, shape):
         jc.rollout(pushed[0], METHOD, pushed[1], jnp.zeros(shape), DT, 6)
     with pytest.raises(TypeError, match="controls must be None, arrays by step, or a function"):
         jc.rollout(pushed[0], METHOD, pushed[1], "none", DT, 6)
+    with pytest.raises(ValueError, match="6 rows.* in an array, got the number 0.0; of a list"):
+        jc.rollout(pushed[0], METHOD, pushed[1], [[0.0, 0.0]] * 6, DT, 6)
+
+
+def test_what_is_no_record_and_no_policy_is_refused(pushed):
+    def run(controls=None, **options):
+        return jc.rollout(pushed[0], METHOD, pushed[1], controls, DT, 6, **options)
+
+    with pytest.raises(TypeError, match="record must be a function of state, got 3"):
+        run(record=3)
+    with pytest.raises(TypeError, match=r"record is called as record\(state, info\)"):
+        run(record=lambda s: s.q)
+    with pytest.raises(TypeError, match=r"controls is called as controls\(state\)"):
+        run(lambda state, time: state.v)
+    with pytest.raises(TypeError, match="a function of the state, returned None"):
+        run(lambda state: None)
 
 
 @pytest.fixture(scope="module")

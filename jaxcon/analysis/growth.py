@@ -98,7 +98,8 @@ def gradient_growth(
         seed: of random moves.
 
     Returns:
-        The `GradientGrowth`, with some hundred times.
+        The `GradientGrowth`, with a hundred times or two where the number of steps has a divisor
+        for that, or more.
 
     Raises:
         ValueError: the constraints leave no freedom, the rollout fails, or what `rollout` refuses.

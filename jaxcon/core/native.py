@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -31,6 +32,13 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxcon.core import fusion
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import spread
+
+_ORDER = ContextVar("order", default=0)
+
+
+def order() -> int:
+    """Of the derivative of a native function that is being traced: 0 for the function itself."""
+    return _ORDER.get()
 
 
 class Native:
@@ -117,7 +125,11 @@ class Tangent(Native):
             results = self.whole(*(replaced.get(i, x) for i, x in enumerate(primals)))
             return list(filter(is_real, results))
 
-        return jax.jvp(along, [primals[i] for i in self.places], tangents)[1]
+        before = _ORDER.set(order() + 1)
+        try:
+            return jax.jvp(along, [primals[i] for i in self.places], tangents)[1]
+        finally:
+            _ORDER.reset(before)
 
 
 class Transposed(Native):

@@ -275,7 +275,7 @@ class Impulse:
         room, linear, square = jnp.maximum(-start, 0) / size, linear / size, square / size
         inner = jnp.abs(linear) + numerics.safe_sqrt(linear * linear + 4 * square * room)
         # two forms of one root, each where it subtracts nothing, and none where none is asked
-        few = 2 * room / jnp.where(gains & grows, inner, 1)
+        few = 2 * room / jnp.where(gains & grows & (inner > 0), inner, 1)
         many = inner / jnp.where(gains & ~grows, 2 * square, 1)
         return jnp.where(gains, jnp.clip(jnp.where(grows, few, many), 0, 1), 1)
 

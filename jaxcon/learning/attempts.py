@@ -81,7 +81,8 @@ class Attempt:
             width, noise = self.widths[self.decade], self.noise
             precision = self.problem.precision(width, noise)
             assert self.known is not None
-            fit = least_squares(self.known, self.problem.limits, self.steps, precision, self.note)
+            limits, reach = self.problem.limits, self.problem.reach
+            fit = least_squares(self.known, limits, self.steps, precision, self.note, reach)
             try:
                 end = End((yield from _at(fit, width, noise)), noise)
             except ENDS as error:

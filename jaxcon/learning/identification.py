@@ -291,9 +291,8 @@ def _errors(space: Space, y: tuple[Array, ...], deviations: np.ndarray) -> PyTre
     own = space.split(jnp.asarray(deviations, y[0].dtype))
     factors = [jnp.exp(z) if p else 1.0 for z, p in zip(y, space.positive, strict=True)]
     nothing = [None if x is None else np.full(np.shape(x), np.nan) for x in space.fixed]
-    return dataclasses.replace(space, fixed=tuple(nothing)).fill(
-        [d * f for d, f in zip(own, factors, strict=True)]
-    )
+    errors = [jnp.where(jnp.isinf(d), d, d * f) for d, f in zip(own, factors, strict=True)]
+    return dataclasses.replace(space, fixed=tuple(nothing)).fill(errors)
 
 
 def _scalars(space: Space) -> tuple[str, ...]:

@@ -97,6 +97,7 @@ def least_squares(
     steps: int,
     precision: Precision,
     note: Callable[[Progress], None] = lambda known: None,
+    reach: Any = np.inf,
 ) -> Generator[np.ndarray, tuple[np.ndarray, np.ndarray], Fit]:
     """argmin ½ ‖r(z)‖² within limits, by steps −D⁻¹(ĴᵀĴ + μ s₁²)⁻¹ Ĵᵀr, Ĵ = J D⁻¹.
 
@@ -113,6 +114,8 @@ def least_squares(
         steps: at most so many since the start.
         precision: of r.
         note: is told of each step.
+        reach: by how much each unknown may change in one, (n,): a first step by a logarithm leads
+            out of all floating numbers otherwise, where no residual tells the way back.
 
     References:
         Moré, The Levenberg–Marquardt algorithm: implementation and theory (1978).
@@ -122,7 +125,7 @@ def least_squares(
     here, broken = (known, r, J), ""
     try:
         while not here[0].stopped and len(here[0].costs) <= steps:
-            here = yield from _step(*here, limits, precision)
+            here = yield from _step(*here, limits, reach, precision)
             note(here[0])
     except ENDS as error:
         broken = words(error)
@@ -133,13 +136,16 @@ def least_squares(
     )
 
 
-def _step(known: Progress, r: np.ndarray, J: np.ndarray, limits: Any, precision: Precision) -> Any:
+def _step(
+    known: Progress, r: np.ndarray, J: np.ndarray, limits: Any, reach: Any, precision: Precision
+) -> Any:
     """The progress, r and J after a step, which is damped more until it helps."""
     z, damping = known.z, known.damping
+    within = np.maximum(limits[0], z - reach), np.minimum(limits[1], z + reach)
     move = _steps(z, r, J, _free(z, r, J, limits), precision)
     last = _negligible(move(0.0), z, r, J, precision)
     while True:
-        ahead = np.clip(z + move(0.0 if last else damping), *limits)
+        ahead = np.clip(z + move(0.0 if last else damping), *within)
         found = yield ahead
         cost = _cost(*found)
         better = cost < known.costs[-1]

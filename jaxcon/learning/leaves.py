@@ -138,14 +138,14 @@ def _check_numbers(names: list[str], leaves: list[Any], owner: str) -> None:
         ValueError: there is something else.
     """
     for name, x in zip(names, leaves, strict=True):
+        what = f"'{name}'" if name else "the parameter"
         if not isinstance(x, complex | int | float | np.generic | np.ndarray | jax.Array):
             raise ValueError(
-                f"{owner}: '{name}' is {x!r} and no number; leave it out of the parameters, and"
+                f"{owner}: {what} is {x!r} and no number; leave it out of the parameters, and"
                 " close over it."
             )
         written = isinstance(x, int | np.integer | np.ndarray) and not isinstance(x, bool)
         if written and jnp.issubdtype(jnp.result_type(x), jnp.integer):
-            what = f"'{name}'" if name else "the parameter"
             raise ValueError(
                 f"{owner}: {what} is a whole number, {x!r}, along which there is no derivative;"
                 " write it as a float to have it searched, or leave it out of the parameters."
@@ -205,7 +205,7 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
     Raises:
         ValueError: no pair of numbers, or a start beyond them.
     """
-    what = f"{owner}: '{name}'" if name else owner
+    what = f"{owner}: '{name}'" if name else f"{owner}: the parameter"
     start = jnp.asarray(start)
     if not np.all(np.isfinite(start)):
         raise ValueError(f"{what} must be finite at the start, got {np.asarray(start).tolist()}.")
@@ -221,8 +221,10 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
         raise ValueError(
             f"{what} needs bounds (low, high), numbers or arrays {start.shape}, got {pair!r}."
         ) from error
-    if log:  # below this exp may round to zero
-        low = jnp.maximum(low, jnp.minimum(start, jnp.finfo(start.dtype).tiny))
+    if log:  # beyond these exp may round to zero, or to infinity
+        known = jnp.finfo(start.dtype)
+        low = jnp.maximum(low, jnp.minimum(start, known.tiny))
+        high = jnp.minimum(high, jnp.maximum(start, known.max / 2))
     if not np.all(np.asarray(low) <= np.asarray(high)):
         raise ValueError(f"{what} needs bounds (low, high) with low ≤ high, got {pair!r}.")
     if not np.all((np.asarray(low) <= start) & (start <= np.asarray(high))):

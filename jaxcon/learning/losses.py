@@ -38,7 +38,7 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
         ValueError: path and reference differ in structure or shape, the scale has more numbers, or
             the reference is NaN throughout or of no real numbers.
     """
-    reference = jax.tree.map(lambda x: checks.recorded("tracking", "reference", x), reference)
+    reference = _known(reference)
     known = [x for x in jax.tree.leaves(reference) if jnp.size(x)]
     if known and checks.is_concrete(known) and all(np.all(np.isnan(x)) for x in known):
         raise ValueError("tracking: the reference is NaN throughout: there is nothing to track.")
@@ -55,12 +55,14 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
 
     Args:
         path: arrays of chosen quantities.
-        reference: the same as they should be; NaN where nobody knows.
+        reference: the same as they should be; NaN or masked where nobody knows.
         scale: of each quantity, as of `tracking`.
 
     Raises:
-        ValueError: path and reference differ in structure or shape, or the scale has more numbers.
+        ValueError: path and reference differ in structure or shape, the scale has more numbers, or
+            the reference is of no real numbers.
     """
+    reference = _known(reference)
     shapes = [jnp.shape(x) for x in jax.tree.leaves(path)]
     given = [jnp.shape(x) for x in jax.tree.leaves(reference)]
     if jax.tree.structure(path) != jax.tree.structure(reference) or shapes != given:
@@ -88,6 +90,11 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
         return jnp.where(seen, (x - jnp.where(seen, wanted, 0)) / width, 0)
 
     return jax.tree.map(off, path, reference, widths)
+
+
+def _known(reference: PyTree) -> PyTree:
+    """A reference of real numbers, NaN where it is masked."""
+    return jax.tree.map(lambda x: checks.recorded("losses", "a reference", x), reference)
 
 
 def violation(off: Violation, dt: Any) -> Array:
@@ -123,7 +130,8 @@ def mean_violation(off: Violation, dt: Any) -> Array:
     _check("mean_violation", "off", off, Violation, "info.violation of the recorded steps")
     if not off.position.size:
         raise ValueError("losses: the scene has no constraints that could be violated.")
-    return jnp.mean(off.position**2) + jnp.mean((dt * off.velocity) ** 2)
+    h = checks.number("mean_violation", "dt", dt, off.velocity.dtype)
+    return jnp.mean(off.position**2) + jnp.mean((h * off.velocity) ** 2)
 
 
 def energy_drift(energy: Energy, scale: Any = None) -> Array:
@@ -151,7 +159,13 @@ def weighted(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> tuple[An
 
     Raises:
         ValueError: terms and weights have other names, or a term is no single number.
+        TypeError: they have none.
     """
+    if not (isinstance(terms, Mapping) and isinstance(weights, Mapping)):
+        raise TypeError(
+            f"weighted: terms and weights must be numbers by name, as {{'task': 1.0}}, got a"
+            f" {type(terms).__name__} and a {type(weights).__name__}."
+        )
     if set(terms) != set(weights):
         raise ValueError(f"weights {sorted(weights)} must be named as terms {sorted(terms)}.")
     for name, x in terms.items():

@@ -19,6 +19,9 @@ from jaxcon.learning.least_squares import Precision
 from jaxcon.learning.leaves import Space
 from jaxcon.learning.losses import misfit
 
+FARTHEST = float(np.log(10.0))
+"""By how much a logarithm may change in a step."""
+
 
 @dataclass(frozen=True)
 class Stretches:
@@ -109,6 +112,12 @@ class Stretches:
         low, high = (np.asarray(self.space.flatten(x) / self.scale) for x in self.space.limits)
         none = np.full(self.nodes.size, np.inf)
         return np.append(low, -none), np.append(high, none)
+
+    @property
+    def reach(self) -> np.ndarray:
+        """By how much each of the unknowns may change in a step."""
+        none = np.full(self.nodes.size, np.inf)
+        return np.append(np.where(self.space.logarithms, FARTHEST, np.inf), none)
 
     @property
     def rounding(self) -> float:

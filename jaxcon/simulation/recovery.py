@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 
+from jaxcon.core import native
 from jaxcon.core.pytree import Parts
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, PyTree
@@ -22,7 +23,8 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     A forward `where` is not enough: the transpose of a NaN derivative multiplies a zero cotangent
     by NaN. So tangents are masked on both sides of the linearized function, T ↦ P (f′ (P T)) with
     P = 1 in healthy worlds and 0 in failed ones; its transpose is masked on both sides as well, and
-    the gradient by parameters shared between worlds is that of the healthy ones.
+    the gradient by parameters shared between worlds is that of the healthy ones. Where a derivative
+    of f′ is taken, that by the place of f′ is masked, too.
 
     Args:
         function: returns a pytree and the status of this world, ().
@@ -36,18 +38,26 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     def call(floats: list[Array], others: list[Array]) -> Any:
         return function(*parts.merge(floats, others))
 
-    contained = jax.custom_jvp(call)
+    contained, guarded = jax.custom_jvp(call), jax.custom_jvp(lambda floats, _: floats)
 
     def along(primals: Any, tangents: Any) -> Any:
         moved = [type(x) is not SymbolicZero for x in tangents[0]]
         moving = parts.among(moved)
-        start, fixed = moving.split(parts.merge(*primals))
         batch = jax.eval_shape(call, *primals)[1].shape
-        # a tangent shared by worlds must be masked in each of them
+        floats, others = primals
+        # what is shared by worlds must be masked in each of them
+        if native.order() != 1:
+            floats = guarded(spread(floats, batch), others)
+        start, fixed = moving.split(parts.merge(floats, others))
         start, given = spread(start, batch), spread(list(compress(tangents[0], moved)), batch)
         output, pushforward = jax.linearize(lambda x: function(*moving.merge(x, fixed)), start)
         healthy = ~failed(output[1])
         return output, _mask(healthy, pushforward(_mask(healthy, given)))
+
+    @guarded.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        healthy = ~failed(call(*jax.lax.stop_gradient(primals))[1])
+        return guarded(*primals), _mask(healthy, tangents[0])
 
     # what does not move is left out: a tangent of zeros is work too, and by 1/h² may be NaN
     contained.defjvp(along, symbolic_zeros=True)

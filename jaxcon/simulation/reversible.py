@@ -96,7 +96,15 @@ class _Walk:
         real, others = map(list, zip(*pairs, strict=True))
         walk = jax.custom_vjp(lambda *args: self.forwards(*args)[0])
         walk.defvjp(self.begin, self.backwards, symbolic_zeros=True)
-        found = walk(real, (others, jax.lax.stop_gradient(self.of_back)))
+        try:
+            found = walk(real, (others, jax.lax.stop_gradient(self.of_back)))
+        except TypeError as error:
+            if "forward-mode" not in str(error):
+                raise
+            raise TypeError(
+                "Reversible: there is no forward-mode derivative through steps that are taken back;"
+                " take adjoint=jc.EveryStep(), which keeps nothing in forward mode."
+            ) from error
         return self._merged(self.results, *found)
 
     def begin(self, *given: Any) -> tuple[Any, Any]:

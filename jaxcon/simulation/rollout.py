@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.errors import TracerIntegerConversionError
 
+from jaxcon.core import checks
 from jaxcon.core.closures import opened
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
@@ -69,16 +70,22 @@ def rollout(
 
     Raises:
         ValueError: `every` does not divide `steps`, or controls of another length.
-        TypeError: `steps` or `every` is not an integer, or the adjoint is none.
+        TypeError: `steps` or `every` is not an integer, the adjoint is none, or `record` or
+            controls are no functions of what they are called with.
     """
     steps, every = _integer("steps", steps), _integer("every", every)
-    if steps < 0 or every < 1 or steps % every:
+    checks.count("rollout", "steps", steps, 0)
+    checks.count("rollout", "every", every)
+    if steps % every:
         raise ValueError(f"rollout: every={every} must divide steps={steps}.")
     check_method(method)
+    checks.takes("rollout", "record", record, ("state", "info"))
     at(system, state, "jc.rollout(system, method, s, controls, dt, steps)")
     check_adjoint(adjoint)
     warn_if_unstable(method, dt, system, state)
     policy = controls if callable(controls) else None
+    if policy is not None:
+        checks.takes("rollout", "controls", policy, ("state",))
     inputs = jnp.arange(steps), None if policy else _rows(controls, steps, state.q.dtype)
 
     def one(state: State, given: Any) -> tuple[State, StepInfo]:
@@ -101,6 +108,10 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
 
     def judged(state: State, constants: Any) -> tuple[PyTree, Any]:
         control = function(constants, state)
+        if control is None:
+            raise TypeError(
+                "rollout: controls, a function of the state, returned None; is a return missing?"
+            )
         good = ~failed(state.status)
         for x in jax.tree.leaves(control):
             good &= jnp.all(jnp.isfinite(x))
@@ -135,4 +146,10 @@ def _rows(controls: PyTree, steps: int, dtype: Any) -> PyTree:
             )
         return x
 
+    for x in jax.tree.leaves(controls):
+        if isinstance(x, int | float):
+            raise ValueError(
+                f"rollout: controls must have {steps} rows, one a step, in an array, got the number"
+                f" {x}; of a list make an array by jnp.asarray."
+            )
     return jax.tree.map(checked, controls_in(dtype, controls))
