@@ -261,6 +261,123 @@ def test_gradients_through_a_bounce_contain_its_time():
     np.testing.assert_allclose(slopes, [case["dh_dy0"], case["dh_dvy0"]], rtol=1e-6)
 
 
+def falling(dtype=None, restitution=0.7, up=False):
+    """A ball of 0.1 m in the plane, and its height after steps of h."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=dtype)
+    scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
+    side = {"point": (0.0, 1.1), "normal": (0.0, -1.0)} if up else {}
+    scene.add(
+        jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, restitution=restitution, **side)
+    )
+    system, state = scene.build()
+
+    def height(z, e, g, h, steps):
+        own = {"floor": {"restitution": e}, "gravity": jnp.stack([0 * g, -g])}
+        start = dataclasses.replace(state, q=state.q.at[1].set(z))
+        h = jnp.asarray(h, state.q.dtype)
+        return jc.rollout(system.with_params(own), jc.Method(), start, None, h, steps)[0].q[1]
+
+    return system, state, height
+
+
+def fallen(z, e, g, duration=0.6):
+    """y = r + e v d − g d²/2 with v = √(2 g (z − r)) and d = T − v/g."""
+    v = jnp.sqrt(2 * g * (z - 0.1))
+    d = duration - v / g
+    return 0.1 + e * v * d - g * d * d / 2
+
+
+@dtypes
+def test_gradients_through_a_bounce_after_a_fall(dtype):
+    """∂y/∂z = −e + (1 + e) g d/v, with an error that halves with the step, wherever it arrives."""
+    height = falling(dtype)[2]
+    z = jnp.linspace(0.49, 0.51, 41, dtype=dtype)
+    numbers = jnp.asarray(0.7, dtype), jnp.asarray(9.81, dtype)
+    axes = {"in_axes": (0, None, None)}
+    value, want = jax.vmap(jax.value_and_grad(fallen, (0, 1, 2)), **axes)(
+        z.astype(jnp.float64), 0.7, 9.81
+    )
+    errors = []
+    for h in (4e-3, 2e-3, 1e-3):
+        steps = round(0.6 / h)
+        slopes = jax.value_and_grad(lambda *x, h=h, n=steps: height(*x, h, n), (0, 1, 2))
+        y, found = jax.jit(jax.vmap(slopes, **axes))(z, *numbers)
+        pairs = zip((y, *found), (value, *want), strict=True)
+        errors.append([np.abs(np.asarray(a) - np.asarray(b)).max() for a, b in pairs])
+    errors = np.array(errors)
+    assert (errors[0] < [0.015, 0.03, 0.001, 0.003]).all()
+    assert (errors[1:] < 0.56 * errors[:-1]).all()
+
+
+def test_gradients_through_a_bounce_after_a_fall_are_those_of_the_steps():
+    """Central differences, where no arrival changes its step within them."""
+    height = falling()[2]
+    z = np.linspace(0.49, 0.51, 21)
+    y = jax.jit(jax.vmap(lambda z: height(z, 0.7, 9.81, 2e-3, 300)))
+    slopes = jax.jit(jax.vmap(jax.grad(lambda z: height(z, 0.7, 9.81, 2e-3, 300))))(z)
+    eps = 1e-7
+    ahead, here, back = y(z + eps), y(z), y(z - eps)
+    smooth = np.abs(ahead - 2 * here + back) < 1e-10
+    assert smooth.sum() >= 18
+    np.testing.assert_allclose(slopes[smooth], ((ahead - back) / (2 * eps))[smooth], atol=1e-5)
+
+
+def test_gradients_through_a_bounce_off_a_ceiling():
+    """Gravity pulls away from it: without loss what it adds after the impact is no energy of it."""
+    system, state, _ = falling(up=True, restitution=1.0)
+
+    def height(z, h, steps):
+        start = dataclasses.replace(state, q=state.q.at[1].set(z), v=state.v.at[1].set(5.0))
+        final, kept = jc.rollout(
+            system, jc.Method(), start, None, h, steps, record=lambda s, i: i.reactions.kept
+        )
+        return final.q[1], kept.min()
+
+    def want(z):
+        v = jnp.sqrt(25 - 2 * 9.81 * (1 - z))
+        d = 0.4 - (5 - v) / 9.81
+        return 1 - v * d - 9.81 * d * d / 2
+
+    z = jnp.linspace(-0.02, 0.02, 21)
+    value, slope = jax.vmap(jax.value_and_grad(want))(z)
+    for h in (4e-3, 2e-3):
+        both = jax.value_and_grad(lambda z, h=h: height(z, h, round(0.4 / h)), has_aux=True)
+        (y, kept), found = jax.jit(jax.vmap(both))(z)
+        assert float(kept.min()) > 1 - 1e-9
+        assert float(jnp.abs(y - value).max()) < 2.5 * h
+        assert float(jnp.abs(found - slope).max()) < 2.5 * h
+
+
+@dtypes
+@pytest.mark.parametrize("restitution", [0.3, 0.7])
+def test_what_has_ceased_to_bounce_stays(dtype, restitution):
+    system, state, height = falling(dtype, restitution)
+    h = jnp.asarray(2e-3, dtype)
+    states, _ = run(system, state, h, 2000)
+    y, v = np.asarray(states.q[-1000:, 1]), np.asarray(states.v[-1000:, 1])
+    rounding = float(jnp.finfo(dtype).eps)
+    assert np.ptp(y) <= rounding
+    assert abs(y[-1] - 0.1) <= rounding
+    assert np.abs(v).max() < 1e-3 * 9.81 * float(h)
+    numbers = [jnp.asarray(x, dtype) for x in (0.5, restitution, 9.81)]
+    slopes = jax.jit(jax.grad(lambda *x: height(*x, h, 2000), (0, 1, 2)))(*numbers)
+    np.testing.assert_allclose(slopes, 0, atol=1e-6)
+
+
+def test_a_ball_without_loss_goes_on_bouncing():
+    """What is lost is the integrator's, h g v of v²/2 in each bounce; none is ever won."""
+    h, drop = 1e-3, 0.4 * 9.81
+    system, state, _ = falling(restitution=1.0)
+    states, reactions = run(system, state, h, 10000)
+    energy = np.asarray(jax.vmap(lambda s: jc.energy(system, s).total)(states))
+    energy = (energy - 0.1 * 9.81) / drop
+    assert energy.max() < 1 + 1e-9
+    v = np.asarray(states.v[:, 1])
+    bounces = int(((v[1:] > 0) & (v[:-1] < 0)).sum())
+    assert bounces > 15
+    assert energy[-500:].mean() > 1 - 1.1 * bounces * 2 * h * 9.81 / np.sqrt(2 * drop)
+
+
 def test_gradients_through_a_collision():
     case = references.load("grad_two_balls_nimble")
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
