@@ -41,7 +41,8 @@ class BoundSet(NamedTuple):
         friction: μ of contacts.
         rolling, spinning: the lengths by which their moments are bounded [m].
         compliance: C of the first row, by which u* is missed per unit of multiplier.
-        restitution: e; None where nothing can bounce.
+        bounce: what restitution adds to u* at the end of the step; None where nothing can bounce.
+        travel: what it adds to the mean u of the step, by which positions move.
         points: how many each element has, one after the other; None where an element is one.
     """
 
@@ -57,7 +58,8 @@ class BoundSet(NamedTuple):
     spins: tuple[Row, ...] = ()
     spinning: Lane = 0.0
     compliance: Lane = 0.0
-    restitution: Lane | None = None
+    bounce: Lane | None = None
+    travel: Lane | None = None
     points: int | None = None
 
     @property
@@ -85,20 +87,6 @@ class BoundGroup(Protocol):
         ...
 
 
-class Bounce(NamedTuple):
-    """What restitution asks of a step, by row, (n,).
-
-    Attributes:
-        more: what it adds to u* at the end of the step.
-        travel: what it adds to the mean u of the step, by which positions move; None in an impact.
-        later: δ, what accelerations add after the arrival.
-    """
-
-    more: Array
-    travel: Array | None
-    later: Array
-
-
 @pytree
 class BoundRows:
     """The bounded rows of a system, ordered as `solvers.bounded` says.
@@ -112,13 +100,12 @@ class BoundRows:
         friction: (contacts,).
         resistance: by disc of `kinds.turning`, (its contacts,).
         jacobian: (n, n_v); `Gathered` of rows that are chosen by their numbers.
-        restitution: e, (n,), negative of rows that do not bounce; None in a scene where nothing
-            can.
+        bounce, travel: what restitution adds to u* at the end of the step, and to the mean of the
+            step, (n,); None in a scene where nothing can bounce.
         layout: rows by element.
         kinds: how many rows of each law.
         hard: which rows answer an impact, (n,); of a contact its normal says so for all.
         ends: which of these have a gap that closes, (n,).
-        lasts: whether what bounces moves on; not in an impact, for which time stands still.
     """
 
     gap: Array
@@ -130,53 +117,16 @@ class BoundRows:
     friction: Array
     resistance: tuple[Array, ...]
     jacobian: Jacobian
-    restitution: Array | None
+    bounce: Array | None
+    travel: Array | None
     layout: BoundLayout = static()
     kinds: Kinds = static()
     hard: tuple[bool, ...] = static(default=())
     ends: tuple[bool, ...] = static(default=())
-    lasts: bool = static(default=True)
-
-    def bounces(self, e: Array, free: Array, dt: Array) -> Bounce:
-        """What restitution asks of a step of h that would end with w = φ̇₀ + h a without these rows.
-
-        What arrives, φ + h w ≤ 0, does so after τ = φ/|w|. It leaves with −e (φ̇₀ + a τ), and the
-        rest of the step, σ h = h − τ, adds a (h − τ) = σ (w − φ̇₀) = δ: it ends with
-
-            u = −e (w − δ) + δ = −e φ̇₀ + a (h − (1 + e) τ),
-
-        and moves by −e (w − δ) σ h after its arrival. So position and velocity after a bounce are
-        right to first order in h, and their derivatives contain that of τ. What rests, φ = φ̇₀ = 0,
-        has u = h a < 0 and stays, as does what would be back within the step. As a is that without
-        bounded rows, what falls on something that others bear lacks its part in a; and a that would
-        turn φ̇ round within the step is not counted.
-
-        Args:
-            e: restitution, (n,).
-            free: w, (n,).
-            dt: h, () [s].
-        """
-        closing = self.rate < 0
-        if not self.lasts:
-            more = jnp.maximum(-e * self.rate - self.target, 0)
-            more = jnp.where(closing & (e >= 0), more, 0)
-            return Bounce(more, None, jnp.zeros_like(more))
-        way = -dt[None] * jnp.minimum(free, 0)
-        arrives = closing & (self.gap <= way) & (e >= 0)
-        inside = arrives & (self.gap > 0)
-        rest = 1 - jnp.where(inside, self.gap, 0) / jnp.where(inside, way, 1)
-        # what others press together can have any a without them
-        free = jnp.where(free < 0, free, self.rate)
-        later = rest * (free - self.rate)
-        leaves = -e * (free - later)
-        more = leaves + later - self.target
-        up = arrives & (more > 0)
-        more, travel, later = (jnp.where(up, x, 0) for x in (more, leaves * rest, later))
-        return Bounce(more, travel, later)
 
     def chosen(self, choice: Choice) -> BoundRows:
         """Some of the rows."""
-        e = self.restitution
+        bounce, travel = (None if x is None else choice.take(x) for x in (self.bounce, self.travel))
         return dataclasses.replace(
             self,
             gap=choice.take(self.gap),
@@ -185,7 +135,8 @@ class BoundRows:
             compliance=choice.take(self.compliance),
             friction=choice.contacts(self.friction),
             jacobian=Gathered(self.jacobian.pulls(choice.places().astype(self.rate.dtype))),
-            restitution=None if e is None else choice.take(e),
+            bounce=bounce,
+            travel=travel,
             kinds=choice.kinds,
         )
 
@@ -207,13 +158,12 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
     def every(field: str) -> Array:
         return jnp.concatenate([c.flat([getattr(r, field) for r in c.rows]) for c in columns])
 
-    first, bouncy = columns[0], any(s.restitution is not None for s in sets)
+    first, bouncy = columns[0], any(s.bounce is not None for s in sets)
     gaps = [s.rows[0].value if s.rows[0].holonomic else 0.0 for s in sets]
     still = jnp.zeros((kinds.size - first.size, *v.shape[1:]), v.dtype)
 
-    def once(lanes: list[Any], none: float = 0.0) -> Array:
-        own = first.flat([none if x is None else x for x in lanes])
-        return jnp.concatenate([own, still + none])
+    def once(lanes: list[Any]) -> Array:
+        return jnp.concatenate([first.flat([0.0 if x is None else x for x in lanes]), still])
 
     def of(field: str) -> Array:
         return first.flat([getattr(s, field) for s in sets])
@@ -228,7 +178,8 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
         of("friction")[kinds.normal :],
         _resistance(sets, sizes, v),
         Jacobian(tuple(blocks), (kinds.size, v.shape[0])),
-        once([s.restitution for s in sets], -1.0) if bouncy else None,
+        once([s.bounce for s in sets]) if bouncy else None,
+        once([s.travel for s in sets]) if bouncy else None,
         _layout(pairs, columns, starts),
         kinds,
         _by_row([s.hard for s in sets], sizes, kinds),

@@ -213,15 +213,13 @@ class Impulse:
             left = problem.worst(found)
             return implicit_multipliers(problem, found, moved, live, solver.smoothing), left
 
-        if rows.restitution is None:
+        if rows.bounce is None:
             found, left = met(rows.target)
             return Reactions(found, rows.gap, left, jnp.ones_like(left), None, rows.layout)
-        without = self.velocity(jnp.zeros_like(rows.target))
-        bounce = rows.bounces(rows.restitution, without, self.dt)
-        asked = (jnp.zeros_like(rows.target), bounce.more)
-        asked = asked if bounce.travel is None else (*asked, bounce.travel)
+        asked = (jnp.zeros_like(rows.target), rows.bounce)
+        asked = asked if rows.travel is None else (*asked, rows.travel)
         (plain, bounced, *moving), left = jax.vmap(met)(jnp.stack([rows.target + x for x in asked]))
-        kept, shift = self.harmless(without, plain, bounced - plain, bounce.later), None
+        kept, shift = self.harmless(plain, bounced - plain), None
         found = plain + kept[None] * (bounced - plain)
         for own in moving:
             mean = plain + kept[None] * (own - plain)
@@ -250,25 +248,17 @@ class Impulse:
         parts = kinds.split(jax.lax.stop_gradient(jnp.where(self.acts, short, 0)))
         return jnp.max(jnp.concatenate([parts.single, parts.normal]), axis=0, initial=0)
 
-    def harmless(self, free: Array, multipliers: Array, more: Array, later: Array) -> Array:
+    def harmless(self, multipliers: Array, more: Array) -> Array:
         """An s ≤ 1 for which λ + s Δλ does no work, or no more than λ, by world; 1 where it may be.
 
         Over a step multipliers do the work h λ·(u₀ + u)/2, u₀ the velocities without them; motors
-        and friction in joints, which are boxes, may do what they want. Those of a bounce act when
-        it arrives, at velocities that lack δ, what accelerations add later: where that is outward,
-        the work of these does not count as that of the bounce.
-
-        Args:
-            free: u₀, (n,).
-            multipliers: λ, (n,).
-            more: Δλ, (n,).
-            later: δ, (n,), of rows that bounce.
+        and friction in joints, which are boxes, may do what they want.
         """
-        kinds = self.rows.kinds
+        kinds, free = self.rows.kinds, self.velocity(jnp.zeros_like(multipliers))
         acts = jnp.ones(kinds.size, free.dtype).at[kinds.single : kinds.normal].set(0)
         acts = acts.reshape(-1, *(1,) * (free.ndim - 1))
         change = self.velocity(more + multipliers) - self.velocity(multipliers)
-        mean = (free + self.velocity(multipliers)) / 2 - jnp.maximum(later, 0)
+        mean = (free + self.velocity(multipliers)) / 2
 
         def work(x: Array, u: Array) -> Array:
             return jnp.sum(acts * x * u, axis=0)
