@@ -261,6 +261,28 @@ def test_gradients_through_a_bounce_contain_its_time():
     np.testing.assert_allclose(slopes, [case["dh_dy0"], case["dh_dvy0"]], rtol=1e-6)
 
 
+def test_under_gravity_the_gradient_by_place_through_a_bounce_takes_events():
+    """∂y/∂z = −e + (1 + e) g d/v; a plain step knows of −e, the time of impact, alone."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, restitution=0.7))
+    system, state = scene.build()
+
+    def slope(method, h, z):
+        def height(z):
+            start = jc.init(system, method, state.q.at[1].set(z), state.v)
+            return jc.rollout(system, method, start, None, h, round(0.6 / h))[0].q[1]
+
+        return jax.jit(jax.grad(height))(z)
+
+    z, g, e = 0.503, 9.81, 0.7
+    v = np.sqrt(2 * g * (z - 0.1))
+    truth = -e + (1 + e) * g * (0.6 - v / g) / v
+    np.testing.assert_allclose(slope(jc.Method(), 2e-3, z), -e, atol=1e-12)
+    located = jc.Method(integrator=jc.RK4(), events=jc.Events())
+    np.testing.assert_allclose(slope(located, 2e-2, z), truth, rtol=1e-6)
+
+
 def test_gradients_through_a_collision():
     case = references.load("grad_two_balls_nimble")
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))

@@ -76,6 +76,11 @@ def test_what_is_beyond_all_numbers_is_not_tried_and_has_an_infinite_error():
     space = space_of({"x": np.float32(2.0)}, True, None, "identify")
     for end in space.limits[0] + space.limits[1]:
         assert 0 < space.decode((end,))["x"] < np.inf
+    largest = {"x": np.finfo(np.float32).max}
+    top = space_of(largest, True, None, "identify")
+    assert top.decode(top.encode(largest))["x"] == largest["x"]
+    with pytest.raises(ValueError, match="'x' is to stay positive"):
+        space_of({"x": np.float32(1e-44)}, True, None, "identify")
     ones = np.ones(9, np.float32)
     found = jc.identify(lambda p: p["x"] * ones / 1e30, {"x": np.float32(1.0)}, ones, positive=True)
     assert not np.isnan(found.errors["x"])

@@ -136,6 +136,8 @@ def test_what_is_no_record_and_no_policy_is_refused(pushed):
         run(lambda state, time: state.v)
     with pytest.raises(TypeError, match="a function of the state, returned None"):
         run(lambda state: None)
+    with pytest.raises(ValueError, match="6 rows.* got the number 3"):
+        run(np.int64(3))
 
 
 @pytest.fixture(scope="module")

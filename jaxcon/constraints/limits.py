@@ -218,7 +218,7 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
 
     What arrives after τ = φ/|φ̇| leaves with e |φ̇|, and moves by e |φ̇| (h − τ) in the rest of the
     step. So position and velocity after a bounce are right to first order in h, and their
-    derivatives contain that of τ.
+    derivatives contain that of τ, but not how φ̇ changes until then, which takes events.
     """
     h = dt[None]
     closing = numerics.safe_divide(-row.value, h)

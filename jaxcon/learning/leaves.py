@@ -50,7 +50,10 @@ class Space:
         x = [jnp.exp(z) if p else z for z, p in zip(y, self.positive, strict=True)]
         inside = map(jnp.clip, x, self.low, self.high)
         # a clip has no derivative at the bound itself, where a search must be able to turn back
-        return self.fill(z + jax.lax.stop_gradient(c - z) for z, c in zip(x, inside, strict=True))
+        pairs = zip(x, inside, strict=True)
+        return self.fill(
+            jnp.where(jnp.isinf(z), c, z + jax.lax.stop_gradient(c - z)) for z, c in pairs
+        )
 
     def fill(self, leaves: Iterable[Any]) -> PyTree:
         """These in the place of the leaves that are searched."""
@@ -209,7 +212,7 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
     start = jnp.asarray(start)
     if not np.all(np.isfinite(start)):
         raise ValueError(f"{what} must be finite at the start, got {np.asarray(start).tolist()}.")
-    if log and not np.all(np.asarray(start) > 0):
+    if log and not np.all(np.asarray(start) >= jnp.finfo(start.dtype).tiny):
         raise ValueError(
             f"{what} is to stay positive and must start so, got {np.asarray(start).tolist()}."
         )
@@ -223,7 +226,7 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
         ) from error
     if log:  # beyond these exp may round to zero, or to infinity
         known = jnp.finfo(start.dtype)
-        low = jnp.maximum(low, jnp.minimum(start, known.tiny))
+        low = jnp.maximum(low, known.tiny)
         high = jnp.minimum(high, jnp.maximum(start, known.max / 2))
     if not np.all(np.asarray(low) <= np.asarray(high)):
         raise ValueError(f"{what} needs bounds (low, high) with low ≤ high, got {pair!r}.")

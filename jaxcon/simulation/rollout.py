@@ -86,10 +86,15 @@ def rollout(
     policy = controls if callable(controls) else None
     if policy is not None:
         checks.takes("rollout", "controls", policy, ("state",))
+    wanted = not hasattr(system, "layout") or system.layout.n_u
     inputs = jnp.arange(steps), None if policy else _rows(controls, steps, state.q.dtype)
 
     def one(state: State, given: Any) -> tuple[State, StepInfo]:
         control = contained_policy(policy, state) if policy else given[1]
+        if policy and control is None and wanted:
+            raise TypeError(
+                "rollout: controls, a function of the state, returned None; is a return missing?"
+            )
         return step_quietly(system, method, state, control, dt)
 
     def back(state: State, given: Any) -> State:
@@ -108,10 +113,6 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
 
     def judged(state: State, constants: Any) -> tuple[PyTree, Any]:
         control = function(constants, state)
-        if control is None:
-            raise TypeError(
-                "rollout: controls, a function of the state, returned None; is a return missing?"
-            )
         good = ~failed(state.status)
         for x in jax.tree.leaves(control):
             good &= jnp.all(jnp.isfinite(x))
@@ -133,12 +134,13 @@ def _rows(controls: PyTree, steps: int, dtype: Any) -> PyTree:
     """The controls as arrays, one row a step, in the dtype of the scene if they choose none."""
 
     def checked(x: Any) -> Any:
-        if not isinstance(x, jax.Array | np.ndarray | int | float):
+        try:
+            x = jnp.asarray(x)
+        except TypeError as error:
             raise TypeError(
                 f"rollout: controls must be None, arrays by step, or a function of the state, got"
                 f" {controls!r}."
-            )
-        x = jnp.asarray(x)
+            ) from error
         if x.ndim == 0 or x.shape[0] != steps:
             raise ValueError(
                 f"rollout: controls must have {steps} rows, one a step, got shape {x.shape}; repeat"
@@ -147,7 +149,7 @@ def _rows(controls: PyTree, steps: int, dtype: Any) -> PyTree:
         return x
 
     for x in jax.tree.leaves(controls):
-        if isinstance(x, int | float):
+        if isinstance(x, int | float | np.generic):
             raise ValueError(
                 f"rollout: controls must have {steps} rows, one a step, in an array, got the number"
                 f" {x}; of a list make an array by jnp.asarray."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -189,7 +189,9 @@ def _channels(layout: Any, control: Any, dtype: Any) -> Array:
         array = control if isinstance(control, jax.Array) else jnp.asarray(control, dtype)
         got = str(array.shape)
     except (TypeError, ValueError):
-        array, got = None, f"a {type(control).__name__} with {checks.described(control)}"
+        array, got = None, repr(control)
+        if isinstance(control, Mapping):
+            got = f"a {type(control).__name__} with {checks.described(control)}"
     if array is None or array.shape != (layout.n_u,):
         raise ValueError(
             f"step: control must have shape ({layout.n_u},), got {got}; its channels (name, first,"
