@@ -24,7 +24,7 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
     by NaN. So tangents are masked on both sides of the linearized function, T ↦ P (f′ (P T)) with
     P = 1 in healthy worlds and 0 in failed ones; its transpose is masked on both sides as well, and
     the gradient by parameters shared between worlds is that of the healthy ones. Where a derivative
-    of f′ is taken, that by the place of f′ is masked, too.
+    of f′ is taken in a native function, that by the place of f′ is masked, too.
 
     Args:
         function: returns a pytree and the status of this world, ().
@@ -46,7 +46,7 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
         batch = jax.eval_shape(call, *primals)[1].shape
         floats, others = primals
         # what is shared by worlds must be masked in each of them
-        if native.order() != 1:
+        if native.order() > 1:
             floats = guarded(spread(floats, batch), others)
         start, fixed = moving.split(parts.merge(floats, others))
         start, given = spread(start, batch), spread(list(compress(tangents[0], moved)), batch)
