@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core.lanes import Vector
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.typing import Array, Lane, PyTree
 
 
 def safe_sqrt(x: Lane) -> Array:
@@ -95,3 +95,11 @@ def inverse_exponential(square: Lane) -> Array:
     far = jnp.where(near, 1, square)
     cos, sinc = cos_sinc(far / 4)
     return jnp.where(near, series, (1 - safe_divide(cos, sinc)) / far)
+
+
+def all_finite(tree: PyTree) -> Array:
+    """Whether every number of a tree is, ()."""
+    good = jnp.ones((), bool)
+    for x in jax.tree.leaves(tree):
+        good &= jnp.all(jnp.isfinite(x))
+    return good

@@ -15,6 +15,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh
 
+from jaxcon.core import numerics
 from jaxcon.core.devices import over_devices
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status, failed
@@ -165,7 +166,7 @@ class Descent:
     def step(self, search: Search, key: Any) -> tuple[Search, Array]:
         """One step, and the loss before it; where that is not finite, back to where it was."""
         (loss, seen), slope = self.slope(search.y, key)
-        good = jnp.isfinite(loss) & _all_finite(slope)
+        good = jnp.isfinite(loss) & numerics.all_finite(slope)
         # optax counts on promotion, whatever the rest of a program is held to
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             update, memory = self.optimizer.update(
@@ -181,7 +182,7 @@ class Descent:
             lambda y, u: y + share.astype(y.dtype) * u.astype(y.dtype), search.y, update
         )
         moved = self.space.clip(ahead)
-        led = _all_finite(moved)
+        led = numerics.all_finite(moved)
         stop = jnp.where(share < SMALLEST, Stop.NOT_FINITE, Stop.RUNNING)
         stop = jnp.where(good & ~led, Stop.LED_NOWHERE, stop)
         here = search.y, search.memory
@@ -225,14 +226,6 @@ class Descent:
         stop = jnp.where(stalled, Stop.STALLED, search.stop).astype(search.stop.dtype)
         mark = jnp.where(progress, best.loss, search.mark)
         return dataclasses.replace(search, best=best, mark=mark, since=since, stop=stop)
-
-
-def _all_finite(tree: PyTree) -> Array:
-    """Whether every number is."""
-    good = jnp.ones((), bool)
-    for x in jax.tree.leaves(tree):
-        good &= jnp.all(jnp.isfinite(x))
-    return good
 
 
 def split(result: Any) -> tuple[Array, PyTree]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.errors import TracerIntegerConversionError
 
-from jaxcon.core import checks
+from jaxcon.core import checks, numerics
 from jaxcon.core.closures import opened
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
@@ -113,9 +113,7 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
 
     def judged(state: State, constants: Any) -> tuple[PyTree, Any]:
         control = function(constants, state)
-        good = ~failed(state.status)
-        for x in jax.tree.leaves(control):
-            good &= jnp.all(jnp.isfinite(x))
+        good = ~failed(state.status) & numerics.all_finite(control)
         return control, jnp.where(good, Status.OK, Status.NON_FINITE)
 
     return contain(judged, (state, known))[0]
