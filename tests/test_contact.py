@@ -261,26 +261,134 @@ def test_gradients_through_a_bounce_contain_its_time():
     np.testing.assert_allclose(slopes, [case["dh_dy0"], case["dh_dvy0"]], rtol=1e-6)
 
 
-def test_under_gravity_the_gradient_by_place_through_a_bounce_takes_events():
-    """∂y/∂z = −e + (1 + e) g d/v; a plain step knows of −e, the time of impact, alone."""
-    scene = jc.Scene(dim=2)
+def falling(dtype=None, restitution=0.7, ceiling=False):
+    """A ball of 0.1 m in the plane, and its height after steps of h, with v₀ as its velocity."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=dtype)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
-    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, restitution=0.7))
+    side = {"point": (0.0, 1.1), "normal": (0.0, -1.0)} if ceiling else {}
+    end = jc.PlaneContact("end", jc.WORLD, "ball", radius=0.1, restitution=restitution, **side)
+    scene.add(end)
     system, state = scene.build()
 
-    def slope(method, h, z):
-        def height(z):
-            start = jc.init(system, method, state.q.at[1].set(z), state.v)
-            return jc.rollout(system, method, start, None, h, round(0.6 / h))[0].q[1]
+    def height(z, e, g, v, h, steps):
+        own = {"end": {"restitution": e}, "gravity": jnp.stack([0 * g, -g])}
+        start = dataclasses.replace(state, q=state.q.at[1].set(z), v=state.v.at[1].set(v))
+        h = jnp.asarray(h, state.q.dtype)
+        return jc.rollout(system.with_params(own), jc.Method(), start, None, h, steps)[0].q[1]
 
-        return jax.jit(jax.grad(height))(z)
+    return system, state, height
 
-    z, g, e = 0.503, 9.81, 0.7
-    v = np.sqrt(2 * g * (z - 0.1))
-    truth = -e + (1 + e) * g * (0.6 - v / g) / v
-    np.testing.assert_allclose(slope(jc.Method(), 2e-3, z), -e, atol=1e-12)
-    located = jc.Method(integrator=jc.RK4(), events=jc.Events())
-    np.testing.assert_allclose(slope(located, 2e-2, z), truth, rtol=1e-6)
+
+def bounced(z, e, g, v, end, duration):
+    """y after a bounce at y = `end`, where it arrives with √(v² + 2 g (z − end))."""
+    there = jnp.sqrt(v * v + 2 * g * (z - end))
+    up = jnp.where(end > z, 1, -1)
+    left = duration - (v - up * there) / g
+    return end - up * e * there * left - g * left * left / 2
+
+
+@dtypes
+@pytest.mark.parametrize(("ceiling", "speed"), [(False, 0.0), (True, 5.0)])
+def test_what_falls_and_bounces_does_so_exactly(dtype, ceiling, speed):
+    """And by place, restitution and gravity, where v₀ is that of half a step before z."""
+    h, steps = 4e-3, 120
+    height = falling(dtype, ceiling=ceiling)[2]
+    end = 1.0 if ceiling else 0.1
+
+    def found(z, e, g):
+        return height(z, e, g, speed + h * g / 2, h, steps)
+
+    def want(z, e, g):
+        return bounced(z, e, g, speed, end, h * steps)
+
+    z = np.linspace(0.39, 0.41, 41)
+    numbers, axes = (0.7, 9.81), {"in_axes": (0, None, None)}
+    reference = jax.vmap(jax.value_and_grad(want, (0, 1, 2)), **axes)(z, *numbers)
+    given = [jnp.asarray(x, dtype) for x in (z, *numbers)]
+    value, slopes = jax.jit(jax.vmap(jax.value_and_grad(found, (0, 1, 2)), **axes))(*given)
+    tight = 1e-11 if dtype == jnp.float64 else 1e-4
+    for a, b in zip((value, *slopes), (reference[0], *reference[1]), strict=True):
+        np.testing.assert_allclose(a, b, atol=tight)
+
+
+def test_the_gradient_by_place_through_a_bounce_halves_its_error_with_the_step():
+    """∂y/∂z = −e + (1 + e) g d/v for a start at rest, which a step takes for half a step before."""
+    height = falling()[2]
+    z = np.linspace(0.49, 0.51, 41)
+    numbers, axes = (0.7, 9.81), {"in_axes": (0, None, None)}
+    want = jax.vmap(jax.grad(lambda z, e, g: bounced(z, e, g, 0.0, 0.1, 0.6)), **axes)(z, *numbers)
+    errors = []
+    for h in (4e-3, 2e-3, 1e-3):
+        slope = jax.grad(lambda z, e, g, h=h: height(z, e, g, 0.0, h, round(0.6 / h)))
+        errors.append(np.abs(jax.jit(jax.vmap(slope, **axes))(z, *numbers) - want).max())
+    assert errors[0] < 0.013
+    np.testing.assert_allclose(np.divide(errors[1:], errors[:-1]), 0.5, atol=0.01)
+
+
+@dtypes
+@pytest.mark.parametrize("restitution", [0.3, 0.7])
+def test_what_has_ceased_to_bounce_stays(dtype, restitution):
+    system, state, height = falling(dtype, restitution)
+    h = jnp.asarray(2e-3, dtype)
+    states, _ = run(system, state, h, 2000)
+    y, v = np.asarray(states.q[-1000:, 1]), np.asarray(states.v[-1000:, 1])
+    rounding = float(jnp.finfo(dtype).eps)
+    assert np.ptp(y) <= rounding
+    assert abs(y[-1] - 0.1) <= rounding
+    assert np.abs(v).max() < 1e-3 * 9.81 * float(h)
+    numbers = [jnp.asarray(x, dtype) for x in (0.5, restitution, 9.81)]
+    slopes = jax.jit(jax.grad(lambda *x: height(*x, 0.0, h, 2000), (0, 1, 2)))(*numbers)
+    np.testing.assert_allclose(slopes, 0, atol=1e-6)
+
+
+def test_a_ball_without_loss_goes_on_bouncing():
+    """v is that of half a step before y."""
+    h, g = 1e-3, 9.81
+    system, state, _ = falling(restitution=1.0)
+    states, _ = run(system, state, h, 10000)
+    y, v = np.asarray(states.q[:, 1]), np.asarray(states.v[:, 1])
+    energy = (v - h * g / 2) ** 2 / 2 + g * y
+    assert int(((v[1:] > 0) & (v[:-1] < 0)).sum()) > 15
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-11)
+
+
+def test_a_ball_on_a_spring_between_walls_keeps_its_energy_on_average():
+    """The spring kicks before a bounce, at whatever time within the step that is."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("ball", mass=1.0, position=(0.03, 0.0))
+    for name, side in (("left", 1.0), ("right", -1.0)):
+        wall = {"point": (-0.1 * side, 0.0), "normal": (side, 0.0), "restitution": 1.0}
+        scene.add(jc.PlaneContact(name, jc.WORLD, "ball", **wall))
+    scene.add(jc.Spring("spring", jc.WORLD, "ball", stiffness=100.0, rest_length=0.0))
+    system, state = scene.build()
+
+    def grown(speed):
+        start = dataclasses.replace(state, v=state.v.at[0].set(speed))
+        final, _ = jc.rollout(system, jc.Method(), start, None, 4e-3, 5000)
+        before, after = (jc.energy(system, s).total for s in (start, final))
+        return after / before - 1
+
+    grown = np.asarray(jax.jit(jax.vmap(grown))(np.linspace(1.5, 2.5, 64)))
+    assert abs(grown.mean()) < 0.02
+    assert np.sqrt((grown**2).mean()) < 0.1
+
+
+@pytest.mark.parametrize("push", [1000.0, -1000.0])
+@pytest.mark.parametrize("speed", [0.5, 2.0])
+def test_a_ball_bounces_off_a_plate_that_is_pressed_to_a_floor_or_a_ceiling(push, speed):
+    """The force on the plate is borne, and no part of the bounce."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("plate", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    scene.add_particle("ball", mass=0.1, position=(0.0, 0.2))
+    scene.add(jc.Prismatic("guide", jc.WORLD, "plate", axis=(0.0, 1.0)))
+    scene.add(jc.PlaneContact("end", jc.WORLD, "plate", normal=(0.0, np.sign(push))))
+    scene.add(jc.Force("push", "plate", (0.0, -push)))
+    touch = {"radius_a": 0.05, "radius_b": 0.05, "restitution": 1.0}
+    scene.add(jc.CapsuleContact("touch", "plate", "ball", **touch))
+    system, state = scene.build()
+    state = dataclasses.replace(state, v=jnp.asarray([0.0, 0.0, 0.0, 0.0, -speed]))
+    states, _ = run(system, state, 1e-3, 400)
+    assert float(states.v[-1, -1]) == pytest.approx(speed, rel=1e-9)
 
 
 def test_gradients_through_a_collision():

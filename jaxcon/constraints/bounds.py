@@ -41,8 +41,7 @@ class BoundSet(NamedTuple):
         friction: μ of contacts.
         rolling, spinning: the lengths by which their moments are bounded [m].
         compliance: C of the first row, by which u* is missed per unit of multiplier.
-        bounce: what restitution adds to u* at the end of the step; None where nothing can bounce.
-        travel: what it adds to the mean u of the step, by which positions move.
+        restitution: e; None where nothing can bounce.
         points: how many each element has, one after the other; None where an element is one.
     """
 
@@ -58,8 +57,7 @@ class BoundSet(NamedTuple):
     spins: tuple[Row, ...] = ()
     spinning: Lane = 0.0
     compliance: Lane = 0.0
-    bounce: Lane | None = None
-    travel: Lane | None = None
+    restitution: Lane | None = None
     points: int | None = None
 
     @property
@@ -100,8 +98,7 @@ class BoundRows:
         friction: (contacts,).
         resistance: by disc of `kinds.turning`, (its contacts,).
         jacobian: (n, n_v); `Gathered` of rows that are chosen by their numbers.
-        bounce, travel: what restitution adds to u* at the end of the step, and to the mean of the
-            step, (n,); None in a scene where nothing can bounce.
+        restitution: e, (n,), negative of rows that do not bounce; None where nothing can.
         layout: rows by element.
         kinds: how many rows of each law.
         hard: which rows answer an impact, (n,); of a contact its normal says so for all.
@@ -117,8 +114,7 @@ class BoundRows:
     friction: Array
     resistance: tuple[Array, ...]
     jacobian: Jacobian
-    bounce: Array | None
-    travel: Array | None
+    restitution: Array | None
     layout: BoundLayout = static()
     kinds: Kinds = static()
     hard: tuple[bool, ...] = static(default=())
@@ -126,7 +122,7 @@ class BoundRows:
 
     def chosen(self, choice: Choice) -> BoundRows:
         """Some of the rows."""
-        bounce, travel = (None if x is None else choice.take(x) for x in (self.bounce, self.travel))
+        e = self.restitution
         return dataclasses.replace(
             self,
             gap=choice.take(self.gap),
@@ -135,8 +131,7 @@ class BoundRows:
             compliance=choice.take(self.compliance),
             friction=choice.contacts(self.friction),
             jacobian=Gathered(self.jacobian.pulls(choice.places().astype(self.rate.dtype))),
-            bounce=bounce,
-            travel=travel,
+            restitution=None if e is None else choice.take(e),
             kinds=choice.kinds,
         )
 
@@ -158,12 +153,13 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
     def every(field: str) -> Array:
         return jnp.concatenate([c.flat([getattr(r, field) for r in c.rows]) for c in columns])
 
-    first, bouncy = columns[0], any(s.bounce is not None for s in sets)
+    first, bouncy = columns[0], any(s.restitution is not None for s in sets)
     gaps = [s.rows[0].value if s.rows[0].holonomic else 0.0 for s in sets]
     still = jnp.zeros((kinds.size - first.size, *v.shape[1:]), v.dtype)
 
-    def once(lanes: list[Any]) -> Array:
-        return jnp.concatenate([first.flat([0.0 if x is None else x for x in lanes]), still])
+    def once(lanes: list[Any], none: float = 0.0) -> Array:
+        own = first.flat([none if x is None else x for x in lanes])
+        return jnp.concatenate([own, still + none])
 
     def of(field: str) -> Array:
         return first.flat([getattr(s, field) for s in sets])
@@ -178,8 +174,7 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
         of("friction")[kinds.normal :],
         _resistance(sets, sizes, v),
         Jacobian(tuple(blocks), (kinds.size, v.shape[0])),
-        once([s.bounce for s in sets]) if bouncy else None,
-        once([s.travel for s in sets]) if bouncy else None,
+        once([s.restitution for s in sets], -1.0) if bouncy else None,
         _layout(pairs, columns, starts),
         kinds,
         _by_row([s.hard for s in sets], sizes, kinds),

@@ -216,9 +216,7 @@ def saturating(p: dict[str, Any], row: Row, rate: Lane) -> tuple[Row, dict[str, 
 def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]]:
     """A row and the least φ̇ that a step may end with, by its gap φ.
 
-    What arrives after τ = φ/|φ̇| leaves with e |φ̇|, and moves by e |φ̇| (h − τ) in the rest of the
-    step. So position and velocity after a bounce are right to first order in h, and their
-    derivatives contain that of τ, but not how φ̇ changes until then, which takes events.
+    What bounces has more of it, see `jaxcon.dynamics.bounces`.
     """
     h = dt[None]
     closing = numerics.safe_divide(-row.value, h)
@@ -226,12 +224,7 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
     target = jnp.where(row.value > 0, closing, back)
     asked = {"target": target}
     if "restitution" in p:
-        e = not_negative(p["restitution"])
-        arrives = (row.rate < 0) & (row.value + h * row.rate <= 0)
-        leaves = -e * row.rate
-        left = leaves - e * numerics.safe_divide(jnp.maximum(row.value, 0), h)
-        asked["bounce"] = jnp.where(arrives, jnp.maximum(leaves - target, 0), 0)
-        asked["travel"] = jnp.where(arrives, left, 0)
+        asked["restitution"] = not_negative(p["restitution"])
     if "stiffness" not in p:
         return row, asked
     # λ = −k (φ + h u) − c u behind the gap, as u + C λ = u* with the stiffness of both over a step;

@@ -74,7 +74,7 @@ class Dynamics:
         """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago."""
         rows, law, problem = self._problem(q, v, t, age)
         if self.bounded is not None:
-            return self._reacted(q, v, t, rows, law, problem)[:2]
+            return self._reacted(q, v, t, rows, law, problem, leaps=age is not None)[:2]
         own = self.solver.solve(problem) if law.solve is None else law.solve(self.solver, problem)
         return self.system.complete(own), rows
 
@@ -90,7 +90,14 @@ class Dynamics:
         return solution, rows, dataclasses.replace(self, bounded=None, held=force)
 
     def _reacted(
-        self, q: Array, v: Array, t: Any, rows: Rows, law: Any, problem: Saddle
+        self,
+        q: Array,
+        v: Array,
+        t: Any,
+        rows: Rows,
+        law: Any,
+        problem: Saddle,
+        leaps: bool = False,
     ) -> tuple[Solution, Rows, Array]:
         """a and λ with bounded rows, the rows with what these do, and their generalized force."""
         if self.part is None:
@@ -98,7 +105,9 @@ class Dynamics:
         else:
             bounds, acts = self.part.ask(lambda dt: self.bounds(q, v, t, dt), self.dt)
             length = self.part.length
-        impulse = self._impulse(bounds, law, problem, length, acts)
+        leaps &= bounds.restitution is not None
+        weight = self.system.weight(q) if leaps else None
+        impulse = self._impulse(bounds, law, problem, length, acts, weight)
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
         known = self._judged(impulse, known, solution.acceleration)
@@ -140,11 +149,19 @@ class Dynamics:
 
         return self.system.complete(solve(problem.force, law.target)), rows, allowed
 
-    def _impulse(self, rows: BoundRows, law: Any, problem: Saddle, dt: Any, acts: Any) -> Impulse:
+    def _impulse(
+        self,
+        rows: BoundRows,
+        law: Any,
+        problem: Saddle,
+        dt: Any,
+        acts: Any,
+        weight: Array | None = None,
+    ) -> Impulse:
         """How bounded rows act, by factors of wide lanes, to which the solver's numbers belong."""
         wide = dataclasses.replace(self, solver=widened(self.solver, problem.force.ndim - 1))
         factor = partial(wide._factors, law)
-        return Impulse.of(rows, factor, problem, dt, acts, sifts=self._leaves_out(rows))
+        return Impulse.of(rows, factor, problem, dt, acts, weight, self._leaves_out(rows))
 
     def _judged(self, impulse: Impulse, known: Reactions, acceleration: Array) -> Reactions:
         """The reactions with what is missed by rows that were left out."""

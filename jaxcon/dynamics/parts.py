@@ -57,9 +57,8 @@ class Part:
             dt: h, () [s].
         """
         rows, rest = bounds(dt), bounds(jnp.maximum(self.length, SHORTEST * dt))
-        names = [n for n in ("target", "bounce", "travel") if getattr(rows, n) is not None]
-        asked = {n: jnp.where(self.open, getattr(rest, n), getattr(rows, n)) for n in names}
-        return dataclasses.replace(rows, **asked), ~(self.open & self.awaited[None])
+        target = jnp.where(self.open, rest.target, rows.target)
+        return dataclasses.replace(rows, target=target), ~(self.open & self.awaited[None])
 
 
 @pytree
@@ -184,13 +183,11 @@ class Struck:
         touching = self.first | (rows.gap <= rounding[None]) | resting(rows, bend, rounding, dt)
         acts = mask(rows.hard, rows) & (touching | ~ends) & self.happens[None]
         tangents = mask(np.arange(rows.kinds.size) >= rows.kinds.normal + rows.kinds.contacts, rows)
-        target = jnp.where(ends, 0, rows.target)
-        bounce = rows.bounce
-        if bounce is not None:
-            fast = acts & (rows.rate < 0) & ~slow(rows, bend, rounding, dt)
-            # a bounce is given as what is added to the target
-            bounce = jnp.where(fast & (bounce > 0), bounce + rows.target, 0)
-        asked = dataclasses.replace(rows, target=target, bounce=bounce, travel=None)
+        gap, target = (jnp.where(ends, 0, x) for x in (rows.gap, rows.target))
+        e = rows.restitution
+        if e is not None:
+            e = jnp.where(acts & ~slow(rows, bend, rounding, dt), e, -1)
+        asked = dataclasses.replace(rows, gap=gap, target=target, restitution=e)
         return asked, acts | tangents
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
-from jaxcon.core.lanes import Vector, widened
+from jaxcon.core.lanes import widened
 from jaxcon.core.typing import Array
+from jaxcon.dynamics.bounces import Bounce, bounces, freely
 from jaxcon.solvers import gauss_jordan
 from jaxcon.solvers.bounded import Bounded, implicit_multipliers
 from jaxcon.solvers.jacobian import Jacobian
@@ -43,6 +44,8 @@ class Impulse:
         start: a without them, (n_v,), a constant.
         bare: J_b M⁻¹ J_bᵀ on the diagonal, (n,): what rows would move without the equality rows.
         acts: which rows act, (n,), tangents where their normal does; None for all.
+        weight: the force of gravity, (n_v,), where velocities are those of half a step before the
+            positions; else None.
         answers: a of `probing` forces, (n_v, k, …), a constant; None where that is not known yet.
     """
 
@@ -54,6 +57,7 @@ class Impulse:
     start: Array
     bare: Array
     acts: Any = None
+    weight: Array | None = None
     answers: Any = None
 
     @classmethod
@@ -64,6 +68,7 @@ class Impulse:
         saddle: Saddle,
         dt: Any,
         acts: Array | None = None,
+        weight: Array | None = None,
         sifts: bool = False,
     ) -> Impulse:
         """That of a step of h, by the factors of its saddle system.
@@ -74,11 +79,13 @@ class Impulse:
             saddle: M and f, of the equality rows.
             dt: h, () [s].
             acts: which rows act, (n,); None for all.
+            weight: the force of gravity, (n_v,), where velocities are those of half a step before
+                the positions; else None.
             sifts: whether rows that nothing moves are left out, as `nearest` needs it.
         """
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
         solve = factor(widened(saddle, saddle.force.ndim - 1))
-        own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts)
+        own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts, weight)
         return own._sifted() if sifts else own._begun()
 
     def _begun(self) -> Impulse:
@@ -144,6 +151,24 @@ class Impulse:
         """φ̇ + h J_b a, (n,)."""
         return self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
 
+    def _unhindered(self) -> tuple[Array, Array]:
+        """h J_b a without multipliers, and what gravity has in it, (n,) each."""
+        forces, targets = [self.saddle.force], [self.target]
+        if self.weight is not None:
+            forces.append(jnp.broadcast_to(self.weight, forces[0].shape))
+            targets.append(jnp.zeros_like(self.target))
+        found = self.solve(jnp.stack(forces, axis=1), jnp.stack(targets, axis=1)).acceleration
+        led = [self.dt[None] * self.rows.jacobian.apply(found[:, i]) for i in range(len(forces))]
+        return led[0], led[1] if self.weight is not None else jnp.zeros_like(led[0])
+
+    def _bounce(self, matrix: Array, moves: Array, change: Array, fall: Array) -> Bounce:
+        """What restitution asks, of h J_b a and what gravity has in it."""
+        if self.weight is None:
+            free = jnp.zeros(change.shape, bool)
+        else:
+            free = freely(self.rows, change, fall, self.dt, matrix, moves)
+        return bounces(self.rows, *(jnp.where(free, x, 0) for x in (change, fall)), self.dt)
+
     def matrix(self) -> Array:
         """G, (n, n), a constant."""
         j, moved = jax.lax.stop_gradient(self.rows.jacobian), self.answers
@@ -173,10 +198,8 @@ class Impulse:
         rounding = 64 * float(jnp.finfo(matrix.dtype).eps) * self.dt[None] * self.bare
         moving = jax.lax.stop_gradient(own > rounding)
         moving = moving if self.acts is None else moving & self.acts
-        kinds, moves = self.rows.kinds, self.rows.kinds.split(moving)
-        sets = zip(kinds.discs, moves.discs, strict=True)  # no friction without a normal
-        discs = tuple(Vector(*(y & disc.of(moves.normal) for y in x)) for disc, x in sets)
-        return kinds.join(moves._replace(discs=discs))
+        kinds = self.rows.kinds
+        return moving & kinds.by_normals(kinds.split(moving))  # no friction without a normal
 
     def react(self, solver: Any, guess: Array | None) -> Reactions:
         """λ by the laws of the rows, with restitution as far as it adds no energy.
@@ -213,13 +236,15 @@ class Impulse:
             left = problem.worst(found)
             return implicit_multipliers(problem, found, moved, live, solver.smoothing), left
 
-        if rows.bounce is None:
+        if rows.restitution is None:
             found, left = met(rows.target)
             return Reactions(found, rows.gap, left, jnp.ones_like(left), None, rows.layout)
-        asked = (jnp.zeros_like(rows.target), rows.bounce)
-        asked = asked if rows.travel is None else (*asked, rows.travel)
+        change, fall = self._unhindered()
+        bounce = self._bounce(matrix, moves, change, fall)
+        asked = (jnp.zeros_like(change), bounce.more)
+        asked = asked if self.weight is None else (*asked, bounce.travel)
         (plain, bounced, *moving), left = jax.vmap(met)(jnp.stack([rows.target + x for x in asked]))
-        kept, shift = self.harmless(plain, bounced - plain), None
+        kept, shift = self.harmless(rows.rate + change, plain, bounced - plain, bounce.later), None
         found = plain + kept[None] * (bounced - plain)
         for own in moving:
             mean = plain + kept[None] * (own - plain)
@@ -248,17 +273,24 @@ class Impulse:
         parts = kinds.split(jax.lax.stop_gradient(jnp.where(self.acts, short, 0)))
         return jnp.max(jnp.concatenate([parts.single, parts.normal]), axis=0, initial=0)
 
-    def harmless(self, multipliers: Array, more: Array) -> Array:
+    def harmless(self, free: Array, multipliers: Array, more: Array, later: Array) -> Array:
         """An s ≤ 1 for which λ + s Δλ does no work, or no more than λ, by world; 1 where it may be.
 
         Over a step multipliers do the work h λ·(u₀ + u)/2, u₀ the velocities without them; motors
-        and friction in joints, which are boxes, may do what they want.
+        and friction in joints, which are boxes, may do what they want. What bounces is pushed when
+        it arrives, at velocities without what gravity adds later.
+
+        Args:
+            free: u₀, (n,).
+            multipliers: λ, (n,).
+            more: Δλ, (n,).
+            later: what gravity adds after the arrival, (n,).
         """
-        kinds, free = self.rows.kinds, self.velocity(jnp.zeros_like(multipliers))
+        kinds = self.rows.kinds
         acts = jnp.ones(kinds.size, free.dtype).at[kinds.single : kinds.normal].set(0)
         acts = acts.reshape(-1, *(1,) * (free.ndim - 1))
         change = self.velocity(more + multipliers) - self.velocity(multipliers)
-        mean = (free + self.velocity(multipliers)) / 2
+        mean = (free + self.velocity(multipliers)) / 2 - later
 
         def work(x: Array, u: Array) -> Array:
             return jnp.sum(acts * x * u, axis=0)

@@ -122,6 +122,17 @@ class BodySystem:
         gyroscopic = [g.kind.gyroscopic(g.unpack(q, v)[1], p.moments) for g, p in groups]
         return self._forces(q, v, t, control, gyroscopic)
 
+    def weight(self, q: Array) -> Array:
+        """The force of gravity in f, (n_v,)."""
+        pairs = zip(self.layout.groups, self.inertia, strict=True)
+        own = [self._weight(group, p.mass).map(lambda x, m=p.mass: 0 * m + x) for group, p in pairs]
+        return _join(own, q)
+
+    def _weight(self, group: Any, mass: Lane) -> Vector:
+        """That of the bodies of a group."""
+        own = [mass * g[None] for g in Vector.of(self.gravity)]
+        return Vector(*own, *zeros(group.kind.n_v - self.layout.dim))
+
     def applied(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f without the gyroscopic force, (n_v,); reads v only where a force element does."""
         none = [zeros(g.kind.n_v) for g in self.layout.groups]
@@ -150,10 +161,8 @@ class BodySystem:
         """Gravity and gyroscopic force on the bodies of a group."""
         layout, properties = self.layout.groups[group], self.inertia[group]
         _, velocity = layout.unpack(q, v)
-        weight = [properties.mass * g[None] for g in Vector.of(self.gravity)]
-        rest = zeros(layout.kind.n_v - self.layout.dim)
         spread = jnp.zeros_like(velocity[0])
-        return (Vector(*weight, *rest) + gyroscopic).map(lambda x: spread + x)
+        return (self._weight(layout, properties.mass) + gyroscopic).map(lambda x: spread + x)
 
     def kinematics(self, q: Array, v: Array) -> Array:
         """q̇ (n_q,) of the velocities v."""

@@ -104,6 +104,11 @@ class Kinds:
         rows = itertools.chain(*parts.discs)
         return jnp.concatenate([parts.single, parts.box, parts.normal, *rows])
 
+    def by_normals(self, parts: Parts) -> Array:
+        """The array of parts in which each disc has what its contacts' normals have."""
+        discs = tuple(Vector(*[disc.of(parts.normal)] * disc.rank) for disc in self.discs)
+        return self.join(parts._replace(discs=discs))
+
     def largest(self, x: Array) -> Array:
         """Of rows (n, …) that obey a law together, what is largest: normal and slip, or turning."""
         parts = self.split(x)
