@@ -31,7 +31,7 @@ class Bounce(NamedTuple):
     later: Array
 
 
-def bounces(rows: BoundRows, change: Array, fall: Array, dt: Array) -> Bounce:
+def bounces(rows: BoundRows, e: Array, change: Array, fall: Array, dt: Array) -> Bounce:
     """What rows with restitution e ask of a step h.
 
     Forces other than gravity kick at the start of the step; within it the row moves as gravity
@@ -50,11 +50,12 @@ def bounces(rows: BoundRows, change: Array, fall: Array, dt: Array) -> Bounce:
 
     Args:
         rows: the bounded rows.
+        e: restitution, (n,), negative of rows that do not bounce.
         change: h a, (n,), of rows that move `freely`, and zero of others.
         fall: h g, (n,), of the same rows.
         dt: h, () [s].
     """
-    e, mean = rows.restitution, rows.rate + change
+    mean = rows.rate + change
     arrives = (mean < 0) & (rows.gap <= -dt[None] * mean) & (e >= 0)
     start = jnp.where(arrives, fall / 2 - mean, 1)
     gap = jnp.where(arrives, jnp.maximum(rows.gap, 0), 0)
@@ -68,7 +69,13 @@ def bounces(rows: BoundRows, change: Array, fall: Array, dt: Array) -> Bounce:
 
 
 def freely(
-    rows: BoundRows, change: Array, fall: Array, dt: Array, matrix: Array, acts: Array
+    rows: BoundRows,
+    e: Array,
+    change: Array,
+    fall: Array,
+    dt: Array,
+    matrix: Array,
+    acts: Array,
 ) -> Array:
     """Which rows close with the acceleration that their bodies have without bounded rows, (n,).
 
@@ -77,10 +84,11 @@ def freely(
 
     Args:
         rows: the bounded rows.
+        e: restitution, (n,), negative of rows that do not bounce.
         change: h a without them, (n,).
         fall: what gravity has in it, (n,).
         dt: h, () [s].
-        matrix: G, (n, n), a constant; zero for rows that do not act.
+        matrix: G, (n, n), a constant.
         acts: which rows act at all, (n,).
     """
     kinds, mean = rows.kinds, rows.rate + change
@@ -89,7 +97,7 @@ def freely(
     rounding = ROUNDING * float(jnp.finfo(mean.dtype).eps)
     sizes = map(jnp.abs, (rows.rate, change, rows.target))
     most = jnp.max(functools.reduce(jnp.maximum, sizes), axis=0, keepdims=True)
-    bounces = fast & arrives & (rows.restitution >= 0)
+    bounces = fast & arrives & (e >= 0)
     parts = kinds.split((mean <= rows.target + rounding * most) & ~bounces)
     bears = acts & kinds.by_normals(parts._replace(box=jnp.ones_like(parts.box)))
     size = jnp.sqrt(jnp.maximum(gauss_jordan.diagonal(matrix), 0))

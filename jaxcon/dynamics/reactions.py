@@ -151,23 +151,18 @@ class Impulse:
         """φ̇ + h J_b a, (n,)."""
         return self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
 
-    def _unhindered(self) -> tuple[Array, Array]:
-        """h J_b a without multipliers, and what gravity has in it, (n,) each."""
-        forces, targets = [self.saddle.force], [self.target]
-        if self.weight is not None:
-            forces.append(jnp.broadcast_to(self.weight, forces[0].shape))
-            targets.append(jnp.zeros_like(self.target))
-        found = self.solve(jnp.stack(forces, axis=1), jnp.stack(targets, axis=1)).acceleration
-        led = [self.dt[None] * self.rows.jacobian.apply(found[:, i]) for i in range(len(forces))]
-        return led[0], led[1] if self.weight is not None else jnp.zeros_like(led[0])
-
-    def _bounce(self, matrix: Array, moves: Array, change: Array, fall: Array) -> Bounce:
-        """What restitution asks, of h J_b a and what gravity has in it."""
+    def _bounce(self, e: Array, matrix: Array, moves: Array) -> tuple[Array, Bounce]:
+        """u without multipliers, (n,), and what restitution asks of the step."""
+        rows, none = self.rows, jnp.zeros_like(self.rows.rate)
         if self.weight is None:
-            free = jnp.zeros(change.shape, bool)
-        else:
-            free = freely(self.rows, change, fall, self.dt, matrix, moves)
-        return bounces(self.rows, *(jnp.where(free, x, 0) for x in (change, fall)), self.dt)
+            return self.velocity(none), bounces(rows, e, none, none, self.dt)
+        force, target = self.saddle.force, self.target
+        forces = jnp.stack([force, jnp.broadcast_to(self.weight, force.shape)], axis=1)
+        found = self.solve(forces, jnp.stack([target, jnp.zeros_like(target)], axis=1)).acceleration
+        change, fall = (self.dt[None] * rows.jacobian.apply(found[:, i]) for i in range(2))
+        free = freely(rows, e, change, fall, self.dt, matrix, moves)
+        kick, fall = (jnp.where(free, x, 0) for x in (change, fall))
+        return rows.rate + change, bounces(rows, e, kick, fall, self.dt)
 
     def matrix(self) -> Array:
         """G, (n, n), a constant."""
@@ -239,12 +234,11 @@ class Impulse:
         if rows.restitution is None:
             found, left = met(rows.target)
             return Reactions(found, rows.gap, left, jnp.ones_like(left), None, rows.layout)
-        change, fall = self._unhindered()
-        bounce = self._bounce(matrix, moves, change, fall)
-        asked = (jnp.zeros_like(change), bounce.more)
+        without, bounce = self._bounce(rows.restitution, matrix, moves)
+        asked = (jnp.zeros_like(without), bounce.more)
         asked = asked if self.weight is None else (*asked, bounce.travel)
         (plain, bounced, *moving), left = jax.vmap(met)(jnp.stack([rows.target + x for x in asked]))
-        kept, shift = self.harmless(rows.rate + change, plain, bounced - plain, bounce.later), None
+        kept, shift = self.harmless(without, plain, bounced - plain, bounce.later), None
         found = plain + kept[None] * (bounced - plain)
         for own in moving:
             mean = plain + kept[None] * (own - plain)
