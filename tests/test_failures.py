@@ -317,3 +317,59 @@ def test_second_derivatives_are_those_of_the_worlds_that_do_not_fail():
     for one, two in itertools.product(modes, modes):
         found = jax.jit(two(one(functools.partial(value, whole))))(shared)
         np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """What becomes of one world, by numbers that worlds share and one of its own."""
+    s = jc.Scene(dim=2)
+    s.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    s.add(jc.Distance("rod", jc.WORLD, "bob"))
+    s.add(jc.ExternalWrench("push", "bob"))
+    system, state = s.build()
+
+    def value(policy, shared, own):
+        changed = system.with_params({"bob": {"mass": shared[1]}})
+        begin = dataclasses.replace(state, v=jnp.stack([0 * own, 0.1 * own]))
+        controls = functools.partial(policy, shared, own)
+        final, _ = jc.rollout(changed, jc.Method(), begin, controls, shared[2], 3)
+        return jnp.sum(final.q * final.v) + jnp.sum(final.q**3)
+
+    return value
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_second_derivatives_through_a_policy_are_those_of_the_worlds_that_do_not_fail(
+    swing, inside
+):
+    """Through every order of both modes, outside the batch and inside."""
+
+    def policy(shared, own, s):
+        return shared[0] * jnp.stack([jnp.sin(s.v[1]), jnp.sqrt(own * shared[0]) * s.q[0]])
+
+    def second(one, two, own):
+        def each(shared, own):
+            return swing(policy, shared, own)
+
+        if inside:
+            return jnp.sum(jax.vmap(two(one(each)), (None, 0))(shared, own), 0)
+        return two(one(lambda x: jnp.sum(jax.vmap(each, (None, 0))(x, own))))(shared)
+
+    shared, own = jnp.array([0.7, 1.0, 1e-2]), np.array([1.0, -1.0, 2.0])
+    modes = jax.jacfwd, jax.jacrev
+    alone = sum(jax.jit(jax.hessian(functools.partial(swing, policy)))(shared, x) for x in own[::2])
+    assert np.min(np.abs(alone)) > 1e-6
+    for one, two in itertools.product(modes, modes):
+        found = jax.jit(functools.partial(second, one, two))(own)
+        np.testing.assert_allclose(found, alone, rtol=1e-9, atol=1e-12)
+
+
+def test_a_policy_may_return_what_worlds_share(swing):
+    """Controls that are the same in all worlds have a derivative by what worlds share."""
+
+    def value(shared, own):
+        return swing(lambda shared, own, s: shared[:1] * jnp.array([1.0, 2.0]), shared, own)
+
+    shared, own = jnp.array([0.7, 1.0, 1e-2]), np.array([1.0, -1.0, 2.0])
+    found = jax.grad(lambda x: jnp.sum(jax.vmap(value, (None, 0))(x, own)))(shared)
+    np.testing.assert_allclose(found, sum(jax.grad(value)(shared, x) for x in own), rtol=1e-9)

@@ -22,10 +22,10 @@ def opened(function: Callable[..., Any], *args: PyTree) -> tuple[Callable[..., A
         args: pytrees of arrays, or of their shapes and dtypes.
     """
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-    structure = jax.tree.structure(shapes)
+    jaxpr, structure = closed.jaxpr, jax.tree.structure(shapes)
 
     def pure(constants: Any, *args: PyTree) -> PyTree:
-        flat = jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, constants))(*jax.tree.leaves(args))
+        flat = jaxpr_as_fun(ClosedJaxpr(jaxpr, constants))(*jax.tree.leaves(args))
         return jax.tree.unflatten(structure, flat)
 
     return pure, closed.consts, shapes

@@ -46,10 +46,11 @@ class Native:
 
     Attributes:
         function: (arrays) → list of arrays.
+        staged: whether it is cut into stages where those are used, and its derivatives with it.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[..., Any], staged: bool = True) -> None:
+        self.function, self.staged = function, staged
         self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
         self.tangent = functools.lru_cache(maxsize=64)(functools.partial(Tangent, self))
         self.transposed = functools.lru_cache(maxsize=64)(functools.partial(Transposed, self))
@@ -101,7 +102,7 @@ class Tangent(Native):
     """(x, ẋ of the moved arguments) → the tangents of the floating results."""
 
     def __init__(self, whole: Native, moved: tuple[bool, ...]) -> None:
-        super().__init__(self._along)
+        super().__init__(self._along, whole.staged)
         self.whole, self.count = whole, len(moved)
         self.places = [i for i, flag in enumerate(moved) if flag]
 
@@ -143,7 +144,7 @@ class Transposed(Native):
     """
 
     def __init__(self, whole: Native, linear: tuple[bool, ...], avals: Any, rank: int) -> None:
-        super().__init__(self._back)
+        super().__init__(self._back, whole.staged)
         self.whole, self.linear, self.avals, self.rank = whole, linear, avals, rank
         self.fixed = linear.count(False)
 
@@ -176,7 +177,7 @@ class Part(Native):
     """Some of the results of a native function; its trace is a part of the whole's."""
 
     def __init__(self, whole: Native, wanted: tuple[bool, ...]) -> None:
-        super().__init__(self._chosen)
+        super().__init__(self._chosen, whole.staged)
         self.whole, self.wanted = whole, wanted
 
     def shapes(self, args: Sequence[Array]) -> list[Any]:
@@ -200,7 +201,9 @@ native_p.multiple_results = True
 
 
 @functools.lru_cache(maxsize=256)
-def _native(function: Callable[..., Any], structure: Any, shapes: Any) -> tuple[Native, list[Any]]:
+def _native(
+    function: Callable[..., Any], structure: Any, shapes: Any, staged: bool
+) -> tuple[Native, list[Any]]:
     """The function of leaves, and a place where its result's structure is left when tracing.
 
     What a result holds beside arrays may depend on shapes, such as the number of rows.
@@ -212,10 +215,10 @@ def _native(function: Callable[..., Any], structure: Any, shapes: Any) -> tuple[
         arrays, result[0] = jax.tree.flatten(output)
         return [jnp.asarray(x) for x in arrays]
 
-    return Native(flat), result
+    return Native(flat, staged), result
 
 
-def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
+def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> PyTree:
     """function(*args), batched natively under `vmap`.
 
     Args:
@@ -223,13 +226,14 @@ def call(function: Callable[..., Any], *args: PyTree) -> PyTree:
             axes on all leaves (of the batch's size or of size 1) it must return them on all
             results.
         args: pytrees of arrays.
+        staged: whether it may be cut into stages; what users write may be of any operations.
 
     Returns:
         What the function returns.
     """
     leaves, structure = jax.tree.flatten(args)
     arrays = [jnp.asarray(x) for x in leaves]
-    native, result = _native(function, structure, tuple(x.shape for x in arrays))
+    native, result = _native(function, structure, tuple(x.shape for x in arrays), staged)
     arrays = native_p.bind(*arrays, fun=native)  # its trace leaves the structure
     return jax.tree.unflatten(result[0], arrays)
 
@@ -284,7 +288,7 @@ def _in_stages(*args: Array, fun: Native) -> list[Array]:
     time of compiling them and makes the vectorized code no faster.
     """
     lanes = [jnp.expand_dims(x, -1) for x in args]
-    if not fusion.staged():
+    if not (fun.staged and fusion.staged()):
         return squeezed(*fun(*lanes))
     # were it inlined, XLA would copy the results to move the batch to the front
     return fusion.uninlined(squeezed, fusion.settled(fun, lanes))

@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.errors import TracerIntegerConversionError
 
-from jaxcon.core import checks, numerics
+from jaxcon.core import checks, native, numerics
 from jaxcon.core.closures import opened
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
+from jaxcon.core.worlds import per_world
 from jaxcon.model.state import State, at
 from jaxcon.simulation.adjoints import EVERY_STEP, Path, check_adjoint
 from jaxcon.simulation.method import Method, check_method
@@ -116,7 +117,12 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
         good = ~failed(state.status) & numerics.all_finite(control)
         return control, jnp.where(good, Status.OK, Status.NON_FINITE)
 
-    return contain(judged, (state, known))[0]
+    def contained(state: State, constants: Any) -> PyTree:
+        one = per_world(lambda *args: contain(judged, args)[0], state.q.ndim - 1)
+        return one(state, constants)
+
+    # natively, as steps are: the derivative of a derivative is masked there, too
+    return native.call(contained, state, known, staged=False)
 
 
 def _integer(what: str, number: Any) -> int:
