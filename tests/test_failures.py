@@ -373,3 +373,24 @@ def test_a_policy_may_return_what_worlds_share(swing):
     shared, own = jnp.array([0.7, 1.0, 1e-2]), np.array([1.0, -1.0, 2.0])
     found = jax.grad(lambda x: jnp.sum(jax.vmap(value, (None, 0))(x, own)))(shared)
     np.testing.assert_allclose(found, sum(jax.grad(value)(shared, x) for x in own), rtol=1e-9)
+
+
+def test_a_policy_may_branch(swing):
+    """In all orders of `grad` and `vmap`, where the other branch has no derivative."""
+
+    def value(shared, own):
+        def policy(shared, own, s):
+            def root():
+                return shared[0] * jnp.stack([s.q[1], jnp.sqrt(own * shared[0]) * s.q[0]])
+
+            return jax.lax.cond(own > 0, root, lambda: shared[0] ** 2 * s.q[::-1])
+
+        return swing(policy, shared, own)
+
+    shared, own = jnp.array([0.7, 1.0, 1e-2]), np.array([1.0, -1.0, 2.0])
+    alone = np.array([jax.jit(jax.grad(value))(shared, x) for x in own])
+    assert np.min(np.abs(alone)) > 1e-6
+    together = jax.jit(jax.vmap(jax.grad(value), (None, 0)))(shared, own)
+    np.testing.assert_allclose(together, alone, rtol=1e-9)
+    total = jax.jit(jax.grad(lambda x: jnp.sum(jax.vmap(value, (None, 0))(x, own))))(shared)
+    np.testing.assert_allclose(total, alone.sum(0), rtol=1e-9)

@@ -19,7 +19,8 @@ checkpoint, and its derivative evaluates the function once more.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
@@ -27,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Primitive
+from jax.extend.core.primitives import stop_gradient_p
 from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core import fusion
@@ -170,7 +172,25 @@ class Transposed(Native):
             return spread(self.whole(*merged), batch)
 
         cotangents = spread(list(args[self.fixed :]), batch)
-        return list(jax.linear_transpose(along, *self._arguments(args))(cotangents))
+        with stops_transposed():
+            return list(jax.linear_transpose(along, *self._arguments(args))(cotangents))
+
+
+@contextmanager
+def stops_transposed() -> Iterator[None]:
+    """Lets the transpose of `stop_gradient` be zero.
+
+    A batched `lax.cond` puts it around what a branch of worlds that take another one is given, of
+    tangents as well, and JAX has no transpose of it (jax-ml/jax#39219). Those worlds have a
+    cotangent of zero there, which must not meet what is infinite in that branch.
+    """
+    known, rules = stop_gradient_p in ad.primitive_transposes, ad.primitive_transposes
+    rules.setdefault(stop_gradient_p, lambda cotangent, _: [None])
+    try:
+        yield
+    finally:
+        if not known:
+            rules.pop(stop_gradient_p, None)
 
 
 class Part(Native):

@@ -55,8 +55,9 @@ def rollout(
         system: a `BodySystem` or `GeneralizedSystem`.
         method: integrator, stabiliser and solver.
         state: the start.
-        controls: None; arrays whose first axis enumerates steps; or a function of the state. Those
-            of NumPy get the dtype of the state.
+        controls: None; arrays whose first axis enumerates steps; or a function of the state, of one
+            world, which collectives over a batch do not reach. Those of NumPy get the dtype of the
+            state.
         dt: h, () [s].
         steps: how many.
         record: (state, info) → what to keep; the whole state unless given. `info` is what the step
