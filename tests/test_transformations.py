@@ -285,3 +285,22 @@ def test_a_float32_world_survives_a_thousand_steps(name):
     violation = jc.violation(built.system, final)
     for constraint in violation.layout.names:
         assert violation[constraint] < 1e-3, constraint
+
+
+def test_a_force_may_branch():
+    """By `lax.cond`, in both orders of `grad` and `vmap`; the other branch has no derivative."""
+
+    def force(q, v, t, control, k):
+        return jax.lax.cond(q[0] > 0, lambda: -k * jnp.sqrt(q), lambda: -k * q)
+
+    def value(k, v):
+        system = jc.GeneralizedSystem(mass=lambda q, k: jnp.eye(1), force=force, params=k)
+        state = jc.init(system, jc.Method(), jnp.array([0.1]), v[None])
+        return jc.rollout(system, jc.Method(), state, None, 1e-2, 20)[0].q[0]
+
+    speeds = np.array([1.0, -1.0, -2.0])
+    alone = np.array([jax.grad(value)(2.0, v) for v in speeds])
+    together = jax.jit(jax.vmap(jax.grad(value), (None, 0)))(2.0, speeds)
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
+    total = jax.jit(jax.grad(lambda k: jnp.sum(jax.vmap(value, (None, 0))(k, speeds))))(2.0)
+    np.testing.assert_allclose(total, alone.sum(), rtol=1e-12)
