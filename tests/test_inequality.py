@@ -190,3 +190,25 @@ def test_its_numbers_are_leaves():
 def test_what_is_refused(element, message):
     with pytest.raises(ValueError, match=message):
         ball(2, element)
+
+
+def test_restitution_on_generalized_coordinates():
+    """A ball on a floor, of which the force does not tell what is gravity."""
+
+    def force(q, v, t, control, g):
+        return jnp.stack([-g])
+
+    def height(e, g):
+        floor = jc.Inequality(lambda q, t, p: q, name="floor", restitution=e)
+        system = jc.GeneralizedSystem(
+            mass=lambda q, g: jnp.ones(1), force=force, constraints=[floor], params=g
+        )
+        state = jc.init(system, jc.Method(), jnp.array([0.5]), jnp.zeros(1))
+        return jc.rollout(system, jc.Method(), state, None, 1e-3, 500)[0].q[0]
+
+    speed = np.sqrt(9.81)
+    left = 0.5 - speed / 9.81
+    want = 0.8 * speed * left - 9.81 * left**2 / 2
+    value, slope = jax.jit(jax.value_and_grad(height))(0.8, 9.81)
+    np.testing.assert_allclose(value, want, atol=3e-3)
+    np.testing.assert_allclose(slope, speed * left, atol=6e-3)

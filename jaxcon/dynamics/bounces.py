@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -31,12 +30,11 @@ class Bounce(NamedTuple):
     later: Array
 
 
-def bounces(rows: BoundRows, e: Array, change: Array, fall: Array, dt: Array) -> Bounce:
-    """What rows with restitution e ask of a step h.
+def bounces(rows: BoundRows, e: Array, fall: Array, free: Array, dt: Array) -> Bounce:
+    """What rows with restitution e ask of a step h, in which gravity accelerates them by g.
 
-    Forces other than gravity kick at the start of the step; within it the row moves as gravity
-    alone lets it, by an acceleration g of its own. With w = φ̇₀ + h a the velocity in the middle of
-    the step, what arrives, φ + h w ≤ 0, does so after the time τ of the parabola
+    Positions move by h w, w = φ̇₀ + h g, the velocity in the middle of the step. What arrives,
+    φ + h w ≤ 0, does so after the time τ of the parabola
 
         φ + (w − g h/2) τ + g τ²/2 = 0,   with v = w + g (τ − h/2).
 
@@ -44,27 +42,29 @@ def bounces(rows: BoundRows, e: Array, change: Array, fall: Array, dt: Array) ->
 
         u = −e v + g (h/2 − τ),    φ⁺ = (h − τ) (−e v + g (h − τ)/2).
 
-    So what falls and bounces without losses keeps its energy, and the derivatives contain that of
-    τ. Each of the two, the kick and the parabola with its bounce, is symplectic where e = 1, as is
-    the step without them: that is why other forces, which change along the parabola, are not in it.
+    So what falls and bounces is exact, keeps its energy where e = 1, and the derivatives contain
+    that of τ. Other forces are no part of it: those of the start of the step, along the parabola,
+    would let energy in where they change along it, as a spring does; and as a kick before it, let
+    balls hop for ever, in time with the steps.
 
     Args:
         rows: the bounded rows.
         e: restitution, (n,), negative of rows that do not bounce.
-        change: h a, (n,), of rows that move `freely`, and zero of others.
-        fall: h g, (n,), of the same rows.
+        fall: h g, (n,), of rows that move `freely`, and zero of others.
+        free: which rows those are, (n,).
         dt: h, () [s].
     """
-    mean = rows.rate + change
+    mean = rows.rate + fall
     arrives = (mean < 0) & (rows.gap <= -dt[None] * mean) & (e >= 0)
-    start = jnp.where(arrives, fall / 2 - mean, 1)
-    gap = jnp.where(arrives, jnp.maximum(rows.gap, 0), 0)
-    away = numerics.safe_divide(gap, dt[None]) / start
-    before = 2 * away / (1 + jnp.sqrt(1 - 2 * fall / start * away))
-    after = 1 - before
-    leaves, later = e * (start - fall * before), fall * (0.5 - before)
-    more, travel = leaves + later - rows.target, after * (leaves + fall * after / 2)
-    up = arrives & (more > 0) & (travel > 0)
+    start = fall / 2 - mean
+    whole = numerics.safe_divide(jnp.where(arrives, jnp.maximum(rows.gap, 0), 0), dt[None])
+    size = jnp.where(free, start, 1)  # no quotients by what may be as slow as it likes
+    closed = 2 * whole / (1 + jnp.sqrt(1 - 2 * (fall / size) * (whole / size)))
+    before = closed / size
+    slowed = 1 - fall / size * before
+    later, last = fall * (0.5 - before), fall * (1 - before) ** 2 / 2
+    more, travel = e * start * slowed + later - rows.target, e * (start - closed) * slowed + last
+    up = arrives & (more > 0) & (travel >= 0)
     return Bounce(*(jnp.where(up, x, 0) for x in (more, travel, later)))
 
 
@@ -77,29 +77,30 @@ def freely(
     matrix: Array,
     acts: Array,
 ) -> Array:
-    """Which rows close with the acceleration that their bodies have without bounded rows, (n,).
+    """Which rows close as gravity alone lets their bodies, (n,).
 
-    Those that are faster than it can make them in a step, where no other row that acts pulls on the
-    same bodies: it may bear some of it, as a floor bears a plate on which something falls.
+    Those that are faster than accelerations can make them in a step, where no other row that acts
+    pulls on the same bodies: it may bear some of it, as a floor bears a plate on which something
+    falls.
 
     Args:
         rows: the bounded rows.
         e: restitution, (n,), negative of rows that do not bounce.
-        change: h a without them, (n,).
+        change: h a without bounded rows, (n,).
         fall: what gravity has in it, (n,).
         dt: h, () [s].
         matrix: G, (n, n), a constant.
         acts: which rows act at all, (n,).
     """
-    kinds, mean = rows.kinds, rows.rate + change
-    fast = rows.rate < -(jnp.abs(change) + 2 * jnp.abs(fall))
-    arrives = rows.gap <= -dt[None] * mean
-    rounding = ROUNDING * float(jnp.finfo(mean.dtype).eps)
-    sizes = map(jnp.abs, (rows.rate, change, rows.target))
-    most = jnp.max(functools.reduce(jnp.maximum, sizes), axis=0, keepdims=True)
-    bounces = fast & arrives & (e >= 0)
-    parts = kinds.split((mean <= rows.target + rounding * most) & ~bounces)
+    kinds, numbers = rows.kinds, jnp.finfo(rows.rate.dtype)
+    slow = float(numbers.tiny) ** 0.25  # up to its square there are derivatives of quotients
+    fast = rows.rate < -(jnp.abs(change) + 2 * jnp.abs(fall) + slow)
+    up = fast & (rows.gap <= -dt[None] * (rows.rate + fall)) & (e >= 0)
+    rounding = ROUNDING * float(numbers.eps)
+    size = jnp.max(jnp.maximum(jnp.abs(rows.rate), jnp.abs(change)), axis=0, keepdims=True)
+    least = rows.target + rounding * jnp.maximum(size, jnp.abs(rows.target))
+    parts = kinds.split((rows.rate + change <= least) & ~up)
     bears = acts & kinds.by_normals(parts._replace(box=jnp.ones_like(parts.box)))
-    size = jnp.sqrt(jnp.maximum(gauss_jordan.diagonal(matrix), 0))
-    bound = jnp.abs(matrix) > rounding * size[:, None] * size[None]
+    length = jnp.sqrt(jnp.maximum(gauss_jordan.diagonal(matrix), 0))
+    bound = jnp.abs(matrix) > rounding * length[:, None] * length[None]
     return jax.lax.stop_gradient(fast & ~jnp.any(bound & bears[None], axis=1))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
-from jaxcon.core.lanes import widened
+from jaxcon.core.lanes import Vector, widened
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.bounces import Bounce, bounces, freely
 from jaxcon.solvers import gauss_jordan
@@ -155,14 +155,13 @@ class Impulse:
         """u without multipliers, (n,), and what restitution asks of the step."""
         rows, none = self.rows, jnp.zeros_like(self.rows.rate)
         if self.weight is None:
-            return self.velocity(none), bounces(rows, e, none, none, self.dt)
+            return self.velocity(none), bounces(rows, e, none, none > 0, self.dt)
         force, target = self.saddle.force, self.target
         forces = jnp.stack([force, jnp.broadcast_to(self.weight, force.shape)], axis=1)
         found = self.solve(forces, jnp.stack([target, jnp.zeros_like(target)], axis=1)).acceleration
         change, fall = (self.dt[None] * rows.jacobian.apply(found[:, i]) for i in range(2))
         free = freely(rows, e, change, fall, self.dt, matrix, moves)
-        kick, fall = (jnp.where(free, x, 0) for x in (change, fall))
-        return rows.rate + change, bounces(rows, e, kick, fall, self.dt)
+        return rows.rate + change, bounces(rows, e, jnp.where(free, fall, 0), free, self.dt)
 
     def matrix(self) -> Array:
         """G, (n, n), a constant."""
@@ -193,8 +192,10 @@ class Impulse:
         rounding = 64 * float(jnp.finfo(matrix.dtype).eps) * self.dt[None] * self.bare
         moving = jax.lax.stop_gradient(own > rounding)
         moving = moving if self.acts is None else moving & self.acts
-        kinds = self.rows.kinds
-        return moving & kinds.by_normals(kinds.split(moving))  # no friction without a normal
+        kinds, moves = self.rows.kinds, self.rows.kinds.split(moving)
+        sets = zip(kinds.discs, moves.discs, strict=True)  # no friction without a normal
+        discs = tuple(Vector(*(y & disc.of(moves.normal) for y in x)) for disc, x in sets)
+        return kinds.join(moves._replace(discs=discs))
 
     def react(self, solver: Any, guess: Array | None) -> Reactions:
         """λ by the laws of the rows, with restitution as far as it adds no energy.

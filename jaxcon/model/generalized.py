@@ -86,6 +86,10 @@ class GeneralizedCoordinates:
             raise ValueError(f"GeneralizedSystem: force must return {q.shape}, got {f.shape}.")
         return f
 
+    def weight(self, q: Array) -> Array:
+        """None, (n_v,): f does not tell what of it is gravity."""
+        return jnp.zeros_like(q)
+
     def applied(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f, (n_v,)."""
         return self.force(q, v, t, control)
