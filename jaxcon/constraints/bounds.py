@@ -155,11 +155,11 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
 
     first, bouncy = columns[0], any(s.restitution is not None for s in sets)
     gaps = [s.rows[0].value if s.rows[0].holonomic else 0.0 for s in sets]
-    still = jnp.zeros((kinds.size - first.size, *v.shape[1:]), v.dtype)
+    rest = (kinds.size - first.size, *v.shape[1:])
 
     def once(lanes: list[Any], none: float = 0.0) -> Array:
         own = first.flat([none if x is None else x for x in lanes])
-        return jnp.concatenate([own, still + none])
+        return jnp.concatenate([own, jnp.full(rest, none, v.dtype)])
 
     def of(field: str) -> Array:
         return first.flat([getattr(s, field) for s in sets])
