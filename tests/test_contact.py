@@ -1,6 +1,7 @@
 """Contact and ropes: closed forms, energy, Coulomb's law, gradients through impacts."""
 
 import dataclasses
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -311,6 +312,21 @@ def test_what_falls_and_bounces_does_so_exactly(dtype, ceiling, speed):
         np.testing.assert_allclose(a, b, atol=tight)
 
 
+@dtypes
+@pytest.mark.parametrize("ceiling", [False, True])
+def test_what_hardly_arrives_has_finite_derivatives(dtype, ceiling):
+    """Where gravity turns it round, or it moves by less than has a square."""
+    h = 2.0**-10
+    height = falling(dtype, ceiling=ceiling)[2]
+    slopes = jax.jit(jax.grad(height, (0, 1, 2, 3)), static_argnums=(4, 5))
+    toward, end = (1.0, 1.0) if ceiling else (-1.0, 0.1)
+    speeds = (0.0, 1e-160, 1e-25, 1e-20, 1e-9, h * 4, h * 8)
+    for gap, speed, g in itertools.product((0.0, 1e-30, 1e-6), speeds, (0.0, 8.0)):
+        numbers = (end - toward * gap, 0.5, g, toward * speed)
+        found = slopes(*(jnp.asarray(x, dtype) for x in numbers), h, 1)
+        assert np.all(np.isfinite(found)), (gap, speed, g, found)
+
+
 def test_the_gradient_by_place_through_a_bounce_halves_its_error_with_the_step():
     """∂y/∂z = −e + (1 + e) g d/v for a start at rest, which a step takes for half a step before."""
     height = falling()[2]
@@ -402,6 +418,35 @@ def test_a_ball_bounces_off_a_plate_that_is_pressed_to_a_floor_or_a_ceiling(push
     state = dataclasses.replace(state, v=jnp.asarray([0.0, 0.0, 0.0, 0.0, -speed]))
     states, _ = run(system, state, 1e-3, 400)
     assert float(states.v[-1, -1]) == pytest.approx(speed, rel=1e-9)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.9])
+def test_what_a_floor_bears_does_not_fall_when_it_bounces_off_a_wall(restitution):
+    """A ball slides into a wall that leans over the floor by half a right angle."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("ball", mass=1.0, position=(0.0, 0.0))
+    floor = {} if restitution == 0 else {"restitution": restitution}
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", **floor))
+    wall = {"point": (0.1003, 0.0), "normal": (-(0.5**0.5), 0.5**0.5), "restitution": 1.0}
+    scene.add(jc.PlaneContact("wall", jc.WORLD, "ball", **wall))
+    system, state = scene.build()
+    state = dataclasses.replace(state, v=jnp.asarray([1.0, 0.0]))
+    states, _ = run(system, state, H, 200)
+    away = np.asarray(states.v) @ np.asarray(wall["normal"])
+    assert away[np.argmax(away > 0)] == pytest.approx(0.5**0.5, rel=1e-9)
+
+
+def test_what_friction_bears_does_not_fall_when_it_bounces():
+    """A block slides down a rail at constant speed, as friction is as large as its weight."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81))
+    scene.add_body("block", mass=1.0, inertia=1.0, position=(0.0, 0.1003))
+    scene.add(jc.Prismatic("rail", jc.WORLD, "block", axis=(0.0, 1.0)))
+    scene.add(jc.JointFriction("friction", "rail", 9.81))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "block", restitution=1.0))
+    system, state = scene.build()
+    state = dataclasses.replace(state, v=jnp.asarray([0.0, -1.0, 0.0]))
+    states, _ = run(system, state, H, 150)
+    assert float(states.v[:, 1].max()) == pytest.approx(1.0, rel=1e-9)
 
 
 def test_gradients_through_a_collision():

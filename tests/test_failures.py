@@ -394,3 +394,28 @@ def test_a_policy_may_branch(swing):
     np.testing.assert_allclose(together, alone, rtol=1e-9)
     total = jax.jit(jax.grad(lambda x: jnp.sum(jax.vmap(value, (None, 0))(x, own))))(shared)
     np.testing.assert_allclose(total, alone.sum(0), rtol=1e-9)
+
+
+def test_a_policy_may_have_a_derivative_of_its_own(swing):
+    """By `custom_vjp`, which JAX batches only before it is differentiated."""
+
+    @jax.custom_vjp
+    def clipped(x):
+        return x
+
+    clipped.defvjp(lambda x: (x, None), lambda _, y: (jnp.clip(y, -1e-3, 1e-3),))
+
+    def value(shared, own):
+        def policy(shared, own, s):
+            return clipped(shared[0] * jnp.stack([s.q[1], own * s.q[0]]))
+
+        return swing(policy, shared, own)
+
+    shared, own = jnp.array([0.7, 1.0, 1e-2]), np.array([1.0, -1.0, 2.0])
+    alone = np.array([jax.jit(jax.grad(value))(shared, x) for x in own])
+    free = swing(lambda shared, own, s: shared[0] * jnp.stack([s.q[1], own * s.q[0]]), shared, 1.0)
+    assert value(shared, 1.0) == free
+    together = jax.jit(jax.vmap(jax.grad(value), (None, 0)))(shared, own)
+    np.testing.assert_allclose(together, alone, rtol=1e-9)
+    total = jax.jit(jax.grad(lambda x: jnp.sum(jax.vmap(value, (None, 0))(x, own))))(shared)
+    np.testing.assert_allclose(total, alone.sum(0), rtol=1e-9)

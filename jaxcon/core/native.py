@@ -19,8 +19,7 @@ checkpoint, and its derivative evaluates the function once more.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any
 
@@ -36,6 +35,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import spread
 
 _ORDER = ContextVar("order", default=0)
+_TRANSPOSED = ContextVar("transposed", default=False)
 
 
 def order() -> int:
@@ -172,25 +172,11 @@ class Transposed(Native):
             return spread(self.whole(*merged), batch)
 
         cotangents = spread(list(args[self.fixed :]), batch)
-        with stops_transposed():
+        before = _TRANSPOSED.set(True)
+        try:
             return list(jax.linear_transpose(along, *self._arguments(args))(cotangents))
-
-
-@contextmanager
-def stops_transposed() -> Iterator[None]:
-    """Lets the transpose of `stop_gradient` be zero.
-
-    A batched `lax.cond` puts it around what a branch of worlds that take another one is given, of
-    tangents as well, and JAX has no transpose of it (jax-ml/jax#39219). Those worlds have a
-    cotangent of zero there, which must not meet what is infinite in that branch.
-    """
-    known, rules = stop_gradient_p in ad.primitive_transposes, ad.primitive_transposes
-    rules.setdefault(stop_gradient_p, lambda cotangent, _: [None])
-    try:
-        yield
-    finally:
-        if not known:
-            rules.pop(stop_gradient_p, None)
+        finally:
+            _TRANSPOSED.reset(before)
 
 
 class Part(Native):
@@ -319,6 +305,24 @@ def squeezed(*lanes: Array) -> list[Array]:
     return [jnp.squeeze(x, -1) for x in lanes]
 
 
+def _stopped(cotangent: Any, _: Any) -> list[Any]:
+    """The transpose of `stop_gradient` within that of a native function: zero.
+
+    A batched `lax.cond` puts it around what a branch of worlds that take another one is given, of
+    tangents as well, and JAX has no transpose of it (jax-ml/jax#39219). Those worlds have a
+    cotangent of zero there, which must not meet what is infinite in that branch. Where users stop
+    a tangent in a derivative of their own, reverse mode so has zero, and forward mode the tangent.
+
+    Raises:
+        NotImplementedError: outside native functions, as without this rule.
+    """
+    if not _TRANSPOSED.get():
+        raise NotImplementedError(
+            "Transpose rule (for reverse-mode differentiation) for 'stop_gradient' not implemented"
+        )
+    return [None]
+
+
 def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]:
     """Leaves out the results that nobody needs, and what is done for them alone."""
     if not any(wanted):
@@ -343,3 +347,4 @@ batching.primitive_batchers[native_p] = _batched
 ad.primitive_jvps[native_p] = _jvp
 partial_eval.dce_rules[native_p] = _without_unused
 ad.primitive_transposes[native_p] = _transpose
+ad.primitive_transposes.setdefault(stop_gradient_p, _stopped)

@@ -13,6 +13,7 @@ from jax.errors import TracerIntegerConversionError
 
 from jaxcon.core import checks, native, numerics
 from jaxcon.core.closures import opened
+from jaxcon.core.operations import primitives
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
 from jaxcon.core.worlds import per_world
@@ -118,9 +119,13 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
         good = ~failed(state.status) & numerics.all_finite(control)
         return control, jnp.where(good, Status.OK, Status.NON_FINITE)
 
+    own_vjp = "custom_vjp_call" in primitives(jax.make_jaxpr(function)(known, state).jaxpr)
+
     def contained(state: State, constants: Any) -> PyTree:
-        one = per_world(lambda *args: contain(judged, args)[0], state.q.ndim - 1)
-        return one(state, constants)
+        args, rank = (state, constants), state.q.ndim - 1
+        if own_vjp:  # JAX cannot batch its tangents; masked outside, what worlds share is spread
+            return contain(per_world(judged, rank), args)[0]
+        return per_world(lambda *own: contain(judged, own)[0], rank)(*args)
 
     # natively, as steps are: the derivative of a derivative is masked there, too
     return native.call(contained, state, known, staged=False)
