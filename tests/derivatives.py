@@ -26,3 +26,20 @@ def assert_smooth_and_batched(value, numbers, step, close):
     one_by_one = [run({key: number[i] for key, number in worlds.items()}) for i in (0, 1)]
     got = jax.jit(jax.vmap(value))(worlds)
     np.testing.assert_allclose(got, jnp.stack(one_by_one), rtol=close)
+
+
+def assert_batched_either_way(value, shared, own, close):
+    """Gradients by what worlds share, inside of their batch and outside; returns those of a loop.
+
+    Args:
+        value: from (shared, of one world) to a number.
+        shared: what worlds share.
+        own: of each world, by first axis.
+        close: what they may be off by, relative.
+    """
+    alone = np.array([jax.jit(jax.grad(value))(shared, x) for x in own])
+    together = jax.jit(jax.vmap(jax.grad(value), (None, 0)))(shared, own)
+    np.testing.assert_allclose(together, alone, rtol=close)
+    total = jax.jit(jax.grad(lambda x: jnp.sum(jax.vmap(value, (None, 0))(x, own))))(shared)
+    np.testing.assert_allclose(total, alone.sum(0), rtol=close)
+    return alone

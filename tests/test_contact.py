@@ -341,6 +341,20 @@ def test_the_gradient_by_place_through_a_bounce_halves_its_error_with_the_step()
     np.testing.assert_allclose(np.divide(errors[1:], errors[:-1]), 0.5, atol=0.01)
 
 
+def test_events_have_the_gradient_by_place_through_a_bounce():
+    """And all of it, from a start at rest."""
+    system, state, _ = falling()
+    method, h, z, g, e = jc.Method(integrator=jc.RK4(), events=jc.Events()), 2e-2, 0.503, 9.81, 0.7
+
+    def height(z):
+        start = jc.init(system, method, state.q.at[1].set(z), state.v)
+        return jc.rollout(system, method, start, None, h, round(0.6 / h))[0].q[1]
+
+    v = np.sqrt(2 * g * (z - 0.1))
+    truth = -e + (1 + e) * g * (0.6 - v / g) / v
+    np.testing.assert_allclose(jax.jit(jax.grad(height))(z), truth, rtol=1e-6)
+
+
 @dtypes
 @pytest.mark.parametrize("restitution", [0.3, 0.7])
 def test_what_has_ceased_to_bounce_stays(dtype, restitution):

@@ -19,7 +19,8 @@ checkpoint, and its derivative evaluates the function once more.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
@@ -41,6 +42,16 @@ _TRANSPOSED = ContextVar("transposed", default=False)
 def order() -> int:
     """Of the derivative of a native function that is being traced: 0 for the function itself."""
     return _ORDER.get()
+
+
+@contextmanager
+def during(variable: ContextVar[Any], value: Any) -> Iterator[None]:
+    """A variable has this value meanwhile."""
+    before = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(before)
 
 
 class Native:
@@ -128,11 +139,8 @@ class Tangent(Native):
             results = self.whole(*(replaced.get(i, x) for i, x in enumerate(primals)))
             return list(filter(is_real, results))
 
-        before = _ORDER.set(order() + 1)
-        try:
+        with during(_ORDER, order() + 1):
             return jax.jvp(along, [primals[i] for i in self.places], tangents)[1]
-        finally:
-            _ORDER.reset(before)
 
 
 class Transposed(Native):
@@ -172,11 +180,8 @@ class Transposed(Native):
             return spread(self.whole(*merged), batch)
 
         cotangents = spread(list(args[self.fixed :]), batch)
-        before = _TRANSPOSED.set(True)
-        try:
+        with during(_TRANSPOSED, True):
             return list(jax.linear_transpose(along, *self._arguments(args))(cotangents))
-        finally:
-            _TRANSPOSED.reset(before)
 
 
 class Part(Native):

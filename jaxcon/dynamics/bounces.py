@@ -54,9 +54,8 @@ def bounces(rows: BoundRows, e: Array, fall: Array, free: Array, dt: Array) -> B
         free: which rows those are, (n,).
         dt: h, () [s].
     """
-    mean = rows.rate + fall
-    arrives = (mean < 0) & (rows.gap <= -dt[None] * mean) & (e >= 0)
-    start = fall / 2 - mean
+    arrives = arrival(rows, e, fall, dt)
+    start = -rows.rate - fall / 2
     whole = numerics.safe_divide(jnp.where(arrives, jnp.maximum(rows.gap, 0), 0), dt[None])
     size = jnp.where(free, start, 1)  # no quotients by what may be as slow as it likes
     closed = 2 * whole / (1 + jnp.sqrt(1 - 2 * (fall / size) * (whole / size)))
@@ -66,6 +65,12 @@ def bounces(rows: BoundRows, e: Array, fall: Array, free: Array, dt: Array) -> B
     more, travel = e * start * slowed + later - rows.target, e * (start - closed) * slowed + last
     up = arrives & (more > 0) & (travel >= 0)
     return Bounce(*(jnp.where(up, x, 0) for x in (more, travel, later)))
+
+
+def arrival(rows: BoundRows, e: Array, fall: Array, dt: Array) -> Array:
+    """Which rows with restitution close within the step, φ + h w ≤ 0 with w = φ̇₀ + h g, (n,)."""
+    mean = rows.rate + fall
+    return (mean < 0) & (rows.gap <= -dt[None] * mean) & (e >= 0)
 
 
 def freely(
@@ -95,12 +100,13 @@ def freely(
     kinds, numbers = rows.kinds, jnp.finfo(rows.rate.dtype)
     slow = float(numbers.tiny) ** 0.25  # up to its square there are derivatives of quotients
     fast = rows.rate < -(jnp.abs(change) + 2 * jnp.abs(fall) + slow)
-    up = fast & (rows.gap <= -dt[None] * (rows.rate + fall)) & (e >= 0)
+    up = fast & arrival(rows, e, fall, dt)
     rounding = ROUNDING * float(numbers.eps)
     size = jnp.max(jnp.maximum(jnp.abs(rows.rate), jnp.abs(change)), axis=0, keepdims=True)
     least = rows.target + rounding * jnp.maximum(size, jnp.abs(rows.target))
-    parts = kinds.split((rows.rate + change <= least) & ~up)
-    bears = acts & kinds.by_normals(parts._replace(box=jnp.ones_like(parts.box)))
+    touch = kinds.split((rows.rate + change <= least) & ~up)
+    box, discs = jax.tree.map(jnp.ones_like, (touch.box, touch.discs))
+    bears = acts & kinds.under_normals(touch._replace(box=box, discs=discs))
     length = jnp.sqrt(jnp.maximum(gauss_jordan.diagonal(matrix), 0))
     bound = jnp.abs(matrix) > rounding * length[:, None] * length[None]
     return jax.lax.stop_gradient(fast & ~jnp.any(bound & bears[None], axis=1))

@@ -15,7 +15,7 @@ import numpy as np
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
-from jaxcon.core.lanes import Vector, widened
+from jaxcon.core.lanes import widened
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.bounces import Bounce, bounces, freely
 from jaxcon.solvers import gauss_jordan
@@ -192,10 +192,8 @@ class Impulse:
         rounding = 64 * float(jnp.finfo(matrix.dtype).eps) * self.dt[None] * self.bare
         moving = jax.lax.stop_gradient(own > rounding)
         moving = moving if self.acts is None else moving & self.acts
-        kinds, moves = self.rows.kinds, self.rows.kinds.split(moving)
-        sets = zip(kinds.discs, moves.discs, strict=True)  # no friction without a normal
-        discs = tuple(Vector(*(y & disc.of(moves.normal) for y in x)) for disc, x in sets)
-        return kinds.join(moves._replace(discs=discs))
+        kinds = self.rows.kinds
+        return kinds.under_normals(kinds.split(moving))
 
     def react(self, solver: Any, guess: Array | None) -> Reactions:
         """λ by the laws of the rows, with restitution as far as it adds no energy.

@@ -104,10 +104,11 @@ class Kinds:
         rows = itertools.chain(*parts.discs)
         return jnp.concatenate([parts.single, parts.box, parts.normal, *rows])
 
-    def by_normals(self, parts: Parts) -> Array:
-        """The array of parts in which each disc has what its contacts' normals have."""
-        discs = tuple(Vector(*[disc.of(parts.normal)] * disc.rank) for disc in self.discs)
-        return self.join(parts._replace(discs=discs))
+    def under_normals(self, flags: Parts) -> Array:
+        """Flags (n,) of which those of discs hold only where their normals' do."""
+        sets = zip(self.discs, flags.discs, strict=True)
+        discs = tuple(Vector(*(y & disc.of(flags.normal) for y in x)) for disc, x in sets)
+        return self.join(flags._replace(discs=discs))
 
     def largest(self, x: Array) -> Array:
         """Of rows (n, …) that obey a law together, what is largest: normal and slip, or turning."""
