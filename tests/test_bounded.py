@@ -185,7 +185,7 @@ def _ball():
 
 @pytest.mark.parametrize(
     "integrator",
-    [jc.RATTLE(), jc.GeneralizedAlpha(), jc.SemiImplicitEuler(gyroscopic="trapezoidal")],
+    [jc.RATTLE(), jc.GeneralizedAlpha()],
     ids=lambda x: type(x).__name__,
 )
 def test_integrators_without_a_place_for_bounds_say_so(integrator):

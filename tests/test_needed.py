@@ -90,10 +90,6 @@ SPRING = functools.partial(jc.JointSpring, "spring", "hinge", 2.0)
 METHODS = {  # of a method, and a scene on which it has nothing to do
     "events": (jc.Method(solver=jc.Sparse(), events=jc.Events()), arm),
     "bounded": (jc.Method(solver=jc.Sparse(), bounded=jc.GaussSeidel(7)), arm),
-    "trapezoidal torque": (
-        jc.Method(jc.SemiImplicitEuler(gyroscopic="trapezoidal"), solver=jc.Sparse()),
-        lambda: arm(SPRING()),
-    ),
     "rank": (jc.Method(), arm),  # of a tree, whose rows cannot depend on each other
 }
 
@@ -119,6 +115,18 @@ def test_what_was_built_before_leaves_nothing():
     every = [floor(friction=0.5), jc.Limit("stop", "hinge", -1.0, 1.0), SPRING()]
     jaxpr_of(*arm(*every, jc.Motor("motor", "hinge")))
     assert text(jaxpr_of(*arm())) == before
+
+
+def test_free_rotation_is_split_off_for_bodies_that_turn_in_space_only():
+    """Particles have no branch for fast turns, nor has a body without joints."""
+    free, body, hung = (jc.Scene() for _ in range(3))
+    free.add_particle("bob", mass=1.0, position=(1.0, 0.0, 0.0))
+    free.add(jc.Distance("rod", jc.WORLD, "bob"))
+    for scene in (body, hung):
+        scene.add_body("top", mass=1.0, inertia=(1.0, 2.0, 3.0), position=(0.0, 0.0, -1.0))
+    hung.add(jc.Spherical("tip", jc.WORLD, "top", point=(0.0, 0.0, 0.0)))
+    found = [primitives(jaxpr_of(*scene.build())) for scene in (free, body, hung)]
+    assert ["cond" in x for x in found] == [False, False, True]
 
 
 def force_of(scene):

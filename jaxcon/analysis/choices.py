@@ -13,7 +13,7 @@ from jaxcon.core.precision import cast, precision
 from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
 from jaxcon.simulation.events import Events
 from jaxcon.simulation.generalized_alpha import GeneralizedAlpha
-from jaxcon.simulation.integrators import RK4, Heun, SemiImplicitEuler, turns_in_space
+from jaxcon.simulation.integrators import RK4, Heun, SemiImplicitEuler
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rattle import RATTLE
 from jaxcon.solvers.gauss_seidel import GaussSeidel
@@ -65,9 +65,6 @@ def _pairs(system: Any) -> list[tuple[str, Any, Any, Any, Any]]:
         ("Heun, Baumgarte", Heun(), feedback),
         ("generalized-α", GeneralizedAlpha(), feedback),
     ]
-    if turns_in_space(system):
-        euler = SemiImplicitEuler(gyroscopic="trapezoidal")
-        pairs.insert(3, ("semi-implicit Euler (trapezoidal), Baumgarte", euler, feedback))
     if not system.constraints and not system.bounds:  # nothing to stabilise
         pairs = [pair for pair in pairs if pair[2] is feedback]
     found: list[Any] = [(*pair, bounded, None) for pair in pairs]

@@ -188,7 +188,7 @@ class Watched(Dynamics):
         return self._watched(q, v, t, super().__call__(q, v, t, age))
 
     def factored(self, q: Array, v: Array, t: Any, age: Any = None) -> Any:
-        """The same, and which changes of v the rows allow."""
+        """The same, and b → the least a with J a + C λ = b."""
         return self._watched(q, v, t, super().factored(q, v, t, age))
 
     def _watched(self, q: Array, v: Array, t: Any, found: Any) -> Any:

@@ -86,7 +86,7 @@ class Dynamics:
         if self.bounded is None:
             return *self(q, v, t), self
         rows, law, problem = self._problem(q, v, t, None)
-        solution, rows, force = self._reacted(q, v, t, rows, law, problem)
+        solution, rows, force, _ = self._reacted(q, v, t, rows, law, problem)
         return solution, rows, dataclasses.replace(self, bounded=None, held=force)
 
     def _reacted(
@@ -98,8 +98,8 @@ class Dynamics:
         law: Any,
         problem: Saddle,
         leaps: bool = False,
-    ) -> tuple[Solution, Rows, Array]:
-        """a and λ with bounded rows, the rows with what these do, and their generalized force."""
+    ) -> tuple[Solution, Rows, Array, Factored]:
+        """a and λ with inequality rows, the rows with λ of these, their force, and the factors."""
         if self.part is None:
             bounds, length, acts = self.bounds(q, v, t, self.dt), self.dt, None
         else:
@@ -112,7 +112,7 @@ class Dynamics:
         solution = self.system.complete(impulse.motion(known.multipliers))
         known = self._judged(impulse, known, solution.acceleration)
         own = bounds.jacobian.transpose(known.multipliers)
-        return solution, dataclasses.replace(rows, reactions=known), own
+        return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone
 
     def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
         """The bounded rows, and what a step of dt wants of them."""
@@ -139,15 +139,22 @@ class Dynamics:
 
     def factored(
         self, q: Array, v: Array, t: Any, age: Any = None
-    ) -> tuple[Solution, Rows, Callable[[Array], Solution]]:
-        """The same, and Δv → the nearest change of v in the metric of M that the rows allow."""
+    ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None]:
+        """As the call, and b → the least a, in the metric of M, with J a + C λ = b.
+
+        It uses the factors of the step. It is None where the stabilizer solves by itself.
+        """
         rows, law, problem = self._problem(q, v, t, age)
-        solve, none = self._factors(law, problem), jnp.zeros_like(law.target)
-
-        def allowed(change: Array) -> Solution:
-            return solve(problem.mass.apply(change), none)
-
-        return self.system.complete(solve(problem.force, law.target)), rows, allowed
+        if self.bounded is not None:
+            solution, rows, _, solve = self._reacted(
+                q, v, t, rows, law, problem, leaps=age is not None
+            )
+        elif law.solve is not None:
+            return self.system.complete(law.solve(self.solver, problem)), rows, None
+        else:
+            solve = self._factors(law, problem)
+            solution = self.system.complete(solve(problem.force, law.target))
+        return solution, rows, lambda target: solve(0 * problem.force, target)
 
     def _impulse(
         self,
@@ -182,8 +189,8 @@ class Dynamics:
         """
         if law.solve is not None:
             raise ValueError(
-                'gyroscopic="trapezoidal" and bounded rows solve with the factors of the step, and'
-                " AugmentedLagrangian has rounds of its own; take Baumgarte(), or do without them."
+                "bounded rows solve with the factors of the step, and AugmentedLagrangian has"
+                " rounds of its own; take Baumgarte(), or do without them."
             )
         return self.solver.factor(problem)
 

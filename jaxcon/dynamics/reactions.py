@@ -137,11 +137,11 @@ class Impulse:
 
     def motion(self, multipliers: Array) -> Solution:
         """a and λ_e under multipliers λ (n,)."""
-        return self._alone(self.saddle.force + self._pull(multipliers), self.target)
+        return self.alone(self.saddle.force + self._pull(multipliers), self.target)
 
     def change(self, multipliers: Array) -> Array:
         """What λ (n,) adds to a, (n_v,)."""
-        return self._alone(self._pull(multipliers), jnp.zeros_like(self.target)).acceleration
+        return self.alone(self._pull(multipliers), jnp.zeros_like(self.target)).acceleration
 
     def velocity(self, multipliers: Array) -> Array:
         """u at the end of the step, (n,)."""
@@ -177,7 +177,7 @@ class Impulse:
     def _pull(self, multipliers: Array) -> Array:
         return self.rows.jacobian.transpose(multipliers)
 
-    def _alone(self, force: Array, target: Array) -> Solution:
+    def alone(self, force: Array, target: Array) -> Solution:
         """The solution for one right side."""
         a, multipliers, status = self.solve(force[:, None], target[:, None])
         return Solution(a[:, 0], multipliers[:, 0], status[0])

@@ -161,6 +161,20 @@ class Vakonomic:
         """q ⊕ Δ."""
         return self.system.retract(q, self._split(step)[0])
 
+    @property
+    def turns_in_space(self) -> bool:
+        """Whether bodies of the system have an orientation in space."""
+        return self.system.turns_in_space
+
+    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
+        """The velocities after a step of h as those of the system, and μ + h μ̇."""
+        (v, μ), (a, rate) = self._split(v), self._split(acceleration)
+        return jnp.concatenate([self.system.kick(q, v, a, dt), μ + dt * rate])
+
+    def turn(self, q: Array, v: Array, dt: Any) -> Array:
+        """The largest (h|ω|)² of all bodies, () [rad²]."""
+        return self.system.turn(q, self._split(v)[0], dt)
+
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""
         return self.system.normalize(q)

@@ -63,9 +63,9 @@ class Particle:
         """p: these velocities are rates of coordinates."""
         return p
 
-    def kicked(self, v: Vector, change: Vector, moments: Any, dt: Lane) -> Vector:
-        """Nothing: these velocities are rates of coordinates."""
-        return v.map(jnp.zeros_like)
+    def kick(self, v: Vector, acceleration: Vector, moments: Any, dt: Lane) -> Vector:
+        """v + h a: these velocities are rates of coordinates."""
+        return v + acceleration * dt
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
@@ -171,21 +171,28 @@ class SpatialRigid(Particle):
         turned = p_φ + across * 0.5 + φ.cross(across) * numerics.inverse_exponential(φ.dot(φ))
         return Vector(*p[:3], *turned)
 
-    def kicked(self, v: Vector, change: Vector, moments: Array, dt: Lane) -> Vector:
-        """What ω + h a lacks of Ω, the gyroscopic torque by the trapezoidal rule.
+    def kick(self, v: Vector, acceleration: Vector, moments: Array, dt: Lane) -> Vector:
+        """Half a step of free rotation, h times all that is not gyroscopic in a, half a step more.
 
-            I Ω = I ω + h (I a + ω × Iω) − ½ h (ω × Iω + Ω × IΩ)
+        This is Strang's splitting of v̇ = a. An explicit gyroscopic torque would add energy in every
+        step, in proportion to h. The free rotation keeps |Iω| exactly and ½ ω·Iω to 1e-4 at a turn
+        of one radian a step.
 
-        is, but for terms of (hω)², what the discrete Lagrangian ½ ω·Iω of a body that turns by hω
-        and then by hΩ leads to: turning freely it neither gains energy nor loses any. The equation
-        is quadratic, and one step of Newton's method from ω + h a is enough.
+        Args:
+            v: velocities before the step.
+            acceleration: a, which contains −I⁻¹ (ω × Iω) at v.
+            moments: principal moments of inertia [kg m²].
+            dt: h [s].
+
+        References:
+            Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections II.5 and VII.5.
         """
-        turn, weight = Vector(*change[3:]), dt / 2
-        ω, shares = Vector(*v[3:]), shares_of(Vector.of(moments))
-        after = ω + turn
-        grown = (spun(shares, after) - spun(shares, ω)) * weight
-        lacking = -cramer(gyroscopic_slope(shares, after * weight), grown)
-        return Vector(*(jnp.zeros_like(x) for x in v[:3]), *lacking)
+        moments_, half = Vector.of(moments), dt / 2
+        shares, ω = shares_of(moments_), Vector(*v[3:])
+        applied = (Vector(*acceleration[3:]) + spun(shares, ω)) * dt
+        turned = rotate_freely(ω, moments_, shares, half)
+        turned = rotate_freely(turned + applied, moments_, shares, half)
+        return Vector(*(Vector(*v[:3]) + Vector(*acceleration[:3]) * dt), *turned)
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
@@ -209,6 +216,32 @@ def spun(shares: Vector, ω: Vector) -> Vector:
     """I⁻¹ (ω × Iω)."""
     (a, b, c), (x, y, z) = shares, ω
     return Vector(a * y * z, b * z * x, c * x * y)
+
+
+def rotate_freely(ω: Vector, moments: Vector, shares: Vector, dt: Lane) -> Vector:
+    """ω after a body has turned without torque: I ω̇ = −ω × Iω by the implicit midpoint rule.
+
+    The rule p⁺ − p = −h ω̄ × (p + p⁺)/2 with p = Iω is a rotation of p by the Cayley map of −h ω̄,
+    so |p| is kept whatever ω̄ is. With ω̄ = (ω + ω⁺)/2 energy is kept as well. One step of Newton's
+    method from ω finds ω̄ up to (h|ω|/2)³.
+
+    Args:
+        ω: angular velocity in the body's frame [rad/s].
+        moments: principal moments of inertia [kg m²].
+        shares: as of `shares_of`.
+        dt: h [s].
+
+    References:
+        Austin, Krishnaprasad, Wang, Almost Poisson integration of rigid body systems, Journal of
+            Computational Physics 107 (1993).
+    """
+    half = dt / 2
+    middle = ω - cramer(gyroscopic_slope(shares, ω * half), spun(shares, ω) * half)
+    axis, p = middle * -half, Vector(*(i * x for i, x in zip(moments, ω, strict=True)))
+    across = axis.cross(p)
+    turned = (across + axis.cross(across)) * (2 / (1 + axis.dot(axis)))
+    # the change alone is divided by I: of a body that hardly precesses ω keeps its last digit
+    return Vector(*(x + y * (1 / i) for x, y, i in zip(ω, turned, moments, strict=True)))
 
 
 def gyroscopic_slope(shares: Vector, ω: Vector) -> tuple[Vector, ...]:

@@ -110,6 +110,15 @@ class GeneralizedCoordinates:
         """q + Δ."""
         return q + step
 
+    @property
+    def turns_in_space(self) -> bool:
+        """No: v is q̇."""
+        return False
+
+    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
+        """v + h a."""
+        return v + dt * acceleration
+
     def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
         """None: v is q̇."""
         return jnp.zeros_like(v)

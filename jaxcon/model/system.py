@@ -185,11 +185,36 @@ class BodySystem:
         pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
         return _join([kind.carry(own, momentum) for kind, own, momentum in pairs], q)
 
-    def kicked(self, q: Array, v: Array, change: Array, dt: Any) -> Array:
-        """What a change h a of v lacks (n_v,), where bodies turn in space before and after it."""
+    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
+        """v after a step of h under a, (n_v,); free rotation in space is split off.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities before the step, (n_v,).
+            acceleration: a at q and v, (n_v,), with its gyroscopic part.
+            dt: h, (1,) [s].
+        """
+        if not self.turns_in_space:
+            return v + dt * acceleration
         parts = zip(self.layout.groups, self.inertia, strict=True)
-        pairs = [(g.kind, g.unpack(q, v)[1], g.unpack(q, change)[1], p.moments) for g, p in parts]
-        return _join([kind.kicked(*known, dt) for kind, *known in pairs], q)
+        known = [
+            (g.kind, g.unpack(q, v)[1], g.unpack(q, acceleration)[1], p.moments) for g, p in parts
+        ]
+        return _join([kind.kick(*own, dt) for kind, *own in known], q)
+
+    @property
+    def turns_in_space(self) -> bool:
+        """Whether bodies have an orientation in space."""
+        return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
+
+    def turn(self, q: Array, v: Array, dt: Any) -> Array:
+        """The largest (h|ω|)² of all bodies in space, () [rad²]."""
+        most = jnp.zeros(v.shape[1:], v.dtype)
+        for g in self.layout.groups:
+            if g.kind.n_q != g.kind.n_v:
+                ω = Vector(*g.unpack(q, v)[1][3:])
+                most = jnp.maximum(most, jnp.max(ω.dot(ω), axis=0))
+        return dt[0] * dt[0] * most
 
     def complete(self, solution: Solution) -> Solution:
         """The solution of the saddle system as it is."""
@@ -209,7 +234,7 @@ class BodySystem:
 
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""
-        if all(g.kind.n_q == g.kind.n_v for g in self.layout.groups):
+        if not self.turns_in_space:
             return q
         v = jnp.zeros((self.n_v, *q.shape[1:]), q.dtype)
         groups = self.layout.groups

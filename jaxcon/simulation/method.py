@@ -123,8 +123,7 @@ class Method:
             names = [name for group in system.bounds for name in group.names]
             reason = (
                 f"it has no place for the bounded rows of {names}, which are solved once a step"
-                " beside explicit forces; take SemiImplicitEuler() with the explicit torque, or a"
-                " Runge–Kutta method"
+                " beside explicit forces; take SemiImplicitEuler() or a Runge–Kutta method"
             )
         if reason:
             raise ValueError(f"{type(self.integrator).__name__}: {reason}.")
