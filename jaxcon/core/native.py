@@ -328,8 +328,13 @@ def _stopped(cotangent: Any, _: Any) -> list[Any]:
     return [None]
 
 
-def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]:
-    """Leaves out the results that nobody needs, and what is done for them alone."""
+def _without_unused(wanted: list[bool], *context: Any) -> tuple[list[bool], Any]:
+    """Leaves out the results that nobody needs, and what is done for them alone.
+
+    JAX calls the rule with (wanted, equation), and from 0.11.2 or 0.12 on with
+    (wanted, whether references are read later, equation). No native function has references.
+    """
+    equation = context[-1]
     if not any(wanted):
         return [False] * len(equation.invars), None
     results = [x for x, flag in zip(equation.outvars, wanted, strict=True) if flag]
