@@ -32,6 +32,7 @@ from jax.extend.core.primitives import stop_gradient_p
 from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core import fusion
+from jaxcon.core.jaxprs import without_unused
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import spread
 
@@ -76,7 +77,7 @@ class Native:
 
     def eager(self, *args: Array) -> list[Array]:
         """The function outside jit: compiled, unless that is switched off."""
-        return self(*args) if jax.config.values["jax_disable_jit"] else self.compiled(*args)
+        return self(*args) if jax.config.jax_disable_jit else self.compiled(*args)
 
     def shapes(self, args: Sequence[Array]) -> list[Any]:
         """Shape and dtype of the results; traced as `_in_stages` does it."""
@@ -203,8 +204,7 @@ class Part(Native):
 
     def _traced(self, *avals: Any) -> Any:
         closed = self.whole.traced(*avals)
-        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, self.wanted, instantiate=True)
-        return ClosedJaxpr(jaxpr, closed.consts)
+        return ClosedJaxpr(without_unused(closed.jaxpr, self.wanted), closed.consts)
 
 
 native_p = Primitive("native")
@@ -331,8 +331,8 @@ def _stopped(cotangent: Any, _: Any) -> list[Any]:
 def _without_unused(wanted: list[bool], *context: Any) -> tuple[list[bool], Any]:
     """Leaves out the results that nobody needs, and what is done for them alone.
 
-    JAX calls the rule with (wanted, equation), and from 0.11.2 or 0.12 on with
-    (wanted, whether references are read later, equation). No native function has references.
+    The last argument is the equation. From JAX 0.12 on there is one before it, whether references
+    are read later; native functions have none.
     """
     equation = context[-1]
     if not any(wanted):

@@ -12,21 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
-from jax.interpreters import partial_eval
 
+from jaxcon.core.jaxprs import called, without_unused
 from jaxcon.core.typing import Array
-
-INLINED = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "checkpoint": "jaxpr",
-    "remat2": "jaxpr",
-}
-"""Primitives that only call a function, and the parameter that holds it."""
 
 IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
 """Primitives that return their arguments; XLA, too, drops barriers before it forms kernels."""
@@ -84,9 +72,7 @@ class Operation:
 def traced(function: Any, args: Sequence[Any]) -> Any:
     """The closed jaxpr of a native function, without what no result needs."""
     closed = function.traced(*((x.shape, x.dtype) for x in args))
-    wanted = [True] * len(closed.jaxpr.outvars)
-    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, wanted, instantiate=True)
-    return jex.ClosedJaxpr(jaxpr, closed.consts)
+    return jex.ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
 
 
 class Program:
@@ -192,8 +178,9 @@ class Program:
 
     def _append(self, equation: Any, args: list[Operand]) -> list[Operand]:
         name, params = equation.primitive.name, equation.params
-        if name in INLINED:
-            return self._inline_closed(params[INLINED[name]], args)
+        inner = called(equation)
+        if inner is not None:
+            return self._inline_closed(inner, args)
         if name in IDENTITIES:
             return args
         if name == "custom_linear_solve":
