@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -236,7 +237,7 @@ def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -
     Of an odd number the one in the middle belongs to both halves where that changes nothing, and
     the last one waits where it does.
     """
-    x = x.reshape((-1, *x.shape[axes:]))
+    x = x.reshape((math.prod(x.shape[:axes]), *x.shape[axes:]))
     waiting: list[Array] = []
     while len(x) > 1:
         if len(x) % 2 and operation is jax.lax.add:
@@ -255,8 +256,14 @@ def slices(sizes: Sequence[int], axis: int, x: Array) -> list[Array]:
 
 
 def _leading(axes: Any, shape: tuple[int, ...]) -> bool:
-    """Whether these are the first axes, none of them empty."""
-    return tuple(axes) == tuple(range(len(axes))) and all(shape[: len(axes)])
+    """Whether these are the first axes, of known sizes, none of them empty."""
+    sizes = shape[: len(axes)]
+    return tuple(axes) == tuple(range(len(axes))) and is_known(sizes) and all(sizes)
+
+
+def is_known(shape: Sequence[Any]) -> bool:
+    """Whether all sizes are numbers; those of `jax.export.symbolic_shape` are not."""
+    return all(isinstance(n, int) for n in shape)
 
 
 def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
@@ -267,6 +274,8 @@ def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
     if len(equation.outvars) != 1:
         return None
     name, aval = equation.primitive.name, equation.outvars[0].aval
+    if not is_known(aval.shape):  # no constant is of a size that is still open
+        return None
     if 0 in aval.shape and not _is_key(aval):
         return [Constant(np.zeros(aval.shape, aval.dtype))]
     exponent = args[1] if name == "pow" and len(args) == 2 else None
