@@ -15,6 +15,8 @@ from functions import (
 import jaxcon as jc
 from jaxcon.core import fusion, native
 from jaxcon.core.native import Native
+from jaxcon.core.operations import count
+from jaxcon.core.program import Program
 from jaxcon.scenes import four_bar
 
 X = np.linspace(0.3, 1.7, 24).reshape(4, 6)
@@ -176,3 +178,55 @@ def test_it_can_be_left_to_the_compiler(monkeypatch):
     monkeypatch.setenv("JAXCON_STAGES", "off")
     left = jax.jit(staged(chain_of_shared_values)).lower(X, Y).as_text()
     assert "inlineable" not in left
+
+
+@jax.custom_jvp
+def own_tangent(x):
+    return jnp.sin(x)
+
+
+own_tangent.defjvp(lambda xs, dxs: (own_tangent(*xs), dxs[0] * jnp.cos(xs[0])))
+
+
+@jax.custom_vjp
+def own_cotangent(x):
+    return jnp.sin(x)
+
+
+own_cotangent.defvjp(lambda x: (own_cotangent(x), x), lambda x, dy: (dy * jnp.cos(x),))
+
+
+def root(x):
+    """y of y + y = sin x, with the derivative of what is implicit."""
+
+    def solve(function, start):
+        return start - function(start) / 2
+
+    return jax.lax.custom_root(
+        lambda y: y + y - jnp.sin(x), x, solve, lambda linear, b: b / linear(jnp.ones_like(b))
+    )
+
+
+CALLING = {
+    "jit": jax.jit(jnp.sin),
+    "checkpoint": jax.checkpoint(jnp.sin),
+    "tangent of a checkpoint": lambda x: jax.jvp(jax.checkpoint(jnp.sin), (x,), (x,))[1],
+    "custom_jvp": own_tangent,
+    "custom_vjp": own_cotangent,
+    "custom_root": root,
+    "relu": jax.nn.relu,
+}
+
+
+@pytest.mark.parametrize("name", CALLING)
+def test_functions_that_are_only_called_are_inlined(name):
+    """However the version of JAX writes them down; else each would break a kernel in two."""
+    function = Native(lambda x: [CALLING[name](x) * 2])
+    program = Program(function.traced(((4, 6), np.dtype("float64"))), fusion._settled_body)
+    known = fusion.ARITHMETIC | fusion.COSTLY | fusion.MOVES
+    assert {op.name for op in program.operations} <= known
+    assert program.operations
+    (found,) = fusion.settled(function, [jnp.asarray(X)])
+    np.testing.assert_allclose(found, CALLING[name](jnp.asarray(X)) * 2, rtol=1e-14)
+    counted = count(jax.make_jaxpr(CALLING[name])(jnp.asarray(X)).jaxpr)
+    assert counted >= X.size

@@ -4,11 +4,10 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-from jax.interpreters import partial_eval
+
+from jaxcon.core.jaxprs import read_arguments
 
 
 def depends(function: Callable[[Any], Any], x: Any) -> bool:
     """Whether some number in the result of function(x) is computed from the numbers in x."""
-    jaxpr = jax.make_jaxpr(function)(x).jaxpr
-    used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1]
-    return any(used)
+    return any(read_arguments(jax.make_jaxpr(function)(x).jaxpr))

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core.pytree import exportable
 from jaxcon.core.typing import Array, Lane
 
 
@@ -55,6 +56,7 @@ def total(terms: Any) -> Lane:
     return functools.reduce(plus, terms, 0.0)
 
 
+@exportable
 @jax.tree_util.register_pytree_node_class
 class Vector:
     """A vector whose components are lanes; `Vector(x, y, z)`."""
@@ -162,7 +164,7 @@ class Matrix(Vector):
         return Matrix(*(Vector(*column) for column in zip(*self, strict=True)))
 
 
-jax.tree_util.register_pytree_node_class(Matrix)
+exportable(jax.tree_util.register_pytree_node_class(Matrix))
 
 
 def zeros(n: int) -> Vector:

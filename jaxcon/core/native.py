@@ -31,7 +31,8 @@ from jax.extend.core import ClosedJaxpr, Primitive
 from jax.extend.core.primitives import stop_gradient_p
 from jax.interpreters import ad, batching, mlir, partial_eval
 
-from jaxcon.core import fusion
+from jaxcon.core import fusion, meshes
+from jaxcon.core.jaxprs import without_unused
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import spread
 
@@ -101,7 +102,8 @@ class Native:
             TypeError: a user's function holds a traced value that is not among the arguments; its
                 derivative would silently be zero.
         """
-        closed = jax.make_jaxpr(self)(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
+        with meshes.apart():
+            closed = jax.make_jaxpr(self)(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
         if any(isinstance(x, Tracer) for x in closed.consts):
             raise TypeError(
                 "a function of the scene (a force, constraint, motion, mass or potential) closes"
@@ -203,8 +205,7 @@ class Part(Native):
 
     def _traced(self, *avals: Any) -> Any:
         closed = self.whole.traced(*avals)
-        jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, self.wanted, instantiate=True)
-        return ClosedJaxpr(jaxpr, closed.consts)
+        return ClosedJaxpr(without_unused(closed.jaxpr, self.wanted), closed.consts)
 
 
 native_p = Primitive("native")
@@ -245,6 +246,7 @@ def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> Py
     leaves, structure = jax.tree.flatten(args)
     arrays = [jnp.asarray(x) for x in leaves]
     native, result = _native(function, structure, tuple(x.shape for x in arrays), staged)
+    arrays = meshes.together(arrays)
     arrays = native_p.bind(*arrays, fun=native)  # its trace leaves the structure
     return jax.tree.unflatten(result[0], arrays)
 
@@ -255,7 +257,7 @@ def is_real(x: Any) -> bool:
 
 
 def _abstract(*args: Any, fun: Native) -> list[Any]:
-    return fun.shapes(args)
+    return meshes.typed(fun.shapes(args), args)
 
 
 def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
@@ -310,6 +312,18 @@ def squeezed(*lanes: Array) -> list[Array]:
     return [jnp.squeeze(x, -1) for x in lanes]
 
 
+def _lowered(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The lowering rule of a function (*args, fun=) that sees shapes and dtypes alone."""
+    rule = mlir.lower_fun(function, multiple_results=True)
+
+    def lower(ctx: Any, *args: Any, fun: Native) -> Any:
+        with meshes.apart():
+            plain = [meshes.plain(x) for x in ctx.avals_in]
+            return rule(ctx.replace(avals_in=plain), *args, fun=fun)
+
+    return lower
+
+
 def _stopped(cotangent: Any, _: Any) -> list[Any]:
     """The transpose of `stop_gradient` within that of a native function: zero.
 
@@ -328,8 +342,13 @@ def _stopped(cotangent: Any, _: Any) -> list[Any]:
     return [None]
 
 
-def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]:
-    """Leaves out the results that nobody needs, and what is done for them alone."""
+def _without_unused(wanted: list[bool], *context: Any) -> tuple[list[bool], Any]:
+    """Leaves out the results that nobody needs, and what is done for them alone.
+
+    The last argument is the equation. From JAX 0.12 on there is one before it, whether references
+    are read later; native functions have none.
+    """
+    equation = context[-1]
     if not any(wanted):
         return [False] * len(equation.invars), None
     results = [x for x, flag in zip(equation.outvars, wanted, strict=True) if flag]
@@ -340,14 +359,8 @@ def _without_unused(wanted: list[bool], equation: Any) -> tuple[list[bool], Any]
 
 native_p.def_impl(lambda *args, fun: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
-mlir.register_lowering(
-    native_p, mlir.lower_fun(lambda *args, fun: fun(*args), multiple_results=True)
-)
-mlir.register_lowering(
-    native_p,
-    mlir.lower_fun(_in_stages, multiple_results=True),
-    platform="cpu",
-)
+mlir.register_lowering(native_p, _lowered(lambda *args, fun: fun(*args)))
+mlir.register_lowering(native_p, _lowered(_in_stages), platform="cpu")
 batching.primitive_batchers[native_p] = _batched
 ad.primitive_jvps[native_p] = _jvp
 partial_eval.dce_rules[native_p] = _without_unused

@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import Literal
-from jax.interpreters import partial_eval
+
+from jaxcon.core.jaxprs import called, without_unused
 
 COUNTED = """add sub mul div neg max min sqrt rsqrt cbrt square pow exp exp2 log tanh
              sin cos tan asin acos atan atan2 sinh cosh"""
@@ -84,7 +85,7 @@ class Values:
             jaxpr: open.
             given: its inputs.
         """
-        used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=True)[0]
+        used = without_unused(jaxpr)
         place = dict(zip(used.invars, given, strict=True))
         place |= {x: self.fresh() for x in used.constvars}
 
@@ -100,9 +101,9 @@ class Values:
 
     def equation(self, equation: Any, inputs: list[int]) -> tuple[float, list[int]]:
         """Operations that an equation adds, and its results."""
-        called = called_by(equation, inputs)
-        if called is not None:
-            return self.evaluate(*called)
+        evaluated = called_by(equation, inputs)
+        if evaluated is not None:
+            return self.evaluate(*evaluated)
         name = equation.primitive.name
         key = name, tuple(sorted(inputs) if name in COMMUTING else inputs), parameters(equation)
         if key in self.known:
@@ -163,6 +164,10 @@ def inside(equation: Any) -> Iterator[Any]:
     if name == "native":
         shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
         yield jax.make_jaxpr(params["fun"])(*shapes).jaxpr
+        return
+    function = called(equation)
+    if function is not None:
+        yield getattr(function, "jaxpr", function)
         return
     for value in params.values():
         for part in value if isinstance(value, tuple) else (value,):

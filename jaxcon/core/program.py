@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,21 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core as jex
-from jax.interpreters import partial_eval
 
+from jaxcon.core.jaxprs import called, without_unused
 from jaxcon.core.typing import Array
-
-INLINED = {
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "core_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "checkpoint": "jaxpr",
-    "remat2": "jaxpr",
-}
-"""Primitives that only call a function, and the parameter that holds it."""
 
 IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
 """Primitives that return their arguments; XLA, too, drops barriers before it forms kernels."""
@@ -84,9 +73,7 @@ class Operation:
 def traced(function: Any, args: Sequence[Any]) -> Any:
     """The closed jaxpr of a native function, without what no result needs."""
     closed = function.traced(*((x.shape, x.dtype) for x in args))
-    wanted = [True] * len(closed.jaxpr.outvars)
-    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, wanted, instantiate=True)
-    return jex.ClosedJaxpr(jaxpr, closed.consts)
+    return jex.ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
 
 
 class Program:
@@ -192,8 +179,9 @@ class Program:
 
     def _append(self, equation: Any, args: list[Operand]) -> list[Operand]:
         name, params = equation.primitive.name, equation.params
-        if name in INLINED:
-            return self._inline_closed(params[INLINED[name]], args)
+        inner = called(equation)
+        if inner is not None:
+            return self._inline_closed(inner, args)
         if name in IDENTITIES:
             return args
         if name == "custom_linear_solve":
@@ -249,7 +237,7 @@ def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -
     Of an odd number the one in the middle belongs to both halves where that changes nothing, and
     the last one waits where it does.
     """
-    x = x.reshape((-1, *x.shape[axes:]))
+    x = x.reshape((math.prod(x.shape[:axes]), *x.shape[axes:]))
     waiting: list[Array] = []
     while len(x) > 1:
         if len(x) % 2 and operation is jax.lax.add:
@@ -268,8 +256,14 @@ def slices(sizes: Sequence[int], axis: int, x: Array) -> list[Array]:
 
 
 def _leading(axes: Any, shape: tuple[int, ...]) -> bool:
-    """Whether these are the first axes, none of them empty."""
-    return tuple(axes) == tuple(range(len(axes))) and all(shape[: len(axes)])
+    """Whether these are the first axes, of known sizes, none of them empty."""
+    sizes = shape[: len(axes)]
+    return tuple(axes) == tuple(range(len(axes))) and is_known(sizes) and all(sizes)
+
+
+def is_known(shape: Sequence[Any]) -> bool:
+    """Whether all sizes are numbers; those of `jax.export.symbolic_shape` are not."""
+    return all(isinstance(n, int) for n in shape)
 
 
 def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
@@ -280,6 +274,8 @@ def _known_result(equation: Any, args: list[Operand]) -> list[Operand] | None:
     if len(equation.outvars) != 1:
         return None
     name, aval = equation.primitive.name, equation.outvars[0].aval
+    if not is_known(aval.shape):  # no constant is of a size that is still open
+        return None
     if 0 in aval.shape and not _is_key(aval):
         return [Constant(np.zeros(aval.shape, aval.dtype))]
     exponent = args[1] if name == "pow" and len(args) == 2 else None

@@ -1,13 +1,21 @@
 """Frozen dataclasses that JAX flattens: numbers are leaves, choices are static."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+from jax import export
+from jax.core import Tracer
+
+from jaxcon.core.equality import equal, hashed
+from jaxcon.core.static_data import decoded, encoded
 
 T = TypeVar("T")
+
+_WRITTEN: set[str] = set()
+"""Names by which `jax.export` writes our classes; it takes each but once."""
 
 
 def static(**options: Any) -> Any:
@@ -19,9 +27,69 @@ def static(**options: Any) -> Any:
 def pytree(cls: type[T]) -> type[T]:
     """Registers a class as a frozen dataclass whose non-static fields are pytree children.
 
-    There is no `__eq__`: arrays have no single truth value, and structures are compared by JAX.
+    Instances are compared and hashed by structure and leaves, see `equality`: a method can be a
+    static argument of `jax.jit`. Those of classes of the library can be written by `jax.export`.
     """
-    return jax.tree_util.register_dataclass(dataclass(frozen=True, eq=False)(cls))
+    cls = dataclass(frozen=True, eq=False)(cls)
+    if cls.__eq__ is object.__eq__:
+        cls.__eq__, cls.__hash__ = _equal, _hash
+    numbers = [f.name for f in fields(cls) if not f.metadata.get("static")]  # type: ignore[arg-type]
+    choices = [f.name for f in fields(cls) if f.metadata.get("static")]  # type: ignore[arg-type]
+    jax.tree_util.register_dataclass(cls, numbers, choices)
+
+    def rebuilt(known: Any, children: Any) -> T:
+        values = *zip(numbers, children, strict=True), *zip(choices, known, strict=True)
+        return cls(**dict(values))
+
+    return exportable(cls, rebuilt)
+
+
+def exportable(cls: type[T], rebuilt: Any = None) -> type[T]:
+    """Lets `jax.export` write trees with nodes of a class of the library.
+
+    Args:
+        cls: a named tuple, or registered as a pytree.
+        rebuilt: (static data, children) → the node, unless the registration says it.
+    """
+    name = f"{cls.__module__}.{cls.__qualname__}"
+    if not name.startswith("jaxcon.") or name in _WRITTEN:  # there where its module is reloaded
+        return cls
+    _WRITTEN.add(name)
+    if issubclass(cls, tuple):
+        return export.register_namedtuple_serialization(cls, serialized_name=name)
+    return export.register_pytree_node_serialization(
+        cls,
+        serialized_name=name,
+        serialize_auxdata=encoded,
+        deserialize_auxdata=decoded,
+        from_children=rebuilt,
+    )
+
+
+def _equal(self: Any, other: Any) -> Any:
+    return equal(self, other) if type(self) is type(other) else NotImplemented
+
+
+def _hash(self: Any) -> int:
+    return hashed(self)
+
+
+def unshared(tree: Any, *others: Any) -> Any:
+    """The tree with copies of the arrays that are in it twice, or in another tree as well.
+
+    JAX frees the arrays of an argument that is donated, wherever else they are.
+    """
+    seen = {id(x) for x in jax.tree.leaves(others)}
+
+    def own(x: Any) -> Any:
+        if not isinstance(x, jax.Array) or isinstance(x, Tracer):
+            return x
+        if id(x) in seen:
+            return jnp.array(x, copy=True)
+        seen.add(id(x))
+        return x
+
+    return jax.tree.map(own, tree)
 
 
 @dataclass(frozen=True)

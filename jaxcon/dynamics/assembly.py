@@ -14,7 +14,7 @@ import numpy as np
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.constraints.rows import Violation, linearize
 from jaxcon.core import checks, numerics
-from jaxcon.core.pytree import pytree
+from jaxcon.core.pytree import pytree, unshared
 from jaxcon.core.status import SimulationError, Status
 from jaxcon.core.typing import Array
 from jaxcon.dynamics import nearest
@@ -284,7 +284,7 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
         if isinstance(group, Custom):
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
-    return State(q, v, t, status, memory, turns)
+    return unshared(State(q, v, t, status, memory, turns), system)
 
 
 def _held(system: Any, hold: Any, n_v: int) -> tuple[int, ...]:

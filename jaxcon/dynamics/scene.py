@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxcon.constraints.curves import Curves
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
+from jaxcon.core.pytree import unshared
 from jaxcon.core.status import Status
 from jaxcon.dynamics import grouping
 from jaxcon.dynamics.along import no_turns
@@ -170,7 +171,7 @@ class Scene:
                 check_function(group, system.snapshot(state.q, state.v, state.time))
             if isinstance(group, Curves):
                 group.check(system.snapshot(state.q, state.v, state.time))
-        return system, state
+        return system, unshared(state, system)
 
     def _state(self, layout: Any, bodies: Any) -> State:
         q, v = [], []

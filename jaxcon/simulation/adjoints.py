@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
+from jaxcon.core.meshes import together
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
@@ -58,6 +59,7 @@ class Path:
         first = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self.inputs)
         seen = jax.eval_shape(lambda s, x: self.step(s, x)[1], self.start, first)
         empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), seen)
+        empty, _ = together((empty, self.start))  # as what the steps see
 
         def one(known: tuple[State, Any], given: Any) -> tuple[tuple[State, Any], None]:
             return self.step(known[0], given), None

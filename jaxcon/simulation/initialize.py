@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ import numpy as np
 
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
+from jaxcon.core.pytree import unshared
 from jaxcon.core.status import Status
 from jaxcon.model.state import State, recall
 from jaxcon.simulation.method import Method, check_method
@@ -47,11 +47,11 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
     memory = method.init(system, q, v)
-    start = State(q, v, jnp.asarray(time, dtype), status, memory, system.turns)
-    if turns is None:
-        return start
-    recall(system, turns)
-    return dataclasses.replace(start, turns=jnp.asarray(turns, dtype))
+    if turns is not None:
+        recall(system, turns)
+        turns = jnp.asarray(turns, dtype)
+    turns = system.turns if turns is None else turns
+    return unshared(State(q, v, jnp.asarray(time, dtype), status, memory, turns), system)
 
 
 def check_dtype(system: Any, dtype: Any) -> None:

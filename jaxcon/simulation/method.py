@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.bounds import count_bounds
-from jaxcon.core.pytree import pytree
+from jaxcon.core.pytree import exportable, pytree
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
 from jaxcon.simulation.choice import choose
@@ -30,6 +30,7 @@ PARTS = (
 """What a method consists of: the field, what its value can do, and an example."""
 
 
+@exportable
 class Memory(NamedTuple):
     """What a state remembers for its method, by part; each () where there is nothing."""
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
@@ -26,6 +26,7 @@ UNWANTED = Status.NOT_CONVERGED
 """Of a projection that nobody asked for."""
 
 
+@exportable
 class Repairs(NamedTuple):
     """What a world remembers of its repairs.
 

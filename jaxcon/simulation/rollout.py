@@ -13,6 +13,7 @@ from jax.errors import TracerIntegerConversionError
 
 from jaxcon.core import checks, native, numerics
 from jaxcon.core.closures import opened
+from jaxcon.core.meshes import together
 from jaxcon.core.operations import primitives
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import PyTree
@@ -91,6 +92,8 @@ def rollout(
         checks.takes("rollout", "controls", policy, ("state",))
     wanted = not hasattr(system, "layout") or system.layout.n_u
     inputs = jnp.arange(steps), None if policy else _rows(controls, steps, state.q.dtype)
+    # once, not in every step: in reverse mode devices then add what they share once
+    system, method, state, inputs, dt = together((system, method, state, inputs, dt))
 
     def one(state: State, given: Any) -> tuple[State, StepInfo]:
         control = contained_policy(policy, state) if policy else given[1]

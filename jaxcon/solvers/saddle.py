@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
 from jaxcon.solvers.jacobian import Jacobian
@@ -126,6 +126,7 @@ class Saddle:
     layout: Any = static(default=None)
 
 
+@exportable
 class Solution(NamedTuple):
     """What a solver returns; unpacks as `a, λ, status`.
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, layout_of
 from jaxcon.core import checks, numerics
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.stabilization.baumgarte import Baumgarte, Unstabilized
 from jaxcon.stabilization.gains import by_row, check_between, check_gains, column, squares
@@ -68,6 +68,7 @@ LEAST_RATIO = 0.5
 """The least damping ratio of a sliding window."""
 
 
+@exportable
 class History(NamedTuple):
     """What a sliding window remembers.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
@@ -19,6 +19,7 @@ from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_s
 from jaxcon.stabilization.gains import check_gains, column, squares
 
 
+@exportable
 class Parts(NamedTuple):
     """One thing for each range of violations; memories of nothing are ()."""
 

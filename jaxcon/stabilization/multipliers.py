@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, layout_of
 from jaxcon.core import checks
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.status import first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
@@ -32,6 +32,7 @@ OPEN = 0.5
 """The part of b that rows may leave open before it is a conflict; rounds that begin leave some."""
 
 
+@exportable
 class Held(NamedTuple):
     """What the method of multipliers remembers: λ of the last step (n_c,), and the feedback's."""
 

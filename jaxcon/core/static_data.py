@@ -1,0 +1,113 @@
+"""Static data of pytrees as JSON: what `jax.export` writes of them into a file.
+
+Only names and numbers are written. Reading makes instances of dataclasses by their fields and looks
+classes and functions up by their names; it runs no code from the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import sys
+from enum import Enum
+from typing import Any
+
+
+def encoded(data: Any) -> bytes:
+    """Static data as JSON.
+
+    Raises:
+        TypeError: it has what cannot be found again by a name, such as a lambda.
+    """
+    return json.dumps(_written(data)).encode()
+
+
+def decoded(text: bytes) -> Any:
+    """The static data that `encoded` wrote.
+
+    Raises:
+        ValueError: it names a class or function that is not there.
+    """
+    return _read(json.loads(text.decode()))
+
+
+def _written(x: Any) -> Any:
+    """In terms of JSON: a number or text as it is, all else as {kind: …}."""
+    if x is None or type(x) in (bool, int, float, str):
+        return x
+    if isinstance(x, Enum):
+        return {"enum": _name(type(x)), "member": x.name}
+    if isinstance(x, tuple | list):
+        items = [_written(y) for y in x]
+        kind = type(x).__name__ if type(x) in (tuple, list) else _name(type(x))
+        return {"sequence": kind, "items": items}
+    if isinstance(x, dict):
+        return {"dict": [[_written(key), _written(value)] for key, value in x.items()]}
+    if dataclasses.is_dataclass(x) and not isinstance(x, type):
+        fields = {f.name: _written(getattr(x, f.name)) for f in dataclasses.fields(x)}
+        return {"dataclass": _name(type(x)), "fields": fields}
+    return {"name": _name(x)}
+
+
+def _read(x: Any) -> Any:
+    if not isinstance(x, dict):
+        return x
+    if "enum" in x:
+        return _found(x["enum"])[x["member"]]
+    if "sequence" in x:
+        items = [_read(y) for y in x["items"]]
+        if x["sequence"] in ("tuple", "list"):
+            return tuple(items) if x["sequence"] == "tuple" else items
+        return _found(x["sequence"])._make(items)
+    if "dict" in x:
+        return {_read(key): _read(value) for key, value in x["dict"]}
+    if "dataclass" in x:
+        cls = _found(x["dataclass"])
+        if not (isinstance(cls, type) and dataclasses.is_dataclass(cls)):
+            raise ValueError(f"{x['dataclass']} is no dataclass, but the file has fields of one.")
+        return cls(**{name: _read(value) for name, value in x["fields"].items()})
+    return _found(x["name"])
+
+
+def _name(x: Any) -> str:
+    """module:name of a class or function.
+
+    Raises:
+        TypeError: it is none, or has no name under which it can be found again.
+    """
+    name = f"{getattr(x, '__module__', None)}:{getattr(x, '__qualname__', None)}"
+    try:
+        found = _found(name)
+    except ValueError:
+        found = None
+    if found is not x:
+        raise TypeError(
+            f"{x!r} is part of the structure of a system or method and cannot be written to a file:"
+            " it must be a class or function at the top of a module. Define it there, or export a"
+            " function of the state alone that closes over the system."
+        )
+    return name
+
+
+def _found(name: str) -> Any:
+    """The class or function of this name.
+
+    Modules of the library are imported; others must be there, since importing one runs its code.
+
+    Raises:
+        ValueError: there is none.
+    """
+    module, _, path = name.partition(":")
+    try:
+        if module.partition(".")[0] == "jaxcon":
+            importlib.import_module(module)
+        found = sys.modules[module]
+        for part in path.split("."):
+            found = getattr(found, part)
+    except (ImportError, KeyError, AttributeError) as error:
+        raise ValueError(
+            f"there is no {name}, which the file needs; import its module {module!r} first, in the"
+            " version with which it was written."
+        ) from error
+    return found
