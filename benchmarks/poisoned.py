@@ -39,8 +39,8 @@ BATCH = 256
 """Worlds of a batch; what is left over is healthy, too."""
 STEPS, DT = 3, 0.01
 
-NO_LIMIT = {("lower", -np.inf), ("upper", np.inf)}
-"""Fields that may be infinite, and on which side: a joint without a stop there."""
+NO_LIMIT = {("lower", -np.inf), ("upper", np.inf), ("dt", 0.0)}
+"""Infinite fields that are none: a joint without a stop on that side. A step of 0 may stand still."""
 
 
 def stage(dim: int, tables: dict[str, Any]) -> Any:
@@ -106,7 +106,7 @@ class Counts:
 
     Attributes:
         tried: cases.
-        told: worlds that failed in the first step.
+        told: worlds that failed in the first step, or after the retries of a `Recovery`.
         free: worlds that went on, where infinity means "no limit".
         idle: worlds that went on as without the poison, whose number takes no part in the motion,
             as the time where nothing depends on it. Numbers of inequalities are never idle.
@@ -162,6 +162,7 @@ class Study:
 
     def __init__(self, system: Any, state: Any, method: Any, thorough: bool = False) -> None:
         self.system, self.state, self.thorough = system, state, thorough
+        self.patience = 0 if method.recovery is None else method.recovery.retries
         leaves, self.structure = jax.tree.flatten(method)
         self.gains = [isinstance(x, float) for x in leaves]
         self.others = leaves
@@ -184,7 +185,7 @@ class Study:
         for leaf, (path, x) in enumerate(zip(self.paths, self.numbers, strict=True)):
             indices = list(itertools.product(*map(range, x.shape)))
             for index in indices if self.thorough else indices[:1]:
-                for poison in POISONS:
+                for poison in (*POISONS, 0.0) if path == "dt" else POISONS:
                     yield Case(path, leaf, index, poison)
 
     def batch(self, cases: list[Case | None]) -> list[np.ndarray]:
@@ -265,7 +266,7 @@ class Study:
         codes = np.asarray(codes)[HEALTHY : HEALTHY + len(cases)]
         failed = (codes > 0) & (codes < int(jc.Status.CONFLICT))
         if failures_count:  # their losses must not add to the gradient
-            counts[HEALTHY : HEALTHY + len(cases)] = failed[:, 0]
+            counts[HEALTHY : HEALTHY + len(cases)] = failed[:, self.patience]
             gradient = self.compiled(numbers, counts)[2]
         worlds = tuple(np.asarray(x) for x in worlds)
         return Seen(
@@ -286,7 +287,7 @@ class Study:
     def _lot(self, cases: list[Case]) -> Counts:
         good, seen = self.seen([]), self.seen(cases, failures_count=True)
         unpoisoned = self.seen([None] * len(cases)).cases
-        told = seen.failed[:, 0]
+        told = seen.failed[:, self.patience]
 
         def noticed(some: list[Case]) -> bool:
             return not _same(self.seen(some).healthy, good.healthy)
@@ -294,7 +295,8 @@ class Study:
         def changed(some: list[Case]) -> bool:
             return not _near(self.seen(some, failures_count=True).gradient, good.gradient)
 
-        moving = [c for c, t, x in zip(cases, told, seen.cases[-1], strict=True) if t and x != 0]
+        ends = zip(cases, told, seen.cases[-1], strict=True)
+        moving = [c for c, t, x in ends if (x != 0 if t else not np.isfinite(x))]
         free, idle, accepted = [], [], []
         for i, case in enumerate(cases):
             if not told[i]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -97,7 +98,8 @@ class SlidingWindowBaumgarte(Unstabilized):
     any other β goes back to the rate. τ and o are smooth for δ > 0, and 0 where φ is far below δ.
     ζ ≤ α/β ≤ 1 always, β stays within `reach` of the rate, and below `margin` times the largest β
     at which the integrator is stable at h for every such ratio. Nothing is adapted until the window
-    is full; rows of velocities, without φ, keep their gains.
+    is full; rows of velocities, without φ, keep their gains. A step of h = 0 has no limit: with
+    limit=None such a world ends in NON_FINITE.
 
     Attributes:
         rate: β to start with [1/s], as gains of `Baumgarte` are given; if None, that of the
@@ -166,6 +168,7 @@ class SlidingWindowBaumgarte(Unstabilized):
         """α and β by row, (n_c,) [1/s]."""
         rate, bound = self._bounds(rows)
         beta = jnp.minimum(rate * jnp.exp(memory.raised), bound)
+        beta = jnp.where(self._finite(rows), beta, jnp.nan)
         ratio = by_row(self.damping_ratio, SlidingWindowBaumgarte.damping_ratio, rows, "ratio")
         ratio = jnp.clip(ratio, LEAST_RATIO, 1)
         return (ratio + (1 - ratio) * memory.damping) * beta, beta
@@ -176,6 +179,18 @@ class SlidingWindowBaumgarte(Unstabilized):
         rate = by_row(self.rate, self.fallback[1], rows, "SlidingWindowBaumgarte")
         limit = jnp.asarray(self.margin, dtype) * jnp.asarray(self.limit, dtype)
         return rate, limit[None]
+
+    def _finite(self, rows: Rows) -> Array:
+        """Whether all numbers are, by row; where one is not there is no gain, from the first step.
+
+        Otherwise the clips of `advance` would hide it, and keep its derivative, NaN.
+        """
+        numbers = (self.damping_ratio, self.speed, self.recovery, self.noise)
+        others = (by_row(x, 0.0, rows, "SlidingWindowBaumgarte") for x in numbers)
+        finite = functools.reduce(
+            jnp.logical_and, map(jnp.isfinite, (*self._bounds(rows), *others))
+        )
+        return finite & (jnp.asarray(self.reach, rows.bias.dtype) >= 1)[None]
 
     def advance(self, rows: Rows, memory: History, dt: Any) -> History:
         """The memory with the φ of this step."""

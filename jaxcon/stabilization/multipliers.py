@@ -26,7 +26,7 @@ from jaxcon.solvers.proximal import (
 )
 from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
-from jaxcon.stabilization.gains import check_gains, column
+from jaxcon.stabilization.gains import check_gains, column, finite
 
 OPEN = 0.5
 """The part of b that rows may leave open before it is a conflict; rounds that begin leave some."""
@@ -109,7 +109,8 @@ class AugmentedLagrangian(Unstabilized):
         solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
         holding = rows.layout.holds
         # few rounds leave a trace of W in the solution, and so in its derivative
-        weight = row_weights(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
+        stiffness = finite(jnp.asarray(self.stiffness, start.dtype))[None]
+        weight = row_weights(system, 1e-6) / stiffness
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
         acts = _acts(system)  # of the others W alone would make λ, huge, for the next step to feel
