@@ -1,16 +1,18 @@
-"""Batches in which one number of one world is NaN or infinite: who is told, and who else notices.
+"""Batches in which a number of one world is NaN or infinite: who is told, and who else notices.
 
-    python -m benchmarks.poisoned [--quick] [--names TEXT] [--list]
+    python -m benchmarks.poisoned [NAMES …] [--quick] [--list]
 
 Each element of `gradient_elements` joins a scene of its dimension on two bodies of its own. Every
 number is poisoned in turn: those of `system.params`, control, start, step size and the method. All
-cases run as worlds of one batch beside healthy worlds, so that a scene is compiled once. Checked:
+cases run as worlds of a batch beside healthy worlds, so that a scene is compiled once. Checked:
 
     status     the poisoned world fails after the first step, unless infinity means "no limit"
     neighbors  healthy worlds are those of a healthy batch, bit for bit
     gradient   the gradient by shared numbers is that of the healthy worlds alone, in both modes
 
-Prints counts by scene and method, and the cases that go wrong.
+Prints counts by scene and method, and the cases that go wrong; ends with 1 where there are any.
+`--quick` takes the small scenes of the tests, and the first entry of each array. The long version
+takes every element in the plane and in space under several methods, some hours on one core.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import argparse
 import dataclasses
 import itertools
 import sys
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -33,14 +36,16 @@ from benchmarks.gradient_elements import ENDS, FORCES, JOINTS, PAIR
 from benchmarks.gradient_scenes import add, along
 
 POISONS = (np.nan, np.inf, -np.inf)
+LIMITS = (0.0, -1.0)
+"""Numbers by which a world may fail or go on; others must not notice either."""
 HEALTHY = 2
 """Healthy worlds at the front of each batch."""
 BATCH = 256
 """Worlds of a batch; what is left over is healthy, too."""
 STEPS, DT = 3, 0.01
 
-NO_LIMIT = {("lower", -np.inf), ("upper", np.inf), ("dt", 0.0)}
-"""Infinite fields that are none: a joint without a stop on that side. A step of 0 may stand still."""
+NO_LIMIT = {("lower", -np.inf), ("upper", np.inf)}
+"""Fields that may be infinite, and on which side: a joint without a stop there."""
 
 
 def stage(dim: int, tables: dict[str, Any]) -> Any:
@@ -93,8 +98,9 @@ class Case:
 
     @property
     def allowed(self) -> bool:
-        """Whether infinity there is documented to mean "no limit"."""
-        return (self.path.rsplit("/", 1)[-1], self.poison) in NO_LIMIT
+        """Whether the world may go on: infinity means "no limit", or it is none of the poisons."""
+        finite = bool(np.isfinite(self.poison))
+        return finite or (self.path.rsplit("/", 1)[-1], self.poison) in NO_LIMIT
 
     def __str__(self) -> str:
         return f"{self.path}{list(self.index) or ''} = {self.poison}"
@@ -107,7 +113,7 @@ class Counts:
     Attributes:
         tried: cases.
         told: worlds that failed in the first step, or after the retries of a `Recovery`.
-        free: worlds that went on, where infinity means "no limit".
+        free: worlds that went on and may, see `Case.allowed`.
         idle: worlds that went on as without the poison, whose number takes no part in the motion,
             as the time where nothing depends on it. Numbers of inequalities are never idle.
         accepted: cases in which the world went on otherwise.
@@ -185,7 +191,7 @@ class Study:
         for leaf, (path, x) in enumerate(zip(self.paths, self.numbers, strict=True)):
             indices = list(itertools.product(*map(range, x.shape)))
             for index in indices if self.thorough else indices[:1]:
-                for poison in (*POISONS, 0.0) if path == "dt" else POISONS:
+                for poison in (*POISONS, *LIMITS):
                     yield Case(path, leaf, index, poison)
 
     def batch(self, cases: list[Case | None]) -> list[np.ndarray]:
@@ -334,3 +340,101 @@ def _near(a: Any, b: Any) -> bool:
     """Whether gradients agree to rounding, relative to the largest."""
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.allclose(x, y, rtol=1e-9, atol=1e-9 * np.max(np.abs(y))) for x, y in pairs)
+
+
+QUICK: dict[str, tuple[tuple[str, ...], int, Any]] = {
+    "contact": (("soft stops", "ball that rolls with resistance"), 2, jc.Method()),
+    "sweeps": (("stops", "dry friction"), 2, jc.Method(bounded=jc.GaussSeidel(sweeps=4))),
+    "generalized-α": (("distance",), 2, jc.Method(jc.GeneralizedAlpha())),
+    "RATTLE": (("distance",), 2, jc.Method(jc.RATTLE())),
+    "PID": (("distance",), 2, jc.Method(stabilizer=jc.PID(100.0, 20.0, 10.0, limit=5.0))),
+    "adaptive": (("distance",), 2, jc.Method(stabilizer=jc.AdaptiveBaumgarte(10.0, 10.0))),
+    "window": (("distance",), 2, jc.Method(stabilizer=jc.SlidingWindowBaumgarte())),
+    "springs": (("distance",), 2, jc.Method(stabilizer=jc.Penalty(100.0, 1.0))),
+    "rounds": (("distance",), 2, jc.Method(stabilizer=jc.AugmentedLagrangian())),
+    "recovery": (("distance",), 2, jc.Method(recovery=jc.Recovery(limit=0.5, retries=1))),
+}
+"""Elements, dimension and method of the small studies, by name."""
+
+SETS = {
+    "plain": ({**JOINTS, **FORCES, **ENDS}, jc.Method()),
+    "RK4": ({**JOINTS, **FORCES, **ENDS}, jc.Method(jc.RK4())),
+    "RATTLE": ({**JOINTS, **FORCES}, jc.Method(jc.RATTLE())),
+    "generalized-α": ({**JOINTS, **FORCES}, jc.Method(jc.GeneralizedAlpha())),
+    "sweeps": (ENDS, jc.Method(bounded=jc.GaussSeidel(sweeps=8))),
+    "nearest": (ENDS, jc.Method(bounded=jc.Nearest(stops=1))),
+    "events": (ENDS, jc.Method(events=jc.Events())),
+    "recovery": (ENDS, jc.Method(recovery=jc.Recovery(retries=1))),
+}
+"""Elements and methods of the long studies."""
+
+TOGETHER = 3
+"""Elements of a scene of the long studies: compiling takes ten seconds each."""
+
+
+def studies(quick: bool) -> dict[str, tuple[tuple[str, ...], int, Any]]:
+    """Elements, dimension and method of every study, by name."""
+    if quick:
+        return QUICK
+    found = dict(QUICK)
+    for name, (tables, method) in SETS.items():
+        for dim in (2, 3):
+            fits = [element for element, (dims, _) in tables.items() if dim in dims]
+            for start in range(0, len(fits), TOGETHER):
+                lot = tuple(fits[start : start + TOGETHER])
+                found[f"{name}, {dim}D, {', '.join(lot)}"] = lot, dim, method
+    return found
+
+
+def measure(name: str, quick: bool) -> Counts:
+    """The counts of one study."""
+    elements, dim, method = studies(quick)[name]
+    every = {**JOINTS, **FORCES, **ENDS}
+    system, state = stage(dim, {element: every[element] for element in elements})
+    return Study(system, state, method, thorough=not quick).run()
+
+
+def words(name: str, counts: Counts) -> str:
+    """A line of the table, and what went wrong below it."""
+    wrong = {
+        "accepted wrongly": counts.accepted,
+        "neighbors changed": counts.neighbors,
+        "gradients of others changed": counts.gradients,
+    }
+    line = f"{name}: tried {counts.tried}, told by status {counts.told}, may go on {counts.free},"
+    line += f" take no part {counts.idle}, "
+    line += ", ".join(f"{what} {len(cases)}" for what, cases in wrong.items())
+    below = [f"    {what}: {case}" for what, cases in wrong.items() for case in cases]
+    return "\n".join([line, *below])
+
+
+def main(given: list[str] | None = None) -> int:
+    """Prints the table."""
+    text = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("benchmarks.poisoned", None, __doc__, formatter_class=text)
+    parser.add_argument("names", nargs="*", help="parts of the names of studies")
+    parser.add_argument("--quick", action="store_true", help="the small studies of the tests")
+    parser.add_argument("--list", action="store_true", help="the names alone")
+    options = parser.parse_args(given)
+    jax.config.update("jax_enable_x64", True)
+    names = [
+        name
+        for name in studies(options.quick)
+        if not options.names or any(part in name for part in options.names)
+    ]
+    total = Counts()
+    for name in names:
+        if options.list:
+            print(name)
+            continue
+        counts = measure(name, options.quick)
+        print(words(name, counts), flush=True)
+        total += counts
+    if not options.list:
+        print(words("all", dataclasses.replace(total)).splitlines()[0])
+    return 0 if total.clean else 1
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")  # gains are poisoned, and some steps have none
+    sys.exit(main())

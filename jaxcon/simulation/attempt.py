@@ -42,6 +42,12 @@ class StepInfo:
     impacts: Any = None
 
 
+def nothing_seen(info: StepInfo) -> StepInfo:
+    """What a failed world has seen: zeros, and no impacts."""
+    none = jax.tree.map(jnp.zeros_like, info)
+    return none if info.impacts is None else dataclasses.replace(none, impacts=info.impacts.none())
+
+
 def attempt(
     system: Any, method: Method, state: State, control: PyTree, dt: Array, part: Part | None = None
 ) -> Any:

@@ -17,6 +17,7 @@ from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.model.state import State, is_finite
+from jaxcon.simulation.attempt import nothing_seen
 from jaxcon.simulation.recovery import contain
 from jaxcon.stabilization.baumgarte import Law, check_stabilizer
 from jaxcon.stabilization.hybrid import Hybrid
@@ -148,7 +149,7 @@ class Recovery:
         code = first(code, jnp.where(sound, Status.OK, Status.NON_FINITE).astype(jnp.int32))
         new = keep(~again, new, back)
         memory = new.memory._replace(recovery=self._remember(known, bad))
-        info = keep(~again, info, jax.tree.map(jnp.zeros_like, info))
+        info = keep(~again, info, nothing_seen(info))
         return (dataclasses.replace(new, memory=memory), info), code
 
     def _finite(self, state: State) -> Array:

@@ -181,7 +181,7 @@ class SlidingWindowBaumgarte(Unstabilized):
         return rate, limit[None]
 
     def _finite(self, rows: Rows) -> Array:
-        """Whether all numbers are, by row; where one is not there is no gain, from the first step.
+        """Whether all numbers are, and δ positive, by row; where not, there is no gain.
 
         Otherwise the clips of `advance` would hide it, and keep its derivative, NaN.
         """
@@ -190,7 +190,8 @@ class SlidingWindowBaumgarte(Unstabilized):
         finite = functools.reduce(
             jnp.logical_and, map(jnp.isfinite, (*self._bounds(rows), *others))
         )
-        return finite & (jnp.asarray(self.reach, rows.bias.dtype) >= 1)[None]
+        reach, noise = (jnp.asarray(x, rows.bias.dtype)[None] for x in (self.reach, self.noise))
+        return finite & (reach >= 1) & (noise > 0)
 
     def advance(self, rows: Rows, memory: History, dt: Any) -> History:
         """The memory with the φ of this step."""
