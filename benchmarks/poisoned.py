@@ -22,7 +22,7 @@ import dataclasses
 import itertools
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -76,8 +76,8 @@ def _renamed(element: Any, known: set[str], suffix: str) -> Any:
             return tuple(renamed(y) for y in x)
         return x + suffix if isinstance(x, str) and x in known else x
 
-    fields = (f.name for f in dataclasses.fields(element))
-    return dataclasses.replace(element, **{name: renamed(getattr(element, name)) for name in fields})
+    names = [field.name for field in dataclasses.fields(element)]
+    return dataclasses.replace(element, **{x: renamed(getattr(element, x)) for x in names})
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class Study:
                 for poison in (*POISONS, *LIMITS):
                     yield Case(path, leaf, index, poison)
 
-    def batch(self, cases: list[Case | None]) -> list[np.ndarray]:
+    def batch(self, cases: Sequence[Case | None]) -> list[np.ndarray]:
         """The numbers of all worlds: healthy ones, and one for each case."""
         numbers = [np.repeat(x[None], BATCH, axis=0) for x in self.numbers]
         velocity = numbers[self.paths.index("v")]
@@ -264,7 +264,7 @@ class Study:
         names = {name for group in self.system.bounds for name in group.names}
         return case.path.split("/")[1:2] != [] and case.path.split("/")[1] in names
 
-    def seen(self, cases: list[Case | None], failures_count: bool = False) -> Seen:
+    def seen(self, cases: Sequence[Case | None], failures_count: bool = False) -> Seen:
         """What a batch of these cases does."""
         numbers = self.batch(cases)
         counts = np.arange(BATCH) < HEALTHY

@@ -54,8 +54,8 @@ class Recovery:
     a `Penalty` stay as they are. An integrator that keeps constraints by itself has no feedback to
     relax: there projection and damping are what can help. Where the step fails again, or the state
     itself is beyond the limit, the state is also projected to the nearest valid configuration.
-    After `retries` failures in a row the failure sticks, and at once where the state before the step
-    is not finite itself.
+    After `retries` failures in a row the failure sticks; at once where the state before the step is
+    not finite itself.
 
     What acted is in `info.status` of each step, as a note: ROLLED_BACK, PROJECTED, or RELAXED where
     the step was taken with r < 1; the state remembers the first note. A world decides by itself and

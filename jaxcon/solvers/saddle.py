@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
@@ -34,7 +35,7 @@ class Diagonal:
 
     def _inverse(self) -> Array:
         """1/m; not 0 of an infinite m, which would hold still what nobody fixed."""
-        return jnp.where(jnp.isinf(self.values), jnp.nan, 1 / self.values)
+        return 1 / finite_or_nan(self.values)
 
     def apply(self, x: Array) -> Array:
         """M x, (n_v,)."""

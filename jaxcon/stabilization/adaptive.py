@@ -200,10 +200,12 @@ class SlidingWindowBaumgarte(Unstabilized):
         seen = memory.seen + 1
         trend, oscillation = judge(residuals, jnp.asarray(self.noise, dtype)[None])
         rate, bound = self._bounds(rows)
-        reach = jnp.log(jnp.asarray(self.reach, dtype))[None]
+        most = jnp.asarray(self.reach, dtype)[None]
+        reach = jnp.log(most)
         back = jnp.asarray(self.recovery, dtype)[None] * memory.raised
         pull = jnp.maximum(trend, 0) * (1 - oscillation) - oscillation - back
-        top = jnp.maximum(jnp.minimum(reach, jnp.log(bound / rate)), -reach)
+        # clipped first: the logarithm of 0 has no derivative
+        top = jnp.log(jnp.clip(numerics.safe_divide(bound, rate), 1 / most, most))
         raised = jnp.clip(memory.raised + jnp.asarray(self.speed, dtype)[None] * pull, -reach, top)
         full = (seen >= self.window)[None] & column(rows.layout.holonomic, rows)
         return History(

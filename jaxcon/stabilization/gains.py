@@ -12,6 +12,7 @@ import numpy as np
 from jaxcon.constraints.rows import RowLayout, Rows
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.typing import Array
 
 
@@ -31,22 +32,17 @@ def by_row(gain: Any, fallback: Any, rows: Rows, owner: str = "Baumgarte") -> Ar
     """
     dtype = rows.bias.dtype
     if isinstance(gain, Mapping):
-        return finite(_from_names(gain, jnp.asarray(fallback, dtype), rows, owner))
+        return finite_or_nan(_from_names(gain, jnp.asarray(fallback, dtype), rows, owner))
     gain = jnp.asarray(gain, dtype)
     worlds = rows.bias.ndim - 1
     if gain.ndim == worlds:
-        return finite(gain[None])
+        return finite_or_nan(gain[None])
     if gain.ndim != worlds + 1 or gain.shape[0] != rows.bias.shape[0]:
         raise ValueError(
             f"{owner}: a gain must be a number, an array {rows.bias.shape[:1]} by row, or a"
             f" mapping by constraint name; got shape {gain.shape[: gain.ndim - worlds]}."
         )
-    return finite(gain)
-
-
-def finite(x: Array) -> Array:
-    """A number, and NaN for an infinite one, which a quotient or a comparison would hide."""
-    return jnp.where(jnp.isfinite(x), x, jnp.nan)
+    return finite_or_nan(gain)
 
 
 def _from_names(gain: Mapping[str, Any], fallback: Array, rows: Rows, owner: str) -> Array:

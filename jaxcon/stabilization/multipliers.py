@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, layout_of
 from jaxcon.core import checks
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import first
 from jaxcon.core.typing import Array, PyTree
@@ -26,7 +27,7 @@ from jaxcon.solvers.proximal import (
 )
 from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
-from jaxcon.stabilization.gains import check_gains, column, finite
+from jaxcon.stabilization.gains import check_gains, column
 
 OPEN = 0.5
 """The part of b that rows may leave open before it is a conflict; rounds that begin leave some."""
@@ -109,7 +110,7 @@ class AugmentedLagrangian(Unstabilized):
         solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
         holding = rows.layout.holds
         # few rounds leave a trace of W in the solution, and so in its derivative
-        stiffness = finite(jnp.asarray(self.stiffness, start.dtype))[None]
+        stiffness = finite_or_nan(jnp.asarray(self.stiffness, start.dtype))[None]
         weight = row_weights(system, 1e-6) / stiffness
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
