@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxcon.constraints.base import RowSet, gather
 from jaxcon.core import checks
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.model.coordinates import JointCoordinate
@@ -55,7 +56,8 @@ class Armatures(Elements):
     def rows(self, snapshot: Any) -> RowSet:
         """J a + λ/I = −γ; there is no φ, and no feedback."""
         row = self.along.read(snapshot)._replace(value=0.0, rate=0.0)
-        return gather(snapshot, self.places, [row], (1 / self.params["inertia"],))
+        compliance = 1 / finite_or_nan(self.params["inertia"])  # not 0, which would hold the joint
+        return gather(snapshot, self.places, [row], (compliance,))
 
     def kinetic(self, snapshot: Any) -> Lane:
         """½ I θ̇² [J]."""

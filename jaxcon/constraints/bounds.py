@@ -8,6 +8,7 @@ and its tangents to rest as far as friction suffices.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 from typing import Any, NamedTuple, Protocol
 
@@ -19,6 +20,7 @@ from jaxcon.constraints.bound_layout import BoundLayout
 from jaxcon.constraints.primitives import Row
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
+from jaxcon.model.elements import Grid
 from jaxcon.model.layout import Place
 from jaxcon.solvers.bounded import Disc, Kinds
 from jaxcon.solvers.jacobian import Block, Gathered, Jacobian
@@ -92,7 +94,7 @@ class BoundRows:
     Attributes:
         gap: φ (n,); zero where a row has none.
         rate: φ̇ (n,).
-        target: u* (n,).
+        target: u* (n,); NaN of an element of which a number is not finite.
         compliance: the diagonal of C, (n,).
         lower, upper: (boxes,).
         friction: (contacts,).
@@ -120,6 +122,15 @@ class BoundRows:
     hard: tuple[bool, ...] = static(default=())
     ends: tuple[bool, ...] = static(default=())
 
+    def finite(self, bare: Array) -> Array:
+        """Whether all numbers of the rows are, ().
+
+        Args:
+            bare: J_b M⁻¹ J_bᵀ on the diagonal, (n,), which says so of J.
+        """
+        numbers = (self.gap, self.rate, self.target, self.compliance, bare)
+        return jnp.all(functools.reduce(jnp.logical_and, map(jnp.isfinite, numbers)), axis=0)
+
     def chosen(self, choice: Choice) -> BoundRows:
         """Some of the rows."""
         e = self.restitution
@@ -139,7 +150,9 @@ class BoundRows:
 def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: Any) -> BoundRows:
     """Every bounded row at one instant."""
     snapshot = system.snapshot(q, v, t)
-    pairs = [(group.names, group.bounds(snapshot, control, dt)) for group in system.bounds]
+    pairs = [
+        (group.names, _told(group, group.bounds(snapshot, control, dt))) for group in system.bounds
+    ]
     pairs.sort(key=lambda pair: pair[1].order)
     sets = [own for _, own in pairs]
     sizes = [len(names) * (own.points or 1) for names, own in pairs]
@@ -180,6 +193,26 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
         _by_row([s.hard for s in sets], sizes, kinds),
         _by_row([s.hard and s.rows[0].holonomic for s in sets], sizes, kinds),
     )
+
+
+def _told(group: Any, own: BoundSet) -> BoundSet:
+    """The rows with u* = NaN of elements of which a number is not finite.
+
+    Laws compare such numbers, and a comparison with NaN is false: the element would vanish.
+    """
+    numbers = getattr(group, "numbers", group.params)
+    finite = jnp.ones((), bool)
+    for field, x in numbers.items():
+        good = _not_nan if field in getattr(group, "endless", ()) else jnp.isfinite
+        for lane in () if isinstance(x, Grid) else jax.tree.leaves(x):
+            finite &= good(lane)
+    if own.points is not None and finite.ndim:
+        finite = jnp.repeat(finite, own.points, axis=0)
+    return own._replace(target=jnp.where(finite, own.target, jnp.nan))
+
+
+def _not_nan(x: Lane) -> Array:
+    return ~jnp.isnan(x)
 
 
 class _Column:

@@ -85,7 +85,7 @@ class Limit:
         side = jnp.where(near, 1.0, -1.0).astype(row.value.dtype)
         gap = jnp.where(near, row.value - p["lower"], p["upper"] - row.value)
         # a stop that is nowhere has a row of zeros, which solvers leave out
-        nowhere = jnp.isinf(gap)
+        nowhere = gap == jnp.inf
         side, gap = jnp.where(nowhere, 0, side), jnp.where(nowhere, 0, gap)
         pulls = tuple(pull * side for pull in row.pulls)
         own = row._replace(value=gap, rate=side * row.rate, pulls=pulls)

@@ -26,6 +26,11 @@ def safe_divide(numerator: Lane, denominator: Lane) -> Array:
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1), 0)
 
 
+def finite_or_nan(x: Lane) -> Array:
+    """A number, and NaN for an infinite one, which a quotient or a comparison would hide."""
+    return jnp.where(jnp.isfinite(x), x, jnp.nan)
+
+
 def norm(x: Any) -> Array:
     """‖x‖ over the first axis (or a Vector's components), with zero gradient at x = 0."""
     x = Vector.of(x)

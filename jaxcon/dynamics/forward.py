@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows, linearize_bounds
 from jaxcon.constraints.rows import Rows, linearize
+from jaxcon.core import status
 from jaxcon.core.lanes import widened
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.parts import Part, Struck
@@ -110,6 +111,7 @@ class Dynamics:
         impulse = self._impulse(bounds, law, problem, length, acts, weight)
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
+        solution = solution._replace(status=status.first(solution.status, impulse.judge()))
         known = self._judged(impulse, known, solution.acceleration)
         own = bounds.jacobian.transpose(known.multipliers)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone

@@ -16,6 +16,7 @@ from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
 from jaxcon.core.lanes import widened
+from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.bounces import Bounce, bounces, freely
 from jaxcon.solvers import gauss_jordan
@@ -134,6 +135,14 @@ class Impulse:
         moves = largest > rounding * length
         acts = moves if self.acts is None else moves & self.acts
         return dataclasses.replace(self, start=start, acts=acts)
+
+    def judge(self) -> Array:
+        """NON_FINITE where a number of the rows is not finite, ().
+
+        Laws and solvers compare numbers, and from what compares false they leave the row out.
+        """
+        finite = self.rows.finite(self.bare)
+        return jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32)
 
     def motion(self, multipliers: Array) -> Solution:
         """a and λ_e under multipliers λ (n,)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.pytree import pytree
@@ -30,6 +31,11 @@ class State:
     status: Array
     memory: PyTree = ()
     turns: PyTree = ()
+
+
+def is_finite(state: State) -> Array:
+    """Whether all positions and velocities of a world are finite, ()."""
+    return jnp.all(jnp.isfinite(state.q), axis=0) & jnp.all(jnp.isfinite(state.v), axis=0)
 
 
 def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
@@ -14,7 +16,7 @@ from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.parts import Part
-from jaxcon.model.state import State, recall
+from jaxcon.model.state import State, is_finite, recall
 from jaxcon.simulation.method import Memory, Method
 from jaxcon.solvers.saddle import Solution
 
@@ -40,6 +42,12 @@ class StepInfo:
     impacts: Any = None
 
 
+def nothing_seen(info: StepInfo) -> StepInfo:
+    """What a failed world has seen: zeros, and no impacts."""
+    none = jax.tree.map(jnp.zeros_like, info)
+    return none if info.impacts is None else dataclasses.replace(none, impacts=info.impacts.none())
+
+
 def attempt(
     system: Any, method: Method, state: State, control: PyTree, dt: Array, part: Part | None = None
 ) -> Any:
@@ -57,7 +65,7 @@ def attempt(
     react = rows.reactions.multipliers if _keeps_reactions(system, method) else ()
     kept = Memory(advanced.memory, own, memory.recovery, react) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
-    code = status.first(judge(new, solution), corrected)
+    code = functools.reduce(status.first, (judge(new, solution), corrected, remembered(own, new)))
     if method.recovery is not None:
         code = status.first(code, method.recovery.judge(system, new))
     seen = (solution.acceleration, solution.multipliers, rows.violation)
@@ -89,8 +97,18 @@ def dynamics_at(
     return Dynamics(*own, method.bounded, guess, part=part)
 
 
+def remembered(memory: PyTree, state: State) -> Array:
+    """NON_FINITE where a number is not finite that the stabiliser is to remember, ().
+
+    The next step would fail by it, when the derivative of this one is NaN already.
+    """
+    good, worlds = jnp.ones_like(state.status, bool), state.status.ndim
+    for x in jax.tree.leaves(memory):
+        good &= jnp.all(jnp.isfinite(x), axis=tuple(range(x.ndim - worlds)))
+    return jnp.where(good, Status.OK, Status.NON_FINITE).astype(jnp.int32)
+
+
 def judge(state: State, solution: Solution) -> Array:
     """What the solver said, or NON_FINITE where the new state is."""
-    finite = jnp.all(jnp.isfinite(state.q), axis=0) & jnp.all(jnp.isfinite(state.v), axis=0)
-    code = jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32)
+    code = jnp.where(is_finite(state), Status.OK, Status.NON_FINITE).astype(jnp.int32)
     return status.first(solution.status, code)

@@ -37,6 +37,11 @@ class Impacts:
     elements: Array
     names: tuple[str, ...] = static()
 
+    def none(self) -> Impacts:
+        """No impacts, of as many."""
+        times, elements = jnp.full_like(self.times, jnp.inf), jnp.full_like(self.elements, -1)
+        return Impacts(jnp.zeros_like(self.count), times, elements, self.names)
+
 
 @pytree
 class Events:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +16,8 @@ from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
-from jaxcon.model.state import State
+from jaxcon.model.state import State, is_finite
+from jaxcon.simulation.attempt import nothing_seen
 from jaxcon.simulation.recovery import contain
 from jaxcon.stabilization.baumgarte import Law, check_stabilizer
 from jaxcon.stabilization.hybrid import Hybrid
@@ -53,7 +55,8 @@ class Recovery:
     a `Penalty` stay as they are. An integrator that keeps constraints by itself has no feedback to
     relax: there projection and damping are what can help. Where the step fails again, or the state
     itself is beyond the limit, the state is also projected to the nearest valid configuration.
-    After `retries` failures in a row the failure sticks.
+    After `retries` failures in a row the failure sticks; at once where the state before the step is
+    not finite itself.
 
     What acted is in `info.status` of each step, as a note: ROLLED_BACK, PROJECTED, or RELAXED where
     the step was taken with r < 1; the state remembers the first note. A world decides by itself and
@@ -139,14 +142,22 @@ class Recovery:
         (new, info), code = attempt
         known = state.memory.recovery
         bad = failed(code)
-        again = bad & (known.failures < self.retries)
+        sound = self._finite(state)
+        again = bad & (known.failures < self.retries) & is_finite(state) & sound
         back, note = self._back(system, solver, state, again, dt)
         relaxed = jnp.where(known.relaxation < 1, Status.RELAXED, Status.OK).astype(jnp.int32)
         code = jnp.where(again, note, first(code, relaxed))
+        code = first(code, jnp.where(sound, Status.OK, Status.NON_FINITE).astype(jnp.int32))
         new = keep(~again, new, back)
         memory = new.memory._replace(recovery=self._remember(known, bad))
-        info = keep(~again, info, jax.tree.map(jnp.zeros_like, info))
+        info = keep(~again, info, nothing_seen(info))
         return (dataclasses.replace(new, memory=memory), info), code
+
+    def _finite(self, state: State) -> Array:
+        """Whether its numbers are, (); what they multiply is not always used, its derivative is."""
+        numbers = (self.limit, self.shrink, self.growth, self.damping)
+        known = [jnp.asarray(x, state.q.dtype) for x in numbers if x is not None]
+        return functools.reduce(jnp.logical_and, map(jnp.isfinite, known))
 
     def _remember(self, known: Repairs, bad: Array) -> Repairs:
         r = known.relaxation
@@ -204,8 +215,7 @@ def _correct(
 ) -> tuple[State, Array]:
     """The state corrected where that is wanted, and a failure where it is not or does not help."""
     new, code = projector.correct(system, solver, state, state, (), dt)
-    finite = jnp.all(jnp.isfinite(new.q), axis=0) & jnp.all(jnp.isfinite(new.v), axis=0)
-    code = first(code, jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32))
+    code = first(code, jnp.where(is_finite(new), Status.OK, Status.NON_FINITE).astype(jnp.int32))
     return new, jnp.where(wanted, code, UNWANTED).astype(jnp.int32)
 
 

@@ -14,7 +14,7 @@ from jaxcon.core import checks, native, status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import batch_of, keep, per_world, spread
 from jaxcon.model.state import State, at, recall
-from jaxcon.simulation.attempt import StepInfo, attempt, dynamics_at
+from jaxcon.simulation.attempt import StepInfo, attempt, dynamics_at, nothing_seen
 from jaxcon.simulation.initialize import check_dtype
 from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain
@@ -107,7 +107,7 @@ def _settle(state: State, attempt: Any) -> Any:
     (new, info), own = attempt
     code = status.first(state.status, own)
     healthy = ~status.failed(code)
-    info = keep(healthy, info, jax.tree.map(jnp.zeros_like, info))
+    info = keep(healthy, info, nothing_seen(info))
     new = dataclasses.replace(keep(healthy, new, state), status=code)
     return (new, dataclasses.replace(info, status=jnp.where(healthy, own, code))), code
 

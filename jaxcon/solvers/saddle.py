@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
@@ -25,12 +26,16 @@ class Diagonal:
     values: Array
 
     def solve(self, x: Array) -> Array:
-        """M⁻¹ x, (n_v,)."""
-        return x * (1 / self.values)
+        """M⁻¹ x, (n_v,); NaN where a mass is infinite."""
+        return x * self._inverse()
 
     def solve_columns(self, x: Array) -> Array:
-        """M⁻¹ X, (n_v, k)."""
-        return x * (1 / self.values)[:, None]
+        """M⁻¹ X, (n_v, k); NaN where a mass is infinite."""
+        return x * self._inverse()[:, None]
+
+    def _inverse(self) -> Array:
+        """1/m; not 0 of an infinite m, which would hold still what nobody fixed."""
+        return 1 / finite_or_nan(self.values)
 
     def apply(self, x: Array) -> Array:
         """M x, (n_v,)."""

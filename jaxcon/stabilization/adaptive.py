@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -98,7 +99,8 @@ class SlidingWindowBaumgarte(Unstabilized):
     any other β goes back to the rate. τ and o are smooth for δ > 0, and 0 where φ is far below δ.
     ζ ≤ α/β ≤ 1 always, β stays within `reach` of the rate, and below `margin` times the largest β
     at which the integrator is stable at h for every such ratio. Nothing is adapted until the window
-    is full; rows of velocities, without φ, keep their gains.
+    is full; rows of velocities, without φ, keep their gains. A step of h = 0 has no limit: with
+    limit=None such a world ends in NON_FINITE.
 
     Attributes:
         rate: β to start with [1/s], as gains of `Baumgarte` are given; if None, that of the
@@ -167,6 +169,7 @@ class SlidingWindowBaumgarte(Unstabilized):
         """α and β by row, (n_c,) [1/s]."""
         rate, bound = self._bounds(rows)
         beta = jnp.minimum(rate * jnp.exp(memory.raised), bound)
+        beta = jnp.where(self._finite(rows), beta, jnp.nan)
         ratio = by_row(self.damping_ratio, SlidingWindowBaumgarte.damping_ratio, rows, "ratio")
         ratio = jnp.clip(ratio, LEAST_RATIO, 1)
         return (ratio + (1 - ratio) * memory.damping) * beta, beta
@@ -178,6 +181,19 @@ class SlidingWindowBaumgarte(Unstabilized):
         limit = jnp.asarray(self.margin, dtype) * jnp.asarray(self.limit, dtype)
         return rate, limit[None]
 
+    def _finite(self, rows: Rows) -> Array:
+        """Whether all numbers are, and δ positive, by row; where not, there is no gain.
+
+        Otherwise the clips of `advance` would hide it, and keep its derivative, NaN.
+        """
+        numbers = (self.damping_ratio, self.speed, self.recovery, self.noise)
+        others = (by_row(x, 0.0, rows, "SlidingWindowBaumgarte") for x in numbers)
+        finite = functools.reduce(
+            jnp.logical_and, map(jnp.isfinite, (*self._bounds(rows), *others))
+        )
+        reach, noise = (jnp.asarray(x, rows.bias.dtype)[None] for x in (self.reach, self.noise))
+        return finite & (reach >= 1) & (noise > 0)
+
     def advance(self, rows: Rows, memory: History, dt: Any) -> History:
         """The memory with the φ of this step."""
         dtype = rows.bias.dtype
@@ -185,10 +201,12 @@ class SlidingWindowBaumgarte(Unstabilized):
         seen = memory.seen + 1
         trend, oscillation = judge(residuals, jnp.asarray(self.noise, dtype)[None])
         rate, bound = self._bounds(rows)
-        reach = jnp.log(jnp.asarray(self.reach, dtype))[None]
+        most = jnp.asarray(self.reach, dtype)[None]
+        reach = jnp.log(most)
         back = jnp.asarray(self.recovery, dtype)[None] * memory.raised
         pull = jnp.maximum(trend, 0) * (1 - oscillation) - oscillation - back
-        top = jnp.maximum(jnp.minimum(reach, jnp.log(bound / rate)), -reach)
+        # clipped first: the logarithm of 0 has no derivative
+        top = jnp.log(jnp.clip(numerics.safe_divide(bound, rate), 1 / most, most))
         raised = jnp.clip(memory.raised + jnp.asarray(self.speed, dtype)[None] * pull, -reach, top)
         full = (seen >= self.window)[None] & column(rows.layout.holonomic, rows)
         return History(

@@ -12,11 +12,12 @@ import numpy as np
 from jaxcon.constraints.rows import RowLayout, Rows
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.typing import Array
 
 
 def by_row(gain: Any, fallback: Any, rows: Rows, owner: str = "Baumgarte") -> Array:
-    """A gain as an array by row, (n_c,), or (1,) where all rows share it.
+    """A gain as an array by row, (n_c,), or (1,) where all rows share it; NaN for an infinite one.
 
     Args:
         gain: a number, an array by row, or a mapping from names of constraints, or from shell
@@ -31,17 +32,17 @@ def by_row(gain: Any, fallback: Any, rows: Rows, owner: str = "Baumgarte") -> Ar
     """
     dtype = rows.bias.dtype
     if isinstance(gain, Mapping):
-        return _from_names(gain, jnp.asarray(fallback, dtype), rows, owner)
+        return finite_or_nan(_from_names(gain, jnp.asarray(fallback, dtype), rows, owner))
     gain = jnp.asarray(gain, dtype)
     worlds = rows.bias.ndim - 1
     if gain.ndim == worlds:
-        return gain[None]
+        return finite_or_nan(gain[None])
     if gain.ndim != worlds + 1 or gain.shape[0] != rows.bias.shape[0]:
         raise ValueError(
             f"{owner}: a gain must be a number, an array {rows.bias.shape[:1]} by row, or a"
             f" mapping by constraint name; got shape {gain.shape[: gain.ndim - worlds]}."
         )
-    return gain
+    return finite_or_nan(gain)
 
 
 def _from_names(gain: Mapping[str, Any], fallback: Array, rows: Rows, owner: str) -> Array:

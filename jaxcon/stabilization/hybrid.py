@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
@@ -139,7 +140,7 @@ class Hybrid(Unstabilized):
                 "Hybrid: small and middle must act by J a + C λ = b alone, to be mixed; take an"
                 " implicit `Penalty`, and no `AugmentedLagrangian`."
             )
-        size = jnp.asarray(self.soft_below, rows.bias.dtype)[None]
+        size = finite_or_nan(jnp.asarray(self.soft_below, rows.bias.dtype))[None]
         w = 1 - self.beyond(squares(rows.residual / size, rows.layout))
         w = jnp.where(column(rows.layout.holonomic, rows), w, 0)
         target = w * small.target + (1 - w) * middle.target
@@ -179,7 +180,7 @@ class Hybrid(Unstabilized):
             return state, jnp.zeros_like(state.status)
         new, code = self.large.correct(system, solver, before, state, Parts(*memory).large, dt)
         residual = linearize(system, state.q, state.v, state.time).residual
-        size = jnp.asarray(self.project_above, residual.dtype)[None]
+        size = finite_or_nan(jnp.asarray(self.project_above, residual.dtype))[None]
         w = self.beyond(jnp.sum((residual / size) ** 2, axis=0))[None]
         q = system.normalize(state.q + w * (new.q - state.q))
         return dataclasses.replace(new, q=q, v=state.v + w * (new.v - state.v)), code

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, layout_of
 from jaxcon.core import checks
+from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.status import first
 from jaxcon.core.typing import Array, PyTree
@@ -110,7 +111,8 @@ class AugmentedLagrangian(Unstabilized):
         solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
         holding = rows.layout.holds
         # few rounds leave a trace of W in the solution, and so in its derivative
-        weight = row_weights(system, 1e-6) / jnp.asarray(self.stiffness, start.dtype)[None]
+        stiffness = finite_or_nan(jnp.asarray(self.stiffness, start.dtype))[None]
+        weight = row_weights(system, 1e-6) / stiffness
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
         acts = _acts(system)  # of the others W alone would make λ, huge, for the next step to feel
