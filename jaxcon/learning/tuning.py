@@ -21,11 +21,10 @@ from jaxcon.core.ends import ENDS, bar, words
 from jaxcon.core.typing import PyTree
 from jaxcon.learning.descent import Descent, Search, Stop
 from jaxcon.learning.leaves import Space, space_of
+from jaxcon.learning.optimizer import adam, adam_then_newton
 from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.tuned import Tuned, result
 
-RATE = 0.2
-"""Of the optimiser unless one is given: a step of 20 % of a positive leaf at first."""
 NEVER = np.iinfo(np.int32).max
 SCHEDULE = "the number of steps, along which the rate of the default optimizer falls"
 PROGRAM = "the loss, its data, the bounds, the optimizer, another option, or the version of jax"
@@ -119,9 +118,10 @@ def tune(
         chunk = min(chunk, steps)
     space = space_of(params, positive, bounds, "tune")
     default = optimizer is None
-    if default:
-        optimizer = optax.adam(optax.cosine_decay_schedule(RATE, steps))
-    own = optax.with_extra_args_support(optimizer)
+    if default and not samples:
+        own = adam_then_newton(space, steps)
+    else:
+        own = optax.with_extra_args_support(adam(steps) if optimizer is None else optimizer)
     descent = Descent(loss, space, own, samples, patience, float(tolerance), forward, mesh)
     for_starts, for_samples = (None, None) if key is None else jax.random.split(key)
     starts = scattered(space, space.encode(params), restarts, spread, for_starts, "tune")
@@ -144,7 +144,7 @@ def tune(
         return compiled(search, jnp.asarray(min(ahead, steps), jnp.int32), for_samples)
 
     found, broken = _loop(advance, found, steps, save, progress, bool(samples))
-    return result(space, found[0], found[1], broken)
+    return result(space, starts, found[0], found[1], broken)
 
 
 def _scan(descent: Descent, chunk: int) -> Any:
