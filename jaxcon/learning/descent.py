@@ -289,15 +289,16 @@ class Descent:
     def runs_away(self, search: Search, loss: Array, before: Array) -> Array:
         """Whether a step makes the loss so much worse that it is taken back.
 
-        It is a thousand times that before the step, or above all accepted ones by more than they
-        differ and by more than the first one's size. The second holds for losses of any sign,
-        logarithms too. Rounding around a loss of zero is not judged.
+        It is a thousand times that before the step; or above all accepted ones by ten times their
+        range, or by the range and the size of the first one. The latter holds for losses of any
+        sign, logarithms too. A rise by a hundredth of the first one is never judged, nor is
+        rounding around a loss of zero.
         """
-        size = jnp.abs(search.first)
+        size, span = jnp.abs(search.first), search.highest - search.best.loss
         rounding = jnp.finfo(loss.dtype).eps * size
         thousandfold = (search.best.loss >= 0) & (loss > WORSE * jnp.maximum(before, rounding))
-        span = jnp.maximum(size, search.highest - search.best.loss)
-        return search.accepted & (thousandfold | (loss > search.highest + span))
+        rise = jnp.minimum(jnp.maximum(size, span), jnp.maximum(size / 100, 10 * span))
+        return search.accepted & (thousandfold | (loss > search.highest + rise))
 
     @staticmethod
     def accept(search: Search, loss: Array, good: Array) -> Search:

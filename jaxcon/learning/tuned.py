@@ -153,7 +153,6 @@ class Outlook:
         distance: largest relative change of a parameter that is left to the least; NaN where the
             curvature is not known.
         leaf: name of that parameter.
-        fall: of the loss on the way.
         pace: by which the loss fell in each of the last steps.
         late: share of the fall of the loss in the second half of the steps; NaN where there are
             too few to tell.
@@ -161,7 +160,6 @@ class Outlook:
 
     distance: float
     leaf: str
-    fall: float
     pace: float
     late: float
 
@@ -174,17 +172,13 @@ class Outlook:
         A slow slide through a valley has a small gradient and hardly lowers the loss; the step
         −H⁻¹ g is long there none the less, since the curvature is as small.
         """
-        step, best = np.asarray(search.ahead), search.best
+        steps = space.split(search.ahead)
+        leaves = zip(steps, search.best.y, start, space.positive, strict=True)
         distances = [
-            float(np.max(np.abs(d) / _size(z, z0, log), initial=0))
-            for d, z, z0, log in zip(
-                space.split(search.ahead), best.y, start, space.positive, strict=True
-            )
+            float(np.max(np.abs(d) / _size(z, z0, log), initial=0)) for d, z, z0, log in leaves
         ]
         furthest = int(np.argmax(distances))
-        pace, late = _pace(history)
-        fall = -0.5 * float(step @ np.asarray(space.flatten(best.slope)))
-        return cls(distances[furthest], space.names[furthest], fall, pace, late)
+        return cls(distances[furthest], space.names[furthest], *_pace(history))
 
     @property
     def converged(self) -> bool:
@@ -198,14 +192,14 @@ class Outlook:
         if self.converged:
             return (
                 f", and it converged: by the curvature, {name} is within {self.distance:.1e} of the"
-                " least (relative), and no other further"
+                " least, relative to its size, and no other is further"
             )
         if np.isfinite(self.distance):
-            far = f"{self.distance:.2g}" if self.distance < 1 else "more than its size"
+            far = f"by about {self.distance:.1g}" if self.distance < 1 else "far"
             return (
-                f" before it converged: by the curvature, {name} is about {far} off the least"
-                f" (relative), where the loss is lower by {self.fall:.1e}; it falls by"
-                f" {self.pace:.1e} a step: ask for more, or fit recordings by jc.identify"
+                f" before it converged: by the curvature, {name} may be off the least {far},"
+                f" relative to its size, and the loss still fell by {self.pace:.1e} a step; ask for"
+                " more, or fit recordings with jc.identify"
             )
         if np.isnan(self.late):
             return " before it converged: too few to tell more; ask for more"
