@@ -139,26 +139,170 @@ def _hold(axes: Any, points: np.ndarray) -> None:
     axes.set(xlim=(low[0] - edge, high[0] + edge), ylim=(low[1] - edge, high[1] + edge))
 
 
-def main_job(result: Any, tuning: Any, world: PyTree, step: float, path: str) -> None:
-    """One picture: the mechanism through a turn, violation over time, and the loss."""
+INK = "#22303c"
+"""Color of outlines."""
+BEFORE, AFTER = "#8a949e", "#c8501e"
+"""Colors of default and tuned gains."""
+NM = 1e9
+"""Nanometers in a meter."""
+PARTS = {"crank": "#c8501e", "coupler": "#2f6f9f", "rocker": "#3f8f5f"}
+"""Colors of the links of a four-bar."""
+
+
+def main_job(tuning: Any, fresh: Any, world: PyTree, step: float, path: str) -> None:
+    """One picture: the mechanism through a turn, the loss, and errors of copies not tuned on.
+
+    Args:
+        tuning: a `Tuning` of the demo.
+        fresh: a `Validation` of the demo.
+        world: a four-bar, (system, state).
+        step: h [s].
+        path: where the picture is written.
+    """
     plt = pyplot()
+    style = {
+        "font.size": 10,
+        "axes.titlesize": 11,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.edgecolor": INK,
+        "legend.frameon": False,
+        "legend.fontsize": 10,
+        "legend.title_fontsize": 10,
+    }
+    with plt.rc_context(style):
+        figure, axes = plt.subplots(
+            1, 3, figsize=(14, 4.4), width_ratios=(1.25, 1, 1), layout="constrained"
+        )
+        figure.get_layout_engine().set(wspace=0.06)
+        _draw_turn(axes[0], world, step)
+        _draw_loss(axes[1], tuning)
+        _draw_errors(axes[2], fresh)
+        figure.savefig(path, dpi=120)
+        plt.close(figure)
+
+
+def _draw_turn(axes: Any, world: PyTree, step: float) -> None:
+    """A four-bar through one turn of its crank: links, pins, ground, and traces of its points."""
     system, state = world
+    now, frames = links(system, state.q), _turn(system, state, step)
+    center = frames["coupler"].mean(axis=1)
+    tip = frames["coupler"][:, 0]
+    axes.plot(*frames["crank"][:, 1].T, color=PARTS["crank"], lw=1.2, ls=":")
+    axes.plot(*tip.T, color=PARTS["rocker"], lw=1.2, ls=":")
+    axes.plot(*center.T, color=PARTS["coupler"], lw=1.8, label="path of the coupler's center")
+    for i in np.linspace(0, len(center) - 1, 9)[1:-1].astype(int):
+        _draw_links(axes, {k: x[i] for k, x in frames.items()}, width=2.5, alpha=0.2)
+    for pivot in (now["crank"][0], now["rocker"][-1]):
+        _draw_ground(axes, pivot)
+    _draw_links(axes, now, width=8)
+    axes.plot(*center[0], "o", ms=5.5, mfc=PARTS["coupler"], mec="white", zorder=7)
+    for name, points in now.items():
+        _label_link(axes, name, *points)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.06)
+    axes.set(xlabel="x [m]", ylabel="y [m]", title="A crank-rocker through one turn")
+    axes.legend(loc="upper left")
+
+
+def _turn(system: Any, state: Any, step: float) -> dict[str, np.ndarray]:
+    """The hinges of each link from the start until its crank has turned once, (n, 2, 2) [m]."""
     dt = jnp.asarray(step, state.q.dtype)
-    run = jax.jit(lambda s: rollout(system, Method(), s, None, dt, 300, every=30))
-    _, trajectory = run(state)
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 4))
-    for i, q in enumerate(trajectory.q):
-        draw(system, q, left, alpha=0.2 + 0.08 * i, label=None)
-    draw(system, state.q, left)
-    left.legend(fontsize=8, loc="lower right")
-    left.set_title("a crank-rocker through one turn")
-    middle.semilogy(result.times, result.violation)
-    middle.set(xlabel="time [s]", ylabel="worst |φ| of all copies [m]", title="violation")
-    right.plot(10**tuning.history, label="tuning")
-    right.axhline(10 ** tuning.default[1], color="gray", ls="--", label="default gains")
-    right.set(yscale="log", xlabel="iteration", ylabel="rms of φ and h φ̇ [m]")
-    right.set_title("gains tuned by gradient")
-    right.legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    plt.close(figure)
+    run = jax.jit(lambda s: rollout(system, Method(), s, None, dt, 800, every=4)[1].q)
+    q = jnp.concatenate([state.q[None], run(state)])
+    frames = {k: np.asarray(x) for k, x in jax.vmap(_links, (None, 0))(system, q).items()}
+    along = frames["crank"][:, 1] - frames["crank"][:, 0]
+    angle = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+    after = np.nonzero(np.abs(angle - angle[0]) >= 2 * np.pi)[0]
+    return {k: x[: after[0] + 1] if after.size else x for k, x in frames.items()}
+
+
+def _label_link(axes: Any, name: str, start: np.ndarray, end: np.ndarray) -> None:
+    """The name of a link, along it on its lower or right-hand side."""
+    along = (end - start) / np.hypot(*(end - start))
+    across = np.array([along[1], -along[0]])
+    across = across if across[0] > across[1] else -across
+    angle = np.degrees(np.arctan2(along[1], along[0]))
+    axes.annotate(
+        name,
+        (start + end) / 2,
+        14 * across,
+        textcoords="offset points",
+        ha="center",
+        va="center",
+        rotation=(angle + 90) % 180 - 90,
+        rotation_mode="anchor",
+        color=PARTS.get(name, INK),
+        zorder=8,
+    )
+
+
+def _draw_links(axes: Any, points: dict[str, np.ndarray], width: float, alpha: float = 1) -> None:
+    """Rods between their hinges, and the pins; thick ones with an outline."""
+    solid = alpha == 1
+    for name, (start, end) in points.items():
+        x, y = zip(start, end, strict=True)
+        line = {"solid_capstyle": "round", "zorder": 4 if solid else 2}
+        if solid:
+            axes.plot(x, y, color=INK, lw=width + 2, **line)
+        axes.plot(x, y, color=PARTS.get(name, INK), lw=width, alpha=alpha, **line)
+    if solid:
+        pins = np.concatenate(list(points.values()))
+        axes.plot(*pins.T, "o", ms=width - 1, mfc="white", mec=INK, mew=1.3, zorder=6)
+
+
+def _draw_ground(axes: Any, pivot: np.ndarray, size: float = 0.075) -> None:
+    """A fixed bearing: a triangle on hatched ground, its height `size` [m]."""
+    from matplotlib.patches import Polygon, Rectangle
+
+    x, y = pivot
+    foot = [(x, y), (x - 0.7 * size, y - size), (x + 0.7 * size, y - size)]
+    axes.add_patch(Polygon(foot, facecolor="#dfe3e7", edgecolor=INK, lw=1.3, zorder=3))
+    ground = (x - 1.2 * size, y - 1.6 * size), 2.4 * size, 0.6 * size
+    axes.add_patch(
+        Rectangle(*ground, facecolor="none", edgecolor=INK, hatch="/////", lw=0, zorder=3)
+    )
+    axes.plot([x - 1.2 * size, x + 1.2 * size], [y - size] * 2, color=INK, lw=1.3, zorder=3)
+
+
+def _draw_loss(axes: Any, tuning: Any) -> None:
+    """The loss of each iteration, the best so far, and that of the default gains."""
+    seen = NM * np.where(np.isfinite(tuning.history), tuning.history, np.nan)
+    best, default = np.fmin.accumulate(seen), NM * tuning.before
+    axes.plot(seen, "o", ms=4, color=AFTER, alpha=0.4, mew=0, label="tried")
+    axes.step(np.arange(len(best)), best, where="post", color=AFTER, lw=2, label="best so far")
+    axes.axhline(default, color=BEFORE, ls="--", lw=1.8, label=f"default gains: {default:.3g} nm")
+    axes.set(xlabel="iteration", title=f"Loss on the {tuning.copies} linkages tuned on")
+    _error_axis(axes)
+    axes.set_ylim(None, 1.1 * max(default, np.nanmax(seen)))
+    axes.legend(loc="upper right", bbox_to_anchor=(1, 0.92))
+
+
+def _draw_errors(axes: Any, fresh: Any) -> None:
+    """The median and the middle 90 % of the copies, by time."""
+    for rms, mean, color, label in zip(
+        fresh.rms, fresh.mean, (BEFORE, AFTER), ("default", "tuned"), strict=True
+    ):
+        low, middle, high = NM * np.quantile(rms, (0.05, 0.5, 0.95), axis=1)
+        axes.fill_between(fresh.times, low, high, color=color, alpha=0.25, lw=0)
+        label = f"{label} gains: {NM * mean:.3g} nm rms"
+        axes.plot(fresh.times, middle, color=color, lw=1.6, label=label)
+    copies, less = fresh.rms.shape[2], fresh.mean[0] / fresh.mean[1]
+    axes.set(xlabel="time [s]", title=f"{copies} linkages not tuned on: {less:.1f} times less")
+    _error_axis(axes)
+    axes.set_xlim(0, None)
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high * (high / low) ** 0.35)  # room for the legend
+    axes.legend(loc="upper right", title="median, and 90 % of the linkages")
+
+
+def _error_axis(axes: Any) -> None:
+    """A logarithmic axis of errors [nm] with plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set(yscale="log", ylabel="rms joint error φ [nm]")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(color="#e6e9ec", lw=0.8)
+    axes.set_axisbelow(True)

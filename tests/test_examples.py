@@ -95,7 +95,9 @@ def test_main_job_small(tmp_path):
         [*command, "--picture", str(picture)], capture_output=True, text=True, check=True
     )
     assert "environment-steps per second" in done.stdout
-    assert "tuned" in done.stdout
+    said = re.search(r"the tuned gains leave ([\d.]+) times less", done.stdout)
+    assert said
+    assert float(said[1]) > 3  # on linkages that were not tuned on
     assert picture.stat().st_size > 10_000
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
@@ -83,6 +84,13 @@ class Space:
         limits = zip(y, *self.limits, strict=True)
         return tuple(jnp.clip(z, low, high) for z, low, high in limits)
 
+    def free(self, y: tuple[Array, ...], slope: tuple[Array, ...]) -> Array:
+        """Whether each number of y may follow −slope: on a bound, only back inside, (n,)."""
+        sides = zip(y, slope, *self.limits, strict=True)
+        return jnp.concatenate(
+            [jnp.ravel(jnp.where(g > 0, z > low, z < high) | (g == 0)) for z, g, low, high in sides]
+        )
+
     @property
     def limits(self) -> tuple[list[Array], list[Array]]:
         """The bounds of y."""
@@ -90,6 +98,12 @@ class Space:
         ends = (self.low, self.high)
         low, high = ([f(x) for f, x in zip(log, end, strict=True)] for end in ends)
         return low, high
+
+
+def flat(y: PyTree) -> tuple[Array, Any]:
+    """All numbers of a tree in one array of the widest dtype, and what restores the tree."""
+    with jax.numpy_dtype_promotion("standard"):  # leaves may have several precisions
+        return ravel_pytree(y)
 
 
 def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
