@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
@@ -14,8 +15,8 @@ from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.parts import Part
-from jaxcon.model.state import State, recall
-from jaxcon.simulation.method import Memory, Method
+from jaxcon.model.state import MethodMemory, State, recall
+from jaxcon.simulation.method import Method
 from jaxcon.solvers.saddle import Solution
 
 
@@ -46,7 +47,7 @@ def attempt(
     """(new state, info) and the status of this step of dt alone, or of a part of it."""
     dynamics = dynamics_at(system, method, state, control, dt, part)
     length = dt if part is None else part.length
-    system, memory = dynamics.system, Memory(*state.memory)
+    system, memory = dynamics.system, MethodMemory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
     new = dataclasses.replace(state, q=q, v=v, time=time)
@@ -54,8 +55,10 @@ def attempt(
     own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
     new, corrected = stabilizer.correct(system, method.solver, state, new, own, length)
     turns = system.count(state.q, state.v, state.time)
-    react = rows.reactions.multipliers if _keeps_reactions(system, method) else ()
-    kept = Memory(advanced.memory, own, memory.recovery, react) if state.memory else ()
+    # as the state came, with or without them, so that it can be the carry of a scan
+    multipliers = rows.reactions.multipliers if _has_multipliers(memory) else ()
+    kept = (advanced.memory, own, memory.recovery, multipliers)
+    kept = MethodMemory(*kept) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
     code = status.first(judge(new, solution), corrected)
     if method.recovery is not None:
@@ -64,9 +67,9 @@ def attempt(
     return (new, StepInfo(*seen, code, rows.reactions)), code
 
 
-def _keeps_reactions(system: Any, method: Method) -> bool:
-    """Whether the next step starts from what bounded rows did in this one."""
-    return bool(system.bounds) and method.bounded.warm
+def _has_multipliers(memory: MethodMemory) -> bool:
+    """Whether a state carries the multipliers of inequality constraints of the last step."""
+    return bool(jax.tree.leaves(memory.bounded))
 
 
 def dynamics_at(
@@ -78,14 +81,14 @@ def dynamics_at(
     part: Part | None = None,
 ) -> Dynamics:
     """What an integrator sees of the system during a step from this state, or a part of it."""
-    stabilizer, memory = method.feedback(dt), Memory(*state.memory)
+    stabilizer, memory = method.feedback(dt), MethodMemory(*state.memory)
     if method.recovery is not None:
         stabilizer = method.recovery.relax(stabilizer, memory.recovery)
     system = recall(system, state.turns)
     own = (system, stabilizer, method.solver, control, memory.stabilizer, dt)
     if not system.bounds:
         return Dynamics(*own)
-    guess = memory.bounded if method.bounded.warm else None
+    guess = memory.bounded if method.bounded.warm and _has_multipliers(memory) else None
     return Dynamics(*own, method.bounded, guess, part=part)
 
 

@@ -55,6 +55,7 @@ def step_quietly(
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
     checks.positive("step", "dt", dt, strictly=False)
+    method = method.resolve(system, state)
     return native.call(contained_step, system, method, state, control, h)
 
 
@@ -66,6 +67,7 @@ def undo(system: Any, method: Method, state: State, control: PyTree, dt: Any) ->
     """
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
+    method = method.resolve(system, state)
     return native.call(contained_step, system, method, state, control, -h)[0]
 
 
@@ -138,6 +140,7 @@ def forward_dynamics(
     """
     control = check_step(system, method, state, control)
     h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
+    method = method.resolve(system, state)
     return native.call(_dynamics, system, method, state, control, h)
 
 
@@ -170,12 +173,7 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
             raise ValueError(f"step: control is {got}, but the state is {state.q.dtype}.")
     check_dtype(system, state.q.dtype)
     method.check_system(system)
-    memory = method.init(system, state.q, state.v)
-    if jax.tree.structure(memory) != jax.tree.structure(state.memory):
-        raise ValueError(
-            "step: the state does not have the memory that this method keeps; start with"
-            " state = jc.init(system, method, state.q, state.v)."
-        )
+    method.check_memory(system, state)
     return control
 
 
