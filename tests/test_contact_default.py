@@ -203,3 +203,13 @@ def test_multipliers_stay_where_a_body_is_restated():
     after = jc.restate(state, system, moved)
     np.testing.assert_array_equal(after.memory.bounded, 2.0)
     assert int(jc.step(moved, jc.Method(), after, None, DT)[0].status) == 0
+
+
+def test_worlds_along_trailing_axes_have_the_structure_of_one():
+    for name, (build, kind) in SCENES.items():
+        system, state = build()
+        shared, worlds = (
+            jax.tree.map(lambda x, n=n: x[..., None].repeat(n, -1), tree)
+            for tree, n in ((system, 1), (state, 3))
+        )
+        assert type(default_contact_solver(shared, worlds.q, worlds.v)) is kind, name

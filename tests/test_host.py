@@ -50,7 +50,7 @@ def test_it_is_what_jax_computes(name, dtype):
         np.testing.assert_allclose(a, b, rtol=40 * float(jnp.finfo(dtype).eps), atol=1e-6)
 
 
-@pytest.mark.parametrize("name", ["polar", "arm", "mixed-2d", "core-3d-loop"])
+@pytest.mark.parametrize("name", ["polar", "arm", "mixed-2d", "revolute-3d-loop"])
 def test_rows_are_what_jax_computes(name):
     built = scenes.build(name)
     rows, jacobian, mass = linearized(built.system, built.off)

@@ -156,7 +156,7 @@ def _look(
     found = [*findings.given(system, state, control)]
     if found:
         return found, 0, Status.NON_FINITE
-    plain = dynamics_at(system, method.resolve(system, state), state, control, h)
+    plain = dynamics_at(system, method, state, control, h)
     watched = Watched(*(getattr(plain, f.name) for f in dataclasses.fields(plain)))
     memory = MethodMemory(*state.memory)
     advanced = method.integrator.advance(watched, state, memory.integrator, h)

@@ -291,10 +291,17 @@ def count_bounds(system: Any, q: Array, v: Array) -> int:
 
 
 def linearize_at_rest(system: Any, q: Array, v: Array) -> BoundRows:
-    """The inequality rows at time 0, without control, for their structure."""
-    layout = getattr(system, "layout", None)
-    control = jnp.zeros(layout.n_u, q.dtype) if layout is not None else None
-    return linearize_bounds(system, q, v, jnp.zeros((), q.dtype), control, jnp.ones((), q.dtype))
+    """The inequality rows at time 0, without control, for their structure.
+
+    Args:
+        system: with bounds.
+        q: positions, (n_q, …), worlds along trailing axes.
+        v: velocities, (n_v, …).
+    """
+    layout, batch = getattr(system, "layout", None), (1,) * (q.ndim - 1)
+    control = None if layout is None else jnp.zeros((layout.n_u, *batch), q.dtype)
+    t, dt = jnp.zeros(batch, q.dtype), jnp.ones(batch, q.dtype)
+    return linearize_bounds(system, q, v, t, control, dt)
 
 
 def has_ends(system: Any, q: Array, v: Array, t: Any, control: Any, dt: Any) -> bool:

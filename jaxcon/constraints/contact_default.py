@@ -41,15 +41,15 @@ def default_contact_solver(system: Any, q: Array, v: Array) -> Any:
 
     Args:
         system: any system; its numbers do not matter and may be traced.
-        q: positions, (n_q,).
-        v: velocities, (n_v,).
+        q: positions, (n_q, …), worlds along trailing axes.
+        v: velocities, (n_v, …).
     """
     if not system.bounds:
         return InteriorPoint()
     rows = jax.eval_shape(linearize_at_rest, system, q, v)
     if rows.kinds.size <= EXACT_UP_TO:
         return InteriorPoint()
-    constraints = jax.eval_shape(linearize, system, q, v, jnp.zeros((), q.dtype))
+    constraints = jax.eval_shape(linearize, system, q, v, jnp.zeros((1,) * (q.ndim - 1), q.dtype))
     return InteriorPoint() if stacked(constraints.jacobian, rows.jacobian) else GaussSeidel()
 
 

@@ -27,7 +27,8 @@ def evaluate(function: Callable[..., Any], *args: Any) -> Any:
         args: pytrees of numbers and arrays.
     """
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
-    given = [np.asarray(x) for x in jax.tree.leaves(args)]
+    pairs = zip(jax.tree.leaves(args), closed.jaxpr.invars, strict=True)
+    given = [np.asarray(x, place.aval.dtype) for x, place in pairs]
     with np.errstate(all="ignore"):
         results = _evaluate(closed.jaxpr, closed.consts, given)
     return jax.tree.unflatten(jax.tree.structure(shapes), [np.asarray(x) for x in results])
@@ -39,12 +40,17 @@ def _evaluate(jaxpr: Any, constants: Sequence[Any], given: Sequence[Any]) -> lis
     values = dict(zip(places, [*map(np.asarray, constants), *given], strict=True))
 
     def read(x: Any) -> Any:
-        return np.asarray(x.val, x.aval.dtype) if isinstance(x, Literal) else values[x]
+        return _literal(x) if isinstance(x, Literal) else values[x]
 
     for equation in _needed(jaxpr):
         results = _apply(jaxpr, equation, [read(x) for x in equation.invars])
         values.update(zip(equation.outvars, results, strict=True))
     return [read(x) for x in jaxpr.outvars]
+
+
+def _literal(x: Any) -> np.ndarray:
+    """A number written into the program."""
+    return np.asarray(x.val, x.aval.dtype)
 
 
 def _needed(jaxpr: Any) -> list[Any]:
@@ -64,8 +70,8 @@ def _apply(jaxpr: Any, equation: Any, inputs: list[Any]) -> Sequence[Any]:
     if name in CALLS and CALLS[name] in params:
         inner = params[CALLS[name]]
         return _evaluate(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs)
-    whole = np.issubdtype(equation.outvars[0].aval.dtype, np.integer)
-    if name in ELEMENTWISE and not (whole and name == "div"):  # that of integers truncates
+    truncates = name == "div" and np.issubdtype(inputs[0].dtype, np.integer)
+    if name in ELEMENTWISE and not truncates:
         return [ELEMENTWISE[name](*inputs)]
     if name in STRUCTURAL and not (name == "pad" and _cuts(params)):
         return [STRUCTURAL[name](params, *inputs)]

@@ -88,8 +88,9 @@ def dynamics_at(
     own = (system, stabilizer, method.solver, control, memory.stabilizer, dt)
     if not system.bounds:
         return Dynamics(*own)
-    guess = memory.bounded if method.bounded.warm and _has_multipliers(memory) else None
-    return Dynamics(*own, method.bounded, guess, part=part)
+    solver = method.resolve(system, state).bounded
+    guess = memory.bounded if solver.warm and _has_multipliers(memory) else None
+    return Dynamics(*own, solver, guess, part=part)
 
 
 def judge(state: State, solution: Solution) -> Array:

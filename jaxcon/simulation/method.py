@@ -130,8 +130,8 @@ class Method:
         """Returns the method with a solver of the inequality constraints of the system.
 
         Args:
-            system: whose inequality rows are counted.
-            state: of one world.
+            system: whose structure is looked at; its numbers may be traced.
+            state: of one world, or of worlds along trailing axes.
         """
         if self.bounded is not None or not system.bounds:
             return self

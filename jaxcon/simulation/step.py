@@ -55,7 +55,6 @@ def step_quietly(
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
     checks.positive("step", "dt", dt, strictly=False)
-    method = method.resolve(system, state)
     return native.call(contained_step, system, method, state, control, h)
 
 
@@ -67,7 +66,6 @@ def undo(system: Any, method: Method, state: State, control: PyTree, dt: Any) ->
     """
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
-    method = method.resolve(system, state)
     return native.call(contained_step, system, method, state, control, -h)[0]
 
 
@@ -140,7 +138,6 @@ def forward_dynamics(
     """
     control = check_step(system, method, state, control)
     h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
-    method = method.resolve(system, state)
     return native.call(_dynamics, system, method, state, control, h)
 
 
