@@ -77,7 +77,7 @@ def test_a_rollout_takes_what_a_step_takes():
 def test_a_report_has_it_where_a_method_is_given():
     system, state = chain(1, jnp.float32)
     assert jc.report(system, state).memory is None
-    report = jc.report(system, state, jc.Method())
+    report = jc.report(system, state, jc.Method(), measure=True)
     assert report.memory == jc.memory(system, jc.Method(), state)
     assert report.memory.state == (7 + 6 + 1 + 1) * 4
     assert "60 B of state" in str(report)

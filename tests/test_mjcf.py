@@ -1,6 +1,7 @@
 """Models of MuJoCo against MuJoCo itself: accelerations at random states, maps, what is refused."""
 
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon.simulation.choice import words
 
 mujoco = pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -177,6 +179,41 @@ def test_a_model_unpacks_and_runs_in_single_precision():
     final, _ = jax.jit(lambda s: jc.step(system, jc.Method(), s, None, 2e-3))(state)
     jc.raise_for_status(final)
     assert {x.dtype for x in jax.tree.leaves(system)} == {jnp.dtype("float32")}
+
+
+def test_a_model_says_which_method_suits_it():
+    """That of its structure, with other parts as they are given; a state of it is enough."""
+    arm = model(f"<body>{HINGES.format(1, AXES[0], '').format(0)}{BODY}</body>")
+    read = jc.from_mjcf(arm)
+    found = read.method()
+    assert words(found.solver) == words(jc.Method.auto(*read).solver) == "Sparse()"
+    assert jax.tree.structure(found) == jax.tree.structure(jc.Method(solver=jc.Sparse()))
+    given = read.method(integrator=jc.RK4(), solver=jc.Dense(), batch=4)
+    assert isinstance(given.integrator, jc.RungeKutta)
+    assert isinstance(given.solver, jc.Dense)
+    with pytest.raises(TypeError, match="unexpected keyword"):
+        read.method(dt=1e-3)
+    end, _ = jc.rollout(read.system, found, read.start, None, float(read.timestep), 3)
+    assert int(end.status) == 0
+
+
+@pytest.mark.parametrize("name", ["hopper", "ant"])
+def test_robots_on_the_floor_are_swept_by_default(name):
+    """And their report, which names that, answers without compiling a step."""
+    read = jc.from_mjcf(str(agreement.ASSETS / f"{name}.xml"))
+    method = read.method()
+    assert words(method.solver) == "Sparse()"
+    assert words(method.resolve(*read).bounded) == "GaussSeidel()"
+    start = read.state(read.tree.reference, np.zeros(read.tree.size))
+    rows = start.memory.bounded.shape[0]
+    assert rows == {"hopper": 30, "ant": 83}[name]
+    began = time.process_time()
+    found = jc.report(read.system, start, method, float(read.timestep))
+    assert time.process_time() - began < 3.0
+    assert found.cost.contact_solver == "GaussSeidel()"
+    assert found.warnings == {}
+    slow = jc.report(read.system, start, jc.Method(bounded=jc.InteriorPoint()))
+    assert f"inverts a matrix of {rows} inequality rows" in slow.warnings["dense"]
 
 
 def test_the_map_to_states_is_differentiable():

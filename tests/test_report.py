@@ -2,11 +2,13 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon.analysis.work import work
 
 
 def add_link(scene, name, start, end):
@@ -163,3 +165,60 @@ def test_generalized_coordinates_have_a_report():
     built = scenes.build("polar")
     report = jc.report(built.system, built.state)
     assert (report.coordinates, report.rows, report.degrees_of_freedom) == (2, 1, 1)
+
+
+def crawler(count):
+    """A chain of links on the floor, hinged, with a stop in each hinge: 3 count − 1 rows."""
+    scene = jc.Scene(dim=2)
+    for i in range(count):
+        scene.add_body(f"link{i}", mass=1.0, inertia=0.1, position=(i, 0.0))
+        scene.add(jc.PlaneContact(f"floor{i}", jc.WORLD, f"link{i}", friction=0.3))
+        if i:
+            scene.add(jc.Revolute(f"hinge{i}", f"link{i - 1}", f"link{i}", point=(i - 0.5, 0.0)))
+            scene.add(jc.Limit(f"stop{i}", f"hinge{i}", -1.0, 1.0))
+    return scene.build()
+
+
+def test_a_report_compiles_nothing_of_the_scene(caplog):
+    """Neither its rows nor a step, unless it is asked to measure."""
+    system, state = crawler(12)
+    exact = jc.Method(bounded=jc.InteriorPoint())
+    with jax.log_compiles(), caplog.at_level("WARNING"):
+        report = jc.report(system, state, exact, 1e-3)
+        compiled = [x.getMessage() for x in caplog.records if "Compiling" in x.getMessage()]
+        assert not [x for x in compiled if "linearize" in x or "step" in x or "_run" in x]
+        assert len(compiled) < 20  # single operations of default gains and the like
+    assert report.memory is report.work is report.probe is report.seconds is None
+    assert report.degrees_of_freedom == 36 - 22
+    assert "35 inequality rows" in report.warnings["dense"]
+    assert "GaussSeidel()" in report.warnings["dense"]
+
+
+@pytest.mark.parametrize("solver", [jc.Sparse(), jc.Schur(), jc.Dense()], ids=str)
+def test_the_cost_by_structure_is_near_that_of_the_trace(solver):
+    """Leading terms, right within a factor of 2.5."""
+    system, state = crawler(12)
+    method = jc.Method(solver=solver)
+    found = jc.report(system, state, method).cost
+    assert found.contact_solver == "GaussSeidel()"
+    counted = work(system, method, state).operations
+    assert counted / 2.5 < found.operations < 2.5 * counted
+    assert found.operations == found.rows + found.solver + found.contact
+    for part in ("for the rows", "for the inequality constraints by GaussSeidel()", "(estimated)"):
+        assert part in str(found)
+
+
+def test_the_cost_of_few_rows_of_many():
+    """With n = 35 contact rows and stops, 2 · 8 + 4 are solved at a time."""
+    system, state = crawler(12)
+    nearest = jc.Nearest(jc.GaussSeidel(10), contacts=8, stops=4)
+    found = jc.report(system, state, jc.Method(bounded=nearest)).cost
+    assert found.contact == 10 * (2 * 20**2 + 6 * 20)
+    slow = jc.report(system, state, jc.Method(bounded=jc.InteriorPoint())).cost
+    assert slow.contact == 15 * (2 * 35**3 + 6 * 35**2)
+
+
+def test_a_cost_that_is_not_known_is_not_made_up():
+    found = jc.report(*four_bar(2), jc.Method(solver=jc.Priority({"hinge0": 1}))).cost
+    assert found.solver is None
+    assert "no estimate for the solver" in str(found)

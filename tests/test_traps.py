@@ -147,7 +147,19 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
     "iterated": (far, with_(stabilizer=jc.Projection()), ("start",), "jc.assemble"),
     "gentle": (far, with_(stabilizer=GENTLE), ("start",), "jc.assemble"),
     "dense": (lambda: rope(14), with_(solver=jc.Dense()), ("dense",), "fewer operations: Sparse()"),
-    "many contacts": (crowd, with_(), ("dense",), "a matrix of 48 bounded rows"),
+    "many contacts": (
+        crowd,
+        with_(bounded=jc.InteriorPoint()),
+        ("dense",),
+        "a matrix of 48 inequality rows in each iteration, about 3.5e+06 operations a step",
+    ),
+    "nearest contacts": (
+        crowd,
+        with_(bounded=jc.Nearest(jc.InteriorPoint(), contacts=4)),
+        (),
+        "",
+    ),
+    "many by default": (crowd, with_(), (), ""),
     "many swept": (crowd, with_(bounded=jc.GaussSeidel()), (), ""),
     "few rows": (lambda: rope(3), with_(solver=jc.Dense()), (), ""),
     "swept": (
@@ -187,7 +199,8 @@ def test_each_trap_of_the_chapter_is_there():
 
 def test_a_method_that_remembers_needs_no_state_of_its_own():
     system, state = bob(rod())
-    report = jc.report(system, state, with_(stabilizer=jc.SlidingWindowBaumgarte()), DT)
+    forgets = with_(stabilizer=jc.SlidingWindowBaumgarte())
+    report = jc.report(system, state, forgets, DT, measure=True)
     assert report.probe.status == jc.Status.OK
     assert "gains" not in str(dataclasses.replace(report, gains=(0.0, 0.0, np.inf), choice=None))
 
@@ -208,7 +221,7 @@ def test_without_a_step_nothing_is_said_of_it():
 def test_a_report_is_a_checklist():
     system, state = bob(rod())
     wild = with_(stabilizer=jc.Baumgarte.critical(rate=5e3), solver=jc.Dense())
-    report = jc.report(system, state, wild, DT, timed=True)
+    report = jc.report(system, state, wild, DT, measure=True, timed=True)
     assert report.gains[:2] == (5e3, 5e3)
     assert report.gains[2] == pytest.approx((2 * np.sqrt(2) - 2) / DT)
     assert set(report.warnings) == {"gains"}

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from jaxcon.analysis.reference import Reference
+from jaxcon.constraints.contact_default import default_contact_solver
 from jaxcon.constraints.rows import layout_of
 from jaxcon.core.precision import cast, precision
 from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
@@ -43,7 +44,7 @@ def methods_for(system: Any, reference: Reference) -> dict[str, Method]:
     name, solver = ("Sparse", Sparse()) if independent else ("RankSafe", RankSafe())
     found = {
         f"{words}, {name}": Method(integrator, stabilizer, solver, bounded=bounded, events=events)
-        for words, integrator, stabilizer, bounded, events in _pairs(system)
+        for words, integrator, stabilizer, bounded, events in _pairs(system, reference)
     }
     others: dict[str, Any] = {"RankSafe": RankSafe()} if loops and independent else {}
     if loops and independent and rows <= SMALL:
@@ -53,7 +54,7 @@ def methods_for(system: Any, reference: Reference) -> dict[str, Method]:
     return found
 
 
-def _pairs(system: Any) -> list[tuple[str, Any, Any, Any, Any]]:
+def _pairs(system: Any, reference: Reference) -> list[tuple[str, Any, Any, Any, Any]]:
     """Words, integrator, stabiliser, what solves bounded rows, and events."""
     bounded, feedback, projection = Method().bounded, Baumgarte(), Projection()
     pairs = [
@@ -70,8 +71,11 @@ def _pairs(system: Any) -> list[tuple[str, Any, Any, Any, Any]]:
     found: list[Any] = [(*pair, bounded, None) for pair in pairs]
     if system.bounds:
         split = ("RK4, Baumgarte, events", RK4(), feedback, bounded, Events())
-        swept = ("semi-implicit Euler, Baumgarte, sweeps", SemiImplicitEuler(), feedback)
-        found[1:2] = [split, found[1], (*swept, GaussSeidel(), None)]
+        found[1:2] = [split, found[1]]
+        q, v = reference.points.q[0], reference.points.v[0]
+        if not isinstance(default_contact_solver(system, q, v), GaussSeidel):
+            swept = ("semi-implicit Euler, Baumgarte, sweeps", SemiImplicitEuler(), feedback)
+            found.insert(3, (*swept, GaussSeidel(), None))
     return found
 
 

@@ -19,9 +19,9 @@ from jaxcon.core import checks
 from jaxcon.core.status import MEANING, Status, failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
-from jaxcon.model.state import State
+from jaxcon.model.state import MethodMemory, State
 from jaxcon.simulation.attempt import dynamics_at
-from jaxcon.simulation.method import Memory, Method
+from jaxcon.simulation.method import Method
 from jaxcon.simulation.step import check_step, controls_in, policy_in, step_quietly
 from jaxcon.solvers.saddle import Solution
 
@@ -158,7 +158,7 @@ def _look(
         return found, 0, Status.NON_FINITE
     plain = dynamics_at(system, method, state, control, h)
     watched = Watched(*(getattr(plain, f.name) for f in dataclasses.fields(plain)))
-    memory = Memory(*state.memory)
+    memory = MethodMemory(*state.memory)
     advanced = method.integrator.advance(watched, state, memory.integrator, h)
     if not watched.seen:  # an integrator that iterates shows no values
         watched(state.q, state.v, state.time)

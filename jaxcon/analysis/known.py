@@ -11,19 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.analysis.estimate import Cost, cost
 from jaxcon.analysis.probe import Probe, begun, probe
 from jaxcon.constraints.rows import Rows
-from jaxcon.core import checks
+from jaxcon.core import checks, host
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.dynamics.assembly import assemble
 from jaxcon.dynamics.rank import UnitRows, dependent_rows, linearized
 from jaxcon.model.state import State, at
 from jaxcon.simulation.choice import Choice, choose
-from jaxcon.simulation.method import Method
+from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.stability import default_gains, parts
 
 ASIDE = 0.05
 """How far a configuration is moved to see whether rows depend on each other there, too."""
+NEWTON = 20
+"""The most iterations by which such a configuration is closed."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Known:
         rows: linearized.
         mass: M, (n_v, n_v).
         jacobian: J, (n_c, n_v).
+        measured: whether steps may be compiled and run to see what they do.
     """
 
     system: Any
@@ -49,8 +52,9 @@ class Known:
     control: PyTree
     batch: int
     rows: Rows
-    mass: Array
-    jacobian: Array
+    mass: np.ndarray
+    jacobian: np.ndarray
+    measured: bool = True
 
     @classmethod
     def of(
@@ -61,17 +65,20 @@ class Known:
         dt: Any = None,
         control: PyTree = None,
         batch: int = 1,
+        measured: bool = True,
     ) -> Known:
         """The same from what a user gives."""
         system = at(system, state, "jc.report(system, s)")
         if dt is not None:
             checks.positive("report", "dt", dt)
         own = method or Method()
+        check_method(own)
+        own = own.resolve(system, state)
         if method is not None or dt is not None:
             state = begun(system, own, state)
         rows, jacobian, mass = linearized(system, state)
         h = None if dt is None else float(dt)
-        return cls(system, state, own, h, control, batch, rows, mass, jacobian)
+        return cls(system, state, own, h, control, batch, rows, mass, jacobian, measured)
 
     @cached_property
     def unit(self) -> UnitRows:
@@ -91,7 +98,8 @@ class Known:
             )
             for p in self.system.inertia
         )
-        mass = dataclasses.replace(self.system, inertia=groups).mass(self.state.q).dense()
+        even = dataclasses.replace(self.system, inertia=groups)
+        mass = host.evaluate(_mass, even, self.state.q)
         return UnitRows(self.rows.layout, self.jacobian, mass)
 
     @cached_property
@@ -116,11 +124,27 @@ class Known:
         return choose(self.system, self.state, self.batch, dependent=len(self.dependent))
 
     @cached_property
+    def cost(self) -> Cost:
+        """What the accelerations take under the method, by the structure of the scene."""
+        return cost(self.system, self.method, self.state, self.choice)
+
+    @cached_property
     def probe(self) -> Probe | None:
-        """What some steps leave open; None where the step is not known."""
-        if self.dt is None:
+        """What some steps leave open; None where the step is not known, or none may be run."""
+        if self.dt is None or not self.measured:
             return None
         return probe(self.system, self.method, self.state, self.control, self.dt)
+
+    @cached_property
+    def violation(self) -> dict[str, tuple[float, float]]:
+        """‖φ‖ and ‖φ̇‖ by constraint; ‖ψ‖ twice where it holds velocities alone."""
+        layout, found = self.rows.layout, {}
+        φ, rate = (np.asarray(x, np.float64) for x in (self.rows.residual, self.rows.rate))
+        for name in layout.names:
+            fast = float(np.linalg.norm(rate[layout.rows(name)]))
+            size = float(np.linalg.norm(φ[layout.rows(name)]))
+            found[name] = (fast if name in layout.velocity_level else size, fast)
+        return found
 
     @cached_property
     def passing(self) -> bool:
@@ -130,12 +154,26 @@ class Known:
         if not self.dependent or not len(free):
             return False
         along = self.velocities(np.random.default_rng(0).normal(size=len(free)) @ free)
-        moved = assemble(self.system, self.moved(ASIDE * along / np.max(np.abs(along))))
-        if int(moved.status):
+        beside = self._closed(self.moved(ASIDE * along / np.max(np.abs(along))))
+        if beside is None:
             return False
-        rows, jacobian, mass = linearized(self.system, moved.state)
-        unit = UnitRows(rows.layout, jacobian, mass)
-        return len(dependent_rows(unit.values, unit.tolerance)) < len(self.dependent)
+        return len(dependent_rows(beside.values, beside.tolerance)) < len(self.dependent)
+
+    def _closed(self, state: State) -> UnitRows | None:
+        """The unit rows at the position that closes all constraints near a state.
+
+        Newton's method, each step the least in the metric of M; None where it does not converge.
+        """
+        for _ in range(NEWTON):
+            rows, jacobian, mass = linearized(self.system, state)
+            unit = UnitRows(rows.layout, jacobian, mass)
+            open_by = np.asarray(rows.residual, np.float64)[unit.numbers] / unit.length
+            if np.max(np.abs(open_by), initial=0) < unit.tolerance:
+                return unit
+            x = np.linalg.lstsq(unit.values, -open_by, rcond=unit.tolerance)[0]
+            factor = np.linalg.cholesky(np.asarray(mass, np.float64))
+            state = self._displaced(state, np.linalg.solve(factor.T, x))
+        return None
 
     def velocities(self, x: np.ndarray) -> np.ndarray:
         """A displacement (n_v,) from one in the metric in which rows have unit length."""
@@ -143,11 +181,17 @@ class Known:
 
     def moved(self, step: np.ndarray) -> State:
         """The state at q ⊕ Δ, Δ (n_v,)."""
-        move = jnp.asarray(step, self.state.q.dtype)
-        return dataclasses.replace(self.state, q=_retract(self.system, self.state.q, move))
+        return self._displaced(self.state, step)
+
+    def _displaced(self, state: State, step: np.ndarray) -> State:
+        move = np.asarray(step, state.q.dtype)
+        return dataclasses.replace(state, q=host.evaluate(_retract, self.system, state.q, move))
 
 
-@jax.jit
+def _mass(system: Any, q: Array) -> Array:
+    return system.mass(q).dense()
+
+
 def _retract(system: Any, q: Array, step: Array) -> Array:
     return system.retract(q, step)
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxcon.analysis import traps
+from jaxcon.analysis.estimate import Cost
 from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.probe import Probe
@@ -37,18 +38,21 @@ class Report:
             other; only of constraints where there is such a part.
         condition: of J M⁻¹ Jᵀ with rows scaled to unit length, independent rows only.
         violation: ‖φ‖ and ‖φ̇‖ by constraint; both ‖ψ‖ where it holds velocities alone.
-        memory: of a world in a batch [B], where a method was given.
+        memory: of a world in a batch [B], where it was asked to measure.
         bounded: names of what has bounded rows, limits, friction and contact, left out of the rest.
         off: names of the constraints with ‖φ‖ above 1e-4; those that hold velocities have no φ.
         choice: the solver that `Method.auto` takes, and why.
-        work: operations of a step of one world, where a method was given.
+        cost: operations of the accelerations of one world by part, estimated from the structure,
+            where a method was given.
+        work: operations of a step of one world, counted from its trace, where it was asked to
+            measure.
         seconds: what a step of one world takes in a batch on this device [s], where that was asked.
         gains: α and β of the feedback, and the largest β that is stable at their ratio [1/s], where
             a method and a step were given.
-        probe: what some steps from the state left open, likewise.
+        probe: what some steps from the state left open, where it was asked to measure.
         warnings: by trap, "gains", "singular", "order", "over-constrained", "start", "nonlinear",
             "dense" and "iterations", of those in which the scene and the method are; a method is
-            needed, and for some a step.
+            needed, for some a step, and for "order" to measure.
     """
 
     coordinates: int
@@ -69,6 +73,7 @@ class Report:
     gains: tuple[float, float, float] | None = None
     probe: Probe | None = None
     warnings: dict[str, str] = field(default_factory=dict)
+    cost: Cost | None = None
 
     def __str__(self) -> str:
         lines = [
@@ -111,9 +116,11 @@ class Report:
 
     def _of_method(self) -> list[str]:
         """What is said of cost, gains and what is to be expected, and which solver suits."""
-        lines = [str(x) for x in (self.work, self.memory) if x]
+        lines = [str(x) for x in (self.cost, self.work, self.memory) if x]
         if self.seconds is not None:
-            lines.append(f"{1e6 * self.seconds:.3g} µs a step of one world on this device")
+            lines.append(
+                f"{1e6 * self.seconds:.3g} µs a step of one world on this device (measured)"
+            )
         if self.gains and any(self.gains[:2]):
             α, β, most = self.gains
             lines.append(
@@ -144,6 +151,7 @@ def report(
     *,
     control: PyTree = None,
     batch: int = 1,
+    measure: bool = False,
     timed: bool = False,
 ) -> Report:
     """The checklist: freedoms, redundancy and condition; with a method, cost, gains and traps.
@@ -151,15 +159,20 @@ def report(
     Rows are compared in the metric of M⁻¹, scaled to unit length; a row counts as dependent where
     the part that earlier rows do not explain is below 1e-9 (float64) or 1e-4 (float32).
 
+    The report answers from the structure of the scene and one linearization on the host: nothing is
+    compiled unless `measure` or `timed` asks for it.
+
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
         state: of one world; what it remembers of a method is left out.
-        method: by which the system is to be stepped, for operations, memory and warnings; memory
-            compiles a step and takes seconds. None leaves these out.
-        dt: h, () [s], for gains, the violation to be expected, which takes some steps, and the
-            warnings that depend on it; None leaves these out.
+        method: by which the system is to be stepped, for cost and warnings. None leaves these out.
+        dt: h, () [s], for gains, the violation to be expected, and the warnings that depend on it;
+            None leaves these out.
         control: of a step of one world, as of `step`.
         batch: worlds that are to be stepped together, for the choice of a solver and the time.
+        measure: whether to trace a step to count its operations, to compile it for its memory, and
+            to run some steps for the violation to be expected. This takes seconds, and minutes
+            where there are hundreds of rows.
         timed: whether to measure the time of a step, with a batch of so many.
 
     Returns:
@@ -169,15 +182,11 @@ def report(
         TypeError: something else than a system, a state and a method.
         ValueError: a step that is not positive, or shapes that are not those of the system.
     """
-    known = Known.of(system, state, method, dt, control, batch)
+    known = Known.of(system, state, method, dt, control, batch, measure)
     unit, layout = known.unit, known.rows.layout
     rank = len(unit.values) - len(known.dependent)
     independent = np.delete(unit.values, known.dependent, axis=0)
     singular = np.linalg.svd(independent, compute_uv=False)
-    violation = {
-        name: (float(known.rows.violation[name]), float(known.rows.violation.rate(name)))
-        for name in layout.names
-    }
     found = Report(
         coordinates=state.q.shape[0],
         velocities=state.v.shape[0],
@@ -186,20 +195,20 @@ def report(
         degrees_of_freedom=state.v.shape[0] - rank,
         redundant=tuple(unit.owners[i] for i in known.dependent),
         condition=float((singular[0] / singular[-1]) ** 2) if len(singular) else 1.0,
-        violation=violation,
+        violation=known.violation,
         off=tuple(
             name
-            for name, (size, _) in violation.items()
+            for name, (size, _) in known.violation.items()
             if size > OFF and name not in layout.velocity_level
         ),
         bounded=tuple(name for group in known.system.bounds for name in group.names),
         conflicts=known.conflicts,
         choice=known.choice,
     )
-    return found if method is None else _with_method(found, known, timed)
+    return found if method is None else _with_method(found, known, measure, timed)
 
 
-def _with_method(found: Report, known: Known, timed: bool) -> Report:
+def _with_method(found: Report, known: Known, measure: bool, timed: bool) -> Report:
     """The same with what belongs to the method."""
     args = known.system, known.method, known.state, known.control
     gains = None
@@ -209,8 +218,9 @@ def _with_method(found: Report, known: Known, timed: bool) -> Report:
         gains = (α, β, largest_stable_rate(known.method.integrator, known.dt, ratio))
     return dataclasses.replace(
         found,
-        memory=memory(*args),
-        work=work(*args),
+        cost=known.cost,
+        memory=memory(*args) if measure else None,
+        work=work(*args) if measure else None,
         seconds=seconds(*args, known.batch) if timed else None,
         gains=gains,
         probe=known.probe,

@@ -8,10 +8,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.analysis.estimate import contact_operations, solved_rows
 from jaxcon.analysis.known import Known, asked_gains
-from jaxcon.constraints.bounds import count_bounds
+from jaxcon.constraints.bounds import kinds_of
+from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
 from jaxcon.dynamics.rank import linearized
-from jaxcon.simulation.choice import several, words
+from jaxcon.simulation.choice import innermost, several, words
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import instability, parts
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
@@ -34,8 +36,6 @@ DEARER = 3.0
 """How many times the operations of elimination are worth a word."""
 MANY = 12
 """Rows from which on that matters."""
-PRESSED = 48
-"""Bounded rows from which on the interior point takes most of a step."""
 
 
 def found(known: Known) -> dict[str, str]:
@@ -120,15 +120,15 @@ def overconstrained(known: Known) -> str | None:
 def start(known: Known) -> str | None:
     """Trap 5: a start off the constraints."""
     layout, off, moving, slips = known.rows.layout, [], [], []
-    violation, h = known.rows.violation, known.dt or 0.0
-    for name in layout.names:
+    h = known.dt or 0.0
+    for name, (size, rate) in known.violation.items():
         if name in layout.inertial:
             continue
         drift = h * float(np.linalg.norm(np.asarray(known.rows.bias)[layout.rows(name)]))
-        fast = float(violation.rate(name)) > MOVING + drift  # v may be half a step old
+        fast = rate > MOVING + drift  # v may be half a step old
         if name in layout.velocity_level:
             slips += [name] if fast else []
-        elif float(violation[name]) > OFF:
+        elif size > OFF:
             off.append(name)
         elif fast:
             moving.append(name)
@@ -166,14 +166,9 @@ def curved(known: Known) -> str | None:
 
 def dense(known: Known) -> str | None:
     """Trap 7: dense matrices where J is sparse, or where few of many contacts touch."""
-    size = count_bounds(known.system, known.state.q, known.state.v)
-    if isinstance(known.method.bounded, InteriorPoint) and size >= PRESSED:
-        return (
-            f"InteriorPoint() inverts a matrix of {size} bounded rows in each of its rounds. Take"
-            " bounded=GaussSeidel(), whose sweeps do not, or jc.Nearest(jc.InteriorPoint(),"
-            " contacts=8) where only few act at a time."
-        )
-    efforts, name = known.choice.efforts, type(_innermost(known.method.solver)).__name__
+    if slow := _slow_contact(known):
+        return slow
+    efforts, name = known.choice.efforts, type(innermost(known.method.solver)).__name__
     if name not in ("Dense", "Schur") or "Sparse" not in efforts or known.rows.layout.size < MANY:
         return None
     ratio = efforts[name].operations / efforts["Sparse"].operations
@@ -185,9 +180,34 @@ def dense(known: Known) -> str | None:
     )
 
 
+def _slow_contact(known: Known) -> str | None:
+    """The warning of an interior point with more rows than it is fast for."""
+    kinds = kinds_of(known.system, known.state.q, known.state.v)
+    solver = getattr(known.method.bounded, "solver", known.method.bounded)
+    if kinds is None or not isinstance(solver, InteriorPoint):
+        return None
+    rows = solved_rows(known.method.bounded, kinds)
+    other = contact_operations(GaussSeidel(), kinds)
+    if rows <= EXACT_UP_TO or known.cost.contact < DEARER * other:
+        return None
+    rest, point = known.cost.operations - known.cost.contact, (known.state.q, known.state.v)
+    said = (
+        f"InteriorPoint() inverts a matrix of {rows} inequality rows in each iteration, about"
+        f" {known.cost.contact:.2g} operations a step, where GaussSeidel() takes {other:.2g} and"
+        f" all else {rest:.2g}."
+    )
+    nearest = "jc.Nearest(jc.InteriorPoint(), contacts=8) where only few act at a time"
+    if isinstance(default_contact_solver(known.system, *point), InteriorPoint):
+        return (
+            f"{said} Take {nearest}, or GaussSeidel() where no light body carries heavy ones, since"
+            " bodies may rest on each other here."
+        )
+    return f"{said} Leave out bounded=, which then is GaussSeidel(), or take {nearest}."
+
+
 def iterations(known: Known) -> str | None:
     """Trap 8: more iterations than bring anything."""
-    solver = _innermost(known.method.solver)
+    solver = innermost(known.method.solver)
     if isinstance(solver, ConjugateGradients) and (said := _swept(known, solver.iterations)):
         return said
     for part, field, enough in _counted(known.method):
@@ -239,13 +259,6 @@ def _counted(method: Method) -> list[tuple[Any, str, int]]:
     found = [(method.solver, "rounds", 5), (swept, "sweeps", 100)]
     found += [(p, "iterations", 5) for p in parts(method.stabilizer) if hasattr(p, "stiffness")]
     return [(part, field, enough) for part, field, enough in found if hasattr(part, field)]
-
-
-def _innermost(solver: Any) -> Any:
-    """The solver inside others."""
-    while hasattr(solver, "solver"):
-        solver = solver.solver
-    return solver
 
 
 def _linear(known: Known) -> bool:

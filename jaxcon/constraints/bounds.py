@@ -310,14 +310,31 @@ def _layout(
     return BoundLayout(tuple(entries))
 
 
+def kinds_of(system: Any, q: Array, v: Array) -> Kinds | None:
+    """The numbers of inequality rows of a system by law; None in a system without."""
+    if not system.bounds:
+        return None
+    return jax.eval_shape(linearize_at_rest, system, q, v).kinds
+
+
 def count_bounds(system: Any, q: Array, v: Array) -> int:
     """How many bounded rows a system has."""
-    if not system.bounds:
-        return 0
-    layout = getattr(system, "layout", None)
-    control = jnp.zeros(layout.n_u, q.dtype) if layout is not None else None
-    t, dt = jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
-    return jax.eval_shape(linearize_bounds, system, q, v, t, control, dt).kinds.size
+    kinds = kinds_of(system, q, v)
+    return 0 if kinds is None else kinds.size
+
+
+def linearize_at_rest(system: Any, q: Array, v: Array) -> BoundRows:
+    """The inequality rows at time 0, without control, for their structure.
+
+    Args:
+        system: with bounds.
+        q: positions, (n_q, …), worlds along trailing axes.
+        v: velocities, (n_v, …).
+    """
+    layout, batch = getattr(system, "layout", None), (1,) * (q.ndim - 1)
+    control = None if layout is None else jnp.zeros((layout.n_u, *batch), q.dtype)
+    t, dt = jnp.zeros(batch, q.dtype), jnp.ones(batch, q.dtype)
+    return linearize_bounds(system, q, v, t, control, dt)
 
 
 def has_ends(system: Any, q: Array, v: Array, t: Any, control: Any, dt: Any) -> bool:

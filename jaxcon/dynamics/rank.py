@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxcon.constraints.rows import RowLayout, Rows, linearize
+from jaxcon.core import host
 from jaxcon.core.typing import Array
 from jaxcon.model.state import State
 
@@ -28,7 +29,7 @@ class UnitRows:
         tolerance: below which a length counts as zero.
     """
 
-    def __init__(self, layout: RowLayout, jacobian: Array, mass: Array) -> None:
+    def __init__(self, layout: RowLayout, jacobian: Any, mass: Any) -> None:
         owners = _owners(layout)
         self.numbers, self.owners = list(owners), list(owners.values())
         self.tolerance = 1e-9 if jacobian.dtype == np.float64 else 1e-4
@@ -74,9 +75,18 @@ class UnitRows:
         return found
 
 
-@jax.jit
-def linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
-    """The rows with J and M as arrays."""
+def linearized(system: Any, state: State) -> tuple[Rows, np.ndarray, np.ndarray]:
+    """The rows, J and M of a state as NumPy arrays; nothing is compiled.
+
+    Args:
+        system: as the state remembers it.
+        state: of one world, with known numbers.
+    """
+    return host.evaluate(_linearized, system, state)
+
+
+@jax.jit  # so that a system is traced once, however many of its states are looked at
+def _linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
     rows = linearize(system, state.q, state.v, state.time)
     return rows, rows.jacobian.dense(), system.mass(state.q).dense()
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.constraints.contact_default import first_multipliers
 from jaxcon.constraints.curves import Curves
 from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
@@ -19,7 +20,7 @@ from jaxcon.dynamics.inputs import BodyInput, resolve
 from jaxcon.geometry.pose import Pose, WorldPose
 from jaxcon.model.elements import side_by_side
 from jaxcon.model.layout import WORLD
-from jaxcon.model.state import State
+from jaxcon.model.state import MethodMemory, State
 from jaxcon.model.system import BodySystem
 
 
@@ -133,7 +134,8 @@ class Scene:
         """Checks the scene, lays it out, and attaches every element where its bodies now are.
 
         Returns:
-            The system, and the state at assembly.
+            The system, and the state at assembly. Where the default method warm-starts its solver
+            of inequality constraints, the state has the multipliers for it.
 
         Raises:
             ValueError: an unknown name, a joint between a body and itself, a wrong shape or dtype,
@@ -171,6 +173,9 @@ class Scene:
                 check_function(group, system.snapshot(state.q, state.v, state.time))
             if isinstance(group, Curves):
                 group.check(system.snapshot(state.q, state.v, state.time))
+        multipliers = first_multipliers(system, state.q, state.v)
+        if jax.tree.leaves(multipliers):
+            state = dataclasses.replace(state, memory=MethodMemory(bounded=multipliers))
         return system, unshared(state, system)
 
     def _state(self, layout: Any, bodies: Any) -> State:

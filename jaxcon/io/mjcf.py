@@ -27,6 +27,7 @@ from jaxcon.model.coordinates import TurnCounter
 from jaxcon.model.inertial import restate
 from jaxcon.model.state import State
 from jaxcon.model.system import BodySystem
+from jaxcon.simulation.method import Method
 
 
 @pytree
@@ -46,7 +47,8 @@ class Keyframe:
 class MujocoModel:
     """A model of MuJoCo as a system, with maps to and from MuJoCo's coordinates.
 
-    `system, state = model` unpacks what a `Scene` builds. The control array is MuJoCo's ctrl.
+    `system, state = model` unpacks what a `Scene` builds, and `model.method()` is the `Method` that
+    suits it. The control array is MuJoCo's ctrl.
 
     Attributes:
         system: its links are named as the bodies, its joints and actuators as MuJoCo's, with their
@@ -104,6 +106,18 @@ class MujocoModel:
         turns = self.tree.turns_of(self.system, qpos)
         time = checks.number("state", "time", time, dtype)
         return dataclasses.replace(self.start, q=q, v=v, time=time, turns=turns)
+
+    def method(self, **parts: Any) -> Method:
+        """Returns the method that suits the model by its structure: `Method.auto` at the start.
+
+        `Method.auto` chooses the solver of the joints. That of stops, friction and contacts is left
+        to `Method`, which takes sweeps where they have many rows.
+
+        Args:
+            parts: other parts, such as `integrator=jc.RK4()`, and the arguments `batch` and
+                `platform` of `Method.auto`.
+        """
+        return Method.auto(self.system, self.start, **parts)
 
     def qpos(self, state: State) -> Array:
         """MuJoCo's positions of a state, (nq,).

@@ -28,7 +28,7 @@ from jaxcon.geometry.solid import resolve_inertia, resolve_mass
 from jaxcon.model.elements import Elements, Grid, element_at, side_by_side
 from jaxcon.model.forces import CustomForces
 from jaxcon.model.layout import Layout, Place
-from jaxcon.model.state import State, at
+from jaxcon.model.state import MethodMemory, State, at
 
 POINTS = {"anchor", "start", "end"}
 DIRECTIONS = {"axis", "first", "second", "normal", "travel", "edge"}
@@ -163,8 +163,9 @@ def restate(state: State, before: Any, after: Any) -> State:
         after: the same with other numbers (`BodySystem.with_params`).
 
     Returns:
-        The state of `after`. What a method remembers is of the old frames and left out: one with a
-        memory takes `jc.init(after, method, s.q, s.v, s.time, s.turns)` of the state s.
+        The state of `after`. What a method remembers is of the old frames and left out, but for
+        the multipliers of inequality constraints: one with a memory takes
+        `jc.init(after, method, s.q, s.v, s.time, s.turns)` of the state s.
 
     Raises:
         TypeError, ValueError: the state is not one of `before`, or the systems differ in more than
@@ -182,7 +183,12 @@ def restate(state: State, before: Any, after: Any) -> State:
         motion = motion.seen_from(None if offset is None else offset.inverse)
         x, y = group.kind.coordinates(motion)
         q, v = q.at[before.layout.q(name)].set(x), v.at[before.layout.v(name)].set(y)
-    return dataclasses.replace(state, q=q, v=v, memory=() if others else state.memory)
+    memory = MethodMemory(*state.memory)
+    kept = state.memory
+    if others:  # forces of contacts have no frame of a body; accelerations and histories have
+        multipliers = jax.tree.leaves(memory.bounded)
+        kept = MethodMemory(bounded=memory.bounded) if multipliers else ()
+    return dataclasses.replace(state, q=q, v=v, memory=kept)
 
 
 def _placed(

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.pytree import pytree
+from jaxcon.core.pytree import exportable, pytree
 from jaxcon.core.typing import Array, PyTree
+
+
+@exportable
+class MethodMemory(NamedTuple):
+    """The memory of a method between steps, by part of the method; () where a part has none.
+
+    Attributes:
+        integrator: accelerations of the last step, for integrators that use them.
+        stabilizer: integrals or histories of the feedback.
+        recovery: counters of repaired steps.
+        bounded: multipliers of the inequality constraints in the last step, (n,), from which
+            iterative solvers start.
+    """
+
+    integrator: PyTree = ()
+    stabilizer: PyTree = ()
+    recovery: PyTree = ()
+    bounded: PyTree = ()
 
 
 @pytree

@@ -16,8 +16,8 @@ from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.parts import Part
-from jaxcon.model.state import State, is_finite, recall
-from jaxcon.simulation.method import Memory, Method
+from jaxcon.model.state import MethodMemory, State, is_finite, recall
+from jaxcon.simulation.method import Method
 from jaxcon.solvers.saddle import Solution
 
 
@@ -54,7 +54,7 @@ def attempt(
     """(new state, info) and the status of this step of dt alone, or of a part of it."""
     dynamics = dynamics_at(system, method, state, control, dt, part)
     length = dt if part is None else part.length
-    system, memory = dynamics.system, Memory(*state.memory)
+    system, memory = dynamics.system, MethodMemory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
     new = dataclasses.replace(state, q=q, v=v, time=time)
@@ -62,8 +62,10 @@ def attempt(
     own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
     new, corrected = stabilizer.correct(system, method.solver, state, new, own, length)
     turns = system.count(state.q, state.v, state.time)
-    react = rows.reactions.multipliers if _keeps_reactions(system, method) else ()
-    kept = Memory(advanced.memory, own, memory.recovery, react) if state.memory else ()
+    # as the state came, with or without them, so that it can be the carry of a scan
+    multipliers = rows.reactions.multipliers if _has_multipliers(memory) else ()
+    kept = (advanced.memory, own, memory.recovery, multipliers)
+    kept = MethodMemory(*kept) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
     code = functools.reduce(status.first, (judge(new, solution), corrected, remembered(own, new)))
     if method.recovery is not None:
@@ -72,9 +74,9 @@ def attempt(
     return (new, StepInfo(*seen, code, rows.reactions)), code
 
 
-def _keeps_reactions(system: Any, method: Method) -> bool:
-    """Whether the next step starts from what bounded rows did in this one."""
-    return bool(system.bounds) and method.bounded.warm
+def _has_multipliers(memory: MethodMemory) -> bool:
+    """Whether a state carries the multipliers of inequality constraints of the last step."""
+    return bool(jax.tree.leaves(memory.bounded))
 
 
 def dynamics_at(
@@ -86,15 +88,16 @@ def dynamics_at(
     part: Part | None = None,
 ) -> Dynamics:
     """What an integrator sees of the system during a step from this state, or a part of it."""
-    stabilizer, memory = method.feedback(dt), Memory(*state.memory)
+    stabilizer, memory = method.feedback(dt), MethodMemory(*state.memory)
     if method.recovery is not None:
         stabilizer = method.recovery.relax(stabilizer, memory.recovery)
     system = recall(system, state.turns)
     own = (system, stabilizer, method.solver, control, memory.stabilizer, dt)
     if not system.bounds:
         return Dynamics(*own)
-    guess = memory.bounded if method.bounded.warm else None
-    return Dynamics(*own, method.bounded, guess, part=part)
+    solver = method.resolve(system, state).bounded
+    guess = memory.bounded if solver.warm and _has_multipliers(memory) else None
+    return Dynamics(*own, solver, guess, part=part)
 
 
 def remembered(memory: PyTree, state: State) -> Array:

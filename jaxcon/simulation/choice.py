@@ -207,6 +207,13 @@ def several(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
+def innermost(solver: Any) -> Any:
+    """The solver inside others, such as that of `RankSafe`."""
+    while hasattr(solver, "solver"):
+        solver = solver.solver
+    return solver
+
+
 def words(solver: Any) -> str:
     """A solver as it is written, with what is not the default."""
     inside = []

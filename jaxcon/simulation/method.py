@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 
-from jaxcon.constraints.bounds import count_bounds
-from jaxcon.core.pytree import exportable, pytree
+from jaxcon.constraints.contact_default import default_contact_solver, first_multipliers
+from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import PyTree
-from jaxcon.model.state import State
+from jaxcon.model.state import MethodMemory, State
 from jaxcon.simulation.choice import choose
 from jaxcon.simulation.integrators import SemiImplicitEuler
 from jaxcon.simulation.stability import stable_rate
-from jaxcon.solvers.interior_point import InteriorPoint
 from jaxcon.solvers.proximal import RankSafe
 from jaxcon.stabilization.baumgarte import Baumgarte
 
@@ -28,16 +27,8 @@ PARTS = (
     ("events", "splits", "Events()"),
 )
 """What a method consists of: the field, what its value can do, and an example."""
-
-
-@exportable
-class Memory(NamedTuple):
-    """What a state remembers for its method, by part; each () where there is nothing."""
-
-    integrator: PyTree = ()
-    stabilizer: PyTree = ()
-    recovery: PyTree = ()
-    bounded: PyTree = ()
+OPTIONAL = ("recovery", "bounded", "events")
+"""Fields that may be None."""
 
 
 @pytree
@@ -51,9 +42,11 @@ class Method:
         solver: `RankSafe()`, or `Sparse()`, `Schur()`, `Dense()` or `ConjugateGradients()`, which
             want independent rows; `Priority(levels)` meets them level by level.
         recovery: `Recovery(…)`, which repairs steps that fail; None, and a world that fails stops.
-        bounded: of limits, friction and contact: `InteriorPoint()`, exact, `GaussSeidel(…)`,
-            cheap, or `Nearest(…)` of one of them, for few rows of many. A scene without such rows
-            has no trace of it.
+        bounded: solver of the inequality constraints, which are limits, friction and contact:
+            `InteriorPoint()`, exact; `GaussSeidel(…)`, cheap; or `Nearest(…)` of either, for few
+            rows of many. None chooses by structure when the step is traced: `GaussSeidel()` for
+            more than 24 rows that act on mechanisms one by one, such as robots on the floor, and
+            `InteriorPoint()` elsewhere. A scene without such rows has no trace of it.
         events: `Events(…)`, which splits a step where a stop, rope or contact is hit; None, and
             impacts are those of plain stepping. A scene without such rows has no trace of it.
     """
@@ -62,7 +55,7 @@ class Method:
     stabilizer: Any = Baumgarte()
     solver: Any = RankSafe()
     recovery: Any = None
-    bounded: Any = InteriorPoint()
+    bounded: Any = None
     events: Any = None
 
     @classmethod
@@ -101,12 +94,48 @@ class Method:
         return cls(**parts)
 
     def init(self, system: Any, q: Any, v: Any) -> PyTree:
-        """What a state remembers for the method: a `Memory`, or () where there is nothing."""
-        repairs = () if self.recovery is None else self.recovery.init(system, q, v)
-        own = self.integrator.init(system, q, v), self.stabilizer.init(system, q, v)
-        count = count_bounds(system, q, v) if self.bounded.warm else 0
-        memory = Memory(*own, repairs, jnp.zeros(count, q.dtype) if count else ())
+        """Returns the first memory of the method: a `MethodMemory`, or () where it keeps none."""
+        multipliers = first_multipliers(system, q, v, self.bounded)
+        memory = self._memory_of_parts(system, q, v)._replace(bounded=multipliers)
         return memory if jax.tree.leaves(memory) else ()
+
+    def _memory_of_parts(self, system: Any, q: Any, v: Any) -> MethodMemory:
+        """The first memory of all parts but the solver of inequality constraints."""
+        repairs = () if self.recovery is None else self.recovery.init(system, q, v)
+        return MethodMemory(
+            self.integrator.init(system, q, v), self.stabilizer.init(system, q, v), repairs
+        )
+
+    def check_memory(self, system: Any, state: State) -> None:
+        """Checks that a state has the memory of this method.
+
+        A state may carry multipliers that the solver does not use. It may lack them where the
+        solver is chosen by default: each step then starts its sweeps from zero.
+
+        Raises:
+            ValueError: it has the memory of another method, or none.
+        """
+        expected = self._memory_of_parts(system, state.q, state.v)
+        given = MethodMemory(*state.memory)
+        others = jax.tree.structure(given._replace(bounded=()))
+        wanted = self.bounded is not None and self.bounded.warm and bool(system.bounds)
+        missing = wanted and not jax.tree.leaves(given.bounded)
+        if missing or jax.tree.structure(expected) != others:
+            raise ValueError(
+                "step: the state does not have the memory that this method keeps; start with"
+                " state = jc.init(system, method, state.q, state.v)."
+            )
+
+    def resolve(self, system: Any, state: State) -> Method:
+        """Returns the method with a solver of the inequality constraints of the system.
+
+        Args:
+            system: whose structure is looked at; its numbers may be traced.
+            state: of one world, or of worlds along trailing axes.
+        """
+        if self.bounded is not None or not system.bounds:
+            return self
+        return dataclasses.replace(self, bounded=default_contact_solver(system, state.q, state.v))
 
     def feedback(self, dt: Any) -> Any:
         """The stabiliser, its missing gains chosen for the integrator at this step."""
@@ -153,7 +182,7 @@ class Method:
                 part.check()
         for part, verb, example in PARTS:
             value = getattr(self, part)
-            absent = part in ("recovery", "events") and value is None
+            absent = part in OPTIONAL and value is None
             if not absent and (isinstance(value, type) or not hasattr(value, verb)):
                 fits = [other for other, can, _ in PARTS if hasattr(value, can)]
                 hint = f"; that is one for {fits[0]}=" if fits and fits[0] != part else ""

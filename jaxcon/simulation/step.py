@@ -170,12 +170,7 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
             raise ValueError(f"step: control is {got}, but the state is {state.q.dtype}.")
     check_dtype(system, state.q.dtype)
     method.check_system(system)
-    memory = method.init(system, state.q, state.v)
-    if jax.tree.structure(memory) != jax.tree.structure(state.memory):
-        raise ValueError(
-            "step: the state does not have the memory that this method keeps; start with"
-            " state = jc.init(system, method, state.q, state.v)."
-        )
+    method.check_memory(system, state)
     return control
 
 

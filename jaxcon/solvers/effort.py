@@ -147,3 +147,26 @@ def iterations(structure: Structure, rows: int, rounds: int, solves: int = 1) ->
     code += sum(4 * m * columns.components for _, m, columns in structure)
     once = 4.0 * entries(structure) + swept + 12 * rows
     return Effort(blocks + solves * rounds * once, code, float(8 * rows))
+
+
+ROUNDS = 15
+"""Iterations that the interior point usually takes."""
+
+
+def interior_point(rows: int) -> float:
+    """Operations of `InteriorPoint`: each iteration inverts one matrix, 2 n³, and applies it twice.
+
+    Args:
+        rows: n, the number of inequality rows that are solved.
+    """
+    return ROUNDS * (2.0 * rows**3 + 6.0 * rows * rows)
+
+
+def gauss_seidel(rows: int, sweeps: int) -> float:
+    """Operations of `GaussSeidel`: each sweep is about one product with the matrix, 2 n².
+
+    Args:
+        rows: n, the number of inequality rows that are solved.
+        sweeps: how many.
+    """
+    return sweeps * (2.0 * rows * rows + 6.0 * rows)
