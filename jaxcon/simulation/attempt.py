@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
@@ -30,6 +31,8 @@ class StepInfo:
         status: what became of this step, or what stopped the world before, ().
         reactions: what bounded rows did during it; None in a scene without.
         impacts: those at which it was split; None without `Events`.
+        state: the state to which a and λ belong, without the memory of the method. That is the
+            state before the step, and for `GeneralizedAlpha` the point that it reached.
     """
 
     acceleration: Array
@@ -38,6 +41,7 @@ class StepInfo:
     status: Array
     reactions: Any = None
     impacts: Any = None
+    state: Any = None
 
 
 def attempt(
@@ -61,7 +65,19 @@ def attempt(
     if method.recovery is not None:
         code = status.first(code, method.recovery.judge(system, new))
     seen = (solution.acceleration, solution.multipliers, rows.violation)
-    return (new, StepInfo(*seen, code, rows.reactions)), code
+    place = dataclasses.replace(bare(state), q=q, v=v, time=time) if advanced.ends else None
+    return (new, StepInfo(*seen, code, rows.reactions, state=place)), code
+
+
+def nothing_seen(info: StepInfo, state: State) -> StepInfo:
+    """Zeros in the place of what a step from a state saw that led nowhere."""
+    blank = jax.tree.map(jnp.zeros_like, info)
+    return blank if info.state is None else dataclasses.replace(blank, state=bare(state))
+
+
+def bare(state: State) -> State:
+    """The state without the memory of a method."""
+    return dataclasses.replace(state, memory=())
 
 
 def _keeps_reactions(system: Any, method: Method) -> bool:

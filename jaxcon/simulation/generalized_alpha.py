@@ -132,7 +132,7 @@ class GeneralizedAlpha:
         solution, ends = dynamics(q, v, t)  # compiled only where it is read
         if equations.soft is not None:
             code = status.first(code, self._contradicted(equations, solution, ends, allowed))
-        return Advanced((q, v, t), solution._replace(status=code), rows, kept)
+        return Advanced((q, v, t), solution._replace(status=code), rows, kept, ends=True)
 
     def _contradicted(
         self, equations: Equations, solution: Solution, ends: Rows, allowed: Array

@@ -16,6 +16,7 @@ from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.model.state import State
+from jaxcon.simulation.attempt import nothing_seen
 from jaxcon.simulation.recovery import contain
 from jaxcon.stabilization.baumgarte import Law, check_stabilizer
 from jaxcon.stabilization.hybrid import Hybrid
@@ -144,7 +145,7 @@ class Recovery:
         code = jnp.where(again, note, first(code, relaxed))
         new = keep(~again, new, back)
         memory = new.memory._replace(recovery=self._remember(known, bad))
-        info = keep(~again, info, jax.tree.map(jnp.zeros_like, info))
+        info = keep(~again, info, nothing_seen(info, state))
         return (dataclasses.replace(new, memory=memory), info), code
 
     def _remember(self, known: Repairs, bad: Array) -> Repairs:
