@@ -225,7 +225,7 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     for group, rows in zip(system.constraints, sets, strict=True):
         k = len(group.names)
         if isinstance(group, Joints):
-            vectors += [(start, k, own) for own in components(rows, system.layout.dim)]
+            vectors += [(start, k, own) for own in components(rows, snapshot.system.layout.dim)]
         blocks += [Block(value, start, columns) for columns, value in rows.jacobian]
         if rows.value:  # a joint may be there to be read and driven only
             entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
