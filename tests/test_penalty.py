@@ -14,6 +14,7 @@ from tolerances import IDENTITY, ROUND_OFF
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.pytree import pytree
+from jaxcon.geometry import quaternion
 from jaxcon.scenes import four_bar
 
 H = 0.01
@@ -451,3 +452,70 @@ def test_a_hybrid_comes_back_from_a_tenth_off(integrator):
     assert final.status == jc.Status.OK
     assert jc.violation(system, final).worst < 1e-3
     assert jnp.linalg.norm(final.v) < 5.0  # √(2 g l) = 4.4
+
+
+def turned(turn, kind):
+    """A body on another that hangs in the world, with the world turned."""
+
+    def place(x):
+        return quaternion.rotate(turn, jnp.asarray(x))
+
+    down = place((0.3, -0.5, -9.81))
+    scene = jc.Scene(dim=3, gravity=down)
+    solid = {"mass": 1.5, "inertia": (0.15, 0.3, 0.4), "quaternion": turn}
+    scene.add_body("a", position=place((0.5, 0.1, 0.0)), **solid)
+    scene.add_body("b", position=place((1.4, 0.2, 0.3)), **solid)
+    point, axis = place((0.0, 0.0, 0.0)), place((0.0, 0.6, 0.8))
+    scene.add(jc.Spherical("first", jc.WORLD, "a", point=point))
+    points = {"point": place((1.0, 0.1, 0.1))}
+    joints = {
+        "revolute": lambda: jc.Revolute("second", "a", "b", axis=axis, **points),
+        "prismatic": lambda: jc.Prismatic("second", "a", "b", axis=axis, **points),
+        "planar": lambda: jc.Planar("second", "a", "b", axis=axis, **points),
+    }
+    scene.add(joints[kind]())
+    return scene.build()
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic", "planar"])
+def test_a_spring_by_its_time_does_not_see_how_the_world_is_turned(kind):
+    """The motion in a world turned by a random rotation is the same motion, turned."""
+    method = jc.Method(stabilizer=jc.Penalty.from_time(0.05, 0.2))
+
+    def ends(turn):
+        system, state = turned(turn, kind)
+        final, _ = rolled((system, state), method, 60, 5e-3)
+        places = [jc.position(system, final, name) for name in ("a", "b")]
+        back = quaternion.conjugate(turn)
+        return jnp.stack([quaternion.rotate(back, x) for x in places]), jc.violation(system, final)
+
+    turns = np.random.default_rng(3).normal(size=(2, 4))
+    turns = jnp.asarray(np.concatenate([[[1.0, 0, 0, 0]], turns / norms(turns)]))
+    places, left = jax.jit(jax.vmap(ends))(turns)
+    assert np.min(left.worst) > 1e-3  # the springs do give way
+    for other in places[1:]:
+        np.testing.assert_allclose(other, places[0], rtol=0, atol=1e-9)
+
+
+def norms(x):
+    return np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def test_a_spring_by_its_time_has_one_stiffness_in_all_directions():
+    """Of a meeting point the mean of A_ii over its axes; of a hinge that of its two turns besides.
+
+    The rod of 1.5 kg turns about its middle, 0.5 m from the point: A = 1/m + r²/I across it.
+    """
+    scene = jc.Scene(dim=3)
+    moments = (0.15, 0.3, 0.4)
+    scene.add_body("rod", mass=1.5, inertia=moments, position=(0.5, 0.0, 0.0))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "rod", point=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0)))
+    system, state = scene.build()
+    rows = linearize(system, state.q, state.v, state.time)
+    rows = dataclasses.replace(rows, mass=system.mass(state.q))
+    k, d = jc.Penalty.from_time(0.1, 0.3).constants(rows)
+    lengths = np.mean([1 / 1.5, 1 / 1.5 + 0.25 / 0.4, 1 / 1.5 + 0.25 / 0.3])
+    turns = np.mean([1 / 0.3, 1 / 0.4])
+    mass = 1 / np.array([lengths] * 3 + [turns] * 2)
+    np.testing.assert_allclose(k, mass / 0.1**2, rtol=1e-12)
+    np.testing.assert_allclose(d, 2 * 0.3 * mass / 0.1, rtol=1e-12)

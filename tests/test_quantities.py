@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -108,6 +109,110 @@ def test_wrench_from_the_info_of_a_step():
     np.testing.assert_allclose(
         jc.wrench(system, state, info, "joint"), jc.wrench(system, state, solution, "joint")
     )
+
+
+def swing(omega=3.0):
+    """A physical pendulum in the plane, hanging from its pin, at an angular velocity."""
+    scene = jc.Scene(dim=2)
+    turn = {"velocity": (0.5 * omega, 0.0), "angular_velocity": omega}
+    scene.add_body("bob", mass=2.0, inertia=0.1, position=(0.0, -0.5), **turn)
+    scene.add(jc.Revolute("pin", jc.WORLD, "bob", point=(0.0, 0.0)))
+    return scene.build()
+
+
+def load(q, v):
+    """The force of the pin on the bob of `swing`, from Newton's law of its circle."""
+    radius, mass = 0.5, 2.0
+    theta, omega = q[2], v[2]
+    bend = -mass * 9.81 * radius * np.sin(theta) / (0.1 + mass * radius**2)
+    along, inward = (np.cos(theta), np.sin(theta)), (-np.sin(theta), np.cos(theta))
+    turned = radius * bend * np.array(along) + radius * omega**2 * np.array(inward)
+    return mass * (turned + np.array([0.0, 9.81]))
+
+
+EXACT = {
+    "explicit": jc.Method(jc.RK4(), jc.Unstabilized()),
+    "implicit": jc.Method(jc.GeneralizedAlpha()),
+}
+
+
+@pytest.mark.parametrize("kind", EXACT)
+def test_a_wrench_is_read_where_the_step_found_it(kind):
+    """At its start, or at its end where it is implicit; the other end is refused."""
+    system, state = swing()
+    state = jc.init(system, EXACT[kind], state.q, state.v)
+    new, info = jc.step(system, EXACT[kind], state, None, 1e-2)
+    right, wrong = (state, new) if kind == "explicit" else (new, state)
+    np.testing.assert_array_equal(info.state.q, right.q)
+    expected = load(np.asarray(right.q), np.asarray(right.v))
+    assert np.linalg.norm(expected - load(np.asarray(wrong.q), np.asarray(wrong.v))) > 1e-2
+    got = jc.wrench(system, right, info, "pin")
+    np.testing.assert_allclose(got[:2], expected, rtol=1e-8, atol=1e-8)
+    np.testing.assert_array_equal(got, jc.wrench(system, info.state, info, "pin"))
+    for read in (jc.wrench, jc.multipliers):
+        with pytest.raises(ValueError, match=r"λ belongs to info\.state.*info\.state, info, name"):
+            read(system, wrong, info, "pin")
+
+
+@pytest.mark.parametrize("kind", EXACT)
+def test_a_wrench_recorded_in_a_rollout_is_that_of_the_state_it_belongs_to(kind):
+    """`record` gets the state after a step: while tracing, the wrench is read at the right one."""
+    system, state = swing()
+    state = jc.init(system, EXACT[kind], state.q, state.v)
+
+    def record(s, info):
+        place = info.state
+        return jc.wrench(system, s, info, "pin"), place.q, place.v
+
+    _, (wrench, q, v) = jc.rollout(system, EXACT[kind], state, None, 1e-2, 20, record=record)
+    expected = [load(*x) for x in zip(np.asarray(q), np.asarray(v), strict=True)]
+    np.testing.assert_allclose(wrench[:, :2], expected, rtol=1e-7, atol=1e-7)
+
+
+def test_the_derivative_of_a_wrench_is_that_at_the_place_of_its_multipliers():
+    system, state = swing()
+
+    def pull(omega, traced):
+        v = jnp.stack([0.5 * omega, jnp.zeros_like(omega), omega])
+        start = dataclasses.replace(state, v=v)
+        new, info = jc.step(system, EXACT["explicit"], start, None, 1e-2)
+        return jc.wrench(system, new if traced else start, info, "pin")[1]
+
+    omegas = jnp.array([1.0, 3.0])  # ∂(m g + m r ω²)/∂ω = 2 m r ω
+    for derivative in (jax.grad, jax.jacfwd):
+        slope = jax.jit(jax.vmap(lambda x, d=derivative: d(lambda y: pull(y, True))(x)))(omegas)
+        np.testing.assert_allclose(slope, 2 * omegas, rtol=1e-9)
+
+
+def test_forward_dynamics_knows_its_state():
+    """It unpacks as three numbers, under jit, too, and another state is refused."""
+    system, state = swing()
+    new, _ = jc.step(system, IDEAL, state, None, 1e-2)
+    forward = jax.jit(lambda s: jc.forward_dynamics(system, s, None, IDEAL, 1e-2))
+    solution = forward(state)
+    assert isinstance(solution, jc.Solution)
+    acceleration, multipliers, status = solution
+    assert (acceleration.shape, multipliers.shape, status.shape) == ((3,), (2,), ())
+    jc.wrench(system, state, solution, "pin")
+    with pytest.raises(ValueError, match="λ belongs to info"):
+        jc.wrench(system, new, solution, "pin")
+    batch = jax.tree.map(lambda *x: jnp.stack(x), state, new)
+    solutions = jax.vmap(forward)(batch)
+    loads = jax.vmap(lambda i: jc.wrench(system, i.state, i, "pin"))(solutions)
+    np.testing.assert_allclose(loads[0], jc.wrench(system, state, solution, "pin"), atol=1e-12)
+    with pytest.raises(ValueError, match="jax.vmap"):
+        jc.wrench(system, state, solutions, "pin")
+
+
+@pytest.mark.parametrize("recovery", [None, jc.Recovery()])
+@pytest.mark.parametrize("kind", EXACT)
+def test_a_step_that_failed_has_the_wrench_zero(kind, recovery):
+    system, state = swing()
+    method = dataclasses.replace(EXACT[kind], recovery=recovery)
+    state = jc.init(system, method, state.q, state.v.at[0].set(jnp.nan))
+    _, info = jc.step(system, method, state, None, 1e-2)
+    np.testing.assert_array_equal(info.state.q, state.q)
+    np.testing.assert_array_equal(jc.wrench(system, state, info, "pin"), 0)
 
 
 def test_wrench_of_equal_joints_side_by_side():

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Violation, layout_of, linearize
 from jaxcon.core import checks
@@ -198,8 +199,11 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
 
     Args:
         system: a `BodySystem`.
-        state: where; the state from which the step of `info` started.
-        info: a `StepInfo` or `Solution`, for its multipliers.
+        state: the state to which λ belongs, `info.state`: the one from which the step of `info`
+            started, and the one at its end for `GeneralizedAlpha`. Another one is refused; while
+            tracing, where values are not known, `info.state` is taken in its place.
+        info: a `StepInfo`, or the `Solution` of `forward_dynamics`, for its multipliers. That of a
+            bare solver does not know its state and cannot be checked.
         name: of the constraint.
         body: on which body; the second one unless given. On the world it is the opposite of that
             on the other body.
@@ -208,15 +212,11 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
         (F, τ): (dim,) on a particle, (3,) in the plane, (6,) in space [N, N m].
 
     Raises:
-        ValueError: no such constraint, or it does not act on this body.
+        ValueError: no such constraint, it does not act on this body, or λ does not belong to this
+            state.
         TypeError: `info` has no multipliers.
     """
-    system = at(system, state, "jc.wrench(system, s, info, name)")
-    if not hasattr(info, "multipliers"):
-        raise TypeError(
-            f"wrench: info must be a StepInfo or the Solution of forward_dynamics, got"
-            f" {type(info).__name__}."
-        )
+    system, state = _at_multipliers(system, state, info, "wrench")
     snapshot = system.snapshot(state.q, state.v, state.time)
     group = next((g for g in system.constraints if name in g.names), None)
     if group is None:
@@ -248,16 +248,46 @@ def multipliers(system: Any, state: State, info: Any, name: str) -> Array:
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
-        state: where; the state from which the step of `info` started.
+        state: `info.state`, as of `wrench`.
         info: a `StepInfo` or `Solution`.
         name: of the constraint.
 
     Raises:
-        ValueError: no such constraint.
+        ValueError: no such constraint, or λ does not belong to this state.
+        TypeError: `info` has no multipliers.
     """
-    here = at(system, state, "jc.multipliers(system, s, info, name)")
+    here, state = _at_multipliers(system, state, info, "multipliers")
     layout = layout_of(here, state.q, state.v, state.time)
     return info.multipliers[layout.rows(name)]
+
+
+def _at_multipliers(system: Any, state: State, info: Any, caller: str) -> tuple[Any, State]:
+    """The system and the state to which the multipliers of `info` belong."""
+    here = at(system, state, f"jc.{caller}(system, s, info, name)")
+    if not hasattr(info, "multipliers"):
+        raise TypeError(
+            f"{caller}: info must be a StepInfo or the Solution of forward_dynamics, got"
+            f" {type(info).__name__}."
+        )
+    place = getattr(info, "state", None)
+    if place is None:
+        return here, state
+    if np.shape(place.q) != np.shape(state.q):
+        raise ValueError(
+            f"{caller}: info.state.q has shape {np.shape(place.q)}, but state.q"
+            f" {np.shape(state.q)}; for a batch use jax.vmap:"
+            f" jax.vmap(lambda i: jc.{caller}(system, i.state, i, name))(info)."
+        )
+    given, own = ((s.q, s.v, s.time) for s in (state, place))
+    if checks.is_concrete((given, own)) and not all(
+        np.array_equal(x, y, equal_nan=True) for x, y in zip(given, own, strict=True)
+    ):
+        raise ValueError(
+            f"{caller}: λ belongs to info.state, at t = {float(place.time):.6g} s, and state is"
+            f" another one, at t = {float(state.time):.6g} s; a step tells λ at its start, or with"
+            f" GeneralizedAlpha at its end. Call jc.{caller}(system, info.state, info, name)."
+        )
+    return at(system, place, f"jc.{caller}(system, s, info, name)"), place
 
 
 def _row(system: Any, state: State, joint: str, name: str | None, caller: str) -> Any:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.armature import Armatures
-from jaxcon.constraints.base import RowSet
+from jaxcon.constraints.base import Joints, RowSet
 from jaxcon.constraints.custom import Custom
 from jaxcon.constraints.drive import Drives
 from jaxcon.constraints.redundancy import has_loops
@@ -34,12 +34,16 @@ class RowLayout:
         inertial: names of those that hold nothing, but resist acceleration: rotors.
         loops: whether rows may depend on each other, as those of closed loops do, and several of a
             user's function.
+        vectors: rows of joints that are components of one vector, along axes chosen by a frame or
+            by assembly: (first, elements, rows of each element), such as the three of a meeting
+            point.
     """
 
     entries: tuple[tuple[str, int, int, int], ...]
     free: tuple[int, ...] = ()
     inertial: tuple[str, ...] = ()
     loops: bool = False
+    vectors: tuple[tuple[int, int, tuple[int, ...]], ...] = ()
 
     @property
     def velocity_level(self) -> tuple[str, ...]:
@@ -79,6 +83,18 @@ class RowLayout:
             raise ValueError(f"constraint '{name}' is unknown; known are {list(self.names)}.")
         first, count, stride = self._places[name]
         return first + stride * np.arange(count)
+
+    def isotropic(self, x: Array) -> Array:
+        """x by row, (n_c,), in which the components of one vector share their mean.
+
+        The mean of a diagonal, as of J M⁻¹ Jᵀ, over the components of a vector does not depend on
+        the axes that were chosen for them; its entries do.
+        """
+        for first, elements, rows in self.vectors:
+            places = first + elements * np.array(rows)[:, None] + np.arange(elements)
+            mean = jnp.mean(x[places], axis=0)
+            x = x.at[places].set(jnp.broadcast_to(mean, (len(rows), *mean.shape)))
+        return x
 
     @cached_property
     def _places(self) -> dict[str, list[int]]:
@@ -204,9 +220,12 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     blocks: list[Block] = []
     entries: list[tuple[str, int, int, int]] = []
     free: list[int] = []
+    vectors: list[tuple[int, int, tuple[int, ...]]] = []
     start = 0
     for group, rows in zip(system.constraints, sets, strict=True):
         k = len(group.names)
+        if isinstance(group, Joints):
+            vectors += [(start, k, own) for own in components(rows, snapshot.system.layout.dim)]
         blocks += [Block(value, start, columns) for columns, value in rows.jacobian]
         if rows.value:  # a joint may be there to be read and driven only
             entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
@@ -229,8 +248,24 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     driven = [(along.group, along.joints, along.name) for along in drives]
     loops |= len(set(driven)) < len(driven)
     loops |= any(isinstance(group, Custom) and len(rows.value) > 1 for group, rows in pairs)
-    layout = RowLayout(tuple(entries), tuple(free), inertial, loops)
+    layout = RowLayout(tuple(entries), tuple(free), inertial, loops, tuple(vectors))
     return Rows(residual, rate, jacobian, bias, layout, compliance)
+
+
+def components(rows: RowSet, dim: int) -> list[tuple[int, ...]]:
+    """Rows of a joint that are components of one vector: its lengths, and its turns.
+
+    A turn pulls at no point, and the zeros of its pulls are known while tracing.
+    """
+
+    def turns(r: int) -> bool:
+        linear = [x for _, pulls in rows.jacobian for x in list(pulls[r])[:dim]]
+        return all(isinstance(x, int | float) and x == 0 for x in linear)
+
+    kinds: dict[tuple[bool, bool], list[int]] = {}
+    for r, holonomic in enumerate(rows.holonomic):
+        kinds.setdefault((turns(r), holonomic), []).append(r)
+    return [tuple(own) for own in kinds.values() if len(own) > 1]
 
 
 def layout_of(system: Any, q: Array, v: Array, t: Any) -> RowLayout:

@@ -32,6 +32,8 @@ class StepInfo:
         status: what became of this step, or what stopped the world before, ().
         reactions: what bounded rows did during it; None in a scene without.
         impacts: those at which it was split; None without `Events`.
+        state: the state to which a and λ belong, without the memory of the method. That is the
+            state before the step, and for `GeneralizedAlpha` the point that it reached.
     """
 
     acceleration: Array
@@ -40,12 +42,7 @@ class StepInfo:
     status: Array
     reactions: Any = None
     impacts: Any = None
-
-
-def nothing_seen(info: StepInfo) -> StepInfo:
-    """What a failed world has seen: zeros, and no impacts."""
-    none = jax.tree.map(jnp.zeros_like, info)
-    return none if info.impacts is None else dataclasses.replace(none, impacts=info.impacts.none())
+    state: Any = None
 
 
 def attempt(
@@ -71,7 +68,21 @@ def attempt(
     if method.recovery is not None:
         code = status.first(code, method.recovery.judge(system, new))
     seen = (solution.acceleration, solution.multipliers, rows.violation)
-    return (new, StepInfo(*seen, code, rows.reactions)), code
+    place = dataclasses.replace(bare(state), q=q, v=v, time=time) if advanced.ends else None
+    return (new, StepInfo(*seen, code, rows.reactions, state=place)), code
+
+
+def nothing_seen(info: StepInfo, state: State) -> StepInfo:
+    """What a failed world has seen in a step from a state: zeros, and no impacts."""
+    blank = jax.tree.map(jnp.zeros_like, info)
+    if info.impacts is not None:
+        blank = dataclasses.replace(blank, impacts=info.impacts.none())
+    return blank if info.state is None else dataclasses.replace(blank, state=bare(state))
+
+
+def bare(state: State) -> State:
+    """The state without the memory of a method."""
+    return dataclasses.replace(state, memory=())
 
 
 def _has_multipliers(memory: MethodMemory) -> bool:

@@ -48,17 +48,19 @@ class GeneralizedAlpha:
     the λ of the equations is of first order only, and `info` has a and λ as they are at the end of
     the step, by `solver` from q and v there.
 
-    Where rows may depend on each other, as those of closed loops do, each gives way by its λ times
-    ε W κβh², W the diagonal of J M⁻¹ Jᵀ, which is below rounding: λ is then unique. The derivative
-    of a step is that of its solution, exact to every order. Newton's matrix is dense: for up to
-    some hundreds of rows. A state that is changed by hand starts anew, by `init`.
+    Where rows may depend on each other, as those of closed loops do, Newton's matrix has ε W added,
+    W the diagonal of J M⁻¹ Jᵀ, and proximal rounds take out again what that does: φ is zero to
+    rounding, and λ the least of those that fit. The derivative of a step is that of its solution,
+    exact to every order. Newton's matrix is dense: for up to some hundreds of rows. A state that is
+    changed by hand starts anew, by `init`.
 
     Attributes:
         rho: ρ∞, from 1 (no dissipation) to 0 (the highest frequencies are gone after a step).
         tolerance: by how much the last correction may move q, in proportion to 1 + max |q|, or the
             world is NOT_CONVERGED; if None, ε^⅔, ε the spacing of floating numbers.
-        tikhonov: ε; if None, the third root of the spacing of floating numbers where the scene has
-            loops, and 0 elsewhere.
+        tikhonov: ε, on which the solution does not depend, but how fast it is found and how far
+            rounding is kept out of λ; if None, the square root of the spacing of floating numbers
+            where the scene has loops, and 0 elsewhere.
         iterations: of Newton's method, each with a new matrix.
         projects: whether φ̇ is brought to zero.
 
@@ -132,14 +134,15 @@ class GeneralizedAlpha:
         solution, ends = dynamics(q, v, t)  # compiled only where it is read
         if equations.soft is not None:
             code = status.first(code, self._contradicted(equations, solution, ends, allowed))
-        return Advanced((q, v, t), solution._replace(status=code), rows, kept)
+        return Advanced((q, v, t), solution._replace(status=code), rows, kept, ends=True)
 
     def _contradicted(
         self, equations: Equations, solution: Solution, ends: Rows, allowed: Array
     ) -> Array:
-        """CONFLICT where φ gave way by more than the λ of least norm accounts for.
+        """CONFLICT where φ is left beyond what a regularization by ε W would do under the least λ.
 
-        φ = −κβh² ε W λ, and the λ of rows that contradict each other is that large.
+        Proximal rounds take out of that what independent rows lack, most slowly near a singular
+        position, and nothing of what rows that contradict each other do.
         """
         gives = equations.scheme.reach * equations.soft * jnp.abs(solution.multipliers)
         most = allowed + 10 * jnp.max(gives, axis=0)
@@ -147,14 +150,16 @@ class GeneralizedAlpha:
         return jnp.where(bad, Status.CONFLICT, Status.OK).astype(jnp.int32)
 
     def _softness(self, dynamics: Dynamics, state: State, rows: Rows) -> Array | None:
-        """ε W, (n_c,); None where there is none."""
+        """ε W, (n_c,), zero where a row has compliance; None where there is none."""
         if self.tikhonov is None and not rows.layout.loops:
             return None
         dtype = rows.bias.dtype
         eps = float(jnp.finfo(dtype).eps)
-        share = eps ** (1 / 3) if self.tikhonov is None else jnp.asarray(self.tikhonov, dtype)[None]
+        # what a proximal round leaves, ε, and the rounding that it lets into λ, eps/ε, are alike
+        share = eps**0.5 if self.tikhonov is None else jnp.asarray(self.tikhonov, dtype)[None]
         problem = saddle(dynamics.system, state.q, rows, state.v, rows.bias)
-        return share * scaled(problem, 1e-6)
+        soft = share * scaled(problem, 1e-6)
+        return soft if rows.compliance is None else jnp.where(rows.compliance > 0, 0, soft)
 
     def _tolerance(self, q: Array) -> Any:
         if self.tolerance is None:

@@ -15,10 +15,12 @@ References:
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core.pytree import pytree
@@ -91,6 +93,7 @@ class Equations:
         scheme: the coefficients.
         inertia: the diagonal of M at the start, (n_v,).
         weights: 1/κβh² and 1/κγh.
+        soft: ε W, (n_c,), by which Newton's matrix is regularized; None where it is not.
     """
 
     def __init__(
@@ -132,35 +135,56 @@ class Equations:
         holonomic = rows.layout.holonomic.reshape(-1, *(1,) * (multipliers.ndim - 1))
         positions, velocities = self.weights
         hard = jnp.where(holonomic, rows.residual * positions, rows.rate * velocities)
-        hard = hard if self.soft is None else hard + self.soft * multipliers
         if rows.compliance is None:
             return hard
         soft = rows.jacobian.apply(acceleration) + rows.compliance * multipliers + rows.bias
         return jnp.where(rows.compliance > 0, soft, hard)
 
 
+CLOSING = 2
+"""Newton's iterations that take out what regularization did; all but the first, at most."""
+
+ROUNDS = 4
+"""Rounds of refinement against it in each."""
+
+
 def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
     """x with r(x) = 0 by Newton's method; the derivative is that of the root.
 
-    Returns:
-        x (n_v + n_c,), by how much the last correction moved q, (), and whether a matrix was
-        singular, ().
-    """
-    inertia = jax.lax.stop_gradient(equations.inertia)
+    Where rows may depend on each other K is singular, and K + R is factored, R = ε W on the rows of
+    constraints. First r(x) + R λ = 0 is solved, whose λ is unique: of all that fit it is the least,
+    whatever the guess was, and φ gives way by κβh² R λ. From there the last iterations go on to
+    r(x) = 0 by proximal rounds, see `lu.factor`: of what a direction with the eigenvalue σ of the
+    scaled J M⁻¹ Jᵀ lacks, each round leaves the share ε/(σ + ε), and where σ = 0 it adds nothing
+    but rounding. Derivatives are those of r(x) = 0, by the same rounds.
 
-    def solve(linear: Any, right: Array) -> tuple[Array, Array]:
+    Returns:
+        x (n_v + n_c,), by how much the last correction moved q, the last iterations left out, (),
+        and whether a matrix was singular, ().
+    """
+    inertia, soft = jax.lax.stop_gradient((equations.inertia, equations.soft))
+
+    def solve(linear: Any, right: Array, yields: Any = None) -> tuple[Array, Array]:
         columns = matrix(linear, right)
-        return per_world(_solve, right.ndim - 1)(columns, right, inertia)
+        given = (columns, right, inertia) if soft is None else (columns, right, inertia, soft)
+        one = functools.partial(_solve, yields=yields)
+        return per_world(one, right.ndim - 1)(*given)
 
     def newton(residual: Any, guess: Array) -> tuple[Array, tuple[Array, Array]]:
-        def improve(known: Any, _: None) -> tuple[Any, None]:
-            x, _, singular = known
+        def improve(known: Any, yields: Any) -> tuple[Any, None]:
+            x, last, singular = known
             value, linear = jax.linearize(residual, x)
-            correction, dependent = solve(linear, value)
-            return (x - correction, correction, singular | dependent), None
+            if soft is not None:
+                value = value.at[len(inertia) :].add(yields * soft * equations.split(x)[1])
+            correction, dependent = solve(linear, value, yields)
+            # near a singular position the last ones go on to move q, by what regularization did
+            last = correction if soft is None else jnp.where(yields > 0, correction, last)
+            return (x - correction, last, singular | dependent), None
 
         start = guess, jnp.zeros_like(guess), jnp.zeros(guess.shape[1:], bool)
-        (x, last, singular), _ = jax.lax.scan(improve, start, length=iterations)
+        yields = np.arange(iterations) < max(iterations - CLOSING, 1)
+        flags = None if soft is None else jnp.asarray(yields, guess.dtype)
+        (x, last, singular), _ = jax.lax.scan(improve, start, flags, length=iterations)
         moved = jnp.abs(equations.split(last)[0]) * equations.scheme.reach
         # the derivative of a root passes on real numbers only
         return x, (jnp.max(moved, axis=0, initial=0), singular.astype(x.dtype))
@@ -178,8 +202,10 @@ def matrix(linear: Any, like: Array) -> Array:
     return jax.vmap(lambda e: linear(jnp.broadcast_to(e, like.shape)))(directions)
 
 
-def _solve(columns: Array, right: Array, inertia: Array) -> tuple[Array, Array]:
-    """K⁻¹ r, and whether K is singular, of one world.
+def _solve(
+    columns: Array, right: Array, inertia: Array, soft: Array | None = None, yields: Any = None
+) -> tuple[Array, Array]:
+    """K⁻¹ r, and whether K is singular, of one world; with R as a part of K where `yields` is 1.
 
     Rows of velocities are scaled by 1/√K_ii, rows of constraints by their length so measured.
     """
@@ -187,5 +213,11 @@ def _solve(columns: Array, right: Array, inertia: Array) -> tuple[Array, Array]:
     own = jnp.maximum(jnp.abs(jnp.diagonal(columns)[:n]), inertia)
     weight = (1 / own) @ columns[:n, n:] ** 2 + jnp.abs(jnp.diagonal(columns)[n:])
     size = jnp.concatenate([own, jnp.where(weight > 0, weight, 1)])
-    known = lu.factor(columns.T, 1 / jnp.sqrt(size))
+    scale = 1 / jnp.sqrt(size)
+    k, added = columns.T, None
+    if soft is not None:
+        added = jnp.append(jnp.zeros_like(inertia), soft)
+        if yields is not None:
+            k, added = k + jnp.diag(yields * added), (1 - yields) * added
+    known = lu.factor(k, scale, added, 1 if soft is None else ROUNDS)
     return known.solve(right), known.singular

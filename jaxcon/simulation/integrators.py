@@ -32,12 +32,14 @@ class Advanced(NamedTuple):
         solution: a and λ.
         rows: the constraints.
         memory: of the integrator.
+        ends: whether a and λ belong to the point reached, and not to the start of the step.
     """
 
     point: tuple[Array, Array, Any]
     solution: Solution
     rows: Rows
     memory: PyTree = ()
+    ends: bool = False
 
 
 Pair = tuple[Any, Any]

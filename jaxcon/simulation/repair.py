@@ -150,7 +150,7 @@ class Recovery:
         code = first(code, jnp.where(sound, Status.OK, Status.NON_FINITE).astype(jnp.int32))
         new = keep(~again, new, back)
         memory = new.memory._replace(recovery=self._remember(known, bad))
-        info = keep(~again, info, nothing_seen(info))
+        info = keep(~again, info, nothing_seen(info, state))
         return (dataclasses.replace(new, memory=memory), info), code
 
     def _finite(self, state: State) -> Array:

@@ -14,7 +14,7 @@ from jaxcon.core import checks, native, status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import batch_of, keep, per_world, spread
 from jaxcon.model.state import State, at, recall
-from jaxcon.simulation.attempt import StepInfo, attempt, dynamics_at, nothing_seen
+from jaxcon.simulation.attempt import StepInfo, attempt, bare, dynamics_at, nothing_seen
 from jaxcon.simulation.initialize import check_dtype
 from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.recovery import contain
@@ -55,7 +55,10 @@ def step_quietly(
     control = check_step(system, method, state, control)
     h = checks.number("step", "dt", dt, state.q.dtype)
     checks.positive("step", "dt", dt, strictly=False)
-    return native.call(contained_step, system, method, state, control, h)
+    new, info = native.call(contained_step, system, method, state, control, h)
+    # put in outside of the step, which so computes what it did; a rollout that does not record it
+    # does not carry it either
+    return new, info if info.state is not None else dataclasses.replace(info, state=bare(state))
 
 
 def undo(system: Any, method: Method, state: State, control: PyTree, dt: Any) -> State:
@@ -107,14 +110,38 @@ def _settle(state: State, attempt: Any) -> Any:
     (new, info), own = attempt
     code = status.first(state.status, own)
     healthy = ~status.failed(code)
-    info = keep(healthy, info, nothing_seen(info))
+    info = keep(healthy, info, nothing_seen(info, state))
     new = dataclasses.replace(keep(healthy, new, state), status=code)
     return (new, dataclasses.replace(info, status=jnp.where(healthy, own, code))), code
 
 
+@jax.tree_util.register_pytree_node_class
+class SolutionAt(Solution):
+    """A `Solution` with the `state` to which it belongs; unpacks as `a, λ, status`."""
+
+    state: Any = None
+
+    def __new__(
+        cls, acceleration: Any, multipliers: Any, status: Any, state: Any = None
+    ) -> SolutionAt:
+        """The solution at a state, without the memory of a method."""
+        solution = super().__new__(cls, acceleration, multipliers, status)
+        solution.state = state
+        return solution
+
+    def tree_flatten(self) -> Any:
+        """Children, the state among them."""
+        return (*self, self.state), None
+
+    @classmethod
+    def tree_unflatten(cls, _: Any, children: Any) -> SolutionAt:
+        """Of its children."""
+        return cls(*children)
+
+
 def forward_dynamics(
     system: Any, state: State, control: PyTree, method: Method, dt: Any
-) -> Solution:
+) -> SolutionAt:
     """a and λ at a state, under the method's feedback of φ and φ̇ as they are there.
 
     Bounded rows are solved as over a step of h: a then holds their mean over it, of an impact the
@@ -131,14 +158,16 @@ def forward_dynamics(
         dt: h, () [s], on which default gains depend.
 
     Returns:
-        acceleration (n_v,) [m/s², rad/s²], multipliers (n_c,) [N, N·m], status ().
+        acceleration (n_v,) [m/s², rad/s²], multipliers (n_c,) [N, N·m], status (): a `Solution`
+        that unpacks so, and whose `state` is the one given.
 
     Raises:
         ValueError: shapes or dtypes disagree (at trace time).
     """
     control = check_step(system, method, state, control)
     h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
-    return native.call(_dynamics, system, method, state, control, h)
+    found = native.call(_dynamics, system, method, state, control, h)
+    return SolutionAt(*found, state=bare(state))
 
 
 def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Solution:

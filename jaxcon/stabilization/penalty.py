@@ -43,7 +43,9 @@ class Penalty(Unstabilized):
         stiffness: k [N/m], [N m/rad]: a number for all constraints, an array by row, or a mapping
             as of `Baumgarte`, and then only the constraints that it names are soft.
         damping: d [N s/m], [N m s/rad], in the same way; 0 where a mapping leaves one out.
-        time: T [s] instead of a stiffness: k = m/T² with m = 1/A_ii at each instant.
+        time: T [s] instead of a stiffness: k = m/T² at each instant. 1/m is A_ii, and for the
+            components of one vector, such as the three of a meeting point, the mean of theirs, so
+            that no direction of the world is preferred. The rows of a user's function stay alone.
         damping_ratio: ζ of d = 2 ζ m/T.
         others: stabiliser of the constraints that stay hard.
         implicit: whether λ is that after the step.
@@ -60,7 +62,10 @@ class Penalty(Unstabilized):
     def from_time(
         cls, time: Any, damping_ratio: Any = 1.0, others: Any = None, implicit: bool = True
     ) -> Penalty:
-        """A spring that along its row alone has frequency 1/T and damping ratio ζ.
+        """A spring that has frequency 1/T and damping ratio ζ along its row alone.
+
+        Of a vector, such as the three rows of a meeting point, that holds on the mean over its
+        directions: all have one stiffness, whichever way the world frame is turned.
 
         Args:
             time: T [s], a number, array by row or mapping by constraint.
@@ -143,7 +148,7 @@ class Penalty(Unstabilized):
             k, d = by_row(main, 0.0, rows, "Penalty"), by_row(second, 0.0, rows, "Penalty")
         else:
             time = by_row(main, 1.0, rows, "Penalty")
-            m = 1 / felt(rows)
+            m = 1 / rows.layout.isotropic(felt(rows))
             k = m / (time * time)
             d = 2 * by_row(second, 1.0, rows, "Penalty") * m / time
         return jnp.where(column(rows.layout.holonomic, rows), k, 0), d
