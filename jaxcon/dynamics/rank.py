@@ -77,7 +77,7 @@ class UnitRows:
 @jax.jit
 def linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
     """The rows with J and M as arrays."""
-    rows = linearize(system, state.q, state.v, state.time)
+    rows = linearize(system, state.q, state.v, state.instant)
     return rows, rows.jacobian.dense(), system.mass(state.q).dense()
 
 

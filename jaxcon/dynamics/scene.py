@@ -167,9 +167,9 @@ class Scene:
         state = dataclasses.replace(self._state(layout, bodies), turns=turns)
         for group in (*constraints, *system.bounds):
             if isinstance(group, Custom):
-                check_function(group, system.snapshot(state.q, state.v, state.time))
+                check_function(group, system.snapshot(state.q, state.v, state.instant))
             if isinstance(group, Curves):
-                group.check(system.snapshot(state.q, state.v, state.time))
+                group.check(system.snapshot(state.q, state.v, state.instant))
         return system, state
 
     def _state(self, layout: Any, bodies: Any) -> State:

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import RowLayout, layout_of, linearize
 from jaxcon.core import checks
+from jaxcon.core.doubled import Doubled, rounded
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Motion
@@ -138,11 +139,12 @@ class Vakonomic:
         system, every = self.system, jnp.zeros(self.rows.size, q.dtype)
         every = every.at[self.free].set(μ)
 
-        def momentum(q: Array, t: Any) -> Array:
-            return linearize(system, q, v, t).jacobian.transpose(every)
+        def momentum(q: Array, later: Any) -> Array:
+            return linearize(system, q, v, Doubled.of(t) + later).jacobian.transpose(every)
 
-        along = (system.kinematics(q, v), jnp.ones_like(t))
-        p, ṗ = jax.jvp(momentum, (q, t), along)
+        now = jnp.zeros_like(rounded(t))
+        along = (system.kinematics(q, v), jnp.ones_like(now))
+        p, ṗ = jax.jvp(momentum, (q, now), along)
         slope = jax.grad(lambda q: linearize(system, q, v, t).rate @ every)(q)
         (pull,) = jax.vjp(lambda w: system.kinematics(q, w), v)[1](slope)
         return pull - ṗ + system.coadjoint(q, v, p)
@@ -204,7 +206,7 @@ def vakonomic(
             f"vakonomic: there is no variational form of the bounded rows of {names} here; build"
             " the scene without these elements."
         )
-    layout = layout_of(at(system, state), state.q, state.v, state.time)
+    layout = layout_of(at(system, state), state.q, state.v, state.instant)
     result = Vakonomic(system, layout)
     μ = jnp.zeros(len(result.free), state.v.dtype)
     for name, given in (multipliers or {}).items():

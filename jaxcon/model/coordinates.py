@@ -9,6 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
+from jaxcon.core.doubled import Doubled
 from jaxcon.core.lanes import take
 from jaxcon.core.typing import Array
 
@@ -42,11 +43,13 @@ class JointCoordinate:
         before = take(snapshot.system.turns, self.counters)
         return row._replace(value=before + numerics.wrap(row.value - before))
 
-    def difference(self, snapshot: Any, row: Any, reference: Any) -> Any:
+    def difference(self, snapshot: Any, row: Any, reference: Doubled) -> Any:
         """value − reference, in [−π, π] where a joint's angle is seen modulo whole turns."""
-        error = row.value - reference
         joint = snapshot.system.constraints[self.group].joint
         wraps = turns_over(joint, self.name, snapshot.system.layout.dim)
+        if wraps and jnp.finfo(reference.high.dtype).bits < 64:
+            reference = reference.reduced()
+        error = (row.value - reference.high) - reference.low
         return numerics.wrap(error) if wraps else error
 
 

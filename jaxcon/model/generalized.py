@@ -8,6 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxcon.core.doubled import rounded
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.layout import Place
@@ -81,7 +82,7 @@ class GeneralizedCoordinates:
 
     def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f(q, v, t, u, θ), (n_v,)."""
-        f = self.force_function(q, v, t, control, self.params)
+        f = self.force_function(q, v, rounded(t), control, self.params)
         if f.shape != q.shape:
             raise ValueError(f"GeneralizedSystem: force must return {q.shape}, got {f.shape}.")
         return f
@@ -134,7 +135,7 @@ class GeneralizedCoordinates:
         """½ vᵀMv, and the user's potential(q, t, θ) where there is one [J]."""
         potential = jnp.zeros((), q.dtype)
         if self.potential is not None:
-            potential = self.potential(q, t, self.params)
+            potential = self.potential(q, rounded(t), self.params)
         return Energy(v @ self.mass(q).apply(v) / 2, potential)
 
     def with_params(self, params: PyTree) -> GeneralizedCoordinates:

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.doubled import rounded
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
@@ -41,8 +42,13 @@ class MassProperties:
 class Snapshot:
     """A system at one instant: the frames of its bodies, computed once and shared."""
 
-    def __init__(self, system: Any, q: Array, v: Array, t: Any) -> None:
-        self.system, self.q, self.v, self.t = system, q, v, t
+    def __init__(self, system: Any, q: Array, v: Array, instant: Any) -> None:
+        self.system, self.q, self.v, self.instant = system, q, v, instant
+
+    @property
+    def t(self) -> Any:
+        """The time, rounded, for users' functions; `instant` may hold its remainder."""
+        return rounded(self.instant)
 
     @cached_property
     def frames(self) -> tuple[Any, ...]:
@@ -56,7 +62,7 @@ class Snapshot:
 
     def map(self, function: Any) -> Snapshot:
         """The same with every number replaced by a function of it."""
-        return Snapshot(*jax.tree.map(function, (self.system, self.q, self.v, self.t)))
+        return Snapshot(*jax.tree.map(function, (self.system, self.q, self.v, self.instant)))
 
     def frame(self, place: Place) -> Any:
         """The motion of some bodies of one group, or of the world."""

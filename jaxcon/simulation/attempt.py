@@ -14,7 +14,8 @@ from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.parts import Part
-from jaxcon.model.state import State, recall
+from jaxcon.model.state import State, at_instant, recall
+from jaxcon.simulation.integrators import reached
 from jaxcon.simulation.method import Memory, Method
 from jaxcon.solvers.saddle import Solution
 
@@ -49,11 +50,11 @@ def attempt(
     system, memory = dynamics.system, Memory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
-    new = dataclasses.replace(state, q=q, v=v, time=time)
+    new = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, length))
     stabilizer = method.feedback(dt)
     own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
     new, corrected = stabilizer.correct(system, method.solver, state, new, own, length)
-    turns = system.count(state.q, state.v, state.time)
+    turns = system.count(state.q, state.v, state.instant)
     react = rows.reactions.multipliers if _keeps_reactions(system, method) else ()
     kept = Memory(advanced.memory, own, memory.recovery, react) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
