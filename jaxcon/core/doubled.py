@@ -122,7 +122,7 @@ def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
 
 
 def _carrying(large: Array, small: Array, like: Array) -> Doubled:
-    """The sum of a number and a small one, with the derivative of one computed as usual (Dekker)."""
+    """The sum of a number and a small one (Dekker), with the derivative of a plain sum."""
     high = large + small
     return Doubled(_carry(high, like), small - (high - large))
 

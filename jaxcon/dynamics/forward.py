@@ -111,7 +111,7 @@ class Dynamics:
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
         known = self._judged(impulse, known, solution.acceleration)
-        own = bounds.jacobian.transpose(known.multipliers)
+        own = impulse.rows.jacobian.transpose(known.multipliers)
         return solution, dataclasses.replace(rows, reactions=known), own
 
     def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:

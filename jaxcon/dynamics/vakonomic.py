@@ -105,12 +105,16 @@ class Vakonomic:
         return self.system.counted
 
     def remember(self, turns: Any) -> Vakonomic:
-        """With other angles of a step ago."""
+        """With other angles near which those that are counted lie."""
         return dataclasses.replace(self, system=self.system.remember(turns))
 
     def count(self, q: Array, v: Array, t: Any) -> Any:
         """The angles that the system counts."""
         return self.system.count(q, self._split(v)[0], t)
+
+    def expect(self, here: Any, end: Array, dt: Array, within: bool) -> Any:
+        """What a state remembers of turns after a step, and what of them cannot be told."""
+        return self.system.expect(here, self._split(end)[0], dt, within)
 
     def sizes(self, n_q: int) -> tuple[int, int]:
         """How many positions and velocities a state has, μ among them."""

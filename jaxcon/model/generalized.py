@@ -70,6 +70,10 @@ class GeneralizedCoordinates:
         """Nothing."""
         return ()
 
+    def expect(self, here: Snapshot, end: Array, dt: Array, within: bool) -> tuple[PyTree, Array]:
+        """Nothing, and nothing is missed."""
+        return (), jnp.zeros_like(dt)
+
     def mass(self, q: Array) -> Mass:
         """M(q, θ), (n_v, n_v), or its diagonal (n_v,) where the user's function gives that."""
         m = self.mass_function(q, self.params)

@@ -31,8 +31,8 @@ class State:
         time: () [s], rounded.
         status: `Status` code of this world, (); the first failure sticks.
         memory: of the method (integrals, histories); `jc.init` makes it.
-        turns: the angles a step ago of joints whose whole turns are counted, (n,) [rad]; empty
-            where there are none.
+        turns: the angles near which those of joints whose whole turns are counted lie, within half
+            a turn, (n,) [rad]; empty where there are none.
         time_remainder: what `time` lacks of the sum of all steps, () [s]; zero unless given.
     """
 
@@ -114,7 +114,7 @@ def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:
 
 
 def recall(system: Any, turns: PyTree) -> Any:
-    """The system with the angles a step ago of the joints whose turns it counts.
+    """The system with the angles near which those of joints lie whose turns it counts.
 
     Raises:
         ValueError: there are not as many as it counts.

@@ -17,7 +17,7 @@ from jaxcon.core.typing import Array, Lane, PyTree
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.model import params
 from jaxcon.model.bodies import rest
-from jaxcon.model.coordinates import JointCoordinate, count
+from jaxcon.model.coordinates import JointCoordinate, count, expected
 from jaxcon.model.frames import WorldFrame
 from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
@@ -83,7 +83,7 @@ class BodySystem:
         offsets: by name, the body's own frame as given by the user, in its principal frame; only
             for bodies where they differ.
         fixed: by name, the pose of each frame that is fixed to the world.
-        turns: the angles a step ago of joints whose whole turns are counted, (n,) [rad].
+        turns: the angles near which those of joints whose whole turns are counted lie, (n,) [rad].
         layout: names and indices.
         counted: which these are.
         bounds: groups of equal elements whose multipliers are bounded.
@@ -110,12 +110,26 @@ class BodySystem:
         return Snapshot(self, q, v, t)
 
     def remember(self, turns: PyTree) -> BodySystem:
-        """With other angles of a step ago."""
+        """With other angles near which those that are counted lie."""
         return dataclasses.replace(self, turns=turns)
 
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
-        """The angles of the joints whose turns are counted, over turns: what a state remembers."""
+        """The angles of the joints whose turns are counted, over turns, (n,) [rad]."""
         return count(self.counted, self.snapshot(q, v, t)) if self.counted else self.turns
+
+    def expect(self, here: Snapshot, end: Array, dt: Array, within: bool) -> tuple[PyTree, Array]:
+        """What a state remembers of turns after a step, and what of them cannot be told, ().
+
+        Args:
+            here: the start of the step.
+            end: v after it, (n_v,).
+            dt: its length, () [s].
+            within: whether angles are also read between its ends.
+        """
+        if not self.counted:
+            return self.turns, jnp.zeros_like(dt)
+        turns, missed = expected(self.counted, here, end, dt, within)
+        return turns, jnp.max(missed, axis=0)
 
     def mass(self, q: Array) -> Diagonal:
         """M: constant and diagonal, since frames lie at centres of mass along principal axes."""

@@ -54,15 +54,24 @@ def attempt(
     stabilizer = method.feedback(dt)
     own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
     new, corrected = stabilizer.correct(system, method.solver, state, new, own, length)
-    turns = system.count(state.q, state.v, state.instant)
+    here = system.snapshot(state.q, state.v, state.instant)
+    turns, missed = system.expect(here, new.v, length, _reads_within(method))
     react = rows.reactions.multipliers if _keeps_reactions(system, method) else ()
     kept = Memory(advanced.memory, own, memory.recovery, react) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
     code = status.first(judge(new, solution), corrected)
+    if system.counted:
+        lost = jnp.where(missed < jnp.pi, Status.OK, Status.LOST_TURNS).astype(jnp.int32)
+        code = status.first(code, lost)
     if method.recovery is not None:
         code = status.first(code, method.recovery.judge(system, new))
     seen = (solution.acceleration, solution.multipliers, rows.violation)
     return (new, StepInfo(*seen, code, rows.reactions)), code
+
+
+def _reads_within(method: Method) -> bool:
+    """Whether the integrator reads angles between the ends of a step, as all but one do."""
+    return getattr(method.integrator, "reads_within", True)
 
 
 def _keeps_reactions(system: Any, method: Method) -> bool:

@@ -107,6 +107,8 @@ class SemiImplicitEuler(Explicit):
     """
 
     gyroscopic: str = static(default="explicit")
+    reads_within = False
+    """Whether angles are read between the ends of a step."""
 
     @property
     def bounded(self) -> bool:
