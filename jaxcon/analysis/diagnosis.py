@@ -156,7 +156,7 @@ def _run(policy: Any, steps: int, every: int, *args: Any) -> tuple[State, Array]
     system, method, state, controls, dt = args
 
     def record(state: State, _: Any = None) -> Array:
-        return linearize(at(system, state), state.q, state.v, state.time).residual
+        return linearize(at(system, state), state.q, state.v, state.instant).residual
 
     controls = policy or controls
     end, path = rollout(system, method, state, controls, dt, steps, record=record, every=every)
@@ -171,7 +171,7 @@ def _rounding(system: Any, state: State) -> float:
     """ε max_i Σ_j |∂φ_i/∂q_j| |q_j|: what rounding each q_j does to φ."""
 
     def residual(q: Array) -> Array:
-        return linearize(at(system, state), q, state.v, state.time).residual
+        return linearize(at(system, state), q, state.v, state.instant).residual
 
     slope = np.asarray(jax.jit(jax.jacfwd(residual))(state.q), np.float64)
     return _largest(np.abs(slope) @ np.abs(state.q)) * float(jnp.finfo(state.q.dtype).eps)

@@ -19,8 +19,9 @@ from jaxcon.core import checks
 from jaxcon.core.status import MEANING, Status, failed
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
-from jaxcon.model.state import MethodMemory, State
+from jaxcon.model.state import MethodMemory, State, at_instant
 from jaxcon.simulation.attempt import dynamics_at
+from jaxcon.simulation.integrators import reached
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.step import check_step, controls_in, policy_in, step_quietly
 from jaxcon.solvers.saddle import Solution
@@ -161,12 +162,12 @@ def _look(
     memory = MethodMemory(*state.memory)
     advanced = method.integrator.advance(watched, state, memory.integrator, h)
     if not watched.seen:  # an integrator that iterates shows no values
-        watched(state.q, state.v, state.time)
+        watched(state.q, state.v, state.instant)
     for stage, (found, code) in enumerate(watched.seen):
         if found:
             return found, stage, code
     q, v, time = advanced.point
-    new = dataclasses.replace(state, q=q, v=v, time=time)
+    new = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, h))
     found = [*findings.entries(system, "velocity", v), *findings.positions(system, q)]
     if found:
         return found, 0, Status.NON_FINITE

@@ -123,7 +123,7 @@ def dependent(system: Any, q: Array, rows: Rows) -> list[Finding]:
 
 def worst(system: Any, state: State) -> Finding:
     """The constraint that is furthest off."""
-    found = linearize(system, state.q, state.v, state.time).violation
+    found = linearize(system, state.q, state.v, state.instant).violation
     name = max(found.layout.names, key=lambda n: float(found[n]), default="none")
     size = float(found[name]) if found.layout.names else 0.0
     return Finding("violation", name, f"is {size:.3g} after the step")

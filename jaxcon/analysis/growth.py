@@ -163,10 +163,10 @@ def _allowed(system: Any, state: State) -> np.ndarray:
 
     def both(move: Array) -> tuple[Array, Array]:
         q = system.retract(state.q, move[:n])
-        rows = linearize(system, q, state.v + move[n:], state.time)
+        rows = linearize(system, q, state.v + move[n:], state.instant)
         return rows.residual, rows.rate
 
-    layout = linearize(system, state.q, state.v, state.time).layout
+    layout = linearize(system, state.q, state.v, state.instant).layout
     by_φ, by_rate = jax.jit(jax.jacfwd(both))(jnp.zeros(2 * n, state.v.dtype))
     held, holding = layout.holonomic & layout.holds, layout.holding
     rows = np.concatenate([np.asarray(by_φ)[held], np.asarray(by_rate)[holding]])

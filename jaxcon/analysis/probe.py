@@ -62,7 +62,7 @@ def begun(system: Any, method: Method, state: State) -> State:
 @jax.jit
 def _run(method: Method, system: Any, start: State, control: PyTree, dt: Array) -> Any:
     def record(state: State, info: Any) -> tuple[Array, Array]:
-        rows = linearize(at(system, state), state.q, state.v, state.time)
+        rows = linearize(at(system, state), state.q, state.v, state.instant)
         none = jnp.zeros((), state.q.dtype)
         missed = none if info.reactions is None else info.reactions.residual
         return jnp.max(jnp.abs(rows.residual), initial=0), missed

@@ -27,7 +27,7 @@ def energy(system: Any, state: State) -> Energy:
         state: where, of one world.
     """
     system = at(system, state, "jc.energy(system, s)")
-    return system.energy(state.q, state.v, state.time)
+    return system.energy(state.q, state.v, state.instant)
 
 
 def violation(system: Any, state: State) -> Violation:
@@ -41,7 +41,7 @@ def violation(system: Any, state: State) -> Violation:
         A `Violation`: by name the norm of φ [m, rad], with `rate` that of φ̇ [m/s, rad/s].
     """
     system = at(system, state, "jc.violation(system, s)")
-    return linearize(system, state.q, state.v, state.time).violation
+    return linearize(system, state.q, state.v, state.instant).violation
 
 
 def position(system: Any, state: State, body: str, point: Any = None) -> Array:
@@ -183,7 +183,7 @@ def _momentum(system: Any, state: State, bodies: Sequence[str] | None, caller: s
     if not names or len(set(names)) < len(names):
         raise ValueError(f"momentum: bodies must be different names, got {list(names)}.")
     places = [Place(group, (i,)) for group, i in map(system.layout.locate, names)]
-    return momentum_of(system.snapshot(state.q, state.v, state.time), places)
+    return momentum_of(system.snapshot(state.q, state.v, state.instant), places)
 
 
 def _point(x: Vector) -> Array:
@@ -217,7 +217,7 @@ def wrench(system: Any, state: State, info: Any, name: str, body: str | None = N
         TypeError: `info` has no multipliers.
     """
     system, state = _at_multipliers(system, state, info, "wrench")
-    snapshot = system.snapshot(state.q, state.v, state.time)
+    snapshot = system.snapshot(state.q, state.v, state.instant)
     group = next((g for g in system.constraints if name in g.names), None)
     if group is None:
         known = [n for g in system.constraints for n in g.names]
@@ -257,7 +257,7 @@ def multipliers(system: Any, state: State, info: Any, name: str) -> Array:
         TypeError: `info` has no multipliers.
     """
     here, state = _at_multipliers(system, state, info, "multipliers")
-    layout = layout_of(here, state.q, state.v, state.time)
+    layout = layout_of(here, state.q, state.v, state.instant)
     return info.multipliers[layout.rows(name)]
 
 
@@ -296,7 +296,7 @@ def _row(system: Any, state: State, joint: str, name: str | None, caller: str) -
     where = coordinates.directory(system.constraints)
     end = coordinates.find(system.constraints, where, "coordinate", joint, name)
     along = coordinates.at(coordinates.numbered(system.counted), [end])
-    return along.read(system.snapshot(state.q, state.v, state.time))
+    return along.read(system.snapshot(state.q, state.v, state.instant))
 
 
 def _acts_on(system: Any, group: Any, index: int, body: str | None) -> tuple[str, int]:

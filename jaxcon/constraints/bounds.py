@@ -14,10 +14,12 @@ from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.base import gather
 from jaxcon.constraints.bound_layout import BoundLayout
 from jaxcon.constraints.primitives import Row
+from jaxcon.core import numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.model.elements import Grid
@@ -44,6 +46,7 @@ class BoundSet(NamedTuple):
         rolling, spinning: the lengths by which their moments are bounded [m].
         compliance: C of the first row, by which u* is missed per unit of multiplier.
         restitution: e; None where nothing can bounce.
+        far: the gap of a second stop, opposite to that of the first row; None without.
         points: how many each element has, one after the other; None where an element is one.
     """
 
@@ -60,6 +63,7 @@ class BoundSet(NamedTuple):
     spinning: Lane = 0.0
     compliance: Lane = 0.0
     restitution: Lane | None = None
+    far: Lane | None = None
     points: int | None = None
 
     @property
@@ -101,10 +105,13 @@ class BoundRows:
         resistance: by disc of `kinds.turning`, (its contacts,).
         jacobian: (n, n_v); `Gathered` of rows that are chosen by their numbers.
         restitution: e, (n,), negative of rows that do not bounce; None where nothing can.
+        far: the gap of a second stop, opposite to the first, (n,), infinite of rows that have none;
+            None where no row has one.
         layout: rows by element.
         kinds: how many rows of each law.
         hard: which rows answer an impact, (n,); of a contact its normal says so for all.
         ends: which of these have a gap that closes, (n,).
+        paired: which have a second stop, (n,).
     """
 
     gap: Array
@@ -117,10 +124,12 @@ class BoundRows:
     resistance: tuple[Array, ...]
     jacobian: Jacobian
     restitution: Array | None
+    far: Array | None
     layout: BoundLayout = static()
     kinds: Kinds = static()
     hard: tuple[bool, ...] = static(default=())
     ends: tuple[bool, ...] = static(default=())
+    paired: tuple[bool, ...] = static(default=())
 
     def finite(self, bare: Array) -> Array:
         """Whether all numbers of the rows are, ().
@@ -133,7 +142,7 @@ class BoundRows:
 
     def chosen(self, choice: Choice) -> BoundRows:
         """Some of the rows."""
-        e = self.restitution
+        e, far = self.restitution, self.far
         return dataclasses.replace(
             self,
             gap=choice.take(self.gap),
@@ -143,7 +152,29 @@ class BoundRows:
             friction=choice.contacts(self.friction),
             jacobian=Gathered(self.jacobian.pulls(choice.places().astype(self.rate.dtype))),
             restitution=None if e is None else choice.take(e),
+            far=None if far is None else choice.take(far),
             kinds=choice.kinds,
+        )
+
+    def passes(self, free: Array, dt: Array) -> Array:
+        """Which rows would pass their second stop in a step, (n,), a constant.
+
+        Args:
+            free: u at its end without multipliers, (n,), away from the first stop.
+            dt: the length of the step, () [s].
+        """
+        return jax.lax.stop_gradient(dt[None] * free > self.far)
+
+    def facing(self, second: Array, dt: Array) -> BoundRows:
+        """The rows with the second stop in place of the first where that is asked for, (n,)."""
+        gap, sign = jnp.where(second, self.far, 0), jnp.where(second, -1, 1).astype(dt.dtype)
+        return dataclasses.replace(
+            self,
+            gap=jnp.where(second, gap, self.gap),
+            rate=sign * self.rate,
+            target=jnp.where(second, -numerics.safe_divide(gap, dt[None]), self.target),
+            jacobian=self.jacobian.scaled(sign, np.array(self.paired)),  # type: ignore[union-attr]
+            far=None,
         )
 
 
@@ -167,6 +198,7 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
         return jnp.concatenate([c.flat([getattr(r, field) for r in c.rows]) for c in columns])
 
     first, bouncy = columns[0], any(s.restitution is not None for s in sets)
+    paired = any(s.far is not None for s in sets)
     gaps = [s.rows[0].value if s.rows[0].holonomic else 0.0 for s in sets]
     rest = (kinds.size - first.size, *v.shape[1:])
 
@@ -188,10 +220,12 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
         _resistance(sets, sizes, v),
         Jacobian(tuple(blocks), (kinds.size, v.shape[0])),
         once([s.restitution for s in sets], -1.0) if bouncy else None,
+        once([s.far for s in sets], jnp.inf) if paired else None,
         _layout(pairs, columns, starts),
         kinds,
         _by_row([s.hard for s in sets], sizes, kinds),
         _by_row([s.hard and s.rows[0].holonomic for s in sets], sizes, kinds),
+        _by_row([s.far is not None for s in sets], sizes, kinds),
     )
 
 

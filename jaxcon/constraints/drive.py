@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.base import RowSet, gather
+from jaxcon.core.doubled import Doubled, evaluate
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import per_world
@@ -24,7 +25,9 @@ class Drive:
 
     θ is a coordinate of the joint, an angle [rad] or a travel [m], zero at assembly.
     λ is the torque or force that the drive applies. In space angles are compared modulo whole
-    turns, so a crank may be driven round and round.
+    turns, so a crank may be driven round and round. In float32 the motion is computed from the time
+    with its remainder, in sums of two floats where it adds and multiplies, so that its phase is
+    right after days.
 
     Attributes:
         name: unique in the scene.
@@ -69,7 +72,8 @@ class Drives:
         """φ = θ − θ*(t), φ̇ = θ̇ − θ̇*, γ = γ_θ − θ̈*, by two nested derivatives of the motion."""
         row = self.along.read(snapshot)
         motion = per_world(self._motion, snapshot.q.ndim - 1)
-        target, rate, bias = (x[None] for x in motion(snapshot.t, self.params))
+        target, rate, bias = motion(Doubled.of(snapshot.instant), self.params)
+        target, rate, bias = jax.tree.map(lambda x: x[None], (target, rate, bias))
         error = self.along.difference(snapshot, row, target)
         row = row._replace(value=error, rate=row.rate - rate, bias=row.bias - bias)
         return gather(snapshot, self.places, [row])
@@ -81,7 +85,7 @@ class Drives:
             ValueError: it cannot be called, or returns no number.
         """
         try:
-            jax.eval_shape(self._motion, jnp.zeros((), dtype), self.params)
+            jax.eval_shape(self._motion, Doubled.of(jnp.zeros((), dtype)), self.params)
         except TypeError as error:
             raise ValueError(
                 f"Drive '{self.law.name}': motion(t, params) cannot be called: {error}."
@@ -92,7 +96,7 @@ class Drives:
         (joint,) = self.along.joints
         return snapshot.system.constraints[self.along.group].anchor(snapshot, joint)
 
-    def _motion(self, t: Any, params: PyTree) -> tuple[Array, Array, Array]:
+    def _motion(self, t: Doubled, params: PyTree) -> tuple[Doubled, Array, Array]:
         """θ*, θ̇*, θ̈*."""
 
         def motion(t: Any) -> Array:
@@ -104,8 +108,16 @@ class Drives:
                 )
             return target
 
-        def with_rate(t: Any) -> tuple[Array, Array]:
-            return jax.jvp(motion, (t,), (jnp.ones_like(t),))
+        def at(high: Array) -> tuple[Array, Array]:
+            # in float64 a time of days is rounded to 1e-11 s
+            if jnp.finfo(high.dtype).bits == 64:
+                return motion(high), jnp.zeros_like(high)
+            target = evaluate(motion, Doubled(high, t.low))
+            return target.high, target.low
 
-        (target, rate), (_, bias) = jax.jvp(with_rate, (t,), (jnp.ones_like(t),))
-        return target, rate, bias
+        def with_rate(high: Array) -> tuple[Array, Array, Array]:
+            target, rate, low = jax.jvp(at, (high,), (jnp.ones_like(high),), has_aux=True)
+            return target, rate, low
+
+        (target, rate, low), (_, bias, _) = jax.jvp(with_rate, (t.high,), (jnp.ones_like(t.high),))
+        return Doubled(target, low), rate, bias

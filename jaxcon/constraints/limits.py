@@ -31,8 +31,8 @@ class Limit:
     At the nearer stop, with gap φ ≥ 0, a step ends with φ̇ ≥ −φ/h: it may reach the stop and not
     pass it. What has passed it comes back by a fifth in each step, no faster than `recovery`. What
     would arrive within the step leaves with −e φ̇, at the time at which it arrives. A stop with a
-    stiffness is a spring and a damper behind the gap, implicit over the step. The stop that is
-    farther away is not looked at, so that the range must be wider than twice what a step travels.
+    stiffness is a spring and a damper behind the gap, implicit over the step. The farther stop
+    acts in place of the nearer one where the step would otherwise pass it.
 
     Attributes:
         name: unique in the scene.
@@ -80,16 +80,18 @@ class Limit:
 
     @staticmethod
     def bounds(p: dict[str, Any], row: Row, u: Lane, dt: Any) -> Any:
-        """The gap of the nearer stop."""
-        near = row.value - p["lower"] < p["upper"] - row.value
+        """The gap of the nearer stop, and that of the other."""
+        below, above = row.value - p["lower"], p["upper"] - row.value
+        near = below < above
         side = jnp.where(near, 1.0, -1.0).astype(row.value.dtype)
-        gap = jnp.where(near, row.value - p["lower"], p["upper"] - row.value)
+        gap, far = jnp.where(near, below, above), jnp.where(near, above, below)
         # a stop that is nowhere has a row of zeros, which solvers leave out
         nowhere = gap == jnp.inf
         side, gap = jnp.where(nowhere, 0, side), jnp.where(nowhere, 0, gap)
         pulls = tuple(pull * side for pull in row.pulls)
         own = row._replace(value=gap, rate=side * row.rate, pulls=pulls)
-        return one_sided(p, own, dt)
+        own, asked = one_sided(p, own, dt)
+        return own, asked | {"far": far}
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ class Status(IntEnum):
         SINGULAR: rows depend on each other, or the mass matrix is not positive definite.
         NOT_CONVERGED: an iteration did not reach its tolerance.
         VIOLATED: constraints stayed off by more than the limit of a `Recovery`.
+        LOST_TURNS: a joint turned further in a step than its count of whole turns can tell.
         CONFLICT: constraints contradict each other; least squares go on.
         ROLLED_BACK: a `Recovery` went back to the state before the step.
         PROJECTED: it went to the valid configuration nearest to the state before.
@@ -28,6 +29,7 @@ class Status(IntEnum):
     SINGULAR = 2
     NOT_CONVERGED = 3
     VIOLATED = 4
+    LOST_TURNS = 5
     CONFLICT = 16
     ROLLED_BACK = 17
     PROJECTED = 18
@@ -58,6 +60,10 @@ MEANING = {
     Status.VIOLATED: "constraints are off by more than the limit of the method's Recovery, which"
     " tried again as often as it may; likely (a) a step too large, (b) an unstable gain,"
     " (c) constraints that contradict each other",
+    Status.LOST_TURNS: "a joint turned further in a step than its count of whole turns can tell, so"
+    " that servos, springs, limits and couplings on its angle would be off by turns; likely (a) a"
+    " step too large for the speed or the acceleration of the joint, (b) a servo or spring too"
+    " stiff for the inertia behind it, (c) a velocity in the wrong unit",
     Status.ROLLED_BACK: "a step failed: the world went back to the state before it",
     Status.PROJECTED: "steps failed: the world went back to the valid configuration nearest to the"
     " state before them",

@@ -174,11 +174,11 @@ def _assemble(system: Any, start: State, tolerance: Any, *, held: tuple[int, ...
     problem = _Problem(system, start, free)
     y = nearest.implicit(problem.surface, y) if problem.rows else y
     q = problem.displaced(y)
-    v, stuck = _nearest_velocity(system, q, start.v, start.time, free)
-    left = linearize(system, q, v, start.time).violation
+    v, stuck = _nearest_velocity(system, q, start.v, start.instant, free)
+    left = linearize(system, q, v, start.instant).violation
     met = (left.worst <= allowed[0]) & (left.worst_rate <= allowed[1])
     status = jnp.where(met, Status.OK, Status.NOT_CONVERGED).astype(jnp.int32)
-    turns = system.count(q, v, start.time)
+    turns = system.count(q, v, start.instant)
     state = dataclasses.replace(start, q=q, v=v, status=status, turns=turns)
     return Assembly(state, left, numerics.norm(y), allowed, stuck)
 
@@ -194,7 +194,7 @@ class _Problem:
     def __init__(self, system: Any, start: State, free: np.ndarray) -> None:
         self.system, self.start, self.free = system, start, free
         self.factor = jnp.linalg.cholesky(system.mass(start.q).dense()[np.ix_(free, free)])
-        rows = linearize(system, start.q, jnp.zeros_like(start.v), start.time)
+        rows = linearize(system, start.q, jnp.zeros_like(start.v), start.instant)
         self.rows = rows.layout.size
         length = numerics.norm(_weighted(rows.jacobian.dense()[:, free], self.factor).T)
         self.scale = jax.lax.stop_gradient(1 / jnp.where(length > 0, length, 1))
@@ -207,7 +207,7 @@ class _Problem:
     def surface(self, y: Array) -> Array:
         """φ, each row scaled."""
         q, rest = self.displaced(y), jnp.zeros_like(self.start.v)
-        return self.scale * linearize(self.system, q, rest, self.start.time).residual
+        return self.scale * linearize(self.system, q, rest, self.start.instant).residual
 
 
 def _solve(problem: _Problem, allowed: Array) -> tuple[Array, Array]:

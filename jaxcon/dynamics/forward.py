@@ -113,7 +113,7 @@ class Dynamics:
         solution = self.system.complete(impulse.motion(known.multipliers))
         solution = solution._replace(status=status.first(solution.status, impulse.judge()))
         known = self._judged(impulse, known, solution.acceleration)
-        own = bounds.jacobian.transpose(known.multipliers)
+        own = impulse.rows.jacobian.transpose(known.multipliers)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone
 
     def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:

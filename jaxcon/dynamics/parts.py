@@ -187,7 +187,7 @@ class Struck:
         e = rows.restitution
         if e is not None:
             e = jnp.where(acts & ~slow(rows, bend, rounding, dt), e, -1)
-        asked = dataclasses.replace(rows, gap=gap, target=target, restitution=e)
+        asked = dataclasses.replace(rows, gap=gap, target=target, restitution=e, far=None)
         return asked, acts | tangents
 
 

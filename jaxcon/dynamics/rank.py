@@ -87,7 +87,7 @@ def linearized(system: Any, state: State) -> tuple[Rows, np.ndarray, np.ndarray]
 
 @jax.jit  # so that a system is traced once, however many of its states are looked at
 def _linearized(system: Any, state: State) -> tuple[Rows, Array, Array]:
-    rows = linearize(system, state.q, state.v, state.time)
+    rows = linearize(system, state.q, state.v, state.instant)
     return rows, rows.jacobian.dense(), system.mass(state.q).dense()
 
 

@@ -87,7 +87,7 @@ class Impulse:
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
         solve = factor(widened(saddle, saddle.force.ndim - 1))
         own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts, weight)
-        return own._sifted() if sifts else own._begun()
+        return (own._sifted() if sifts else own._begun())._facing()
 
     def _begun(self) -> Impulse:
         """With the a of no multipliers, and of `probing` forces."""
@@ -103,6 +103,19 @@ class Impulse:
         )
         found = jax.lax.stop_gradient(self.solve(forces, targets).acceleration)
         return dataclasses.replace(self, start=found[:, 0], answers=found[:, 1:])
+
+    def _facing(self) -> Impulse:
+        """With the stops that it would pass in place of those that it leaves.
+
+        What is known of a row that changes its side only changes its sign.
+        """
+        if self.rows.far is None:
+            return self
+        second, answers = self.rows.passes(self.led(self.start), self.dt), self.answers
+        if answers is not None and not self._by_velocities():
+            answers = jnp.where(second[None], -answers, answers)
+        rows = self.rows.facing(second, self.dt)
+        return dataclasses.replace(self, rows=rows, answers=answers)
 
     def _by_velocities(self) -> bool:
         """Whether there are fewer velocities than rows."""

@@ -170,9 +170,9 @@ class Scene:
         state = dataclasses.replace(self._state(layout, bodies), turns=turns)
         for group in (*constraints, *system.bounds):
             if isinstance(group, Custom):
-                check_function(group, system.snapshot(state.q, state.v, state.time))
+                check_function(group, system.snapshot(state.q, state.v, state.instant))
             if isinstance(group, Curves):
-                group.check(system.snapshot(state.q, state.v, state.time))
+                group.check(system.snapshot(state.q, state.v, state.instant))
         multipliers = first_multipliers(system, state.q, state.v)
         if jax.tree.leaves(multipliers):
             state = dataclasses.replace(state, memory=MethodMemory(bounded=multipliers))

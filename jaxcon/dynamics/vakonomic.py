@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import RowLayout, layout_of, linearize
 from jaxcon.core import checks
+from jaxcon.core.doubled import Doubled, rounded
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Motion
@@ -104,12 +105,16 @@ class Vakonomic:
         return self.system.counted
 
     def remember(self, turns: Any) -> Vakonomic:
-        """With other angles of a step ago."""
+        """With other angles near which those that are counted lie."""
         return dataclasses.replace(self, system=self.system.remember(turns))
 
     def count(self, q: Array, v: Array, t: Any) -> Any:
         """The angles that the system counts."""
         return self.system.count(q, self._split(v)[0], t)
+
+    def expect(self, here: Any, end: Array, dt: Array, within: bool) -> Any:
+        """What a state remembers of turns after a step, and what of them cannot be told."""
+        return self.system.expect(here, self._split(end)[0], dt, within)
 
     def sizes(self, n_q: int) -> tuple[int, int]:
         """How many positions and velocities a state has, μ among them."""
@@ -138,11 +143,12 @@ class Vakonomic:
         system, every = self.system, jnp.zeros(self.rows.size, q.dtype)
         every = every.at[self.free].set(μ)
 
-        def momentum(q: Array, t: Any) -> Array:
-            return linearize(system, q, v, t).jacobian.transpose(every)
+        def momentum(q: Array, later: Any) -> Array:
+            return linearize(system, q, v, Doubled.of(t) + later).jacobian.transpose(every)
 
-        along = (system.kinematics(q, v), jnp.ones_like(t))
-        p, ṗ = jax.jvp(momentum, (q, t), along)
+        now = jnp.zeros_like(rounded(t))
+        along = (system.kinematics(q, v), jnp.ones_like(now))
+        p, ṗ = jax.jvp(momentum, (q, now), along)
         slope = jax.grad(lambda q: linearize(system, q, v, t).rate @ every)(q)
         (pull,) = jax.vjp(lambda w: system.kinematics(q, w), v)[1](slope)
         return pull - ṗ + system.coadjoint(q, v, p)
@@ -218,7 +224,7 @@ def vakonomic(
             f"vakonomic: there is no variational form of the bounded rows of {names} here; build"
             " the scene without these elements."
         )
-    layout = layout_of(at(system, state), state.q, state.v, state.time)
+    layout = layout_of(at(system, state), state.q, state.v, state.instant)
     result = Vakonomic(system, layout)
     μ = jnp.zeros(len(result.free), state.v.dtype)
     for name, given in (multipliers or {}).items():

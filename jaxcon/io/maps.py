@@ -190,7 +190,7 @@ class Tree:
                 x, y = self._relative(i, joint, above, motions[i])
                 qpos = qpos.at[joint.q : joint.q + len(x)].set(x)
                 qvel = qvel.at[joint.v : joint.v + len(y)].set(y)
-        snapshot = system.snapshot(state.q, state.v, state.time)
+        snapshot = system.snapshot(state.q, state.v, state.instant)
         for scalars, ends in self._groups(system):
             row = coordinates.at(coordinates.numbered(system.counted), ends).read(snapshot)
             places = jnp.asarray([s.q for s in scalars])

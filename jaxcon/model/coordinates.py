@@ -6,11 +6,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
-from jaxcon.core.lanes import take
-from jaxcon.core.typing import Array
+from jaxcon.core.doubled import Doubled
+from jaxcon.core.lanes import take, total
+from jaxcon.core.typing import Array, Lane
 
 
 @dataclass(frozen=True)
@@ -18,8 +20,8 @@ class JointCoordinate:
     """One coordinate of several joints of one group.
 
     In space an angle is seen modulo whole turns only. Where an element needs more, the state holds
-    the angle of a step ago, θ₀, and the one now is that nearest to it: θ = θ₀ + wrap(θ_seen − θ₀).
-    Its derivative is that of θ_seen, whatever θ₀ is.
+    the angle θ₀ that the last step was expected to lead to, see `expected`. The one now is that
+    nearest to it, θ = θ₀ + wrap(θ_seen − θ₀). Its derivative is that of θ_seen, whatever θ₀ is.
 
     Attributes:
         group: of the joints, in the constraints of the system.
@@ -42,11 +44,23 @@ class JointCoordinate:
         before = take(snapshot.system.turns, self.counters)
         return row._replace(value=before + numerics.wrap(row.value - before))
 
-    def difference(self, snapshot: Any, row: Any, reference: Any) -> Any:
+    def rate(self, snapshot: Any, row: Any, v: Array) -> Lane:
+        """θ̇ of the row under other velocities (n_v,), the bodies being where they are."""
+        places = snapshot.system.constraints[self.group].select(self.joints).places
+        sides = zip(places, row.pulls, strict=True)
+        return total(
+            pull.dot(snapshot.system.columns(place).take(v))
+            for place, pull in sides
+            if place.group is not None
+        )
+
+    def difference(self, snapshot: Any, row: Any, reference: Doubled) -> Any:
         """value − reference, in [−π, π] where a joint's angle is seen modulo whole turns."""
-        error = row.value - reference
         joint = snapshot.system.constraints[self.group].joint
         wraps = turns_over(joint, self.name, snapshot.system.layout.dim)
+        if wraps and jnp.finfo(reference.high.dtype).bits < 64:
+            reference = reference.reduced()
+        error = (row.value - reference.high) - reference.low
         return numerics.wrap(error) if wraps else error
 
 
@@ -106,7 +120,41 @@ def turns_over(joint: Any, name: str, dim: int) -> bool:
 
 def count(counted: tuple[JointCoordinate, ...], snapshot: Any) -> Array:
     """The angles whose turns are counted, (n,) [rad]."""
-    lanes = [coordinate.read(snapshot).value for coordinate in counted]
+    return _joined([coordinate.read(snapshot).value for coordinate in counted])
+
+
+def expected(
+    counted: tuple[JointCoordinate, ...], snapshot: Any, end: Array, dt: Array, within: bool
+) -> tuple[Array, Array]:
+    """The angles after a step by the mean of the rates before and after it, and what that misses.
+
+    With rates θ̇ and θ̇⁺ an angle changes by h (θ̇ + θ̇⁺)/2, give or take h |θ̇⁺ − θ̇|/2: an integrator
+    may move it by any mean of both. The turns are known where that is less than half a turn.
+
+    Args:
+        counted: which angles.
+        snapshot: at the start of the step.
+        end: v after it, (n_v,).
+        dt: its length, () [s].
+        within: whether angles are also read between its ends, which must then be less than half a
+            turn away from its start.
+
+    Returns:
+        The angles, (n,) [rad], and by how much they may be off or go unseen, (n,) [rad].
+    """
+    rows = [coordinate.read(snapshot) for coordinate in counted]
+    start = _joined([row.value for row in rows])
+    pairs = zip(counted, rows, strict=True)
+    before = _joined([row.rate for row in rows])
+    after = _joined([coordinate.rate(snapshot, row, end) for coordinate, row in pairs])
+    h = dt[None]
+    missed = jnp.abs(h * (after - before)) / 2
+    if within:
+        missed = jnp.maximum(missed, jnp.abs(h) * jnp.maximum(jnp.abs(before), jnp.abs(after)))
+    return jax.lax.stop_gradient((start + h * (before + after) / 2, missed))
+
+
+def _joined(lanes: list[Lane]) -> Array:
     batch = jnp.broadcast_shapes(*(x.shape[1:] for x in lanes))
     return jnp.concatenate([jnp.broadcast_to(x, (x.shape[0], *batch)) for x in lanes])
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxcon.core.doubled import rounded
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.layout import Place
@@ -69,6 +70,10 @@ class GeneralizedCoordinates:
         """Nothing."""
         return ()
 
+    def expect(self, here: Snapshot, end: Array, dt: Array, within: bool) -> tuple[PyTree, Array]:
+        """Nothing, and nothing is missed."""
+        return (), jnp.zeros_like(dt)
+
     def mass(self, q: Array) -> Mass:
         """M(q, θ), (n_v, n_v), or its diagonal (n_v,) where the user's function gives that."""
         m = self.mass_function(q, self.params)
@@ -81,7 +86,7 @@ class GeneralizedCoordinates:
 
     def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f(q, v, t, u, θ), (n_v,)."""
-        f = self.force_function(q, v, t, control, self.params)
+        f = self.force_function(q, v, rounded(t), control, self.params)
         if f.shape != q.shape:
             raise ValueError(f"GeneralizedSystem: force must return {q.shape}, got {f.shape}.")
         return f
@@ -143,7 +148,7 @@ class GeneralizedCoordinates:
         """½ vᵀMv, and the user's potential(q, t, θ) where there is one [J]."""
         potential = jnp.zeros((), q.dtype)
         if self.potential is not None:
-            potential = self.potential(q, t, self.params)
+            potential = self.potential(q, rounded(t), self.params)
         return Energy(v @ self.mass(q).apply(v) / 2, potential)
 
     def with_params(self, params: PyTree) -> GeneralizedCoordinates:

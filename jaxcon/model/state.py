@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core.doubled import Doubled
 from jaxcon.core.pytree import exportable, pytree
 from jaxcon.core.typing import Array, PyTree
+
+UNSET: Any = object()
+"""In the place of a remainder that was not given."""
 
 
 @exportable
@@ -33,14 +38,20 @@ class MethodMemory(NamedTuple):
 class State:
     """Everything that a step changes.
 
+    Time is kept as the sum of two floats, `time` and `time_remainder`: steps of 1 ms added up in
+    one float32 would be 0.9 % off after a million. `time` is the float nearest to the sum, which
+    users' functions of time get. A remainder that no longer fits, since `time` was replaced, counts
+    as zero.
+
     Attributes:
         q: positions, (n_q,); `system.layout` maps names to indices.
         v: velocities, (n_v,); not q̇ where bodies turn in space.
-        time: () [s].
+        time: () [s], rounded.
         status: `Status` code of this world, (); the first failure sticks.
         memory: of the method (integrals, histories); `jc.init` makes it.
-        turns: the angles a step ago of joints whose whole turns are counted, (n,) [rad]; empty
-            where there are none.
+        turns: the angles near which those of joints whose whole turns are counted lie, within half
+            a turn, (n,) [rad]; empty where there are none.
+        time_remainder: what `time` lacks of the sum of all steps, () [s]; zero unless given.
     """
 
     q: Array
@@ -49,6 +60,48 @@ class State:
     status: Array
     memory: PyTree = ()
     turns: PyTree = ()
+    time_remainder: Array = UNSET
+
+    # written out, since the default of the remainder has the shape of the time
+    def __init__(
+        self,
+        q: Any,
+        v: Any,
+        time: Any,
+        status: Any,
+        memory: PyTree = (),
+        turns: PyTree = (),
+        time_remainder: Any = UNSET,
+    ) -> None:
+        if time_remainder is UNSET:
+            time_remainder = _without_remainder(time)
+        fields = (q, v, time, status, memory, turns, time_remainder)
+        for field, value in zip(dataclasses.fields(State), fields, strict=True):
+            object.__setattr__(self, field.name, value)
+
+    def __setstate__(self, fields: dict[str, Any]) -> None:
+        """Also reads states that were pickled before time had a remainder."""
+        self.__init__(**fields)  # type: ignore[misc]
+
+    @property
+    def instant(self) -> Doubled:
+        """The time with its remainder, () [s]."""
+        fits = self.time + self.time_remainder == self.time
+        return Doubled(self.time, jnp.where(fits, self.time_remainder, 0))
+
+
+def _without_remainder(time: Any) -> Any:
+    """Zero in the shape of a time; in trees of axes or of shardings, what stands for the time."""
+    if isinstance(time, np.ndarray | np.generic):
+        return np.zeros_like(time)
+    if hasattr(time, "dtype"):
+        return jnp.zeros_like(time)
+    return 0 * time if isinstance(time, int | float) else time
+
+
+def at_instant(state: State, instant: Doubled) -> State:
+    """The state at another time."""
+    return dataclasses.replace(state, time=instant.high, time_remainder=instant.low)
 
 
 def is_finite(state: State) -> Array:
@@ -84,7 +137,7 @@ def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:
 
 
 def recall(system: Any, turns: PyTree) -> Any:
-    """The system with the angles a step ago of the joints whose turns it counts.
+    """The system with the angles near which those of joints lie whose turns it counts.
 
     Raises:
         ValueError: there are not as many as it counts.

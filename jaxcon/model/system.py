@@ -10,13 +10,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.doubled import rounded
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.model import params
 from jaxcon.model.bodies import rest
-from jaxcon.model.coordinates import JointCoordinate, count
+from jaxcon.model.coordinates import JointCoordinate, count, expected
 from jaxcon.model.frames import WorldFrame
 from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
@@ -41,8 +42,13 @@ class MassProperties:
 class Snapshot:
     """A system at one instant: the frames of its bodies, computed once and shared."""
 
-    def __init__(self, system: Any, q: Array, v: Array, t: Any) -> None:
-        self.system, self.q, self.v, self.t = system, q, v, t
+    def __init__(self, system: Any, q: Array, v: Array, instant: Any) -> None:
+        self.system, self.q, self.v, self.instant = system, q, v, instant
+
+    @property
+    def t(self) -> Any:
+        """The time, rounded, for users' functions; `instant` may hold its remainder."""
+        return rounded(self.instant)
 
     @cached_property
     def frames(self) -> tuple[Any, ...]:
@@ -56,7 +62,7 @@ class Snapshot:
 
     def map(self, function: Any) -> Snapshot:
         """The same with every number replaced by a function of it."""
-        return Snapshot(*jax.tree.map(function, (self.system, self.q, self.v, self.t)))
+        return Snapshot(*jax.tree.map(function, (self.system, self.q, self.v, self.instant)))
 
     def frame(self, place: Place) -> Any:
         """The motion of some bodies of one group, or of the world."""
@@ -77,7 +83,7 @@ class BodySystem:
         offsets: by name, the body's own frame as given by the user, in its principal frame; only
             for bodies where they differ.
         fixed: by name, the pose of each frame that is fixed to the world.
-        turns: the angles a step ago of joints whose whole turns are counted, (n,) [rad].
+        turns: the angles near which those of joints whose whole turns are counted lie, (n,) [rad].
         layout: names and indices.
         counted: which these are.
         bounds: groups of equal elements whose multipliers are bounded.
@@ -104,12 +110,26 @@ class BodySystem:
         return Snapshot(self, q, v, t)
 
     def remember(self, turns: PyTree) -> BodySystem:
-        """With other angles of a step ago."""
+        """With other angles near which those that are counted lie."""
         return dataclasses.replace(self, turns=turns)
 
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
-        """The angles of the joints whose turns are counted, over turns: what a state remembers."""
+        """The angles of the joints whose turns are counted, over turns, (n,) [rad]."""
         return count(self.counted, self.snapshot(q, v, t)) if self.counted else self.turns
+
+    def expect(self, here: Snapshot, end: Array, dt: Array, within: bool) -> tuple[PyTree, Array]:
+        """What a state remembers of turns after a step, and what of them cannot be told, ().
+
+        Args:
+            here: the start of the step.
+            end: v after it, (n_v,).
+            dt: its length, () [s].
+            within: whether angles are also read between its ends.
+        """
+        if not self.counted:
+            return self.turns, jnp.zeros_like(dt)
+        turns, missed = expected(self.counted, here, end, dt, within)
+        return turns, jnp.max(missed, axis=0)
 
     def mass(self, q: Array) -> Diagonal:
         """M: constant and diagonal, since frames lie at centres of mass along principal axes."""

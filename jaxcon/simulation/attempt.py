@@ -16,7 +16,8 @@ from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.parts import Part
-from jaxcon.model.state import MethodMemory, State, is_finite, recall
+from jaxcon.model.state import MethodMemory, State, at_instant, is_finite, recall
+from jaxcon.simulation.integrators import reached
 from jaxcon.simulation.method import Method
 from jaxcon.solvers.saddle import Solution
 
@@ -54,21 +55,29 @@ def attempt(
     system, memory = dynamics.system, MethodMemory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
-    new = dataclasses.replace(state, q=q, v=v, time=time)
+    new = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, length))
     stabilizer = method.feedback(dt)
     own = stabilizer.remember(stabilizer.advance(rows, memory.stabilizer, dt), solution)
     new, corrected = stabilizer.correct(system, method.solver, state, new, own, length)
-    turns = system.count(state.q, state.v, state.time)
+    here = system.snapshot(state.q, state.v, state.instant)
+    turns, missed = system.expect(here, new.v, length, _reads_within(method))
     # as the state came, with or without them, so that it can be the carry of a scan
     multipliers = rows.reactions.multipliers if _has_multipliers(memory) else ()
     kept = (advanced.memory, own, memory.recovery, multipliers)
     kept = MethodMemory(*kept) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
     code = functools.reduce(status.first, (judge(new, solution), corrected, remembered(own, new)))
+    if system.counted:
+        lost = jnp.where(missed < jnp.pi, Status.OK, Status.LOST_TURNS).astype(jnp.int32)
+        code = status.first(code, lost)
     if method.recovery is not None:
         code = status.first(code, method.recovery.judge(system, new))
     seen = (solution.acceleration, solution.multipliers, rows.violation)
-    place = dataclasses.replace(bare(state), q=q, v=v, time=time) if advanced.ends else None
+    place = (
+        at_instant(dataclasses.replace(bare(state), q=q, v=v), reached(state, time, length))
+        if advanced.ends
+        else None
+    )
     return (new, StepInfo(*seen, code, rows.reactions, state=place)), code
 
 
@@ -83,6 +92,11 @@ def nothing_seen(info: StepInfo, state: State) -> StepInfo:
 def bare(state: State) -> State:
     """The state without the memory of a method."""
     return dataclasses.replace(state, memory=())
+
+
+def _reads_within(method: Method) -> bool:
+    """Whether the integrator reads angles between the ends of a step, as all but one do."""
+    return getattr(method.integrator, "reads_within", True)
 
 
 def _has_multipliers(memory: MethodMemory) -> bool:

@@ -108,7 +108,7 @@ def choose(
 
 def look(system: Any, state: State, dependent: int | None = None) -> Facts:
     """The facts of a system at a state."""
-    point = state.q, state.v, state.time
+    point = state.q, state.v, state.instant
     rows: Rows = jax.eval_shape(linearize, system, *point)
     size = rows.layout.size
     if dependent is None and not rows.layout.loops and 0 < size <= LOOKED:

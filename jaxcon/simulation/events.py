@@ -11,11 +11,12 @@ import jax.numpy as jnp
 from jaxcon.constraints.bound_layout import BoundLayout, Reactions
 from jaxcon.constraints.bounds import BoundRows, has_ends
 from jaxcon.core import checks, numerics, status
+from jaxcon.core.doubled import rounded
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import Outlook, Part, Struck, look
-from jaxcon.model.state import State, recall
+from jaxcon.model.state import State, at_instant, recall
 from jaxcon.simulation.arrival import Arrival, Search
 from jaxcon.simulation.attempt import StepInfo, attempt, dynamics_at
 from jaxcon.simulation.method import Method
@@ -122,7 +123,7 @@ class Events:
         mean = numerics.safe_divide(done.impulses, dt[None])
         gap = world.rows(state).gap
         reactions = Reactions(mean, gap, done.residual, done.kept, None, rows.layout)
-        new = dataclasses.replace(done.state, time=state.time + dt)
+        new = at_instant(done.state, state.instant + dt)
         impacts = list_impacts(told, rows.layout)
         info = dataclasses.replace(first, status=done.code, reactions=reactions, impacts=impacts)
         return (new, info), done.code
@@ -224,7 +225,7 @@ class World:
 
     def rows(self, state: State) -> BoundRows:
         """The bounded rows at a state."""
-        return self.dynamics(state).bounds(state.q, state.v, state.time, self.dt)
+        return self.dynamics(state).bounds(state.q, state.v, state.instant, self.dt)
 
     def dynamics(self, state: State) -> Any:
         """What an integrator sees of the system."""
@@ -232,7 +233,7 @@ class World:
 
     def outlook(self, state: State) -> Outlook:
         """What is to be expected from here on."""
-        free = self.dynamics(state).unbounded(state.q, state.v, state.time)
+        free = self.dynamics(state).unbounded(state.q, state.v, state.instant)
         return look(self.rows(state), free, state.q, self.dt, self.method.events.slips)
 
     def clearances(self, outlook: Outlook, passed: Passed) -> Array:
@@ -267,7 +268,7 @@ class World:
         code = status.first(progress.code, passed.code)
         new = progress._replace(state=final, left=length - time, active=found.happens, code=code)
         new = new.beyond(passed.impulses).beyond(impulses)
-        told = Impact(hit, state.time + time, jnp.where(hit, found.row, 0))
+        told = Impact(hit, rounded(state.instant + time), jnp.where(hit, found.row, 0))
         return keep(active, new, progress), (passed.seen, told)
 
 
@@ -292,7 +293,7 @@ def chosen(row: Array, like: Array) -> Array:
 
 def strike(world: World, state: State, struck: Struck) -> tuple[Array, Impulses]:
     """Δv of an impact and its impulses."""
-    jump, known = world.dynamics(state).impact(state.q, state.v, state.time, struck)
+    jump, known = world.dynamics(state).impact(state.q, state.v, state.instant, struck)
     return jump, Impulses(known.multipliers, known.residual, known.kept)
 
 

@@ -119,14 +119,14 @@ class GeneralizedAlpha:
     def advance(self, dynamics: Dynamics, state: State, memory: History, dt: Any) -> Advanced:
         """One step."""
         known, began = _begun(dynamics, state, memory)
-        rows = linearize(dynamics.system, state.q, state.v, state.time)
+        rows = linearize(dynamics.system, state.q, state.v, state.instant)
         scheme = Scheme.of(jnp.asarray(self.rho, state.q.dtype)[None], dt[None])
         equations = Equations(dynamics, state, known, scheme, self._softness(dynamics, state, rows))
         allowed = self._tolerance(q := state.q) * (1 + jnp.max(jnp.abs(q), axis=0, initial=0))
         x, moved, singular = root(equations, self.iterations)
         acceleration, multipliers = equations.split(x)
         average, q, v = equations.end(acceleration)
-        t = state.time + dt
+        t = state.instant + dt
         v, nearest = projected(dynamics, q, v, t) if self.projects else (v, jnp.zeros_like(began))
         late = jnp.where(moved <= allowed, Status.OK, Status.NOT_CONVERGED).astype(jnp.int32)
         code = functools.reduce(status.first, (began, judge(x, singular), late, nearest))
@@ -172,7 +172,7 @@ def _begun(dynamics: Dynamics, state: State, memory: History) -> tuple[History, 
     healthy = jnp.zeros_like(state.status)
 
     def look() -> tuple[History, Array]:
-        (a, multipliers, code), _ = dynamics(state.q, state.v, state.time)
+        (a, multipliers, code), _ = dynamics(state.q, state.v, state.instant)
         fresh = History(a, a, multipliers, memory.started)
         return keep(memory.started, (memory, healthy), (fresh, code))
 

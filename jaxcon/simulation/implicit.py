@@ -103,6 +103,7 @@ class Equations:
         self.scheme, self.soft = scheme, soft
         # made before the root, see `roots.implicit`
         self.weights = 1 / scheme.reach, 1 / scheme.push
+        self.time = state.instant + dynamics.dt
         self.guess = jnp.concatenate([known.acceleration, known.multipliers])
         self.inertia = dynamics.system.mass(state.q).diagonal
 
@@ -124,9 +125,8 @@ class Equations:
         """r(x), (n_v + n_c,)."""
         own, (acceleration, multipliers) = self.dynamics, self.split(x)
         _, q, v = self.end(acceleration)
-        t = self.state.time + own.dt
-        rows = linearize(own.system, q, v, t)
-        pull = own.system.force(q, v, t, own.control) + rows.jacobian.transpose(multipliers)
+        rows = linearize(own.system, q, v, self.time)
+        pull = own.system.force(q, v, self.time, own.control) + rows.jacobian.transpose(multipliers)
         balance = own.system.mass(q).apply(acceleration) - pull
         return jnp.concatenate([balance, self.closed(rows, acceleration, multipliers)])
 

@@ -17,8 +17,10 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks, numerics, status
+from jaxcon.core.doubled import Doubled
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.worlds import keep
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
@@ -28,7 +30,8 @@ class Advanced(NamedTuple):
     """Where a step leads, and what was seen at its start.
 
     Attributes:
-        point: q (n_q,), v (n_v,) and the time reached, () [s].
+        point: q (n_q,), v (n_v,) and the time reached, () [s], as `state.instant + dt`, which keeps
+            its remainder, or rounded.
         solution: a and λ.
         rows: the constraints.
         memory: of the integrator.
@@ -40,6 +43,19 @@ class Advanced(NamedTuple):
     rows: Rows
     memory: PyTree = ()
     ends: bool = False
+
+
+def reached(state: State, time: Any, dt: Array) -> Doubled:
+    """The instant of `Advanced.point`, with its remainder where it is the rounded end of the step.
+
+    Args:
+        state: at the start of the step.
+        time: that of the point.
+        dt: the length of the step, () [s].
+    """
+    if isinstance(time, Doubled):
+        return time
+    return keep(time == state.time + dt, state.instant + dt, Doubled.of(time))
 
 
 Pair = tuple[Any, Any]
@@ -88,9 +104,12 @@ class SemiImplicitEuler(Explicit):
         Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections VII.1.4 and VII.5.
     """
 
+    reads_within = False
+    """Whether angles are read between the ends of a step."""
+
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
-        system, here = dynamics.system, (state.q, state.v, state.time)
+        system, here = dynamics.system, (state.q, state.v, state.instant)
         if system.turns_in_space:
             solution, rows, least = dynamics.factored(*here, dt / 2)
             v = system.kick(state.q, state.v, solution.acceleration, dt[None])
@@ -105,7 +124,7 @@ class SemiImplicitEuler(Explicit):
         if rows.reactions is not None and rows.reactions.shift is not None:
             moving = v + rows.reactions.shift
         q = system.retract(state.q, dt[None] * moving)
-        return Advanced((q, v, state.time + dt), solution, rows)
+        return Advanced((q, v, state.instant + dt), solution, rows)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.
@@ -174,7 +193,7 @@ def missed(
         promised = rows.rate + h * (rows.jacobian.apply(solution.acceleration) + rows.bias / 2)
         promised = rows.residual + h * promised
         q = system.retract(state.q, h * v)
-        there = linearize(system, q, v, state.time + dt).residual
+        there = linearize(system, q, v, state.instant + dt).residual
         off = jnp.where(held, there - promised, 0)
         return least(-share[None] * numerics.safe_divide(off, h * h))
 
@@ -228,9 +247,9 @@ class RungeKutta(Explicit):
 
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
-        q, v, t, h = state.q, state.v, state.time, dt[None]
+        q, v, t, h = state.q, state.v, state.instant, dt[None]
         system = dynamics.system
-        solution, rows, dynamics = dynamics.begun(state.q, state.v, state.time)
+        solution, rows, dynamics = dynamics.begun(state.q, state.v, state.instant)
         first = system.kinematics(q, v), solution.acceleration
 
         def stage(carry: Any, row: tuple[Array, Array]) -> tuple[Any, None]:

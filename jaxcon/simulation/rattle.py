@@ -89,14 +89,14 @@ class RATTLE:
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
         system, q, v, h = dynamics.system, state.q, state.v, dt[None]
-        rows = linearize(system, q, v, state.time)
+        rows = linearize(system, q, v, state.instant)
         _check_rows(rows.layout)
         if depends(system.mass, q):
             raise ValueError(
                 "RATTLE: the mass matrix depends on q, and the kinetic energy must not; take RK4()"
                 " with Projection(), or coordinates in which the mass is constant."
             )
-        kick = h / 2 * system.applied(q, v, state.time, dynamics.control)
+        kick = h / 2 * system.applied(q, v, state.instant, dynamics.control)
         drift = _Drift(dynamics, state, rows, system.mass(q).apply(v) + kick, dt)
         start = jnp.concatenate([v, jnp.zeros_like(rows.rate)])
         between, moved = roots.implicit(
@@ -113,13 +113,13 @@ class RATTLE:
         q = system.retract(q, h * middle)
         acceleration = numerics.safe_divide(end - v, h)
         solution = Solution(acceleration, numerics.safe_divide(2 * pull, h), code)
-        return Advanced((q, end, state.time + dt), solution, rows)
+        return Advanced((q, end, state.instant + dt), solution, rows)
 
     def _arrive(
         self, dynamics: Dynamics, state: State, middle: Array, dt: Any
     ) -> tuple[Array, Array]:
         """v⁺ from V, and a status."""
-        system, h, time = dynamics.system, dt[None], state.time + dt
+        system, h, time = dynamics.system, dt[None], state.instant + dt
         q = system.retract(state.q, h * middle)
         momentum = system.carry(q, -h * middle, system.mass(q).apply(middle))
         rows = linearize(system, q, middle, time)
@@ -162,7 +162,7 @@ class _Drift:
         self, dynamics: Dynamics, state: State, rows: Rows, momentum: Array, dt: Any
     ) -> None:
         self.system, self.q, self.rows, self.momentum = dynamics.system, state.q, rows, momentum
-        self.h, self.time = dt[None], state.time + dt
+        self.h, self.time = dt[None], state.instant + dt
         # made before the root, see `roots.implicit`
         self.per_step = numerics.safe_divide(jnp.ones_like(self.h), self.h)
         problem = saddle(self.system, self.q, rows, momentum, rows.rate)

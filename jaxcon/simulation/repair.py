@@ -123,7 +123,7 @@ class Recovery:
         """VIOLATED where a state is beyond the limit, ()."""
         if self.limit is None:
             return jnp.zeros_like(state.status)
-        rows = linearize(system, state.q, state.v, state.time)
+        rows = linearize(system, state.q, state.v, state.instant)
         return jnp.where(self._beyond(rows), Status.VIOLATED, Status.OK).astype(jnp.int32)
 
     def repair(self, system: Any, solver: Any, state: State, attempt: Any, dt: Any) -> Any:

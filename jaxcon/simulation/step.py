@@ -178,7 +178,7 @@ def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Ar
     args = (system, method, state, control, dt)
     state = spread(state, batch_of(args, state.q.ndim - 1))
     dynamics = dynamics_at(system, method, state, control, dt)
-    return dynamics(state.q, state.v, state.time)[0]
+    return dynamics(state.q, state.v, state.instant)[0]
 
 
 def check_step(system: Any, method: Method, state: State, control: PyTree) -> PyTree:

@@ -139,6 +139,24 @@ class Jacobian:
 
         return dataclasses.replace(self, blocks=tuple(map(block, self.blocks)))
 
+    def scaled(self, factor: Array, chosen: np.ndarray) -> Jacobian:
+        """J with some of its rows multiplied, each by a factor (n_c,).
+
+        Args:
+            factor: of each row, 1 of those that are not chosen.
+            chosen: which rows these are, (n_c,); blocks without one stay as they are.
+        """
+
+        def block(old: Block) -> Block:
+            m, k = old.shape
+            if not chosen[old.start : old.start + m * k].any():
+                return old
+            pairs = zip(old.value, Vector.of_rows(factor, old.start, m, k), strict=True)
+            value = tuple(row.map(partial(times, own)) for row, own in pairs)
+            return dataclasses.replace(old, value=value)
+
+        return dataclasses.replace(self, blocks=tuple(map(block, self.blocks)))
+
     def dense(self) -> Array:
         """J as one array (n_c, n_v): one concatenation and one gather by a fixed index."""
         entries: list[Array] = []

@@ -179,7 +179,7 @@ class Hybrid(Unstabilized):
         if self.large is None:
             return state, jnp.zeros_like(state.status)
         new, code = self.large.correct(system, solver, before, state, Parts(*memory).large, dt)
-        residual = linearize(system, state.q, state.v, state.time).residual
+        residual = linearize(system, state.q, state.v, state.instant).residual
         size = finite_or_nan(jnp.asarray(self.project_above, residual.dtype))[None]
         w = self.beyond(jnp.sum((residual / size) ** 2, axis=0))[None]
         q = system.normalize(state.q + w * (new.q - state.q))

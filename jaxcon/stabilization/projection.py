@@ -48,7 +48,7 @@ class Tolerance:
         if self.speed is not None:
             scale = scale + _number(self.speed, state) * numerics.norm(state.v)
         if self.force is not None:
-            force = system.force(state.q, state.v, state.time)
+            force = system.force(state.q, state.v, state.instant)
             scale = scale + _number(self.force, state) * numerics.norm(force)
         return _number(self.base, state) * scale
 
@@ -178,12 +178,12 @@ class Projection(Unstabilized):
     ) -> tuple[Array, Array, Array]:
         """q with φ(q, t) = 0 by the directions at the start, the v that goes with it, a status."""
         q, still = state.q, jnp.zeros_like(state.v)
-        rows = linearize(system, start.q, still, start.time)
+        rows = linearize(system, start.q, still, start.instant)
         held, rotors = _held(rows.layout)
         if not held.any():
             return q, state.v, jnp.zeros_like(state.status)
         problem = self._problem(system, start.q, rows, held, rotors)
-        off = rows if start is state else linearize(system, q, still, state.time)
+        off = rows if start is state else linearize(system, q, still, state.instant)
         surface = _Surface(system, state, off.residual, problem, held)
         factored, bounds = solver.factor(problem), self._bounds(system, state)
         step, left, code = self._step(surface, partial(factored, still), bounds)
@@ -247,7 +247,7 @@ class Projection(Unstabilized):
 
     def _velocities(self, system: Any, solver: Any, state: State) -> tuple[Array, Array]:
         """v with φ̇ = 0 and ψ = 0, and a status."""
-        rows = linearize(system, state.q, state.v, state.time)
+        rows = linearize(system, state.q, state.v, state.instant)
         if not rows.layout.size:
             return state.v, jnp.zeros_like(state.status)
         rotors = _held(rows.layout)[1]
@@ -322,7 +322,7 @@ class _Surface:
         """φ(q* ⊕ d), (n_c,)."""
         moved = self.system.retract(self.state.q, d)
         still = jnp.zeros_like(d)
-        return linearize(self.system, moved, still, self.state.time).residual
+        return linearize(self.system, moved, still, self.state.instant).residual
 
     def apply(self, d: Array) -> Array:
         """J₀ d, (n_c,)."""

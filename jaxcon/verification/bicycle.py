@@ -46,7 +46,7 @@ def tangents(system: Any, state: jc.State) -> np.ndarray:
 
     Where the bicycle stands, how it heads and how its wheels are turned does not matter.
     """
-    rows = linearize(system, state.q, state.v, state.time)
+    rows = linearize(system, state.q, state.v, state.instant)
     held = np.asarray(rows.jacobian.dense())[rows.layout.holonomic]
     select = np.asarray(jax.jacfwd(lambda v: rates(system, state.q, v))(state.v))[:2]
     right = np.vstack([np.zeros((len(held), 2)), np.eye(2)])

@@ -1,0 +1,162 @@
+"""Joints that turn far in a step, and how many whole turns they have made."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+
+RIGHT = np.pi / 2
+METHODS = {
+    "euler": jc.Method(),
+    "rk4": jc.Method(integrator=jc.RK4()),
+    "events": jc.Method(events=jc.Events()),
+    "seidel": jc.Method(bounded=jc.GaussSeidel()),
+}
+both = pytest.mark.parametrize("dim", [2, 3])
+dtypes = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+
+
+def rod(dim, dtype, lower=0.0, upper=RIGHT, **stop):
+    """A rod of 0.12 m, 0.08 kg on a hinge with damping and a strong servo, maybe with stops."""
+    length, mass = 0.12, 0.08
+    scene = jc.Scene(dim=dim, gravity=(0, -9.81) if dim == 2 else (0, 0, -9.81), dtype=dtype)
+    inertia = mass * length**2 / 12
+    moments = inertia if dim == 2 else (1e-6, inertia, inertia)
+    position = (length / 2, 0.0, 0.0)[:dim]
+    scene.add_body("rod", mass=mass, inertia=moments, position=position)
+    axis = None if dim == 2 else (0, 1, 0)
+    scene.add(jc.Revolute("hinge", jc.WORLD, "rod", point=(0.0,) * dim, axis=axis))
+    if upper is not None:
+        scene.add(jc.Limit("range", "hinge", lower, upper, **stop))
+    scene.add(jc.JointDamper("damper", "hinge", 0.02))
+    scene.add(jc.PositionServo("servo", "hinge", 100.0))
+    return scene.build()
+
+
+def moved(system, method, state, target, steps=1000, dt=2e-3):
+    """The angles after each step, λ of the stop where there is one, and the final state."""
+    start = jc.init(system, method, state.q, state.v)
+    controls = jnp.full((steps, 1), target, state.q.dtype)
+
+    def seen(state, info):
+        return jc.coordinate(system, state, "hinge"), info.reactions["range"][0]
+
+    end, (angles, pushes) = jc.rollout(system, method, start, controls, dt, steps, record=seen)
+    return np.asarray(angles), np.asarray(pushes), end
+
+
+@both
+@dtypes
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize(("target", "stop"), [(12.2, RIGHT), (-12.2, 0.0)])
+def test_a_servo_rests_at_the_stop_that_one_step_would_pass(name, dim, dtype, target, stop):
+    """Without it the first step would be two turns; the stop bears what the servo pushes."""
+    if name in ("events", "seidel") and dtype == jnp.float64:
+        pytest.skip("as in float32")
+    system, state = rod(dim, dtype)
+    angles, pushes, end = moved(system, METHODS[name], state, target)
+    assert int(end.status) == jc.Status.OK
+    np.testing.assert_allclose(angles[-1], stop, atol=1e-3)
+    assert angles.max() < RIGHT + 0.2
+    assert angles.min() > -0.2
+    weight = 0.08 * 9.81 * 0.06 * np.cos(stop)
+    np.testing.assert_allclose(pushes[-1], 100.0 * abs(target - stop) + weight, rtol=2e-2)
+
+
+@pytest.mark.parametrize("kind", ["hard", "bouncing", "soft"])
+def test_one_step_ends_at_the_far_stop(kind):
+    """From anywhere in the range, 2 mrad off at most for how the arm turns within the step."""
+    choice = {"bouncing": {"restitution": 0.5}, "soft": {"stiffness": 1e9, "damping": 1e5}}
+    for start in (0.0, 0.5, 1.5):
+        system, state = rod(2, jnp.float64, -start, RIGHT - start, **choice.get(kind, {}))
+        angles, _, end = moved(system, jc.Method(), state, 12.2, 1)
+        assert int(end.status) == jc.Status.OK
+        if kind != "bouncing":
+            np.testing.assert_allclose(angles[0], RIGHT - start, atol=2e-3)
+        assert angles[0] < RIGHT - start + 2e-3
+
+
+def test_the_gradient_of_a_step_to_the_far_stop():
+    """Where it ends depends on the stop and on nothing else, in both modes."""
+    system, state = rod(2, jnp.float64)
+
+    def end(upper, torque):
+        changed = system.with_params({"range": {"upper": upper}})
+        start = jc.init(changed, jc.Method(), state.q, state.v)
+        after, _ = jc.step(changed, jc.Method(), start, torque[None], 2e-3)
+        return after.q[2]
+
+    at = jnp.asarray(RIGHT), jnp.asarray(12.2)
+    for slope in (jax.grad(end, (0, 1))(*at), jax.jacfwd(end, (0, 1))(*at)):
+        np.testing.assert_allclose(slope, (1.0, 0.0), atol=1e-3)
+    alone = [end(at[0] + x, at[1]) for x in (1e-4, -1e-4)]
+    np.testing.assert_allclose(jax.grad(end)(*at), (alone[0] - alone[1]) / 2e-4, rtol=1e-6)
+
+
+def test_worlds_of_a_batch_meet_stops_of_their_own():
+    system, state = rod(2, jnp.float64)
+    targets = jnp.asarray([12.2, -12.2, 0.5, 1e3])
+    last = jax.vmap(lambda x: jnp.asarray(_last(system, state, x)))(targets)
+    alone = [_last(system, state, x) for x in targets]
+    np.testing.assert_allclose(last, alone, atol=1e-9)
+    np.testing.assert_allclose(last[:2], (RIGHT, 0.0), atol=1e-3)
+
+
+def _last(system, state, target):
+    start = jc.init(system, jc.Method(), state.q, state.v)
+    controls = jnp.full((50, 1), target, state.q.dtype)
+    end, _ = jc.rollout(system, jc.Method(), start, controls, 2e-3, 50)
+    return end.q[2]
+
+
+def test_turning_further_than_can_be_told_is_a_status():
+    """The rod without stops: two turns in the first step, of which a joint in space sees none."""
+    system, state = rod(3, jnp.float64, upper=None)
+    start = jc.init(system, jc.Method(), state.q, state.v)
+    end, info = jc.step(system, jc.Method(), start, jnp.asarray([12.2]), 2e-3)
+    assert int(end.status) == int(info.status) == jc.Status.LOST_TURNS
+    np.testing.assert_array_equal(end.q, start.q)
+    with pytest.raises(jc.SimulationError, match="LOST_TURNS.*whole turns"):
+        jc.raise_for_status(end)
+    gentle, _ = jc.step(system, jc.Method(), start, jnp.asarray([1.0]), 2e-3)
+    assert int(gentle.status) == jc.Status.OK
+
+
+def spinning(speed, dtype):
+    scene = jc.Scene(dim=3, gravity=(0, 0, 0), dtype=dtype)
+    spin = (0, 0, speed)
+    scene.add_body("wheel", mass=1.0, inertia=(0.4, 0.5, 0.7), angular_velocity=spin)
+    scene.add(jc.Revolute("hub", jc.WORLD, "wheel", point=(0, 0, 0), axis=(0, 0, 1)))
+    scene.add(jc.TurnCounter("count", "hub"))
+    return scene.build()
+
+
+@dtypes
+@pytest.mark.parametrize("turn", [0.4, 2.0, 3.6, -10.0, 50.0])
+def test_turns_are_counted_at_any_speed(turn, dtype):
+    """An angle of many half turns a step is told by the velocity."""
+    system, state = spinning(turn / 2e-3, dtype)
+    start = jc.init(system, jc.Method(), state.q, state.v)
+    end, _ = jc.rollout(system, jc.Method(), start, None, 2e-3, 50)
+    assert int(end.status) == jc.Status.OK
+    np.testing.assert_allclose(jc.coordinate(system, end, "hub"), 50 * turn, rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        jc.Method(integrator=jc.RK4()),
+        jc.Method(integrator=jc.RATTLE(), stabilizer=jc.Unstabilized()),
+        jc.Method(integrator=jc.GeneralizedAlpha(), stabilizer=jc.Unstabilized()),
+    ],
+    ids=["rk4", "rattle", "alpha"],
+)
+def test_stages_tell_less_than_half_a_turn(method):
+    """Angles are read within the step there."""
+    for turn, status in ((1.0, jc.Status.OK), (3.6, jc.Status.LOST_TURNS)):
+        system, state = spinning(turn / 2e-3, jnp.float64)
+        start = jc.init(system, method, state.q, state.v)
+        end, _ = jc.rollout(system, method, start, None, 2e-3, 5)
+        assert int(end.status) == status
