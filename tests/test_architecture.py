@@ -98,6 +98,42 @@ def test_the_library_keeps_its_hands_off(path):
         assert name not in NOT_IN_THE_LIBRARY or name in allowed, f"{path}:{line}: {name}"
 
 
+INNER = ("jax.extend", "jax.interpreters", "jax.experimental", "jax.core")
+"""Modules of JAX that may change between its versions; CONTRIBUTING.md says why each is used."""
+MAY_IMPORT = {
+    "core/native.py": {"jax.core", "jax.extend", "jax.interpreters"},
+    "core/jaxprs.py": {"jax.interpreters"},
+    "core/program.py": {"jax.extend"},
+    "core/operations.py": {"jax.extend"},
+    "core/closures.py": {"jax.extend"},
+    "core/fusion.py": {"jax.experimental"},
+    "core/meshes.py": {"jax.core"},
+    "core/equality.py": {"jax.core"},
+    "core/pytree.py": {"jax.core"},
+    "core/checks.py": {"jax.core"},
+}
+
+
+def foreign(path):
+    """Names of the modules of JAX that a file imports or reaches by a dotted name."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Attribute):
+            yield ast.unparse(node)
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_the_library_leans_on_few_inner_workings_of_jax(path):
+    allowed = MAY_IMPORT.get(path.relative_to(ROOT).as_posix(), set())
+    names = set(foreign(path))
+    assert not [name for name in names if name.startswith("jax._src")]
+    used = {inner for inner in INNER for name in names if f"{name}.".startswith(f"{inner}.")}
+    assert used == allowed
+
+
 def test_every_public_name_exists_and_says_what_it_is():
     assert sorted(set(jc.__all__)) == sorted(jc.__all__)
     shown = {name for name in dir(jc) if not name.startswith("__")}

@@ -6,7 +6,6 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
-import jax.experimental
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,9 +14,7 @@ from jaxcon.core.typing import PyTree
 
 def precision(dtype: Any) -> AbstractContextManager[Any]:
     """Within it float64 is there where `dtype` is that, and float32 is the default elsewhere."""
-    old = getattr(jax.experimental, "enable_x64", None)
-    switch: Any = getattr(jax, "enable_x64", old)
-    return switch(np.dtype(dtype) == np.float64)
+    return jax.enable_x64(np.dtype(dtype) == np.float64)
 
 
 def cast(tree: PyTree, dtype: Any) -> PyTree:
