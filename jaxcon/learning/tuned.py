@@ -196,10 +196,11 @@ class Outlook:
             )
         if np.isfinite(self.distance):
             far = f"by about {self.distance:.1g}" if self.distance < 1 else "far"
+            pace = f"still fell by {self.pace:.1e} a step" if self.pace > 0 else "fell no more"
             return (
                 f" before it converged: by the curvature, {name} may be off the least {far},"
-                f" relative to its size, and the loss still fell by {self.pace:.1e} a step; ask for"
-                " more, or fit recordings with jc.identify"
+                f" relative to its size, and the loss {pace}; ask for more, or fit recordings with"
+                " jc.identify"
             )
         if np.isnan(self.late):
             return " before it converged: too few to tell more; ask for more"
