@@ -283,3 +283,17 @@ def gradient_states(quick: bool) -> list[Metric]:
             found.append(count(f"{title}, modes apart", row.beyond))
             found.append(count(f"{title}, off", row.off))
     return found
+
+
+@entry("poisoned")
+def poisoned(quick: bool) -> list[Metric]:
+    """Batches with a number that is NaN or infinite in one world: what goes wrong, of all tried."""
+    from benchmarks import poisoned as study
+
+    total = study.Counts()
+    with jax.enable_x64(True):
+        for name in ("PID", "recovery") if quick else study.studies(quick=True):
+            total += study.measure(name, quick)
+    wrong = ("accepted", "neighbors", "gradients")
+    found = [count(f"{what}, wrong", len(getattr(total, what))) for what in wrong]
+    return [Metric("tried", total.tried), *found]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax
@@ -66,7 +65,9 @@ def attempt(
     kept = (advanced.memory, own, memory.recovery, multipliers)
     kept = MethodMemory(*kept) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
-    code = functools.reduce(status.first, (judge(new, solution), corrected, remembered(own, new)))
+    code = status.first(judge(new, solution), corrected)
+    if jax.tree.leaves(own):
+        code = status.first(code, judge_memory(own, new))
     if system.counted:
         lost = jnp.where(missed < jnp.pi, Status.OK, Status.LOST_TURNS).astype(jnp.int32)
         code = status.first(code, lost)
@@ -125,7 +126,7 @@ def dynamics_at(
     return Dynamics(*own, solver, guess, part=part)
 
 
-def remembered(memory: PyTree, state: State) -> Array:
+def judge_memory(memory: PyTree, state: State) -> Array:
     """NON_FINITE where a number is not finite that the stabiliser is to remember, ().
 
     The next step would fail by it, when the derivative of this one is NaN already.

@@ -52,7 +52,8 @@ class GeneralizedAlpha:
     W the diagonal of J M⁻¹ Jᵀ, and proximal rounds take out again what that does: φ is zero to
     rounding, and λ the least of those that fit. The derivative of a step is that of its solution,
     exact to every order. Newton's matrix is dense: for up to some hundreds of rows. A state that is
-    changed by hand starts anew, by `init`.
+    changed by hand starts anew, by `init`. The equations divide by h: a world with h = 0 ends in
+    NON_FINITE.
 
     Attributes:
         rho: ρ∞, from 1 (no dissipation) to 0 (the highest frequencies are gone after a step).
@@ -129,7 +130,8 @@ class GeneralizedAlpha:
         t = state.instant + dt
         v, nearest = projected(dynamics, q, v, t) if self.projects else (v, jnp.zeros_like(began))
         late = jnp.where(moved <= allowed, Status.OK, Status.NOT_CONVERGED).astype(jnp.int32)
-        code = functools.reduce(status.first, (began, judge(x, singular), late, nearest))
+        codes = (began, judge(x, singular), judge(equations.weights[0]), late, nearest)
+        code = functools.reduce(status.first, codes)
         kept = History(acceleration, average, multipliers, jnp.ones_like(memory.started))
         solution, ends = dynamics(q, v, t)  # compiled only where it is read
         if equations.soft is not None:
