@@ -133,6 +133,58 @@ def test_what_is_free_stays_free(kind):
     np.testing.assert_allclose(multipliers, jnp.zeros_like(multipliers), atol=IDENTITY)
 
 
+PLANES = {"planar": jc.Planar, "point": jc.PointOnPlane}
+
+
+def slid(kind, axis, x_axis, travel=(0.3, -0.2, 0.1), dtype=None):
+    """The coordinates x and y after a body has moved by a vector."""
+    scene = jc.Scene(gravity=(0.0, 0.0, 0.0), dtype=dtype)
+    scene.add_body("body", mass=1.0, inertia=(1.0, 1.0, 1.0))
+    more = {} if x_axis is None else {"x_axis": x_axis}
+    scene.add(PLANES[kind]("plane", jc.WORLD, "body", axis=axis, **more))
+    system, state = scene.build()
+    moved = dataclasses.replace(state, q=state.q.at[:3].add(jnp.asarray(travel, state.q.dtype)))
+    return np.array([jc.coordinate(system, moved, "plane", name) for name in "xy"])
+
+
+@pytest.mark.parametrize("kind", PLANES)
+def test_x_of_a_plane_is_the_axis_that_was_chosen(kind):
+    """Its part in the plane, at length one, and y = axis × x."""
+    np.testing.assert_allclose(slid(kind, Z, X), [0.3, -0.2], atol=IDENTITY)
+    np.testing.assert_allclose(slid(kind, -2 * Z, 3 * X + Z), [0.3, 0.2], atol=IDENTITY)
+    np.testing.assert_allclose(slid(kind, Y, Z), [0.1, 0.3], atol=IDENTITY)
+    n, x = np.array([1.0, 2.0, 2.0]) / 3, np.array([2.0, 1.0, -2.0]) / 3
+    expected = [np.dot(u, [0.3, -0.2, 0.1]) for u in (x, np.cross(n, x))]
+    np.testing.assert_allclose(slid(kind, 5 * n, x + n), expected, atol=IDENTITY)
+    assert slid(kind, Z, X, dtype=jnp.float32).dtype == np.float32
+
+
+@pytest.mark.parametrize("kind", PLANES)
+def test_x_of_a_plane_without_a_choice_is_that_of_the_documentation(kind):
+    """axis × e, e the world axis along which the normal is shortest."""
+    np.testing.assert_allclose(slid(kind, Z, None), [-0.2, -0.3], atol=IDENTITY)
+    np.testing.assert_allclose(slid(kind, Y, None), [-0.1, -0.3], atol=IDENTITY)
+    np.testing.assert_allclose(slid(kind, X, None), [0.1, 0.2], atol=IDENTITY)
+
+
+@pytest.mark.parametrize("kind", PLANES)
+def test_x_along_the_normal_of_a_plane_is_refused(kind):
+    with pytest.raises(ValueError, match="'plane'.*x_axis must not be parallel to axis"):
+        slid(kind, Z, -3 * Z)
+
+
+def test_x_of_a_line_in_the_plane_points_as_it_was_chosen():
+    for x_axis, sign in ((None, 1), ((-1.0, 0.2), 1), ((1.0, 0.0), -1)):
+        scene = jc.Scene(dim=2)
+        scene.add_particle("bead", mass=1.0, position=(0.0, 1.0))
+        plane = jc.PointOnPlane("line", jc.WORLD, "bead", axis=(0.0, 2.0), x_axis=x_axis)
+        scene.add(plane)
+        system, state = scene.build()
+        moved = dataclasses.replace(state, q=state.q.at[0].add(-0.5))
+        got = jc.coordinate(system, moved, "line", "x")
+        np.testing.assert_allclose(got, 0.5 * sign, atol=IDENTITY)
+
+
 def test_a_parallel_axis_is_held_by_a_torque_across_it():
     """A body that would tip under a force off its centre is held by a pure torque."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))

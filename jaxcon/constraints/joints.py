@@ -253,10 +253,24 @@ def anchors(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
 def triad(joint: Any, pose: Pose) -> list[Array]:
     """The unit axis of a joint and the directions normal to it, right-handed.
 
+    The first of them is the part of `x_axis` normal to the axis, where the joint has one.
+
     Raises:
-        ValueError: the axis is missing, has the wrong shape or length zero.
+        ValueError: an axis is missing, has the wrong shape or length zero, or they are parallel.
     """
-    return basis(unit(joint, "axis", pose))
+    n = unit(joint, "axis", pose)
+    if getattr(joint, "x_axis", None) is None:
+        return basis(n)
+    given = unit(joint, "x_axis", pose)
+    across = given - jnp.dot(n, given) * n
+    length = numerics.norm(across)
+    if checks.is_concrete(length) and float(length) <= PERPENDICULAR:
+        raise ValueError(
+            f"{label(joint)}: x_axis must not be parallel to axis, got {joint.x_axis} and"
+            f" {joint.axis}; give a direction in the plane."
+        )
+    u = across / length
+    return [n, u] if n.shape == (2,) else [n, u, jnp.cross(n, u)]
 
 
 def basis(n: Array) -> list[Array]:
@@ -265,7 +279,10 @@ def basis(n: Array) -> list[Array]:
 
 
 def normals(n: Array) -> list[Array]:
-    """The directions normal to a unit vector (dim,) that make it a right-handed frame."""
+    """The directions normal to a unit vector (dim,) that make it a right-handed frame.
+
+    In space the first is n × e, e the world axis along which n is shortest, x before y before z.
+    """
     if n.shape == (2,):
         return [jnp.stack([-n[1], n[0]])]
     smallest = jnp.argmin(jnp.abs(n))

@@ -76,6 +76,11 @@ class PointOnPlane:
         axis: the normal, world frame at assembly, (dim,), any length but zero.
         point: on the plane, world frame at assembly, (dim,) [m]; the second body's centre of mass
             unless given.
+        x_axis: the direction of the coordinate x, world frame at assembly, (dim,); its part in the
+            plane counts, and y is axis × x. Unless given, x is axis × e, e the world axis along
+            which the axis is shortest, x before y before z: of a normal along world z, x points
+            along world y, and y along −x.
+            In the plane x is the axis turned by +90°.
     """
 
     name: str
@@ -83,6 +88,7 @@ class PointOnPlane:
     body_b: str
     axis: Any
     point: Any = None
+    x_axis: Any = None
     coordinates = MappingProxyType({"x": "m", "y": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
@@ -98,7 +104,7 @@ class PointOnPlane:
 
     @staticmethod
     def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
-        """How far b has moved along two directions of the plane; in the plane there is only x."""
+        """How far b has moved along x and y of a [m]; in the plane there is only x."""
         side = {"x": "first_a", "y": "second_a"}[name]
         if side not in p:
             raise ValueError("PointOnPlane: in the plane its one coordinate is x, got y.")
@@ -221,9 +227,14 @@ class Planar(Parallel):
         axis: the normal, world frame at assembly, (3,), any length but zero.
         point: on the plane, world frame at assembly, (3,) [m]; the second body's centre of mass
             unless given.
+        x_axis: the direction of the coordinate x, world frame at assembly, (3,); its part in the
+            plane counts, and y is axis × x. Unless given, x is axis × e, e the world axis along
+            which the axis is shortest, x before y before z: of a normal along world z, x points
+            along world y, and y along −x.
     """
 
     point: Any = None
+    x_axis: Any = None
     coordinates = MappingProxyType({"x": "m", "y": "m", "angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
@@ -237,7 +248,7 @@ class Planar(Parallel):
 
     @staticmethod
     def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
-        """How far b has moved along two directions of the plane [m] and turned in it [rad]."""
+        """How far b has moved along x and y of a [m] and turned about the normal [rad]."""
         if name == "angle":
             return turn_about(p, a, b)
         return PointOnPlane.coordinate(name, p, a, b)
