@@ -100,10 +100,22 @@ def test_the_torque_is_that_of_the_law(dim, law):
 
 
 @both
-def test_without_control_a_motor_rests_and_a_servo_holds_zero(dim):
+def test_at_control_zero_a_motor_rests_and_a_servo_holds_zero(dim):
     servo = jc.PositionServo("servo", "hub", 4.0)
     system, state = wheel(dim, jc.Motor("motor", "hub"), servo)
-    np.testing.assert_allclose(torque(system, turned(system, state, 0.3)), -1.2, rtol=1e-9)
+    found = torque(system, turned(system, state, 0.3), jnp.zeros(2))
+    np.testing.assert_allclose(found, -1.2, rtol=1e-9)
+
+
+def test_a_motor_without_control_is_named():
+    system, state = wheel(2, jc.Motor("motor", "hub"), jc.PositionServo("servo", "hub", 4.0))
+    for act in (
+        lambda: jc.step(system, jc.Method(), state, None, 1e-3),
+        lambda: jc.rollout(system, jc.Method(), state, None, 1e-3, 2),
+        lambda: jc.forward_dynamics(system, state, None, jc.Method(), 1e-3),
+    ):
+        with pytest.raises(ValueError, match=r"None, but the motors \['motor', 'servo'\] wait"):
+            act()
 
 
 def test_channels_lie_in_the_order_of_the_elements():

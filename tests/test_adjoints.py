@@ -264,8 +264,8 @@ def test_a_budget_takes_as_few_levels_as_it_can():
         (jc.Checkpoints(segments=()), ValueError, "as a tuple of one number or more"),
         (jc.Checkpoints(budget="1MB"), ValueError, "budget must be a real number"),
         (jc.Truncated(0), ValueError, "steps must be a whole number"),
-        (jc.Discounted(-0.5), ValueError, "factor must be zero or more"),
-        (jc.Discounted(1.5), ValueError, "factor must be from 0 to 1"),
+        (jc.Discounted(-0.5), ValueError, "factor must lie between 0 and 1"),
+        (jc.Discounted(1.5), ValueError, "factor must lie between 0 and 1"),
         (jc.Discounted(np.array([0.5, 0.9])), ValueError, r"one number, got shape \(2,\)"),
     ],
 )

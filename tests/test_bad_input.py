@@ -715,4 +715,4 @@ def test_of_many_numbers_only_the_first_wrong_one_is_shown():
     masses = np.ones((5, 4))
     masses[2, 3] = -1.0
     with pytest.raises(ValueError, match=r"got -1.0 at \[2, 3\] of an array \(5, 4\)\.$"):
-        checks.positive("body 'a'", "mass", masses)
+        checks.check("body 'a'", "mass", masses, above=0)

@@ -157,10 +157,10 @@ MISTAKES = {
     "shape": (lambda s: jc.rope(s, "r", np.ones((4, 3)), 1.0), r"\(links \+ 1, 2\).*\(4, 3\)"),
     "one link": (lambda s: jc.rope(s, "r", SPAN[:2], 1.0), "2 links or more"),
     "twice": (lambda s: jc.rod(s, "r", SPAN[[0, 1, 1, 2]], 1.0), "points 1 and 2 must be apart"),
-    "nan": (lambda s: jc.rope(s, "r", SPAN * np.nan, 1.0), "apart and finite"),
+    "nan": (lambda s: jc.rope(s, "r", SPAN * np.nan, 1.0), "points must be finite"),
     "mass": (lambda s: jc.rope(s, "r", SPAN, -1.0), "mass must be positive"),
     "unknown end": (lambda s: jc.rope(s, "r", SPAN, 1.0, end="hook"), "'hook' is unknown"),
-    "stiffness": (lambda s: jc.rope(s, "r", SPAN, 1.0, bending=-1.0), "stiffness must be zero or"),
+    "stiffness": (lambda s: jc.rope(s, "r", SPAN, 1.0, bending=-1.0), "bending must be zero or"),
     "twist": (
         lambda s: s.add(jc.Flexure("f", "p", jc.WORLD, 1.0)),
         "'p' is a particle: it has no orientation",
@@ -196,7 +196,7 @@ def test_a_rod_in_space_needs_a_radius_and_a_bounded_twist():
     [
         (((0, 0), (1, 0), 0.9, 5), "does not reach over 1 m"),
         (((0, 0), (0, 1), 2.0, 5), "above one another"),
-        (((0, 0), (1, 0), 2.0, 1), "links must be an integer of 2 or more"),
+        (((0, 0), (1, 0), 2.0, 1), "links must be a whole number from 2"),
         (((0, 0), (1, 0, 0), 2.0, 5), "must be points"),
     ],
 )

@@ -187,7 +187,8 @@ def test_gradients_by_the_size_of_a_box():
         (jc.PlaneContact("b", jc.WORLD, "dot", center=np.zeros((2, 3))), "a particle is one"),
         (jc.PlaneContact("b", "dot", "crate"), "'b': it needs an orientation, but 'dot'"),
         (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((2, 2))), r"shape \(2, 3\)"),
-        (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((0, 3))), r"shape \(1, 3\)"),
+        (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((0, 3))), r"\(k, 3\)"),
+        (jc.PlaneContact("b", jc.WORLD, "crate", center=np.zeros((1, 3))), r"\(k, 3\)"),
     ],
 )
 def test_bad_numbers_are_refused(element, match):

@@ -336,7 +336,7 @@ def test_a_group_of_constraints_shares_a_gain(rows):
         (jc.Baumgarte({"leg*": 5.0, "*_x": 4.0}, 1.0), ["leg_x", r"\['\*_x', 'leg\*'\]"]),
         (jc.PID(-1.0, 1.0), ["PID", "proportional", "zero or more", "-1"]),
         (jc.PID(1.0, 1.0, {"leg_x": -2.0}), ["integral of 'leg_x'", "-2"]),
-        (jc.PID(1.0, 1.0, limit="big"), ["PID", "limit must be numbers", "big"]),
+        (jc.PID(1.0, 1.0, limit="big"), ["PID", "limit must be real numbers", "big"]),
         (jc.AdaptiveBaumgarte(1.0, 1.0, size=0.0), ["AdaptiveBaumgarte", "size", "positive"]),
         (jc.AdaptiveBaumgarte(1.0, 1.0, floor=2.0), ["floor must lie between 0 and 1"]),
         (jc.SlidingWindowBaumgarte(damping_ratio=0.1), ["damping_ratio must lie between 0.5"]),

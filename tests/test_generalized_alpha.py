@@ -411,7 +411,7 @@ def test_it_refuses_what_it_cannot_do():
         assert step(admitted)[0].status == jc.Status.OK
     with pytest.raises(ValueError, match="leaves nothing to Baumgarte.*without gains"):
         step(jc.Baumgarte.critical(rate=10.0))
-    with pytest.raises(ValueError, match="rho must be from 0 to 1, got 1.5"):
+    with pytest.raises(ValueError, match="rho must lie between 0 and 1, got 1.5"):
         step(rho=1.5)
     with pytest.raises(ValueError, match="iterations must be a whole number from 1, got 0"):
         step(iterations=0)

@@ -10,7 +10,7 @@ def built():
     scene = jc.Scene(dim=2)
     scene.add_body("a", mass=1, inertia=1, position=(1, 2), angle=3, velocity=(4, 5))
     scene.add_particle("p", mass=1, position=(6, 7), velocity=(8, 9))
-    scene.add_body("b", mass=1, inertia=1, position=(10, 11), angle=12, angular_velocity=13)
+    scene.add_body("b", mass=1, inertia=1, position=(10, 11), angle=6, angular_velocity=13)
     scene.add_body("wall", fixed=True, position=(1, 1))
     scene.add(jc.ExternalWrench("pull", "p"))
     scene.add(jc.ExternalWrench("push", "b"))
@@ -19,7 +19,7 @@ def built():
 
 def test_coordinates_are_component_major_by_kind(built):
     system, state = built
-    np.testing.assert_array_equal(state.q, [1, 10, 2, 11, 3, 12, 6, 7])
+    np.testing.assert_array_equal(state.q, [1, 10, 2, 11, 3, 6, 6, 7])
     np.testing.assert_array_equal(state.v, [4, 0, 5, 0, 0, 13, 8, 9])
     assert system.layout.n_q == system.layout.n_v == 8
 

@@ -220,16 +220,16 @@ def test_numbers_that_are_arrays_are_checked_inside_a_trace_too():
         jax.make_jaxpr(recovery.check)()
 
     check(limit=0.1)
-    with pytest.raises(ValueError, match="shrink must lie between 0 and 1"):
+    with pytest.raises(ValueError, match="shrink must be above 0 and at most 1"):
         check(shrink=1.5)
 
 
 def test_what_is_refused(scene):
     system, state = scene
     for wrong, kind, words in (
-        (jc.Recovery(growth=float("nan")), ValueError, "growth must lie between 1 and inf"),
-        (jc.Recovery(growth=float("inf")), ValueError, "growth must be positive and finite"),
-        (jc.Recovery(shrink=2.0), ValueError, "shrink must lie between 0 and 1, got 2.0"),
+        (jc.Recovery(growth=float("nan")), ValueError, "growth must be 1 or more and finite"),
+        (jc.Recovery(growth=float("inf")), ValueError, "growth must be 1 or more and finite"),
+        (jc.Recovery(shrink=2.0), ValueError, "shrink must be above 0 and at most 1, got 2.0"),
         (jc.Recovery(shrink="a"), ValueError, "shrink must be a real number, got 'a'"),
         (jc.Recovery(limit=1j), ValueError, "limit must be a real number, got 1j"),
         (jc.Recovery(limit=True), ValueError, "limit must be a real number, got True"),
@@ -257,7 +257,11 @@ def test_what_is_refused(scene):
             "AugmentedLagrangian has a memory",
         ),
         (jc.Recovery(projector=jc.Projection(metric="Mass")), ValueError, "metric must be one of"),
-        (jc.Recovery(projector=jc.Projection(factor=3.0)), ValueError, "factor must be at most 1"),
+        (
+            jc.Recovery(projector=jc.Projection(factor=3.0)),
+            ValueError,
+            "factor must be above 0 and at most 1",
+        ),
         (jc.Recovery(projector="projection"), TypeError, "projector must be a stabiliser"),
         (jc.Recovery, TypeError, r"recovery must be a value such as Recovery\(\)"),
     ):

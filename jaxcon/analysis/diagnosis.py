@@ -14,6 +14,7 @@ import numpy as np
 from jaxcon.analysis.quantities import angular_momentum, energy, momentum
 from jaxcon.analysis.report import Report, report
 from jaxcon.constraints.rows import linearize
+from jaxcon.core import checks
 from jaxcon.core.status import MEANING, Status
 from jaxcon.core.typing import Array
 from jaxcon.dynamics.assembly import assemble
@@ -104,6 +105,8 @@ def diagnose(
     Returns:
         A `Diagnosis`.
     """
+    checks.count("diagnose", "steps", steps)
+    checks.check("diagnose", "dt", dt, (), above=0)
     assembled = assemble(system, state).state
     assembled = dataclasses.replace(assembled, status=state.status, memory=state.memory)
     finer = controls

@@ -87,6 +87,8 @@ def find_first_failure(
     Returns:
         The `Failure`, of the first world where several fail in one step; None where none does.
     """
+    checks.count("find_first_failure", "steps", steps, 0)
+    checks.check("find_first_failure", "dt", dt, least=0)
     batch = state.q.ndim > 1
     controls = controls if callable(controls) else controls_in(state.q.dtype, controls)
     if not batch:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.differences import differences, unseen
-from jaxcon.core import checks
+from jaxcon.core import checks, functions
 from jaxcon.core.typing import Array, PyTree
 
 
@@ -173,8 +173,7 @@ def check_gradients(
     checks.takes("check_gradients", "f", f, ("x",))
     checks.count("check_gradients", "directions", directions)
     checks.count("check_gradients", "seed", seed, 0)
-    if tolerance is not None:
-        checks.positive("check_gradients", "tolerance", tolerance)
+    checks.check("check_gradients", "tolerance", tolerance, (), above=0, optional=True)
     random = np.random.default_rng(seed)
     named = [(_name(path), leaf) for path, leaf in jax.tree.leaves_with_path(x)]
     floating = [i for i, (_, leaf) in enumerate(named) if _is_floating(leaf)]
@@ -184,11 +183,16 @@ def check_gradients(
 
     def at(moved: list[Array]) -> PyTree:
         chosen = dict(zip(floating, moved, strict=True))
-        return f(structure.unflatten([chosen.get(i, leaf) for i, leaf in enumerate(given)]))
+        return functions.call(
+            "check_gradients",
+            "f",
+            f,
+            structure.unflatten([chosen.get(i, leaf) for i, leaf in enumerate(given)]),
+        )
 
     here = [jnp.asarray(given[i]) for i in floating]
     for i, leaf in zip(floating, here, strict=True):
-        checks.finite("check_gradients", f"x.{named[i][0]}" if named[i][0] != "x" else "x", leaf)
+        checks.check("check_gradients", f"x.{named[i][0]}" if named[i][0] != "x" else "x", leaf)
     results = [y for y in jax.tree.leaves(jax.eval_shape(at, here)) if _is_floating(y)]
     if not results:
         raise ValueError("check_gradients: f returns no floating number to differentiate.")

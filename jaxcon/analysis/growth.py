@@ -105,7 +105,8 @@ def gradient_growth(
         ValueError: the constraints leave no freedom, the rollout fails, or what `rollout` refuses.
     """
     checks.count("gradient_growth", "steps", steps, 4)
-    checks.positive("gradient_growth", "dt", dt)
+    checks.count("gradient_growth", "seed", seed, 0)
+    checks.check("gradient_growth", "dt", dt, (), above=0)
     moves = _allowed(at(system, state), state)
     n = moves.shape[1]
     if n == 0:

@@ -21,6 +21,7 @@ from jaxcon.model.state import State, at
 from jaxcon.simulation.choice import Choice, choose
 from jaxcon.simulation.method import Method, check_method
 from jaxcon.simulation.stability import default_gains, parts
+from jaxcon.simulation.step import idle
 
 ASIDE = 0.05
 """How far a configuration is moved to see whether rows depend on each other there, too."""
@@ -70,14 +71,15 @@ class Known:
         """The same from what a user gives."""
         system = at(system, state, "jc.report(system, s)")
         if dt is not None:
-            checks.positive("report", "dt", dt)
-        own = method or Method()
+            checks.check("report", "dt", dt, (), above=0)
+        own = Method() if method is None else method
         check_method(own)
         own = own.resolve(system, state)
         if method is not None or dt is not None:
             state = begun(system, own, state)
         rows, jacobian, mass = linearized(system, state)
         h = None if dt is None else float(dt)
+        control = idle(system, control)
         return cls(system, state, own, h, control, batch, rows, mass, jacobian, measured)
 
     @cached_property

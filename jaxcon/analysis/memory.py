@@ -17,7 +17,7 @@ from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.segments import bytes_of
-from jaxcon.simulation.step import check_step, controls_in, step_quietly
+from jaxcon.simulation.step import check_step, controls_in, idle, step_quietly
 
 BATCHES = 64, 256
 """Sizes that are compiled: what a world takes is in proportion from here on."""
@@ -67,7 +67,7 @@ def memory(system: Any, method: Method, state: State, control: PyTree = None) ->
         system: a `BodySystem` or `GeneralizedSystem`.
         method: integrator, stabiliser and solver.
         state: of one world.
-        control: of one world, as of `step`, or None.
+        control: of one world, as of `step`; motors idle unless given.
 
     Returns:
         The `Memory`.
@@ -76,7 +76,7 @@ def memory(system: Any, method: Method, state: State, control: PyTree = None) ->
         ValueError: state and control do not fit, as in `step`.
         RuntimeError: the compiler of this device does not say what it plans.
     """
-    control = jax.tree.map(jnp.asarray, check_step(system, method, state, control))
+    control = jax.tree.map(jnp.asarray, check_step(system, method, state, idle(system, control)))
 
     def step(state: State, control: PyTree) -> Any:
         return step_quietly(system, method, state, control, DT)
@@ -154,7 +154,7 @@ def gradient_memory(
     policy = control if callable(control) else None
 
     def planned(steps: int, worlds: int) -> int:
-        one = None if policy else controls_in(state.q.dtype, control)
+        one = None if policy else controls_in(state.q.dtype, idle(system, control))
         controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), one)
 
         def end(moved: tuple[Any, Any], rest: State) -> Any:

@@ -165,9 +165,7 @@ def angular_momentum(
     found = _momentum(system, state, bodies, "angular_momentum")
     own = found.angular
     if about is not None:
-        point = checks.number(
-            "angular_momentum", "about", about, state.q.dtype, (system.layout.dim,)
-        )
+        point = checks.real("angular_momentum", "about", about, state.q.dtype, (system.layout.dim,))
         arm = found.position - Vector.of(point).map(lambda x: x[None])
         own = own + arm.cross(found.linear)
     return _point(own) if isinstance(own, Vector) else own[0]
@@ -332,7 +330,7 @@ def _about(motion: Motion, force: Array, anchor: Array) -> Array:
 
 def _local(motion: Motion, point: Any) -> Array:
     dtype, shape = motion.position.dtype, motion.position.shape
-    return checks.number("point", "it", point, dtype, shape)
+    return checks.real("position or velocity", "point", point, dtype, shape)
 
 
 def _motion(system: Any, state: State, body: str, caller: str) -> Motion:

@@ -15,6 +15,7 @@ from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.probe import Probe
 from jaxcon.analysis.traps import OFF, TRAPS
 from jaxcon.analysis.work import Work, seconds, work
+from jaxcon.core import checks
 from jaxcon.core.status import MEANING, Status
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import State
@@ -182,6 +183,9 @@ def report(
         TypeError: something else than a system, a state and a method.
         ValueError: a step that is not positive, or shapes that are not those of the system.
     """
+    checks.flag("report", "measure", measure)
+    checks.flag("report", "timed", timed)
+    checks.count("report", "batch", batch)
     known = Known.of(system, state, method, dt, control, batch, measure)
     unit, layout = known.unit, known.rows.layout
     rank = len(unit.values) - len(known.dependent)

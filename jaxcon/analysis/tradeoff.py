@@ -93,8 +93,9 @@ def tradeoff(
             " take one of a batch or a trajectory, jax.tree.map(lambda x: x[0], states)."
         )
     at(system, state, "jc.tradeoff(system, s, horizon)")
+    checks.flag("tradeoff", "gradients", gradients)
     dtypes = (dtypes,) if isinstance(dtypes, str) else dtypes
-    dts = (float(dts),) if isinstance(dts, int | float) else dts
+    dts = (dts,) if isinstance(dts, int | float) else dts
     _check(horizon, methods, dtypes, dts, (batch, budget))
     clock, horizon = Clock(budget), float(horizon)
     start = Points(*(np.asarray(x, np.float64) for x in Points.of(state)))
@@ -202,16 +203,23 @@ def _check(horizon: Any, methods: Any, dtypes: Any, dts: Any, numbers: tuple[Any
         TypeError: something else than methods.
     """
     batch, budget = numbers
-    checks.positive("tradeoff", "horizon", horizon)
-    checks.positive("tradeoff", "budget", budget)
+    checks.check("tradeoff", "horizon", horizon, (), above=0)
+    checks.check("tradeoff", "budget", budget, (), above=0)
     checks.count("tradeoff", "batch", batch)
     if dts is not None:
-        checks.positive("tradeoff", "dts", list(dts))
+        if not isinstance(dts, Sequence | np.ndarray) or isinstance(dts, str):
+            raise ValueError(f"tradeoff: dts must be steps [s], got {checks.shortened(dts)}.")
+        checks.check("tradeoff", "dts", list(dts), (len(dts),), above=0)
         if not len(dts) or max(map(float, dts)) > float(horizon):
             raise ValueError(
                 f"tradeoff: dts must be steps within the horizon of {horizon:g} s, got {dts}."
             )
-    names = [x if isinstance(x, str) else np.dtype(x).name for x in dtypes]
+    try:
+        names = [x if isinstance(x, str) else np.dtype(x).name for x in dtypes]
+    except TypeError as error:
+        raise TypeError(
+            f"tradeoff: dtypes must be some of {DTYPES}, got {checks.shortened(dtypes)}."
+        ) from error
     if not names or set(names) - set(DTYPES):
         raise ValueError(f"tradeoff: dtypes must be some of {DTYPES}, got {names}.")
     if methods is not None:

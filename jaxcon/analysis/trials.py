@@ -108,7 +108,7 @@ def _holds(hold: float | None, horizon: float) -> int:
             "tradeoff: controls that are a function of the state need hold=, the time in seconds"
             " for which each value is held; else they would mean another thing at every step."
         )
-    checks.positive("tradeoff", "hold", hold)
+    checks.check("tradeoff", "hold", hold, above=0)
     count = round(horizon / float(hold))
     if count < 1 or abs(count * float(hold) / horizon - 1) > 1e-6:
         raise ValueError(

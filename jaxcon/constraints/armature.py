@@ -42,8 +42,7 @@ class Armature:
         Raises:
             ValueError: it is not positive; a joint without a rotor has no armature.
         """
-        inertia = checks.number(label(self), "inertia", self.inertia, dtype)
-        checks.positive(label(self), "inertia", inertia)
+        inertia = checks.real(label(self), "inertia", self.inertia, dtype, above=0)
         return {"inertia": inertia}
 
 

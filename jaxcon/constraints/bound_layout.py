@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,6 +11,13 @@ import numpy as np
 
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
+
+
+class UnknownElementError(KeyError, ValueError):
+    """No element has this name: a KeyError to who takes reactions for a mapping."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
 
 
 @dataclass(frozen=True)
@@ -32,10 +40,10 @@ class BoundLayout:
         """The row numbers of an element, (rows,), or of its points, (points, rows).
 
         Raises:
-            ValueError: no element has this name.
+            UnknownElementError: no element has this name.
         """
-        if name not in self._places:
-            raise ValueError(f"element '{name}' is unknown; known are {list(self.names)}.")
+        if not isinstance(name, str) or name not in self._places:
+            raise UnknownElementError(f"element '{name}' is unknown; known are {list(self.names)}.")
         rows, points = self._places[name]
         one = np.array(rows)
         return one if points is None else np.arange(points)[:, None] + one[None]
@@ -55,8 +63,10 @@ class BoundLayout:
 
 
 @pytree
-class Reactions:
+class Reactions(Mapping[str, Array]):
     """What bounded rows did during a step; `reactions["stop"]` is the force of one element.
+
+    A mapping from names of elements to their forces: `in`, `iter`, `len`, `items()` and `get`.
 
     Attributes:
         multipliers: λ (n,) [N, N m], means over the step: of an impact, its impulse over h.
@@ -74,6 +84,17 @@ class Reactions:
     kept: Array
     shift: Array | None
     layout: BoundLayout = static()
+    # a mapping compares its items, which are arrays without a single truth value
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__  # type: ignore[assignment]
+
+    def __iter__(self) -> Iterator[str]:
+        """The names of the elements."""
+        return iter(self.layout.names)
+
+    def __len__(self) -> int:
+        """The number of elements."""
+        return len(self.layout.names)
 
     def __getitem__(self, name: str) -> Array:
         """λ of an element, (1,); of a contact that of the normal and of the tangents, (1 + t,).

@@ -60,8 +60,7 @@ class BoxContact:
     def attach(self, a: Pose, b: Pose, own_a: Pose, own_b: Pose) -> dict[str, Array]:
         """The plane in the frame of a, the box in that of b, and the material."""
         owner, dtype = label(self), b.position.dtype
-        size = checks.number(owner, "size", self.size, dtype, b.position.shape)
-        checks.positive(owner, "size", size)
+        size = checks.real(owner, "size", self.size, dtype, b.position.shape, above=0)
         if b.orientation is None:
             raise ValueError(f"{owner}: '{self.body_b}' is a particle, which has no corners.")
         middle, axes = point_sets.own_frame(self, b, own_b)

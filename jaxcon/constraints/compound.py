@@ -109,6 +109,9 @@ class Compound:
     oriented = True
     dims = (3,)
 
+    def __post_init__(self) -> None:
+        checks.flag(label(self), "ball", self.ball)
+
     @property
     def kind(self) -> Freedoms:
         """What joints that move alike share."""

@@ -110,7 +110,7 @@ class PlaneContact:
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """The plane in the frame of a, the ball in that of b, and the material."""
-        radius = checks.amount(label(self), "radius", self.radius, b.position.dtype)
+        radius = checks.real(label(self), "radius", self.radius, b.position.dtype, least=0)
         ball = {"anchor_b": own_points(self, "center", self.center, b), "radius": radius}
         return plane(self, a) | ball | material(self, a, b)
 
@@ -173,13 +173,13 @@ class CapsuleContact:
             given = getattr(self, f"segment_{side}")
             shape = (2, *pose.position.shape)
             ends = jnp.stack([pose.position] * 2) if given is None else given
-            ends = checks.number(label(self), f"segment_{side}", ends, pose.position.dtype, shape)
+            ends = checks.real(label(self), f"segment_{side}", ends, pose.position.dtype, shape)
             names = ("start", "end")
             for what, x in zip(names, ends, strict=True):
                 point = own_point(self, f"segment_{side}", x, pose)
                 result[f"{what}_{side}"] = pose.local_point(point)
             own = getattr(self, f"radius_{side}")
-            radius = checks.amount(label(self), f"radius_{side}", own, pose.position.dtype)
+            radius = checks.real(label(self), f"radius_{side}", own, pose.position.dtype, least=0)
             result[f"radius_{side}"] = radius
         return result | material(self, a, b)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.base import RowSet, gather
 from jaxcon.constraints.primitives import Row
@@ -245,7 +245,7 @@ class PolynomialCoupling(Pair):
         Raises:
             ValueError: there are fewer than two.
         """
-        shape = jnp.asarray(self.coefficients).shape
+        shape = np.shape(checks.check(label(self), "coefficients", self.coefficients))
         if len(shape) != 1 or shape[0] < 2:
             raise ValueError(
                 f"{label(self)}: coefficients must be (c0, c1, …), at least two, got shape {shape}."

@@ -31,7 +31,7 @@ from jaxcon.constraints.base import Joints, RowSet, gather
 from jaxcon.constraints.joints import anchors
 from jaxcon.constraints.pairs import check_oriented
 from jaxcon.constraints.primitives import Row
-from jaxcon.core import checks
+from jaxcon.core import checks, functions
 from jaxcon.core.lanes import Vector, plus, times, total
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
@@ -114,7 +114,7 @@ class Curves(Joints):
         """g, G ẋ, ẋᵀ(∂²g/∂x²)ẋ, each (m,), and G (m, dim), in one world."""
 
         def g(x: Array) -> Array:
-            return self.joint.curve(x, given)
+            return functions.call(label(self.joint), "curve", self.joint.curve, x, given)
 
         def along(x: Array) -> tuple[Array, Array]:
             return jax.jvp(g, (x,), (ẋ,))
@@ -132,8 +132,12 @@ class Curves(Joints):
         owner = label(self.joint)
         x = jnp.stack([row.value.reshape(()) for row in self.place(snapshot)])
         try:
-            out = jax.eval_shape(self.joint.curve, x, self.given)
+            out = jax.eval_shape(
+                functools.partial(functions.call, owner, "curve", self.joint.curve), x, self.given
+            )
         except TypeError as error:
+            if str(error).startswith(owner):
+                raise
             raise ValueError(f"{owner}: curve(x, params) cannot be called: {error}.") from error
         shape, expected = getattr(out, "shape", None), (len(x) - 1,)
         if shape != expected or out.dtype != x.dtype:

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcon.constraints import autodiff
 from jaxcon.constraints.base import RowSet
-from jaxcon.core import checks
+from jaxcon.core import checks, functions
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
@@ -99,6 +99,11 @@ class Custom:
         """Of the constraint."""
         return (self.law.name,)
 
+    @property
+    def owner(self) -> str:
+        """What errors begin with."""
+        return f"{type(self.law).__name__} '{self.law.name}'"
+
     def get(self, i: int) -> dict[str, Any]:
         """The user's parameters."""
         return {"params": self.params}
@@ -143,7 +148,7 @@ class CustomOnCoordinates(Custom):
 
         def call(q: Any, v: Any, t: Any) -> Array:
             args = (*q, t, params) if v is None else (*q, *v, t, params)
-            return self.law.function(*args)
+            return functions.call(self.owner, "function", self.law.function, *args)
 
         return [snapshot.q], [snapshot.v], lambda q, v: v, call
 
@@ -171,7 +176,9 @@ class CustomOnBodies(Custom):
             }
             bodies = [motions.get(name) or snapshot.motion(name) for name in self.law.bodies]
             bodies = [b.pose for b in bodies] if v is None else bodies
-            return self.law.function(*bodies, t, self.params)
+            return functions.call(
+                self.owner, "function", self.law.function, *bodies, t, self.params
+            )
 
         q = [snapshot.q[layout.q(name)] for name in moving]
         v = [snapshot.v[layout.v(name)] for name in moving]
@@ -196,12 +203,14 @@ def check_function(group: Custom, snapshot: Any) -> None:
     Raises:
         ValueError: not of shape (m,), not floating, or not affine in v.
     """
-    owner = f"{type(group.law).__name__} '{group.law.name}'"
+    owner = group.owner
     q, v, _, call = group.problem(snapshot)
     velocities = v if isinstance(group.law, VelocityLevel) else None
     try:
         out = jax.eval_shape(lambda q, v, t: call(q, v, t), q, velocities, snapshot.t)
     except TypeError as error:
+        if str(error).startswith(owner):
+            raise
         raise ValueError(f"{owner}: its function cannot be called: {error}.") from error
     shape, dtype = getattr(out, "shape", None), getattr(out, "dtype", None)
     if shape is None or len(shape) != 1 or dtype != q[0].dtype:

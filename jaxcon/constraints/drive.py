@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.base import RowSet, gather
+from jaxcon.core import functions
 from jaxcon.core.doubled import Doubled, evaluate
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
@@ -87,6 +88,8 @@ class Drives:
         try:
             jax.eval_shape(self._motion, Doubled.of(jnp.zeros((), dtype)), self.params)
         except TypeError as error:
+            if str(error).startswith("Drive '"):
+                raise
             raise ValueError(
                 f"Drive '{self.law.name}': motion(t, params) cannot be called: {error}."
             ) from error
@@ -100,7 +103,9 @@ class Drives:
         """θ*, θ̇*, θ̈*."""
 
         def motion(t: Any) -> Array:
-            target = jnp.asarray(self.law.motion(t, params))
+            owner = f"Drive '{self.law.name}'"
+            target = functions.call(owner, "motion", self.law.motion, t, params)
+            target = functions.array(owner, "motion", target)
             if target.shape != jnp.shape(t):
                 raise ValueError(
                     f"Drive '{self.law.name}': its motion must return a number, got shape"

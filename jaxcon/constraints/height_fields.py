@@ -87,9 +87,8 @@ class HeightFieldContact:
         """
         owner, dtype, axes = label(self), b.position.dtype, b.position.shape[0] - 1
         check_oriented(self, a)
-        size = checks.number(owner, "size", self.size, dtype, (2,) if axes == 2 else ())
-        checks.positive(owner, "size", size)
-        radius = checks.amount(owner, "radius", self.radius, dtype)
+        size = checks.real(owner, "size", self.size, dtype, (2,) if axes == 2 else (), above=0)
+        radius = checks.real(owner, "radius", self.radius, dtype, least=0)
         middle, frame = point_sets.own_frame(self, a, own_a)
         center = point_sets.own_points(self, "center", self.center, b)
         field = {"heights": Grid(self._grid(axes, dtype)), "size": size, "anchor_a": middle} | frame
@@ -108,9 +107,7 @@ class HeightFieldContact:
                 f"{owner}: heights must have shape {wanted}, at least {LEAST} along each axis, got"
                 f" {shape}."
             )
-        heights = checks.number(owner, "heights", self.heights, dtype, shape)
-        checks.finite(owner, "heights", heights)
-        return heights
+        return checks.real(owner, "heights", self.heights, dtype, shape)
 
     points = staticmethod(point_sets.given_points)
 

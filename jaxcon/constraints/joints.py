@@ -309,7 +309,7 @@ def unit_vector(joint: Any, what: str, given: Any, pose: Pose) -> Array:
     Raises:
         ValueError: it has the wrong shape or length zero.
     """
-    axis = checks.number(label(joint), what, given, pose.position.dtype, pose.position.shape)
+    axis = checks.real(label(joint), what, given, pose.position.dtype, pose.position.shape)
     checks.nonzero(label(joint), what, axis)
     return axis / numerics.norm(axis)
 
@@ -350,6 +350,5 @@ def stretched(element: Any, a: Pose, b: Pose) -> dict[str, Array]:
             numerics.norm(end - start),
             "the distance of its points, as no length is given,",
         )
-    length = checks.number(label(element), what, length, a.position.dtype)
-    checks.positive(label(element), what, length)
+    length = checks.real(label(element), what, length, a.position.dtype, above=0)
     return {"anchor_a": a.local_point(start), "anchor_b": b.local_point(end), "length": length}

@@ -38,7 +38,7 @@ class Limit:
         name: unique in the scene.
         joint: name of the joint.
         lower, upper: [rad] or [m], zero being the assembly; None where there is no stop,
-            or later an infinite one.
+            or later an infinite one. `build` warns of angles beyond a turn: degrees, most likely.
         coordinate: which of the joint's; not needed where it has but one.
         restitution: e, 0 to 1.
         stiffness: k of a soft stop [N m/rad] or [N/m]; None for a hard one.
@@ -58,6 +58,7 @@ class Limit:
     counts = True
     law = "single"
     endless = ("lower", "upper")
+    angles = ("lower", "upper")
     optional = ("restitution",)
 
     def attach(self, dtype: Any) -> dict[str, Array]:
@@ -69,11 +70,11 @@ class Limit:
         if self.lower is None and self.upper is None:
             raise ValueError(f"{label(self)}: give lower, upper or both.")
         far = float("inf")
-        lower = checks.number(
-            label(self), "lower", -far if self.lower is None else self.lower, dtype
+        lower = checks.real(
+            label(self), "lower", -far if self.lower is None else self.lower, dtype, finite=False
         )
-        upper = checks.number(
-            label(self), "upper", far if self.upper is None else self.upper, dtype
+        upper = checks.real(
+            label(self), "upper", far if self.upper is None else self.upper, dtype, finite=False
         )
         check_ends(label(self), lower, upper)
         return {"lower": lower, "upper": upper} | stop(self, dtype)
@@ -177,7 +178,7 @@ class RateLimit:
 
     def attach(self, dtype: Any) -> dict[str, Array]:
         """The numbers of the element."""
-        rate = checks.amount(label(self), "rate", self.rate, dtype)
+        rate = checks.real(label(self), "rate", self.rate, dtype, least=0)
         return {"rate": rate}
 
     @staticmethod
@@ -260,7 +261,7 @@ def stop(element: Any, dtype: Any) -> dict[str, Array]:
         raise ValueError(f"{owner}: damping is of a soft stop; give its stiffness, too.")
     if element.stiffness is not None:
         numbers |= {"stiffness": element.stiffness, "damping": element.damping}
-    result = {what: checks.number(owner, what, x, dtype) for what, x in numbers.items()}
+    result = {what: checks.real(owner, what, x, dtype) for what, x in numbers.items()}
     check_ranges(owner, result)
     return result
 
@@ -271,5 +272,5 @@ def most(element: Any, dtype: Any) -> dict[str, Array]:
     Raises:
         ValueError: it is negative.
     """
-    value = checks.amount(label(element), "most", element.most, dtype)
+    value = checks.real(label(element), "most", element.most, dtype, least=0)
     return {"most": value}

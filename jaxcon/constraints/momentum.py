@@ -135,6 +135,4 @@ def _element(x: Any, k: int) -> Any:
 def _number(element: Any, shape: tuple[int, ...], dtype: Any) -> Array:
     owner = label(element)
     value = jnp.zeros(shape, dtype) if element.value is None else element.value
-    value = checks.number(owner, "value", value, dtype, shape)
-    checks.finite(owner, "value", value)
-    return value
+    return checks.real(owner, "value", value, dtype, shape)

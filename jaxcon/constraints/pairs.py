@@ -199,7 +199,7 @@ class Screw(Cylindrical):
         """That of the sleeve, and the lead."""
         if self.lead is None:
             raise ValueError(f"{label(self)}: a lead is needed, the travel in one turn [m].")
-        lead = checks.number(label(self), "lead", self.lead, a.position.dtype)
+        lead = checks.real(label(self), "lead", self.lead, a.position.dtype)
         checks.nonzero(label(self), "lead", lead)
         return Cylindrical.attach(self, a, b) | {"lead": lead}
 
@@ -297,7 +297,7 @@ class RevoluteSpherical:
         n = unit(self, "axis", a)
         hinge, ball = own_point(self, "hinge", self.hinge, a), own_point(self, "ball", self.ball, b)
         length = numerics.norm(ball - hinge)
-        checks.positive(label(self), "the distance from hinge to ball", length)
+        checks.check(label(self), "the distance from hinge to ball", length, above=0)
         rod = (ball - hinge) / length
         check_normal(self, n, rod)
         return {

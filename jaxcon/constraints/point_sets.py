@@ -35,17 +35,16 @@ def box_corners(size: Any, position: Any = None, orientation: Any = None) -> Arr
     Raises:
         ValueError: a wrong shape, an edge that is not positive, or an orientation without length.
     """
-    size = jnp.asarray(size)
+    size = jnp.asarray(checks.check("box_corners", "size", size, above=0))
     if size.ndim != 1 or size.shape[0] not in (2, 3):
         raise ValueError(f"box_corners: size must have shape (2,) or (3,), got {size.shape}.")
-    checks.positive("box_corners", "size", size)
     size = size.astype(jnp.result_type(size, float))
     owner, dim, dtype = "box_corners", len(size), size.dtype
     middle, turn = jnp.zeros_like(size), None
     if position is not None:
-        middle = checks.number(owner, "position", jnp.asarray(position, dtype), dtype, (dim,))
+        middle = checks.real(owner, "position", position, dtype, (dim,))
     if orientation is not None:
-        turn = _orientation(owner, "orientation", jnp.asarray(orientation, dtype), dim, dtype)
+        turn = _orientation(owner, "orientation", orientation, dim, dtype)
     halves = jnp.asarray(_signs(dim), dtype) * size[None] / 2
     return jax.vmap(Pose(middle, turn).point)(halves)
 
@@ -59,9 +58,13 @@ def own_points(element: Any, what: str, points: Any, pose: Pose) -> Any:
     if not _several(points):
         return pose.local_point(own_point(element, what, points, pose))
     owner, dim = label(element), pose.position.shape[0]
-    shape = (max(len(points), 1), dim)
-    points = checks.number(owner, what, points, pose.position.dtype, shape)
-    checks.finite(owner, what, points)
+    if len(points) < 2:
+        raise ValueError(
+            f"{owner}: {what} must have shape ({dim},), or (k, {dim}) for several points, got"
+            f" {np.shape(points)}."
+        )
+    shape = (len(points), dim)
+    points = checks.real(owner, what, points, pose.position.dtype, shape)
     if pose.orientation is None:
         raise ValueError(f"{owner}: {what} has {shape[0]} points, but a particle is one.")
     return Grid(jax.vmap(pose.local_point)(points))
@@ -134,9 +137,9 @@ def spread_place(place: Place, count: int) -> Place:
 
 def _orientation(owner: str, what: str, given: Any, dim: int, dtype: Any) -> Array:
     """An angle () in the plane, a unit quaternion (4,) in space, checked."""
-    turn = checks.number(owner, what, given, dtype, () if dim == 2 else (4,))
+    turn = checks.real(owner, what, given, dtype, () if dim == 2 else (4,))
     if dim == 2:
-        checks.finite(owner, what, turn)
+        checks.radians(owner, what, turn)
         return turn
     checks.nonzero(owner, what, turn)
     return turn / jnp.sqrt(jnp.sum(turn * turn))
@@ -151,5 +154,5 @@ def _several(points: Any) -> bool:
     """Whether these are the points of a set."""
     try:
         return points is not None and jnp.asarray(points).ndim == 2
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False

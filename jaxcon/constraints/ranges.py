@@ -36,10 +36,9 @@ def check_ranges(owner: str, numbers: Mapping[str, Any]) -> None:
     Raises:
         ValueError: one is out of range, or a lower end is not below the upper one.
     """
-    for fields, strictly in ((POSITIVE, True), (NOT_NEGATIVE, False)):
-        for field in fields:
-            if field in numbers:
-                checks.positive(owner, field, numbers[field], strictly)
+    for field in numbers.keys() & {*POSITIVE, *NOT_NEGATIVE}:
+        limit: Any = {"above": 0} if field in POSITIVE else {"least": 0}
+        checks.check(owner, field, numbers[field], **limit)
     e = numbers.get("restitution", 0.0)
     if checks.is_concrete(e) and e > 1:
         raise ValueError(f"{owner}: restitution must lie in 0 to 1, got {float(e):g}.")

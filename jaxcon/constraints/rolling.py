@@ -253,8 +253,7 @@ def touch(joint: Any, a: Pose, b: Pose, reach: Any = 1.0) -> dict[str, Array]:
     Raises:
         ValueError: a radius that is not positive, or a wrong shape.
     """
-    radius = checks.number(label(joint), "radius", joint.radius, a.position.dtype)
-    checks.positive(label(joint), "radius", radius)
+    radius = checks.real(label(joint), "radius", joint.radius, a.position.dtype, above=0)
     center, n = own_point(joint, "center", joint.center, b), normal(joint, a)
     contact = center - radius * reach * n if joint.point is None else joint.point
     point = own_point(joint, "point", contact, a)

@@ -79,7 +79,7 @@ class RowLayout:
         Raises:
             ValueError: no constraint has this name.
         """
-        if name not in self._places:
+        if not isinstance(name, str) or name not in self._places:
             raise ValueError(f"constraint '{name}' is unknown; known are {list(self.names)}.")
         first, count, stride = self._places[name]
         return first + stride * np.arange(count)

@@ -107,7 +107,7 @@ def material(element: Any, a: Pose, b: Pose) -> dict[str, Array]:
     for what, x in given.items():
         if checks.plain_zero(x) and not (turns and what == "friction"):
             continue
-        numbers[what] = checks.amount(owner, what, x, dtype)
+        numbers[what] = checks.real(owner, what, x, dtype, least=0)
     if turns and (a.orientation is None or b.orientation is None):
         raise ValueError(f"{owner}: a particle does not turn; give no {turns[0]}.")
     if "spinning" in turns and a.position.shape == (2,):

@@ -13,7 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.core.typing import PyTree
+
+PART = ".part"
+"""Ending of a file that is still being written."""
 
 
 def path(file: str | Path, owner: str) -> Path:
@@ -27,9 +31,18 @@ def path(file: str | Path, owner: str) -> Path:
         raise TypeError(f"{owner}: checkpoint must be the path of a file, got {file!r}.")
     file = Path(file)
     folder = file.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK) or file.is_dir():
-        what = "is a folder" if file.is_dir() else "lies in no folder that can be written to"
-        raise ValueError(f"{owner}: checkpoint {file} {what}.")
+    here = os.path.isdir(file)
+    if here or not os.path.isdir(folder) or not os.access(folder, os.W_OK):
+        what = "is a folder" if here else "lies in no folder that can be written to"
+        raise ValueError(f"{owner}: checkpoint {checks.shortened(str(file))} {what}.")
+    try:
+        os.lstat(file.with_name(file.name + PART))
+    except FileNotFoundError:
+        return file
+    except (OSError, ValueError) as error:  # too long a name, or a zero byte in it
+        raise ValueError(
+            f"{owner}: checkpoint {checks.shortened(str(file))} is no path: {error.args[-1]}."
+        ) from error
     return file
 
 
@@ -39,7 +52,7 @@ def write(file: Path, about: Mapping[str, Any], contents: PyTree) -> None:
         f"leaf_{i}": numbers(x) for i, x in enumerate(jax.tree.leaves(contents))
     }
     arrays["about"] = np.array(json.dumps(about))
-    part = file.with_name(file.name + ".part")
+    part = file.with_name(file.name + PART)
     with part.open("wb") as stream:
         np.savez(stream, **arrays)
         stream.flush()

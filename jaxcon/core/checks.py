@@ -4,6 +4,10 @@ Shapes and dtypes are checked always; values only where they are concrete, since
 """
 
 import inspect
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import jax
@@ -16,10 +20,35 @@ from jaxcon.core.typing import Array, PyTree
 FEW = 12
 """Numbers that a message shows whole."""
 
+TURN = 2 * np.pi * 1.001
+"""An angle beyond a turn, and beyond what rounding to four digits makes of one [rad]."""
+
+LONG = 80
+"""Letters of what was given that a message shows."""
+
+_waiting_is_forbidden = ContextVar("_waiting_is_forbidden", default=False)
+
 
 def is_concrete(x: Any) -> bool:
-    """Whether every leaf has a value now."""
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(x))
+    """Whether every leaf has a value that can be read now: none is traced.
+
+    Within `without_waiting` an array of JAX has none either.
+    """
+    unknown = jax.Array if _waiting_is_forbidden.get() else Tracer
+    return not any(isinstance(leaf, unknown) for leaf in jax.tree.leaves(x))
+
+
+@contextmanager
+def without_waiting() -> Iterator[None]:
+    """Leaves the values of JAX's arrays unread, since a device may still compute them.
+
+    Their shapes and dtypes are checked all the same, and what they are is judged by the status.
+    """
+    token = _waiting_is_forbidden.set(True)
+    try:
+        yield
+    finally:
+        _waiting_is_forbidden.reset(token)
 
 
 def is_floating(x: Any) -> bool:
@@ -38,14 +67,25 @@ def chosen_dtype(*trees: Any) -> Any:
 
 def plain_zero(x: Any) -> bool:
     """Whether a user gave the number 0 itself, which leaves no trace in the compiled step."""
-    return isinstance(x, int | float) and x == 0
+    return isinstance(x, int | float) and not isinstance(x, bool) and x == 0
 
 
-def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = ()) -> Array:
-    """The value as an array of this dtype and shape.
+def real(
+    owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = (), **limits: Any
+) -> Array:
+    """Real numbers as an array of this dtype and shape.
+
+    Args:
+        owner: whose number it is, for errors.
+        what: the number is.
+        x: as it was given.
+        dtype: of the scene.
+        shape: of the array.
+        limits: as of `check`.
 
     Raises:
-        ValueError: another shape, another floating dtype of a JAX array, or not a number.
+        ValueError: not real numbers, another shape, another floating dtype of a JAX array, or a
+            value that is known and out of range.
     """
     known = isinstance(x, jax.Array) and not x.aval.weak_type  # a Python number is no choice
     if known and jnp.issubdtype(x.dtype, jnp.floating) and x.dtype != dtype:
@@ -53,69 +93,150 @@ def number(owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = (
             f"{owner}: {what} is {x.dtype}, but the scene is {jnp.dtype(dtype).name};"
             " mixed dtypes are not promoted: convert it, or build the scene with dtype=."
         )
-    try:
-        if isinstance(x, str):
-            raise TypeError("a string is no number")
-        array = jnp.asarray(x, dtype)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{owner}: {what} must be numbers, got {x!r}.") from error
-    if array.shape != shape:
+    return jnp.asarray(check(owner, what, x, shape, dtype=dtype, **limits), dtype)
+
+
+def check(
+    owner: str,
+    what: str,
+    x: Any,
+    shape: tuple[int, ...] | None = None,
+    *,
+    dtype: Any = None,
+    above: float = -np.inf,
+    least: float = -np.inf,
+    most: float = np.inf,
+    finite: bool = True,
+    optional: bool = False,
+) -> Any:
+    """Checks real numbers: their kind and shape always, and their values where these are known.
+
+    Args:
+        owner: whose number it is, for errors.
+        what: the number is.
+        x: as it was given.
+        shape: that it must have; any if None.
+        dtype: in whose range it must lie.
+        above: below all that is allowed.
+        least: the smallest that is allowed.
+        most: the largest.
+        finite: whether infinity is refused; NaN always is.
+        optional: whether it may be None.
+
+    Returns:
+        The numbers: an array of JAX as it is, anything else as an array; None as it is.
+
+    Raises:
+        ValueError: not real numbers, another shape, or a value out of range.
+    """
+    if x is None and optional:
+        return None
+    array = _numbers(owner, what, x, "a real number" if shape == () else "real numbers")
+    if shape is not None and array.shape != shape:
         raise ValueError(f"{owner}: {what} must have shape {shape}, got {array.shape}.")
+    if isinstance(array, jax.Array) and not is_concrete(array):
+        return array
+    given = np.asarray(array, float)
+    values = given if dtype is None else _narrowed(owner, what, given, dtype)
+    good = (values > above) | (above == -np.inf)
+    good &= (values >= least) & (values <= most) & (np.isfinite(values) | (not finite))
+    if not np.all(good):
+        wanted = _limits(above, least, most, finite)
+        raise ValueError(f"{owner}: {what} must {wanted}, got {_shown(values, good)}.")
     return array
 
 
-def positive(owner: str, what: str, x: Any, strictly: bool = True) -> None:
-    """Checks that every value is positive (or not negative) and finite.
+def _narrowed(owner: str, what: str, given: np.ndarray, dtype: Any) -> np.ndarray:
+    """The numbers in the dtype of the scene.
 
     Raises:
-        ValueError: one is not, or is no number.
+        ValueError: one is beyond its range.
     """
-    if is_concrete(x):
-        values = _values(owner, what, x)
-        good = np.isfinite(values) & ((values > 0) if strictly else (values >= 0))
-        if not np.all(good):
-            bound, found = "positive" if strictly else "zero or more", _shown(values, good)
-            raise ValueError(f"{owner}: {what} must be {bound} and finite, got {found}.")
+    if given.dtype == dtype:
+        return given
+    with np.errstate(over="ignore"):
+        values = given.astype(dtype)
+    overflow = np.isinf(values) & ~np.isinf(given)
+    if np.any(overflow):
+        raise ValueError(
+            f"{owner}: {what} must be in the range of {jnp.dtype(dtype).name}, got"
+            f" {_shown(given, ~overflow)}."
+        )
+    return values
 
 
-def amount(owner: str, what: str, x: Any, dtype: Any) -> Array:
-    """The value as an array () of this dtype, zero or more and finite.
+def _limits(above: float, least: float, most: float, finite: bool) -> str:
+    """The values that are allowed, in words."""
+    ending = " and finite" if finite else ""
+    if above > -np.inf and most < np.inf:
+        return f"be above {above:g} and at most {most:g}"
+    if most < np.inf:
+        return f"lie between {least:g} and {most:g}"
+    if above > -np.inf:
+        return ("be positive" if above == 0 else f"be above {above:g}") + ending
+    if least > -np.inf:
+        return ("be zero or more" if least == 0 else f"be {least:g} or more") + ending
+    return "be finite" if finite else "not be NaN"
+
+
+def _numbers(owner: str, what: str, x: Any, wanted: str = "real numbers") -> Any:
+    """Real numbers as an array, of JAX where it is one or has one in it.
+
+    Args:
+        owner: whose they are, for errors.
+        what: they are.
+        x: as it was given.
+        wanted: what they must be, in words.
 
     Raises:
-        ValueError: as of `number` and `positive`.
+        ValueError: they are none, or not of one shape.
     """
-    value = number(owner, what, x, dtype)
-    positive(owner, what, value, strictly=False)
-    return value
+    if isinstance(x, jax.Array):
+        array = x
+    elif type(x) is float:
+        return np.asarray(x)
+    else:
+        array = _from_host(owner, what, x, wanted)
+    # by kind, since NumPy counts durations among the integers; bfloat16 has one of its own
+    kind = getattr(array.dtype, "kind", "?")
+    if kind not in "fiu" and not jnp.issubdtype(array.dtype, jnp.floating):
+        raise ValueError(f"{owner}: {what} must be {wanted}, got {shortened(x)}.")
+    return array
 
 
-def between(owner: str, what: str, x: Any, low: float, high: float) -> None:
-    """Checks that every value lies between two.
-
-    Raises:
-        ValueError: one does not, or is no number.
-    """
-    if is_concrete(x):
-        values = _values(owner, what, x)
-        good = (values >= low) & (values <= high)
-        if not np.all(good):
-            found = _shown(values, good)
-            raise ValueError(f"{owner}: {what} must lie between {low} and {high}, got {found}.")
-
-
-def _values(owner: str, what: str, x: Any) -> np.ndarray:
-    """Real numbers as an array of the host.
-
-    Raises:
-        ValueError: they are none.
-    """
+def _from_host(owner: str, what: str, x: Any, wanted: str) -> Any:
+    """An array of what is no array of JAX."""
+    leaves = jax.tree.leaves(x) if isinstance(x, list | tuple) else [x]
+    wrong = next((y for y in leaves if isinstance(y, bool | np.bool_)), None)
+    if x is None or wrong is not None:
+        raise ValueError(f"{owner}: {what} must be {wanted}, got {shortened(x)}.")
     try:
-        values = np.asarray([np.asarray(y) for y in x] if isinstance(x, list | tuple) else x)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{owner}: {what} must be numbers of one shape, got {x!r}.") from error
-    if not any(jnp.issubdtype(values.dtype, kind) for kind in (jnp.floating, jnp.integer)):
-        raise ValueError(f"{owner}: {what} must be a real number, got {x!r}.")
-    return values.astype(float)
+        if any(isinstance(y, jax.Array) for y in leaves) or hasattr(x, "__jax_array__"):
+            return jnp.asarray(x)
+        if isinstance(x, np.ma.MaskedArray):
+            x = np.ma.filled(x.astype(float), np.nan)
+        with warnings.catch_warnings():  # of ragged lists, by older versions of NumPy
+            warnings.simplefilter("error")
+            array = np.asarray(x)
+        integers = array.dtype == object and all(type(y) is int for y in array.ravel())
+        return array.astype(float) if integers else array  # those beyond 64 bits
+    except OverflowError as error:
+        raise ValueError(
+            f"{owner}: {what} is beyond the range of floating numbers, got {shortened(x)}."
+        ) from error
+    except (TypeError, ValueError, Warning) as error:
+        raise ValueError(
+            f"{owner}: {what} must be real numbers of one shape, got {shortened(x)}."
+        ) from error
+
+
+def shortened(x: Any) -> str:
+    """What was given, in few words."""
+    try:
+        text = repr(x)
+    except Exception:  # an integer of too many digits, or a faulty object of the user's
+        return f"a value of type {type(x).__name__}"
+    return text if len(text) <= LONG else f"{text[:LONG]}…"
 
 
 def _shown(values: np.ndarray, good: np.ndarray) -> str:
@@ -126,15 +247,29 @@ def _shown(values: np.ndarray, good: np.ndarray) -> str:
     return f"{values[place]} at {list(place)} of an array {values.shape}"
 
 
-def count(owner: str, what: str, x: Any, least: int = 1) -> None:
-    """Checks that a value is a whole number, and not below the least one.
+def count(owner: str, what: str, x: Any, least: int = 1, most: int = 2**31 - 1) -> None:
+    """Checks that a value is a whole number within limits.
 
     Raises:
         ValueError: it is not.
     """
-    whole = isinstance(x, int | np.integer) and not isinstance(x, bool)
+    whole = isinstance(x, int | np.integer) and not isinstance(x, bool | np.timedelta64)
     if not whole or x < least:
-        raise ValueError(f"{owner}: {what} must be a whole number from {least}, got {x!r}.")
+        raise ValueError(
+            f"{owner}: {what} must be a whole number from {least}, got {shortened(x)}."
+        )
+    if x > most:
+        raise ValueError(f"{owner}: {what} must be at most {most}, got {shortened(x)}.")
+
+
+def flag(owner: str, what: str, x: Any) -> None:
+    """Checks that a value is True or False.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not isinstance(x, bool):
+        raise ValueError(f"{owner}: {what} must be True or False, got {shortened(x)}.")
 
 
 def nonzero(owner: str, what: str, x: Any) -> None:
@@ -143,24 +278,27 @@ def nonzero(owner: str, what: str, x: Any) -> None:
     Raises:
         ValueError: it has none, or is none of numbers.
     """
-    if is_concrete(x):
-        values = _values(owner, what, x)
+    values = _numbers(owner, what, x)
+    if is_concrete(values):
+        values = np.asarray(values, float)
         if not np.all(np.isfinite(values)) or not np.linalg.norm(values) > 0:
             raise ValueError(f"{owner}: {what} must have a length, got {values.tolist()}.")
 
 
-def finite(owner: str, what: str, x: Any) -> None:
-    """Checks that every value is finite.
+def radians(owner: str, what: str, x: Any) -> None:
+    """Warns of an angle of more than a turn, which is more likely to be one in degrees.
 
-    Raises:
-        ValueError: one is not, or is no number.
+    Args:
+        owner: whose angle it is.
+        what: the angle is.
+        x: angle () [rad]; infinity is no angle.
     """
-    if is_concrete(x):
-        values = _values(owner, what, x)
-        good = np.isfinite(values)
-        if not np.all(good):
-            found = _shown(values, good)
-            raise ValueError(f"{owner}: {what} must be finite, got {found}.")
+    if is_concrete(x) and TURN < abs(float(x)) < np.inf:
+        warnings.warn(
+            f"{owner}: {what} is {float(x):g} rad, more than a turn; give radians, of degrees"
+            " np.deg2rad(…). Filter this warning where whole turns are meant.",
+            stacklevel=2,
+        )
 
 
 def recorded(owner: str, what: str, x: Any) -> Any:
@@ -170,7 +308,7 @@ def recorded(owner: str, what: str, x: Any) -> Any:
         ValueError: they are none.
     """
     kind = x.dtype if isinstance(x, jax.Array) else np.asarray(x).dtype
-    if kind.kind not in "fiu" and not jnp.issubdtype(kind, jnp.floating):
+    if getattr(kind, "kind", "?") not in "fiu" and not jnp.issubdtype(kind, jnp.floating):
         raise ValueError(
             f"{owner}: {what} must be real numbers, NaN where nothing was seen, got {kind}."
         )

@@ -36,7 +36,7 @@ class Status(IntEnum):
     RELAXED = 19
 
 
-_CONFLICT = int(Status.CONFLICT)
+_CONFLICT, _RELAXED = int(Status.CONFLICT), int(Status.RELAXED)
 """A member is no Python number to JAX where jit is disabled, and would make an int64 of a code."""
 
 REPAIRS = (Status.ROLLED_BACK, Status.PROJECTED, Status.RELAXED)
@@ -76,8 +76,11 @@ class SimulationError(RuntimeError):
 
 
 def failed(code: Array) -> Array:
-    """Whether a world has failed, by its code: it keeps its last finite state."""
-    return (code != 0) & (code < _CONFLICT)
+    """Whether a world has failed, by its code: it keeps its last finite state.
+
+    So has a world with a code that no `Status` has.
+    """
+    return (code != 0) & ((code < _CONFLICT) | (code > _RELAXED))
 
 
 def failures(code: Array) -> Array:
@@ -99,15 +102,27 @@ def raise_for_status(result: object) -> None:
         result: a State, StepInfo or Solution, of one world or a batch.
 
     Raises:
+        TypeError: it has no status.
         SimulationError: some `status` is neither OK nor that of a repair; the message names world,
             code and likely causes.
     """
-    status = np.asarray(getattr(result, "status", result))
+    try:
+        status = np.asarray(getattr(result, "status", result))
+    except (TypeError, ValueError):
+        status = np.asarray(None)
+    if status.dtype.kind not in "iu":
+        raise TypeError(
+            "raise_for_status: result must have a status, as a State, StepInfo or Solution, got"
+            f" {type(result).__name__}."
+        )
     bad = np.argwhere(~np.isin(np.atleast_1d(status), (Status.OK, *REPAIRS)))
     if bad.size:
-        code = Status(int(np.atleast_1d(status)[tuple(bad[0])]))
+        number = int(np.atleast_1d(status)[tuple(bad[0])])
+        known = number in Status.__members__.values()
+        name = Status(number).name if known else f"status {number}"
+        meaning = MEANING[Status(number)] if known else "no Status has this code"
         where = "" if status.ndim == 0 else f" in {len(bad)} of {status.size} worlds"
         index = "" if status.ndim == 0 else f", first in world {tuple(map(int, bad[0]))}"
         times = getattr(result, "time", None)
         when = "" if times is None else f", at t = {float(np.atleast_1d(times)[tuple(bad[0])]):g} s"
-        raise SimulationError(f"{code.name}{where}{index}{when}: {MEANING[code]}.")
+        raise SimulationError(f"{name}{where}{index}{when}: {meaning}.")

@@ -12,6 +12,7 @@ from jaxcon.constraints.base import Joints
 from jaxcon.constraints.couplings import Couplings
 from jaxcon.constraints.drive import Drives
 from jaxcon.constraints.limits import Bounds
+from jaxcon.core import checks
 from jaxcon.model.actuators import JointForces
 from jaxcon.model.coordinates import (
     End,
@@ -98,6 +99,10 @@ class Along:
         groups: dict[Any, list[Any]] = {}
         for element in elements:
             ends, params = self._ends(element), element.attach(self.dtype)
+            group, _, name = ends[0]
+            if self.joints[group].joint.coordinates[name] == "rad":
+                for field in getattr(element, "angles", ()):
+                    checks.radians(label(element), field, params[field])
             shapes = tuple((field, x.shape) for field, x in params.items())
             kinds = tuple((group, name) for group, _, name in ends)
             key = (type(element), shapes, kinds, self._pattern(ends))

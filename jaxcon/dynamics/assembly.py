@@ -157,8 +157,7 @@ def assemble(
     start = _start(system, q, v, time)
     held = _held(system, hold, start.v.shape[0])
     if tolerance is not None:
-        tolerance = checks.number("assemble", "tolerance", tolerance, start.q.dtype)
-        checks.positive("assemble", "tolerance", tolerance)
+        tolerance = checks.real("assemble", "tolerance", tolerance, start.q.dtype, above=0)
     return _assemble(system, start, tolerance, held=held)
 
 
@@ -274,11 +273,9 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
     if len(n_q) != 1:
         raise ValueError(f"assemble: q must have shape (n_q,), got {n_q}; batches by jax.vmap.")
     n_v = n_q if layout is None else (layout.n_v,)
-    q = system.normalize(checks.number("assemble", "q", q, dtype, n_q))
-    v = checks.number("assemble", "v", np.zeros(n_v) if v is None else v, dtype, n_v)
-    for what, x in (("q", q), ("v", v)):
-        checks.finite("assemble", what, x)
-    t = checks.number("assemble", "time", 0.0 if time is None else time, dtype)
+    q = system.normalize(checks.real("assemble", "q", q, dtype, n_q))
+    v = checks.real("assemble", "v", np.zeros(n_v) if v is None else v, dtype, n_v)
+    t = checks.real("assemble", "time", 0.0 if time is None else time, dtype)
     snapshot = system.snapshot(q, v, t)
     for group in (*snapshot.system.constraints, *snapshot.system.bounds):
         if isinstance(group, Custom):

@@ -53,15 +53,17 @@ def hanging(start: Any, end: Any, length: float, links: int, gravity: Any = None
     Raises:
         ValueError: the chain is too short, or the ends lie above one another.
     """
-    a, b = np.asarray(start, float), np.asarray(end, float)
-    up = np.eye(len(a))[-1] if gravity is None else -np.asarray(gravity, float)
-    if a.shape != b.shape or a.shape not in ((2,), (3,)) or not np.linalg.norm(up) > 0:
+    a, b = (_known(what, x) for what, x in (("start", start), ("end", end)))
+    length = float(_known("length", length, (), above=0))
+    checks.count("hanging", "links", links, 2)
+    if a.shape not in ((2,), (3,)) or a.shape != b.shape:
         raise ValueError(
-            f"hanging: start and end must be points (2,) or (3,) and gravity not zero, got shapes"
-            f" {a.shape} and {b.shape}."
+            f"hanging: start and end must be points (2,) or (3,), got shapes {a.shape} and"
+            f" {b.shape}."
         )
-    if not isinstance(links, int) or links < 2:
-        raise ValueError(f"hanging: links must be an integer of 2 or more, got {links!r}.")
+    gravity = None if gravity is None else _known("gravity", gravity, a.shape)
+    up = np.eye(len(a))[-1] if gravity is None else -gravity
+    checks.nonzero("hanging", "gravity", up)
     up = up / np.linalg.norm(up)
     rise = float((b - a) @ up)
     level = b - a - rise * up
@@ -84,6 +86,11 @@ def hanging(start: Any, end: Any, length: float, links: int, gravity: Any = None
             " the points yourself."
         )
     return a + way[:, :1] * (level / reach) + way[:, 1:] * up
+
+
+def _known(what: str, x: Any, shape: tuple[int, ...] | None = None, **limits: Any) -> np.ndarray:
+    """Numbers of a chain, which are not traced."""
+    return np.asarray(checks.check("hanging", what, x, shape, **limits), float)
 
 
 def _tensions(gap: np.ndarray, step: float, links: int) -> np.ndarray:
@@ -143,7 +150,11 @@ def rope(
     Raises:
         ValueError: points of a wrong shape, or two of them at one place.
     """
-    xp, points = _points(scene, f"rope '{name}'", points)
+    label = f"rope '{name}'"
+    mass = checks.real(label, "mass", mass, scene.dtype, above=0)
+    if bending is not None:
+        bending = checks.real(label, "bending", bending, scene.dtype, least=0)
+    xp, points = _points(scene, label, points)
     lengths = xp.sqrt(xp.sum((points[1:] - points[:-1]) ** 2, axis=1))
     share = mass / xp.sum(lengths) * lengths / 2
     masses = xp.pad(share, (1, 0)) + xp.pad(share, (0, 1))
@@ -210,6 +221,14 @@ def rod(
         raise ValueError(f"{label}: its points must be known numbers, not traced ones.")
     if scene.dim == 3 and radius is None:
         raise ValueError(f"{label}: in space a radius is needed for the moments of its links.")
+    thick: Any = radius
+    if radius is not None:
+        thick = checks.real(label, "radius", radius, scene.dtype, above=0)
+    mass = checks.real(label, "mass", mass, scene.dtype, above=0)
+    checks.flag(label, "straight", straight)
+    if bending is not None:
+        bending = checks.real(label, "bending", bending, scene.dtype, least=0)
+    twisting = checks.real(label, "twisting", twisting, scene.dtype, least=0)
     _, points = _points(scene, label, points)
     gaps = np.diff(points, axis=0)
     lengths = np.linalg.norm(gaps, axis=1)
@@ -220,10 +239,11 @@ def rod(
         middle = (points[i] + points[i + 1]) / 2
         if scene.dim == 2:
             scene.add_body(link, mass=m, inertia=m * s**2 / 12, position=middle, angle=turns[i])
+            scene.allow_turns(link)
             continue
-        across = m * (3 * radius**2 + s**2) / 12
+        across = m * (3 * thick**2 + s**2) / 12
         inertia = jnp.stack(
-            [jnp.asarray(x, scene.dtype) for x in (m * radius**2 / 2, across, across)]
+            [jnp.asarray(x, scene.dtype) for x in (m * thick**2 / 2, across, across)]
         )
         scene.add_body(link, mass=m, inertia=inertia, position=middle, quaternion=turns[i])
     joint = Revolute if scene.dim == 2 else Spherical
@@ -242,7 +262,8 @@ def rod(
 def _points(scene: Scene, owner: str, points: Any) -> tuple[Any, Any]:
     """numpy and an array of its, or those of JAX where the points are traced."""
     xp = np if checks.is_concrete(points) else jnp
-    points = xp.asarray(points, scene.dtype)
+    shape = np.shape(checks.check(owner, "points", points))
+    points = xp.asarray(checks.real(owner, "points", points, scene.dtype, shape))
     if points.ndim != 2 or points.shape[1] != scene.dim or len(points) < 3:
         raise ValueError(
             f"{owner}: points must have shape (links + 1, {scene.dim}) with 2 links or more, got"

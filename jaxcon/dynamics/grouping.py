@@ -210,7 +210,7 @@ class Gather:
             if got is not None and not jnp.issubdtype(got, jnp.floating):
                 return jnp.asarray(x)
             shape = jnp.asarray(x).shape
-            return checks.number(f"'{element.name}'", "params", x, self.dtype, shape)
+            return checks.real(f"'{element.name}'", "params", x, self.dtype, shape)
 
         return jax.tree.map(convert, element.params)
 

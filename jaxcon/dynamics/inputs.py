@@ -17,7 +17,10 @@ from jaxcon.model.bodies import Particle, PlanarRigid, SpatialRigid
 
 @dataclass(frozen=True)
 class BodyInput:
-    """The arguments of `add_body` or `add_particle`, as given."""
+    """The arguments of `add_body` or `add_particle`, as given.
+
+    `winds` says of a body in the plane that its angle counts whole turns, as in a spiral.
+    """
 
     name: str
     mass: Any
@@ -28,6 +31,7 @@ class BodyInput:
     angular_velocity: Any
     rigid: bool
     fixed: bool
+    winds: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ def resolve(body: BodyInput, dim: int, dtype: Any) -> Resolved:
         return Resolved(kind, motion, solid.mass, solid.moments, None)
     center = jnp.zeros(dim, dtype)
     if solid.center is not None:
-        center = checks.number(_label(body), "inertia.center", solid.center, dtype, (dim,))
+        center = checks.real(_label(body), "inertia.center", solid.center, dtype, (dim,))
     own = Pose(center)
     if dim == 3:
         axes = jnp.eye(4, dtype=dtype)[0] if solid.axes is None else solid.axes
@@ -84,9 +88,7 @@ def _motion(body: BodyInput, dim: int, dtype: Any) -> Motion:
     spin_shape = () if dim == 2 else (3,)
 
     def given(what: str, x: Any, default: Any, shape: tuple[int, ...]) -> Array:
-        value = checks.number(_label(body), what, default if x is None else x, dtype, shape)
-        checks.finite(_label(body), what, value)
-        return value
+        return checks.real(_label(body), what, default if x is None else x, dtype, shape)
 
     position = given("position", body.position, zero, (dim,))
     velocity = given("velocity", body.velocity, zero, (dim,))
@@ -96,7 +98,10 @@ def _motion(body: BodyInput, dim: int, dtype: Any) -> Motion:
         "angular_velocity", body.angular_velocity, jnp.zeros(spin_shape, dtype), spin_shape
     )
     if dim == 2:
-        return Motion(position, given("angle", body.orientation, 0.0, ()), velocity, spin)
+        angle = given("angle", body.orientation, 0.0, ())
+        if not body.winds:
+            checks.radians(_label(body), "angle", angle)
+        return Motion(position, angle, velocity, spin)
     turn = given("quaternion", body.orientation, (1.0, 0.0, 0.0, 0.0), (4,))
     checks.nonzero(_label(body), "quaternion", turn)
     return Motion(position, quaternion.normalize(turn), velocity, spin)

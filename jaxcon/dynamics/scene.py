@@ -24,6 +24,22 @@ from jaxcon.model.state import MethodMemory, State
 from jaxcon.model.system import BodySystem
 
 
+def _dtype(given: Any) -> Any:
+    """The dtype of a scene.
+
+    Raises:
+        ValueError: it is neither float32 nor float64.
+    """
+    try:
+        dtype = jnp.dtype(jnp.result_type(float) if given is None else given)
+    except (TypeError, ValueError):
+        dtype = None
+    if dtype not in (jnp.float32, jnp.float64) or given is float:
+        got = checks.shortened(given) if dtype is None else dtype
+        raise ValueError(f"Scene: dtype must be float32 or float64, got {got}.")
+    return dtype
+
+
 class Scene:
     """Bodies, constraints and forces by name; `build` checks them and makes a system.
 
@@ -37,19 +53,17 @@ class Scene:
     """
 
     def __init__(self, dim: int = 3, gravity: Any = None, dtype: Any = None) -> None:
-        if dim not in (2, 3):
-            raise ValueError(f"Scene: dim must be 2 or 3, got {dim!r}.")
+        if type(dim) is not int or dim not in (2, 3):
+            raise ValueError(f"Scene: dim must be 2 or 3, got {checks.shortened(dim)}.")
         self.dim = dim
-        self.dtype = jnp.dtype(jnp.result_type(float) if dtype is None else dtype)
-        if self.dtype not in (jnp.float32, jnp.float64):
-            raise ValueError(f"Scene: dtype must be float32 or float64, got {self.dtype}.")
+        self.dtype = _dtype(dtype)
         if self.dtype == jnp.float64 and not jax.config.read("jax_enable_x64"):
             raise ValueError(
                 "Scene: float64 needs jax.config.update('jax_enable_x64', True) at the start."
             )
         default = (0.0,) * (dim - 1) + (-9.81,)
         gravity = default if gravity is None else gravity
-        self.gravity = checks.number("Scene", "gravity", gravity, self.dtype, (dim,))
+        self.gravity = checks.real("Scene", "gravity", gravity, self.dtype, (dim,))
         self._bodies: dict[str, BodyInput] = {}
         self._elements: dict[str, Any] = {}
 
@@ -76,7 +90,7 @@ class Scene:
             position: of the body's frame, world, (dim,) [m]. The frame lies at the centre of mass
                 unless an `Inertia` says otherwise.
             quaternion: body to world, wxyz, (4,); in space.
-            angle: () [rad]; in the plane.
+            angle: () [rad]; in the plane. `build` warns of more than a turn: degrees, most likely.
             velocity: of the body's frame, world, (dim,) [m/s].
             angular_velocity: () in the plane, (3,) in the body frame in space [rad/s].
             fixed: whether it is part of the world; it then needs no mass and has no coordinates.
@@ -89,11 +103,20 @@ class Scene:
             raise ValueError(
                 f"body '{name}': in {self.dim} dimensions give {right}=, not {wrong}=."
             )
+        checks.flag(f"body '{name}'", "fixed", fixed)
         orientation = angle if self.dim == 2 else quaternion
         self._take_name(name)
         self._bodies[name] = BodyInput(
             name, mass, inertia, position, orientation, velocity, angular_velocity, True, fixed
         )
+
+    def allow_turns(self, name: str) -> None:
+        """Lets the angle of a body in the plane count whole turns: `build` does not warn of it.
+
+        Args:
+            name: of a body that was added.
+        """
+        self._bodies[name] = dataclasses.replace(self._bodies[name], winds=True)
 
     def add_particle(
         self, name: str, *, mass: Any, position: Any = None, velocity: Any = None

@@ -218,6 +218,11 @@ def vakonomic(
     Raises:
         ValueError: an unknown name, one whose rows all have a φ, or a wrong shape; bounded rows.
     """
+    if not isinstance(multipliers, Mapping | None):
+        raise TypeError(
+            "vakonomic: multipliers must be a mapping from names of constraints to μ, got"
+            f" {checks.shortened(multipliers)}."
+        )
     if system.bounds:
         names = [name for group in system.bounds for name in group.names]
         raise ValueError(
@@ -234,8 +239,8 @@ def vakonomic(
                 f"vakonomic: constraint '{name}' has a φ in each of its rows and takes no μ; those"
                 f" that take one are {[n for n in layout.names if _takes(layout, n)]}."
             )
-        shape = np.shape(given) and (len(mine),)
-        value = checks.number(f"vakonomic: '{name}'", "μ", given, μ.dtype, shape)
+        shape = np.shape(checks.check("vakonomic", f"μ of '{name}'", given)) and (len(mine),)
+        value = checks.real(f"vakonomic: '{name}'", "μ", given, μ.dtype, shape)
         μ = μ.at[mine].set(value)
     return result, dataclasses.replace(state, v=jnp.concatenate([state.v, μ]))
 

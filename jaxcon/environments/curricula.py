@@ -12,11 +12,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Environment
 from jaxcon.stabilization.penalty import Penalty
+
+OWNER = "vary and jitter"
+"""What errors of theirs begin with."""
 
 
 def decay(t: Any, initial: Any, time: Any) -> Array:
@@ -28,9 +32,11 @@ def decay(t: Any, initial: Any, time: Any) -> Array:
         time: τ, in the unit of t.
 
     Raises:
-        ValueError: τ is not positive.
+        ValueError: a number is none, or τ is not positive.
     """
-    checks.positive("decay", "time", time)
+    for what, x in (("t", t), ("initial", initial)):
+        checks.check("decay", what, x)
+    checks.check("decay", "time", time, above=0)
     return initial * jnp.exp(-jnp.asarray(t) / time)
 
 
@@ -44,9 +50,11 @@ def warm_up(episode: Any, begin: Any, end: Any, least: Any = 0.1) -> Array:
         least: the strength before.
 
     Raises:
-        ValueError: `end` is not beyond `begin`.
+        ValueError: a number is none, or `end` is not beyond `begin`.
     """
-    if checks.is_concrete((begin, end)) and not begin < end:
+    for what, x in (("episode", episode), ("begin", begin), ("end", end), ("least", least)):
+        checks.check("warm_up", what, x)
+    if checks.is_concrete((begin, end)) and not np.all(np.less(begin, end)):
         raise ValueError(f"warm_up: end must lie beyond begin, got {end} and {begin}.")
     done = (jnp.asarray(episode, jnp.result_type(float)) - begin) / (end - begin)
     return least + (1 - least) * jnp.clip(done, 0, 1)
@@ -65,9 +73,12 @@ def by_performance(
         width: w > 0; from 0.27 to 0.73 of the way within one of it either side.
 
     Raises:
-        ValueError: w is not positive.
+        ValueError: a number is none, or w is not positive.
     """
-    checks.positive("by_performance", "width", width)
+    given = {"performance": performance, "least": least, "most": most, "middle": middle}
+    for what, x in given.items():
+        checks.check("by_performance", what, x)
+    checks.check("by_performance", "width", width, above=0)
     return least + (most - least) * jax.nn.sigmoid((jnp.asarray(performance) - middle) / width)
 
 
@@ -131,6 +142,7 @@ def jitter(
 
 def _changed(environment: Environment, key: Array, which: Any, change: Any) -> Environment:
     """With change(key, number, how) in place of each number that is named."""
+    _check_sizes(which)
     known = environment.system.params
     wanted = [(name, field) for name, fields in which.items() for field in fields]
     _check_names(wanted, known)
@@ -138,6 +150,22 @@ def _changed(environment: Environment, key: Array, which: Any, change: Any) -> E
     for own, (name, field) in zip(jax.random.split(key, len(wanted)), wanted, strict=True):
         changes[name][field] = change(own, known[name][field], which[name][field])
     return dataclasses.replace(environment, system=environment.system.with_params(changes))
+
+
+def _check_sizes(which: Any) -> None:
+    """Checks that there is a number, zero or more, for each field by name.
+
+    Raises:
+        ValueError: there is not.
+    """
+    for name, fields in which.items() if isinstance(which, Mapping) else [("", which)]:
+        if not isinstance(fields, Mapping):
+            raise ValueError(
+                f"{OWNER}: give numbers by name and field, {{'arm': {{'mass': 0.1}}}}, got"
+                f" {checks.shortened(which)}."
+            )
+        for field, x in fields.items():
+            checks.check(OWNER, f"{field} of '{name}'", x, least=0)
 
 
 def _check_names(wanted: Sequence[tuple[str, str]], known: Mapping[str, Any]) -> None:

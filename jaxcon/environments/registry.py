@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from jaxcon.core import checks
@@ -50,18 +50,35 @@ def make(task: str | Environment, **options: Any) -> Environment:
                 " its build."
             )
         return task
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"task {task!r} is unknown; known are {', '.join(TASKS)}.")
     try:
         inspect.signature(TASKS[task]).bind(**options)
     except TypeError as error:
         known = list(inspect.signature(TASKS[task]).parameters)
         raise TypeError(f"task {task}: {error}; its options are {', '.join(known)}.") from error
+    _check_numbers(task, options)
     built = TASKS[task](**options)
     checks.count(task, "skip", built.skip)
     if built.horizon is not None:
         checks.count(task, "horizon", built.horizon)
     return built
+
+
+def _check_numbers(task: str, options: Mapping[str, Any]) -> None:
+    """Checks the options whose usual values are numbers: sizes, masses, forces and the step.
+
+    Raises:
+        ValueError: one is negative or no number, or a choice that is no value of its kind.
+    """
+    known = inspect.signature(TASKS[task]).parameters
+    for name, x in options.items():
+        usual = known[name].default if name in known else None
+        if isinstance(usual, float | tuple):
+            limit: dict[str, Any] = {"above": 0} if name == "dt" else {"least": 0}
+            checks.check(task, name, x, **limit)
+        elif type(usual) is int:
+            checks.count(task, name, x)
 
 
 def horizon(task: str) -> int:

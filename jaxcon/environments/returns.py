@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Environment, Episode
 
@@ -34,6 +35,9 @@ def returns(
     Raises:
         ValueError: neither `actions` nor a horizon bounds an episode.
     """
+    checks.count("returns", "count", count)
+    if actions is not None:
+        checks.count("returns", "actions", actions)
     most = environment.horizon if actions is None else actions
     if most is None:
         raise ValueError("returns: the environment has no horizon; say how many actions to take.")

@@ -139,7 +139,7 @@ def from_tensor(mass: Any, tensor: Any, center: Any = None, owner: str = "inerti
         ValueError: not 3×3, not symmetric, not positive definite, or against the triangle
             inequality, which no distribution of mass can violate.
     """
-    tensor = jnp.asarray(tensor)
+    tensor = jnp.asarray(checks.check(owner, "the tensor", tensor))
     if tensor.shape != (3, 3):
         raise ValueError(f"{owner}: the tensor must have shape (3, 3), got {tensor.shape}.")
     moments, axes = principal_axes(tensor)
@@ -168,7 +168,8 @@ def from_log_cholesky(theta: Any) -> Inertia:
         Rucker, Wensing, Smooth Parameterization of Rigid-Body Inertia, IEEE Robotics and Automation
         Letters 7 (2022).
     """
-    theta = jnp.asarray(theta)
+    theta = jnp.asarray(checks.check("inertia", "theta", theta))
+    theta = theta.astype(jnp.result_type(theta, float))
     if theta.shape != (10,):
         raise ValueError(f"inertia: theta must have shape (10,), got {theta.shape}.")
     α, d1, d2, d3, s12, s23, s13 = theta[:7]
@@ -237,14 +238,14 @@ def _apart(moments: Array) -> Array:
 
 def _check(solid: str, **values: Any) -> None:
     for what, value in values.items():
-        checks.positive(solid, what, value)
+        checks.check(solid, what, value, (3,) if what == "size" else (), above=0)
 
 
 def _check_tensor(owner: str, tensor: Array, moments: Array) -> None:
     known = np.asarray(tensor)
     if np.max(np.abs(known - known.T)) > 1e-6 * np.max(np.abs(known)):
         raise ValueError(f"{owner}: the tensor must be symmetric, got {known.tolist()}.")
-    checks.positive(owner, "the principal moments", moments)
+    checks.check(owner, "the principal moments", moments, above=0)
     check_triangle(owner, moments)
 
 

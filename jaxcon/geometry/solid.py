@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
@@ -33,21 +32,20 @@ def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> 
         raise ValueError(f"{owner}: inertia is needed; a body without one is a particle.")
     elif isinstance(given, str):
         raise ValueError(f"{owner}: inertia must be numbers or an Inertia, got {given!r}.")
-    elif dim == 3 and jnp.asarray(given).shape == (3, 3):
-        tensor = checks.number(owner, "inertia", given, dtype, (3, 3))
+    elif dim == 3 and checks.check(owner, "inertia", given, finite=False).shape == (3, 3):
+        tensor = checks.real(owner, "inertia", given, dtype, (3, 3))
         given = from_tensor(mass, tensor, owner=owner)
     else:
-        if dim == 2 and np.ndim(given):
+        if dim == 2 and np.ndim(checks.check(owner, "inertia", given, finite=False)):
             raise ValueError(
                 f"{owner}: inertia must have shape () in the plane, about the normal through the"
                 f" centre of mass, got {np.shape(given)}; of principal moments give the third."
             )
         given = Inertia(mass, given)
     moments = given.moments
-    if dim == 2 and jnp.asarray(moments).shape == (3,):
+    if dim == 2 and np.shape(checks.check(owner, "inertia", moments, finite=False)) == (3,):
         moments = moments[2]
-    moments = checks.number(owner, "inertia", moments, dtype, () if dim == 2 else (3,))
-    checks.positive(owner, "inertia", moments)
+    moments = checks.real(owner, "inertia", moments, dtype, () if dim == 2 else (3,), above=0)
     if dim == 3:
         check_triangle(owner, moments)
     return Inertia(resolve_mass(owner, given.mass, dtype), moments, given.center, given.axes)
@@ -64,6 +62,4 @@ def resolve_mass(owner: str, mass: Any, dtype: Any) -> Array:
             f"{owner}: a mass is needed; mass=, or of a body an inertia that brings it, such as"
             " jc.inertia.box(mass, size)."
         )
-    value = checks.number(owner, "mass", mass, dtype)
-    checks.positive(owner, "mass", value)
-    return value
+    return checks.real(owner, "mass", mass, dtype, above=0)

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+
+from jaxcon.core.checks import shortened
 
 
 class Compiled:
@@ -17,13 +22,14 @@ class Compiled:
     Raises:
         ImportError: MuJoCo is not installed.
         FileNotFoundError: there is no such file.
-        ValueError: MuJoCo cannot compile it.
+        ValueError: MuJoCo cannot compile it, or a number of it is NaN.
         TypeError: it is none of these.
     """
 
     def __init__(self, source: Any, ignored: frozenset[str] = frozenset()) -> None:
         self.mujoco, self.ignored = _mujoco(), ignored
         self.model = self._compile(source)
+        self._refuse_nan_numbers()
         self.data = self.mujoco.MjData(self.model)
         self.mujoco.mj_kinematics(self.model, self.data)
 
@@ -37,15 +43,29 @@ class Compiled:
                 f" {type(source).__name__}."
             )
         text = isinstance(source, str) and "<" in source
-        if not text and not Path(source).is_file():
+        if not text and not os.path.isfile(source):
             raise FileNotFoundError(
-                f"from_mjcf: there is no file '{source}'; text of a model begins with '<'."
+                f"from_mjcf: there is no file {shortened(str(source))}; text of a model begins"
+                " with '<'."
             )
+        _refuse_nan(str(source) if text else Path(source).read_text(errors="replace"))
         try:
             return model.from_xml_string(source) if text else model.from_xml_path(str(source))
         except ValueError as error:
             what = "this text" if text else f"'{source}'"
             raise ValueError(f"from_mjcf: MuJoCo cannot compile {what}: {error}") from error
+
+    def _refuse_nan_numbers(self) -> None:
+        """Checks the model's arrays.
+
+        Raises:
+            ValueError: one has NaN in it.
+        """
+        for holder in (self.model, self.model.opt):
+            for field in dir(holder):
+                x = None if field.startswith("_") else getattr(holder, field)
+                if isinstance(x, float | np.ndarray) and np.any(np.isnan(_floats(x))):
+                    raise ValueError(f"from_mjcf: the model's {field} must be numbers, got NaN.")
 
     def name(self, kind: str, i: int) -> str:
         """Of a "body", "joint", "actuator", …; its kind and number where it has none."""
@@ -81,6 +101,25 @@ class Names:
             free, n = (None if numbered in self.taken else numbered), n + 1
         self.taken.add(free)
         return free
+
+
+def _floats(x: Any) -> np.ndarray:
+    """Floating numbers as they are, and none of anything else."""
+    x = np.asarray(x)
+    return x if x.dtype.kind == "f" else np.zeros(0)
+
+
+def _refuse_nan(text: str) -> None:
+    """Checks the attributes of a model's text: MuJoCo takes NaN for what is left out.
+
+    Raises:
+        ValueError: one is NaN.
+    """
+    attributes = re.findall(r"""([\w:]+)\s*=\s*["']([^"']*)["']""", text)
+    names = {value for key, value in attributes if key == "name"}
+    for key, value in attributes:
+        if key != "name" and value not in names and "nan" in value.lower().split():
+            raise ValueError(f'from_mjcf: {key}="{value}" must be numbers, got NaN.')
 
 
 def _mujoco() -> Any:

@@ -99,12 +99,12 @@ class MujocoModel:
             ValueError: a wrong shape or dtype, or a middle hinge beyond gimbal lock.
         """
         dtype = self.start.q.dtype
-        qpos = checks.number("state", "qpos", qpos, dtype, self.tree.reference.shape)
-        qvel = checks.number("state", "qvel", qvel, dtype, (self.tree.size,))
+        qpos = checks.real("state", "qpos", qpos, dtype, self.tree.reference.shape)
+        qvel = checks.real("state", "qvel", qvel, dtype, (self.tree.size,))
         self.tree.check(qpos)
         q, v = self.tree.flat(self.system, qpos, qvel)
         turns = self.tree.turns_of(self.system, qpos)
-        time = checks.number("state", "time", time, dtype)
+        time = checks.real("state", "time", time, dtype)
         return dataclasses.replace(self.start, q=q, v=v, time=time, turns=turns)
 
     def method(self, **parts: Any) -> Method:
@@ -212,6 +212,7 @@ def from_mjcf(
         ValueError: MuJoCo cannot compile it, or nothing in it moves.
         NotImplementedError: it has what is not supported; the message names it.
     """
+    checks.flag("from_mjcf", "count_turns", count_turns)
     compiled = Compiled(source, left_out(ignore))
     refuse(compiled)
     names = Names()

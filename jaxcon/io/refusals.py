@@ -83,7 +83,8 @@ def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
     Raises:
         ValueError: `ignore` has an unknown entry.
     """
-    if isinstance(ignore, str) or set(ignore) - set(IGNORABLE):
+    names = isinstance(ignore, tuple | list | set | frozenset)
+    if not names or not all(isinstance(x, str) and x in IGNORABLE for x in ignore):
         raise ValueError(
             f"from_mjcf: ignore must be names out of {list(IGNORABLE)}, got {ignore!r}."
         )

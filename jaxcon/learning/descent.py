@@ -14,7 +14,7 @@ import numpy as np
 import optax
 from jax.sharding import Mesh
 
-from jaxcon.core import numerics
+from jaxcon.core import checks, functions, numerics
 from jaxcon.core.devices import over_devices
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status, failed
@@ -175,6 +175,10 @@ class Descent:
             ahead=jnp.full_like(x, jnp.nan),
         )
 
+    def _loss(self, *args: Any) -> tuple[Array, PyTree]:
+        """(loss, aux) of the user's function."""
+        return split(functions.call("tune", "loss", self.loss, *args))
+
     def evaluate(self, y: Any, key: Any) -> tuple[Array, PyTree]:
         """Loss at y, aux there, and how many samples are not finite.
 
@@ -182,11 +186,11 @@ class Descent:
         others have no gradient.
         """
         if not self.samples:
-            value, aux = split(self.loss(self.space.decode(y)))
+            value, aux = self._loss(self.space.decode(y))
             return value, (aux, jnp.zeros((), jnp.int32))
 
         def one(y: Any, key: Any) -> Any:
-            value, aux = split(self.loss(self.space.decode(y), key))
+            value, aux = self._loss(self.space.decode(y), key)
             good = jnp.isfinite(value)
             return (value, aux), jnp.where(good, Status.OK, Status.NON_FINITE).astype(jnp.int32)
 
@@ -353,6 +357,7 @@ def split(result: Any) -> tuple[Array, PyTree]:
     if not number or jnp.shape(value) or not jnp.issubdtype(jnp.result_type(value), jnp.floating):
         raise TypeError(
             "tune: the loss must return a floating scalar, or a pair of one and anything else; got"
-            f" {value!r}."
+            f" {checks.shortened(value)}."
         )
+    aux = functions.tree("tune", "loss", aux)
     return jnp.asarray(value), jax.tree.map(jnp.asarray, aux)

@@ -187,12 +187,14 @@ def identify(
     """
     checks.count("identify", "steps", steps)
     checks.count("identify", "restarts", restarts)
-    checks.positive("identify", "continuity", continuity)
+    checks.check("identify", "continuity", continuity, (), above=0)
     check_key(key, restarts > 1, "identify")
     file = None if checkpoint is None else files.path(checkpoint, "identify")
     for x in jax.tree.leaves(noise):
-        checks.positive("identify", "noise", x)
+        checks.check("identify", "noise", x, above=0)
     _check_nodes(nodes)
+    if isinstance(simulate, type):
+        raise TypeError(f"identify: simulate must be a function, got the class {simulate!r}.")
     given = ("params",) if nodes is None else ("params", "node")
     checks.takes("identify", "simulate", simulate, given, " with nodes" * (nodes is not None))
     if not jax.tree.leaves(data):
@@ -220,7 +222,7 @@ def _check_nodes(nodes: PyTree) -> None:
     Raises:
         ValueError: they are no arrays of real and finite numbers with one first axis.
     """
-    leaves = [jnp.asarray(x) for x in jax.tree.leaves(nodes)]
+    leaves = [jnp.asarray(checks.check("identify", "nodes", x)) for x in jax.tree.leaves(nodes)]
     if nodes is not None and not leaves:
         raise ValueError(f"identify: nodes={nodes!r} hold no array; leave them out to have none.")
     real = all(x.ndim and jnp.issubdtype(x.dtype, jnp.floating) for x in leaves)
@@ -230,7 +232,6 @@ def _check_nodes(nodes: PyTree) -> None:
             "identify: nodes must be arrays of floating numbers with one first axis of stretches,"
             f" got {', '.join(given)}."
         )
-    checks.finite("identify", "nodes", leaves and np.concatenate([np.ravel(x) for x in leaves]))
 
 
 def _ignore() -> None:

@@ -185,7 +185,7 @@ def by_name(values: Mapping[str, Any], names: Iterable[str], default: Any, owner
     """
     names = list(names)
     for key in values:
-        if not any(_stands_for(key, name) for name in names):
+        if not isinstance(key, str) or not any(_stands_for(key, name) for name in names):
             raise ValueError(f"{owner}: there is no leaf '{key}'; there are {names}.")
     result = []
     for name in names:

@@ -130,7 +130,7 @@ def mean_violation(off: Violation, dt: Any) -> Array:
     _check("mean_violation", "off", off, Violation, "info.violation of the recorded steps")
     if not off.position.size:
         raise ValueError("losses: the scene has no constraints that could be violated.")
-    h = checks.number("mean_violation", "dt", dt, off.velocity.dtype)
+    h = checks.real("mean_violation", "dt", dt, off.velocity.dtype)
     return jnp.mean(off.position**2) + jnp.mean((h * off.velocity) ** 2)
 
 
@@ -145,6 +145,7 @@ def energy_drift(energy: Energy, scale: Any = None) -> Array:
         TypeError: it is no `Energy`.
     """
     _check("energy_drift", "energy", energy, Energy, "jc.energy(system, state) of recorded states")
+    checks.check("energy_drift", "scale", scale, above=0, optional=True)
     scale = jnp.max(energy.kinetic) if scale is None else scale
     change = (energy.total - energy.total[:1]) / scale
     return numerics.safe_sqrt(jnp.mean(change**2))

@@ -34,7 +34,7 @@ def scattered(
     values = spread if isinstance(spread, Mapping) else {"*": spread}
     widths = by_name(values, space.names, 0.0, f"{owner}: spread")
     for name, width, x in zip(space.names, widths, y, strict=True):
-        checks.positive(owner, "spread", width, strictly=False)
+        checks.check(owner, "spread", width, least=0)
         if not checks.fits(np.shape(width), x.shape):
             raise ValueError(
                 f"{owner}: spread must be a number, or an array that broadcasts to the shape"

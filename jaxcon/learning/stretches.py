@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from jaxcon.core import checks
+from jaxcon.core import checks, functions
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.learning.least_squares import Precision
 from jaxcon.learning.leaves import Space
@@ -235,10 +235,24 @@ class Stretches:
         p = self.scale.size
         params, end = self.space.decode(self.space.split(x[:p] * self.scale)), ()
         if self.given is None:
-            predicted = self.simulate(params)
+            predicted = self._simulated(params)
         else:
             predicted, end = self._onward(params, x[p:])
         return ravel_pytree(misfit(predicted, data, noise))[0], ravel_pytree(end)[0]
+
+    def _simulated(self, *args: Any) -> Any:
+        """What the user's function returns.
+
+        Raises:
+            TypeError: it returns no arrays, or needs the value of a traced number.
+        """
+        found = functions.call("identify", "simulate", self.simulate, *args)
+        if not jax.tree.leaves(functions.tree("identify", "simulate", found)):
+            raise TypeError(
+                "identify: simulate must return predictions of the data,"
+                f" {checks.described(self.data)}, got {found!r}; is a return missing?"
+            )
+        return found
 
     def _onward(self, params: PyTree, node: Array) -> tuple[PyTree, PyTree]:
         """Predictions from a node on, and the end.
@@ -247,7 +261,7 @@ class Stretches:
             ValueError: there is no end like a node.
         """
         first = jax.tree.map(lambda x: x[0], self.given)
-        found = self.simulate(params, ravel_pytree(first)[1](node))
+        found = self._simulated(params, ravel_pytree(first)[1](node))
         both = isinstance(found, tuple | list) and len(found) == 2
         predicted, end = found if both else (found, ())
         wanted, got = checks.described(first), checks.described(end)

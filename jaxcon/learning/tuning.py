@@ -111,6 +111,7 @@ def tune(
     """
     counts = _counts(steps=steps, samples=samples, restarts=restarts, chunk=chunk)
     steps, samples, restarts, chunk = counts
+    checks.check("tune", "tolerance", tolerance, (), least=0)
     if tolerance and patience is None:
         raise ValueError(
             f"tune: tolerance={tolerance} is what progress is within so many steps: give patience=."
@@ -118,7 +119,7 @@ def tune(
     if not isinstance(forward, bool):
         raise TypeError(f"tune: forward must be True or False, got {forward!r}.")
     patience = NEVER if patience is None else _counts(patience=patience)[0]
-    _check(loss, optimizer, key, samples, restarts, tolerance)
+    _check(loss, optimizer, key, samples, restarts)
     _check_mesh(mesh, samples, restarts)
     file = None if checkpoint is None else files.path(checkpoint, "tune")
     if checkpoint is None:  # whose chunk stays when it is resumed with more steps
@@ -232,21 +233,17 @@ def _counts(**given: Any) -> list[int]:
         ValueError: one is none, or out of range.
     """
     for what, x in given.items():
-        own = operator.index(x) if isinstance(x, np.integer) else x
-        checks.count("tune", what, own, 0 if what == "samples" else 1)
+        checks.count("tune", what, x, 0 if what == "samples" else 1)
     return [operator.index(x) for x in given.values()]
 
 
-def _check(
-    loss: Any, optimizer: Any, key: Any, samples: int, restarts: int, tolerance: float
-) -> None:
+def _check(loss: Any, optimizer: Any, key: Any, samples: int, restarts: int) -> None:
     """Checks what can be checked before anything is traced.
 
     Raises:
-        ValueError: no key where one is needed, or a tolerance out of range.
+        ValueError: no key where one is needed.
         TypeError: no key of random numbers, no optimizer, or a loss of other arguments.
     """
-    checks.positive("tune", "tolerance", tolerance, strictly=False)
     called = hasattr(optimizer, "init") and hasattr(optimizer, "update")
     if optimizer is not None and not called:
         raise TypeError(

@@ -268,10 +268,7 @@ def numbers(
 ) -> dict[str, Array]:
     """Fields of an element as finite numbers of one shape."""
     owner = label(element)
-    params = {f: checks.number(owner, f, getattr(element, f), dtype, shape) for f in fields}
-    for field, value in params.items():
-        checks.finite(owner, field, value)
-    return params
+    return {f: checks.real(owner, f, getattr(element, f), dtype, shape) for f in fields}
 
 
 def not_negative(element: Any, params: dict[str, Array], *fields: str) -> dict[str, Array]:
@@ -281,7 +278,7 @@ def not_negative(element: Any, params: dict[str, Array], *fields: str) -> dict[s
         ValueError: one of these fields is negative.
     """
     for field in fields:
-        checks.positive(label(element), field, params[field], strictly=False)
+        checks.check(label(element), field, params[field], least=0)
     return params
 
 
@@ -292,7 +289,7 @@ def ranges(element: Any, dtype: Any, *fields: str) -> dict[str, Array]:
         ValueError: a range of another shape, or whose lower end lies above the upper.
     """
     given = {f: getattr(element, f) for f in fields if getattr(element, f) is not None}
-    result = {f: checks.number(label(element), f, x, dtype, (2,)) for f, x in given.items()}
+    result = {f: checks.real(label(element), f, x, dtype, (2,)) for f, x in given.items()}
     for field, x in result.items():
         if checks.is_concrete(x) and not x[0] <= x[1]:
             raise ValueError(

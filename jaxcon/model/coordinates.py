@@ -80,7 +80,7 @@ def find(groups: Sequence[Any], where: Any, owner: str, joint: str, name: str | 
     Raises:
         ValueError: no joint has this name, or it has no such coordinate, or several.
     """
-    if joint not in where:
+    if not isinstance(joint, str) or joint not in where:
         raise ValueError(f"{owner}: joint '{joint}' is unknown; known are {[*where]}.")
     group, index = where[joint]
     known = list(getattr(groups[group].joint, "coordinates", ()))

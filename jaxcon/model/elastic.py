@@ -52,7 +52,7 @@ class Bending:
         )
         checks.nonzero(owner, "point_b − point_a", middle - first)
         checks.nonzero(owner, "point_c − point_b", last - middle)
-        stiffness = checks.amount(owner, "stiffness", self.stiffness, a.position.dtype)
+        stiffness = checks.real(owner, "stiffness", self.stiffness, a.position.dtype, least=0)
         return {
             "anchor_a": a.local_point(first),
             "anchor_b": b.local_point(middle),
@@ -122,10 +122,9 @@ class Flexure:
         for name, pose in zip(self.bodies, (a, b), strict=True):
             if pose.orientation is None:
                 raise ValueError(f"{owner}: '{name}' is a particle: it has no orientation.")
-        bending = checks.number(owner, "bending", self.bending, dtype)
-        twisting = checks.number(owner, "twisting", self.twisting, dtype)
-        for what, x in (("bending", bending), ("twisting", twisting)):
-            checks.positive(owner, what, x, strictly=False)
+        checks.flag(owner, "straight", self.straight)
+        bending = checks.real(owner, "bending", self.bending, dtype, least=0)
+        twisting = checks.real(owner, "twisting", self.twisting, dtype, least=0)
         dim = a.position.shape[0]
         if checks.is_concrete((bending, twisting)) and float(twisting) > 2 * float(bending):
             raise ValueError(

@@ -139,11 +139,7 @@ def replace_at(owner: str, x: Any, i: int, value: Any, endless: bool = False) ->
         known, shape = x.values, x.values.shape[1:]
     else:
         known, shape = (x[0], (len(x),)) if isinstance(x, Vector) else (x, ())
-    new = checks.number(owner, "the new value", value, known.dtype, shape)
-    if endless:
-        checks.between(owner, "the new value", value, -np.inf, np.inf)
-    else:
-        checks.finite(owner, "the new value", value)
+    new = checks.real(owner, "the new value", value, known.dtype, shape, finite=not endless)
     if isinstance(x, Grid):
         return Grid(x.values.at[i].set(new))
     if not isinstance(x, Vector):
@@ -166,8 +162,7 @@ def own_point(element: Any, what: str, point: Any, pose: Pose) -> Array:
     if point is None:
         return pose.position
     owner = label(element)
-    point = checks.number(owner, what, point, pose.position.dtype, pose.position.shape)
-    checks.finite(owner, what, point)
+    point = checks.real(owner, what, point, pose.position.dtype, pose.position.shape)
     known = pose.orientation is None and checks.is_concrete((point, pose.position))
     if known and not np.allclose(point, pose.position, rtol=1e-5, atol=1e-6):
         raise ValueError(

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core import checks, numerics
+from jaxcon.core import checks, functions, numerics
 from jaxcon.core.lanes import Vector, times, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
@@ -78,16 +78,13 @@ class Spring:
         end = own_point(self, "point_b", self.point_b, b)
         owner = f"spring '{self.name}'"
         length = numerics.norm(end - start) if self.rest_length is None else self.rest_length
-        params = {
+        return {
             "anchor_a": a.local_point(start),
             "anchor_b": b.local_point(end),
-            "stiffness": checks.number(owner, "stiffness", self.stiffness, dtype),
-            "damping": checks.number(owner, "damping", self.damping, dtype),
-            "rest_length": checks.number(owner, "rest_length", length, dtype),
+            "stiffness": checks.real(owner, "stiffness", self.stiffness, dtype, least=0),
+            "damping": checks.real(owner, "damping", self.damping, dtype, least=0),
+            "rest_length": checks.real(owner, "rest_length", length, dtype, least=0),
         }
-        for field in ("stiffness", "damping", "rest_length"):
-            checks.positive(owner, field, params[field], strictly=False)
-        return params
 
     @staticmethod
     def forces(p: dict[str, Any], a: Any, b: Any) -> tuple[Vector, Vector]:
@@ -136,8 +133,7 @@ class Force:
         """The numbers of the element."""
         dtype, shape = a.position.dtype, a.position.shape
         start = own_point(self, "point", self.point, a)
-        force = checks.number(f"force '{self.name}'", "force", self.force, dtype, shape)
-        checks.finite(f"force '{self.name}'", "force", force)
+        force = checks.real(f"force '{self.name}'", "force", self.force, dtype, shape)
         return {"anchor": a.local_point(start), "force": force}
 
     @staticmethod
@@ -264,9 +260,10 @@ class CustomForces(Elements):
     def _wrenches(self, system: Any, params: PyTree, q: Any, v: Any, t: Any, own: Any) -> Any:
         """The user's wrenches in one world."""
         motions = [system.motion(name, q, v) for name in self.bodies]
-        wrenches = self.function(*motions, t, own, params)
+        owner = f"CustomForce '{self.names[0]}'"
+        wrenches = functions.call(owner, "function", self.function, *motions, t, own, params)
         wrenches = wrenches if isinstance(wrenches, tuple) else (wrenches,)
-        return tuple(jnp.asarray(wrench) for wrench in wrenches)
+        return tuple(functions.array(owner, "function", wrench) for wrench in wrenches)
 
     def potential(self, snapshot: Any) -> Iterable[Lane]:
         """None."""

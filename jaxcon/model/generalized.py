@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
+from jaxcon.core import checks, functions
 from jaxcon.core.doubled import rounded
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
@@ -16,6 +18,9 @@ from jaxcon.model.state import Energy
 from jaxcon.model.system import Snapshot
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal, Full, Mass, Solution
+
+OWNER = "GeneralizedSystem"
+"""What errors begin with."""
 
 WHOLE = Place(0, (0,))
 """All coordinates at once, as the one element of one group."""
@@ -76,7 +81,8 @@ class GeneralizedCoordinates:
 
     def mass(self, q: Array) -> Mass:
         """M(q, θ), (n_v, n_v), or its diagonal (n_v,) where the user's function gives that."""
-        m = self.mass_function(q, self.params)
+        m = functions.call(OWNER, "mass", self.mass_function, q, self.params)
+        m = functions.array(OWNER, "mass", m)
         n = q.shape[0]
         if m.shape not in ((n,), (n, n)):
             raise ValueError(
@@ -86,10 +92,28 @@ class GeneralizedCoordinates:
 
     def force(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f(q, v, t, u, θ), (n_v,)."""
-        f = self.force_function(q, v, rounded(t), control, self.params)
+        f = functions.call(
+            OWNER, "force", self.force_function, q, v, rounded(t), control, self.params
+        )
+        f = functions.array(OWNER, "force", f)
         if f.shape != q.shape:
             raise ValueError(f"GeneralizedSystem: force must return {q.shape}, got {f.shape}.")
         return f
+
+    def check(self, q: Array) -> None:
+        """Checks what can be checked of the mass matrix at q, where it is known.
+
+        Raises:
+            ValueError: it is not symmetric.
+        """
+        mass = self.mass(q)
+        if isinstance(mass, Full) and checks.is_concrete(mass.values):
+            known = np.asarray(mass.values)
+            if not np.max(np.abs(known - known.T), initial=0) <= 1e-6 * np.max(np.abs(known)):
+                raise ValueError(
+                    "GeneralizedSystem: mass must return a symmetric matrix, got"
+                    f" {checks.shortened(known.tolist())} at q = {q.tolist()}."
+                )
 
     def weight(self, q: Array) -> Array:
         """None, (n_v,): f does not tell what of it is gravity."""

@@ -109,8 +109,7 @@ def changed(
     turns = "axes" in given and not _same(given["axes"], known["axes"])
     if not moves and not turns:
         return Changed(solid.mass, solid.moments, offset, None)
-    center = checks.number(owner, "center", given.get("center", known["center"]), dtype, (dim,))
-    checks.finite(owner, "center", center)
+    center = checks.real(owner, "center", given.get("center", known["center"]), dtype, (dim,))
     axes = known.get("axes")
     own = Pose(center, quaternion.normalize(given["axes"]) if turns else axes)
     shift = own if offset is None else offset.then(own)
@@ -206,7 +205,10 @@ def _placed(
         ValueError: axes twice, or no quaternion.
     """
     dtype, space = solid.moments.dtype, solid.moments.ndim > 0
-    place = {} if "center" not in given else {"center": given["center"]}
+    place = {}
+    if "center" in given:
+        dim = 3 if space else 2
+        place["center"] = checks.real(owner, "center", given["center"], dtype, (dim,))
     if default is not None:
         place["center"] = default.position if solid.center is None else solid.center
     if not space:
@@ -218,7 +220,7 @@ def _placed(
     elif default is not None:
         place["axes"] = default.orientation
     elif "axes" in given:
-        axes = checks.number(owner, "axes", given["axes"], dtype, (4,))
+        axes = checks.real(owner, "axes", given["axes"], dtype, (4,))
         checks.nonzero(owner, "axes", axes)
         place["axes"] = axes
     return place

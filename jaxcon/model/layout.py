@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxcon.core.checks import shortened
 from jaxcon.core.lanes import Vector, take
 from jaxcon.core.typing import Array, Lane
 
@@ -108,6 +109,8 @@ class Layout:
         Raises:
             ValueError: no body has this name, or it has no coordinates.
         """
+        if not isinstance(name, str):
+            raise ValueError(f"a body must be given by its name, got {shortened(name)}.")
         if name in self.places:
             return self.places[name]
         reason = "is fixed to the world" if name in (WORLD, *self.fixed) else "is unknown"

@@ -61,8 +61,7 @@ def replaced(system: Any, changes: Mapping[str, Any]) -> Any:
     gravity = system.gravity
     if "gravity" in changes:
         shape = (system.layout.dim,)
-        gravity = checks.number("gravity", "it", changes["gravity"], gravity.dtype, shape)
-        checks.finite("gravity", "it", changes["gravity"])
+        gravity = checks.real("with_params", "gravity", changes["gravity"], gravity.dtype, shape)
     bodies = {
         name: inertial.changed(name, fields, *_body(system, name))
         for name, fields in changes.items()
@@ -127,5 +126,5 @@ def _check(system: Any, known: Mapping[str, Any], name: str, fields: Any) -> Non
         return
     for field in fields.keys() & POSITIVE | fields.keys() & NOT_NEGATIVE:
         shape, dtype = known[name][field].shape, system.gravity.dtype
-        value = checks.number(f"{name}.{field}", "the new value", fields[field], dtype, shape)
-        checks.positive(name, field, value, strictly=field in POSITIVE)
+        limit = {"above": 0} if field in POSITIVE else {"least": 0}
+        checks.real(f"with_params: '{name}'", field, fields[field], dtype, shape, **limit)

@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.core.doubled import Doubled
 from jaxcon.core.pytree import exportable, pytree
+from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 
 UNSET: Any = object()
@@ -126,6 +128,7 @@ def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:
             f"expected a system and a State, got {type(system).__name__} and"
             f" {type(state).__name__}; `system, state = scene.build()` makes them."
         )
+    _check_kinds(state)
     sizes = system.sizes(state.q.shape[-1] if state.q.ndim else 0)
     for what, got, size in zip("qv", (state.q.shape, state.v.shape), sizes, strict=True):
         if got != (size,):
@@ -133,7 +136,46 @@ def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:
                 f"state.{what} must have shape ({size},), got {got}; for batches and trajectories"
                 f" use jax.vmap: jax.vmap(lambda s: {call})(states)."
             )
+    for what in ("time", "time_remainder", "status"):
+        if got := np.shape(getattr(state, what)):
+            raise ValueError(f"state.{what} must have shape (), got {got}.")
     return recall(system, state.turns)
+
+
+def _check_kinds(state: State) -> None:
+    """Checks that what a state holds are arrays of one floating dtype, and a code.
+
+    Values that a device may still compute are not waited for.
+
+    Raises:
+        ValueError: a field is of another kind, or the status is no `Status`.
+    """
+    for what in ("q", "v", "time", "time_remainder", "turns"):
+        x: Any = getattr(state, what)
+        own: Any = getattr(x, "dtype", None)
+        array = own is not None and jnp.issubdtype(own, jnp.floating)
+        plain = what.startswith("time") and type(x) in (int, float)
+        plain = plain or what == "turns" and isinstance(x, tuple) and not x
+        if not array and not plain:
+            raise ValueError(
+                f"state.{what} must be an array of floating numbers, got {_kind(x)};"
+                " jc.init(system, method, q, v) makes a state."
+            )
+        if array and not isinstance(x, np.ndarray | np.generic) and own != state.q.dtype:
+            raise ValueError(
+                f"state.{what} is {own}, but state.q is {state.q.dtype}: mixed dtypes are not"
+                " promoted."
+            )
+    code = state.status
+    known = isinstance(code, int | np.integer) and not isinstance(code, bool | np.timedelta64)
+    whole = known or getattr(getattr(code, "dtype", None), "kind", "?") in "iu"
+    if not whole or (known and int(code) not in Status.__members__.values()):
+        raise ValueError(f"state.status must be a code of jc.Status, got {_kind(code)}.")
+
+
+def _kind(x: Any) -> str:
+    """What was given in place of an array, in few words."""
+    return f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else checks.shortened(x)
 
 
 def recall(system: Any, turns: PyTree) -> Any:

@@ -277,7 +277,7 @@ class BodySystem:
         Raises:
             ValueError: the name is unknown.
         """
-        if name in self.fixed:
+        if isinstance(name, str) and name in self.fixed:
             return rest(self.fixed[name])
         return self.principal_motion(name, q, v).seen_from(self.offsets.get(name))
 

@@ -16,7 +16,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.meshes import together
@@ -138,9 +137,10 @@ class Checkpoints:
             return _given(self.segments)
         if self.budget is None:
             levels = 2 if self.levels is None else self.levels
-            checks.count("Checkpoints", "levels", levels)
-            return whole_levels(steps, levels)
-        checks.positive("Checkpoints", "budget", self.budget)
+            checks.count("Checkpoints", "levels", levels, most=64)
+            # more levels than halvings of the steps keep nothing less
+            return whole_levels(steps, min(levels, steps.bit_length() + 1))
+        checks.check("Checkpoints", "budget", self.budget, (), above=0)
         own = bytes_of(state)
         levels = range(1, steps.bit_length() + 2)
         choices = [f(steps, n) for n in levels for f in (whole_levels, equal_levels)]
@@ -198,14 +198,11 @@ class Discounted:
 
     def scan(self, path: Path) -> tuple[State, PyTree]:
         """The final state and the record of a path."""
-        checks.positive("Discounted", "factor", self.factor, strictly=False)
-        if jnp.shape(self.factor):
+        if checks.check("Discounted", "factor", self.factor, least=0, most=1).shape:
             raise ValueError(
                 f"Discounted: factor must be one number, got shape {jnp.shape(self.factor)}; map"
                 " over several with jax.vmap."
             )
-        if checks.is_concrete(self.factor) and np.any(np.asarray(self.factor) > 1):
-            raise ValueError(f"Discounted: factor must be from 0 to 1, got {self.factor}.")
 
         def step(state: State, given: Any) -> tuple[State, Any]:
             return path.step(faded(state, self.factor), given)
@@ -237,7 +234,7 @@ def check_adjoint(adjoint: Any) -> None:
 
 def _given(segments: int | tuple[int, ...]) -> tuple[int, ...]:
     """The lengths of segments as the user gave them, checked."""
-    if isinstance(segments, list) or segments == ():
+    if isinstance(segments, list) or (isinstance(segments, tuple) and not segments):
         raise ValueError(
             f"Checkpoints: give segments as a tuple of one number or more, got {segments}."
         )

@@ -97,8 +97,7 @@ class Events:
         """
         checks.count("Events", "splits", self.splits)
         checks.count("Events", "iterations", self.iterations)
-        if not isinstance(self.slips, bool):
-            raise ValueError(f"Events: slips must be True or False, got {self.slips!r}.")
+        checks.flag("Events", "slips", self.slips)
 
     def attempt(self, system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Any:
         """(new state, info) and the status of a step, split at impacts."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcon.constraints.rows import Rows, layout_of, linearize
 from jaxcon.core import checks, status
@@ -102,11 +101,13 @@ class GeneralizedAlpha:
         """Checks the numbers.
 
         Raises:
-            ValueError: ρ is not in [0, 1], or there are no iterations.
+            ValueError: ρ is not in [0, 1], there are no iterations, or a number is negative.
         """
-        rho = np.asarray(self.rho) if checks.is_concrete(self.rho) else np.ones(())
-        if not np.all((rho >= 0) & (rho <= 1)):
-            raise ValueError(f"GeneralizedAlpha: rho must be from 0 to 1, got {self.rho}.")
+        checks.check("GeneralizedAlpha", "rho", self.rho, (), least=0, most=1)
+        checks.flag("GeneralizedAlpha", "projects", self.projects)
+        for what in ("tolerance", "tikhonov"):
+            x = getattr(self, what)
+            checks.check("GeneralizedAlpha", what, x, (), least=0, optional=True)
         checks.count("GeneralizedAlpha", "iterations", self.iterations)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:

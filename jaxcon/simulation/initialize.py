@@ -12,7 +12,7 @@ from jaxcon.constraints.custom import Custom, check_function
 from jaxcon.core import checks
 from jaxcon.core.pytree import unshared
 from jaxcon.core.status import Status
-from jaxcon.model.state import State, recall
+from jaxcon.model.state import State
 from jaxcon.simulation.method import Method, check_method
 
 
@@ -36,11 +36,20 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
         ValueError: wrong shapes, mixed dtypes, or a user's function that returns the wrong shape.
     """
     check_method(method)
+    if not hasattr(system, "snapshot"):
+        raise TypeError(
+            "init: system must be a BodySystem or GeneralizedSystem, got"
+            f" {checks.shortened(system)}; `system, state = scene.build()` makes one."
+        )
     dtype = checks.chosen_dtype(q, v, system)
-    n_q, n_v = system.sizes(np.shape(q)[-1] if np.ndim(q) else 0)
-    q = checks.number("init", "q", q, dtype, (n_q,))
-    v = checks.number("init", "v", v, dtype, (n_v,))
+    if jnp.finfo(dtype).bits < 32:
+        raise ValueError(f"init: q and v must be float32 or float64, got {dtype}.")
+    n_q, n_v = system.sizes(_length(q))
+    q = checks.real("init", "q", q, dtype, (n_q,))
+    v = checks.real("init", "v", v, dtype, (n_v,))
     check_dtype(system, dtype)
+    if hasattr(system, "check"):
+        system.check(q)
     snapshot = system.snapshot(q, v, jnp.zeros((), dtype))
     for group in (*snapshot.system.constraints, *snapshot.system.bounds):
         if isinstance(group, Custom):
@@ -48,10 +57,16 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
     status = jnp.asarray(Status.OK, jnp.int32)
     memory = method.init(system, q, v)
     if turns is not None:
-        recall(system, turns)
-        turns = jnp.asarray(turns, dtype)
+        turns = checks.real("init", "turns", turns, dtype, np.shape(system.turns)[:1])
     turns = system.turns if turns is None else turns
-    return unshared(State(q, v, jnp.asarray(time, dtype), status, memory, turns), system)
+    time = checks.real("init", "time", time, dtype)
+    return unshared(State(q, v, time, status, memory, turns), system)
+
+
+def _length(q: Any) -> int:
+    """The number of positions given, where a system takes any."""
+    array = checks.check("init", "q", q)
+    return array.shape[-1] if array.ndim else 0
 
 
 def check_dtype(system: Any, dtype: Any) -> None:

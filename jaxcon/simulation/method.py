@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import jax
 
 from jaxcon.constraints.contact_default import default_contact_solver, first_multipliers
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import PyTree
 from jaxcon.model.state import MethodMemory, State
@@ -194,8 +196,12 @@ class Method:
                 part.check()
 
 
-def check_method(method: Any) -> None:
+def check_method(method: Any, wait: bool = True) -> None:
     """Checks a method and its parts.
+
+    Args:
+        method: to be checked.
+        wait: whether its numbers are read where a device may still compute them.
 
     Raises:
         TypeError: it is something else, or one of its parts is.
@@ -206,4 +212,5 @@ def check_method(method: Any) -> None:
             f"the method must be a value such as jc.Method(jc.RK4()), got {got}; the arguments of"
             " step and rollout are (system, method, state, …), of init (system, method, q, v)."
         )
-    method.check()
+    with contextlib.nullcontext() if wait else checks.without_waiting():
+        method.check()

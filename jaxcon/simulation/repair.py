@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
@@ -87,13 +86,11 @@ class Recovery:
             ValueError: one is out of range, or the projector moves no positions or has a memory.
             TypeError: the projector is no stabiliser.
         """
-        checks.positive("Recovery", "shrink", self.shrink)
         checks.count("Recovery", "retries", self.retries, 0)
-        for name, low, high in (("shrink", 0, 1), ("growth", 1, np.inf), ("damping", 0, 1)):
-            checks.between("Recovery", name, getattr(self, name), low, high)
-        checks.positive("Recovery", "growth", self.growth)  # finite, for the sake of derivatives
-        if self.limit is not None:
-            checks.positive("Recovery", "limit", self.limit)
+        checks.check("Recovery", "shrink", self.shrink, (), above=0, most=1)
+        checks.check("Recovery", "growth", self.growth, (), least=1)
+        checks.check("Recovery", "damping", self.damping, (), least=0, most=1)
+        checks.check("Recovery", "limit", self.limit, (), above=0, optional=True)
         check_stabilizer("Recovery", "projector", self.projector)
         kind = type(self.projector).__name__
         if "position" not in self.projector.corrects:

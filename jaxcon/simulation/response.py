@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.typing import Array
 
 
@@ -42,22 +43,25 @@ def frequency_response(
         up to where it is not.
 
     Raises:
-        ValueError: one of integrator and step is given without the other, or the integrator keeps
-            constraints by itself and has no feedback.
+        ValueError: an argument is no finite number, one of integrator and step is given without
+            the other, or the integrator keeps constraints by itself and has no feedback.
 
     References:
         Åström and Wittenmark, Computer-Controlled Systems (1997), section 3.3.
     """
+    owner = "frequency_response"
+    numbers = {"frequency": frequency, "alpha": alpha, "beta": beta, "integral": integral}
+    for what, x in numbers.items():
+        checks.check(owner, what, x)
+    checks.check(owner, "dt", dt, above=0, optional=True)
     if (integrator is None) != (dt is None):
         raise ValueError("frequency_response: integrator and dt go together; give both or neither.")
     if integrator is not None and not hasattr(integrator, "error_map"):
         raise ValueError(
-            f"frequency_response: {type(integrator).__name__} keeps constraints itself and has no"
-            " feedback; give SemiImplicitEuler() or a Runge-Kutta method such as RK4()."
+            f"frequency_response: integrator={type(integrator).__name__} keeps constraints itself"
+            " and has no feedback; give SemiImplicitEuler() or a Runge-Kutta method such as RK4()."
         )
-    ω, α, β, k = (
-        jnp.asarray(x, jnp.result_type(float)) for x in (frequency, alpha, beta, integral)
-    )
+    ω, α, β, k = (jnp.asarray(x, jnp.result_type(float)) for x in numbers.values())
     if integrator is None:
         s = jax.lax.complex(jnp.zeros_like(ω), ω)
         plant = 1 / (s * s + _complex(2 * α) * s + _complex(β * β))

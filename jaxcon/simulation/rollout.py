@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.errors import TracerIntegerConversionError
 
-from jaxcon.core import checks, native, numerics
+from jaxcon.core import checks, functions, native, numerics
 from jaxcon.core.closures import opened
 from jaxcon.core.meshes import together
 from jaxcon.core.operations import primitives
@@ -57,9 +57,9 @@ def rollout(
         system: a `BodySystem` or `GeneralizedSystem`.
         method: integrator, stabiliser and solver.
         state: the start.
-        controls: None; arrays whose first axis enumerates steps; or a function of the state, of one
-            world, which collectives over a batch do not reach. Those of NumPy get the dtype of the
-            state.
+        controls: None, where no motor waits for any; arrays whose first axis enumerates steps,
+            those of NumPy in the dtype of the state; or a function of the state of one world, which
+            collectives over a batch do not reach.
         dt: h, () [s].
         steps: how many.
         record: (state, info) → what to keep; the whole state unless given. `info` is what the step
@@ -77,9 +77,7 @@ def rollout(
         TypeError: `steps` or `every` is not an integer, the adjoint is none, or `record` or
             controls are no functions of what they are called with.
     """
-    steps, every = _integer("steps", steps), _integer("every", every)
-    checks.count("rollout", "steps", steps, 0)
-    checks.count("rollout", "every", every)
+    steps, every = _integer("steps", steps, 0), _integer("every", every)
     if steps % every:
         raise ValueError(f"rollout: every={every} must divide steps={steps}.")
     check_method(method)
@@ -107,9 +105,20 @@ def rollout(
         return undo(system, method, state, given[1], dt)
 
     reason = FEEDBACK if policy else method.irreversible()
-    path = Path(one, record, state, inputs, steps, every, reason or back)
+    path = Path(one, _recorded(record), state, inputs, steps, every, reason or back)
     final, trajectory = adjoint.scan(path)
     return stop_failed(final.status, final), stop_failed(final.status, trajectory)
+
+
+def _recorded(record: Record) -> Record:
+    """What a user keeps, errors naming the function."""
+
+    def recorded(state: State, info: StepInfo) -> PyTree:
+        return functions.tree(
+            "rollout", "record", functions.call("rollout", "record", record, state, info)
+        )
+
+    return record if record is record_state else recorded
 
 
 def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
@@ -134,13 +143,18 @@ def contained_policy(policy: Callable[[State], PyTree], state: State) -> PyTree:
     return native.call(contained, state, known, staged=False)
 
 
-def _integer(what: str, number: Any) -> int:
+def _integer(what: str, number: Any, least: int = 1) -> int:
     try:
-        return operator.index(number)
+        if isinstance(number, bool | np.bool_):
+            raise TypeError("a truth value is no count")
+        whole = operator.index(number)
     except (TypeError, TracerIntegerConversionError) as error:
         raise TypeError(
-            f"rollout: {what} must be an integer known when tracing, got {number!r}."
+            f"rollout: {what} must be an integer known when tracing, got"
+            f" {checks.shortened(number)}."
         ) from error
+    checks.count("rollout", what, whole, least)
+    return whole
 
 
 def _rows(controls: PyTree, steps: int, dtype: Any) -> PyTree:

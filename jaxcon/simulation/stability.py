@@ -33,7 +33,19 @@ def largest_stable_rate(integrator: Any, dt: float, damping_ratio: float = 1.0) 
 
     Returns:
         The limit, to ten digits; 0 where no rate is stable.
+
+    Raises:
+        TypeError: the integrator is none.
+        ValueError: h is not positive, or ζ negative.
     """
+    owner = "largest_stable_rate"
+    if isinstance(integrator, type) or not hasattr(integrator, "growth"):
+        raise TypeError(
+            f"{owner}: integrator must be a value such as RK4(), got"
+            f" {checks.shortened(integrator)}."
+        )
+    checks.check(owner, "dt", dt, (), above=0)
+    checks.check(owner, "damping_ratio", damping_ratio, (), least=0)
 
     def stable(x: float) -> bool:
         return integrator.growth(damping_ratio * x, x, 1.0) <= 1 + 1e-12
@@ -81,7 +93,7 @@ def warn_if_unstable(method: Any, dt: Any, system: Any = None, state: Any = None
         return
     try:
         h = float(dt)
-    except (TypeError, ValueError):  # the step itself says what is wrong with it
+    except (TypeError, ValueError, OverflowError):  # the step itself says what is wrong with it
         return
     message = instability(method, h, system, state)
     if message:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core import checks, native, status
+from jaxcon.core import checks, functions, native, status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import batch_of, keep, per_world, spread
 from jaxcon.model.state import State, at, recall
@@ -31,20 +31,23 @@ def step(
         system: a `BodySystem` or `GeneralizedSystem`.
         method: integrator, stabiliser and solver.
         state: from `Scene.build` or `init`.
-        control: (n_u,) by `system.layout.controls`, what the user's force expects, or None.
+        control: (n_u,) by `system.layout.controls`, or what the user's force expects; None only
+            where no motor waits for it.
         dt: h, () [s].
+
+    Shapes and dtypes are always checked. Values are read only where they are numbers of Python or
+    NumPy: an array of JAX may still be computed, and is judged by the status.
 
     Returns:
         The new state and what the step saw at its start. A world that fails keeps its last finite
         state, says why in `status`, and has no gradient; the others do not notice.
 
     Raises:
-        ValueError: shapes or dtypes disagree (at trace time).
+        ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.
     """
-    check_method(method)
-    warn_if_unstable(
-        method, dt, system, state
-    )  # as given: under jit an array made of it would be traced
+    check_method(method, wait=False)
+    with checks.without_waiting():  # of dt as given: under jit an array of it would be traced
+        warn_if_unstable(method, dt, system, state)
     return step_quietly(system, method, state, control, dt)
 
 
@@ -53,8 +56,8 @@ def step_quietly(
 ) -> tuple[State, StepInfo]:
     """`step` without a warning of unstable gains, for those who have given it."""
     control = check_step(system, method, state, control)
-    h = checks.number("step", "dt", dt, state.q.dtype)
-    checks.positive("step", "dt", dt, strictly=False)
+    with checks.without_waiting():
+        h = checks.real("step", "dt", dt, state.q.dtype, least=0)
     new, info = native.call(contained_step, system, method, state, control, h)
     # put in outside of the step, which so computes what it did; a rollout that does not record it
     # does not carry it either
@@ -68,7 +71,8 @@ def undo(system: Any, method: Method, state: State, control: PyTree, dt: Any) ->
     tells the same turns.
     """
     control = check_step(system, method, state, control)
-    h = checks.number("step", "dt", dt, state.q.dtype)
+    with checks.without_waiting():
+        h = checks.real("step", "dt", dt, state.q.dtype)
     return native.call(contained_step, system, method, state, control, -h)[0]
 
 
@@ -165,7 +169,8 @@ def forward_dynamics(
         ValueError: shapes or dtypes disagree (at trace time).
     """
     control = check_step(system, method, state, control)
-    h = checks.number("forward_dynamics", "dt", dt, state.q.dtype)
+    with checks.without_waiting():
+        h = checks.real("forward_dynamics", "dt", dt, state.q.dtype, least=0)
     found = native.call(_dynamics, system, method, state, control, h)
     return SolutionAt(*found, state=bare(state))
 
@@ -188,10 +193,16 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
         ValueError: wrong shapes, mixed dtypes, or memory of another method.
     """
     at(system, state, "jc.step(system, method, s, control, dt)")
-    check_method(method)
+    check_method(method, wait=False)
     layout = getattr(system, "layout", None)
     if layout is not None and control is not None:
         control = _channels(layout, control, state.q.dtype)
+    if control is None and (waiting := _motors(system)):
+        raise ValueError(
+            f"step: control is None, but the motors {waiting} wait for one, an array"
+            f" ({system.layout.n_u},); its channels (name, first, end) are"
+            f" {list(system.layout.controls)}."
+        )
     control = controls_in(state.q.dtype, control)
     for leaf in jax.tree.leaves(control):
         got = getattr(leaf, "dtype", state.q.dtype)
@@ -203,6 +214,18 @@ def check_step(system: Any, method: Method, state: State, control: PyTree) -> Py
     return control
 
 
+def idle(system: Any, control: PyTree) -> PyTree:
+    """A control, zeros where there is none and motors wait for one."""
+    return np.zeros(system.layout.n_u) if control is None and _motors(system) else control
+
+
+def _motors(system: Any) -> list[str]:
+    """The names of actuators, which act by what their channels say."""
+    groups = (*getattr(system, "forces", ()), *getattr(system, "bounds", ()))
+    driven = (g for g in groups if getattr(g, "starts", ()) and hasattr(g, "law"))
+    return [name for group in driven for name in group.names]
+
+
 def _channels(layout: Any, control: Any, dtype: Any) -> Array:
     """The control of a `BodySystem` as one array.
 
@@ -210,10 +233,12 @@ def _channels(layout: Any, control: Any, dtype: Any) -> Array:
         ValueError: it is none of numbers, or of another length.
     """
     try:
-        array = control if isinstance(control, jax.Array) else jnp.asarray(control, dtype)
+        with checks.without_waiting():
+            array = checks.check("step", "control", control, dtype=dtype)
+        array = array if isinstance(array, jax.Array) else jnp.asarray(array, dtype)
         got = str(array.shape)
-    except (TypeError, ValueError):
-        array, got = None, repr(control)
+    except ValueError:
+        array, got = None, checks.shortened(control)
         if isinstance(control, Mapping):
             got = f"a {type(control).__name__} with {checks.described(control)}"
     if array is None or array.shape != (layout.n_u,):
@@ -226,7 +251,12 @@ def _channels(layout: Any, control: Any, dtype: Any) -> Array:
 
 def policy_in(policy: Callable[[State], PyTree]) -> Callable[[State], PyTree]:
     """A policy whose controls are in the dtype of the scene; see `controls_in`."""
-    return lambda state: controls_in(state.q.dtype, policy(state))
+
+    def called(state: State) -> PyTree:
+        controls = functions.call("rollout", "controls", policy, state)
+        return controls_in(state.q.dtype, functions.tree("rollout", "controls", controls))
+
+    return called
 
 
 def controls_in(dtype: Any, controls: PyTree) -> PyTree:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.numerics import safe_divide
 from jaxcon.core.pytree import pytree, static
@@ -57,6 +58,16 @@ class ConjugateGradients:
     tikhonov: Any = None
     tolerance: Any = None
     iterations: int = static(default=100)
+
+    def check(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: one is out of range.
+        """
+        checks.check("ConjugateGradients", "tikhonov", self.tikhonov, (), least=0, optional=True)
+        checks.count("ConjugateGradients", "iterations", self.iterations)
+        checks.check("ConjugateGradients", "tolerance", self.tolerance, (), least=0, optional=True)
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.

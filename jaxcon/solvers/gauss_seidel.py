@@ -40,12 +40,14 @@ class GaussSeidel:
     smoothing: Any = None
 
     def check(self) -> None:
-        """Checks the number of sweeps.
+        """Checks the numbers.
 
         Raises:
-            ValueError: there are none.
+            ValueError: there are no sweeps, or a number is out of range.
         """
         checks.count("GaussSeidel", "sweeps", self.sweeps)
+        checks.flag("GaussSeidel", "warm", self.warm)
+        checks.check("GaussSeidel", "smoothing", self.smoothing, (), least=0, optional=True)
 
     def solve(self, problem: Bounded, start: Array) -> Array:
         """λ, (n,), from a first guess (n,)."""

@@ -60,12 +60,14 @@ class InteriorPoint:
     warm = False
 
     def check(self) -> None:
-        """Checks the number of iterations.
+        """Checks the numbers.
 
         Raises:
-            ValueError: there are none.
+            ValueError: there are no iterations, or a number is out of range.
         """
         checks.count("InteriorPoint", "iterations", self.iterations)
+        checks.count("InteriorPoint", "polish", self.polish, 0)
+        checks.check("InteriorPoint", "smoothing", self.smoothing, (), least=0, optional=True)
 
     def solve(self, problem: Bounded, start: Array) -> Array:
         """λ, (n,); it does not start from a guess."""

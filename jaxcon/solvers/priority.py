@@ -38,8 +38,14 @@ def Priority(  # noqa: N802
     Raises:
         ValueError: a level is not 0, 1, 2 or 3.
     """
+    if not isinstance(levels, Mapping):
+        raise ValueError(
+            "Priority: levels must be a mapping of names of constraints to levels, got"
+            f" {checks.shortened(levels)}."
+        )
     for name, level in levels.items():
-        if level not in LEVELS:
+        whole = isinstance(level, int | np.integer) and not isinstance(level, bool)
+        if not isinstance(name, str) or not whole or level not in LEVELS:
             raise ValueError(
                 f"Priority: the level of '{name}' must be 0, 1, 2 or 3, got {level!r}."
             )
@@ -82,7 +88,7 @@ class Lexicographic:
         cutoff: eigenvalues of S_k, its rows scaled, that count as zero; if None, 1e-9 in float64
             and 1e-5 in float32; never below what rounding makes of zero, n_c times the precision.
         conflict: the part of b that a level may leave open on its own before it is a conflict; if
-            None, 1e-2.
+            None, 1e-2; infinite for no limit.
         damping: μ; a lower level gives way where its rows come within an angle of √μ of those
             above it; if None, 3e-3, which is 3 degrees; 0 for the pseudo-inverse as it is.
         levels: (pattern, level) of constraints.
@@ -108,11 +114,9 @@ class Lexicographic:
         Raises:
             ValueError: one is negative or no number, or one but `conflict` is infinite.
         """
-        for what in ("cutoff", "damping"):
-            if getattr(self, what) is not None:
-                checks.positive("Priority", what, getattr(self, what), strictly=False)
-        if self.conflict is not None:
-            checks.between("Priority", "conflict", self.conflict, 0, np.inf)
+        for what in ("cutoff", "damping", "conflict"):
+            x, finite = getattr(self, what), what != "conflict"
+            checks.check("Priority", what, x, (), least=0, finite=finite, optional=True)
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status."""

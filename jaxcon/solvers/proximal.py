@@ -38,7 +38,7 @@ class RankSafe:
         rounds: k.
         scaling: w, the least length of a row beside the longest one; if None, 1e-6.
         conflict: the part of b and J M⁻¹ f that least squares may leave before it is called a
-            conflict; if None, a hundredth.
+            conflict; if None, a hundredth; infinite for no limit.
         always: also where the structure has no loops, for rows that depend on each other by their
             numbers alone.
 
@@ -59,9 +59,22 @@ class RankSafe:
         """Checks the numbers.
 
         Raises:
-            ValueError: there are no rounds.
+            ValueError: there are no rounds, or a number is out of range.
+            TypeError: the solver is none, or no solver of independent rows.
         """
         checks.count("RankSafe", "rounds", self.rounds)
+        checks.flag("RankSafe", "always", self.always)
+        for what in ("share", "scaling", "conflict"):
+            x, finite = getattr(self, what), what != "conflict"
+            checks.check("RankSafe", what, x, (), least=0, finite=finite, optional=True)
+        wrong = isinstance(self.solver, type | RankSafe) or not hasattr(self.solver, "factor")
+        if wrong or hasattr(self.solver, "levels"):
+            raise TypeError(
+                "RankSafe: solver must be Sparse(), Schur(), Dense() or ConjugateGradients(), got"
+                f" {checks.shortened(self.solver)}."
+            )
+        if hasattr(self.solver, "check"):
+            self.solver.check()
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status."""

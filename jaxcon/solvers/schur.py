@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import per_world
@@ -29,6 +30,14 @@ class Schur:
     """
 
     tikhonov: Any = None
+
+    def check(self) -> None:
+        """Checks the regularization.
+
+        Raises:
+            ValueError: it is negative or no number.
+        """
+        checks.check("Schur", "tikhonov", self.tikhonov, (), least=0, optional=True)
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.

@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
 from jaxcon.solvers import ordering
@@ -49,6 +50,19 @@ class Sparse:
     tikhonov: Any = None
     run: int = static(default=ordering.RUN)
     order: str | None = static(default=None)
+
+    def check(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: one is out of range, or there is no such order.
+        """
+        checks.check("Sparse", "tikhonov", self.tikhonov, (), least=0, optional=True)
+        checks.count("Sparse", "run", self.run)
+        if self.order is not None and self.order not in ordering.ORDERS:
+            raise ValueError(
+                f"Sparse: order must be one of {list(ordering.ORDERS)}, got {self.order!r}."
+            )
 
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.

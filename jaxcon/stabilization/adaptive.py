@@ -45,7 +45,7 @@ class AdaptiveBaumgarte(Baumgarte):
         """
         owner = "AdaptiveBaumgarte"
         check_gains(owner, alpha=self.alpha, beta=self.beta)
-        check_gains(owner, strictly=True, size=self.size)
+        check_gains(owner, strictly=True, optional=False, size=self.size)
         check_between(owner, "floor", self.floor, 0, 1)
 
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
@@ -134,11 +134,14 @@ class SlidingWindowBaumgarte(Unstabilized):
             ValueError: one is out of its range.
         """
         owner = "SlidingWindowBaumgarte"
-        check_gains(owner, rate=self.rate, speed=self.speed, recovery=self.recovery)
-        check_gains(owner, strictly=True, noise=self.noise, limit=self.limit)
+        check_gains(owner, rate=self.rate)
         check_between(owner, "damping_ratio", self.damping_ratio, LEAST_RATIO, 1)
-        check_between(owner, "margin", self.margin, 0, 1)
-        check_between(owner, "reach", self.reach, 1, jnp.inf)
+        for what in ("speed", "recovery"):
+            checks.check(owner, what, getattr(self, what), (), least=0)
+        checks.check(owner, "noise", self.noise, (), above=0)
+        checks.check(owner, "reach", self.reach, (), least=1)
+        checks.check(owner, "margin", self.margin, (), least=0, most=1)
+        checks.check(owner, "limit", self.limit, (), above=0, optional=True)
         checks.count(owner, "window", self.window, 4)
 
     def init(self, system: Any, q: Array, v: Array) -> History:

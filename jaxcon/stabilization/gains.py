@@ -116,19 +116,22 @@ def squares(x: Array, layout: RowLayout) -> Array:
     return jnp.concatenate(lanes) if lanes else x
 
 
-def check_gains(owner: str, strictly: bool = False, **gains: Any) -> None:
+def check_gains(owner: str, strictly: bool = False, optional: bool = True, **gains: Any) -> None:
     """Checks that gains are zero or more (or positive) and finite, as far as they are known.
+
+    Args:
+        owner: whose gains they are, for errors.
+        strictly: whether zero is refused.
+        optional: whether a gain may be None.
+        gains: by name, each a number, an array by row, or a mapping by constraint.
 
     Raises:
         ValueError: one is not, or is not a number.
     """
+    limit = {"above": 0} if strictly else {"least": 0}
     for what, gain in gains.items():
-        for name, value in gain.items() if isinstance(gain, Mapping) else [("", gain)]:
-            which = f"{what} of '{name}'" if name else what
-            if isinstance(value, str | type):
-                raise ValueError(f"{owner}: {which} must be numbers, got {value!r}.")
-            if value is not None:
-                checks.positive(owner, which, value, strictly)
+        if gain is not None or not optional:
+            _check_gain(owner, what, gain, **limit)
 
 
 def check_between(owner: str, what: str, value: Any, low: float, high: float) -> None:
@@ -137,5 +140,17 @@ def check_between(owner: str, what: str, value: Any, low: float, high: float) ->
     Raises:
         ValueError: one does not.
     """
-    for x in value.values() if isinstance(value, Mapping) else [value]:
-        checks.between(owner, what, x, low, high)
+    _check_gain(owner, what, value, least=low, most=high)
+
+
+def _check_gain(owner: str, what: str, gain: Any, **limits: Any) -> None:
+    """Checks a number, an array by row, or a mapping of names to numbers."""
+    if not isinstance(gain, Mapping):
+        checks.check(owner, what, gain, **limits)
+        return
+    for name, value in gain.items():
+        if not isinstance(name, str):
+            raise ValueError(
+                f"{owner}: {what} by constraint wants names as its keys, got {name!r}."
+            )
+        checks.check(owner, f"{what} of '{name}'", value, (), **limits)

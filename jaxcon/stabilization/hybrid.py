@@ -17,7 +17,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
-from jaxcon.stabilization.gains import check_gains, column, squares
+from jaxcon.stabilization.gains import column, squares
 
 
 @exportable
@@ -78,7 +78,7 @@ class Hybrid(Unstabilized):
         for what, size in zip(("soft_below", "project_above"), sizes, strict=True):
             if size is None or isinstance(size, Mapping):
                 raise TypeError(f"Hybrid: {what} must be one number, got {size!r}.")
-            check_gains("Hybrid", strictly=True, **{what: size})
+            checks.check("Hybrid", what, size, (), above=0)
         if all(map(checks.is_concrete, sizes)) and np.any(np.greater(*sizes)):
             raise ValueError(
                 f"Hybrid: soft_below={sizes[0]} must not exceed project_above={sizes[1]}; a"

@@ -79,7 +79,7 @@ class AugmentedLagrangian(Unstabilized):
             TypeError: the feedback is no stabiliser.
             ValueError: the stiffness is not positive, or there is no round.
         """
-        check_gains("AugmentedLagrangian", strictly=True, stiffness=self.stiffness)
+        check_gains("AugmentedLagrangian", strictly=True, optional=False, stiffness=self.stiffness)
         checks.count("AugmentedLagrangian", "iterations", self.iterations)
         check_stabilizer("AugmentedLagrangian", "feedback", self.feedback)
 

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.rows import RowLayout, Rows
+from jaxcon.core import checks
 from jaxcon.core.numerics import safe_divide
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
@@ -86,8 +87,10 @@ class Penalty(Unstabilized):
         """
         if (self.stiffness is None) == (self.time is None):
             raise ValueError("Penalty: give a stiffness, or a time by `Penalty.from_time`.")
-        check_gains("Penalty", stiffness=self.stiffness, damping=self.damping)
-        check_gains("Penalty", damping_ratio=self.damping_ratio)
+        checks.flag("Penalty", "implicit", self.implicit)
+        check_gains("Penalty", stiffness=self.stiffness)
+        check_gains("Penalty", optional=False, damping=self.damping)
+        check_gains("Penalty", optional=False, damping_ratio=self.damping_ratio)
         check_gains("Penalty", strictly=True, time=self.time)
         if isinstance(self.others, Projection):
             raise ValueError(

@@ -52,9 +52,9 @@ class PID(Unstabilized):
             "PID",
             proportional=self.proportional,
             derivative=self.derivative,
-            integral=self.integral,
             limit=self.limit,
         )
+        check_gains("PID", optional=False, integral=self.integral)
 
     @property
     def alpha(self) -> Any:

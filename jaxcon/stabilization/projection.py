@@ -42,6 +42,16 @@ class Tolerance:
     speed: Any = None
     force: Any = None
 
+    def check(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: one is negative or no number.
+        """
+        for what in ("base", "speed", "force"):
+            x, optional = getattr(self, what), what != "base"
+            checks.check("Tolerance", what, x, (), least=0, optional=optional)
+
     def at(self, system: Any, state: State) -> Array:
         """ε by world, ()."""
         scale = jnp.ones_like(state.q[0])
@@ -288,10 +298,13 @@ class Projection(Unstabilized):
             raise ValueError(f"Projection: metric must be one of {METRICS}, got {self.metric!r}.")
         for what in ("iterations", "every"):
             checks.count("Projection", what, getattr(self, what))
-        checks.positive("Projection", "factor", self.factor)
-        if checks.is_concrete(self.factor) and np.any(np.asarray(self.factor) > 1):
-            raise ValueError(f"Projection: factor must be at most 1, got {self.factor}.")
-        checks.positive("Projection", "tolerance", jax.tree.leaves(self.tolerance), strictly=False)
+        for what in ("coupled", "position", "velocity"):
+            checks.flag("Projection", what, getattr(self, what))
+        checks.check("Projection", "factor", self.factor, (), above=0, most=1)
+        if isinstance(self.tolerance, Tolerance):
+            self.tolerance.check()
+        else:
+            checks.check("Projection", "tolerance", self.tolerance, (), least=0, optional=True)
 
 
 def _missed(mass: Mass, v: Array, step: Array, dt: Any) -> Array:

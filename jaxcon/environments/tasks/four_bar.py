@@ -98,8 +98,8 @@ class FourBarTracking(Environment):
             ValueError: other than four lengths or three masses.
         """
         dtype = checks.chosen_dtype(lengths, masses) if dtype is None else dtype
-        lengths = checks.number("FourBarTracking", "lengths", lengths, dtype, (4,))
-        masses = checks.number("FourBarTracking", "masses", masses, dtype, (3,))
+        lengths = checks.real("FourBarTracking", "lengths", lengths, dtype, (4,))
+        masses = checks.real("FourBarTracking", "masses", masses, dtype, (3,))
         motor = jc.Motor("drive", "ground_crank", gear=torque)
         system, _ = four_bar(lengths, masses, rate=0.0, elements=(motor,))
         method = jc.Method(solver=jc.Sparse()) if method is None else method

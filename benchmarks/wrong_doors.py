@@ -1,0 +1,1311 @@
+"""The doors that `wrong_calls` knocks at: calls of the public interface, one argument left open."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxcon as jc
+from jaxcon import environments
+from jaxcon.environments import curricula
+
+F32 = jnp.float32
+
+
+@dataclass(frozen=True)
+class Takes:
+    """What an argument takes.
+
+    Attributes:
+        kind: "real" numbers, a "count", a "flag", or "other" things.
+        good: numbers that it takes, of its shape.
+        sign: "any", "not negative" or "positive".
+        most: the largest number.
+        least: the smallest count.
+        allows: tags of other values that it takes, as "none".
+        dtype: of the scene; None where the door does not know it.
+        shaped: whether only the shape of `good` will do.
+        unread: whether values of JAX's arrays are judged by the status, not read.
+    """
+
+    kind: str = "none"
+    good: Any = 1.0
+    sign: str = "any"
+    most: float | None = None
+    least: int = 1
+    allows: frozenset[str] = frozenset()
+    dtype: Any = None
+    shaped: bool = True
+    unread: bool = False
+
+
+@dataclass(frozen=True)
+class Door:
+    """One argument of one call.
+
+    Attributes:
+        name: of the call and the argument.
+        call: with the argument, all others right.
+        takes: what is right.
+        words: patterns, one of which a message must have.
+    """
+
+    name: str
+    call: Callable[[Any], Any]
+    takes: Takes
+    words: tuple[str, ...]
+
+
+def real(good: Any = 1.0, sign: str = "any", *allows: str, **more: Any) -> Takes:
+    """Real numbers in the dtype of the scene."""
+    allowed = frozenset(allows)
+    return Takes(
+        **({"kind": "real", "good": good, "sign": sign, "allows": allowed, "dtype": F32} | more)
+    )
+
+
+def free(good: Any = 1.0, sign: str = "any", *allows: str, **more: Any) -> Takes:
+    """Real numbers where the dtype of the scene is not known."""
+    return real(good, sign, *allows, **({"dtype": None} | more))
+
+
+def count(least: int = 1, *allows: str) -> Takes:
+    """A whole number."""
+    return Takes("count", 1, least=least, allows=frozenset(allows))
+
+
+FUNCTION = Takes("other", allows=frozenset({"function"}))
+"""A function of the user's."""
+
+
+def flag() -> Takes:
+    """True or False."""
+    return Takes("flag", allows=frozenset({"flag"}))
+
+
+ORIGIN, X, Y, Z = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+POINT, AXIS = real(ORIGIN, "any", "none"), real(Z)
+ANY, SOME, POSITIVE = real(), real(1.0, "not negative"), real(1.0, "positive")
+LENGTH = real(1.0, "positive", "none")
+STOP = {
+    "restitution": real(0.5, "not negative", most=1.0),
+    "stiffness": real(1.0, "positive", "none"),
+    "recovery": POSITIVE,
+}
+TOUCH = {"friction": SOME, **STOP}
+ROUND = {"rolling": SOME, "spinning": SOME}
+RANGE = real((-1.0, 1.0), "any", "none")
+
+ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
+    (jc.Force, {"body": "arm", "force": Z}, {"force": AXIS, "point": POINT}),
+    (
+        jc.Spring,
+        {"body_a": "arm", "body_b": "leg", "stiffness": 1.0},
+        {
+            "stiffness": SOME,
+            "damping": SOME,
+            "rest_length": real(1.0, "not negative", "none"),
+            "point_a": POINT,
+            "point_b": POINT,
+        },
+    ),
+    (jc.ExternalWrench, {"body": "arm"}, {"point": POINT}),
+    (
+        jc.Distance,
+        {"body_a": "arm", "body_b": "leg"},
+        {"length": LENGTH, "point_a": POINT, "point_b": POINT},
+    ),
+    (jc.Coincident, {"body_a": "arm", "body_b": "leg", "point": ORIGIN}, {"point": POINT}),
+    (jc.Fixed, {"body_a": "arm", "body_b": "leg"}, {"point": POINT}),
+    (
+        jc.Revolute,
+        {"body_a": "arm", "body_b": "leg", "point": ORIGIN, "axis": Z},
+        {"point": POINT, "axis": AXIS},
+    ),
+    (jc.Prismatic, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
+    (jc.Spherical, {"body_a": "arm", "body_b": "leg", "point": ORIGIN}, {"point": POINT}),
+    (jc.Cylindrical, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
+    (
+        jc.Universal,
+        {"body_a": "arm", "body_b": "leg", "point": ORIGIN, "axis_a": X, "axis_b": Y},
+        {"point": POINT, "axis_a": AXIS, "axis_b": AXIS},
+    ),
+    (jc.Planar, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
+    (
+        jc.Screw,
+        {"body_a": "arm", "body_b": "leg", "axis": Z, "lead": 0.1},
+        {"axis": AXIS, "point": POINT, "lead": ANY},
+    ),
+    (
+        jc.ConstantVelocity,
+        {"body_a": "arm", "body_b": "leg", "point": ORIGIN, "axis": Z},
+        {"point": POINT, "axis": AXIS, "axis_b": real(Z, "any", "none")},
+    ),
+    (
+        jc.RevoluteSpherical,
+        {"body_a": "arm", "body_b": "leg", "hinge": ORIGIN, "ball": X, "axis": Z},
+        {"hinge": POINT, "ball": POINT, "axis": AXIS},
+    ),
+    (
+        jc.SphericalSpherical,
+        {"body_a": "arm", "body_b": "leg"},
+        {"length": LENGTH, "point_a": POINT, "point_b": POINT},
+    ),
+    (jc.Span, {"body_a": "arm", "body_b": "leg"}, {"point_a": POINT, "point_b": POINT}),
+    (jc.Twist, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
+    (jc.Parallel, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS}),
+    (jc.PointOnLine, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
+    (
+        jc.PointOnPlane,
+        {"body_a": "arm", "body_b": "leg", "axis": Z},
+        {"axis": AXIS, "point": POINT},
+    ),
+    *[
+        (
+            joint,
+            {"body_a": jc.WORLD, "body_b": "leg", "radius": 1.0, **more},
+            {"radius": POSITIVE, "normal": real(Z, "any", "none"), "center": POINT, "point": POINT},
+        )
+        for joint, more in (
+            (jc.RollingSphere, {}),
+            (jc.RollingDisc, {"axis": Y}),
+            (jc.RollingCylinder, {"axis": Y}),
+        )
+    ],
+    (
+        jc.KnifeEdge,
+        {"body_a": jc.WORLD, "body_b": "leg", "edge": X},
+        {"edge": real(X), "normal": real(Z, "any", "none"), "center": POINT},
+    ),
+    (jc.LinearMomentum, {}, {"value": real(ORIGIN, "any", "none")}),
+    (jc.AngularMomentum, {}, {"value": real(ORIGIN, "any", "none")}),
+    (
+        jc.PlaneContact,
+        {"body_a": jc.WORLD, "body_b": "leg"},
+        {
+            "radius": SOME,
+            "center": POINT,
+            "normal": real(Z, "any", "none"),
+            "point": POINT,
+            **TOUCH,
+            **ROUND,
+        },
+    ),
+    (
+        jc.CapsuleContact,
+        {"body_a": "arm", "body_b": "leg", "radius_a": 0.1, "radius_b": 0.1},
+        {
+            "radius_a": SOME,
+            "radius_b": SOME,
+            "segment_a": real((ORIGIN, X), "any", "none"),
+            "segment_b": real((X, Y), "any", "none"),
+            **TOUCH,
+            **ROUND,
+        },
+    ),
+    (
+        jc.BoxContact,
+        {"body_a": jc.WORLD, "body_b": "leg", "size": (1.0, 1.0, 1.0)},
+        {
+            "size": real((1.0, 1.0, 1.0), "positive"),
+            "position": POINT,
+            "orientation": real((1.0, 0.0, 0.0, 0.0), "any", "none"),
+            "normal": real(Z, "any", "none"),
+            "point": POINT,
+            **TOUCH,
+        },
+    ),
+    (
+        jc.HeightFieldContact,
+        {
+            "body_a": jc.WORLD,
+            "body_b": "leg",
+            "heights": np.zeros((4, 4)),
+            "size": (1.0, 1.0),
+            "radius": 0.1,
+        },
+        {
+            "heights": real(np.zeros((4, 4)), shaped=False),
+            "size": real((1.0, 1.0), "positive"),
+            "radius": SOME,
+            "center": POINT,
+            "position": POINT,
+            "orientation": real((1.0, 0.0, 0.0, 0.0), "any", "none"),
+            **TOUCH,
+            **ROUND,
+        },
+    ),
+    (
+        jc.Rope,
+        {"body_a": "arm", "body_b": "leg"},
+        {"length": LENGTH, "point_a": POINT, "point_b": POINT, **STOP},
+    ),
+    (
+        jc.Compound,
+        {"body_a": "arm", "body_b": "leg", "slides": (X,), "hinges": (Y,)},
+        {
+            "point": POINT,
+            "slides": Takes("other"),
+            "hinges": Takes("other"),
+            "ball": flag(),
+        },
+    ),
+    (
+        jc.Bending,
+        {"body_a": "arm", "body_b": "leg", "body_c": "bob", "stiffness": 1.0},
+        {"stiffness": SOME, "point_a": POINT, "point_b": POINT, "point_c": POINT},
+    ),
+    (
+        jc.Flexure,
+        {"body_a": "arm", "body_b": "leg", "bending": 1.0},
+        {"bending": SOME, "twisting": real(0.5, "not negative"), "straight": flag()},
+    ),
+]
+"""Elements on bodies: the class, arguments that are right, and numbers to be got wrong."""
+
+ALONG: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
+    (jc.Armature, {"joint": "one", "inertia": 1.0}, {"inertia": POSITIVE}),
+    (
+        jc.JointSpring,
+        {"joint": "one", "stiffness": 1.0},
+        {"stiffness": SOME, "damping": SOME, "rest": ANY},
+    ),
+    (jc.JointDamper, {"joint": "one", "damping": 1.0}, {"damping": SOME}),
+    (jc.Motor, {"joint": "one"}, {"gear": ANY, "control_range": RANGE}),
+    (
+        jc.PositionServo,
+        {"joint": "one", "stiffness": 1.0},
+        {
+            "stiffness": SOME,
+            "damping": SOME,
+            "gear": ANY,
+            "control_range": RANGE,
+            "force_range": RANGE,
+        },
+    ),
+    (
+        jc.VelocityServo,
+        {"joint": "one", "damping": 1.0},
+        {"damping": SOME, "gear": ANY, "control_range": RANGE, "force_range": RANGE},
+    ),
+    (
+        jc.AffineActuator,
+        {"joint": "one"},
+        {"gain": real(X), "bias": real(X), "gear": ANY, "control_range": RANGE},
+    ),
+    (
+        jc.Limit,
+        {"joint": "one", "lower": -1.0, "upper": 1.0},
+        {
+            "lower": real(-1.0, "any", "none", "infinity"),
+            "upper": real(1.0, "any", "none", "infinity"),
+            **STOP,
+        },
+    ),
+    (jc.JointFriction, {"joint": "one", "most": 1.0}, {"most": SOME}),
+    (jc.RateLimit, {"joint": "one", "rate": 1.0}, {"rate": SOME}),
+    (jc.RateMotor, {"joint": "one", "most": 1.0}, {"most": SOME}),
+    (jc.Gear, {"joint_a": "one", "joint_b": "two", "ratio": 2.0}, {"ratio": ANY}),
+    (
+        jc.Belt,
+        {"joint_a": "one", "joint_b": "two", "radius_a": 1.0, "radius_b": 1.0},
+        {"radius_a": ANY, "radius_b": ANY},
+    ),
+    (
+        jc.RackAndPinion,
+        {"pinion": "one", "rack": "slide", "radius": 1.0},
+        {"radius": ANY},
+    ),
+    (
+        jc.PolynomialCoupling,
+        {"joint_a": "one", "joint_b": "two", "coefficients": (0.0, 1.0, 0.5)},
+        {"coefficients": real((0.0, 1.0, 0.5), shaped=False)},
+    ),
+    (jc.Pulley, {"span_a": "span", "span_b": "span2"}, {"parts": ANY}),
+]
+"""Elements on joints."""
+
+
+def bodies(dtype: Any = F32) -> jc.Scene:
+    """Two bodies and a particle."""
+    scene = jc.Scene(dtype=dtype)
+    for i, name in enumerate(("arm", "leg")):
+        scene.add_body(name, mass=1.0, inertia=(1.0, 1.0, 1.0), position=(float(i), 0.0, 0.0))
+    scene.add_particle("bob", mass=1.0, position=(2.0, 1.0, 0.0))
+    return scene
+
+
+def jointed(dtype: Any = F32) -> jc.Scene:
+    """Two arms on hinges, one of which carries a slide, and two spans."""
+    scene = bodies(dtype)
+    scene.add(jc.Revolute("one", jc.WORLD, "arm", point=ORIGIN, axis=Z))
+    scene.add(jc.Revolute("two", "arm", "leg", point=X, axis=Z))
+    scene.add_body("block", mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 2.0, 0.0))
+    scene.add(jc.Prismatic("slide", jc.WORLD, "block", axis=X))
+    scene.add(jc.Span("span", jc.WORLD, "bob"))
+    scene.add(jc.Span("span2", "leg", "bob"))
+    return scene
+
+
+def with_element(make: Callable[[], jc.Scene], kind: Any, given: Mapping[str, Any]) -> Any:
+    """A built scene with one more element."""
+    scene = make()
+    scene.add(kind("it", **given))
+    return scene.build()
+
+
+@functools.cache
+def motor() -> tuple[Any, Any]:
+    """An arm on a hinge with a motor and a stop, that is at rest."""
+    scene = bodies()
+    scene.add(jc.Revolute("one", jc.WORLD, "arm", point=ORIGIN, axis=Z))
+    scene.add(jc.Motor("drive", "one"))
+    scene.add(jc.Limit("stop", "one", lower=-1.0, upper=1.0))
+    scene.add(jc.Spring("coil", "arm", "leg", 1.0))
+    scene.add(jc.TurnCounter("turns", "one"))
+    return scene.build()
+
+
+@functools.cache
+def plain() -> tuple[Any, Any]:
+    """A pendulum, at rest."""
+    scene = jc.Scene(dim=2, dtype=F32)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    return scene.build()
+
+
+def body(dim: int, **given: Any) -> Any:
+    """A scene of one body."""
+    scene = jc.Scene(dim=dim, dtype=F32)
+    inertia = 1.0 if dim == 2 else (1.0, 1.0, 1.0)
+    scene.add_body("arm", **({"mass": 1.0, "inertia": inertia} | given))
+    return scene.build()
+
+
+def particle(**given: Any) -> Any:
+    """A scene of one particle."""
+    scene = jc.Scene(dtype=F32)
+    scene.add_particle("bob", **({"mass": 1.0} | given))
+    return scene.build()
+
+
+def begun(**parts: Any) -> Any:
+    """The first state under a method: where its numbers are read."""
+    system, state = plain()
+    return jc.init(system, jc.Method(**parts), state.q, state.v)
+
+
+def step(**given: Any) -> Any:
+    """A step with a motor."""
+    system, state = motor()
+    arguments = {"control": np.zeros(1), "dt": 1e-3, "state": state} | given
+    return jc.step(system, jc.Method(), arguments["state"], arguments["control"], arguments["dt"])
+
+
+def rollout(**given: Any) -> Any:
+    """Two steps."""
+    system, state = plain()
+    named = {"controls": None, "dt": 1e-3, "steps": 2} | given
+    return jc.rollout(
+        system,
+        jc.Method(),
+        state,
+        named.pop("controls"),
+        named.pop("dt"),
+        named.pop("steps"),
+        **named,
+    )
+
+
+PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
+    (
+        "solver",
+        jc.Sparse,
+        {},
+        {"tikhonov": free(1e-6, "not negative", "none"), "run": count()},
+    ),
+    ("solver", jc.Schur, {}, {"tikhonov": free(1e-6, "not negative", "none")}),
+    (
+        "solver",
+        jc.ConjugateGradients,
+        {},
+        {
+            "tikhonov": free(1e-6, "not negative", "none"),
+            "tolerance": free(1e-6, "not negative", "none"),
+            "iterations": count(),
+        },
+    ),
+    (
+        "solver",
+        jc.RankSafe,
+        {},
+        {
+            "share": free(1e-6, "not negative", "none"),
+            "scaling": free(1e-6, "not negative", "none"),
+            "conflict": free(1e-2, "not negative", "none", "infinity"),
+            "rounds": count(),
+            "always": flag(),
+            "solver": Takes("other"),
+        },
+    ),
+    (
+        "solver",
+        jc.Priority,
+        {"levels": {"rod": 0}},
+        {
+            "cutoff": free(1e-6, "not negative", "none"),
+            "conflict": free(1e-6, "not negative", "none", "infinity"),
+            "damping": free(1e-6, "not negative", "none"),
+            "levels": Takes("other"),
+        },
+    ),
+    (
+        "bounded",
+        jc.InteriorPoint,
+        {},
+        {
+            "iterations": count(),
+            "polish": count(0),
+            "smoothing": free(1e-3, "not negative", "none"),
+        },
+    ),
+    (
+        "bounded",
+        jc.GaussSeidel,
+        {},
+        {"sweeps": count(), "warm": flag(), "smoothing": free(1e-3, "not negative", "none")},
+    ),
+    (
+        "bounded",
+        jc.Nearest,
+        {},
+        {"contacts": count(1, "none"), "stops": count(1, "none"), "solver": Takes("other")},
+    ),
+    (
+        "stabilizer",
+        jc.Baumgarte,
+        {"alpha": 1.0, "beta": 1.0},
+        {
+            "alpha": free(1.0, "not negative", "none", shaped=False),
+            "beta": free(1.0, "not negative", "none", shaped=False),
+        },
+    ),
+    (
+        "stabilizer",
+        jc.AdaptiveBaumgarte,
+        {},
+        {
+            "size": free(1e-3, "positive", shaped=False),
+            "floor": free(0.2, "not negative", most=1, shaped=False),
+        },
+    ),
+    (
+        "stabilizer",
+        jc.SlidingWindowBaumgarte,
+        {},
+        {
+            "rate": free(1.0, "not negative", "none", shaped=False),
+            "damping_ratio": free(0.7, "positive", most=1, shaped=False),
+            "speed": free(0.1, "not negative"),
+            "recovery": free(0.1, "not negative"),
+            "reach": free(10.0, "positive"),
+            "noise": free(1e-9, "positive"),
+            "margin": free(0.9, "not negative", most=1),
+            "limit": free(1.0, "positive", "none"),
+            "window": count(4),
+        },
+    ),
+    (
+        "stabilizer",
+        jc.PID,
+        {},
+        {
+            "proportional": free(1.0, "not negative", "none", shaped=False),
+            "derivative": free(1.0, "not negative", "none", shaped=False),
+            "integral": free(0.0, "not negative", shaped=False),
+            "limit": free(1.0, "not negative", "none", shaped=False),
+        },
+    ),
+    (
+        "stabilizer",
+        jc.Penalty,
+        {"stiffness": 1.0},
+        {
+            "stiffness": free(1.0, "not negative", shaped=False),
+            "damping": free(1.0, "not negative", shaped=False),
+            "damping_ratio": free(1.0, "not negative", shaped=False),
+            "implicit": flag(),
+            "others": Takes("other"),
+        },
+    ),
+    (
+        "stabilizer",
+        jc.AugmentedLagrangian,
+        {},
+        {
+            "stiffness": free(1.0, "positive", shaped=False),
+            "iterations": count(),
+            "feedback": Takes("other"),
+        },
+    ),
+    (
+        "stabilizer",
+        jc.Projection,
+        {},
+        {
+            "metric": Takes("other"),
+            "iterations": count(),
+            "every": count(),
+            "tolerance": free(1e-6, "not negative", "none"),
+            "factor": free(1.0, "positive", most=1),
+            "coupled": flag(),
+            "position": flag(),
+            "velocity": flag(),
+        },
+    ),
+    (
+        "stabilizer",
+        jc.Hybrid,
+        {"small": jc.Baumgarte(1.0, 1.0)},
+        {
+            "soft_below": free(1e-6, "positive"),
+            "project_above": free(1e-2, "positive"),
+            "sharpness": count(),
+            "small": Takes("other"),
+            "middle": Takes("other"),
+        },
+    ),
+    (
+        "integrator",
+        jc.GeneralizedAlpha,
+        {},
+        {
+            "rho": free(0.9, "not negative", most=1),
+            "tolerance": free(1e-6, "not negative", "none"),
+            "tikhonov": free(1e-6, "not negative", "none"),
+            "iterations": count(),
+            "projects": flag(),
+        },
+    ),
+    ("integrator", jc.RATTLE, {}, {"iterations": count(), "rounds": count()}),
+    ("integrator", jc.SemiImplicitEuler, {}, {"gyroscopic": Takes("other")}),
+    (
+        "recovery",
+        jc.Recovery,
+        {},
+        {
+            "limit": free(1.0, "positive", "none"),
+            "shrink": free(0.5, "positive", most=1),
+            "growth": free(1.05, "positive"),
+            "damping": free(0.1, "not negative", most=1),
+            "retries": count(0),
+            "projector": Takes("other"),
+        },
+    ),
+    ("events", jc.Events, {}, {"splits": count(), "iterations": count(), "slips": flag()}),
+]
+"""Parts of a method: the field, the class, arguments that are right, and those to be got wrong."""
+
+
+def doors() -> Iterator[Door]:
+    """All of them."""
+    for make, table in ((bodies, ELEMENTS), (jointed, ALONG)):
+        for kind, given, fields in table:
+            for field, takes in fields.items():
+                yield _element(make, kind, given, field, takes)
+    yield from _of_bodies()
+    yield from _of_params()
+    for part, kind, given, fields in PARTS:
+        for field, takes in fields.items():
+
+            def call(
+                x: Any, part: str = part, kind: Any = kind, given: Any = given, f: str = field
+            ) -> Any:
+                return begun(**{part: kind(**(given | {f: x}))})
+
+            yield Door(f"{kind.__name__}.{field}", call, takes, (rf"\b{field.rstrip('s')}",))
+    for name, call, takes, *words in (*_simulation(), *_analysis(), *_search(), *_others()):
+        yield Door(name, call, takes, tuple(words) or (rf"\b{re.split('[.(]', name)[-1]}\b",))
+
+
+def _element(make: Any, kind: Any, given: Any, field: str, takes: Takes) -> Door:
+    def call(x: Any) -> Any:
+        return with_element(make, kind, given | {field: x})
+
+    return Door(f"{kind.__name__}.{field}", call, takes, (rf"\b{field}\b",))
+
+
+def _of_bodies() -> Iterator[Door]:
+    vector, turn = real(ORIGIN, "any", "none"), real((1.0, 0.0, 0.0, 0.0), "any", "none")
+    three = {
+        "mass": POSITIVE,
+        "inertia": real((1.0, 1.0, 1.0), "positive"),
+        "position": vector,
+        "quaternion": turn,
+        "velocity": vector,
+        "angular_velocity": vector,
+        "fixed": flag(),
+    }
+    two = {
+        "inertia": POSITIVE,
+        "position": real((0.0, 0.0), "any", "none"),
+        "angle": real(0.0, "any", "none"),
+        "angular_velocity": real(0.0, "any", "none"),
+    }
+    for dim, fields in ((3, three), (2, two)):
+        for field, takes in fields.items():
+            call = functools.partial(_body_with, dim, field)
+            yield Door(f"add_body.{field} in {dim}D", call, takes, (rf"\b{field}\b",))
+    for field, takes in {"mass": POSITIVE, "position": vector, "velocity": vector}.items():
+        call = functools.partial(_particle_with, field)
+        yield Door(f"add_particle.{field}", call, takes, (rf"\b{field}\b",))
+
+
+def _body_with(dim: int, field: str, x: Any) -> Any:
+    return body(dim, **{field: x})
+
+
+def _particle_with(field: str, x: Any) -> Any:
+    return particle(**{field: x})
+
+
+def _of_params() -> Iterator[Door]:
+    fields = {
+        ("gravity", None): AXIS,
+        ("arm", "mass"): POSITIVE,
+        ("arm", "inertia"): real((1.0, 1.0, 1.0), "positive"),
+        ("arm", "center"): real(ORIGIN),
+        ("coil", "stiffness"): SOME,
+        ("coil", "damping"): SOME,
+        ("coil", "rest_length"): SOME,
+        ("drive", "gear"): ANY,
+        ("stop", "lower"): real(-1.0, "any", "infinity"),
+        ("stop", "recovery"): POSITIVE,
+        ("one", "axis_a"): AXIS,
+    }
+    for (name, field), takes in fields.items():
+
+        def call(x: Any, name: str = name, field: str | None = field) -> Any:
+            return motor()[0].with_params({name: x if field is None else {field: x}})
+
+        yield Door(f"with_params.{name}.{field}", call, takes, (rf"\b{field or name}\b",))
+
+
+Row = tuple[Any, ...]
+
+
+def _simulation() -> Iterator[Row]:
+    yield "Scene.gravity", lambda x: jc.Scene(gravity=x, dtype=F32), real(ORIGIN, "any", "none")
+    yield "Scene.dim", lambda x: jc.Scene(dim=x), count(2)
+    yield "Scene.dtype", lambda x: jc.Scene(dtype=x), Takes("other", allows=frozenset({"none"}))
+    system, state = motor()
+    n_v = state.v.shape
+    init = functools.partial(jc.init, system, jc.Method())
+    yield "init.q", lambda x: init(x, state.v), real(np.asarray(state.q)), r"\bq\b"
+    yield "init.v", lambda x: init(state.q, x), real(np.zeros(n_v)), r"\bv\b"
+    yield "init.time", lambda x: init(state.q, state.v, x), real(0.0)
+    turns = real(np.zeros(1), "any", "none")
+    yield "init.turns", lambda x: init(state.q, state.v, turns=x), turns
+    for field, good in {
+        "q": state.q,
+        "v": np.zeros(n_v),
+        "time": 0.0,
+        "turns": np.zeros(1),
+    }.items():
+
+        def call(x: Any, field: str = field) -> Any:
+            return step(state=dataclasses.replace(state, **{field: x}))
+
+        takes = Takes("state", np.asarray(good))
+        yield f"State.{field}", call, takes, rf"state.{field}\b"
+        for what, x in wrong_arrays().items():
+            yield (
+                f"State.{field} {what}",
+                functools.partial(_given, call, x),
+                Takes("one"),
+                rf"state.{field}\b",
+            )
+    yield (
+        "State.status",
+        lambda x: step(state=dataclasses.replace(state, status=x)),
+        Takes("other"),
+        r"state.status\b",
+    )
+    dt = real(1e-3, "not negative", unread=True)
+    yield "step.dt", lambda x: step(dt=x), dt
+    yield "step.control", lambda x: step(control=x), real(np.zeros(1), unread=True)
+    yield "step.state", lambda x: step(state=x), Takes("other"), "State"
+    yield "step.method", lambda x: jc.step(*_swapped(method=x)), Takes("other"), "method"
+    yield "step.system", lambda x: jc.step(*_swapped(system=x)), Takes("other"), "system"
+    forward = lambda x: jc.forward_dynamics(system, state, np.zeros(1), jc.Method(), x)  # noqa: E731
+    yield "forward_dynamics.dt", forward, dt
+    yield "rollout.dt", lambda x: rollout(dt=x), dt
+    yield "rollout.steps", lambda x: rollout(steps=x), count(0)
+    yield "rollout.every", lambda x: rollout(every=x), count()
+    yield "rollout.record", lambda x: rollout(record=x), FUNCTION
+    yield "rollout.adjoint", lambda x: rollout(adjoint=x), Takes("other")
+    controls = Takes("other", allows=frozenset({"none", "function"}))
+    yield "rollout.controls", lambda x: rollout(controls=x), controls
+    yield (
+        "Checkpoints.levels",
+        lambda x: rollout(adjoint=jc.Checkpoints(levels=x)),
+        count(1, "none"),
+    )
+    yield (
+        "Checkpoints.segments",
+        lambda x: rollout(adjoint=jc.Checkpoints(segments=x)),
+        count(1, "none"),
+    )
+    yield (
+        "Checkpoints.budget",
+        lambda x: rollout(adjoint=jc.Checkpoints(budget=x)),
+        free(1e9, "positive", "none"),
+    )
+    yield "Truncated.steps", lambda x: rollout(adjoint=jc.Truncated(x)), count()
+    yield (
+        "Truncated.within",
+        lambda x: rollout(adjoint=jc.Truncated(1, x)),
+        Takes("other"),
+        "adjoint|within",
+    )
+    yield (
+        "Discounted.factor",
+        lambda x: rollout(adjoint=jc.Discounted(x)),
+        free(0.5, "not negative", most=1),
+    )
+    yield (
+        "Reversible.segments",
+        lambda x: rollout(adjoint=jc.Reversible(x)),
+        count(1, "none"),
+    )
+
+
+def wrong_arrays() -> dict[str, Any]:
+    """What a field of a float32 state must not be."""
+    return {
+        "of booleans": np.ones(1, bool),
+        "of complex numbers": np.ones(1, complex),
+        "of float16": jnp.ones(1, jnp.float16),
+        "of float64": jnp.ones(1, jnp.float64),
+        "of integers": jnp.ones(1, int),
+        "of another shape": np.ones((2, 3), np.float32),
+        "as a list": [1.0, 2.0],
+    }
+
+
+def _given(call: Callable[[Any], Any], x: Any, _: Any) -> Any:
+    return call(x)
+
+
+def _swapped(**given: Any) -> tuple[Any, ...]:
+    system, state = motor()
+    named = {"system": system, "method": jc.Method()} | given
+    return named["system"], named["method"], state, np.zeros(1), 1e-3
+
+
+def _analysis() -> Iterator[Row]:
+    system, state = motor()
+    for reader in (jc.position, jc.velocity):
+        read = functools.partial(reader, system, state, "arm")
+        yield f"{reader.__name__}.point", read, real(ORIGIN, "any", "none")
+    yield (
+        "angular_momentum.about",
+        lambda x: jc.angular_momentum(system, state, about=x),
+        real(ORIGIN, "any", "none"),
+    )
+    names = Takes("other")
+    for reader in (jc.position, jc.orientation, jc.velocity, jc.angular_velocity):
+        yield (
+            f"{reader.__name__}.body",
+            functools.partial(reader, system, state),
+            names,
+            "body|unknown",
+        )
+    for reader in (jc.coordinate, jc.coordinate_rate):
+        yield (
+            f"{reader.__name__}.joint",
+            functools.partial(reader, system, state),
+            names,
+            "joint|unknown",
+        )
+    for reader in (jc.multipliers, jc.wrench):
+        yield (
+            f"{reader.__name__}.info",
+            lambda x, reader=reader: reader(system, state, x, "one"),
+            names,
+        )
+    ratio = free(1.0, "not negative")
+    rate = jc.largest_stable_rate
+    yield "largest_stable_rate.dt", lambda x: rate(jc.RK4(), x), free(1e-3, "positive")
+    yield "largest_stable_rate.damping_ratio", lambda x: rate(jc.RK4(), 1e-3, x), ratio
+    yield "largest_stable_rate.integrator", lambda x: rate(x, 1e-3), names
+    response = {"frequency": 1.0, "alpha": 1.0, "beta": 1.0, "integral": 0.0}
+    for what, good in response.items():
+        takes = free(good, shaped=False)
+        yield f"frequency_response.{what}", functools.partial(_response, what), takes
+    yield (
+        "frequency_response.dt",
+        functools.partial(_response, "dt"),
+        free(1e-3, "positive", shaped=False),
+    )
+    yield "frequency_response.integrator", functools.partial(_response, "integrator"), names
+    system, state = plain()
+    yield "report.dt", lambda x: jc.report(system, state, dt=x), free(1e-3, "positive", "none")
+    yield "report.timed", lambda x: jc.report(system, state, timed=x), flag()
+    yield "report.batch", lambda x: jc.report(system, state, batch=x), count()
+    yield (
+        "report.method",
+        lambda x: jc.report(system, state, x),
+        Takes("other", allows=frozenset({"none"})),
+    )
+    yield "Method.auto.batch", lambda x: jc.Method.auto(system, state, x), count()
+    three = (system, jc.Method(), state, None)
+    yield "diagnose.dt", lambda x: jc.diagnose(*three, x, 5), free(1e-3, "positive")
+    yield "diagnose.steps", lambda x: jc.diagnose(*three, 1e-3, x), count()
+    yield (
+        "find_first_failure.dt",
+        lambda x: jc.find_first_failure(*three, x, 5),
+        free(1e-3, "not negative", unread=True),
+    )
+    yield "find_first_failure.steps", lambda x: jc.find_first_failure(*three, 1e-3, x), count(0)
+    yield "gradient_growth.dt", lambda x: jc.gradient_growth(*three, x, 5), free(1e-3, "positive")
+    yield "gradient_growth.steps", lambda x: jc.gradient_growth(*three, 1e-3, x), count(4)
+    yield "gradient_growth.seed", lambda x: jc.gradient_growth(*three, 1e-3, 5, x), count(0)
+    check = functools.partial(jc.check_gradients, jnp.sum, jnp.ones(2))
+    yield "check_gradients.tolerance", lambda x: check(tolerance=x), free(1e-3, "positive", "none")
+    yield "check_gradients.directions", lambda x: check(directions=x), count()
+    yield "check_gradients.seed", lambda x: check(seed=x), count(0)
+    yield (
+        "check_gradients.f",
+        lambda x: jc.check_gradients(x, jnp.ones(2)),
+        FUNCTION,
+    )
+    q = np.asarray(state.q)
+    yield "assemble.q", lambda x: jc.assemble(system, x), real(q), r"\bq\b"
+    yield "assemble.v", lambda x: jc.assemble(system, q, x), real(0 * q, "any", "none"), r"\bv\b"
+    yield "assemble.time", lambda x: jc.assemble(system, q, time=x), real(0.0, "any", "none")
+    yield (
+        "assemble.tolerance",
+        lambda x: jc.assemble(system, q, tolerance=x),
+        real(1e-6, "positive", "none"),
+    )
+    yield "raise_for_status.result", jc.raise_for_status, Takes("other")
+    yield (
+        "vakonomic.multipliers",
+        lambda x: jc.vakonomic(*_sledge(), x),
+        Takes("other", allows=frozenset({"none"})),
+        "multipliers|constraint",
+    )
+    yield (
+        "vakonomic.multipliers of a row",
+        lambda x: jc.vakonomic(*_sledge(), {"edge": x}),
+        real(np.zeros(1)),
+        "μ|multipliers",
+    )
+    for what in ("horizon", "budget"):
+        yield f"tradeoff.{what}", functools.partial(_tradeoff, what), free(1.0, "positive")
+    yield "tradeoff.gradients", functools.partial(_tradeoff, "gradients"), flag()
+    yield "tradeoff.batch", functools.partial(_tradeoff, "batch"), count()
+    yield (
+        "tradeoff.dts",
+        functools.partial(_tradeoff, "dts"),
+        Takes("other", allows=frozenset({"none"})),
+    )
+    yield "tradeoff.hold", functools.partial(_tradeoff, "hold"), free(0.5, "positive", "none")
+    yield (
+        "tradeoff.methods",
+        functools.partial(_tradeoff, "methods"),
+        Takes("other", allows=frozenset({"none"})),
+        "methods?",
+    )
+    yield "tradeoff.dtypes", functools.partial(_tradeoff, "dtypes"), Takes("other")
+
+
+def _tradeoff(what: str, x: Any) -> Any:
+    system, state = plain()
+    given = {"horizon": 0.01, "budget": 1.0, "dts": [1e-2], "methods": {"a": jc.Method()}} | {
+        what: x
+    }
+    return jc.tradeoff(system, state, given.pop("horizon"), **given)
+
+
+def _response(what: str, x: Any) -> Any:
+    given = {"frequency": 1.0, "alpha": 1.0, "beta": 1.0}
+    if what in ("dt", "integrator"):
+        given |= {"dt": 1e-3, "integrator": jc.RK4()}
+    return jc.frequency_response(**(given | {what: x}))
+
+
+@functools.cache
+def _sledge() -> tuple[Any, Any]:
+    scene = jc.Scene(dim=2, dtype=F32)
+    scene.add_body("sledge", mass=1.0, inertia=1.0)
+    scene.add(jc.KnifeEdge("edge", jc.WORLD, "sledge", edge=(1.0, 0.0)))
+    return scene.build()
+
+
+def _search() -> Iterator[Row]:
+    none = frozenset({"none"})
+    tune = functools.partial(jc.tune, lambda p: jnp.sum(p**2), jnp.ones(2))
+    yield "tune.steps", lambda x: tune(steps=x), count()
+    yield "tune.restarts", lambda x: tune(steps=1, restarts=x), count()
+    yield "tune.samples", lambda x: tune(steps=1, samples=x), count(0)
+    yield "tune.patience", lambda x: tune(steps=1, patience=x), count(1, "none")
+    yield "tune.tolerance", lambda x: tune(steps=1, tolerance=x), free(1e-3, "not negative")
+    yield "tune.spread", lambda x: tune(steps=1, spread=x), free(0.1, "not negative", shaped=False)
+    yield "tune.optimizer", lambda x: tune(steps=1, optimizer=x), Takes("other", allows=none)
+    yield (
+        "tune.loss",
+        lambda x: jc.tune(x, jnp.ones(2), steps=1),
+        FUNCTION,
+    )
+    yield (
+        "tune.key",
+        lambda x: tune(steps=1, restarts=2, key=x),
+        Takes("other", allows=frozenset({"key"})),
+        "key",
+    )
+    simulate, data = (lambda p: p), jnp.ones(2)
+    identify = functools.partial(jc.identify, simulate, jnp.ones(2), data)
+    yield "identify.steps", lambda x: identify(steps=x), count()
+    yield "identify.restarts", lambda x: identify(restarts=x), count()
+    yield "identify.continuity", lambda x: identify(continuity=x), free(1e-3, "positive")
+    yield "identify.noise", lambda x: identify(noise=x), free(1.0, "positive", "none", shaped=False)
+    yield "identify.spread", lambda x: identify(spread=x), free(0.1, "not negative", shaped=False)
+    nodes = functools.partial(jc.identify, lambda p, node: (p, node), jnp.ones(2), jnp.ones((1, 2)))
+    yield "identify.nodes", lambda x: nodes(nodes=x), Takes("other", allows=none)
+    yield (
+        "identify.data",
+        lambda x: jc.identify(simulate, jnp.ones(2), x),
+        Takes("other"),
+        "data|compared with",
+    )
+    yield (
+        "identify.simulate",
+        lambda x: jc.identify(x, jnp.ones(2), data),
+        FUNCTION,
+    )
+
+
+def _others() -> Iterator[Row]:
+    solids = {
+        "sphere": ({"mass": 1.0, "radius": 1.0}, ()),
+        "box": ({"mass": 1.0, "size": (1.0, 1.0, 1.0)}, ()),
+        "cylinder": ({"mass": 1.0, "radius": 1.0, "length": 1.0}, ()),
+        "capsule": ({"mass": 1.0, "radius": 1.0, "length": 1.0}, ()),
+        "rod": ({"mass": 1.0, "radius": 0.1, "length": 1.0}, ()),
+    }
+    for solid, (given, _) in solids.items():
+        for what, good in given.items():
+
+            def call(x: Any, solid: str = solid, given: Any = given, what: str = what) -> Any:
+                return getattr(jc.inertia, solid)(**(given | {what: x}))
+
+            yield f"inertia.{solid}.{what}", call, free(good, "positive")
+    tensor = functools.partial(jc.inertia.from_tensor, 1.0)
+    yield "inertia.from_tensor.tensor", tensor, free(np.eye(3))
+    yield "inertia.from_log_cholesky.theta", jc.inertia.from_log_cholesky, free(np.zeros(10))
+    yield "box_corners.size", jc.box_corners, free((1.0, 1.0, 1.0), "positive", shaped=False)
+    yield (
+        "box_corners.position",
+        lambda x: jc.box_corners((1.0, 1.0, 1.0), x),
+        free(ORIGIN, "any", "none"),
+    )
+    hung = {"start": (0.0, 0.0), "end": (1.0, 0.0), "length": 2.0}
+    for what, good in hung.items():
+        sign = "positive" if what == "length" else "any"
+        yield f"hanging.{what}", functools.partial(_hanging, what), free(good, sign)
+    yield "hanging.links", functools.partial(_hanging, "links"), count()
+    line = np.linspace(ORIGIN, X, 4)
+    for what, good in {
+        "points": line,
+        "mass": 1.0,
+        "radius": 0.1,
+        "bending": 1.0,
+        "twisting": 0.0,
+    }.items():
+        takes = real(
+            good,
+            "not negative" if what in ("bending", "twisting") else "any",
+            shaped=what == "mass",
+        )
+        if what == "mass":
+            takes = POSITIVE
+        if what in ("radius", "bending"):
+            takes = dataclasses.replace(takes, allows=frozenset({"none"}))
+        yield f"rod.{what}", functools.partial(_rod, jc.rod, what), takes
+        if what in ("points", "mass", "bending"):
+            yield f"rope.{what}", functools.partial(_rod, jc.rope, what), takes
+    yield (
+        "curricula.decay.time",
+        lambda x: curricula.decay(1.0, 1.0, x),
+        free(1.0, "positive", shaped=False),
+    )
+    for what, good in {"t": 1.0, "initial": 1.0}.items():
+        late = functools.partial(_with, curricula.decay, {"t": 1.0, "initial": 1.0, "time": 1.0})
+        yield f"curricula.decay.{what}", functools.partial(late, what), free(good, shaped=False)
+    ramp = functools.partial(
+        _with, curricula.warm_up, {"episode": 1.0, "begin": 0.0, "end": 2.0, "least": 0.1}
+    )
+    for what in ("episode", "begin", "end", "least"):
+        takes = free(3.0 if what == "end" else 0.0, shaped=False)
+        yield f"curricula.warm_up.{what}", functools.partial(ramp, what), takes
+    by_mean = functools.partial(
+        _with, curricula.by_performance, {"performance": 1.0, "least": 0.0, "most": 1.0}
+    )
+    for what in ("performance", "least", "most", "middle"):
+        yield (
+            f"curricula.by_performance.{what}",
+            functools.partial(by_mean, what),
+            free(1.0, shaped=False),
+        )
+    for task, build in environments.TASKS.items():
+        for what, option in inspect.signature(build).parameters.items():
+            make = functools.partial(_made, task, what)
+            if isinstance(option.default, float | tuple):
+                sign = "positive" if what == "dt" else "not negative"
+                yield f"{task}.{what}", make, free(option.default, sign, shaped=False)
+            elif type(option.default) is int:
+                yield f"{task}.{what}", make, count(1, *(["none"] if what == "horizon" else []))
+    for what in ("base", "speed", "force"):
+
+        def tolerance(x: Any, what: str = what) -> Any:
+            return begun(
+                stabilizer=jc.Projection(tolerance=jc.Tolerance(**({"base": 1e-6} | {what: x})))
+            )
+
+        allows = ("none",) if what != "base" else ()
+        yield f"Tolerance.{what}", tolerance, free(1e-6, "not negative", *allows)
+    yield "make.task", environments.make, Takes("other")
+    none = frozenset({"none"})
+    for what in ("qpos", "qvel", "time"):
+        good = 0.0 if what == "time" else np.zeros(1)
+        yield f"MujocoModel.state.{what}", functools.partial(_model_state, what), real(good)
+    for what, takes in {"ignore": Takes("other"), "count_turns": flag()}.items():
+        read = functools.partial(_with, jc.from_mjcf, {"source": _text()})
+        yield f"from_mjcf.{what}", functools.partial(read, what), takes
+    yield "from_mjcf.dtype", lambda x: jc.from_mjcf(_text(), dtype=x), Takes("other", allows=none)
+    yield "from_mjcf.source", jc.from_mjcf, Takes("other"), "source|from_mjcf|file|XML"
+
+
+def _with(function: Any, given: dict[str, Any], what: str, x: Any) -> Any:
+    return function(**(given | {what: x}))
+
+
+def _made(task: str, what: str, x: Any) -> Any:
+    return environments.make(task, **{what: x})
+
+
+def _hanging(what: str, x: Any) -> Any:
+    given = {"start": (0.0, 0.0), "end": (1.0, 0.0), "length": 2.0, "links": 4}
+    return jc.hanging(**(given | {what: x}))
+
+
+def _rod(make: Any, what: str, x: Any) -> Any:
+    scene = jc.Scene(dtype=F32)
+    given = {"points": np.linspace(ORIGIN, X, 4), "mass": 1.0} | {what: x}
+    if make is jc.rod:
+        given = {"radius": 0.05} | given
+    points, mass = given.pop("points"), given.pop("mass")
+    make(scene, "it", points, mass, **given)
+    return scene.build()
+
+
+def hesitant(state: Any) -> Any:
+    """A policy that asks for a value."""
+    return jnp.zeros(1) if state.q[0] > 0 else jnp.ones(1)
+
+
+def nothing(*_: Any) -> None:
+    """Returns nothing."""
+
+
+def words(*_: Any) -> str:
+    """Returns a string."""
+    return "force"
+
+
+def branching(x: Any, *_: Any) -> Any:
+    """Asks for a value."""
+    leaf = jax.tree.leaves(x)[0]
+    return leaf if jnp.sum(leaf) > 0 else -leaf
+
+
+def _levels(level: Any) -> Any:
+    return jc.Priority({"rod": level})
+
+
+def _motor_rollout(**given: Any) -> Any:
+    system, state = motor()
+    return jc.rollout(system, jc.Method(), state, given.pop("controls"), 1e-3, 2, **given)
+
+
+def _custom(function: Any) -> Any:
+    system, state = with_element(bodies, jc.CustomForce, {"bodies": ("bob",), "function": function})
+    return jc.step(system, jc.Method(), state, None, 1e-3)
+
+
+def _generalized(mass: Any = None, force: Any = None, **more: Any) -> Any:
+    system = jc.GeneralizedSystem(
+        mass=mass or (lambda q, p: jnp.ones_like(q)),
+        force=force or (lambda q, v, t, u, p: -q),
+        **more,
+    )
+    state = jc.init(system, jc.Method(), np.ones(2), np.zeros(2))
+    return jc.step(system, jc.Method(), state, None, 1e-3)
+
+
+MJCF = """<mujoco><worldbody><body pos="0 0 1">
+<joint type="hinge" axis="0 1 0" damping="{damping}"/>
+<geom type="sphere" size="{size}" mass="{mass}"/></body></worldbody></mujoco>"""
+
+
+def _text(**given: str) -> str:
+    return MJCF.format(**({"damping": "0.1", "size": "0.1", "mass": "1"} | given))
+
+
+def _mjcf(**given: str) -> Any:
+    return jc.from_mjcf(_text(**given))
+
+
+@functools.cache
+def _model() -> Any:
+    return jc.from_mjcf(_text(), dtype=F32)
+
+
+def _model_state(what: str, x: Any) -> Any:
+    return _model().state(**({"qpos": np.zeros(1), "qvel": np.zeros(1)} | {what: x}))
+
+
+Special = tuple[Callable[[Any], Any], tuple[str, ...]]
+
+SPECIAL: dict[str, Special] = {
+    "a policy with if": (lambda _: _motor_rollout(controls=hesitant), ("hesitant",)),
+    "a policy that returns nothing": (lambda _: _motor_rollout(controls=nothing), ("controls",)),
+    "a policy that returns a string": (lambda _: _motor_rollout(controls=words), ("controls",)),
+    "a record with if": (
+        lambda _: rollout(record=lambda s, i: 1.0 if s.q[0] > 0 else 0.0),
+        ("record",),
+    ),
+    "a record of strings": (lambda _: rollout(record=words), ("record",)),
+    "no control for a motor": (lambda _: step(control=None), ("drive",)),
+    "no controls for a motor": (lambda _: _motor_rollout(controls=None), ("drive",)),
+    "a force that returns nothing": (lambda _: _custom(nothing), ("CustomForce 'it'",)),
+    "a force that returns a string": (lambda _: _custom(words), ("CustomForce 'it'",)),
+    "a force with if": (lambda _: _custom(branching), ("branching",)),
+    **{
+        f"a {what} that {does}": (
+            lambda _, what=what, function=function: _generalized(**{what: function}),
+            (f"GeneralizedSystem: {what}",),
+        )
+        for what in ("mass", "force")
+        for does, function in (
+            ("returns nothing", nothing),
+            ("returns a string", words),
+            ("has if", branching),
+        )
+    },
+    "a mass matrix that is not symmetric": (
+        lambda _: _generalized(mass=lambda q, p: jnp.asarray([[1.0, 0.5], [0.0, 1.0]])),
+        ("symmetric",),
+    ),
+    **{
+        f"a {kind.__name__} that {does}": (
+            lambda _, kind=kind, function=function: with_element_of(kind, function),
+            (f"{kind.__name__} 'it'",),
+        )
+        for kind in (jc.Holonomic, jc.VelocityLevel, jc.Inequality)
+        for does, function in (
+            ("returns nothing", nothing),
+            ("returns a string", words),
+            ("has if", branching),
+        )
+    },
+    **{
+        f"a drive that {does}": (
+            lambda _, function=function: with_element(
+                jointed, jc.Drive, {"joint": "one", "motion": function}
+            ),
+            ("Drive 'it'",),
+        )
+        for does, function in (
+            ("returns nothing", nothing),
+            ("returns a string", words),
+            ("has if", branching),
+        )
+    },
+    **{
+        f"a loss that {does}": (
+            lambda _, function=function: jc.tune(function, jnp.ones(2), steps=1),
+            ("tune: loss", "tune: the loss"),
+        )
+        for does, function in (
+            ("returns nothing", nothing),
+            ("returns a string", words),
+            ("has if", branching),
+        )
+    },
+    **{
+        f"a simulation that {does}": (
+            lambda _, function=function: jc.identify(function, jnp.ones(2), jnp.ones(2)),
+            ("identify: simulate",),
+        )
+        for does, function in (
+            ("returns nothing", nothing),
+            ("returns a string", words),
+            ("has if", branching),
+        )
+    },
+    "RankSafe in RankSafe": (
+        lambda _: begun(solver=jc.RankSafe(jc.RankSafe())),
+        ("RankSafe: solver",),
+    ),
+    "Priority in RankSafe": (
+        lambda _: begun(solver=jc.RankSafe(jc.Priority({"rod": 1}))),
+        ("RankSafe: solver",),
+    ),
+    "a level that is half": (lambda _: begun(solver=_levels(0.5)), ("level",)),
+    "a level that is True": (lambda _: begun(solver=_levels(True)), ("level",)),
+    "no elimination in runs of none": (lambda _: begun(solver=jc.Sparse(run=0)), ("run",)),
+    "a billion levels": (lambda _: rollout(adjoint=jc.Checkpoints(levels=10**9)), ("levels",)),
+    "a status of 99": (
+        lambda _: step(state=dataclasses.replace(motor()[1], status=99)),
+        ("status",),
+    ),
+    "states with the status 99": (lambda _: jc.raise_for_status(np.array([0, 99])), ("99",)),
+    "a path that is too long": (
+        lambda _: jc.tune(jnp.sum, jnp.ones(2), steps=1, checkpoint="x" * 5000),
+        ("checkpoint",),
+    ),
+    "a model in a path that is too long": (
+        lambda _: jc.from_mjcf("x" * 5000),
+        ("from_mjcf", "source"),
+    ),
+    "gains by numbers": (lambda _: begun(stabilizer=jc.Baumgarte({1: 1.0}, 1.0)), ("alpha",)),
+    "a gain that is None by name": (
+        lambda _: begun(stabilizer=jc.Baumgarte({"rod": None}, 1.0)),
+        ("alpha",),
+    ),
+    "MJCF with a mass of NaN": (lambda _: _mjcf(mass="nan"), ("mass",)),
+    "MJCF with a size of NaN": (lambda _: _mjcf(size="nan"), ("size",)),
+    "MJCF with a damping of NaN": (lambda _: _mjcf(damping="nan"), ("damping",)),
+}
+"""Calls that no table makes: each with patterns, one of which its message must have."""
+
+
+def with_element_of(kind: Any, function: Any) -> Any:
+    """A scene with a user's constraint on a body."""
+    scene = bodies()
+    scene.add(kind(function, ("bob",), name="it"))
+    system, state = scene.build()
+    return jc.step(system, jc.Method(), state, None, 1e-3)

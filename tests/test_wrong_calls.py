@@ -1,0 +1,189 @@
+"""Wrong calls of every public door are refused, with a word for the argument.
+
+`python -m benchmarks.wrong_calls` tries them all, ten times as many.
+"""
+
+import random
+from collections import Counter
+from importlib.util import find_spec
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from benchmarks import wrong_calls
+from benchmarks.wrong_doors import SPECIAL, Door, Takes, hesitant, motor
+from jaxcon.core import checks
+
+SHARE = 10
+"""One of so many calls is tried here."""
+
+LONG_COMPILED = ("tradeoff", "identify", "tune", "gradient_growth")
+"""Doors whose right arguments take long: left to the command."""
+
+MUJOCO = ("from_mjcf", "MujocoModel", "HalfCheetah")
+"""Doors of models that MuJoCo compiles."""
+
+
+@pytest.mark.parametrize("part", range(8))
+def test_a_tenth_of_all_wrong_calls_is_refused(part):
+    absent = () if find_spec("mujoco") else MUJOCO
+    chosen = [c for c in wrong_calls.calls() if c.label != "as it says"]
+    chosen = [c for c in chosen if not c.door.name.startswith((*LONG_COMPILED, *absent))]
+    chosen = random.Random(0).sample(chosen, len(chosen) // SHARE)[part::8]
+    missed = [
+        f"{kind}: {c}: {text}" for c in chosen for kind, text in [c.outcome()] if kind != "refused"
+    ]
+    assert len(chosen) > 100
+    assert missed == []
+
+
+@pytest.mark.parametrize("name", SPECIAL)
+def test_a_wrong_call_is_refused(name):
+    if name.startswith("MJCF"):
+        pytest.importorskip("mujoco")
+    call, words = SPECIAL[name]
+    kind, text = wrong_calls.Call(Door(name, call, Takes(), words), name, None).outcome()
+    assert kind == "refused", text
+
+
+def test_the_counts_tell_what_is_accepted_raw_and_hung():
+    """The fuzzer itself: what does nothing, fails in Python, or does not end, is found."""
+
+    def forever(_):
+        while True:
+            pass
+
+    acts = {"accepted": abs, "raw": lambda x: x.shape, "hung": forever, "refused": jc.Scene}
+    calls = [
+        wrong_calls.Call(Door(kind, act, Takes(), ("dim",)), "1", 1) for kind, act in acts.items()
+    ]
+    assert wrong_calls.run(calls, limit=0.1, show=False) == Counter(dict.fromkeys(acts, 1))
+
+
+@pytest.mark.parametrize(
+    ("x", "words"),
+    [
+        (True, "a real number"),
+        (np.timedelta64(1, "s"), "a real number"),
+        (1 + 0j, "a real number"),
+        (jnp.asarray(1 + 0j), "a real number"),
+        ([True, 1.0], "a real number"),
+        (None, "a real number"),
+        ("1", "a real number"),
+        ([[1.0], [1.0, 2.0]], "one shape"),
+        (np.nan, "finite"),
+        (jnp.asarray(jnp.nan, jnp.float32), "finite"),
+        (10**400, "range"),
+        (1e300, "range of float32"),
+        ([1.0], r"shape \(\)"),
+        (np.ma.masked_array(1.0, mask=True), "finite"),
+    ],
+)
+def test_what_is_no_real_number_of_the_scene(x, words):
+    with pytest.raises(ValueError, match=rf"^Spring 's': stiffness .*{words}"):
+        checks.real("Spring 's'", "stiffness", x, jnp.float32)
+
+
+@pytest.mark.parametrize("x", [1, 1.0, np.float64(1.0), np.int8(1), jnp.ones(()), 10**30, [1.0][0]])
+def test_what_is_a_real_number_of_the_scene(x):
+    number = checks.real("Spring 's'", "stiffness", x, jnp.float64)
+    assert number.dtype == jnp.float64
+    assert number.shape == ()
+
+
+def test_a_step_reads_no_array_of_jax(monkeypatch):
+    """A device may still compute it: its shape and dtype are enough, the status says the rest."""
+    system, state = motor()
+    read = []
+    ask = checks.is_concrete
+
+    def spy(x):
+        known = ask(x)
+        if known:
+            read.extend(leaf for leaf in jax.tree.leaves(x) if isinstance(leaf, jax.Array))
+        return known
+
+    method = jc.Method(
+        stabilizer=jc.Baumgarte(jnp.ones((), jnp.float32), jnp.ones((), jnp.float32)),
+        solver=jc.Sparse(tikhonov=jnp.asarray(1e-6, jnp.float32)),
+    )
+    monkeypatch.setattr(checks, "is_concrete", spy)
+    control, dt = jnp.zeros(1, jnp.float32), jnp.asarray(1e-3, jnp.float32)
+    new, _ = jc.step(system, method, state, control, dt)
+    assert read == []
+    assert int(new.status) == 0
+    jc.init(system, method, state.q, state.v)
+    assert read != []
+
+
+def test_nan_gains_that_are_not_read_end_in_a_status():
+    system, state = motor()
+    wrong = jnp.asarray(jnp.nan, jnp.float32)
+    method = jc.Method(stabilizer=jc.Baumgarte(wrong, wrong))
+    new, _ = jc.step(system, method, state, np.zeros(1), 1e-3)
+    assert int(new.status) != 0
+    with pytest.raises(ValueError, match="Baumgarte: alpha must be zero or more and finite"):
+        jc.init(system, method, state.q, state.v)
+
+
+def test_a_policy_that_asks_for_a_value_is_named_with_its_place():
+    system, state = motor()
+    with pytest.raises(TypeError, match=r"rollout: controls, 'hesitant' \(.*wrong_doors.py:\d+\)"):
+        jc.rollout(system, jc.Method(), state, hesitant, 1e-3, 2)
+
+
+def limited(angle=0.0, **limit):
+    scene = jc.Scene(dim=2)
+    scene.add_body("arm", mass=1.0, inertia=1.0, angle=angle)
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
+    scene.add(jc.Limit("stop", "hinge", **limit))
+    return scene.build()
+
+
+def test_degrees_are_warned_of():
+    with pytest.warns(UserWarning, match="body 'arm': angle is 90 rad, more than a turn"):
+        limited(angle=90.0, lower=0.0)
+    with pytest.warns(UserWarning, match="Limit 'stop': upper is 45 rad"):
+        limited(lower=0.0, upper=45.0)
+    limited(angle=2 * np.pi, lower=-6.28319, upper=np.inf)  # a turn, as models round it
+
+
+def test_a_limit_of_travel_is_no_angle():
+    scene = jc.Scene(dim=2)
+    scene.add_body("cart", mass=1.0, inertia=1.0)
+    scene.add(jc.Prismatic("rail", jc.WORLD, "cart", axis=(1.0, 0.0)))
+    scene.add(jc.Limit("stop", "rail", lower=-90.0, upper=90.0))
+    scene.build()
+
+
+def test_a_spiral_counts_its_turns():
+    s = np.linspace(0, 6 * np.pi, 60)
+    points = (1 + s / 10)[:, None] * np.stack([np.cos(s), np.sin(s)], axis=1)
+    scene = jc.Scene(dim=2)
+    jc.rod(scene, "spring", points, 1.0, bending=1.0)
+    _, state = scene.build()
+    assert np.max(np.asarray(state.q)) > 2 * np.pi
+
+
+def test_reactions_are_a_mapping():
+    system, state = limited(lower=-1.0, upper=1.0)
+    _, info = jc.step(system, jc.Method(), state, None, 1e-3)
+    reactions = info.reactions
+    assert "stop" in reactions
+    assert "hinge" not in reactions
+    assert 3 not in reactions
+    assert list(reactions) == ["stop"]
+    assert len(reactions) == 1
+    assert {name: x.shape for name, x in reactions.items()} == {"stop": (1,)}
+    assert reactions.get("hinge") is None
+    for error in (KeyError, ValueError):
+        with pytest.raises(error, match="^element 'hinge' is unknown; known are "):
+            reactions["hinge"]
+    batch = jax.vmap(lambda s: jc.step(system, jc.Method(), s, None, 1e-3)[1])
+    many = batch(jax.tree.map(lambda x: jnp.stack([x, x]), state))
+    assert dict(many.reactions)["stop"].shape == (2, 1)
+    assert reactions == reactions
+    assert isinstance(hash(reactions), int)
