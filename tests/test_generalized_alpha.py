@@ -211,12 +211,26 @@ def parallelogram(dtype):
     return scene.build()
 
 
+def hinges(dtype):
+    """Two links, each on two hinges with one oblique axis, along which their weight pulls."""
+    scene = jc.Scene(dim=3, dtype=dtype)
+    axis, before = np.array([0.0, 0.6, 0.8]), jc.WORLD
+    for i in range(2):
+        name, place = f"link{i}", np.array([i + 0.5, 0.0, 0.0])
+        scene.add_body(name, mass=1.0, inertia=(0.02, 0.1, 0.1), position=place)
+        for side in (-0.1, 0.1):
+            point = np.array([float(i), 0.0, 0.0]) + side * axis
+            scene.add(jc.Revolute(f"{name}{side}", before, name, point=point, axis=axis))
+        before = name
+    return scene.build()
+
+
 CLOSED = {jnp.float64: 1e-13, jnp.float32: 2e-6}
 """How far a loop of a metre may stand open: some hundred roundings, and some ten."""
 
 
 @pytest.mark.parametrize("dtype", list(CLOSED), ids=["float64", "float32"])
-@pytest.mark.parametrize("scene", [bricard, parallelogram])
+@pytest.mark.parametrize("scene", [bricard, parallelogram, hinges])
 def test_loops_close_to_rounding(scene, dtype):
     """Regularization, without which rows that depend on each other have no λ, leaves no trace."""
     system, state = scene(dtype)
