@@ -343,10 +343,9 @@ def _near(a: Any, b: Any) -> bool:
 
 
 QUICK: dict[str, tuple[tuple[str, ...], int, Any]] = {
-    "contact": (("soft stops", "ball that rolls with resistance"), 2, jc.Method()),
-    "sweeps": (("stops", "dry friction"), 2, jc.Method(bounded=jc.GaussSeidel(sweeps=4))),
+    "contact": (("ball that rolls with resistance",), 2, jc.Method()),
+    "sweeps": (("soft stops", "dry friction"), 2, jc.Method(bounded=jc.GaussSeidel(sweeps=4))),
     "generalized-α": (("force",), 2, jc.Method(jc.GeneralizedAlpha())),
-    "RATTLE": (("distance",), 2, jc.Method(jc.RATTLE())),
     "PID": (("distance",), 2, jc.Method(stabilizer=jc.PID(100.0, 20.0, 10.0, limit=5.0))),
     "adaptive": (("distance",), 2, jc.Method(stabilizer=jc.AdaptiveBaumgarte(10.0, 10.0))),
     "window": (("distance",), 2, jc.Method(stabilizer=jc.SlidingWindowBaumgarte())),
