@@ -50,6 +50,10 @@ class Simulation:
     drift: tuple[float, float]
 
 
+_four_bars = jax.jit(jax.vmap(lambda lengths, masses: scenes.four_bar(lengths, masses)))
+"""Builds a batch; compiled once for all of a size."""
+
+
 def linkages(copies: int, seed: int = 0) -> PyTree:
     """Crank-rockers with lengths spread by 5 % and masses by 30 %, all able to turn over.
 
@@ -61,7 +65,7 @@ def linkages(copies: int, seed: int = 0) -> PyTree:
     lengths = lengths * jax.random.uniform(keys[0], (copies, 4), minval=0.95, maxval=1.05)
     masses = jax.random.uniform(keys[1], (copies, 3), minval=0.7, maxval=1.3)
     masses = masses * jnp.array([0.3, 0.9, 0.7])
-    return jax.jit(jax.vmap(scenes.four_bar))(lengths, masses)
+    return _four_bars(lengths, masses)
 
 
 def simulate(worlds: PyTree, seconds: float, chunks: int = 50) -> Simulation:
@@ -146,7 +150,7 @@ class Tuning:
     copies: int
 
 
-def tune(worlds: PyTree, steps: int = 250, iterations: int = 40) -> Tuning:
+def tune(worlds: PyTree, steps: int = 250, iterations: int = 30) -> Tuning:
     """Tunes PID gains by gradients through the rollout, from the default and a small integral.
 
     The error after a step is what the step itself adds, and changes little from one to the next.
