@@ -154,7 +154,8 @@ def _check_kinds(state: State) -> None:
         x: Any = getattr(state, what)
         own: Any = getattr(x, "dtype", None)
         array = own is not None and jnp.issubdtype(own, jnp.floating)
-        plain = what.startswith("time") and type(x) in (int, float)
+        number = type(x) is float or (type(x) is int and abs(x) < 2**53)
+        plain = what.startswith("time") and number
         plain = plain or what == "turns" and isinstance(x, tuple) and not x
         if not array and not plain:
             raise ValueError(
