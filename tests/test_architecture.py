@@ -106,6 +106,8 @@ MAY_IMPORT = {
     "core/program.py": {"jax.extend"},
     "core/operations.py": {"jax.extend"},
     "core/closures.py": {"jax.extend"},
+    "core/doubled.py": {"jax.extend"},
+    "core/host.py": {"jax.extend"},
     "core/fusion.py": {"jax.experimental"},
     "core/meshes.py": {"jax.core"},
     "core/equality.py": {"jax.core"},
