@@ -297,3 +297,16 @@ def poisoned(quick: bool) -> list[Metric]:
     wrong = ("accepted", "neighbors", "gradients")
     found = [count(f"{what}, wrong", len(getattr(total, what))) for what in wrong]
     return [Metric("tried", total.tried), *found]
+
+
+@entry("random_scenes")
+def random_scenes(quick: bool) -> list[Metric]:
+    """Random mechanisms under the default method: checks that fail, of all tried."""
+    from benchmarks import random_scenes as study
+
+    number, total = 1 if quick else 20, dict.fromkeys(study.CHECKS, 0)
+    with jax.enable_x64(True):
+        for found in study.study(number):
+            for name in found.wrong:
+                total[name] += 1
+    return [Metric("tried", 2 * number), *(count(f"{k}, wrong", x) for k, x in total.items())]

@@ -171,7 +171,8 @@ def missed(
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
 
     Most steps turn bodies by less than `TURN`, where e is about 1e-6 of a lever arm, and pay for
-    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist.
+    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist. Where an
+    inequality constraint acts, nothing is taken out, since that would move its row off its target.
 
     Args:
         system: of bodies in space.
@@ -186,6 +187,8 @@ def missed(
     turn = system.turn(state.q, v, h) / TURN**2
     share = jnp.clip((turn - 1) / 3, 0, 1)
     share = share * share * (3 - 2 * share)
+    if rows.reactions is not None:
+        share = jnp.where(jnp.any(rows.reactions.multipliers != 0, axis=0), 0, share)
     held = rows.layout.holds & rows.layout.holonomic
     held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
 

@@ -1,0 +1,25 @@
+"""Random mechanisms under the default method; `python -m benchmarks.random_scenes` takes many."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks import random_scenes  # noqa: E402
+
+
+@pytest.mark.filterwarnings("ignore:.*impacts")
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_random_mechanism_is_simulated_as_it_should(dim, seed):
+    """Status, energy, joints, momentum, the batch, and for one of three seeds derivatives."""
+    assert random_scenes.check(dim, seed, derivatives=seed == 0).wrong == {}
+
+
+def test_a_wrong_motion_is_found(monkeypatch):
+    """The study itself: velocities that the joints do not allow violate them."""
+    starts = random_scenes.starts
+    monkeypatch.setattr(random_scenes, "starts", lambda *given: starts(*given) + 3.0)
+    assert random_scenes.check(2, 0, derivatives=False).wrong
