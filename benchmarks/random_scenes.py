@@ -125,7 +125,7 @@ def _add_joint(
 
 
 def starts(system: Any, state: jc.State, count: int, seed: int) -> jax.Array:
-    """Velocities that the constraints allow, (count, n_v): random ones, projected in the metric M."""
+    """Random velocities, projected in the metric M onto those that joints allow, (count, n_v)."""
     random = np.random.default_rng((seed, 1))
     rows = linearize(system, state.q, state.v, state.time)
     j, mass = np.asarray(rows.jacobian.dense()), np.asarray(system.mass(state.q).dense())
@@ -134,10 +134,10 @@ def starts(system: Any, state: jc.State, count: int, seed: int) -> jax.Array:
     return jnp.asarray(random.normal(size=(count, len(mass))) @ allowed.T)
 
 
-def check(dim: int, seed: int, derivatives: bool = True) -> Found:
-    """Runs a scene, and says what of it is wrong."""
+def check(dim: int, seed: int, derivatives: bool = True, method: jc.Method | None = None) -> Found:
+    """Runs a scene, by the default method where none is given, and says what of it is wrong."""
     system, state, floats = build(dim, seed)
-    method = jc.Method()
+    method = jc.Method() if method is None else method
     speeds = starts(system, state, 2, seed)
     worlds = [(v, h) for v in speeds for h in SIZES[dim]]
     v, h = (jnp.stack([jnp.asarray(w[i], state.q.dtype) for w in worlds]) for i in range(2))

@@ -113,7 +113,6 @@ MAY_IMPORT = {
     "core/equality.py": {"jax.core"},
     "core/pytree.py": {"jax.core"},
     "core/checks.py": {"jax.core"},
-    "core/host.py": {"jax.extend"},
 }
 
 
