@@ -114,7 +114,8 @@ class Dynamics:
         solution = solution._replace(status=status.first(solution.status, impulse.judge()))
         known = self._judged(impulse, known, solution.acceleration)
         own = impulse.rows.jacobian.transpose(known.multipliers)
-        return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone
+        solve = partial(impulse.beside_stops, known.multipliers)
+        return solution, dataclasses.replace(rows, reactions=known), own, solve
 
     def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
         """The bounded rows, and what a step of dt wants of them."""

@@ -204,6 +204,35 @@ class Impulse:
         a, multipliers, status = self.solve(force[:, None], target[:, None])
         return Solution(a[:, 0], multipliers[:, 0], status[0])
 
+    def beside_stops(self, multipliers: Array, force: Array, target: Array) -> Solution:
+        """The solution for another right side, in which stops that act hold what they hold.
+
+        J_b a = 0 of the rows of stops with λ > 0: their own multipliers are found by G, and once
+        more from there, so that derivatives are those of the solution though G is a constant.
+
+        Args:
+            multipliers: λ of the step, (n,).
+            force: f, (n_v,).
+            target: b, (n_c,).
+        """
+        stops = np.flatnonzero(self.rows.paired)
+        if not len(stops) or not isinstance(self.rows.jacobian, Jacobian):
+            return self.alone(force, target)
+        acts = jax.lax.stop_gradient(multipliers[stops] > 0)
+        among = acts[None] & acts[:, None]
+        unit = gauss_jordan.identity(acts.astype(force.dtype))
+        matrix = numerics.safe_divide(self.matrix()[np.ix_(stops, stops)], self.dt[None, None])
+        inverse = gauss_jordan.inverse(jnp.where(among, matrix, unit))
+
+        def needed(acceleration: Array) -> Array:
+            rates = self.rows.jacobian.apply(acceleration)[stops]
+            own = gauss_jordan.apply(inverse, jnp.where(acts, rates, 0))
+            return jnp.zeros_like(multipliers).at[stops].set(-own)
+
+        pull = jax.lax.stop_gradient(needed(self.alone(force, target).acceleration))
+        pull = pull + needed(self.alone(force + self._pull(pull), target).acceleration)
+        return self.alone(force + self._pull(pull), target)
+
     def moves(self, matrix: Array) -> Array:
         """Whether a row acts and moves at all, (n,).
 
