@@ -79,7 +79,10 @@ def attempt(
         if advanced.ends
         else None
     )
-    return (new, StepInfo(*seen, code, rows.reactions, state=place)), code
+    reactions = rows.reactions
+    if reactions is not None:
+        reactions = dataclasses.replace(reactions, jump=None)
+    return (new, StepInfo(*seen, code, reactions, state=place)), code
 
 
 def nothing_seen(info: StepInfo, state: State) -> StepInfo:
