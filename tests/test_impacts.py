@@ -342,10 +342,10 @@ def test_a_gradient_that_lacks_the_time_of_impacts_warns_once(monkeypatch):
     height = height_by(system, state, jc.Method())
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        jax.eval_shape(height, 0.5)
+        jax.jit(height).lower(0.5)
         assert caught == []
         for _ in range(2):
-            jax.eval_shape(jax.grad(height), 0.5)
+            jax.jit(jax.grad(height)).lower(0.5)
     assert len(caught) == 1
     assert "gradients through impacts: a landing of tip takes two steps" in str(caught[0].message)
     check = jc.check_gradients(height, 0.5)
@@ -369,5 +369,5 @@ def test_no_gradient_warns_that_has_the_time_of_impacts(case, monkeypatch):
     method = jc.Method(**parts.get(case, {}))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        jax.eval_shape(jax.grad(height_by(system, state, method)), 0.5)
+        jax.jit(jax.grad(height_by(system, state, method))).lower(0.5)
     assert impact(Known.of(system, state, method, H)) is None

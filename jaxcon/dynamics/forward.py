@@ -138,13 +138,15 @@ class Dynamics:
             length, strikes, lands = self.part.length, False, False
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         impulse = self._impulse(base, law, problem, length, acts)
-        bounds = impulse.rows
+        e, bounds = bounds.restitution, impulse.rows
         start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
         if lands:
             asked = impacts.landing(bounds, start, self.dt)
             impulse = dataclasses.replace(impulse, rows=asked)
-        may = impacts.candidates(bounds, start, self.dt) if strikes else start > 0
+        may = start > 0
         if strikes:
+            bouncy = dataclasses.replace(bounds, restitution=e)
+            may = impacts.candidates(bouncy, start, self.dt)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))

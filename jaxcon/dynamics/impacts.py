@@ -134,14 +134,17 @@ class Arrivals:
 def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
-    One too many does no harm, as a row that stays open has no force.
+    One too many does no harm where it stays open. Rows without restitution must be faster than
+    what accelerations make in a step: slower ones rest, and bear what presses on them.
 
     Args:
         rows: the bounded rows at the start of the step.
         change: h J a without bounded rows, (n,).
         dt: h, () [s].
     """
-    least = slowest(rows, change)
+    e, least = rows.restitution, slowest(rows, change)
+    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
+    least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
     return jax.lax.stop_gradient(may & (dt[None] > 0))
