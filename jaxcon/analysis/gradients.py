@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.differences import differences, unseen
-from jaxcon.core import checks, functions
+from jaxcon.core import checks, functions, notices
 from jaxcon.core.typing import Array, PyTree
 
 
@@ -106,10 +106,12 @@ class GradientCheck:
     Attributes:
         leaves: one `LeafGradient` for each leaf of floating numbers.
         tolerance: relative.
+        notes: cases in which derivatives of f may be wrong by structure, as of some impacts.
     """
 
     leaves: tuple[LeafGradient, ...]
     tolerance: float
+    notes: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -132,7 +134,8 @@ class GradientCheck:
         found = {"wrong for": off, "undecided for": open_}
         verdict = ", ".join(f"{what} {names}" for what, names in found.items() if names) or "right"
         head = f"gradients to {self.tolerance:.1e}: {verdict}"
-        return "\n".join([head, *(f"  {leaf}" for leaf in self.leaves)])
+        notes = (f"  note, {note}" for note in self.notes)
+        return "\n".join([head, *(f"  {leaf}" for leaf in self.leaves), *notes])
 
 
 def check_gradients(
@@ -198,14 +201,15 @@ def check_gradients(
         raise ValueError("check_gradients: f returns no floating number to differentiate.")
     eps = max(float(jnp.finfo(y.dtype).eps) for y in [*here, *results])
     ways = [_directions(leaf, directions, random) for leaf in here]
-    found, size = _three_ways(_weighted(at, results, random), here, ways, eps)
+    with notices.collected() as notes:
+        found, size = _three_ways(_weighted(at, results, random), here, ways, eps)
     allowed = eps ** (1 / 3) if tolerance is None else tolerance
     hidden = unseen(eps) * size / allowed
     leaves = []
     for i, leaf, result in zip(floating, here, found, strict=True):
         scale = _scale(result, hidden, leaf.size <= directions)
         leaves += [LeafGradient(named[i][0], *result, scale=scale, tolerance=allowed)]
-    return GradientCheck(tuple(leaves), allowed)
+    return GradientCheck(tuple(leaves), allowed, tuple(notes))
 
 
 def _scale(result: tuple[np.ndarray, ...], hidden: float, alone: bool) -> np.ndarray:

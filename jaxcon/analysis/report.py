@@ -52,8 +52,8 @@ class Report:
             a method and a step were given.
         probe: what some steps from the state left open, where it was asked to measure.
         warnings: by trap, "gains", "singular", "order", "over-constrained", "start", "nonlinear",
-            "dense" and "iterations", of those in which the scene and the method are; a method is
-            needed, for some a step, and for "order" to measure.
+            "dense", "iterations" and "impacts", of those in which the scene and the method are; a
+            method is needed, for some a step, and for "order" to measure.
     """
 
     coordinates: int

@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.estimate import contact_operations, solved_rows
 from jaxcon.analysis.known import Known, asked_gains
-from jaxcon.constraints.bounds import kinds_of
+from jaxcon.constraints.bounds import kinds_of, linearize_bounds
 from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
+from jaxcon.dynamics.impacts import PREFIX, doubt
 from jaxcon.dynamics.rank import linearized
 from jaxcon.simulation.choice import innermost, several, words
+from jaxcon.simulation.integrators import SemiImplicitEuler
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import instability, parts
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.gauss_seidel import GaussSeidel
 from jaxcon.solvers.interior_point import InteriorPoint
+from jaxcon.solvers.nearest_rows import Nearest
 from jaxcon.solvers.priority import Lexicographic
 from jaxcon.solvers.proximal import RankSafe
 
@@ -240,6 +244,20 @@ def _swept(known: Known, rounds: int) -> str | None:
     )
 
 
+def impact(known: Known) -> str | None:
+    """Trap 9: gradients of plain steps through impacts that lack their time."""
+    system, method, at = known.system, known.method, known.state
+    if method.events is not None or not system.bounds or not hasattr(system, "layout"):
+        return None
+    h = jnp.ones((), at.q.dtype)
+    control = jnp.zeros(system.layout.n_u, at.q.dtype)
+    rows = jax.eval_shape(linearize_bounds, system, at.q, at.v, at.time, control, h)
+    some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
+    lands = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
+    said = doubt(rows, lands, some)
+    return None if said is None else said.removeprefix(PREFIX)
+
+
 TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
     "gains": ("gains too large for the step", gains),
     "singular": ("rows that are singular, or nearly", singular),
@@ -249,6 +267,7 @@ TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
     "nonlinear": ("one linear step is not enough", curved),
     "dense": ("dense matrices", dense),
     "iterations": ("too many iterations", iterations),
+    "impacts": ("gradients through impacts", impact),
 }
 """By name: the trap in words, and how it is found."""
 

@@ -72,9 +72,9 @@ class Reactions(Mapping[str, Array]):
         multipliers: λ (n,) [N, N m], means over the step: of an impact, its impulse over h.
         gap: φ at its start, (n,); zero where a row has none.
         residual: by how much the laws are missed, as a velocity, ().
-        shift: what the velocity by which positions move has more than v at the end, (n_v,), of a
-            bounce within the step; None where nothing can bounce.
         kept: the part of the bounce that adds no energy, from 0 to 1, (): 1 unless it was capped.
+        jump: what impacts within the step change at its end; None where there are none to come,
+            and once an integrator has taken it.
         layout: rows by element.
     """
 
@@ -82,7 +82,7 @@ class Reactions(Mapping[str, Array]):
     gap: Array
     residual: Array
     kept: Array
-    shift: Array | None
+    jump: Any
     layout: BoundLayout = static()
     # a mapping compares its items, which are arrays without a single truth value
     __eq__ = object.__eq__

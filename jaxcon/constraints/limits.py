@@ -219,7 +219,7 @@ def saturating(p: dict[str, Any], row: Row, rate: Lane) -> tuple[Row, dict[str, 
 def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]]:
     """A row and the least φ̇ that a step may end with, by its gap φ.
 
-    What bounces has more of it, see `jaxcon.dynamics.bounces`.
+    What bounces has more of it, see `jaxcon.dynamics.impacts`.
     """
     h = dt[None]
     closing = numerics.safe_divide(-row.value, h)

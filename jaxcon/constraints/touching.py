@@ -31,8 +31,8 @@ class Touch(NamedTuple):
     Attributes:
         gap: φ, negative where they overlap [m].
         normal: n, from the first to the second, world frame.
-        place: halfway between them, world frame: forces act on what of each is there, so that equal
-            and opposite ones have no moment.
+        place: halfway between them, world frame: forces act on what of each is there where they
+            touch or overlap, so that equal and opposite ones have no moment.
         a, b: the motion of the two bodies.
     """
 
@@ -45,7 +45,10 @@ class Touch(NamedTuple):
 
 def touching(p: dict[str, Any], touch: Touch, dt: Any) -> tuple[list[Row], dict[str, Any]]:
     """The normal and, with friction, the tangents of a contact; and what a step wants of them."""
-    points = touch.a.material(touch.place), touch.b.material(touch.place)
+    # across an open gap each body is pulled at its own surface, where it will be touched: a lever
+    # that shrinks with the gap would turn it by the phase of the landing within the step
+    half = touch.normal * (jnp.maximum(touch.gap, 0) / 2)
+    points = touch.a.material(touch.place - half), touch.b.material(touch.place + half)
     first, asked = one_sided(p, along(*points, touch.normal, touch.gap), dt)
     if "friction" not in p:
         return [first], asked

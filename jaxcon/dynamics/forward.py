@@ -8,14 +8,16 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows, linearize_bounds
 from jaxcon.constraints.rows import Rows, linearize
-from jaxcon.core import status
+from jaxcon.core import notices, numerics, status
 from jaxcon.core.lanes import widened
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.dynamics import impacts
 from jaxcon.dynamics.parts import Part, Struck
 from jaxcon.dynamics.reactions import Impulse
 from jaxcon.solvers.nearest_rows import Nearest
@@ -72,22 +74,32 @@ class Dynamics:
     part: Part | None = None
 
     def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
-        """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago."""
+        """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago.
+
+        With bounded rows these are means over the step, its impacts included.
+        """
         rows, law, problem = self._problem(q, v, t, age)
         if self.bounded is not None:
-            return self._reacted(q, v, t, rows, law, problem, leaps=age is not None)[:2]
+            lag = None if age is None else 0.5
+            solution, rows, *_ = self._reacted(q, v, t, rows, law, problem, lag, False)
+            jump = rows.reactions.jump
+            if jump is not None:
+                a = solution.acceleration + numerics.safe_divide(jump.velocity, self.dt[None])
+                solution = solution._replace(acceleration=a)
+            return solution, rows
         own = self.solver.solve(problem) if law.solve is None else law.solve(self.solver, problem)
         return self.system.complete(own), rows
 
     def begun(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows, Dynamics]:
         """The same at the start of a step, and what the rest of it sees.
 
-        Bounded rows contain the step: they are solved once, and act as a force that stays.
+        Bounded rows contain the step: they are solved once, and act as a force that stays. Impacts
+        are none: they are the `jump` of the reactions, for the end of the step.
         """
         if self.bounded is None:
             return *self(q, v, t), self
         rows, law, problem = self._problem(q, v, t, None)
-        solution, rows, force, _ = self._reacted(q, v, t, rows, law, problem)
+        solution, rows, force, _ = self._reacted(q, v, t, rows, law, problem, None, True)
         return solution, rows, dataclasses.replace(self, bounded=None, held=force)
 
     def _reacted(
@@ -98,23 +110,77 @@ class Dynamics:
         rows: Rows,
         law: Any,
         problem: Saddle,
-        leaps: bool = False,
+        lag: float | None,
+        every: bool,
     ) -> tuple[Solution, Rows, Array, Factored]:
-        """a and λ with inequality rows, the rows with λ of these, their force, and the factors."""
+        """a and λ with bounded rows, the rows with what these do, their force, and the factors.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+            rows: the equality rows.
+            law: of the stabilizer.
+            problem: the saddle system of both.
+            lag: velocities are those of lag · h before the positions; None for none.
+            every: whether impacts are told apart in scenes without restitution, too.
+        """
         if self.part is None:
             bounds, length, acts = self.bounds(q, v, t, self.dt), self.dt, None
+            strikes = any(bounds.ends) and (every or bounds.restitution is not None)
+            lands = lag is not None and not strikes
+            doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
+            if doubt is not None:
+                gap = notices.when_differentiated(bounds.gap, doubt)
+                bounds = dataclasses.replace(bounds, gap=gap)
         else:
             bounds, acts = self.part.ask(lambda dt: self.bounds(q, v, t, dt), self.dt)
-            length = self.part.length
-        leaps &= bounds.restitution is not None
-        weight = self.system.weight(q) if leaps else None
-        impulse = self._impulse(bounds, law, problem, length, acts, weight)
+            length, strikes, lands = self.part.length, False, False
+        base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
+        impulse = self._impulse(base, law, problem, length, acts)
+        e, bounds = bounds.restitution, impulse.rows
+        start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
+        if lands:
+            asked = impacts.landing(bounds, start, self.dt)
+            impulse = dataclasses.replace(impulse, rows=asked)
+        may = start > 0
+        if strikes:
+            bouncy = dataclasses.replace(bounds, restitution=e)
+            may = impacts.candidates(bouncy, start, self.dt)
+            impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
         solution = solution._replace(status=status.first(solution.status, impulse.judge()))
         known = self._judged(impulse, known, solution.acceleration)
         own = impulse.rows.jacobian.transpose(known.multipliers)
+        if strikes:
+            lag = 0.0 if lag is None else lag
+            change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
+            times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
+            solution, known = self._struck((q, v, t), solution, known, times, lag)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone
+
+    def _struck(
+        self, at: Any, solution: Solution, known: Reactions, arrivals: Any, lag: float
+    ) -> tuple[Solution, Reactions]:
+        """The same with the impacts of the step: their jump, and the mean of their impulses."""
+        laws = _Laws(dataclasses.replace(self, guess=None))
+        a, λ, joints = solution.acceleration, known.multipliers, solution.multipliers
+        q, v, t = at
+        impact = impacts.Impact(laws, self.system, q, v, t, a, λ, joints, lag, self.dt, arrivals)
+        jump, struck = impact.outcome()
+        λ, joints = (
+            x + numerics.safe_divide(more, self.dt[None])
+            for x, more in ((λ, struck.multipliers), (joints, struck.joints))
+        )
+        known = dataclasses.replace(
+            known,
+            multipliers=λ,
+            residual=jnp.maximum(known.residual, struck.residual),
+            kept=jnp.minimum(known.kept, struck.kept),
+            jump=jump,
+        )
+        return solution._replace(multipliers=joints), known
 
     def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
         """The bounded rows, and what a step of dt wants of them."""
@@ -126,31 +192,40 @@ class Dynamics:
         return self._factors(law, problem)(problem.force, law.target).acceleration
 
     def impact(self, q: Array, v: Array, t: Any, struck: Struck) -> tuple[Array, Reactions]:
-        """Δv of an impact, and its impulses [N s, N m s] in the place of multipliers.
+        """Δv of an impact, and its impulses [N s, N m s] in the place of multipliers."""
+        rows, acts = struck.ask(self.bounds(q, v, t, self.dt), self.dt)
+        solution, known = self.found(q, v, t, rows, acts, False)
+        return solution.acceleration, known
 
-        Time stands still, and forces have none of it: M Δv = J_eᵀ Λ_e + Jᵀ Λ, J_e Δv + C Λ_e = 0.
+    def found(
+        self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Any
+    ) -> tuple[Solution, Reactions]:
+        """Δv, Λ_e and Λ of an impact by the rows that act; or a, λ_e and λ of a step if it `lasts`.
+
+        In an impact time stands still, and forces have none of it: M Δv = J_eᵀ Λ_e + Jᵀ Λ and
+        J_e Δv + C Λ_e = 0.
         """
         _, law, problem = self._problem(q, v, t, None)
-        rows, acts = struck.ask(self.bounds(q, v, t, self.dt), self.dt)
-        none = jnp.zeros_like(problem.force), jnp.zeros_like(law.target)
-        still = dataclasses.replace(problem, force=none[0], target=none[1])
-        impulse = self._impulse(rows, law, still, jnp.ones_like(self.dt), acts)
+        force, target = (jnp.where(lasts, x, 0) for x in (problem.force, law.target))
+        problem = dataclasses.replace(problem, force=force, target=target)
+        time = jnp.where(lasts, self.dt, jnp.ones_like(self.dt))
+        impulse = self._impulse(rows, law, problem, time, acts)
         known = impulse.react(self.bounded, None)
-        jump = impulse.change(known.multipliers)
-        return jump, self._judged(impulse, known, jump)
+        solution = self.system.complete(impulse.motion(known.multipliers))
+        return solution, self._judged(impulse, known, solution.acceleration)
 
     def factored(
         self, q: Array, v: Array, t: Any, age: Any = None
     ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None]:
         """As the call, and b → the least a, in the metric of M, with J a + C λ = b.
 
-        It uses the factors of the step. It is None where the stabilizer solves by itself.
+        It uses the factors of the step. It is None where the stabilizer solves by itself. Impacts
+        are not in a: they are the `jump` of the reactions.
         """
         rows, law, problem = self._problem(q, v, t, age)
         if self.bounded is not None:
-            solution, rows, _, solve = self._reacted(
-                q, v, t, rows, law, problem, leaps=age is not None
-            )
+            lag = None if age is None else 0.5
+            solution, rows, _, solve = self._reacted(q, v, t, rows, law, problem, lag, False)
         elif law.solve is not None:
             return self.system.complete(law.solve(self.solver, problem)), rows, None
         else:
@@ -165,12 +240,11 @@ class Dynamics:
         problem: Saddle,
         dt: Any,
         acts: Any,
-        weight: Array | None = None,
     ) -> Impulse:
         """How bounded rows act, by factors of wide lanes, to which the solver's numbers belong."""
         wide = dataclasses.replace(self, solver=widened(self.solver, problem.force.ndim - 1))
         factor = partial(wide._factors, law)
-        return Impulse.of(rows, factor, problem, dt, acts, weight, self._leaves_out(rows))
+        return Impulse.of(rows, factor, problem, dt, acts, self._leaves_out(rows))
 
     def _judged(self, impulse: Impulse, known: Reactions, acceleration: Array) -> Reactions:
         """The reactions with what is missed by rows that were left out."""
@@ -206,3 +280,22 @@ class Dynamics:
         force = force if law.force is None else force + law.force
         force = force if self.held is None else force + self.held
         return rows, law, saddle(self.system, q, law.rows, force, law.target, law.noise)
+
+
+@dataclass(frozen=True)
+class _Laws:
+    """What an impact asks of the dynamics; see `impacts.Laws`."""
+
+    dynamics: Dynamics
+
+    def rows(self, q: Array, v: Array, t: Any) -> BoundRows:
+        """The bounded rows at a state."""
+        return self.dynamics.bounds(q, v, t, self.dynamics.dt)
+
+    def find(
+        self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array
+    ) -> impacts.Found:
+        """The impulses of the rows that act; or, where it lasts, (), the forces over a step."""
+        solution, known = self.dynamics.found(q, v, t, rows, acts, lasts)
+        a, joints, _ = solution
+        return impacts.Found(a, known.multipliers, joints, known.residual, known.kept)

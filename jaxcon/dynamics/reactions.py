@@ -18,7 +18,7 @@ from jaxcon.core import numerics
 from jaxcon.core.lanes import widened
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
-from jaxcon.dynamics.bounces import Bounce, bounces, freely
+from jaxcon.dynamics.bounces import rebound
 from jaxcon.solvers import gauss_jordan
 from jaxcon.solvers.bounded import Bounded, implicit_multipliers
 from jaxcon.solvers.jacobian import Jacobian
@@ -45,8 +45,6 @@ class Impulse:
         start: a without them, (n_v,), a constant.
         bare: J_b M⁻¹ J_bᵀ on the diagonal, (n,): what rows would move without the equality rows.
         acts: which rows act, (n,), tangents where their normal does; None for all.
-        weight: the force of gravity, (n_v,), where velocities are those of half a step before the
-            positions; else None.
         answers: a of `probing` forces, (n_v, k, …), a constant; None where that is not known yet.
     """
 
@@ -58,7 +56,6 @@ class Impulse:
     start: Array
     bare: Array
     acts: Any = None
-    weight: Array | None = None
     answers: Any = None
 
     @classmethod
@@ -69,7 +66,6 @@ class Impulse:
         saddle: Saddle,
         dt: Any,
         acts: Array | None = None,
-        weight: Array | None = None,
         sifts: bool = False,
     ) -> Impulse:
         """That of a step of h, by the factors of its saddle system.
@@ -80,13 +76,11 @@ class Impulse:
             saddle: M and f, of the equality rows.
             dt: h, () [s].
             acts: which rows act, (n,); None for all.
-            weight: the force of gravity, (n_v,), where velocities are those of half a step before
-                the positions; else None.
             sifts: whether rows that nothing moves are left out, as `nearest` needs it.
         """
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
         solve = factor(widened(saddle, saddle.force.ndim - 1))
-        own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts, weight)
+        own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts)
         return (own._sifted() if sifts else own._begun())._facing()
 
     def _begun(self) -> Impulse:
@@ -161,10 +155,6 @@ class Impulse:
         """a and λ_e under multipliers λ (n,)."""
         return self.alone(self.saddle.force + self._pull(multipliers), self.target)
 
-    def change(self, multipliers: Array) -> Array:
-        """What λ (n,) adds to a, (n_v,)."""
-        return self.alone(self._pull(multipliers), jnp.zeros_like(self.target)).acceleration
-
     def velocity(self, multipliers: Array) -> Array:
         """u at the end of the step, (n,)."""
         return self.led(self.motion(multipliers).acceleration)
@@ -173,17 +163,19 @@ class Impulse:
         """φ̇ + h J_b a, (n,)."""
         return self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
 
-    def _bounce(self, e: Array, matrix: Array, moves: Array) -> tuple[Array, Bounce]:
-        """u without multipliers, (n,), and what restitution asks of the step."""
-        rows, none = self.rows, jnp.zeros_like(self.rows.rate)
-        if self.weight is None:
-            return self.velocity(none), bounces(rows, e, none, none > 0, self.dt)
-        force, target = self.saddle.force, self.target
-        forces = jnp.stack([force, jnp.broadcast_to(self.weight, force.shape)], axis=1)
-        found = self.solve(forces, jnp.stack([target, jnp.zeros_like(target)], axis=1)).acceleration
-        change, fall = (self.dt[None] * rows.jacobian.apply(found[:, i]) for i in range(2))
-        free = freely(rows, e, change, fall, self.dt, matrix, moves)
-        return rows.rate + change, bounces(rows, e, jnp.where(free, fall, 0), free, self.dt)
+    def moved(self) -> Array | None:
+        """∂a/∂λ, (n_v, n), a constant; None where it is not known."""
+        if self.answers is None:
+            return None
+        if not self._by_velocities():
+            return self.answers
+        j = jax.lax.stop_gradient(self.rows.jacobian)
+        return jax.lax.stop_gradient(jnp.swapaxes(j.each(self.answers), 0, 1))
+
+    def without(self, rows: Array) -> Impulse:
+        """The same, and some rows, (n,), do not act."""
+        acts = ~rows if self.acts is None else self.acts & ~rows
+        return dataclasses.replace(self, acts=acts)
 
     def matrix(self) -> Array:
         """G, (n, n), a constant."""
@@ -255,16 +247,12 @@ class Impulse:
         if rows.restitution is None:
             found, left = met(rows.target)
             return Reactions(found, rows.gap, left, jnp.ones_like(left), None, rows.layout)
-        without, bounce = self._bounce(rows.restitution, matrix, moves)
-        asked = (jnp.zeros_like(without), bounce.more)
-        asked = asked if self.weight is None else (*asked, bounce.travel)
-        (plain, bounced, *moving), left = jax.vmap(met)(jnp.stack([rows.target + x for x in asked]))
-        kept, shift = self.harmless(without, plain, bounced - plain, bounce.later), None
+        more = rebound(rows, rows.restitution, self.dt)
+        (plain, bounced), left = jax.vmap(met)(jnp.stack([rows.target, rows.target + more]))
+        without = self.velocity(jnp.zeros_like(more))
+        kept = self.harmless(without, plain, bounced - plain)
         found = plain + kept[None] * (bounced - plain)
-        for own in moving:
-            mean = plain + kept[None] * (own - plain)
-            shift = self.dt[None] * self.change(mean - found)
-        return Reactions(found, rows.gap, jnp.max(left, axis=0), kept, shift, rows.layout)
+        return Reactions(found, rows.gap, jnp.max(left, axis=0), kept, None, rows.layout)
 
     def nearest(self, solver: Nearest, guess: Array | None) -> Reactions:
         """The same for the rows that are nearest to act; others have λ = 0."""
@@ -288,24 +276,22 @@ class Impulse:
         parts = kinds.split(jax.lax.stop_gradient(jnp.where(self.acts, short, 0)))
         return jnp.max(jnp.concatenate([parts.single, parts.normal]), axis=0, initial=0)
 
-    def harmless(self, free: Array, multipliers: Array, more: Array, later: Array) -> Array:
+    def harmless(self, free: Array, multipliers: Array, more: Array) -> Array:
         """An s ≤ 1 for which λ + s Δλ does no work, or no more than λ, by world; 1 where it may be.
 
         Over a step multipliers do the work h λ·(u₀ + u)/2, u₀ the velocities without them; motors
-        and friction in joints, which are boxes, may do what they want. What bounces is pushed when
-        it arrives, at velocities without what gravity adds later.
+        and friction in joints, which are boxes, may do what they want.
 
         Args:
             free: u₀, (n,).
             multipliers: λ, (n,).
             more: Δλ, (n,).
-            later: what gravity adds after the arrival, (n,).
         """
         kinds = self.rows.kinds
         acts = jnp.ones(kinds.size, free.dtype).at[kinds.single : kinds.normal].set(0)
         acts = acts.reshape(-1, *(1,) * (free.ndim - 1))
         change = self.velocity(more + multipliers) - self.velocity(multipliers)
-        mean = (free + self.velocity(multipliers)) / 2 - later
+        mean = (free + self.velocity(multipliers)) / 2
 
         def work(x: Array, u: Array) -> Array:
             return jnp.sum(acts * x * u, axis=0)

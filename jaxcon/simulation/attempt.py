@@ -82,7 +82,10 @@ def attempt(
     if advanced.ends:
         place = at_instant(dataclasses.replace(bare(state), q=q, v=v), reached(state, time, length))
         place = _rewound(system, place)
-    return (new, StepInfo(*seen, code, rows.reactions, state=place)), code
+    reactions = rows.reactions
+    if reactions is not None:
+        reactions = dataclasses.replace(reactions, jump=None)
+    return (new, StepInfo(*seen, code, reactions, state=place)), code
 
 
 def _rewound(system: Any, state: State) -> State:

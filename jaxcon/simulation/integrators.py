@@ -120,9 +120,11 @@ class SemiImplicitEuler(Explicit):
         else:
             solution, rows = dynamics(*here, dt / 2)
             v = state.v + dt[None] * solution.acceleration
-        moving = v
-        if rows.reactions is not None and rows.reactions.shift is not None:
-            moving = v + rows.reactions.shift
+        jump, moving = jump_of(rows), v
+        if jump is not None:
+            if system.turns_in_space:
+                v, solution = v + jump.velocity, with_jump(solution, jump, dt)
+            moving = v - jump.velocity + numerics.safe_divide(jump.travel, dt[None])
         q = system.retract(state.q, dt[None] * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
@@ -274,6 +276,9 @@ class RungeKutta(Explicit):
         (slopes, code), _ = through(stage, (slopes, solution.status), inputs)
         dq, dv = (combine(self.b, x) for x in slopes)
         q, v = system.normalize(q + h * dq), v + h * dv
+        if (jump := jump_of(rows)) is not None:
+            q, v = system.retract(q, jump.travel), v + jump.velocity
+            solution = with_jump(solution, jump, dt)
         return Advanced((q, v, t + dt), solution._replace(status=code), rows)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
@@ -330,6 +335,17 @@ def Heun() -> RungeKutta:  # noqa: N802
 def RK4() -> RungeKutta:  # noqa: N802
     """The classical method of Kutta: fourth order, four solves."""
     return RungeKutta(((0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
+
+
+def jump_of(rows: Rows) -> Any:
+    """What impacts within the step change at its end; None where there are none."""
+    return None if rows.reactions is None else rows.reactions.jump
+
+
+def with_jump(solution: Solution, jump: Any, dt: Any) -> Solution:
+    """The solution with the mean acceleration over a step, its impacts included."""
+    a = solution.acceleration + numerics.safe_divide(jump.velocity, dt[None])
+    return solution._replace(acceleration=a)
 
 
 def one_by_one(function: Any, carry: Any, inputs: Any) -> tuple[Any, None]:

@@ -110,6 +110,13 @@ class Kinds:
         discs = tuple(Vector(*(y & disc.of(flags.normal) for y in x)) for disc, x in sets)
         return self.join(flags._replace(discs=discs))
 
+    def by_contact(self, x: Array) -> Array:
+        """An array (n, …) whose discs have what the normal of their contact has."""
+        parts = self.split(x)
+        sets = zip(self.discs, parts.discs, strict=True)
+        discs = tuple(y.map(lambda _, d=disc: d.of(parts.normal)) for disc, y in sets)
+        return self.join(parts._replace(discs=discs))
+
     def largest(self, x: Array) -> Array:
         """Of rows (n, …) that obey a law together, what is largest: normal and slip, or turning."""
         parts = self.split(x)

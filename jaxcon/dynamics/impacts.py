@@ -1,0 +1,348 @@
+"""Impacts within a plain step: when they are, what they do, and the derivative of both.
+
+An impact at t + τ takes the velocities v⁻ = v + τ a⁻ to v⁺ = v⁻ + Δv; then the bodies move on with
+other accelerations a⁺. At the end of a step h, with r = h − τ the rest of it,
+
+    v_end = v + h a⁻ + Δv + r (a⁺ − a⁻),
+    q_end = q ⊕ (h v + h² a⁻/2) ⊕ (r Δv + r² (a⁺ − a⁻)/2).
+
+The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
+an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
+
+The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
+step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
+
+Nothing here knows how impulses are found. `Laws` says what is asked of a contact solver.
+
+References:
+    Kong, Payne, Zhu and Johnson, Saltation matrices: the essential tool for linearizing hybrid
+        dynamical systems, Proceedings of the IEEE 112 (2024).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.bounds import BoundRows
+from jaxcon.core import numerics
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array
+from jaxcon.core.worlds import keep
+from jaxcon.dynamics.parts import mask
+
+ROUNDING = 64
+"""The rounding error of a velocity, in spacings of the largest one at hand."""
+
+PREFIX = "gradients through impacts: "
+"""How the warning begins."""
+
+SLOW = 2
+"""Impacts slower than this many times h |a| do not bounce: the row comes to rest."""
+
+
+@pytree
+class Jump:
+    """What an impact changes at the end of a step.
+
+    Attributes:
+        velocity: Δv + (a⁺ − a⁻) r, (n_v,).
+        travel: what it adds to the displacement of the step, (n_v,) [m, rad].
+    """
+
+    velocity: Array
+    travel: Array
+
+
+class Found(NamedTuple):
+    """What the laws of bounded rows find at one instant, at an impact or over a step.
+
+    Attributes:
+        change: Δv of an impact, or a, (n_v,).
+        multipliers: Λ or λ of bounded rows, (n,).
+        joints: likewise of equality rows, (n_c,).
+        residual, kept: as of `Reactions`, ().
+    """
+
+    change: Array
+    multipliers: Array
+    joints: Array
+    residual: Array
+    kept: Array
+
+
+class Laws(Protocol):
+    """What an impact needs of the dynamics, whichever solver finds the multipliers."""
+
+    def rows(self, q: Array, v: Array, t: Any) -> BoundRows:
+        """The bounded rows at a state."""
+        ...
+
+    def find(self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array) -> Found:
+        """The impulses of the rows that act; or, where it lasts, (), the forces over a step."""
+        ...
+
+
+@pytree
+class Arrivals:
+    """Which rows arrive within a step, and when.
+
+    Attributes:
+        hits: rows that close within the step by an impact, (n,).
+        bounces: those of them that are fast enough to bounce, (n,).
+        times: τ by row, (n,) [s].
+        leads: shares of rows in the time of each velocity, that of the first impact that changes
+            it, (n_v, n) or (1, n).
+        touched: velocities that an arriving row moves, (n_v,).
+        happens: whether there is an impact, ().
+    """
+
+    hits: Array
+    bounces: Array
+    times: Array
+    leads: Array
+    touched: Array
+    happens: Array
+
+    @property
+    def first(self) -> Array:
+        """The first τ of the world, () [s]; zero where there is none."""
+        least = jnp.min(jnp.where(self.hits, self.times, jnp.inf), axis=0)
+        return jnp.where(self.happens, least, 0)
+
+    @property
+    def by_velocity(self) -> Array:
+        """τ by velocity, (n_v,) or (1,) [s]."""
+        return jnp.sum(self.leads * self.times[None], axis=1)
+
+    def refined(self, rows: BoundRows) -> Arrivals:
+        """The same after a step of Newton on the gaps of rows at the place of the impact.
+
+        Parabolas do not know how a normal turns on the way, and of τ the derivative counts.
+        """
+        closing = self.hits & (rows.rate < 0)
+        late = jnp.where(closing, rows.gap, 0) / jnp.where(closing, -rows.rate, 1)
+        late = rows.kinds.by_contact(jnp.where(jnp.abs(late) <= self.times, late, 0))
+        return dataclasses.replace(self, times=self.times + late)
+
+
+def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
+    """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
+
+    One too many does no harm where it stays open. Rows without restitution must be faster than
+    what accelerations make in a step: slower ones rest, and bear what presses on them.
+
+    Args:
+        rows: the bounded rows at the start of the step.
+        change: h J a without bounded rows, (n,).
+        dt: h, () [s].
+    """
+    e, least = rows.restitution, slowest(rows, change)
+    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
+    least = least + rests
+    reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
+    may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
+    return jax.lax.stop_gradient(may & (dt[None] > 0))
+
+
+def slowest(rows: BoundRows, change: Array) -> Array:
+    """The speed below which a row cannot be told from one at rest, (1,)."""
+    numbers = jnp.finfo(rows.rate.dtype)
+    size = jnp.maximum(jnp.abs(rows.rate), jnp.abs(change))
+    rounding = ROUNDING * float(numbers.eps) * jnp.max(size, axis=0, keepdims=True)
+    # quotients by less have no derivatives
+    return jax.lax.stop_gradient(rounding + float(numbers.tiny) ** 0.25)
+
+
+def arrive(
+    rows: BoundRows, may: Array, change: Array, lag: Any, dt: Array, response: Array | None
+) -> Arrivals:
+    """Which rows arrive, after φ + τ (u + lag h c) + ½ τ² c = 0 with u = φ̇ and c = J a⁻.
+
+    Args:
+        rows: the bounded rows at the start of the step.
+        may: the `candidates`, (n,).
+        change: h c, (n,), with the forces of the other rows.
+        lag: velocities are those of lag · h before the positions.
+        dt: h, () [s].
+        response: ∂a/∂λ, (n_v, n), whose pattern says which row moves which velocity; None where
+            that is not known.
+    """
+    speed = -(rows.rate + lag * change)
+    fast = may & (speed > 0)
+    size = jnp.where(fast, speed, 1)
+    gap = jnp.where(fast & (rows.gap > 0), rows.gap, 0)
+    bend = numerics.safe_divide(change, dt[None])
+    whole = gap / size
+    # the smaller root in a form that subtracts nothing; no root where the row turns round
+    root = numerics.safe_sqrt(1 - 2 * (bend / size) * whole)
+    τ = 2 * whole / (1 + root)
+    hits = fast & (τ <= dt[None]) & (2 * bend * whole <= size)
+    τ = jnp.where(hits, τ, 0)
+    closing = speed - change * numerics.safe_divide(τ, dt[None])
+    bounces = hits & (closing > SLOW * jnp.abs(change))
+    all_hits, all_times = rows.kinds.by_contact(hits), rows.kinds.by_contact(τ)
+    if response is None:
+        # weights that do not cancel where two rows pull on one body
+        weights = (1 + np.arange(len(τ)) / len(τ)).reshape(-1, *(1,) * (τ.ndim - 1))
+        pulls = jnp.where(all_hits, jnp.asarray(weights, τ.dtype), 0)
+        moved, touched = all_hits[None], rows.jacobian.transpose(pulls) != 0
+    else:
+        rounding = ROUNDING * float(jnp.finfo(τ.dtype).eps)
+        size = jnp.max(jnp.abs(response), axis=0, keepdims=True)
+        moved = all_hits[None] & (jnp.abs(response) > rounding * size)
+        touched = jnp.any(moved, axis=1)
+        moved = jnp.where(touched[:, None], moved, all_hits[None])
+    delays = jnp.where(moved, all_times[None], jnp.inf)
+    leads = (moved & (delays == jnp.min(delays, axis=1, keepdims=True))).astype(τ.dtype)
+    leads = leads / jnp.maximum(jnp.sum(leads, axis=1, keepdims=True), 1)
+    fixed = jax.lax.stop_gradient((hits, bounces, leads, touched, jnp.any(hits, axis=0)))
+    hits, bounces, leads, touched, happens = fixed
+    return Arrivals(hits, bounces, all_times, leads, touched, happens)
+
+
+def at_impact(
+    rows: BoundRows, arrivals: Arrivals, dt: Array, lasts: Array
+) -> tuple[BoundRows, Array]:
+    """What the rows want of an impact, and which of them act, (n,).
+
+    Rows that arrive leave with e |φ̇|, or stay if they are slow. The others may close their gap in
+    the time of a step, and none is driven apart by the impact of others. Where it lasts, (), this
+    is the motion after the impact, in which rows want what they want of a step and none bounces.
+    """
+    ends, hits = mask(rows.ends, rows), arrivals.hits
+    hard = mask(rows.hard, rows)
+    nearing = numerics.safe_divide(-jnp.maximum(rows.gap, 0), dt[None])
+    least = jnp.minimum(jnp.where(ends, nearing, rows.target), rows.rate)
+    e = rows.restitution
+    if e is not None:
+        e = jnp.where(arrivals.bounces & ~lasts, e, -1)
+    asked = dataclasses.replace(
+        rows,
+        gap=jnp.where(ends & ~lasts, 0, rows.gap),
+        target=jnp.where(lasts, rows.target, jnp.where(hits | ~hard, 0, least)),
+        restitution=e,
+        far=None,
+    )
+    return asked, lasts | rows.kinds.by_contact(hard & arrivals.happens[None])
+
+
+def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
+    """What contacts without restitution want of a step in which velocities move positions.
+
+    A contact that closes after τ = s h is to end the step with the mean of its velocity over it:
+    s u⁻ along the normal, which closes the gap, and as much along the tangents, which holds
+    friction back until τ. The next step does the rest of the impact. As both impulses are the
+    shares 1 − s and s of one, at the places before and after, the two steps have the time of the
+    impact and its place, and so have their derivatives. That costs nothing, unlike an `Impact`.
+
+    Args:
+        rows: the bounded rows at the start of the step.
+        change: h J a without bounded rows, (n,), a constant: what is no faster rests.
+        dt: h, () [s].
+    """
+    kinds = rows.kinds
+    if not kinds.contacts:
+        return rows
+    gap, rate = kinds.split(rows.gap).normal, kinds.split(rows.rate)
+    least = kinds.split(jnp.abs(change) + slowest(rows, change)).normal
+    way = -dt[None] * rate.normal
+    closes = (rate.normal < -least) & (gap > 0) & (gap < way)
+    share = jnp.where(closes, gap, 0) / jnp.where(closes, way, 1)
+    parts = kinds.split(rows.target)
+    discs = tuple(u * disc.of(share) for disc, u in zip(kinds.discs, rate.discs, strict=True))
+    return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
+
+
+def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
+    """Why derivatives of plain steps through impacts may be wrong, by structure; None if not.
+
+    Args:
+        rows: the bounded rows; only their static fields are read.
+        lags: whether velocities are those of half a step before the positions.
+        some: whether the solver leaves rows out.
+    """
+    reasons = []
+    if lags and rows.lands:
+        reasons.append(
+            f"a landing of {', '.join(rows.lands)} takes two steps, so that where a body turns as"
+            " it lands on a corner, its derivative is right only in the mean over the phases of a"
+            " step; restitution=jnp.zeros(()) or Events() makes it one"
+        )
+    if some and any(rows.ends):
+        reasons.append(
+            "beside Nearest, impacts of several bodies within one step have the time of the first;"
+            " InteriorPoint() alone, or Events(), tells them apart"
+        )
+    return f"{PREFIX}{'; '.join(reasons)}." if reasons else None
+
+
+@dataclass(frozen=True)
+class Impact:
+    """The impact of a step, between what leads to it and what follows.
+
+    Attributes:
+        laws: of the dynamics.
+        system: with `retract`.
+        q, v, t: the state at the start of the step.
+        acceleration: a⁻, (n_v,).
+        multipliers, joints: λ of bounded rows and of equality rows before it, (n,) and (n_c,).
+        lag: velocities are those of lag · h before the positions.
+        dt: h, () [s].
+        arrivals: which rows arrive, and when.
+    """
+
+    laws: Laws
+    system: Any
+    q: Array
+    v: Array
+    t: Any
+    acceleration: Array
+    multipliers: Array
+    joints: Array
+    lag: Any
+    dt: Array
+    arrivals: Arrivals
+
+    def outcome(self) -> tuple[Jump, Found]:
+        """The jump, and the impulses that impacts add to those of the step's smooth forces."""
+        happens = self.arrivals.happens
+        none, one = jnp.zeros_like(self.v), jnp.ones(self.v.shape[1:], self.v.dtype)
+        rows, joints = jnp.zeros_like(self.multipliers), jnp.zeros_like(self.joints)
+        still = Jump(none, none), Found(none, rows, joints, 0 * one, one)
+        return jax.lax.cond(jnp.any(happens), lambda: self._strikes(still), lambda: still)
+
+    def _strikes(self, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
+        h, a = self.dt[None], self.acceleration
+        arrivals = self.arrivals.refined(self.laws.rows(*self._there(self.arrivals)))
+        place, before, time = self._there(arrivals)
+        τ = arrivals.by_velocity
+
+        def find(v: Array, lasts: Array) -> tuple[Array, Found]:
+            known = self.laws.rows(place, v, time)
+            rows, acts = at_impact(known, arrivals, self.dt, lasts)
+            found = self.laws.find(place, v, time, rows, acts, lasts)
+            return v + jnp.where(lasts, 0, found.change), found
+
+        # the impact and what follows are one program, which halves what there is to compile
+        _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
+        struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
+        more = jnp.where(arrivals.touched, after.change - a, 0)
+        rest, left = h - τ, (1 - self.lag) * h - τ
+        jump = Jump(struck.change + left * more, rest * struck.change + rest * rest / 2 * more)
+        share = ((1 - self.lag) * self.dt - arrivals.first)[None]
+        impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
+        joints = struck.joints + share * (after.joints - self.joints)
+        struck = struck._replace(multipliers=impulses, joints=joints)
+        return keep(self.arrivals.happens, (jump, struck), still)
+
+    def _there(self, arrivals: Arrivals) -> tuple[Array, Array, Array]:
+        """q*, v⁻ and the time of the impact."""
+        h, a, τ = self.dt[None], self.acceleration, arrivals.by_velocity
+        place = self.system.retract(self.q, τ * (self.v + (self.lag * h + τ / 2) * a))
+        return place, self.v + (self.lag * h + τ) * a, self.t + arrivals.first

@@ -1,0 +1,373 @@
+"""Impacts in plain steps: values and derivatives beside closed forms, for explicit integrators."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxcon as jc
+from jaxcon.analysis.known import Known
+from jaxcon.analysis.traps import impact
+from jaxcon.core import notices
+
+G, R, H = 9.81, 0.1, 1e-3
+ONE_PERCENT, TWO_PERCENT = 1e-2, 2e-2
+"""What derivatives of plain steps at 1 ms are held to, and differences over 5 mm."""
+INTEGRATORS = {
+    "SIE": jc.SemiImplicitEuler(),
+    "RK4": jc.RK4(),
+    "Heun": jc.Heun(),
+    "Euler": jc.ExplicitEuler(),
+}
+
+
+def landed(system, state, integrator, time, where, of):
+    """(change of the start, parameters) → some numbers of the end."""
+    method = jc.Method(integrator)
+
+    def run(x, params):
+        changed = system.with_params(params) if params else system
+        start = jc.init(changed, method, *where(state, x))
+        final, _ = jc.rollout(
+            changed, method, start, None, H, round(time / H), record=lambda s, i: None
+        )
+        return of(final)
+
+    return run
+
+
+def held_to(run, x, params, want, mode="forward", tight=ONE_PERCENT):
+    """Derivatives at 7 phases of a step, and differences over 5 mm, beside those of a closed form.
+
+    Args:
+        run: (x, params) → (numbers).
+        x: a number to differentiate by.
+        params: by case, with a leading axis, or None.
+        want: (x, case) → (numbers), exactly.
+        mode: "forward" or "reverse".
+        tight: relative to the largest of the numbers' derivatives.
+    """
+    cases = 1 if params is None else len(jax.tree.leaves(params)[0])
+    phases = x + np.linspace(0, 1.5e-3, 7)
+    dtype = jax.eval_shape(run, jnp.asarray(x), jax.tree.map(lambda p: p[0], params)).dtype
+
+    def both(x, params):
+        if mode == "forward":
+            return jax.jvp(lambda x: run(x, params), (x,), (jnp.ones_like(x),))
+        slope, value = jax.jacrev(lambda x: (run(x, params),) * 2, has_aux=True)(x)
+        return value, slope
+
+    every = jax.vmap(both, in_axes=(0, None))
+    if params is not None:
+        every = jax.vmap(every, in_axes=(None, 0))
+    points = np.concatenate([phases, phases - 2.5e-3, phases + 2.5e-3])
+    values, slopes = jax.jit(every)(jnp.asarray(points, dtype), params)
+    values, slopes = (np.asarray(x, float).reshape(cases, 3, 7, -1) for x in (values, slopes))
+    for i in range(cases):
+        for j, y in enumerate(phases):
+            exact = (want(y + 1e-6, i) - want(y - 1e-6, i)) / 2e-6
+            size = np.abs(exact).max()
+            np.testing.assert_allclose(slopes[i, 0, j], exact, atol=tight * size, rtol=0)
+            apart = (values[i, 2, j] - values[i, 1, j]) / 5e-3
+            np.testing.assert_allclose(apart, slopes[i, 0, j], atol=TWO_PERCENT * size, rtol=0)
+
+
+def disc(dtype=None, friction=0.5, restitution=None):
+    """1.3 kg and 0.1 m over a floor, moving sideways."""
+    scene = jc.Scene(dim=2, dtype=dtype)
+    moving = {"position": (0.0, 1.1), "velocity": (1.0, 0.0)}
+    scene.add_body("disc", mass=1.3, inertia=1.3 * R * R / 2, **moving)
+    own = {} if restitution is None else {"restitution": restitution}
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "disc", radius=R, friction=friction, **own))
+    return scene.build()
+
+
+def by_height(state, z):
+    return state.q.at[1].set(z), state.v
+
+
+def bounced(z, friction, e, time):
+    """(x, z) of the disc: slip ends in the impact if μ (1 + e) v suffices, for a third of it."""
+    v = np.sqrt(2 * G * (z - R))
+    rest = time - v / G
+    along = max(1 - friction * (1 + e) * v, 2 / 3)
+    slides = friction * G * rest * rest / 2 if e == 0 and along > 2 / 3 else 0
+    up = e * v * rest - G * rest * rest / 2 if e else 0
+    return np.array([v / G + along * rest - slides, R + up])
+
+
+DISC = {"friction": np.array([0.5, 0.02, 0.5, 0.02]), "restitution": np.array([0.6, 0.6, 0.0, 0.0])}
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "dtype"),
+    [
+        ("SIE", "forward", jnp.float64),
+        ("RK4", "reverse", jnp.float64),
+        ("Heun", "forward", jnp.float64),
+        ("Euler", "forward", jnp.float64),
+        ("SIE", "reverse", jnp.float32),
+    ],
+)
+def test_a_disc_bounces_or_lands_sticking_and_sliding(name, mode, dtype):
+    """At 0.9 s, d(x, z)/dz is (0.0753, 0.9892) where it bounces and sticks."""
+    system, state = disc(dtype, restitution=0.6)
+    run = landed(system, state, INTEGRATORS[name], 0.9, by_height, lambda s: s.q[:2])
+    params = {"floor": {k: jnp.asarray(x, dtype) for k, x in DISC.items()}}
+
+    def want(z, i):
+        return bounced(z, DISC["friction"][i], DISC["restitution"][i], 0.9)
+
+    exact = (want(1.1 + 1e-6, 0) - want(1.1 - 1e-6, 0)) / 2e-6
+    np.testing.assert_allclose(exact, [0.0753, 0.9892], atol=1e-4)
+    held_to(run, 1.1, params, want, mode)
+
+
+@pytest.mark.parametrize("name", ["SIE", "RK4"])
+def test_a_disc_lands_without_restitution(name):
+    """Without a number for it: beside semi-implicit Euler the landing takes two steps."""
+    system, state = disc()
+    run = landed(system, state, INTEGRATORS[name], 0.9, by_height, lambda s: s.q[:1])
+    params = {"floor": {"friction": jnp.asarray([0.5, 0.02])}}
+    held_to(run, 1.1, params, lambda z, i: bounced(z, (0.5, 0.02)[i], 0.0, 0.9)[:1], "reverse")
+
+
+def test_a_block_lands_and_slides_to_rest():
+    """v t* + (v − μ g t*)²/2μg, t* = √(2z/g)."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("block", mass=2.0, position=(0.0, 0.3), velocity=(4.0, 0.0))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "block", friction=0.45))
+    system, state = scene.build()
+    run = landed(system, state, jc.SemiImplicitEuler(), 1.2, by_height, lambda s: s.q[:1])
+
+    def want(z, _):
+        t = np.sqrt(2 * z / G)
+        return np.array([4 * t + (4 - 0.45 * G * t) ** 2 / (2 * 0.45 * G)])
+
+    held_to(run, 0.3, None, want, "reverse")
+
+
+def test_a_block_slides_into_a_wall_and_back():
+    """Friction on the table turns round at the time of the impact."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("block", mass=1.0, position=(0.0, 0.0), velocity=(3.0, 0.0))
+    scene.add(jc.PlaneContact("table", jc.WORLD, "block", friction=0.3))
+    wall = {"normal": (-1.0, 0.0), "point": (0.6, 0.0), "restitution": 0.5}
+    scene.add(jc.PlaneContact("wall", jc.WORLD, "block", **wall))
+    system, state = scene.build()
+
+    def where(state, x):
+        return state.q.at[0].set(x), state.v
+
+    run = landed(system, state, jc.SemiImplicitEuler(), 0.5, where, lambda s: s.q[:1])
+
+    def want(x, _):
+        a = 0.3 * G
+        v = np.sqrt(9 - 2 * a * (0.6 - x))
+        rest = 0.5 - (3 - v) / a
+        return np.array([0.6 - 0.5 * v * rest + a * rest * rest / 2])
+
+    held_to(run, 0.0, None, want)
+
+
+@pytest.mark.parametrize("name", ["SIE", "RK4"])
+def test_a_hinged_rod_strikes_a_floor_with_its_end(name):
+    """Through a joint, and at an end that moves on a circle: θ̇ leaves with −e of what it was."""
+    inertia, mass, arm = 0.06, 1.0, 0.4
+    scene = jc.Scene(dim=2)
+    moving = {"velocity": (0.0, -arm), "angular_velocity": -1.0}
+    scene.add_body("rod", mass=mass, inertia=inertia, position=(arm, 0.5), **moving)
+    scene.add(jc.Revolute("hinge", jc.WORLD, "rod", point=(0.0, 0.5)))
+    end = {"center": (0.8, 0.5), "point": (0.0, 0.1), "friction": 0.4, "restitution": 0.6}
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "rod", **end))
+    system, state = scene.build()
+
+    def where(state, x):
+        return state.q, state.v * x
+
+    run = landed(system, state, INTEGRATORS[name], 0.5, where, lambda s: s.q[2:3])
+
+    def fall(_, y):
+        return [y[1], -mass * G * arm * np.cos(y[0]) / (inertia + mass * arm * arm)]
+
+    def strikes(_, y):
+        return y[0] + np.arcsin(0.4 / 0.8)
+
+    strikes.terminal, strikes.direction = True, -1
+    exactly = {"rtol": 1e-11, "atol": 1e-12}
+
+    def want(x, _):
+        down = solve_ivp(fall, (0, 1), [0.0, -x], events=strikes, **exactly)
+        θ, ω = down.y[:, -1]
+        up = solve_ivp(fall, (down.t[-1], 0.5), [θ, -0.6 * ω], **exactly)
+        return up.y[:1, -1]
+
+    held_to(run, 1.0, None, want)
+
+
+@pytest.mark.parametrize("e", [0.5, None])
+def test_a_weight_on_a_rope_jerks(e):
+    """It is thrown, falls on a parabola, and goes on with the speed across the rope."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("weight", mass=2.0, position=(0.3, -0.5), velocity=(1.0, 0.0))
+    own = {} if e is None else {"restitution": e}
+    rope = {"length": 1.0, "point_a": (0.0, 0.0)} | own
+    scene.add(jc.Rope("rope", jc.WORLD, "weight", **rope))
+    system, state = scene.build()
+    time = 0.35
+    run = landed(system, state, jc.SemiImplicitEuler(), time, by_height, lambda s: s.q)
+
+    def want(z, _):
+        def off(t):
+            return (0.3 + t) ** 2 + (z - G * t * t / 2) ** 2 - 1
+
+        low, high = 0.0, 0.6
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if off(middle) < 0 else (low, middle)
+        t = low
+        p, v = np.array([0.3 + t, z - G * t * t / 2]), np.array([1.0, -G * t])
+        n = p / np.linalg.norm(p)
+        v = v - (1 + (e or 0)) * (v @ n) * n
+        rest = time - t
+        if e:
+            return p + v * rest - np.array([0.0, G * rest * rest / 2])
+        angle, rate = np.arctan2(p[0], -p[1]), v @ np.array([-p[1], p[0]])
+        path = solve_ivp(
+            lambda _, y: [y[1], -G * np.sin(y[0])], (0, rest), [angle, rate], rtol=1e-11, atol=1e-12
+        )
+        return np.array([np.sin(path.y[0, -1]), -np.cos(path.y[0, -1])])
+
+    held_to(run, -0.5, None, want)
+
+
+@pytest.mark.parametrize(("friction", "name"), [(0.05, "SIE"), (1.0, "SIE"), (1.0, "RK4")])
+def test_two_discs_strike_aslant(friction, name):
+    """Sliding and sticking along a tangent that turns as they approach each other."""
+    m, inertia, e, time = np.array([1.0, 0.7]), np.array([5e-3, 4e-3]), 0.7, 0.8
+    p0, v0 = np.array([[0.0, 0.0], [0.8, 0.08]]), np.array([[2.0, 0.0], [-0.5, 0.1]])
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    for k, body in enumerate("ab"):
+        scene.add_body(body, mass=m[k], inertia=inertia[k], position=p0[k], velocity=v0[k])
+    touch = {"radius_a": R, "radius_b": R, "friction": friction, "restitution": e}
+    scene.add(jc.CapsuleContact("touch", "a", "b", **touch))
+    system, state = scene.build()
+
+    def where(state, x):
+        moved = state.q.at[0].add(x)
+        return moved, state.v
+
+    run = landed(system, state, INTEGRATORS[name], time, where, lambda s: s.q)
+
+    def want(x, _):
+        p, v = p0 + np.array([[x, 0.0], [0.0, 0.0]]), v0
+        d, u = p[1] - p[0], v[1] - v[0]
+        a, b, c = u @ u, d @ u, d @ d - 4 * R * R
+        t = (-b - np.sqrt(b * b - a * c)) / a
+        p = p + v * t
+        n = (p[1] - p[0]) / (2 * R)
+        s = np.array([-n[1], n[0]])
+        normal = -(1 + e) * (u @ n) / np.sum(1 / m)
+        along = -(u @ s) / np.sum(1 / m + R * R / inertia)
+        along = np.clip(along, -friction * normal, friction * normal)
+        pull = normal * n + along * s
+        v = v + np.array([-pull, pull]) / m[:, None]
+        ω = -R * along / inertia
+        end = p + v * (time - t)
+        angles = ω * (time - t)
+        return np.array([*end[:, 0], *end[:, 1], *angles])
+
+    order = np.asarray(state.q)  # x of both, y of both, angles of both
+    np.testing.assert_allclose(order, [0.0, 0.8, 0.0, 0.08, 0.0, 0.0])
+    held_to(run, 0.0, None, want)
+
+
+def test_a_slide_with_a_spring_and_a_damper_strikes_a_stop():
+    """What damps has another force after the impact than before it."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("slide", mass=1.0, inertia=1.0)
+    scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
+    scene.add(jc.JointSpring("spring", "rail", stiffness=4.0, damping=0.5))
+    scene.add(jc.Limit("stop", "rail", lower=-0.2, restitution=0.5))
+    system, state = scene.build()
+
+    def where(state, x):
+        return state.q.at[0].set(x), state.v
+
+    run = landed(system, state, jc.SemiImplicitEuler(), 1.5, where, lambda s: s.q[:1])
+
+    def swings(_, y):
+        return [y[1], -4 * y[0] - 0.5 * y[1]]
+
+    def strikes(_, y):
+        return y[0] + 0.2
+
+    strikes.terminal, strikes.direction = True, -1
+    exactly = {"rtol": 1e-11, "atol": 1e-12}
+
+    def want(x, _):
+        there = solve_ivp(swings, (0, 2), [x, 0.0], events=strikes, **exactly)
+        y, v = there.y[:, -1]
+        return solve_ivp(swings, (there.t[-1], 1.5), [y, -0.5 * v], **exactly).y[:1, -1]
+
+    held_to(run, 0.8, None, want)
+
+
+def bar(restitution=None):
+    """A bar over a floor, which it may hit with one end."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("bar", mass=1.0, inertia=0.1, position=(0.0, 0.5), angle=0.3)
+    own = {} if restitution is None else {"restitution": restitution}
+    scene.add(jc.PlaneContact("tip", jc.WORLD, "bar", center=(-0.4, 0.4), friction=0.5, **own))
+    return scene.build()
+
+
+def height_by(system, state, method):
+    """z → height a step later."""
+
+    def height(z):
+        start = jc.init(system, method, state.q.at[1].set(z), state.v)
+        return jc.step(system, method, start, None, H)[0].q[1]
+
+    return height
+
+
+def test_a_gradient_that_lacks_the_time_of_impacts_warns_once(monkeypatch):
+    """Where it is traced, not where the step is; and is named by the report and the check."""
+    monkeypatch.setattr(notices, "_given", set())
+    system, state = bar()
+    height = height_by(system, state, jc.Method())
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        jax.jit(height).lower(0.5)
+        assert caught == []
+        for _ in range(2):
+            jax.jit(jax.grad(height)).lower(0.5)
+    assert len(caught) == 1
+    assert "gradients through impacts: a landing of tip takes two steps" in str(caught[0].message)
+    check = jc.check_gradients(height, 0.5)
+    assert len(check.notes) == 1
+    assert "note, gradients through impacts: a landing of tip" in str(check)
+    said = jc.report(system, state, method=jc.Method(), dt=H)
+    assert "a landing of tip takes two steps" in said.warnings["impacts"]
+    assert "warning, gradients through impacts: a landing" in str(said)
+
+
+@pytest.mark.parametrize("case", ["restitution", "RK4", "events", "particle"])
+def test_no_gradient_warns_that_has_the_time_of_impacts(case, monkeypatch):
+    monkeypatch.setattr(notices, "_given", set())
+    system, state = bar(jnp.zeros(()) if case == "restitution" else None)
+    if case == "particle":
+        scene = jc.Scene(dim=2)
+        scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
+        scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", friction=0.5))
+        system, state = scene.build()
+    parts = {"RK4": {"integrator": jc.RK4()}, "events": {"events": jc.Events()}}
+    method = jc.Method(**parts.get(case, {}))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(jax.grad(height_by(system, state, method))).lower(0.5)
+    assert impact(Known.of(system, state, method, H)) is None
