@@ -281,9 +281,7 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
         if isinstance(group, Custom):
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
-    start = State(q, v, t, status, memory, turns)
-    start = dataclasses.replace(start, angle_remainder=system.no_remainder(dtype))
-    return unshared(start, system)
+    return unshared(State(q, v, t, status, memory, turns), system)
 
 
 def _held(system: Any, hold: Any, n_v: int) -> tuple[int, ...]:

@@ -190,8 +190,7 @@ class Scene:
             counted=along.counted,
             bounds=tuple(gather.bounds(elements, along)),
         )
-        more = {"turns": turns, "angle_remainder": system.no_remainder(self.dtype)}
-        state = dataclasses.replace(self._state(layout, bodies), **more)
+        state = dataclasses.replace(self._state(layout, bodies), turns=turns)
         for group in (*constraints, *system.bounds):
             if isinstance(group, Custom):
                 check_function(group, system.snapshot(state.q, state.v, state.instant))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax
@@ -61,9 +60,7 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
         turns = checks.real("init", "turns", turns, dtype, np.shape(system.turns)[:1])
     turns = system.turns if turns is None else turns
     time = checks.real("init", "time", time, dtype)
-    start = State(q, v, time, status, memory, turns)
-    start = dataclasses.replace(start, angle_remainder=system.no_remainder(dtype))
-    return unshared(start, system)
+    return unshared(State(q, v, time, status, memory, turns), system)
 
 
 def _length(q: Any) -> int:
