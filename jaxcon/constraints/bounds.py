@@ -165,10 +165,12 @@ class BoundRows:
             free: u at its end without multipliers, (n,), away from the first stop.
             dt: the length of the step, () [s].
         """
+        assert self.far is not None
         return jax.lax.stop_gradient(dt[None] * free > self.far)
 
     def facing(self, second: Array, dt: Array) -> BoundRows:
         """The rows with the second stop in place of the first where that is asked for, (n,)."""
+        assert self.far is not None
         gap, sign = jnp.where(second, self.far, 0), jnp.where(second, -1, 1).astype(dt.dtype)
         return dataclasses.replace(
             self,

@@ -222,7 +222,7 @@ def _solve(problem: _Problem, allowed: Array) -> tuple[Array, Array]:
 
 
 def _nearest_velocity(
-    system: Any, q: Array, v: Array, t: Array, free: np.ndarray
+    system: Any, q: Array, v: Array, t: Any, free: np.ndarray
 ) -> tuple[Array, Array]:
     """v with the constraints' rates at zero, and which rows nothing free can change."""
     rows = linearize(system, q, v, t)
