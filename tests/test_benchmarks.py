@@ -192,7 +192,7 @@ def test_operations_are_counted_once():
 def test_the_operations_of_a_step_are_counted():
     found = roofline.work("pendulum", jc.Method(), np.float32)
     assert 100 < found.operations < 10_000
-    assert found.state == (7 + 6 + 1 + 1) * 4
+    assert found.state == (7 + 6 + 2 + 1) * 4  # q, v, time in two parts, status
 
 
 def test_a_rate_counts_only_where_the_run_is_accurate():

@@ -6,6 +6,7 @@ also says how it transforms a constraint error under feedback, which decides whi
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -111,12 +112,7 @@ class SemiImplicitEuler(Explicit):
         """One step."""
         system, here = dynamics.system, (state.q, state.v, state.instant)
         if system.turns_in_space:
-            solution, rows, least = dynamics.factored(*here, dt / 2)
-            v = system.kick(state.q, state.v, solution.acceleration, dt[None])
-            if least is not None and rows.layout.size:
-                more = missed(system, state, v, solution, rows, least, dt)
-                v = v + dt[None] * more.acceleration
-                solution = added(solution, more)
+            v, solution, rows = self._in_space(dynamics, state, here, dt)
         else:
             solution, rows = dynamics(*here, dt / 2)
             v = state.v + dt[None] * solution.acceleration
@@ -127,6 +123,29 @@ class SemiImplicitEuler(Explicit):
             moving = v - jump.velocity + numerics.safe_divide(jump.travel, dt[None])
         q = system.retract(state.q, dt[None] * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
+
+    def _in_space(
+        self, dynamics: Dynamics, state: State, here: tuple[Array, Array, Any], dt: Any
+    ) -> tuple[Array, Solution, Rows]:
+        """v⁺, a and λ, and the rows, with the free rotation of bodies split off.
+
+        Where an inequality constraint acts, v⁺ = v + h a, as its law says something of this v⁺. The
+        gyroscopic part of a is then the mean over a step of free rotation.
+        """
+        system, h = dynamics.system, dt[None]
+        coasting = 0.0
+        if system.bounds:
+            coasting = system.coast(state.q, state.v, h)
+            dynamics = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
+        solution, rows, least = dynamics.factored(*here, dt / 2)
+        v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
+        if rows.reactions is not None:
+            acts = jnp.any(rows.reactions.multipliers != 0, axis=0)
+            v = jnp.where(acts[None], state.v + h * solution.acceleration, v)
+        if least is not None and rows.layout.size:
+            more = missed(system, state, v, solution, rows, least, dt)
+            v, solution = v + h * more.acceleration, added(solution, more)
+        return v, solution, rows
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.
