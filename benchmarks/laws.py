@@ -20,11 +20,13 @@ from jaxcon.constraints.rows import linearize
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.status import failed
+from jaxcon.dynamics.impacts import landing
 
 
 class Laws(NamedTuple):
     """By how much a step misses each law of its bounded rows, at worst, in proportion.
 
+    What a contact wants of the step in which it lands is that of `impacts.landing`.
     Velocities are related to the largest at the start, V, and so are multipliers, as the velocities
     that they give to their own rows, λ̂ = h g λ/V with g as of `moved`. With û = (J v⁺ − u*)/V, û_t
     the slip, and r̂ = μ λ̂_n or the bound of a joint's friction:
@@ -126,6 +128,7 @@ def measure(name: str, dtype: Any, solver: Any, worlds: int) -> Laws:
         rows = linearize_bounds(system, start.q, start.v, start.time, None, h)
         new, info = jc.step(system, method, start, None, h)
         free, _ = jc.step(bare, method, alone, None, h)
+        rows = landing(rows, rows.jacobian.apply(free.v - start.v), h)
         speed, energy = jnp.max(jnp.abs(start.v)), jc.energy(system, start).kinetic
         size = speed, h * moved(system, start, rows), energy
         found = judged(rows, info.reactions.multipliers, (free.v, new.v), size)
