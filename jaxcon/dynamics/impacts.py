@@ -125,8 +125,8 @@ class Arrivals:
 
         Parabolas do not know how a normal turns on the way, and of τ the derivative counts.
         """
-        closing = self.hits & (rows.rate < 0)
-        late = jnp.where(closing, rows.gap, 0) / jnp.where(closing, -rows.rate, 1)
+        closing = self.hits & (rows.rate < -(float(jnp.finfo(rows.rate.dtype).tiny) ** 0.8))
+        late = quotient(jnp.where(closing, rows.gap, 0), jnp.where(closing, -rows.rate, 1))
         late = rows.kinds.by_contact(jnp.where(jnp.abs(late) <= self.times, late, 0))
         return dataclasses.replace(self, times=self.times + late)
 
@@ -155,8 +155,13 @@ def slowest(rows: BoundRows, change: Array) -> Array:
     numbers = jnp.finfo(rows.rate.dtype)
     size = jnp.maximum(jnp.abs(rows.rate), jnp.abs(change))
     rounding = ROUNDING * float(numbers.eps) * jnp.max(size, axis=0, keepdims=True)
-    # quotients by less have no derivatives
-    return jax.lax.stop_gradient(rounding + float(numbers.tiny) ** 0.25)
+    return jax.lax.stop_gradient(rounding + float(numbers.tiny) ** 0.8)
+
+
+def quotient(x: Array, y: Array) -> Array:
+    """x / y where y may be tiny: the derivative of a plain quotient has 1/y², which overflows."""
+    size = jax.lax.stop_gradient(1 / y)
+    return (x * size) / (y * size)
 
 
 def arrive(
@@ -178,9 +183,9 @@ def arrive(
     size = jnp.where(fast, speed, 1)
     gap = jnp.where(fast & (rows.gap > 0), rows.gap, 0)
     bend = numerics.safe_divide(change, dt[None])
-    whole = gap / size
+    whole = quotient(gap, size)
     # the smaller root in a form that subtracts nothing; no root where the row turns round
-    root = numerics.safe_sqrt(1 - 2 * (bend / size) * whole)
+    root = numerics.safe_sqrt(1 - 2 * quotient(bend, size) * whole)
     τ = 2 * whole / (1 + root)
     hits = fast & (τ <= dt[None]) & (2 * bend * whole <= size)
     τ = jnp.where(hits, τ, 0)
@@ -253,7 +258,7 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     least = kinds.split(jnp.abs(change) + slowest(rows, change)).normal
     way = -dt[None] * rate.normal
     closes = (rate.normal < -least) & (gap > 0) & (gap < way)
-    share = jnp.where(closes, gap, 0) / jnp.where(closes, way, 1)
+    share = quotient(jnp.where(closes, gap, 0), jnp.where(closes, way, 1))
     parts = kinds.split(rows.target)
     discs = tuple(u * disc.of(share) for disc, u in zip(kinds.discs, rate.discs, strict=True))
     return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
