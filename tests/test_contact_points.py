@@ -262,8 +262,8 @@ def test_a_capsule_lies_on_both_ends():
 def test_a_ball_hits_a_capsule_in_the_plane(order):
     """Beside it, and beyond either end: the gap, where it is hit, and impulse and friction.
 
-    With K the mobility of the two bodies, each at its own surface, F = λ (n − μ t) for a slip along
-    t, and n·K F h = −φ/h − n·u.
+    With x halfway in the gap and K the mobility of the two bodies there, F = λ (n − μ t) for a slip
+    along t, and n·K F h = −φ/h − n·u.
     """
     m, μ, radii = np.array([3.0, 0.5]), 0.2, np.array([0.1, 0.15])
     inertia, apart = np.array([0.4, 0.006]), 1e-4
@@ -298,8 +298,8 @@ def test_a_ball_hits_a_capsule_in_the_plane(order):
     found, forces, gaps = jax.jit(jax.vmap(step))(balls, speeds)
     np.testing.assert_allclose(gaps, apart, atol=1e-14)
     for i, n in enumerate(normals):
-        surfaces = [feet[i] + (radii[0] + x) * n for x in (0, apart)]
-        arms = [surfaces[0] - middle, surfaces[1] - balls[i]]
+        place = feet[i] + (radii[0] + apart / 2) * n
+        arms = [place - middle, place - balls[i]]
         turns = [np.array([-arm[1], arm[0]]) for arm in arms]
         motions = [before["capsule"], speeds[i]]
         slip = np.diff(

@@ -19,7 +19,7 @@ from jaxcon.core.lanes import Vector, perpendicular
 from jaxcon.core.typing import Array, Lane
 from jaxcon.geometry.pose import Pose
 from jaxcon.model.elements import label
-from jaxcon.model.frames import Point
+from jaxcon.model.frames import Point, WorldFrame
 
 MATERIAL = ("friction", "rolling", "spinning", "restitution")
 """Fields of contacts that the number 0 leaves out."""
@@ -31,8 +31,8 @@ class Touch(NamedTuple):
     Attributes:
         gap: φ, negative where they overlap [m].
         normal: n, from the first to the second, world frame.
-        place: halfway between them, world frame: forces act on what of each is there where they
-            touch or overlap, so that equal and opposite ones have no moment.
+        place: halfway between them, world frame: forces act on what of each is there, so that equal
+            and opposite ones have no moment.
         a, b: the motion of the two bodies.
     """
 
@@ -45,10 +45,15 @@ class Touch(NamedTuple):
 
 def touching(p: dict[str, Any], touch: Touch, dt: Any) -> tuple[list[Row], dict[str, Any]]:
     """The normal and, with friction, the tangents of a contact; and what a step wants of them."""
-    # across an open gap each body is pulled at its own surface, where it will be touched: a lever
-    # that shrinks with the gap would turn it by the phase of the landing within the step
-    half = touch.normal * (jnp.maximum(touch.gap, 0) / 2)
-    points = touch.a.material(touch.place - half), touch.b.material(touch.place + half)
+    # across an open gap to what is fixed, a body is pulled at its own surface, where it will be
+    # touched: a lever that shrinks with the gap would turn it by the phase of the landing within
+    # the step; two bodies keep one place between them, and so their angular momentum
+    half, place = touch.normal * (jnp.maximum(touch.gap, 0) / 2), touch.place
+    if isinstance(touch.a, WorldFrame):
+        place = place + half
+    elif isinstance(touch.b, WorldFrame):
+        place = place - half
+    points = touch.a.material(place), touch.b.material(place)
     first, asked = one_sided(p, along(*points, touch.normal, touch.gap), dt)
     if "friction" not in p:
         return [first], asked

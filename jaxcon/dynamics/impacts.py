@@ -276,8 +276,8 @@ def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
     if lags and rows.lands:
         reasons.append(
             f"a landing of {', '.join(rows.lands)} takes two steps, so that where a body turns as"
-            " it lands on a corner, its derivative is right only in the mean over the phases of a"
-            " step; restitution=jnp.zeros(()) or Events() makes it one"
+            " it lands on a corner or on another body, its derivative is right only in the mean"
+            " over the phases of a step; restitution=jnp.zeros(()) or Events() makes it one"
         )
     if some and any(rows.ends):
         reasons.append(
