@@ -161,12 +161,14 @@ class BoundRows:
     def passes(self, free: Array, dt: Array) -> Array:
         """Which rows would pass their second stop in a step, (n,), a constant.
 
+        None does that is beyond it already: between stops that have crossed, the nearer one acts.
+
         Args:
             free: u at its end without multipliers, (n,), away from the first stop.
             dt: the length of the step, () [s].
         """
         assert self.far is not None
-        return jax.lax.stop_gradient(dt[None] * free > self.far)
+        return jax.lax.stop_gradient((self.far >= 0) & (dt[None] * free > self.far))
 
     def facing(self, second: Array, dt: Array) -> BoundRows:
         """The rows with the second stop in place of the first where that is asked for, (n,)."""
