@@ -41,6 +41,11 @@ def shafts(dim, *elements, **spin):
     return scene.build()
 
 
+def idle(_):
+    """Motors that do nothing."""
+    return jnp.zeros(len(MOMENTS))
+
+
 def accelerations(system, state, *torques):
     """Of the wheels' angles and the slider, and λ of the coupling."""
     control = jnp.zeros(3).at[: len(torques)].set(jnp.asarray(torques, float))
@@ -96,7 +101,7 @@ def test_a_cam_follows_its_polynomial(dim):
     (a, b, *_), _ = accelerations(system, state, 1.0)
     np.testing.assert_allclose(b, 0.5 * a + 4.0 * 9.0, rtol=1e-9)
     fine = jc.Method(jc.RK4())
-    run = jax.jit(lambda s: jc.rollout(system, fine, s, None, 1e-3, 200)[0])
+    run = jax.jit(lambda s: jc.rollout(system, fine, s, idle, 1e-3, 200)[0])
     final = run(state)
     x, y = (jc.coordinate(system, final, f"{name}_hinge") for name in "ab")
     assert abs(x) > 0.1
@@ -106,7 +111,7 @@ def test_a_cam_follows_its_polynomial(dim):
 @both
 def test_a_gear_holds_over_many_turns(dim):
     system, state = shafts(dim, jc.Gear("coupling", "a_hinge", "b_hinge", 2.5), a=20.0, b=50.0)
-    run = jax.jit(lambda s: jc.rollout(system, jc.Method(), s, None, 1e-2, 200)[0])
+    run = jax.jit(lambda s: jc.rollout(system, jc.Method(), s, idle, 1e-2, 200)[0])
     final = run(state)
     assert final.status == jc.Status.OK
     a, b = (jc.coordinate(system, final, f"{name}_hinge") for name in "ab")

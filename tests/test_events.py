@@ -146,7 +146,7 @@ def struck(time):
 
 
 def test_an_impact_keeps_the_order_of_the_integrator():
-    """Four with RK4, and one in plain stepping."""
+    """Four with RK4 where steps are split, and about two in plain steps, which find the impact."""
     system, state = oscillator()
     end, orders = 1.7, []
     for method in (located(), jc.Method(jc.RK4())):
@@ -155,7 +155,7 @@ def test_an_impact_keeps_the_order_of_the_integrator():
         errors = [abs(float(run(state, end / n, n).q[0]) - struck(end)) for n in counts]
         orders.append(-np.polyfit(np.log(counts), np.log(errors), 1)[0])
     assert orders[0] > 3.7
-    assert 0.5 < orders[1] < 2.0
+    assert 1.5 < orders[1] < 3.0
 
 
 def test_what_a_step_tells_of_its_impacts():
