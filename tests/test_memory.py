@@ -79,8 +79,8 @@ def test_a_report_has_it_where_a_method_is_given():
     assert jc.report(system, state).memory is None
     report = jc.report(system, state, jc.Method(), measure=True)
     assert report.memory == jc.memory(system, jc.Method(), state)
-    assert report.memory.state == (7 + 6 + 1 + 1) * 4
-    assert "60 B of state" in str(report)
+    assert report.memory.state == (7 + 6 + 2 + 1) * 4  # time in two parts
+    assert "64 B of state" in str(report)
 
 
 def test_control_is_that_of_a_step():
