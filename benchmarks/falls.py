@@ -81,12 +81,15 @@ def drop(how: str, dtype: str, count: int, seconds: float) -> Fallen:
     method = jc.Method(solver=jc.Sparse(), bounded=legged.BOUNDED[how])
     qpos, qvel = (jnp.asarray(x, dtype) for x in poses(model, count))
 
+    def idle(state: jc.State) -> jax.Array:
+        return jnp.zeros(read.system.layout.n_u, state.q.dtype)
+
     def fall(place: jax.Array, speed: jax.Array) -> tuple[Any, Any, Any]:
         state = read.state(place, speed)
         turns = state.turns if read.system.counted else None
         state = jc.init(read.system, method, state.q, state.v, turns=turns)
         steps = int(seconds / DT)
-        final, _ = jc.rollout(read.system, method, state, None, DT, steps, every=steps)
+        final, _ = jc.rollout(read.system, method, state, idle, DT, steps, every=steps)
         return final.status, read.qpos(final), read.qvel(final)
 
     run, ends = jax.jit(jax.vmap(fall)), []

@@ -134,11 +134,14 @@ def dropped(read: jc.MujocoModel, model: Any, bounded: Any, batches: list[int]) 
     """The robot falls, and in a batch several do that are turned differently."""
     system, method = read.system, jc.Method(solver=jc.Sparse(), bounded=bounded)
 
+    def idle(state: jc.State) -> jax.Array:
+        return jnp.zeros(system.layout.n_u, state.q.dtype)
+
     def run(state: jc.State) -> Any:
-        return jc.rollout(system, method, state, None, DT, STEPS, every=EVERY)
+        return jc.rollout(system, method, state, idle, DT, STEPS, every=EVERY)
 
     def last(state: jc.State) -> jc.State:
-        return jc.rollout(system, method, state, None, DT, STEPS, every=STEPS)[0]
+        return jc.rollout(system, method, state, idle, DT, STEPS, every=STEPS)[0]
 
     first = begun(read, method, start(model))
     (final, states), *measured = timed(run, first, STEPS)

@@ -193,7 +193,10 @@ def test_hopper_stands_on_its_foot():
     def record(state, info):
         return read.qpos(state), info.reactions.multipliers, info.reactions.residual
 
-    run = jax.jit(lambda s: jc.rollout(system, method, s, None, 2e-3, 100, record=record))
+    def idle(_):
+        return jnp.zeros(3)
+
+    run = jax.jit(lambda s: jc.rollout(system, method, s, idle, 2e-3, 100, record=record))
     final, (qpos, forces, residual) = run(state)
     jc.raise_for_status(final)
     assert max(legged.depth(m, np.asarray(qpos))) < 1e-9
