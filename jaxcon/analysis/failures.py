@@ -186,12 +186,8 @@ class Watched(Dynamics):
 
     seen: list[tuple[list[Finding], Status]] = field(default_factory=list)
 
-    def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
-        """a and λ at (q, v, t), and the rows there."""
-        return self._watched(q, v, t, super().__call__(q, v, t, age))
-
     def factored(self, q: Array, v: Array, t: Any, age: Any = None) -> Any:
-        """The same, and b → the least a with J a + C λ = b."""
+        """a and λ at (q, v, t), the rows there, and b → the least a with J a + C λ = b."""
         return self._watched(q, v, t, super().factored(q, v, t, age))
 
     def _watched(self, q: Array, v: Array, t: Any, found: Any) -> Any:

@@ -182,14 +182,6 @@ def perpendicular(x: Vector) -> Vector:
     return Vector(times(-1, x[1]), x[0])
 
 
-def cramer(rows: tuple[Vector, ...], y: Vector) -> Vector:
-    """x of A x = y with the three rows of A."""
-    a, b, c = rows
-    across = b.cross(c)
-    x = across * y[0] + c.cross(a) * y[1] + a.cross(b) * y[2]
-    return x * (1 / a.dot(across))
-
-
 GATHERED = 16
 """Rows from which picking them is one gather instead of as many copies."""
 

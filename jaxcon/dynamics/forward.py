@@ -78,17 +78,8 @@ class Dynamics:
 
         With bounded rows these are means over the step, its impacts included.
         """
-        rows, law, problem = self._problem(q, v, t, age)
-        if self.bounded is not None:
-            lag = None if age is None else 0.5
-            solution, rows, *_ = self._reacted(q, v, t, rows, law, problem, lag, False)
-            jump = rows.reactions.jump
-            if jump is not None:
-                a = solution.acceleration + numerics.safe_divide(jump.velocity, self.dt[None])
-                solution = solution._replace(acceleration=a)
-            return solution, rows
-        own = self.solver.solve(problem) if law.solve is None else law.solve(self.solver, problem)
-        return self.system.complete(own), rows
+        solution, rows, _ = self.factored(q, v, t, age)
+        return impacts.with_jump(solution, impacts.jump_of(rows.reactions), self.dt), rows
 
     def begun(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows, Dynamics]:
         """The same at the start of a step, and what the rest of it sees.
@@ -163,7 +154,7 @@ class Dynamics:
     def _struck(
         self, at: Any, solution: Solution, known: Reactions, arrivals: Any, lag: float
     ) -> tuple[Solution, Reactions]:
-        """The same with the impacts of the step: their jump, and the mean of their impulses."""
+        """Adds the impacts of the step: their jump, and the mean of their impulses."""
         laws = _Laws(dataclasses.replace(self, guess=None))
         a, λ, joints = solution.acceleration, known.multipliers, solution.multipliers
         q, v, t = at
@@ -217,10 +208,10 @@ class Dynamics:
     def factored(
         self, q: Array, v: Array, t: Any, age: Any = None
     ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None]:
-        """As the call, and b → the least a, in the metric of M, with J a + C λ = b.
+        """a and λ, the rows, and b → the least a, in the metric of M, with J a + C λ = b.
 
-        It uses the factors of the step. It is None where the stabilizer solves by itself. Impacts
-        are not in a: they are the `jump` of the reactions.
+        The last uses the factors of the step, and is None where the stabilizer solves by itself.
+        Impacts are not in a: they are the `jump` of the reactions.
         """
         rows, law, problem = self._problem(q, v, t, age)
         if self.bounded is not None:
@@ -284,7 +275,7 @@ class Dynamics:
 
 @dataclass(frozen=True)
 class _Laws:
-    """What an impact asks of the dynamics; see `impacts.Laws`."""
+    """The `impacts.Laws` of these dynamics."""
 
     dynamics: Dynamics
 

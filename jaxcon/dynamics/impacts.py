@@ -35,6 +35,7 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import mask
+from jaxcon.solvers.saddle import Solution
 
 ROUNDING = 64
 """The rounding error of a velocity, in spacings of the largest one at hand."""
@@ -48,7 +49,7 @@ SLOW = 2
 
 @pytree
 class Jump:
-    """What an impact changes at the end of a step.
+    """The change of velocity and displacement that impacts cause at the end of a step.
 
     Attributes:
         velocity: Δv + (a⁺ − a⁻) r, (n_v,).
@@ -59,8 +60,21 @@ class Jump:
     travel: Array
 
 
+def jump_of(reactions: Any) -> Jump | None:
+    """The jump of a step by its reactions; None where there are none, or no impacts to come."""
+    return None if reactions is None else reactions.jump
+
+
+def with_jump(solution: Solution, jump: Jump | None, dt: Any) -> Solution:
+    """The solution with the mean acceleration over a step of dt, its impacts included."""
+    if jump is None:
+        return solution
+    a = solution.acceleration + numerics.safe_divide(jump.velocity, dt[None])
+    return solution._replace(acceleration=a)
+
+
 class Found(NamedTuple):
-    """What the laws of bounded rows find at one instant, at an impact or over a step.
+    """The solution of the inequality constraints at one instant, at an impact or over a step.
 
     Attributes:
         change: Δv of an impact, or a, (n_v,).
@@ -77,7 +91,7 @@ class Found(NamedTuple):
 
 
 class Laws(Protocol):
-    """What an impact needs of the dynamics, whichever solver finds the multipliers."""
+    """The part of the dynamics that an impact uses, whichever solver finds the multipliers."""
 
     def rows(self, q: Array, v: Array, t: Any) -> BoundRows:
         """The bounded rows at a state."""
@@ -121,7 +135,7 @@ class Arrivals:
         return jnp.sum(self.leads * self.times[None], axis=1)
 
     def refined(self, rows: BoundRows) -> Arrivals:
-        """The same after a step of Newton on the gaps of rows at the place of the impact.
+        """Refines the times by one Newton step on the gaps at the place of the impact.
 
         Parabolas do not know how a normal turns on the way, and of τ the derivative counts.
         """
@@ -214,7 +228,7 @@ def arrive(
 def at_impact(
     rows: BoundRows, arrivals: Arrivals, dt: Array, lasts: Array
 ) -> tuple[BoundRows, Array]:
-    """What the rows want of an impact, and which of them act, (n,).
+    """Returns the rows with their targets for an impact, and a mask of those that act, (n,).
 
     Rows that arrive leave with e |φ̇|, or stay if they are slow. The others may close their gap in
     the time of a step, and none is driven apart by the impact of others. Where it lasts, (), this
@@ -238,7 +252,7 @@ def at_impact(
 
 
 def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
-    """What contacts without restitution want of a step in which velocities move positions.
+    """Sets the targets of contacts without restitution for a step in which they may land.
 
     A contact that closes after τ = s h is to end the step with the mean of its velocity over it:
     s u⁻ along the normal, which closes the gap, and as much along the tangents, which holds

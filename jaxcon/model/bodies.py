@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
-from jaxcon.core.lanes import Vector, cramer, zeros
+from jaxcon.core.lanes import Vector, zeros
 from jaxcon.core.typing import Array, Lane
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Motion, Pose
@@ -238,6 +238,9 @@ def rotate_freely(ω: Vector, moments: Vector, shares: Vector, dt: Lane) -> Vect
     so |p| is kept whatever ω̄ is. With ω̄ = (ω + ω⁺)/2 energy is kept as well. One step of Newton's
     method from ω finds ω̄ up to (h|ω|/2)³.
 
+    With s = h/2 ω and G the derivative of g(s) = I⁻¹ (s × Is), it is s̄ = s − (1 + G)⁻¹ g. As g is
+    quadratic, G s = 2 g, and s̄ = (s + (1 + G)⁻¹ s)/2, by Cramer's rule in closed form.
+
     Args:
         ω: angular velocity in the body's frame [rad/s].
         moments: principal moments of inertia [kg m²].
@@ -248,20 +251,19 @@ def rotate_freely(ω: Vector, moments: Vector, shares: Vector, dt: Lane) -> Vect
         Austin, Krishnaprasad, Wang, Almost Poisson integration of rigid body systems, Journal of
             Computational Physics 107 (1993).
     """
-    half = dt / 2
-    middle = ω - cramer(gyroscopic_slope(shares, ω * half), spun(shares, ω) * half)
-    axis, p = middle * -half, Vector(*(i * x for i, x in zip(moments, ω, strict=True)))
+    (a, b, c), (x, y, z) = shares, ω * (dt / 2)
+    xx, yy, zz = b * c * x * x, a * c * y * y, a * b * z * z
+    inverse = 1 / (1 - xx - yy - zz + 2 * a * b * c * x * y * z)
+    middle = Vector(
+        x + (x * (1 - xx + yy + zz) - 2 * a * y * z) * inverse,
+        y + (y * (1 + xx - yy + zz) - 2 * b * z * x) * inverse,
+        z + (z * (1 + xx + yy - zz) - 2 * c * x * y) * inverse,
+    )
+    axis, p = middle * -0.5, Vector(*(i * x for i, x in zip(moments, ω, strict=True)))
     across = axis.cross(p)
     turned = (across + axis.cross(across)) * (2 / (1 + axis.dot(axis)))
     # the change alone is divided by I: of a body that hardly precesses ω keeps its last digit
     return Vector(*(x + y * (1 / i) for x, y, i in zip(ω, turned, moments, strict=True)))
-
-
-def gyroscopic_slope(shares: Vector, ω: Vector) -> tuple[Vector, ...]:
-    """Rows of 1 + ∂(I⁻¹ (ω × Iω))/∂ω."""
-    (a, b, c), (x, y, z) = shares, ω
-    one = jnp.ones_like(x)
-    return Vector(one, a * z, a * y), Vector(b * z, one, b * x), Vector(c * y, c * x, one)
 
 
 def rest(pose: Pose) -> Motion:

@@ -20,7 +20,7 @@ from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal, Full, Mass, Solution
 
 OWNER = "GeneralizedSystem"
-"""What errors begin with."""
+"""The first words of errors."""
 
 WHOLE = Place(0, (0,))
 """All coordinates at once, as the one element of one group."""
@@ -115,10 +115,6 @@ class GeneralizedCoordinates:
                     f" {checks.shortened(known.tolist())} at q = {q.tolist()}."
                 )
 
-    def weight(self, q: Array) -> Array:
-        """None, (n_v,): f does not tell what of it is gravity."""
-        return jnp.zeros_like(q)
-
     def applied(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:
         """f, (n_v,)."""
         return self.force(q, v, t, control)
@@ -143,10 +139,6 @@ class GeneralizedCoordinates:
     def turns_in_space(self) -> bool:
         """No: v is q̇."""
         return False
-
-    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
-        """v + h a."""
-        return v + dt * acceleration
 
     def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
         """None: v is q̇."""

@@ -107,7 +107,7 @@ def at_instant(state: State, instant: Doubled) -> State:
 
 
 def is_finite(state: State) -> Array:
-    """Whether all positions and velocities of a world are finite, ()."""
+    """Returns True where all positions and velocities of a world are finite, ()."""
     return jnp.all(jnp.isfinite(state.q), axis=0) & jnp.all(jnp.isfinite(state.v), axis=0)
 
 
@@ -175,7 +175,7 @@ def _check_kinds(state: State) -> None:
 
 
 def _kind(x: Any) -> str:
-    """What was given in place of an array, in few words."""
+    """Describes a value given in place of an array, in few words."""
     return f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else checks.shortened(x)
 
 

@@ -118,7 +118,7 @@ class BodySystem:
         return count(self.counted, self.snapshot(q, v, t)) if self.counted else self.turns
 
     def expect(self, here: Snapshot, end: Array, dt: Array, within: bool) -> tuple[PyTree, Array]:
-        """What a state remembers of turns after a step, and what of them cannot be told, ().
+        """Returns the expected angles after a step, and by how much they may be off, ().
 
         Args:
             here: the start of the step.
@@ -141,12 +141,6 @@ class BodySystem:
         groups = zip(self.layout.groups, self.inertia, strict=True)
         gyroscopic = [g.kind.gyroscopic(g.unpack(q, v)[1], p.moments) for g, p in groups]
         return self._forces(q, v, t, control, gyroscopic)
-
-    def weight(self, q: Array) -> Array:
-        """The force of gravity in f, (n_v,)."""
-        pairs = zip(self.layout.groups, self.inertia, strict=True)
-        own = [self._weight(group, p.mass).map(lambda x, m=p.mass: 0 * m + x) for group, p in pairs]
-        return _join(own, q)
 
     def _weight(self, group: Any, mass: Lane) -> Vector:
         """That of the bodies of a group."""
@@ -214,8 +208,6 @@ class BodySystem:
             acceleration: a at q and v, (n_v,), with its gyroscopic part.
             dt: h, (1,) [s].
         """
-        if not self.turns_in_space:
-            return v + dt * acceleration
         parts = zip(self.layout.groups, self.inertia, strict=True)
         known = [
             (g.kind, g.unpack(q, v)[1], g.unpack(q, acceleration)[1], p.moments) for g, p in parts
@@ -242,7 +234,7 @@ class BodySystem:
 
     @property
     def turns_in_space(self) -> bool:
-        """Whether bodies have an orientation in space."""
+        """True where bodies have an orientation in space."""
         return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
 
     def turn(self, q: Array, v: Array, dt: Any) -> Array:

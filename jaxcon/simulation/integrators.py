@@ -23,6 +23,7 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.forward import Dynamics
+from jaxcon.dynamics.impacts import jump_of, with_jump
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
 
@@ -106,7 +107,7 @@ class SemiImplicitEuler(Explicit):
     """
 
     reads_within = False
-    """Whether angles are read between the ends of a step."""
+    """True for an integrator that reads angles between the ends of a step."""
 
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
@@ -116,10 +117,8 @@ class SemiImplicitEuler(Explicit):
         else:
             solution, rows = dynamics(*here, dt / 2)
             v = state.v + dt[None] * solution.acceleration
-        jump, moving = jump_of(rows), v
+        jump, moving = jump_of(rows.reactions), v
         if jump is not None:
-            if system.turns_in_space:
-                v, solution = v + jump.velocity, with_jump(solution, jump, dt)
             moving = v - jump.velocity + numerics.safe_divide(jump.travel, dt[None])
         q = system.retract(state.q, dt[None] * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
@@ -139,12 +138,15 @@ class SemiImplicitEuler(Explicit):
             dynamics = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
         solution, rows, least = dynamics.factored(*here, dt / 2)
         v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
+        acts = jnp.zeros((), bool)
         if rows.reactions is not None:
             acts = jnp.any(rows.reactions.multipliers != 0, axis=0)
             v = jnp.where(acts[None], state.v + h * solution.acceleration, v)
         if least is not None and rows.layout.size:
-            more = missed(system, state, v, solution, rows, least, dt)
+            more = missed(system, state, v, solution, rows, least, acts, dt)
             v, solution = v + h * more.acceleration, added(solution, more)
+        if (jump := jump_of(rows.reactions)) is not None:
+            v, solution = v + jump.velocity, with_jump(solution, jump, dt)
         return v, solution, rows
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
@@ -184,6 +186,7 @@ def missed(
     solution: Solution,
     rows: Rows,
     least: Callable[[Array], Solution],
+    acts: Array,
     dt: Any,
 ) -> Solution:
     """The acceleration that takes the linearization error out of φ⁺, by one Newton step.
@@ -202,14 +205,13 @@ def missed(
         solution: a and λ at the start.
         rows: the constraints there.
         least: b → the least a with J a + C λ = b.
+        acts: whether an inequality constraint acts, ().
         dt: h, () [s].
     """
     h = dt[None]
     turn = system.turn(state.q, v, h) / TURN**2
     share = jnp.clip((turn - 1) / 3, 0, 1)
-    share = share * share * (3 - 2 * share)
-    if rows.reactions is not None:
-        share = jnp.where(jnp.any(rows.reactions.multipliers != 0, axis=0), 0, share)
+    share = jnp.where(acts, 0, share * share * (3 - 2 * share))
     held = rows.layout.holds & rows.layout.holonomic
     held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
 
@@ -295,7 +297,7 @@ class RungeKutta(Explicit):
         (slopes, code), _ = through(stage, (slopes, solution.status), inputs)
         dq, dv = (combine(self.b, x) for x in slopes)
         q, v = system.normalize(q + h * dq), v + h * dv
-        if (jump := jump_of(rows)) is not None:
+        if (jump := jump_of(rows.reactions)) is not None:
             q, v = system.retract(q, jump.travel), v + jump.velocity
             solution = with_jump(solution, jump, dt)
         return Advanced((q, v, t + dt), solution._replace(status=code), rows)
@@ -354,17 +356,6 @@ def Heun() -> RungeKutta:  # noqa: N802
 def RK4() -> RungeKutta:  # noqa: N802
     """The classical method of Kutta: fourth order, four solves."""
     return RungeKutta(((0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6))
-
-
-def jump_of(rows: Rows) -> Any:
-    """What impacts within the step change at its end; None where there are none."""
-    return None if rows.reactions is None else rows.reactions.jump
-
-
-def with_jump(solution: Solution, jump: Any, dt: Any) -> Solution:
-    """The solution with the mean acceleration over a step, its impacts included."""
-    a = solution.acceleration + numerics.safe_divide(jump.velocity, dt[None])
-    return solution._replace(acceleration=a)
 
 
 def one_by_one(function: Any, carry: Any, inputs: Any) -> tuple[Any, None]:
