@@ -824,20 +824,12 @@ def _analysis() -> Iterator[Row]:
         real(ORIGIN, "any", "none"),
     )
     names = Takes("other")
-    for reader in (jc.position, jc.orientation, jc.velocity, jc.angular_velocity):
-        yield (
-            f"{reader.__name__}.body",
-            functools.partial(reader, system, state),
-            names,
-            "body|unknown",
-        )
-    for reader in (jc.coordinate, jc.coordinate_rate):
-        yield (
-            f"{reader.__name__}.joint",
-            functools.partial(reader, system, state),
-            names,
-            "joint|unknown",
-        )
+    of_bodies = (jc.position, jc.orientation, jc.velocity, jc.angular_velocity)
+    of_joints = (jc.coordinate, jc.coordinate_rate)
+    for argument, readers in (("body", of_bodies), ("joint", of_joints)):
+        for reader in readers:
+            read = functools.partial(reader, system, state)
+            yield f"{reader.__name__}.{argument}", read, names, f"{argument}|unknown"
     for reader in (jc.multipliers, jc.wrench):
         yield (
             f"{reader.__name__}.info",

@@ -8,27 +8,15 @@ import sys
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scenes
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import jaxcon as jc
 from benchmarks import devices
 
-
-def arm(*elements, dim=2):
-    scene = jc.Scene(dim=dim)
-    place = np.eye(dim)[0]
-    inertia = 0.1 if dim == 2 else (0.1, 0.2, 0.3)
-    axis = {} if dim == 2 else {"axis": (0.0, 1.0, 0.0)}
-    scene.add_body("arm", mass=1.0, inertia=inertia, position=0.5 * place)
-    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=0 * place, **axis))
-    for element in elements:
-        scene.add(element)
-    return scene.build()
-
-
 SCENES = {
-    "turns": (lambda: arm(jc.JointSpring("spring", "hinge", 2.0), dim=3), jc.Sparse()),
-    "stop": (lambda: arm(jc.Limit("stop", "hinge", -0.1, 0.02)), jc.RankSafe()),
+    "turns": (lambda: scenes.arm(jc.JointSpring("spring", "hinge", 2.0), dim=3), jc.Sparse()),
+    "stop": (lambda: scenes.arm(jc.Limit("stop", "hinge", -0.1, 0.02)), jc.RankSafe()),
 }
 
 

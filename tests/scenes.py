@@ -439,6 +439,36 @@ def mixed_scene(dim: int, dtype: Any) -> Built:
     return finish(system, state, random, parameters, (("skate", 0),))
 
 
+def arm(*elements: Any, dim: int = 2) -> tuple[Any, jc.State]:
+    """A body on a hinge, and more elements."""
+    scene = jc.Scene(dim=dim)
+    place = np.eye(dim)[0]
+    inertia = 0.1 if dim == 2 else (0.1, 0.2, 0.3)
+    axis = {} if dim == 2 else {"axis": (0.0, 1.0, 0.0)}
+    scene.add_body("arm", mass=1.0, inertia=inertia, position=0.5 * place)
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=0 * place, **axis))
+    for element in elements:
+        scene.add(element)
+    return scene.build()
+
+
+def hanging(dtype: Any = None) -> Any:
+    """A bob on a rod and a spring, and its height over 0.6 s by stiffness and damping."""
+    scene = jc.Scene(dim=2, dtype=dtype)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    spring = {"stiffness": 5.0, "damping": 0.3, "point_a": (0.0, 1.0)}
+    scene.add(jc.Spring("spring", jc.WORLD, "bob", **spring))
+    system, state = scene.build()
+
+    def height(p: Any) -> jax.Array:
+        own, record = system.with_params({"spring": p}), lambda s, i: s.q[1]
+        last, y = jc.rollout(own, jc.Method(), state, None, 1e-2, 60, record=record)
+        return jc.losses.unless_failed(y, last)
+
+    return height
+
+
 def polar_mass(q: Any, p: Any) -> Any:
     return jnp.stack([p["mass"], p["mass"] * q[0] ** 2])
 

@@ -18,19 +18,6 @@ from jaxcon.core.static_data import decoded, encoded
 ROOT = Path(__file__).parents[1]
 
 
-def arm(*elements, dim=2):
-    """A body on a hinge, and more."""
-    scene = jc.Scene(dim=dim)
-    place = np.eye(dim)[0]
-    inertia = 0.1 if dim == 2 else (0.1, 0.2, 0.3)
-    axis = {} if dim == 2 else {"axis": (0.0, 1.0, 0.0)}
-    scene.add_body("arm", mass=1.0, inertia=inertia, position=0.5 * place)
-    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=0 * place, **axis))
-    for element in elements:
-        scene.add(element)
-    return scene.build()
-
-
 def pull(q, v, t, u, p):
     return -p["k"] * q
 
@@ -44,10 +31,12 @@ def stop():
 
 
 SCENES = {
-    "plane": arm,
-    "stop": lambda: arm(stop()),
-    "turns": lambda: arm(jc.JointSpring("spring", "hinge", 2.0), dim=3),
-    "motor": lambda: arm(jc.Motor("motor", "hinge"), jc.PositionServo("servo", "hinge", 2.0)),
+    "plane": scenes.arm,
+    "stop": lambda: scenes.arm(stop()),
+    "turns": lambda: scenes.arm(jc.JointSpring("spring", "hinge", 2.0), dim=3),
+    "motor": lambda: scenes.arm(
+        jc.Motor("motor", "hinge"), jc.PositionServo("servo", "hinge", 2.0)
+    ),
 }
 METHODS = {
     "default": jc.Method(),
@@ -105,7 +94,7 @@ def test_a_batch_of_any_size_is_exported(name):
 
 
 def test_gradients_of_a_batch_of_any_size_are_exported():
-    system, state = arm()
+    system, state = scenes.arm()
     step = stepped(system, jc.Method())
     slopes = jax.jit(
         jax.vmap(
@@ -121,7 +110,7 @@ def test_gradients_of_a_batch_of_any_size_are_exported():
 def test_system_state_and_info_are_written_to_a_file_and_read():
     pytest.importorskip("flatbuffers")
     method = METHODS["recovery"]
-    system, state = arm(stop(), jc.JointSpring("spring", "hinge", 2.0))
+    system, state = scenes.arm(stop(), jc.JointSpring("spring", "hinge", 2.0))
     state = jc.init(system, method, state.q, state.v)
 
     def step(system, state):
@@ -132,7 +121,7 @@ def test_system_state_and_info_are_written_to_a_file_and_read():
     read = export.deserialize(text)
     same(read.call(system, state), run(system, state))
     with pytest.raises(ValueError, match="args"):  # a system of another structure is refused
-        read.call(*arm())
+        read.call(*scenes.arm())
 
 
 def nodes(structure):
@@ -311,7 +300,7 @@ def test_a_hash_waits_for_no_array():
 
 
 def test_a_method_is_a_static_argument_that_is_traced_once():
-    system, state = arm()
+    system, state = scenes.arm()
     traces = []
 
     def step(method, state):
@@ -327,7 +316,7 @@ def test_a_method_is_a_static_argument_that_is_traced_once():
 
 
 def test_states_and_systems_compare_by_their_numbers():
-    one, other = arm(), arm()
+    one, other = scenes.arm(), scenes.arm()
     assert one[0] == other[0]
     assert one[1] == other[1]
     assert one[1] != jc.init(one[0], jc.Method(), one[1].q + 1, one[1].v)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import scenes
 
 import jaxcon as jc
 from jaxcon.learning.least_squares import Precision, Progress, least_squares, side_by_side
@@ -52,18 +53,7 @@ def test_a_recording_with_gaps_gives_parameters_noise_and_errors():
 @pytest.mark.parametrize("start", [(20.0, 0.05), (100.0, 30.0), (1000.0, 0.01)])
 def test_a_far_start_does_not_lead_out_of_all_numbers(start):
     """A step without reach by these logarithms went to 1e-300, where data seem to tell nothing."""
-    scene = jc.Scene(dim=2)
-    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
-    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
-    spring = {"stiffness": 5.0, "damping": 0.3, "point_a": (0.0, 1.0)}
-    scene.add(jc.Spring("spring", jc.WORLD, "bob", **spring))
-    system, state = scene.build()
-
-    def height(p):
-        own, record = system.with_params({"spring": p}), lambda s, i: s.q[1]
-        last, y = jc.rollout(own, jc.Method(), state, None, 1e-2, 60, record=record)
-        return jc.losses.unless_failed(y, last)
-
+    height = scenes.hanging()
     seen = height({"stiffness": 8.0, "damping": 1.0})
     guess = dict(zip(("stiffness", "damping"), start, strict=True))
     found = jc.identify(height, guess, seen, positive=True)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+import scenes
 
 import jaxcon as jc
 from jaxcon.core import checkpoint as files
@@ -103,28 +104,11 @@ def test_a_positive_leaf_stays_positive_however_far_it_is_thrown(dtype):
     assert 0 < found.params < 1e-30
 
 
-def hanging(dtype):
-    """A bob on a rod and a spring, and its height over 0.6 s by stiffness and damping."""
-    scene = jc.Scene(dim=2, dtype=dtype)
-    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
-    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
-    spring = {"stiffness": 5.0, "damping": 0.3, "point_a": (0.0, 1.0)}
-    scene.add(jc.Spring("spring", jc.WORLD, "bob", **spring))
-    system, state = scene.build()
-
-    def height(p):
-        own, record = system.with_params({"spring": p}), lambda s, i: s.q[1]
-        last, y = jc.rollout(own, jc.Method(), state, None, 1e-2, 60, record=record)
-        return jc.losses.unless_failed(y, last)
-
-    return height
-
-
 SPRING = {"stiffness": 8.0, "damping": 1.0}
 
 
 def spring_loss(dtype):
-    height = hanging(dtype)
+    height = scenes.hanging(dtype)
     seen = height({name: dtype(x) for name, x in SPRING.items()})
     return lambda p: jc.losses.tracking(height(p), seen)
 
