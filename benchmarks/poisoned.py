@@ -98,7 +98,7 @@ class Case:
 
     @property
     def allowed(self) -> bool:
-        """Whether the world may go on: infinity means "no limit", or it is none of the poisons."""
+        """Returns True where the world may go on: its number means "no limit", or is no poison."""
         finite = bool(np.isfinite(self.poison))
         return finite or (self.path.rsplit("/", 1)[-1], self.poison) in NO_LIMIT
 
@@ -108,7 +108,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Counts:
-    """What became of the cases of a study.
+    """The counts of a study.
 
     Attributes:
         tried: cases.
@@ -136,13 +136,13 @@ class Counts:
 
     @property
     def clean(self) -> bool:
-        """Whether nothing went wrong."""
+        """True where no case went wrong."""
         return not (self.accepted or self.neighbors or self.gradients)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What a batch did.
+    """The results of a batch.
 
     Attributes:
         failed: by case and step, whether its world had failed.
@@ -260,12 +260,12 @@ class Study:
         return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
 
     def of_inequality(self, case: Case) -> bool:
-        """Whether it is a number of a stop, contact, friction or motor."""
+        """True for a number of a stop, contact, friction or motor."""
         names = {name for group in self.system.bounds for name in group.names}
         return case.path.split("/")[1:2] != [] and case.path.split("/")[1] in names
 
     def seen(self, cases: Sequence[Case | None], failures_count: bool = False) -> Seen:
-        """What a batch of these cases does."""
+        """Runs the cases as a batch."""
         numbers = self.batch(cases)
         counts = np.arange(BATCH) < HEALTHY
         codes, worlds, gradient = self.compiled(numbers, counts)
@@ -283,7 +283,7 @@ class Study:
         )
 
     def run(self, cases: list[Case] | None = None) -> Counts:
-        """What becomes of the cases."""
+        """Counts how the cases end."""
         cases = list(self.cases()) if cases is None else cases
         total = Counts()
         for start in range(0, len(cases), BATCH - HEALTHY):
@@ -332,12 +332,12 @@ def culprits(bad: Any, cases: list[Case]) -> tuple[Case, ...]:
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether arrays agree bit for bit."""
+    """Returns True where arrays agree bit for bit."""
     return all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def _near(a: Any, b: Any) -> bool:
-    """Whether gradients agree to rounding, relative to the largest."""
+    """Returns True where gradients agree to rounding, relative to the largest."""
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.allclose(x, y, rtol=1e-9, atol=1e-9 * np.max(np.abs(y))) for x, y in pairs)
 

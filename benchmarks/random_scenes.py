@@ -34,7 +34,7 @@ import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 
 STEPS = 600
-"""Of each motion."""
+"""The number of steps of a motion."""
 SIZES = {2: (1e-3, 5e-3), 3: (1e-3, 5e-3, 1 / 60)}
 """Step sizes by dimension [s]; in the plane fast joints gain energy at the largest one."""
 CHECKS = ("status", "energy", "joints", "momentum", "batch", "derivative")
@@ -42,7 +42,7 @@ CHECKS = ("status", "energy", "joints", "momentum", "batch", "derivative")
 
 @dataclass(frozen=True)
 class Found:
-    """What became of a scene.
+    """The failed checks of a scene.
 
     Attributes:
         name: by which it is made again.
@@ -181,7 +181,7 @@ def _drift(system: Any, momentum: np.ndarray, start: np.ndarray, kinetic: np.nda
 
 
 def _modes_differ(system: Any, method: jc.Method, state: jc.State, v: jax.Array) -> float:
-    """By how much forward and reverse mode disagree on a rollout, relative; inf if not finite."""
+    """The relative difference of forward and reverse mode on a rollout; inf if not finite."""
 
     def loss(v: jax.Array) -> jax.Array:
         start = dataclasses.replace(state, v=v)
@@ -196,7 +196,7 @@ def _modes_differ(system: Any, method: jc.Method, state: jc.State, v: jax.Array)
 
 
 def study(scenes: int, seed: int = 0) -> Iterator[Found]:
-    """What becomes of so many scenes in each dimension; derivatives of every fourth."""
+    """Checks a number of scenes in each dimension; derivatives of every fourth."""
     for i in range(scenes):
         for dim in (2, 3):
             yield check(dim, seed + i, i % 4 == 0)

@@ -62,7 +62,7 @@ sys.exit(bool(failed))
 
 
 def project() -> dict[str, Any]:
-    """What pyproject.toml says of the package."""
+    """Reads the package's table of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -142,7 +142,7 @@ class Pair:
         self.found["time"] = f"{(time.monotonic() - start) / 60:.0f} min"
 
     def _installed(self, place: Path, end: float) -> bool:
-        """Whether the environment is there, made now unless it was."""
+        """Makes the environment unless it exists; returns True where it does at the end."""
         done = place / "versions.txt"
         if not done.exists():
             needed = project()["dependencies"]
@@ -166,7 +166,7 @@ class Pair:
         return True
 
     def _stage(self, name: str, command: list[str], place: Path, end: float) -> str | None:
-        """What a command prints; None where it fails or no time is left. Notes which."""
+        """Returns the output of a command; None, with a note, where it fails or is out of time."""
         place.mkdir(parents=True, exist_ok=True)
         left = end - time.monotonic()
         own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "PYTHON"))}
@@ -189,7 +189,7 @@ class Pair:
 
 
 def outcome(text: str) -> str:
-    """How many pages or tests went well and ill, by what a stage printed."""
+    """Counts passed and failed pages or tests in the output of a stage."""
     pages = re.findall(r"^PAGE .*? \d+ s (.*)$", text, re.MULTILINE)
     if len(pages) > 1:
         return f"{pages.count('ok')} of {len(pages)} pages"
@@ -198,7 +198,7 @@ def outcome(text: str) -> str:
 
 
 def table(pairs: Sequence[Pair]) -> str:
-    """What became of all pairs, as Markdown."""
+    """The results of all pairs as a Markdown table."""
     columns = ("install", *STAGES, "time")
     rows = [("Python", "JAX", "with", *STAGES, "time"), ("---",) * 8]
     rows += [(p.python, p.jax, *(p.found.get(c, "—") for c in columns)) for p in pairs]

@@ -54,7 +54,7 @@ class Call:
         return f"{self.door.name} = {self.label}"
 
     def outcome(self, limit: float = LIMIT) -> tuple[str, str]:
-        """What came of it, one of `OUTCOMES`, and the message or value."""
+        """Returns the outcome, one of `OUTCOMES`, and the message or value."""
 
         def stop(*_: Any) -> None:
             raise HungError
@@ -76,7 +76,7 @@ class Call:
         return "accepted", ""
 
     def _named(self, error: Exception) -> bool:
-        """Whether the error is ours, and says which argument is wrong."""
+        """Returns True where the error is the library's own and names the wrong argument."""
         if not isinstance(error, EXPECTED):
             return False
         return any(re.search(word, str(error)) for word in self.door.words)

@@ -1,4 +1,4 @@
-"""What the accelerations of a world cost, estimated from the structure of the scene. Host code.
+"""Estimates the operations of a world's accelerations from the structure of the scene. Host code.
 
 Nothing is compiled and no step is traced, which takes seconds to minutes where there are hundreds
 of rows. `work` counts a whole step from its trace, and `seconds` measures it.

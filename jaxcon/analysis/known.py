@@ -127,12 +127,12 @@ class Known:
 
     @cached_property
     def cost(self) -> Cost:
-        """What the accelerations take under the method, by the structure of the scene."""
+        """The operations of the accelerations under the method, estimated from the structure."""
         return cost(self.system, self.method, self.state, self.choice)
 
     @cached_property
     def probe(self) -> Probe | None:
-        """What some steps leave open; None where the step is not known, or none may be run."""
+        """The violation that some steps leave; None where no step is known or may be run."""
         if self.dt is None or not self.measured:
             return None
         return probe(self.system, self.method, self.state, self.control, self.dt)

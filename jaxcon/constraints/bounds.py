@@ -134,7 +134,7 @@ class BoundRows:
     lands: tuple[str, ...] = static(default=())
 
     def finite(self, bare: Array) -> Array:
-        """Whether all numbers of the rows are, ().
+        """True where all numbers of the rows are finite, ().
 
         Args:
             bare: J_b M⁻¹ J_bᵀ on the diagonal, (n,), which says so of J.

@@ -73,7 +73,7 @@ def first_multipliers(system: Any, q: Array, v: Array, solver: Any = None) -> Py
 
 
 def stacked(constraints: Jacobian, inequalities: Jacobian) -> bool:
-    """Whether an inequality constraint acts between two bodies that no chain of joints connects.
+    """Returns True where an inequality acts between two bodies that no chain of joints connects.
 
     Args:
         constraints: J of the constraints, of which shapes are enough.

@@ -101,7 +101,7 @@ class Custom:
 
     @property
     def owner(self) -> str:
-        """What errors begin with."""
+        """The first words of errors."""
         return f"{type(self.law).__name__} '{self.law.name}'"
 
     def get(self, i: int) -> dict[str, Any]:

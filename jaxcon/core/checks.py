@@ -30,7 +30,7 @@ _waiting_is_forbidden = ContextVar("_waiting_is_forbidden", default=False)
 
 
 def is_concrete(x: Any) -> bool:
-    """Whether every leaf has a value that can be read now: none is traced.
+    """Returns True where every leaf has a value that can be read now: none is traced.
 
     Within `without_waiting` an array of JAX has none either.
     """
@@ -231,7 +231,7 @@ def _from_host(owner: str, what: str, x: Any, wanted: str) -> Any:
 
 
 def shortened(x: Any) -> str:
-    """What was given, in few words."""
+    """Describes a value that was given, in few words."""
     try:
         text = repr(x)
     except Exception:  # an integer of too many digits, or a faulty object of the user's

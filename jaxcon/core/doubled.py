@@ -257,4 +257,4 @@ RULES: dict[str, Callable[..., Doubled]] = {
     "neg": Doubled.__neg__,
     "square": lambda x: x * x,
 }
-"""What is computed in sums of two floats, by primitive."""
+"""The primitives that are computed in sums of two floats."""

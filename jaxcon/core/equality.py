@@ -16,7 +16,7 @@ from jax.core import Tracer
 
 
 def equal(a: Any, b: Any) -> bool:
-    """Whether trees are equal. Values of arrays are asked for only where all else agrees."""
+    """Returns True for equal trees. Values of arrays are read only where all else agrees."""
     if a is b:
         return True
     (leaves_a, structure_a), (leaves_b, structure_b) = jax.tree.flatten(a), jax.tree.flatten(b)
@@ -50,7 +50,7 @@ def _kind(x: Any) -> Any:
 
 
 def _same_bits(x: Any, y: Any) -> bool:
-    """Whether two leaves of one kind have the same value."""
+    """Returns True where two leaves of one kind have the same value."""
     if not isinstance(x, np.ndarray | jax.Array):
         return True  # the kind says it all
     if isinstance(x, jax.Array):

@@ -17,7 +17,7 @@ from jaxcon.core.checks import shortened
 from jaxcon.core.typing import Array, PyTree
 
 UNKNOWN = (ConcretizationTypeError, TracerArrayConversionError, TracerIntegerConversionError)
-"""What JAX raises where a program asks for the value of a traced number."""
+"""The errors that JAX raises where a program asks for the value of a traced number."""
 
 
 def call(owner: str, what: str, function: Callable[..., Any], *args: Any) -> Any:
@@ -50,7 +50,7 @@ def title(function: Any) -> str:
 
 
 def array(owner: str, what: str, x: Any) -> Array:
-    """What a function returned, as an array of real numbers.
+    """The result of a function, as an array of real numbers.
 
     Raises:
         TypeError: it is none.
@@ -68,7 +68,7 @@ def array(owner: str, what: str, x: Any) -> Array:
 
 
 def tree(owner: str, what: str, x: PyTree) -> PyTree:
-    """What a function returned, a pytree of arrays as it is.
+    """The result of a function, a pytree of arrays as it is.
 
     Raises:
         TypeError: a leaf of it is something else.

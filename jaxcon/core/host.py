@@ -81,7 +81,7 @@ def _apply(jaxpr: Any, equation: Any, inputs: list[Any]) -> Sequence[Any]:
 
 
 def _cuts(params: Any) -> bool:
-    """Whether a padding removes entries, or puts some between them."""
+    """Returns True for a padding that removes entries, or puts some between them."""
     return any(low < 0 or high < 0 or inner for low, high, inner in params["padding_config"])
 
 

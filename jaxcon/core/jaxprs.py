@@ -49,5 +49,5 @@ def without_unused(jaxpr: Any, wanted: Sequence[bool] | None = None) -> Any:
 
 
 def read_arguments(jaxpr: Any) -> list[bool]:
-    """Whether some result of an open jaxpr is computed from each of its arguments."""
+    """Returns, for each argument of an open jaxpr, True where some result is computed from it."""
     return partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1]

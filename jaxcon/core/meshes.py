@@ -1,4 +1,4 @@
-"""Where arrays lie on a mesh, as JAX writes it into their types.
+"""The placement of arrays on a mesh, as JAX writes it into their types.
 
 Inside `jax.shard_map` a type says along which mesh axes an array varies, and on a mesh with
 explicit axes how each array axis is split. Native functions see neither: they are traced and

@@ -256,13 +256,13 @@ def slices(sizes: Sequence[int], axis: int, x: Array) -> list[Array]:
 
 
 def _leading(axes: Any, shape: tuple[int, ...]) -> bool:
-    """Whether these are the first axes, of known sizes, none of them empty."""
+    """Returns True for the first axes, of known sizes, none of them empty."""
     sizes = shape[: len(axes)]
     return tuple(axes) == tuple(range(len(axes))) and is_known(sizes) and all(sizes)
 
 
 def is_known(shape: Sequence[Any]) -> bool:
-    """Whether all sizes are numbers; those of `jax.export.symbolic_shape` are not."""
+    """Returns True where all sizes are numbers; those of `jax.export.symbolic_shape` are not."""
     return all(isinstance(n, int) for n in shape)
 
 

@@ -76,7 +76,7 @@ class SimulationError(RuntimeError):
 
 
 def failed(code: Array) -> Array:
-    """Whether a world has failed, by its code: it keeps its last finite state.
+    """Returns True where a world has failed, by its code: it keeps its last finite state.
 
     So has a world with a code that no `Status` has.
     """

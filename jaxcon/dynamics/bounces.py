@@ -9,7 +9,7 @@ from jaxcon.core.typing import Array
 
 
 def rebound(rows: BoundRows, e: Array, dt: Array) -> Array:
-    """What restitution adds to u*, (n,), for rows that close within dt: they leave with -e u.
+    """Returns the addition of restitution to u*, (n,): rows that close within dt leave with -e u.
 
     Args:
         rows: the bounded rows.

@@ -173,7 +173,7 @@ class Impulse:
         return jax.lax.stop_gradient(jnp.swapaxes(j.each(self.answers), 0, 1))
 
     def without(self, rows: Array) -> Impulse:
-        """The same, and some rows, (n,), do not act."""
+        """Returns a problem in which some rows, (n,), do not act."""
         acts = ~rows if self.acts is None else self.acts & ~rows
         return dataclasses.replace(self, acts=acts)
 

@@ -113,7 +113,7 @@ class Vakonomic:
         return self.system.count(q, self._split(v)[0], t)
 
     def expect(self, here: Any, end: Array, dt: Array, within: bool) -> Any:
-        """What a state remembers of turns after a step, and what of them cannot be told."""
+        """Returns the expected angles after a step, and by how much they may be off."""
         return self.system.expect(here, self._split(end)[0], dt, within)
 
     def sizes(self, n_q: int) -> tuple[int, int]:
@@ -169,7 +169,7 @@ class Vakonomic:
 
     @property
     def turns_in_space(self) -> bool:
-        """Whether bodies of the system have an orientation in space."""
+        """True where bodies of the system have an orientation in space."""
         return self.system.turns_in_space
 
     def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:

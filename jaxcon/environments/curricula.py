@@ -20,7 +20,7 @@ from jaxcon.environments.environment import Environment
 from jaxcon.stabilization.penalty import Penalty
 
 OWNER = "vary and jitter"
-"""What errors of theirs begin with."""
+"""The first words of their errors."""
 
 
 def decay(t: Any, initial: Any, time: Any) -> Array:

@@ -9,7 +9,7 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 
 PAIRS = 10
-"""How many secant pairs are remembered."""
+"""The number of secant pairs that are kept."""
 
 
 @pytree

@@ -122,7 +122,7 @@ class Search:
 
     @property
     def accepted(self) -> Array:
-        """Whether any point was."""
+        """True where some point was accepted."""
         return ~jnp.isnan(self.first)
 
 
@@ -291,7 +291,7 @@ class Descent:
         return Origin(search.y, slope, loss, update, memory)
 
     def runs_away(self, search: Search, loss: Array, before: Array) -> Array:
-        """Whether a step makes the loss so much worse that it is taken back.
+        """Returns True where a step makes the loss so much worse that it is taken back.
 
         It is a thousand times that before the step; or above all accepted ones by ten times their
         range, or by the range and the size of the first one. The latter holds for losses of any

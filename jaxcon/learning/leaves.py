@@ -85,7 +85,7 @@ class Space:
         return tuple(jnp.clip(z, low, high) for z, low, high in limits)
 
     def free(self, y: tuple[Array, ...], slope: tuple[Array, ...]) -> Array:
-        """Whether each number of y may follow −slope: on a bound, only back inside, (n,)."""
+        """A mask of the numbers of y that may follow −slope: on a bound, only back inside, (n,)."""
         sides = zip(y, slope, *self.limits, strict=True)
         return jnp.concatenate(
             [jnp.ravel(jnp.where(g > 0, z > low, z < high) | (g == 0)) for z, g, low, high in sides]

@@ -241,7 +241,7 @@ class Stretches:
         return ravel_pytree(misfit(predicted, data, noise))[0], ravel_pytree(end)[0]
 
     def _simulated(self, *args: Any) -> Any:
-        """What the user's function returns.
+        """Calls the user's function.
 
         Raises:
             TypeError: it returns no arrays, or needs the value of a traced number.

@@ -147,7 +147,7 @@ def _bounded(space: Space, y: tuple[Array, ...]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Outlook:
-    """What the end of a search says of the steps that it did not take.
+    """An estimate of the remaining distance at the end of a search.
 
     Attributes:
         distance: largest relative change of a parameter that is left to the least; NaN where the
@@ -182,12 +182,12 @@ class Outlook:
 
     @property
     def converged(self) -> bool:
-        """Whether every parameter is close to the least; False where that is not known."""
+        """True where every parameter is close to the minimum; False where that is unknown."""
         return self.distance <= CLOSE
 
     @property
     def words(self) -> str:
-        """What is said of it."""
+        """The estimate in words."""
         name = f"'{self.leaf}'" if self.leaf else "the parameter"
         if self.converged:
             return (
@@ -216,7 +216,7 @@ class Outlook:
 
 
 def _size(y: Array, start: Array, log: bool) -> np.ndarray | float:
-    """What a change of y is relative to: 1 for logarithms, the larger of y and start for others.
+    """The size to which a change of y is related: 1 for logarithms, else the larger of y and start.
 
     A start at 0 says nothing of the size, and counts as 1.
     """

@@ -84,7 +84,7 @@ def attempt(
 
 
 def nothing_seen(info: StepInfo, state: State) -> StepInfo:
-    """What a failed world has seen in a step from a state: zeros, and no impacts."""
+    """Returns the info of a failed world: zeros, and no impacts."""
     blank = jax.tree.map(jnp.zeros_like, info)
     if info.impacts is not None:
         blank = dataclasses.replace(blank, impacts=info.impacts.none())
@@ -97,12 +97,12 @@ def bare(state: State) -> State:
 
 
 def _reads_within(method: Method) -> bool:
-    """Whether the integrator reads angles between the ends of a step, as all but one do."""
+    """Returns True where the integrator reads angles between the ends of a step, as most do."""
     return getattr(method.integrator, "reads_within", True)
 
 
 def _has_multipliers(memory: MethodMemory) -> bool:
-    """Whether a state carries the multipliers of inequality constraints of the last step."""
+    """Returns True where a state carries the inequality multipliers of the last step."""
     return bool(jax.tree.leaves(memory.bounded))
 
 

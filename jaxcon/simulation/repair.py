@@ -151,7 +151,7 @@ class Recovery:
         return (dataclasses.replace(new, memory=memory), info), code
 
     def _finite(self, state: State) -> Array:
-        """Whether its numbers are, (); what they multiply is not always used, its derivative is."""
+        """True where its own numbers are finite, (). Unused ones would still enter derivatives."""
         numbers = (self.limit, self.shrink, self.growth, self.damping)
         known = [jnp.asarray(x, state.q.dtype) for x in numbers if x is not None]
         return functools.reduce(jnp.logical_and, map(jnp.isfinite, known))

@@ -111,7 +111,7 @@ def rollout(
 
 
 def _recorded(record: Record) -> Record:
-    """What a user keeps, errors naming the function."""
+    """Wraps a user's record function, so that errors name it."""
 
     def recorded(state: State, info: StepInfo) -> PyTree:
         return functions.tree(

@@ -139,7 +139,7 @@ class SolutionAt(Solution):
 
     @classmethod
     def tree_unflatten(cls, _: Any, children: Any) -> SolutionAt:
-        """Of its children."""
+        """Rebuilds the solution from its children."""
         return cls(*children)
 
 

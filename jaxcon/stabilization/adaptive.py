@@ -185,7 +185,7 @@ class SlidingWindowBaumgarte(Unstabilized):
         return rate, limit[None]
 
     def _finite(self, rows: Rows) -> Array:
-        """Whether all numbers are, and δ positive, by row; where not, there is no gain.
+        """True by row where all numbers are finite and δ is positive; elsewhere there is no gain.
 
         Otherwise the clips of `advance` would hide it, and keep its derivative, NaN.
         """
