@@ -67,8 +67,8 @@ def test_two_processes_get_the_numbers_of_one(tmp_path):
 FOUR_DEVICES = """
 import jax
 jax.config.update("jax_num_cpu_devices", 4)
-import jax.numpy as jnp, numpy as np, jaxcon as jc
-from benchmarks import devices, roofline
+import dataclasses, jax.numpy as jnp, numpy as np, jaxcon as jc
+from benchmarks import devices, mechanisms, roofline
 from benchmarks.throughput import worlds
 
 def same(x, y, tolerance=1e-12):
@@ -119,10 +119,19 @@ start = jc.init(system, method, start.q, start.v)
 swing = jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0])
 apart = jc.shard(worlds(start, 4))
 together = jax.jit(swing).lower(apart).compile()
-assert met(together)
+assert met(together) == {}
 alone = jax.jit(jc.over_devices(lambda _, batch: swing(batch))).lower(0.0, apart).compile()
 assert met(alone) == {}
 same(alone(0.0, apart), together(apart))
+
+# by default: a branch for bodies that turn fast in space, and one for loops in singular positions
+for name in ("chain-5", "four-bar"):
+    built, start = mechanisms.find(name).build(jnp.float64)
+    turning = dataclasses.replace(worlds(start, 8), v=9.0 * worlds(start, 8).v)
+    go = jax.jit(jax.vmap(lambda s: jc.rollout(built, jc.Method(), s, None, 2e-3, 3)[0]))
+    compiled = go.lower(jc.shard(turning)).compile()
+    assert met(compiled) == {}
+    same(compiled(jc.shard(turning)), go(turning))
 
 def refused(words, function, *args, **own):
     try:

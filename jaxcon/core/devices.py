@@ -17,10 +17,9 @@ SHARED, APART = PartitionSpec(), PartitionSpec("worlds")
 def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
     """The same batch with equal parts of its worlds, the first axis, on each device.
 
-    What `jit(vmap(f))` makes of it stays there. Nothing is exchanged where every step has a fixed
-    number of operations; methods that iterate until all worlds are done, as `Projection`, `RATTLE`,
-    `GeneralizedAlpha` and what solves limits and contacts, ask all devices in every iteration.
-    Gradients by numbers that worlds share are sums over all of them. Take `over_devices` for both.
+    What `jit(vmap(f))` makes of it stays there, and nothing is exchanged: loops and branches of a
+    method ask on each device of its own worlds alone. Gradients by numbers that worlds share are
+    sums over all of them; take `over_devices` for these.
 
     Several processes, joined by `jax.distributed.initialize`, all give the same batch and keep
     their parts of it. Where it is large, give keys or starts, and make the batch of them in `jit`.

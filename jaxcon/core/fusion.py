@@ -71,16 +71,26 @@ Step = Operation | list[int]
 """An operation by itself, or the values of a stage."""
 
 
-def settled(function: Any, args: Sequence[Array]) -> list[Array]:
+def settled(
+    function: Any, args: Sequence[Array], last: Callable[..., list[Array]] | None = None
+) -> list[Array]:
     """The results of a native function, cut into stages.
 
     Args:
         function: with `traced`, its closed jaxpr for arguments of some shapes.
         args: its arguments.
+        last: a stage of its own at the end, where there is one: last(*results).
     """
     if not staged():
-        return function(*args)
-    return Stages(traced(function, args))(*args)
+        return function(*args) if last is None else last(*function(*args))
+    stages = Stages(traced(function, args))
+    if last is None:
+        return stages(*args)
+
+    def ended(*args: Array) -> list[Array]:
+        return uninlined(last, stages(*args))
+
+    return _kernel(ended, list(args)) if stages.are_one_kernel else ended(*args)
 
 
 def staged() -> bool:
@@ -110,6 +120,11 @@ class Stages:
             else:
                 self._run(steps, values, wanted)
         return [self.program.evaluate(values, x) for x in self.program.outputs]
+
+    @property
+    def are_one_kernel(self) -> bool:
+        """Whether a kernel may contain all of it."""
+        return len(self.parts) == 1 and all(map(_fits, self.parts[0][0]))
 
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
         """Computes values, stage by stage."""

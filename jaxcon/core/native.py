@@ -19,7 +19,7 @@ checkpoint, and its derivative evaluates the function once more.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -33,6 +33,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core import fusion, meshes
 from jaxcon.core.jaxprs import without_unused
+from jaxcon.core.somewhere import asking
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import spread
 
@@ -65,7 +66,7 @@ class Native:
 
     def __init__(self, function: Callable[..., Any], staged: bool = True) -> None:
         self.function, self.staged = function, staged
-        self.compiled = jax.jit(lambda *args: native_p.bind(*args, fun=self))
+        self.compiled = jax.jit(lambda *args: bound(args, self))
         self.tangent = functools.lru_cache(maxsize=64)(functools.partial(Tangent, self))
         self.transposed = functools.lru_cache(maxsize=64)(functools.partial(Transposed, self))
         self.part = functools.lru_cache(maxsize=64)(functools.partial(Part, self))
@@ -212,6 +213,11 @@ native_p = Primitive("native")
 native_p.multiple_results = True
 
 
+def bound(args: Iterable[Any], fun: Native) -> list[Array]:
+    """The results of a native function, of which loops may ask worlds; see `somewhere.asking`."""
+    return native_p.bind(*args, fun=fun, asks=asking())
+
+
 @functools.lru_cache(maxsize=256)
 def _native(
     function: Callable[..., Any], structure: Any, shapes: Any, staged: bool
@@ -247,7 +253,7 @@ def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> Py
     arrays = [jnp.asarray(x) for x in leaves]
     native, result = _native(function, structure, tuple(x.shape for x in arrays), staged)
     arrays = meshes.together(arrays)
-    arrays = native_p.bind(*arrays, fun=native)  # its trace leaves the structure
+    arrays = bound(arrays, native)  # its trace leaves the structure
     return jax.tree.unflatten(result[0], arrays)
 
 
@@ -256,41 +262,41 @@ def is_real(x: Any) -> bool:
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 
-def _abstract(*args: Any, fun: Native) -> list[Any]:
+def _abstract(*args: Any, fun: Native, asks: Any) -> list[Any]:
     return meshes.typed(fun.shapes(args), args)
 
 
-def _batched(args: Any, axes: Any, *, fun: Native) -> Any:
+def _batched(args: Any, axes: Any, *, fun: Native, asks: Any) -> Any:
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
 
     def last(x: Any, axis: int | None) -> Array:
         x = jnp.asarray(x)  # a constant of the trace may come as a Python number
         return x[..., None] if axis is None else jnp.moveaxis(x, axis, -1)
 
-    results = native_p.bind(*map(last, args, axes), fun=fun)
+    results = bound(map(last, args, axes), fun)
     results = [jnp.broadcast_to(y, (*y.shape[:-1], size)) for y in results]
     return results, [y.ndim - 1 for y in results]
 
 
-def _jvp(primals: Any, tangents: Any, *, fun: Native) -> Any:
-    results = native_p.bind(*primals, fun=fun)
+def _jvp(primals: Any, tangents: Any, *, fun: Native, asks: Any) -> Any:
+    results = bound(primals, fun)
     moved = tuple(type(x) is not ad.Zero for x in tangents)
     given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
-    moving = iter(native_p.bind(*primals, *given, fun=fun.tangent(moved)))
+    moving = iter(bound((*primals, *given), fun.tangent(moved)))
     return results, [
         next(moving) if is_real(y) else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
         for y in results
     ]
 
 
-def _transpose(cotangents: Any, *args: Any, fun: Native) -> Any:
+def _transpose(cotangents: Any, *args: Any, fun: Native, asks: Any) -> Any:
     linear = tuple(ad.is_undefined_primal(x) for x in args)
     fixed = [x for x, flag in zip(args, linear, strict=True) if not flag]
     pairs = zip(args, linear, strict=True)
     avals = tuple((x.aval.shape, x.aval.dtype) for x, flag in pairs if flag)
     cotangents = [ad.instantiate_zeros(x) for x in cotangents]
     transposed = fun.transposed(linear, avals, cotangents[0].ndim)
-    found = iter(native_p.bind(*fixed, *cotangents, fun=transposed))
+    found = iter(bound((*fixed, *cotangents), transposed))
     return [next(found) if flag else None for flag in linear]
 
 
@@ -304,7 +310,7 @@ def _in_stages(*args: Array, fun: Native) -> list[Array]:
     if not (fun.staged and fusion.staged()):
         return squeezed(*fun(*lanes))
     # were it inlined, XLA would copy the results to move the batch to the front
-    return fusion.uninlined(squeezed, fusion.settled(fun, lanes))
+    return fusion.settled(fun, lanes, squeezed)
 
 
 def squeezed(*lanes: Array) -> list[Array]:
@@ -316,7 +322,7 @@ def _lowered(function: Callable[..., Any]) -> Callable[..., Any]:
     """The lowering rule of a function (*args, fun=) that sees shapes and dtypes alone."""
     rule = mlir.lower_fun(function, multiple_results=True)
 
-    def lower(ctx: Any, *args: Any, fun: Native) -> Any:
+    def lower(ctx: Any, *args: Any, fun: Native, asks: Any) -> Any:
         with meshes.apart():
             plain = [meshes.plain(x) for x in ctx.avals_in]
             return rule(ctx.replace(avals_in=plain), *args, fun=fun)
@@ -357,7 +363,7 @@ def _without_unused(wanted: list[bool], *context: Any) -> tuple[list[bool], Any]
     return [True] * len(equation.invars), kept
 
 
-native_p.def_impl(lambda *args, fun: fun.eager(*args))
+native_p.def_impl(lambda *args, fun, asks: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
 mlir.register_lowering(native_p, _lowered(lambda *args, fun: fun(*args)))
 mlir.register_lowering(native_p, _lowered(_in_stages), platform="cpu")

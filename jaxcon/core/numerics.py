@@ -60,8 +60,9 @@ def wrap(angle: Lane) -> Array:
     return angle - turn * jnp.round(angle / turn)
 
 
-TERMS = 11
-"""Of the series of cos r and sin r / r in r², exact to the last place of float64 up to r = π/2."""
+TERMS = {32: 6, 64: 11}
+"""Of the series of cos r and sin r / r in r², by the bits of a float: what the next one would add
+for r up to π/2 is below half of its last place."""
 
 
 def cos_sinc(square: Lane) -> tuple[Array, Array]:
@@ -76,11 +77,17 @@ def cos_sinc(square: Lane) -> tuple[Array, Array]:
     rest = root - half_turns * jnp.pi
     sign = 1 + 4 * jnp.floor(half_turns / 2) - 2 * half_turns
     s = jnp.where(near, square, rest * rest)
-    cos = sinc = jnp.ones_like(s)
-    for k in range(TERMS, 0, -1):
-        cos = 1 - s * cos * (1 / (2 * k * (2 * k - 1)))
-        sinc = 1 - s * sinc * (1 / (2 * k * (2 * k + 1)))
+    cos, sinc = alternating(s, 0), alternating(s, 1)
     return sign * cos, jnp.where(near, sinc, sign * sinc * rest / root)
+
+
+def alternating(s: Array, odd: int) -> Array:
+    """1 − s/(2 + odd)! + s²/(4 + odd)! − …: cos √s, or with odd = 1 sin √s / √s."""
+    terms = TERMS[jnp.finfo(s.dtype).bits]
+    total = jnp.full_like(s, (-1) ** terms / math.factorial(2 * terms + odd))
+    for k in range(terms - 1, -1, -1):
+        total = total * s + (-1) ** k / math.factorial(2 * k + odd)
+    return total
 
 
 BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798)

@@ -32,6 +32,7 @@ import numpy as np
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
 from jaxcon.core.pytree import pytree
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import mask
@@ -334,7 +335,7 @@ class Impact:
         none, one = jnp.zeros_like(self.v), jnp.ones(self.v.shape[1:], self.v.dtype)
         rows, joints = jnp.zeros_like(self.multipliers), jnp.zeros_like(self.joints)
         still = Jump(none, none), Found(none, rows, joints, 0 * one, one)
-        return jax.lax.cond(jnp.any(happens), lambda: self._strikes(still), lambda: still)
+        return jax.lax.cond(somewhere(happens), lambda: self._strikes(still), lambda: still)
 
     def _strikes(self, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
         h, a = self.dt[None], self.acceleration

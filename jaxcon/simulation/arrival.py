@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep, lift
 from jaxcon.dynamics.parts import Outlook
@@ -66,7 +67,7 @@ class Search:
                 gaps = jnp.where(self.outlook.open, self.gaps(known.here), jnp.inf)
                 return keep(going, keep(first, self._begun(gaps), self._nearer(known, gaps)), known)
 
-            return jax.lax.cond(jnp.any(going), try_, lambda: known), None
+            return jax.lax.cond(somewhere(going), try_, lambda: known), None
 
         return jax.lax.scan(once, unknown, jnp.arange(self.tries + 1) == 0)[0]
 

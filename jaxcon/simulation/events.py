@@ -13,6 +13,7 @@ from jaxcon.constraints.bounds import BoundRows, has_ends
 from jaxcon.core import checks, numerics, status
 from jaxcon.core.doubled import rounded
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import Outlook, Part, Struck, look
@@ -262,7 +263,7 @@ class World:
         passed, time = Arrival(flow, gap_of)(given, time, found.happens, least)
         there = dataclasses.replace(passed.state, memory=state.memory)
         struck = Struck(outlook, chosen(found.row, outlook.open), hit)
-        jump, impulses = jax.lax.cond(jnp.any(hit), strike, no_strike, self, there, struck)
+        jump, impulses = jax.lax.cond(somewhere(hit), strike, no_strike, self, there, struck)
         final = keep(found.happens, dataclasses.replace(there, v=there.v + jump), passed.state)
         code = status.first(progress.code, passed.code)
         new = progress._replace(state=final, left=length - time, active=found.happens, code=code)

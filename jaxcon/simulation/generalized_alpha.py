@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxcon.constraints.rows import Rows, layout_of, linearize
 from jaxcon.core import checks, status
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.somewhere import everywhere
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import keep
@@ -179,7 +180,7 @@ def _begun(dynamics: Dynamics, state: State, memory: History) -> tuple[History, 
         fresh = History(a, a, multipliers, memory.started)
         return keep(memory.started, (memory, healthy), (fresh, code))
 
-    return jax.lax.cond(jnp.all(memory.started), lambda: (memory, healthy), look)
+    return jax.lax.cond(everywhere(memory.started), lambda: (memory, healthy), look)
 
 
 def projected(dynamics: Dynamics, q: Array, v: Array, t: Any) -> tuple[Array, Array]:

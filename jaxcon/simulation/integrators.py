@@ -20,6 +20,7 @@ from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks, numerics, status
 from jaxcon.core.doubled import Doubled
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.forward import Dynamics
@@ -61,7 +62,7 @@ def reached(state: State, time: Any, dt: Array) -> Doubled:
 
 
 Pair = tuple[Any, Any]
-TURN = 0.0125
+TURN = 0.025
 """Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `missed`."""
 
 
@@ -97,8 +98,8 @@ class SemiImplicitEuler(Explicit):
 
     In space, bodies turn freely for half a step before and after the acceleration acts on them
     (`BodySystem.kick`). A free body so keeps |Iω| and its energy up to turns of a radian a step.
-    Where a body turns by more than 0.0125 rad in a step, what the linearized rows missed of φ is
-    taken out by a second substitution with the factors of the step, in full from 0.025 rad on. Such
+    Where a body turns by more than 0.025 rad in a step, what the linearized rows missed of φ is
+    taken out by a second substitution with the factors of the step, in full from 0.05 rad on. Such
     a step takes about half as long again. Without it, energy would grow with (h|ω|)³, and motions
     of a radian in a few steps would end NON_FINITE.
 
@@ -194,7 +195,7 @@ def missed(
     The rows promise φ⁺ = φ + h p + h² φ̈, with φ̈ = J a + γ and p = φ̇ − ½hγ. At q ⊕ h v⁺ they are
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
 
-    Most steps turn bodies by less than `TURN`, where e is about 1e-6 of a lever arm, and pay for
+    Most steps turn bodies by less than `TURN`, where e is about 1e-5 of a lever arm, and pay for
     the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist. Where an
     inequality constraint acts, nothing is taken out, since that would move its row off its target.
 
@@ -226,7 +227,7 @@ def missed(
     def nothing() -> Solution:
         return jax.tree.map(jnp.zeros_like, solution)
 
-    return jax.lax.cond(jnp.any(share > 0), corrected, nothing)
+    return jax.lax.cond(somewhere(share > 0), corrected, nothing)
 
 
 def added(solution: Solution, more: Solution) -> Solution:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
 from jaxcon.core.pytree import exportable, pytree, static
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
@@ -172,7 +173,7 @@ class Recovery:
             wanted |= again & failed(self.judge(system, state))
         args = (self.projector, system, solver, back, wanted, dt)
         # most steps of most batches need none
-        projected, code = jax.lax.cond(jnp.any(wanted), _project, _leave, *args)
+        projected, code = jax.lax.cond(somewhere(wanted), _project, _leave, *args)
         done = ~failed(code)
         note = jnp.where(done, Status.PROJECTED, Status.ROLLED_BACK).astype(jnp.int32)
         return keep(done, projected, back), note

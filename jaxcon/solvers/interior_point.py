@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan
 from jaxcon.solvers.bounded import Bounded, Kinds
@@ -75,7 +76,7 @@ class InteriorPoint:
 
         def going(known: tuple[Any, Point]) -> Array:
             count, point = known
-            return (count < self.iterations) & jnp.any(unfinished(scaled, point))
+            return (count < self.iterations) & somewhere(unfinished(scaled, point))
 
         def once(known: tuple[Any, Point]) -> tuple[Any, Point]:
             count, point = known

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan
 from jaxcon.solvers.bounded import Bounded, Parts
@@ -62,7 +63,7 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
 
     def going(known: tuple[Any, Tried, Tried]) -> Array:
         count, _, best = known
-        return (count < 5 * rounds) & jnp.any(unmet(count, best))
+        return (count < 5 * rounds) & somewhere(unmet(count, best))
 
     def once(known: tuple[Any, Tried, Tried]) -> tuple[Any, Tried, Tried]:
         count, here, best = known

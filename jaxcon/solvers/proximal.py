@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.somewhere import everywhere
 from jaxcon.core.status import Status, failed, first
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import keep, per_world
@@ -97,7 +98,7 @@ class RankSafe:
             def rescued() -> Solution:
                 return keep(settled, known, self._iterated(system)(force, target))
 
-            return jax.lax.cond(jnp.all(settled), lambda: known, rescued)
+            return jax.lax.cond(everywhere(settled), lambda: known, rescued)
 
         return solve
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 
 Operator = Callable[[Array], Array]
@@ -96,7 +97,7 @@ def settle(
 
     def unsettled(known: tuple[Array, Array, Array]) -> Array:
         count, x, step = known
-        return (count < rounds) & jnp.any(goes(x, step))
+        return (count < rounds) & somewhere(goes(x, step))
 
     def once(known: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         count, x, step = known

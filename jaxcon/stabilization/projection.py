@@ -14,6 +14,7 @@ import numpy as np
 from jaxcon.constraints.rows import RowLayout, Rows, linearize
 from jaxcon.core import checks, numerics, status
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import lift
@@ -163,7 +164,7 @@ class Projection(Unstabilized):
         def rest(q: Array, v: Array) -> tuple[Array, Array, Array]:
             return q, v, jnp.zeros_like(state.status)
 
-        q, v, code = jax.lax.cond(jnp.any(due), go, rest, state.q, state.v)
+        q, v, code = jax.lax.cond(somewhere(due), go, rest, state.q, state.v)
         q, v = (jnp.where(lift(due, x), x, y) for x, y in ((q, state.q), (v, state.v)))
         return dataclasses.replace(state, q=q, v=v), jnp.where(due, code, Status.OK)
 
@@ -231,7 +232,7 @@ class Projection(Unstabilized):
         def iterate(_: Any, d: Array) -> tuple[Array, Array]:
             def wanted(known: tuple[Array, ...]) -> Array:
                 count, _, left, before = known
-                return (count < self.iterations) & jnp.any(goes(_largest(left), before))
+                return (count < self.iterations) & somewhere(goes(_largest(left), before))
 
             def once(known: tuple[Array, ...]) -> tuple[Array, ...]:
                 count, d, left, before = known
