@@ -90,6 +90,10 @@ class Progress:
     costs: tuple[float, ...] = ()
     stopped: str = ""
 
+    def goes_on(self, steps: int) -> bool:
+        """True if the fit is not finished and fewer than so many steps were taken."""
+        return not self.stopped and len(self.costs) <= steps
+
 
 def least_squares(
     known: Progress,
@@ -109,7 +113,7 @@ def least_squares(
     for a step.
 
     Args:
-        known: the start, or how far it came before; r must be finite there.
+        known: the start, or how far it came before.
         limits: (low, high), each (n,).
         steps: at most so many since the start.
         precision: of r.
@@ -121,10 +125,13 @@ def least_squares(
         Moré, The Levenberg–Marquardt algorithm: implementation and theory (1978).
     """
     r, J = yield known.z
-    known = known if known.costs else dataclasses.replace(known, costs=(_cost(r, J),))
+    if not known.costs:
+        cost = _cost(r, J)
+        stopped = "" if np.isfinite(cost) else _stuck(r, J)
+        known = dataclasses.replace(known, costs=(cost,), stopped=stopped)
     here, broken = (known, r, J), ""
     try:
-        while not here[0].stopped and len(here[0].costs) <= steps:
+        while here[0].goes_on(steps):
             here = yield from _step(*here, limits, reach, precision)
             note(here[0])
     except ENDS as error:
