@@ -62,13 +62,13 @@ def test_a_far_start_does_not_lead_out_of_all_numbers(start):
     assert not found.untold
 
 
-@pytest.mark.parametrize(("steps", "noise"), [(120, 0.05), (200, 0.0), (600, 0.05)])
+@pytest.mark.parametrize(("steps", "noise"), [(120, 0.1), (200, 0.0), (600, 0.15)])
 def test_local_minima_of_long_recordings_are_left_by_way_of_their_first_parts(steps, noise):
     """A fit of the whole at once ends at k = 76 or k = 46 from most of these starts."""
     height, truth = scenes.hanging(steps=steps), {"stiffness": 8.0, "damping": 1.0}
-    data = height(truth) + noise * np.random.default_rng(0).normal(size=steps)
+    data = height(truth) + noise * np.random.default_rng(1).normal(size=steps)
     near = jc.identify(height, truth, data, positive=True)
-    for factors in ((1.0, 30.0), (5.0, 5.0), (30.0, 0.03), (30.0, 30.0)):
+    for factors in ((0.178, 31.6), (5.6, 5.6), (31.6, 0.03), (31.6, 31.6)):
         guess = {name: truth[name] * x for name, x in zip(truth, factors, strict=True)}
         found = jc.identify(height, guess, data, positive=True)
         assert found.converged, factors
@@ -416,15 +416,17 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(
     calls_until_killed = (2, 3, 4, 6)
     if kind == "parts":
         times = 0.05 * jnp.arange(80.0)
-        problem = (lambda rate: jnp.cos(rate * times), jnp.asarray(6.0), data.ravel())
-        calls_until_killed = (6, 6, 6, 6)
+        problem = (lambda rate: jnp.cos(rate * times), jnp.asarray(5.0), data.ravel())
+        calls_until_killed = (20, 30, 10, 15)  # of 77, of which the first 42 fit the whole
     elif kind == "stretches":
         options["nodes"] = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(4)}
         problem = (oscillate, jnp.asarray(4.0), data)
     else:
         problem = (lambda p: jnp.exp(-p["d"] * jnp.arange(4.0)) * p["a"],)
         problem += ({"d": 1.0, "a": 1.0}, np.array([2.0, 1.0, 0.6, 0.4]))
-    whole = jc.identify(*problem, **options)
+    with monkeypatch.context() as patch:
+        calls_of_whole = interrupt(patch, lambda seen: False)
+        whole = jc.identify(*problem, **options)
     ended = 0
     for calls in calls_until_killed:
         with monkeypatch.context() as patch:
@@ -438,7 +440,10 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(
         interrupt(patch, lambda seen: len(seen) == 3)
         part = jc.identify(*problem, checkpoint=file, **options)
     assert "interrupted" in part.stopped
-    again = jc.identify(*problem, checkpoint=file, **options)
+    with monkeypatch.context() as patch:
+        calls_of_rest = interrupt(patch, lambda seen: False)
+        again = jc.identify(*problem, checkpoint=file, **options)
+    assert kind != "parts" or len(calls_of_rest) < len(calls_of_whole) / 3
     for name in ("params", "errors", "noise", "costs", "ends"):
         for x, y in zip(*(jax.tree.leaves(getattr(f, name)) for f in (again, whole)), strict=True):
             np.testing.assert_array_equal(x, y, err_msg=name)

@@ -23,6 +23,8 @@ HORIZONS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
 """Parts of a recording that are fitted one after another where the fit of the whole is poor."""
 EXCESS = 2.0
 """Ratio of residuals to their noise above which the noise does not explain them."""
+DOUBT = 1.2
+"""Ratio above which parts of the recording are tried; that costs time and spoils nothing."""
 PROGRAM = "the simulation, another option, or the version of jax"
 """What the compiled program tells apart."""
 
@@ -56,9 +58,9 @@ class Attempt:
     after each decade, since how well ends should meet nodes depends on it. Without nodes there is
     one decade, and nothing depends on it.
 
-    The longer an oscillation is recorded, the more local minima the fit has. If noise does not
-    explain the residuals of a fit without nodes, a second one goes from the start through longer
-    and longer parts of the recording. The better of the two counts.
+    The longer an oscillation is recorded, the more local minima the fit has. If the residuals of a
+    fit without nodes exceed their noise, a second one goes from the start through longer and longer
+    parts of the recording. The better of the two counts.
 
     Attributes:
         problem: the recording.
@@ -98,7 +100,7 @@ class Attempt:
             end = End((yield from self._fitted(self.direct)), self.noise)
         else:
             end = yield from self._by_decades()
-            if end.broken or self.problem.gaps or not unexplained(self.problem, end):
+            if end.broken or self.problem.gaps or not unexplained(self.problem, end, DOUBT):
                 return end
             self.direct, self.known = self.known, Progress(self.begin)
         return (yield from self._by_horizons(end))
@@ -241,10 +243,10 @@ def remaining(problem: Stretches, fit: Fit, J: np.ndarray, noise: float) -> floa
     return noise_left(dataclasses.replace(fit, jacobian=J), rows, problem.observed, told)
 
 
-def unexplained(problem: Stretches, end: End) -> bool:
-    """True if noise and rounding do not explain the residuals; False if that is not known."""
+def unexplained(problem: Stretches, end: End, excess: float = EXCESS) -> bool:
+    """True if residuals exceed noise and rounding by this ratio; False if that is not known."""
     residual = end.fit.residual
-    return problem.share(residual, end.noise) > 0 and problem.excess(residual) > EXCESS
+    return problem.share(residual, end.noise) > 0 and problem.excess(residual) > excess
 
 
 def searched(

@@ -156,9 +156,9 @@ def identify(
     argmin Σ ((simulate(params) − data) / noise)², with derivatives in forward mode: for up to some
     tens of parameters. For more, `tune` a loss by `losses.tracking`.
 
-    A fit of a long oscillation has local minima. If noise does not explain the residuals, a second
-    fit goes from the start through longer and longer parts of the recording, and the better one
-    counts. Time is taken to be the longest axis of each leaf of the data.
+    A fit of a long oscillation has local minima. If the residuals exceed their noise, a second fit
+    goes from the start through longer and longer parts of the recording. The better one counts.
+    Time is taken to be the longest axis of each leaf of the data.
 
     Recordings longer than the motion can be foreseen, or so long that the least of the sum is hard
     to reach, are cut into stretches (multiple shooting). Their first states, the nodes, are unknown
