@@ -26,23 +26,23 @@ EXCESS = 2.0
 DOUBT = 1.2
 """Ratio above which parts of the recording are tried; that costs time and spoils nothing."""
 PROGRAM = "the simulation, another option, or the version of jax"
-"""What the compiled program tells apart."""
+"""Causes of a different compiled program, for the error message."""
 
 
 class End(NamedTuple):
-    """Where a start led, and the noise by which its residuals were divided."""
+    """The fit that a start led to, and the noise by which its residuals were divided."""
 
     fit: Fit
     noise: float
 
     @property
     def cost(self) -> float:
-        """½ ‖r‖² as if they had not been."""
+        """½ ‖r‖² in the units of residuals that were not divided."""
         return float(self.noise**2 * self.fit.costs[-1])
 
     @property
     def broken(self) -> bool:
-        """Whether it was ended from outside."""
+        """True if the search was ended from outside."""
         return self.fit.broken
 
     def broken_by(self, reason: str) -> End:
@@ -65,12 +65,12 @@ class Attempt:
     Attributes:
         problem: the recording.
         begin: its parameters by their scale, (p,).
-        continuity: by how much ends may miss nodes at last.
-        steps: for each decade and each horizon.
-        widths: by how much they may in each; empty before the start was looked at.
-        noise: by which that of the data is multiplied.
-        decade: which it is in.
-        known: how far it has come there.
+        continuity: standard deviation of the gaps between ends and nodes in the last decade.
+        steps: the limit for each decade and each part of the recording.
+        widths: standard deviation of the gaps by decade; empty before the start was evaluated.
+        noise: factor on the noise of the data.
+        decade: index of the present decade.
+        known: progress of the present fit.
         direct: the finished fit of the whole recording, once parts of it are fitted; else None.
         horizon: index of the part that is fitted, in `HORIZONS`.
     """
@@ -174,11 +174,11 @@ class Attempt:
             found, how = ((r, J),), fit.send
 
     def note(self, known: Progress) -> None:
-        """Takes over how far it has come."""
+        """Records the progress of the present fit."""
         self.known = known
 
     def _look(self) -> Any:
-        """The decades, by how much ends miss nodes at the start."""
+        """Evaluates the start, and derives the decades from its gaps."""
         problem, start = self.problem, np.append(self.begin, self.problem.nodes)
         residual, slopes = yield start, 1.0, 1.0
         if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slopes))):
@@ -193,7 +193,7 @@ class Attempt:
         self.widths = tuple(widths)
 
     def _narrow(self, fit: Fit) -> None:
-        """On to the next decade."""
+        """Goes on to the next decade, with the noise estimated again."""
         if self._estimated:
             problem, width = self.problem, self.widths[self.decade]
             left = remaining(problem, fit, problem.condensed(fit.jacobian, width), self.noise)
@@ -208,7 +208,7 @@ class Attempt:
 
     @property
     def contents(self) -> dict[str, np.ndarray]:
-        """What a checkpoint holds of it; nothing of unknowns before the start was looked at."""
+        """Arrays for a checkpoint; z is empty before the start was evaluated."""
         fields = {name: getattr(self, name) for name in ("widths", "noise", "decade", "horizon")}
         fields |= _contents(self.known)
         fields |= {f"direct_{name}": x for name, x in _contents(self.direct).items()}
@@ -238,7 +238,7 @@ def _restored(contents: dict[str, np.ndarray], prefix: str = "") -> Progress | N
 
 
 def remaining(problem: Stretches, fit: Fit, J: np.ndarray, noise: float) -> float:
-    """The noise that a fit leaves, by that with which it began; J is condensed."""
+    """The ratio of the noise left by a fit to the noise it began with; J is condensed."""
     rows, told = fit.residual.size - problem.gaps, problem.told(noise)
     return noise_left(dataclasses.replace(fit, jacobian=J), rows, problem.observed, told)
 
@@ -252,10 +252,10 @@ def unexplained(problem: Stretches, end: End, excess: float = EXCESS) -> bool:
 def searched(
     problem: Stretches, attempts: list[Attempt], save: Callable[[], None], progress: bool | None
 ) -> list[End | None]:
-    """Where starts led, looked at in one batch; None where one could not begin.
+    """Runs all starts in one batch; returns their ends, None for a start that is not finite.
 
     Raises:
-        ValueError: none could.
+        ValueError: no start is finite.
     """
 
     def evaluate(asked: dict[int, Any]) -> dict[int, Any]:
@@ -274,7 +274,7 @@ def searched(
 
 
 def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Callable[[], None]:
-    """What writes attempts to a file, after they went on from what was written there before.
+    """Restores attempts from a file, if it exists; returns a function that writes them to it.
 
     Raises:
         ValueError: the file holds something else.
@@ -296,7 +296,7 @@ def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Calla
 
 
 def _about(problem: Stretches, attempts: list[Attempt]) -> dict[str, Any]:
-    """What a checkpoint belongs to."""
+    """The properties of a search that must match those in a checkpoint, by their description."""
     first, space = attempts[0], problem.space
     limits: PyTree = [*space.low, *space.high]
     numbers = [np.asarray(x) for x in jax.tree.leaves(problem.seen)]

@@ -30,10 +30,10 @@ from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.stretches import Stretches
 
 VAGUE = 1.0
-"""Standard deviation of a relative change from which on the data do not tell it: a factor of e."""
+"""Standard deviation of a relative change above which it is not identified: a factor of e."""
 
 ALIKE = 1e-2
-"""By what the ends of two starts may differ, relative, to be called alike."""
+"""Relative difference of costs below which two starts ended alike."""
 
 
 @dataclass(frozen=True)
@@ -254,17 +254,17 @@ def _check_nodes(nodes: PyTree) -> None:
 
 
 def _ignore() -> None:
-    """A search that nobody wants on disk."""
+    """Does nothing: no checkpoint was asked for."""
 
 
 def _scale(space: Space, y: Array) -> Array:
-    """By what coordinates are divided: 1 for logarithms and what starts near 0, |y| for others."""
+    """Divisors of coordinates: 1 for logarithms and for starts near 0, else |y|."""
     none = jnp.abs(y) <= float(jnp.finfo(y.dtype).eps) ** 0.5
     return jnp.where(space.logarithms | none, 1, jnp.abs(y))
 
 
 def _report(problem: Stretches, end: End, continuity: float, ends: np.ndarray) -> Identified:
-    """What a fit says of the parameters, whatever the nodes are.
+    """The result of the best fit, with errors of parameters for free nodes.
 
     Args:
         problem: the recording.

@@ -20,7 +20,7 @@ from jaxcon.learning.leaves import Space
 from jaxcon.learning.losses import misfit
 
 FARTHEST = float(np.log(10.0))
-"""By how much a logarithm may change in a step."""
+"""Largest change of a logarithm in a step."""
 NEIGHBORS = 16
 """Least number of differences of neighbors from which their noise is estimated."""
 
@@ -99,12 +99,12 @@ class Stretches:
 
     @property
     def observed(self) -> int:
-        """How many numbers were seen."""
+        """The count of numbers in the data that are not NaN."""
         return sum(int(np.sum(np.isfinite(x))) for x in jax.tree.leaves(self.data))
 
     @property
     def gaps(self) -> int:
-        """How many of the residuals, the last ones, are gaps between stretches."""
+        """The count of gaps between stretches; they are the last residuals."""
         stretches, n = self.nodes.shape
         return (stretches - 1) * n
 
@@ -117,19 +117,19 @@ class Stretches:
 
     @property
     def reach(self) -> np.ndarray:
-        """By how much each of the unknowns may change in a step."""
+        """The largest change of each unknown in a step."""
         none = np.full(self.nodes.size, np.inf)
         return np.append(np.where(self.space.logarithms, FARTHEST, np.inf), none)
 
     @property
     def rounding(self) -> float:
-        """What rounding makes of each number that was seen."""
+        """The typical rounding error of a number in the data."""
         spacing = float(jnp.finfo(self.scale.dtype).eps)
         return spacing * self.size / max(self.observed, 1) ** 0.5
 
     @property
     def least(self) -> float:
-        """The same, or 1 where all are 0."""
+        """The rounding error of the data, or 1 if all data are 0."""
         return self.rounding or 1.0
 
     def typical(self, residual: np.ndarray) -> float:
@@ -197,13 +197,13 @@ class Stretches:
         return min(_scatters(seen), default=np.nan)
 
     def precision(self, continuity: float, noise: float = 1.0) -> Precision:
-        """Of the residuals, in the dtype in which they are computed."""
+        """The precision of residuals in the dtype in which they are computed."""
         ends = float(np.linalg.norm(self.nodes)) / continuity
         tolerance = float(jnp.finfo(self.scale.dtype).eps) ** 0.5
         return Precision(tolerance, float(np.hypot(self.size / noise, ends)))
 
     def told(self, noise: float) -> Precision:
-        """Of what residuals of the data alone tell, gaps being unknowns of their own."""
+        """The precision of residuals of the data alone, with gaps as unknowns."""
         return dataclasses.replace(self.precision(np.inf), size=self.size / noise)
 
     def condensed(self, J: np.ndarray, continuity: float) -> np.ndarray:
@@ -228,7 +228,7 @@ class Stretches:
         return np.concatenate([data @ T, alone])
 
     def widths(self, residual: np.ndarray, continuity: float) -> list[float]:
-        """By how much ends may miss nodes, from what they do at the start, by decades.
+        """Standard deviations of the gaps by decade, from their size at the start downwards.
 
         A search that had to keep them together from the start would creep along a narrow valley.
         """
@@ -252,7 +252,7 @@ class Stretches:
         return [self._rows(x, own, *p[1:]) for x, own, p in zip(x, each, points, strict=True)]
 
     def program(self, starts: int) -> str:
-        """What is computed for so many points, in the compiler's words."""
+        """The lowered program that evaluates this many points, as text."""
         x = jnp.zeros((starts, *self._begins(self.start).shape), self.scale.dtype)
         return self._derivatives.lower(x, *self.seen).as_text()
 

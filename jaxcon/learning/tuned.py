@@ -1,4 +1,4 @@
-"""What a search by gradients found."""
+"""The result of a search by gradients."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Tuned:
 
     @property
     def table(self) -> dict[str, str]:
-        """What was found, in words, by leaf; long arrays by their shape."""
+        """The parameters as text, by name of leaf; long arrays by their shape."""
         leaves = jax.tree_util.tree_leaves_with_path(self.params)
         named = (
             (jax.tree_util.keystr(k, simple=True, separator="/"), np.asarray(x)) for k, x in leaves
@@ -100,7 +100,7 @@ class Tuned:
 def result(
     space: Space, starts: tuple[Array, ...], search: Search, losses: np.ndarray, broken: str
 ) -> Tuned:
-    """What the best start found.
+    """The result of the best start.
 
     Args:
         space: of the parameters.
