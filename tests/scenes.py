@@ -452,8 +452,8 @@ def arm(*elements: Any, dim: int = 2) -> tuple[Any, jc.State]:
     return scene.build()
 
 
-def hanging(dtype: Any = None) -> Any:
-    """A bob on a rod and a spring, and its height over 0.6 s by stiffness and damping."""
+def hanging(dtype: Any = None, steps: int = 60) -> Any:
+    """A bob on a rod and a spring: its height by stiffness and damping, every 10 ms for 0.6 s."""
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -463,7 +463,7 @@ def hanging(dtype: Any = None) -> Any:
 
     def height(p: Any) -> jax.Array:
         own, record = system.with_params({"spring": p}), lambda s, i: s.q[1]
-        last, y = jc.rollout(own, jc.Method(), state, None, 1e-2, 60, record=record)
+        last, y = jc.rollout(own, jc.Method(), state, None, 1e-2, steps, record=record)
         return jc.losses.unless_failed(y, last)
 
     return height

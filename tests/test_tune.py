@@ -132,6 +132,32 @@ def test_the_default_search_gets_to_the_end_of_a_narrow_valley(dtype, start, clo
     assert found.history[found.best_step] == found.loss
 
 
+@pytest.mark.parametrize("factors", [(0.03, 0.03), (1.0, 30.0), (30.0, 0.03), (30.0, 30.0)])
+def test_a_search_ends_no_worse_than_it_began_and_converges_to_minima_alone(factors):
+    """A fit of 6 s has local minima, and one without damping, which lies beyond all logarithms."""
+    height = scenes.hanging(steps=600)
+    seen = height(SPRING)
+
+    def loss(log):
+        stiffness, damping = jnp.exp(log)
+        return jc.losses.tracking(height({"stiffness": stiffness, "damping": damping}), seen)
+
+    start = np.array(list(SPRING.values())) * factors
+    guess = dict(zip(SPRING, start, strict=True))
+    found = jc.tune(
+        lambda p: loss(jnp.log(jnp.stack([p[x] for x in SPRING]))), guess, positive=True
+    )
+    assert found.loss <= found.history[0]
+    log = np.log([found.params[x] for x in SPRING])
+    if found.converged:
+        curvature, slope = jax.hessian(loss)(log), jax.grad(loss)(log)
+        assert np.linalg.eigvalsh(curvature)[0] > 0
+        assert np.abs(np.linalg.solve(curvature, slope)).max() < 1e-3
+        assert "may be a local one" in found.stopped
+    else:
+        assert "before it converged" in found.stopped
+
+
 def test_a_slide_through_a_valley_is_not_called_converged():
     """It hardly lowers the loss any more, by 1e-10 a step."""
     adam = optax.adam(optax.cosine_decay_schedule(0.1, 150))

@@ -17,27 +17,37 @@ from jaxcon.core.ends import ENDS, bar, words
 from jaxcon.core.typing import PyTree
 from jaxcon.learning.information import noise_left
 from jaxcon.learning.least_squares import Fit, Progress, least_squares, side_by_side
-from jaxcon.learning.stretches import Stretches
+from jaxcon.learning.stretches import FARTHEST, Stretches
 
+HORIZONS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+"""Parts of a recording that are fitted one after another where the fit of the whole is poor."""
+EXCESS = 2.0
+"""Ratio of residuals to their noise above which the noise does not explain them."""
+DOUBT = 1.2
+"""Ratio above which parts of the recording are tried; that costs time and spoils nothing."""
 PROGRAM = "the simulation, another option, or the version of jax"
-"""What the compiled program tells apart."""
+"""Causes of a different compiled program, for the error message."""
 
 
 class End(NamedTuple):
-    """Where a start led, and the noise by which its residuals were divided."""
+    """The fit that a start led to, and the noise by which its residuals were divided."""
 
     fit: Fit
     noise: float
 
     @property
     def cost(self) -> float:
-        """½ ‖r‖² as if they had not been."""
+        """½ ‖r‖² in the units of residuals that were not divided."""
         return float(self.noise**2 * self.fit.costs[-1])
 
     @property
     def broken(self) -> bool:
-        """Whether it was ended from outside."""
+        """True if the search was ended from outside."""
         return self.fit.broken
+
+    def broken_by(self, reason: str) -> End:
+        """A copy marked as ended from outside for this reason."""
+        return End(dataclasses.replace(self.fit, stopped=reason, broken=True), self.noise)
 
 
 @dataclass
@@ -48,15 +58,21 @@ class Attempt:
     after each decade, since how well ends should meet nodes depends on it. Without nodes there is
     one decade, and nothing depends on it.
 
+    The longer an oscillation is recorded, the more local minima the fit has. If the residuals of a
+    fit without nodes exceed their noise, a second one goes from the start through longer and longer
+    parts of the recording. The better of the two counts.
+
     Attributes:
         problem: the recording.
         begin: its parameters by their scale, (p,).
-        continuity: by how much ends may miss nodes at last.
-        steps: for each decade.
-        widths: by how much they may in each; empty before the start was looked at.
-        noise: by which that of the data is multiplied.
-        decade: which it is in.
-        known: how far it has come there.
+        continuity: standard deviation of the gaps between ends and nodes in the last decade.
+        steps: the limit for each decade and each part of the recording.
+        widths: standard deviation of the gaps by decade; empty before the start was evaluated.
+        noise: factor on the noise of the data.
+        decade: index of the present decade.
+        known: progress of the present fit.
+        direct: the finished fit of the whole recording, once parts of it are fitted; else None.
+        horizon: index of the part that is fitted, in `HORIZONS`.
     """
 
     problem: Stretches
@@ -67,6 +83,8 @@ class Attempt:
     noise: float = 1.0
     decade: int = 0
     known: Progress | None = None
+    direct: Progress | None = None
+    horizon: int = 0
 
     def run(self) -> Generator[Any, Any, End]:
         """Yields (unknowns, continuity, noise) and is sent (r, J) there; returns where it ended.
@@ -76,30 +94,91 @@ class Attempt:
         """
         if not self.widths:
             yield from self._look()
+        if self.direct is not None and self.direct.goes_on(self.steps):  # more were asked for
+            self.known, self.direct, self.horizon = self.direct, None, 0
+        if self.direct is not None:
+            end = End((yield from self._fitted(self.direct)), self.noise)
+        else:
+            end = yield from self._by_decades()
+            if end.broken or self.problem.gaps or not unexplained(self.problem, end, DOUBT):
+                return end
+            self.direct, self.known = self.known, Progress(self.begin)
+        return (yield from self._by_horizons(end))
+
+    def _by_decades(self) -> Generator[Any, Any, End]:
+        """Fits the whole recording, with narrower gaps from decade to decade."""
         end = None
         while True:
-            width, noise = self.widths[self.decade], self.noise
-            precision = self.problem.precision(width, noise)
-            assert self.known is not None
-            limits, reach = self.problem.limits, self.problem.reach
-            fit = least_squares(self.known, limits, self.steps, precision, self.note, reach)
             try:
-                end = End((yield from _at(fit, width, noise)), noise)
+                end = End((yield from self._fitted(self.known)), self.noise)
             except ENDS as error:
                 if end is None:
                     raise  # there is nothing to be lost
-                broken = dataclasses.replace(end.fit, stopped=words(error), broken=True)
-                return End(broken, end.noise)
+                return end.broken_by(words(error))
             if end.broken or self.decade + 1 == len(self.widths):
                 return end
             self._narrow(end.fit)
 
+    def _by_horizons(self, direct: End) -> Generator[Any, Any, End]:
+        """Fits longer and longer parts of the recording; returns the better of this and `direct`.
+
+        Parts with no more numbers than parameters are skipped.
+        """
+        fit, scatter = direct.fit, self.problem.scatter(direct.fit.residual)
+        while True:
+            share = HORIZONS[self.horizon]
+            if self.problem.observed_until(share) > self.begin.size:
+                # without a prior, parameters that a short part hardly tells would follow its noise
+                tie = scatter / FARTHEST if share < 1 else 0.0
+                try:
+                    fit = yield from self._fitted(self.known, share, tie)
+                except ENDS as error:
+                    return direct.broken_by(words(error))
+                if fit.broken:
+                    return direct.broken_by(fit.stopped)
+                self.known = Progress(fit.z) if share < 1 else self.known
+            if share == HORIZONS[-1]:
+                return min(direct, End(fit, self.noise), key=lambda end: end.cost)
+            self.horizon += 1
+
+    def _fitted(
+        self, known: Progress | None, horizon: float = 1.0, tie: float = 0.0
+    ) -> Generator[Any, Any, Fit]:
+        """Fits a part of the recording.
+
+        Args:
+            known: where the fit begins.
+            horizon: end of the part, as a share of the time.
+            tie: weight of the rows tie · (z − begin), a prior on the parameters.
+        """
+        assert known is not None
+        problem, width, noise = self.problem, self.widths[self.decade], self.noise
+        precision = problem.precision(width, noise)
+        fit = least_squares(known, problem.limits, self.steps, precision, self.note, problem.reach)
+        found: Any = ()
+        how: Callable[..., Any] = functools.partial(next, fit)
+        while True:
+            try:
+                z = how(*found)
+            except StopIteration as end:
+                return end.value
+            try:
+                r, J = yield z, width, noise
+            except ENDS as error:
+                found, how = (error,), fit.throw
+                continue
+            r, J = problem.until(horizon, r, J)
+            if tie:
+                r = np.append(r, tie * (z - self.begin))
+                J = np.concatenate([J, tie * np.eye(z.size)])
+            found, how = ((r, J),), fit.send
+
     def note(self, known: Progress) -> None:
-        """Takes over how far it has come."""
+        """Records the progress of the present fit."""
         self.known = known
 
     def _look(self) -> Any:
-        """The decades, by how much ends miss nodes at the start."""
+        """Evaluates the start, and derives the decades from its gaps."""
         problem, start = self.problem, np.append(self.begin, self.problem.nodes)
         residual, slopes = yield start, 1.0, 1.0
         if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slopes))):
@@ -114,7 +193,7 @@ class Attempt:
         self.widths = tuple(widths)
 
     def _narrow(self, fit: Fit) -> None:
-        """On to the next decade."""
+        """Goes on to the next decade, with the noise estimated again."""
         if self._estimated:
             problem, width = self.problem, self.widths[self.decade]
             left = remaining(problem, fit, problem.condensed(fit.jacobian, width), self.noise)
@@ -129,49 +208,54 @@ class Attempt:
 
     @property
     def contents(self) -> dict[str, np.ndarray]:
-        """What a checkpoint holds of it; nothing of unknowns before the start was looked at."""
-        known = self.known or Progress(np.zeros(0))
-        fields = dataclasses.asdict(known) | {
-            name: getattr(self, name) for name in ("widths", "noise", "decade")
-        }
+        """Arrays for a checkpoint; z is empty before the start was evaluated."""
+        fields = {name: getattr(self, name) for name in ("widths", "noise", "decade", "horizon")}
+        fields |= _contents(self.known)
+        fields |= {f"direct_{name}": x for name, x in _contents(self.direct).items()}
         return {name: np.asarray(x) for name, x in fields.items()}
 
     def restore(self, contents: dict[str, np.ndarray]) -> None:
         """Goes on from a checkpoint."""
         self.widths = tuple(contents["widths"].tolist())
-        self.noise, self.decade = float(contents["noise"]), int(contents["decade"])
-        if self.widths:
-            costs, stopped = tuple(contents["costs"].tolist()), str(contents["stopped"])
-            self.known = Progress(contents["z"], float(contents["damping"]), costs, stopped)
+        self.noise = float(contents["noise"])
+        self.decade, self.horizon = int(contents["decade"]), int(contents["horizon"])
+        self.known, self.direct = _restored(contents), _restored(contents, "direct_")
+
+
+def _contents(known: Progress | None) -> dict[str, Any]:
+    """Fields of a `Progress` for a checkpoint; z is empty for None."""
+    return dataclasses.asdict(known or Progress(np.zeros(0)))
+
+
+def _restored(contents: dict[str, np.ndarray], prefix: str = "") -> Progress | None:
+    """The `Progress` in a checkpoint, None if z is empty."""
+    z, damping, costs, stopped = (
+        contents[prefix + field.name] for field in dataclasses.fields(Progress)
+    )
+    if not z.size:
+        return None
+    return Progress(z, float(damping), tuple(costs.tolist()), str(stopped))
 
 
 def remaining(problem: Stretches, fit: Fit, J: np.ndarray, noise: float) -> float:
-    """The noise that a fit leaves, by that with which it began; J is condensed."""
+    """The ratio of the noise left by a fit to the noise it began with; J is condensed."""
     rows, told = fit.residual.size - problem.gaps, problem.told(noise)
     return noise_left(dataclasses.replace(fit, jacobian=J), rows, problem.observed, told)
 
 
-def _at(fit: Any, width: float, noise: float) -> Any:
-    """A fit that asks for residuals of this continuity and noise."""
-    found, how = (), functools.partial(next, fit)
-    while True:
-        try:
-            z = how(*found)
-        except StopIteration as end:
-            return end.value
-        try:
-            found, how = ((yield z, width, noise),), fit.send
-        except ENDS as error:
-            found, how = (error,), fit.throw
+def unexplained(problem: Stretches, end: End, excess: float = EXCESS) -> bool:
+    """True if residuals exceed noise and rounding by this ratio; False if that is not known."""
+    residual = end.fit.residual
+    return problem.share(residual, end.noise) > 0 and problem.excess(residual) > excess
 
 
 def searched(
     problem: Stretches, attempts: list[Attempt], save: Callable[[], None], progress: bool | None
 ) -> list[End | None]:
-    """Where starts led, looked at in one batch; None where one could not begin.
+    """Runs all starts in one batch; returns their ends, None for a start that is not finite.
 
     Raises:
-        ValueError: none could.
+        ValueError: no start is finite.
     """
 
     def evaluate(asked: dict[int, Any]) -> dict[int, Any]:
@@ -190,7 +274,7 @@ def searched(
 
 
 def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Callable[[], None]:
-    """What writes attempts to a file, after they went on from what was written there before.
+    """Restores attempts from a file, if it exists; returns a function that writes them to it.
 
     Raises:
         ValueError: the file holds something else.
@@ -212,7 +296,7 @@ def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Calla
 
 
 def _about(problem: Stretches, attempts: list[Attempt]) -> dict[str, Any]:
-    """What a checkpoint belongs to."""
+    """The properties of a search that must match those in a checkpoint, by their description."""
     first, space = attempts[0], problem.space
     limits: PyTree = [*space.low, *space.high]
     numbers = [np.asarray(x) for x in jax.tree.leaves(problem.seen)]
@@ -221,6 +305,7 @@ def _about(problem: Stretches, attempts: list[Attempt]) -> dict[str, Any]:
         "the number of restarts": len(attempts),
         "the number of steps": first.steps if problem.gaps else None,
         "the continuity": float(first.continuity),
+        "the version of jaxcon": sorted(first.contents),
         "the bounds": files.digest(*limits),
         "the data or their noise": files.digest(*numbers, str(problem.noise is None)),
         "the start, the spread, the key or the nodes": files.digest(

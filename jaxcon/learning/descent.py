@@ -28,13 +28,13 @@ from jaxcon.simulation.recovery import contain
 RETRIES = 20
 """Steps from one point, each half as long as the one before, after which a start is given up."""
 RECOVERY = 1.2
-"""By which the share of the optimizer's step that is taken grows with every good step, up to 1."""
+"""Factor by which the share of the optimizer's step grows with every good step, up to 1."""
 WORSE = 1000.0
-"""By which a step multiplies the loss where it is taken back."""
+"""Factor by which a step must multiply the loss to be taken back."""
 
 
 class Stop(IntEnum):
-    """Why a start takes no more steps."""
+    """The reason why a start takes no more steps."""
 
     RUNNING = 0
     STALLED = 1
@@ -128,7 +128,7 @@ class Search:
 
 @dataclass(frozen=True)
 class Descent:
-    """How a loss is descended.
+    """The descent of a loss: what is fixed during a search.
 
     Attributes:
         loss: params → loss or (loss, aux); (params, key) → the same where there are samples.

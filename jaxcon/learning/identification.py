@@ -15,18 +15,25 @@ import numpy as np
 from jaxcon.core import checkpoint as files
 from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.learning.attempts import Attempt, remaining, remembered, searched
+from jaxcon.learning.attempts import (
+    Attempt,
+    End,
+    remaining,
+    remembered,
+    searched,
+    unexplained,
+)
 from jaxcon.learning.information import deviations, told
-from jaxcon.learning.least_squares import Fit
+from jaxcon.learning.least_squares import CONVERGED
 from jaxcon.learning.leaves import Space, is_searched, space_of
 from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.stretches import Stretches
 
 VAGUE = 1.0
-"""Standard deviation of a relative change from which on the data do not tell it: a factor of e."""
+"""Standard deviation of a relative change above which it is not identified: a factor of e."""
 
 ALIKE = 1e-2
-"""By what the ends of two starts may differ, relative, to be called alike."""
+"""Relative difference of costs below which two starts ended alike."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +60,12 @@ class Identified:
         bounded: the names of those that lie on their bounds.
         singular_values: largest first, (n,), n parameters being off their bounds.
         directions: of unit length by all parameters, a row for each singular value.
-        costs: ½ ‖r‖² by step; with nodes, of the last search, at the continuity asked for.
+        costs: ½ ‖r‖² by step; of the last search, with all data and the continuity asked for.
         ends: ½ ‖r‖² where each start ended, in units of the noise that was given, or of the data;
             infinite where it could not begin, (restarts,).
-        stopped: why it went no further, in words.
+        stopped: why it went no further, in words. "converged" is a minimum whose residuals are at
+            most twice the noise, the one given or else the one seen between neighbors. Any other
+            minimum is called local. A residual that is less than √ε of the data counts as noise.
     """
 
     params: PyTree
@@ -80,6 +89,11 @@ class Identified:
         values, errors = (np.concatenate(x) for x in zip(*found, strict=True))
         pairs = zip(values, errors, strict=True)
         return {name: (float(x), float(e)) for name, (x, e) in zip(self.names, pairs, strict=True)}
+
+    @property
+    def converged(self) -> bool:
+        """True at a minimum whose residuals are no larger than noise, if that can be judged."""
+        return self.stopped == CONVERGED
 
     @property
     def condition(self) -> float:
@@ -142,6 +156,10 @@ def identify(
     argmin Σ ((simulate(params) − data) / noise)², with derivatives in forward mode: for up to some
     tens of parameters. For more, `tune` a loss by `losses.tracking`.
 
+    A fit of a long oscillation has local minima. If the residuals exceed their noise, a second fit
+    goes from the start through longer and longer parts of the recording. The better one counts.
+    Time is taken to be the longest axis of each leaf of the data.
+
     Recordings longer than the motion can be foreseen, or so long that the least of the sum is hard
     to reach, are cut into stretches (multiple shooting). Their first states, the nodes, are unknown
     too, and the end of each stretch must meet the next node.
@@ -160,7 +178,8 @@ def identify(
         nodes: first guesses of the states at the nodes, with a first axis of stretches. Minimal
             coordinates, such as angles and rates, so that every value is a state.
         continuity: standard deviation by which an end may miss the next node, in its units.
-        steps: at most so many; with nodes, for each decade by which ends come closer to them.
+        steps: at most so many for each fit; with nodes there is one for each decade by which ends
+            come closer to them, and without one for each part of the recording.
         restarts: how many starts are searched in one batch; the first is the one given, and all
             have the same nodes.
         spread: as of `tune`, of the parameters of other starts.
@@ -213,7 +232,7 @@ def identify(
     ends = np.array([np.inf if end is None else end.cost for end in found])
     best = found[int(np.argmin(ends))]
     assert best is not None
-    return _report(problem, best.fit, best.noise, continuity, ends)
+    return _report(problem, best, continuity, ends)
 
 
 def _check_nodes(nodes: PyTree) -> None:
@@ -235,27 +254,25 @@ def _check_nodes(nodes: PyTree) -> None:
 
 
 def _ignore() -> None:
-    """A search that nobody wants on disk."""
+    """Does nothing: no checkpoint was asked for."""
 
 
 def _scale(space: Space, y: Array) -> Array:
-    """By what coordinates are divided: 1 for logarithms and what starts near 0, |y| for others."""
+    """Divisors of coordinates: 1 for logarithms and for starts near 0, else |y|."""
     none = jnp.abs(y) <= float(jnp.finfo(y.dtype).eps) ** 0.5
     return jnp.where(space.logarithms | none, 1, jnp.abs(y))
 
 
-def _report(
-    problem: Stretches, fit: Fit, own: float, continuity: float, ends: np.ndarray
-) -> Identified:
-    """What a fit says of the parameters, whatever the nodes are.
+def _report(problem: Stretches, end: End, continuity: float, ends: np.ndarray) -> Identified:
+    """The result of the best fit, with errors of parameters for free nodes.
 
     Args:
         problem: the recording.
-        fit: of it.
-        own: the noise by which its residuals were divided.
+        end: of the best start.
         continuity: as of `identify`.
         ends: as of `Identified`.
     """
+    fit, own = end
     space, scale, p = problem.space, np.asarray(problem.scale), problem.scale.size
     precision, free = problem.told(own), fit.free[:p]
     J = problem.condensed(fit.jacobian, continuity)
@@ -283,7 +300,22 @@ def _report(
         directions=directions,
         costs=fit.costs,
         ends=ends,
-        stopped=fit.stopped,
+        stopped=_stopped(problem, end),
+    )
+
+
+def _stopped(problem: Stretches, end: End) -> str:
+    """The reason for the end, and a warning if noise does not explain the residuals."""
+    fit, noise = end
+    if fit.broken or not unexplained(problem, end):
+        return fit.stopped
+    share, excess = problem.share(fit.residual, noise), problem.excess(fit.residual)
+    reason = "at a minimum" if fit.stopped == CONVERGED else fit.stopped
+    what = "the noise given" if problem.noise is not None else "the noise seen between neighbors"
+    return (
+        f"{reason}, but the residuals, {share:.2g} of the data, are {excess:.2g} times {what}: this"
+        " is a local minimum, or the model lacks something. Try other starts (restarts=, spread=)"
+        f" or {'other' if problem.gaps else 'shorter stretches by'} nodes="
     )
 
 

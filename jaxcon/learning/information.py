@@ -1,4 +1,4 @@
-"""What residuals tell of some unknowns, whatever others are, and of their own noise. Host code."""
+"""Identifiability of some unknowns with others free, and the noise of residuals. Host code."""
 
 from __future__ import annotations
 

@@ -16,12 +16,12 @@ EVERY_STEP = "every step was taken before it converged"
 START = 1e-3
 """μ at the start."""
 FAINT = 8
-"""Columns of the Jacobian below so many roundings of what was predicted are nothing else."""
+"""Columns of J shorter than this many roundings of the predictions count as zero."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Where ½ ‖r‖² is least.
+    """A minimum of ½ ‖r‖², or the point where the search for it ended.
 
     Attributes:
         z: unknowns, (n,).
@@ -30,7 +30,7 @@ class Fit:
         free: which unknowns do not press against a bound, (n,).
         costs: ½ ‖r‖² at the start and after each step.
         stopped: why it went no further, in words.
-        broken: whether it was ended from outside.
+        broken: True if it was ended from outside.
     """
 
     z: np.ndarray
@@ -44,7 +44,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Precision:
-    """How exact residuals are.
+    """The precision of residuals.
 
     Attributes:
         tolerance: √ε.
@@ -76,7 +76,7 @@ class Precision:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a fit has come: all that is needed to go on with the very same numbers.
+    """The state of a fit: enough to resume it with identical numbers.
 
     Attributes:
         z: unknowns, (n,).
@@ -89,6 +89,10 @@ class Progress:
     damping: float = START
     costs: tuple[float, ...] = ()
     stopped: str = ""
+
+    def goes_on(self, steps: int) -> bool:
+        """True if the fit is not finished and fewer than so many steps were taken."""
+        return not self.stopped and len(self.costs) <= steps
 
 
 def least_squares(
@@ -109,7 +113,7 @@ def least_squares(
     for a step.
 
     Args:
-        known: the start, or how far it came before; r must be finite there.
+        known: the start, or how far it came before.
         limits: (low, high), each (n,).
         steps: at most so many since the start.
         precision: of r.
@@ -121,10 +125,13 @@ def least_squares(
         Moré, The Levenberg–Marquardt algorithm: implementation and theory (1978).
     """
     r, J = yield known.z
-    known = known if known.costs else dataclasses.replace(known, costs=(_cost(r, J),))
+    if not known.costs:
+        cost = _cost(r, J)
+        stopped = "" if np.isfinite(cost) else _stuck(r, J)
+        known = dataclasses.replace(known, costs=(cost,), stopped=stopped)
     here, broken = (known, r, J), ""
     try:
-        while not here[0].stopped and len(here[0].costs) <= steps:
+        while here[0].goes_on(steps):
             here = yield from _step(*here, limits, reach, precision)
             note(here[0])
     except ENDS as error:
@@ -164,7 +171,7 @@ def side_by_side(
     evaluate: Callable[[dict[int, Any]], dict[int, Any]],
     after: Callable[[], None] = lambda: None,
 ) -> list[Any]:
-    """What searches return that yield points and are sent what is found there, round by round.
+    """Runs generators in rounds: each yields a point and is sent its evaluation; returns results.
 
     Args:
         searches: generators; those that were ended from outside return something `broken`.
@@ -212,14 +219,14 @@ def _cost(r: np.ndarray, J: np.ndarray) -> float:
 
 
 def _stuck(r: np.ndarray, J: np.ndarray) -> str:
-    """Why no step helps, however short, by what was found at the end of one."""
+    """The reason why no step helps, from the evaluation at the end of a short one."""
     if np.isfinite(_cost(r, J)):
         return "no step, however short, lowers the sum of squares"
     return "the residuals or their derivatives are not finite around the last point"
 
 
 def _free(z: np.ndarray, r: np.ndarray, J: np.ndarray, limits: Any) -> np.ndarray:
-    """Which unknowns do not press against a bound, (n,)."""
+    """A mask of unknowns that do not press against a bound, (n,)."""
     (low, high), slope = limits, J.T @ r
     return ~((z <= low) & (slope > 0) | (z >= high) & (slope < 0))
 
@@ -227,7 +234,7 @@ def _free(z: np.ndarray, r: np.ndarray, J: np.ndarray, limits: Any) -> np.ndarra
 def _negligible(
     step: np.ndarray, z: np.ndarray, r: np.ndarray, J: np.ndarray, precision: Precision
 ) -> bool:
-    """Whether a step changes nothing that matters: not to r, or to no unknown and no prediction."""
+    """True if a step changes r negligibly, or both the unknowns and the predictions."""
     effect, tolerance = float(np.linalg.norm(J @ step)), precision.tolerance
     short = bool(np.all(np.abs(step) <= tolerance * (1 + np.abs(z))))
     unseen = effect <= max(tolerance * float(np.linalg.norm(r)), precision.rounding)
@@ -237,7 +244,7 @@ def _negligible(
 def _steps(
     z: np.ndarray, r: np.ndarray, J: np.ndarray, free: np.ndarray, precision: Precision
 ) -> Callable[[float], np.ndarray]:
-    """Damping → step, (n,)."""
+    """The Levenberg–Marquardt step (n,) as a function of the damping."""
     (U, s, V), D = precision.reached(J[:, free]), precision.scale(J[:, free])
     along = U.T @ r
 

@@ -170,7 +170,7 @@ def _check_numbers(names: list[str], leaves: list[Any], owner: str) -> None:
 
 
 def is_searched(leaf: Any) -> bool:
-    """Whether a leaf has floating numbers."""
+    """True if a leaf has floating numbers."""
     return checks.is_floating(leaf)
 
 
@@ -201,7 +201,7 @@ def _stands_for(key: str, name: str) -> bool:
 
 
 def _flags(positive: Any, params: PyTree, names: list[str], owner: str) -> list[bool]:
-    """Whether each leaf is positive."""
+    """The flag of each leaf: True if it is positive."""
     chosen = jax.tree.leaves(positive)
     if all(isinstance(x, str) for x in chosen):
         return by_name(dict.fromkeys(chosen, True), names, False, f"{owner}: positive")

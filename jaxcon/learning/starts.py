@@ -1,4 +1,4 @@
-"""Where searches begin: the start that was given, and others around it."""
+"""Starts of searches: the one given, and random ones around it."""
 
 from __future__ import annotations
 

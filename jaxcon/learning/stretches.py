@@ -20,7 +20,9 @@ from jaxcon.learning.leaves import Space
 from jaxcon.learning.losses import misfit
 
 FARTHEST = float(np.log(10.0))
-"""By how much a logarithm may change in a step."""
+"""Largest change of a logarithm in a step."""
+NEIGHBORS = 16
+"""Least number of differences of neighbors from which their noise is estimated."""
 
 
 @dataclass(frozen=True)
@@ -97,12 +99,12 @@ class Stretches:
 
     @property
     def observed(self) -> int:
-        """How many numbers were seen."""
+        """The count of numbers in the data that are not NaN."""
         return sum(int(np.sum(np.isfinite(x))) for x in jax.tree.leaves(self.data))
 
     @property
     def gaps(self) -> int:
-        """How many of the residuals, the last ones, are gaps between stretches."""
+        """The count of gaps between stretches; they are the last residuals."""
         stretches, n = self.nodes.shape
         return (stretches - 1) * n
 
@@ -115,19 +117,19 @@ class Stretches:
 
     @property
     def reach(self) -> np.ndarray:
-        """By how much each of the unknowns may change in a step."""
+        """The largest change of each unknown in a step."""
         none = np.full(self.nodes.size, np.inf)
         return np.append(np.where(self.space.logarithms, FARTHEST, np.inf), none)
 
     @property
     def rounding(self) -> float:
-        """What rounding makes of each number that was seen."""
+        """The typical rounding error of a number in the data."""
         spacing = float(jnp.finfo(self.scale.dtype).eps)
         return spacing * self.size / max(self.observed, 1) ** 0.5
 
     @property
     def least(self) -> float:
-        """The same, or 1 where all are 0."""
+        """The rounding error of the data, or 1 if all data are 0."""
         return self.rounding or 1.0
 
     def typical(self, residual: np.ndarray) -> float:
@@ -135,14 +137,73 @@ class Stretches:
         own = residual[: residual.size - self.gaps]
         return max(float(np.linalg.norm(own)) / max(self.observed, 1) ** 0.5, self.least)
 
+    @cached_property
+    def times(self) -> np.ndarray:
+        """The time of each residual of the data as a share of its stretch, (m,).
+
+        Time is the longest axis of a leaf: the data have no other mark of it.
+        """
+        shares = []
+        for x in jax.tree.leaves(self.seen[0]):
+            shape = x.shape[1:] or (1,)
+            axis = int(np.argmax(shape))
+            share = np.arange(1, shape[axis] + 1) / max(shape[axis], 1)
+            along = np.expand_dims(share, [i for i in range(len(shape)) if i != axis])
+            shares.append(np.broadcast_to(along, shape).ravel())
+        return np.tile(np.concatenate(shares), len(self.nodes))
+
+    def observed_until(self, horizon: float) -> int:
+        """The count of numbers seen up to a horizon, a share of the time."""
+        data = jax.tree.map(lambda x: np.reshape(x, (len(self.nodes), -1)), self.seen[0])
+        flat = np.concatenate(jax.tree.leaves(data), axis=1).ravel()
+        return int(np.sum(np.isfinite(flat) & (self.times <= horizon)))
+
+    def until(self, horizon: float, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals and Jacobian with zero rows for data after a horizon, a share of the time."""
+        later = np.append(self.times > horizon, np.zeros(self.gaps, bool))
+        return np.where(later, 0, r), np.where(later[:, None], 0, J)
+
+    def share(self, residual: np.ndarray, noise: float) -> float:
+        """‖residuals‖ / ‖data‖ of the data; 0 if it is below √ε.
+
+        Args:
+            residual: r.
+            noise: by which r was divided.
+        """
+        own = noise * float(np.linalg.norm(residual[: residual.size - self.gaps]))
+        return own / self.size if own > self.precision(np.inf).tolerance * self.size else 0.0
+
+    def excess(self, residual: np.ndarray) -> float:
+        """The ratio of the root mean square of residuals to their `scatter`; NaN with that."""
+        own = residual[: residual.size - self.gaps]
+        return float(np.linalg.norm(own)) / max(self.observed, 1) ** 0.5 / self.scatter(residual)
+
+    def scatter(self, residual: np.ndarray) -> float:
+        """The standard deviation of the noise in residuals of the data.
+
+        It is 1 if the noise was given. Else it is the root mean square of differences of neighbors
+        over √2: residuals of a wrong motion are smooth, and noise is not. NaN if there are too few.
+
+        References:
+            Durbin, Watson, Testing for serial correlation in least squares regression (1950).
+        """
+        if self.noise is not None:
+            return 1.0
+        own = residual[: residual.size - self.gaps].reshape(len(self.nodes), -1)
+        data = [np.asarray(x) for x in jax.tree.leaves(self.seen[0])]
+        ends = np.cumsum([x[0].size for x in data])[:-1]
+        leaves = zip(np.split(own, ends, axis=1), data, strict=True)
+        seen = [np.where(np.isfinite(x), r.reshape(x.shape), np.nan) for r, x in leaves]
+        return min(_scatters(seen), default=np.nan)
+
     def precision(self, continuity: float, noise: float = 1.0) -> Precision:
-        """Of the residuals, in the dtype in which they are computed."""
+        """The precision of residuals in the dtype in which they are computed."""
         ends = float(np.linalg.norm(self.nodes)) / continuity
         tolerance = float(jnp.finfo(self.scale.dtype).eps) ** 0.5
         return Precision(tolerance, float(np.hypot(self.size / noise, ends)))
 
     def told(self, noise: float) -> Precision:
-        """Of what residuals of the data alone tell, gaps being unknowns of their own."""
+        """The precision of residuals of the data alone, with gaps as unknowns."""
         return dataclasses.replace(self.precision(np.inf), size=self.size / noise)
 
     def condensed(self, J: np.ndarray, continuity: float) -> np.ndarray:
@@ -167,7 +228,7 @@ class Stretches:
         return np.concatenate([data @ T, alone])
 
     def widths(self, residual: np.ndarray, continuity: float) -> list[float]:
-        """By how much ends may miss nodes, from what they do at the start, by decades.
+        """Standard deviations of the gaps by decade, from their size at the start downwards.
 
         A search that had to keep them together from the start would creep along a narrow valley.
         """
@@ -191,7 +252,7 @@ class Stretches:
         return [self._rows(x, own, *p[1:]) for x, own, p in zip(x, each, points, strict=True)]
 
     def program(self, starts: int) -> str:
-        """What is computed for so many points, in the compiler's words."""
+        """The lowered program that evaluates this many points, as text."""
         x = jnp.zeros((starts, *self._begins(self.start).shape), self.scale.dtype)
         return self._derivatives.lower(x, *self.seen).as_text()
 
@@ -271,6 +332,21 @@ class Stretches:
                 f" {wanted}; the end that it returns is {got}."
             )
         return predicted, end
+
+
+def _scatters(residuals: list[np.ndarray]) -> list[float]:
+    """The noise estimated along each axis but the first (stretches), over all leaves.
+
+    Axes with fewer than `NEIGHBORS` differences are left out. NaN marks unseen residuals.
+    """
+    scatters = []
+    for axis in range(1, max((r.ndim for r in residuals), default=1)):
+        changes = [np.diff(r, axis=axis).ravel() for r in residuals if r.ndim > axis]
+        seen = np.concatenate(changes)
+        seen = seen[np.isfinite(seen)]
+        if seen.size >= NEIGHBORS:
+            scatters.append(max(float(np.sqrt(np.mean(seen**2) / 2)), np.finfo(float).tiny))
+    return scatters
 
 
 def _placed(by_r: np.ndarray, by_end: np.ndarray, p: int) -> np.ndarray:

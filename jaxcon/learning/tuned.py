@@ -1,4 +1,4 @@
-"""What a search by gradients found."""
+"""The result of a search by gradients."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REASONS = {
 }
 
 CLOSE = 1e-3
-"""Relative distance of every parameter from the least, as estimated, below which it converged."""
+"""Estimated relative distance of every parameter from a minimum below which it converged."""
 LATE = 0.01
 """Share of the whole fall of a loss that its second half of steps may have if they were enough."""
 RECENT = 0.1
@@ -44,8 +44,9 @@ class Tuned:
             `history[best_step]` is its loss.
         refused: how many steps were taken back, since the loss or its gradient was not finite, or
             the loss far worse than before.
-        converged: whether every parameter is within 0.1 % of the least, by the curvature along the
-            last steps: of its size, found or at the start. False where nothing tells it.
+        converged: whether every parameter is within 0.1 % of a minimum, by the curvature along the
+            last steps: of its size, found or at the start. The minimum may be a local one. False
+            where nothing tells it.
         stopped: why it took no more, in words.
         bounded: the names of leaves that lie on a bound, with one of their numbers at least.
     """
@@ -65,7 +66,7 @@ class Tuned:
 
     @property
     def table(self) -> dict[str, str]:
-        """What was found, in words, by leaf; long arrays by their shape."""
+        """The parameters as text, by name of leaf; long arrays by their shape."""
         leaves = jax.tree_util.tree_leaves_with_path(self.params)
         named = (
             (jax.tree_util.keystr(k, simple=True, separator="/"), np.asarray(x)) for k, x in leaves
@@ -99,7 +100,7 @@ class Tuned:
 def result(
     space: Space, starts: tuple[Array, ...], search: Search, losses: np.ndarray, broken: str
 ) -> Tuned:
-    """What the best start found.
+    """The result of the best start.
 
     Args:
         space: of the parameters.
@@ -150,7 +151,7 @@ class Outlook:
     """An estimate of the remaining distance at the end of a search.
 
     Attributes:
-        distance: largest relative change of a parameter that is left to the least; NaN where the
+        distance: largest relative change of a parameter that is left to a minimum; NaN where the
             curvature is not known.
         leaf: name of that parameter.
         pace: by which the loss fell in each of the last steps.
@@ -191,14 +192,14 @@ class Outlook:
         name = f"'{self.leaf}'" if self.leaf else "the parameter"
         if self.converged:
             return (
-                f", and it converged: by the curvature, {name} is within {self.distance:.1e} of the"
-                " least, relative to its size, and no other is further"
+                f", and it converged: by the curvature, {name} is within {self.distance:.1e} of a"
+                " minimum, which may be a local one, relative to its size, and no other is further"
             )
         if np.isfinite(self.distance):
             far = f"by about {self.distance:.1g}" if self.distance < 1 else "far"
             pace = f"still fell by {self.pace:.1e} a step" if self.pace > 0 else "fell no more"
             return (
-                f" before it converged: by the curvature, {name} may be off the least {far},"
+                f" before it converged: by the curvature, {name} may be off a minimum {far},"
                 f" relative to its size, and the loss {pace}; ask for more, or fit recordings with"
                 " jc.identify"
             )

@@ -28,7 +28,7 @@ from jaxcon.learning.tuned import Tuned, result
 NEVER = np.iinfo(np.int32).max
 SCHEDULE = "the number of steps, along which the rate of the default optimizer falls"
 PROGRAM = "the loss, its data, the bounds, the optimizer, another option, or the version of jax"
-"""What the compiled program tells apart."""
+"""Causes of a different compiled program, for the error message."""
 
 
 def tune(
@@ -211,7 +211,10 @@ def _running(search: Search, steps: int) -> np.ndarray:
 
 
 def _about(space: Space, starts: Any, key: Any, chunk: int, rate: int | None) -> dict[str, Any]:
-    """What a checkpoint belongs to, beside the program; `rate` is the length of the default one."""
+    """The properties of a search that must match those in a checkpoint, beside the program.
+
+    `rate` is the length of the default schedule of rates, None for an optimizer of the user.
+    """
     shapes = [list(x.shape[1:]) for x in starts]
     return {
         "the leaves or their shapes": [list(space.names), shapes],
