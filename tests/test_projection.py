@@ -1,6 +1,7 @@
 """Projections: nearest points by hand, what they keep, and their derivatives."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -362,10 +363,42 @@ def door():
 def test_a_linearized_projection_hears_a_solver_that_does_not_converge():
     """A door off both of its hinges: rows that contradict each other."""
     system, state = door()
-    still = jc.Projection(iterations=1, velocity=False)
-    for solver, code in ((jc.ConjugateGradients(), jc.Status.NOT_CONVERGED), (None, jc.Status.OK)):
-        new = projecting(system, still, solver)(system, moved(state, 1e-3))
-        assert new.status == code
+    still, off = jc.Projection(iterations=1, velocity=False), moved(state, 1e-3)
+    few = jc.ConjugateGradients(iterations=2)
+    for solver, expected in ((few, jc.Status.NOT_CONVERGED), (jc.RankSafe(), jc.Status.OK)):
+        _, code = still.project(system, solver, off, off, jnp.asarray(1e-3))
+        assert code == expected
+
+
+def test_conjugate_gradients_project_redundant_rows_with_their_gradient():
+    """Three bars that swing a coupler, where two would do: as by elimination."""
+    scene = jc.Scene(dim=2)
+    half = 0.5 * np.array([np.cos(1.9), -np.sin(1.9)])
+    solid = {"mass": 1.0, "inertia": 0.1}
+    scene.add_body("coupler", **solid, position=(1.0 + 2 * half[0], 2 * half[1]))
+    for i in range(3):
+        foot = np.array([float(i), 0.0])
+        scene.add_body(f"bar{i}", **solid, position=foot + half, angle=-1.9)
+        scene.add(jc.Revolute(f"foot{i}", jc.WORLD, f"bar{i}", point=foot))
+        scene.add(jc.Revolute(f"head{i}", f"bar{i}", "coupler", point=foot + 2 * half))
+    system, state = scene.build()
+
+    def end(solver, gravity):
+        heavy = system.with_params({"gravity": jnp.stack([0.0 * gravity, gravity])})
+        method = jc.Method(stabilizer=PROJECTION, solver=solver)
+        final, code = jc.rollout(
+            heavy, method, state, None, 5e-3, 40, record=lambda s, info: info.status
+        )
+        return final.q[0], code
+
+    found = []
+    for solver in (jc.RankSafe(), jc.ConjugateGradients()):
+        run = jax.jit(jax.value_and_grad(functools.partial(end, solver), has_aux=True))
+        (place, code), slope = run(-9.81)
+        assert np.all(code == jc.Status.OK)
+        found.append((place, slope))
+    assert abs(found[0][1]) > 1e-3
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize("tolerance", [None, 1e-5])

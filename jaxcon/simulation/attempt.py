@@ -119,7 +119,8 @@ def dynamics_at(
     if method.recovery is not None:
         stabilizer = method.recovery.relax(stabilizer, memory.recovery)
     system = recall(system, state.turns)
-    own = (system, stabilizer, method.solver, control, memory.stabilizer, dt)
+    solver = stabilizer.suited(method.solver)
+    own = (system, stabilizer, solver, control, memory.stabilizer, dt)
     if not system.bounds:
         return Dynamics(*own)
     solver = method.resolve(system, state).bounded

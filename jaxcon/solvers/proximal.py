@@ -200,6 +200,9 @@ def conflicts(
 ) -> Array:
     """CONFLICT where more of b is left open than rounding and a share of b and J M⁻¹ f, by world.
 
+    Rounding is that of the terms of J M⁻¹ f, which may cancel: gravity asks nothing of a joint
+    between bodies that fall together.
+
     Args:
         system: M, J and C.
         force: f, (n_v,).
@@ -208,9 +211,11 @@ def conflicts(
         length: in which rows are compared, (n_c,).
         share: what may be left, a number or one by world.
     """
-    asked = jnp.abs(target) + jnp.abs(system.jacobian.apply(system.mass.solve(force)))
+    free = system.mass.solve(force)
+    asked = jnp.abs(target) + jnp.abs(system.jacobian.apply(free))
     size = jnp.max(asked / length, axis=0)
-    allowed = (share * size)[None] * length
+    rounding = 64 * float(jnp.finfo(target.dtype).eps) * system.jacobian.reach(free)
+    allowed = (share * size)[None] * length + rounding
     allowed = allowed if system.noise is None else allowed + system.noise
     conflict = jnp.any(jnp.abs(left) > allowed, axis=0)
     return jnp.where(conflict, Status.CONFLICT, Status.OK).astype(jnp.int32)

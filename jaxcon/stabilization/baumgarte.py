@@ -47,6 +47,10 @@ class Unstabilized:
         """Itself: there is nothing to choose."""
         return self
 
+    def suited(self, solver: Any) -> Any:
+        """The solver of the saddle system, or one that stands in for it beside this stabilizer."""
+        return solver
+
     def bounded(self, stable_rate: Callable[[float], Any]) -> Unstabilized:
         """Itself; one that changes its gains asks here up to which β it may, by least α/β."""
         return self

@@ -21,6 +21,8 @@ from jaxcon.core.worlds import lift
 from jaxcon.dynamics.forward import saddle
 from jaxcon.model.state import State
 from jaxcon.solvers import roots
+from jaxcon.solvers.conjugate_gradients import ConjugateGradients
+from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Diagonal, Mass, Saddle, Solution
 from jaxcon.stabilization.baumgarte import Unstabilized
 
@@ -91,6 +93,12 @@ class Projection(Unstabilized):
 
     Rows that depend on each other do so on the surface only: off it J(q*) has directions too many,
     by which the point is not unique; the solver's regularization chooses, within O(‖d‖).
+    `ConjugateGradients()` has none. Where there are loops, it works inside of `RankSafe` here,
+    which takes six solves for one.
+
+    Beside semi-implicit Euler it loses energy where jointed bodies in space spin fast. A box on a
+    hinge that carries another on a ball joint, at 5 rad/s, loses most of its energy in 6,000 steps
+    of 20 ms, and up to half in as many of 5 ms; `RK4()` loses at most 6 % and 0.1 %.
 
     Rows of velocities alone are part of the second projection only. Rotors are inertia of the mass
     metric. The derivative is that of the root, in every world, and not of the iterations.
@@ -137,6 +145,15 @@ class Projection(Unstabilized):
         """One step more, modulo `every`."""
         return memory if self.every == 1 else (memory + 1) % self.every
 
+    def suited(self, solver: Any) -> Any:
+        """The solver; conjugate gradients by proximal iteration, which redundant rows need.
+
+        They contradict each other off the surface, and so do right sides of derivatives, which may
+        be rounding alone. Conjugate gradients by themselves diverge there.
+        """
+        plain = isinstance(solver, ConjugateGradients) and solver.tikhonov is None
+        return RankSafe(solver) if plain else solver
+
     @property
     def corrects(self) -> tuple[str, ...]:
         """Which of q and v are projected."""
@@ -172,7 +189,7 @@ class Projection(Unstabilized):
         self, system: Any, solver: Any, before: State, state: State, dt: Any
     ) -> tuple[State, Array]:
         """The state on the constraints, and a status: failures of the solver, or NOT_CONVERGED."""
-        code = jnp.zeros_like(state.status)
+        code, solver = jnp.zeros_like(state.status), self.suited(solver)
         if self.position:
             start = state
             if self.coupled and self.velocity and before is not state:
