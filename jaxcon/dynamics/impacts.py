@@ -399,7 +399,9 @@ class Impact:
         """q*, v⁻ and the time of the impact."""
         h, a, τ = self.dt[None], self.acceleration, arrivals.by_velocity
         place = self.system.retract(self.q, τ * (self.v + (self.lag * h + τ / 2) * a))
-        return place, self.v + (self.lag * h + τ) * a, self.t + arrivals.first
+        first = arrivals.first[None]
+        v = self.v + (self.lag * h + τ) * a + first * self._coast(self.q, self.v, first)
+        return place, v, self.t + arrivals.first
 
     def _coast(self, q: Array, v: Array, time: Array) -> Array:
         """By how much free rotation changes a in half of a time (1,) [s], of bodies without joints.
