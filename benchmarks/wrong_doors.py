@@ -31,7 +31,8 @@ class Takes:
         sign: "any", "not negative" or "positive".
         most: the largest number.
         least: the smallest count.
-        allows: tags of other values that it takes, as "none".
+        allows: tags of other values that it takes, as "none"; "NaN" and "infinity", which a formula
+            hands on; "batch", further axes behind.
         dtype: of the scene; None where the door does not know it.
         shaped: whether only the shape of `good` will do.
         unread: whether values of JAX's arrays are judged by the status, not read.
@@ -634,8 +635,16 @@ def doors() -> Iterator[Door]:
                 return begun(**{part: kind(**(given | {f: x}))})
 
             yield Door(f"{kind.__name__}.{field}", call, takes, (rf"\b{field.rstrip('s')}",))
+            yield _constructor(kind, given, field, takes)
     for name, call, takes, *words in (*_simulation(), *_analysis(), *_search(), *_others()):
         yield Door(name, call, takes, tuple(words) or (rf"\b{re.split('[.(]', name)[-1]}\b",))
+
+
+def _constructor(kind: Any, given: dict[str, Any], field: str, takes: Takes) -> Door:
+    """The door of a constructor, which takes arrays for a batch of worlds."""
+    call = functools.partial(_with, kind, given, field)
+    takes = dataclasses.replace(takes, shaped=False)
+    return Door(f"{kind.__name__}({field}=)", call, takes, (rf"\b{field.rstrip('s')}",))
 
 
 def _element(make: Any, kind: Any, given: Any, field: str, takes: Takes) -> Door:
@@ -1069,6 +1078,7 @@ def _others() -> Iterator[Row]:
                 yield f"{task}.{what}", make, free(option.default, sign, shaped=False)
             elif type(option.default) is int:
                 yield f"{task}.{what}", make, count(1, *(["none"] if what == "horizon" else []))
+    yield from _quaternions()
     for what in ("base", "speed", "force"):
 
         def tolerance(x: Any, what: str = what) -> Any:
@@ -1088,6 +1098,33 @@ def _others() -> Iterator[Row]:
         yield f"from_mjcf.{what}", functools.partial(read, what), takes
     yield "from_mjcf.dtype", lambda x: jc.from_mjcf(_text(), dtype=x), Takes("other", allows=none)
     yield "from_mjcf.source", jc.from_mjcf, Takes("other"), "source|from_mjcf|file|XML"
+
+
+QUATERNIONS = {
+    "multiply": {"p": 4, "q": 4},
+    "conjugate": {"q": 4},
+    "rotate": {"q": 4, "x": 3},
+    "matrix": {"q": 4},
+    "derivative": {"q": 4, "omega": 3},
+    "exp": {"phi": 3},
+    "log": {"q": 4},
+    "normalize": {"q": 4},
+}
+"""The functions of arrays of components, and how many of these each argument has."""
+
+
+def _quaternions() -> Iterator[Row]:
+    for name, sizes in QUATERNIONS.items():
+        given = {what: np.eye(size)[0] for what, size in sizes.items()}
+        for what, good in given.items():
+            call = functools.partial(_with, getattr(jc.quaternion, name), given, what)
+            takes = free(good, "any", "NaN", "infinity", "batch")
+            yield f"quaternion.{name}.{what}", call, takes, rf"\b{what}\b"
+    turn = {"axis": Z, "angle": 1.0}
+    for what, good in turn.items():
+        call = functools.partial(_with, jc.quaternion.from_axis_angle, turn, what)
+        yield f"quaternion.from_axis_angle.{what}", call, free(good, unread=True)
+    yield "quaternion.from_matrix.r", jc.quaternion.from_matrix, free(np.eye(3), unread=True)
 
 
 def _with(function: Any, given: dict[str, Any], what: str, x: Any) -> Any:
@@ -1283,6 +1320,14 @@ SPECIAL: dict[str, Special] = {
         lambda _: jc.from_mjcf("x" * 5000),
         ("from_mjcf", "source"),
     ),
+    **{
+        f"{what} as the {part} of a method": (
+            lambda _, part=part, value=value: jc.Method(**{part: value}),
+            (rf"Method: {part}\b",),
+        )
+        for part in ("integrator", "stabilizer", "solver", "recovery", "bounded", "events")
+        for what, value in (("a class", float), ("a name", "RK4"), ("a number", 1.0))
+    },
     "gains by numbers": (lambda _: begun(stabilizer=jc.Baumgarte({1: 1.0}, 1.0)), ("alpha",)),
     "a gain that is None by name": (
         lambda _: begun(stabilizer=jc.Baumgarte({"rod": None}, 1.0)),

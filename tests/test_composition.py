@@ -249,7 +249,11 @@ def test_equal_methods_are_equal_and_hash_alike():
 
 
 def gains(alpha):
-    return jc.Method(stabilizer=jc.Baumgarte(alpha, 25.0))
+    """A method with any leaf in the place of α, as JAX rebuilds it."""
+    leaves, structure = jax.tree.flatten(alpha)
+    known = jax.tree.unflatten(structure, [1.0] * len(leaves))
+    method = jc.Method(stabilizer=jc.Baumgarte(known, 25.0))
+    return jax.tree.unflatten(jax.tree.structure(method), [*leaves, 25.0])
 
 
 @pytest.mark.parametrize(

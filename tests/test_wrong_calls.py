@@ -119,10 +119,67 @@ def test_a_step_reads_no_array_of_jax(monkeypatch):
     assert read != []
 
 
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: jc.Sparse(tikhonov=-1.0), "Sparse: tikhonov must be zero or more and finite, got"),
+        (lambda: jc.Sparse(tikhonov=jnp.asarray([1.0, -1.0])), "Sparse: tikhonov must be zero or"),
+        (lambda: jc.Sparse(tikhonov=[1.0, 1.0]), r"Sparse: tikhonov must have shape \(\), got"),
+        (lambda: jc.RankSafe(rounds=0), "RankSafe: rounds must be a whole number from 1, got 0"),
+        (lambda: jc.RankSafe(share=np.nan), "RankSafe: share must be zero or more and finite, got"),
+        (lambda: jc.Projection(tolerance="1"), "Projection: tolerance must be a real number, got"),
+        (lambda: jc.PID(integral=None), "PID: integral must be real numbers, got None"),
+        (lambda: jc.Baumgarte({"rod": True}, 1.0), "Baumgarte: alpha of 'rod' must be a real numb"),
+        (lambda: jc.GeneralizedAlpha(rho=2.0), "GeneralizedAlpha: rho must lie between 0 and 1"),
+        (lambda: jc.Method(jc.RK4), "Method: integrator must be a value such as SemiImplicitEuler"),
+    ],
+)
+def test_a_constructor_refuses_what_it_can_see(make, words):
+    with pytest.raises((ValueError, TypeError), match=f"^{words}"):
+        make()
+
+
+def test_a_part_is_rebuilt_without_a_check():
+    """Trees of gradients, tracers, axes and placeholders have the structure of a method."""
+    method = jc.Method(stabilizer=jc.PID(4.0, 2.0, 1.0), solver=jc.Sparse(tikhonov=1.0))
+    slope = jax.grad(lambda m: -m.solver.tikhonov - m.stabilizer.integral)(method)
+    assert (float(slope.solver.tikhonov), float(slope.stabilizer.integral)) == (-1.0, -1.0)
+    leaves, structure = jax.tree.flatten(method)
+    held = object()
+    for placed in (None, held, jax.ShapeDtypeStruct((), float), "an axis"):
+        tree = jax.tree.unflatten(structure, [placed] * len(leaves))
+        assert tree.solver.tikhonov is placed
+    rates = jnp.asarray([1.0, 2.0])
+    made = jax.vmap(lambda x: jc.Method(solver=jc.Sparse(tikhonov=x)))(rates)
+    assert made == jc.Method(solver=jc.Sparse(tikhonov=rates))  # one by one, or all at once
+    paths = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(made)]
+    assert paths == [".solver.tikhonov"]
+
+
+def test_a_constructor_within_a_step_reads_no_array():
+    wrong = jnp.asarray(-1.0)
+    with checks.without_waiting():
+        assert jc.Sparse(tikhonov=wrong).tikhonov is wrong
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_quaternions_hand_on_what_is_not_finite(dtype):
+    turns = jnp.full((4, 5), jnp.nan, dtype)
+    assert jc.quaternion.multiply(turns, turns[:, :1]).dtype == dtype
+    assert np.isnan(jc.quaternion.rotate(turns, jnp.ones((3, 5), dtype))).all()
+    with pytest.raises(ValueError, match=r"further axes of q \(4, 5\) and x \(3, 2\) do not broad"):
+        jc.quaternion.rotate(turns, jnp.ones((3, 2), dtype))
+    assert jc.quaternion.from_axis_angle(jnp.ones(3, dtype), 0.1).dtype == dtype
+
+
+def wrongly(alpha):
+    """A method whose gains are traced when it is constructed."""
+    return jax.jit(lambda x: jc.Method(stabilizer=jc.Baumgarte(x, x)))(alpha)
+
+
 def test_nan_gains_that_are_not_read_end_in_a_status():
     system, state = motor()
-    wrong = jnp.asarray(jnp.nan, jnp.float32)
-    method = jc.Method(stabilizer=jc.Baumgarte(wrong, wrong))
+    method = wrongly(jnp.asarray(jnp.nan, jnp.float32))
     new, _ = jc.step(system, method, state, np.zeros(1), 1e-3)
     assert int(new.status) != 0
     with pytest.raises(ValueError, match="Baumgarte: alpha must be zero or more and finite"):

@@ -10,9 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.analysis.differences import differences, unseen
+from jaxcon.analysis import encounters
+from jaxcon.analysis.differences import differences, steps, unseen
 from jaxcon.core import checks, functions, notices
 from jaxcon.core.typing import Array, PyTree
+
+NO_DERIVATIVE = "there plain steps have no derivative that differences could confirm"
+"""What is said of the impacts that a wrong gradient meets."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +110,9 @@ class GradientCheck:
     Attributes:
         leaves: one `LeafGradient` for each leaf of floating numbers.
         tolerance: relative.
-        notes: cases in which derivatives of f may be wrong by structure, as of some impacts.
+        notes: cases in which derivatives of f may be wrong by structure, as of some impacts; and,
+            where a leaf is not right, the simultaneous, grazing or accumulating impacts of plain
+            steps that f meets at x.
     """
 
     leaves: tuple[LeafGradient, ...]
@@ -209,7 +215,17 @@ def check_gradients(
     for i, leaf, result in zip(floating, here, found, strict=True):
         scale = _scale(result, hidden, leaf.size <= directions)
         leaves += [LeafGradient(named[i][0], *result, scale=scale, tolerance=allowed)]
+    doubtful = [i for i, leaf in enumerate(leaves) if not leaf.ok]
+    if doubtful:
+        moves = [_alone(here, i, way, eps) for i in doubtful for way in ways[i]]
+        notes += [f"{case}; {NO_DERIVATIVE}" for case in encounters.cases(at, here, moves)]
     return GradientCheck(tuple(leaves), allowed, tuple(notes))
+
+
+def _alone(at: list[Array], place: int, way: Array, eps: float) -> list[Array]:
+    """The largest move of differences, of one leaf along one of its directions."""
+    step = steps(eps)[0]
+    return [x.dtype.type(step) * way if i == place else 0 * x for i, x in enumerate(at)]
 
 
 def _scale(result: tuple[np.ndarray, ...], hidden: float, alone: bool) -> np.ndarray:

@@ -42,6 +42,8 @@ class Report:
         memory: of a world in a batch [B], where it was asked to measure.
         bounded: names of what has bounded rows, limits, friction and contact, left out of the rest.
         off: names of the constraints with ‖φ‖ above 1e-4; those that hold velocities have no φ.
+        impacts: names of the elements that have impacts, through which a gradient is right for one
+            impact at a time.
         choice: the solver that `Method.auto` takes, and why.
         cost: operations of the accelerations of one world by part, estimated from the structure,
             where a method was given.
@@ -75,6 +77,7 @@ class Report:
     probe: Probe | None = None
     warnings: dict[str, str] = field(default_factory=dict)
     cost: Cost | None = None
+    impacts: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = [
@@ -85,6 +88,12 @@ class Report:
         ]
         if self.bounded:
             lines.append(f"besides, rows with bounds: {', '.join(self.bounded)}")
+        if self.impacts:
+            lines.append(
+                f"impacts of {_listed(self.impacts)}: gradients are right for one impact at a time,"
+                " not where impacts are grazing, simultaneous or accumulating, which"
+                " jc.check_gradients names"
+            )
         if self.redundant:
             named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
             lines.append(
@@ -142,6 +151,16 @@ class Report:
                     f" {self.probe.steps} steps from here, without the first half{ended}"
                 )
         return [*lines, str(self.choice)] if self.choice and self.choice.efforts else lines
+
+
+FEW_NAMES = 6
+"""Names of elements that a line of the report lists."""
+
+
+def _listed(names: tuple[str, ...]) -> str:
+    """The first names, and how many there are besides."""
+    rest = len(names) - FEW_NAMES
+    return ", ".join(names[:FEW_NAMES]) + (f" and {rest} others" if rest > 0 else "")
 
 
 def report(
@@ -206,6 +225,7 @@ def report(
             if size > OFF and name not in layout.velocity_level
         ),
         bounded=tuple(name for group in known.system.bounds for name in group.names),
+        impacts=traps.colliding(known),
         conflicts=known.conflicts,
         choice=known.choice,
     )

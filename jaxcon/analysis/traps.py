@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcon.analysis.estimate import contact_operations, solved_rows
 from jaxcon.analysis.known import Known, asked_gains
-from jaxcon.constraints.bounds import kinds_of, linearize_bounds
+from jaxcon.constraints.bounds import BoundRows, kinds_of, linearize_bounds
 from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
 from jaxcon.dynamics.impacts import PREFIX, doubt
 from jaxcon.dynamics.rank import linearized
@@ -244,14 +244,30 @@ def _swept(known: Known, rounds: int) -> str | None:
     )
 
 
-def impact(known: Known) -> str | None:
-    """Trap 9: gradients of plain steps through impacts that lack their time."""
-    system, method, at = known.system, known.method, known.state
-    if method.events is not None or not system.bounds or not hasattr(system, "layout"):
+def bound_rows(known: Known) -> BoundRows | None:
+    """The inequality constraints of a scene by shape; None where there are none."""
+    system, at = known.system, known.state
+    if not system.bounds or not hasattr(system, "layout"):
         return None
     h = jnp.ones((), at.q.dtype)
     control = jnp.zeros(system.layout.n_u, at.q.dtype)
-    rows = jax.eval_shape(linearize_bounds, system, at.q, at.v, at.time, control, h)
+    return jax.eval_shape(linearize_bounds, system, at.q, at.v, at.time, control, h)
+
+
+def colliding(known: Known) -> tuple[str, ...]:
+    """The names of the elements that have impacts."""
+    rows = bound_rows(known)
+    if rows is None:
+        return ()
+    owners = rows.layout.owners[np.flatnonzero(rows.ends)]
+    return tuple(rows.layout.names[i] for i in dict.fromkeys(owners.tolist()))
+
+
+def impact(known: Known) -> str | None:
+    """Trap 9: gradients of plain steps through impacts that lack their time."""
+    method, rows = known.method, bound_rows(known)
+    if method.events is not None or rows is None:
+        return None
     some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
     lands = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
     said = doubt(rows, lands, some)

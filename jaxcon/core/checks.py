@@ -27,6 +27,7 @@ LONG = 80
 """Letters of what was given that a message shows."""
 
 _waiting_is_forbidden = ContextVar("_waiting_is_forbidden", default=False)
+_constructing = ContextVar("_constructing", default=False)
 
 
 def is_concrete(x: Any) -> bool:
@@ -49,6 +50,31 @@ def without_waiting() -> Iterator[None]:
         yield
     finally:
         _waiting_is_forbidden.reset(token)
+
+
+class Checked:
+    """A part of a method that checks its numbers where it is constructed, as far as they are known.
+
+    Traced numbers, and the shapes of arrays, are checked by `init`, `rollout` and `step`: a part
+    constructed with arrays may be meant for a batch of worlds. JAX rebuilds a part without this
+    check; see `pytree`.
+    """
+
+    def __post_init__(self) -> None:
+        """Checks the numbers.
+
+        Raises:
+            ValueError: a number is out of range.
+            TypeError: a part is of another kind.
+        """
+        token = _constructing.set(True)
+        try:
+            self.check()
+        finally:
+            _constructing.reset(token)
+
+    def check(self) -> None:
+        """Checks the numbers; nothing by default."""
 
 
 def is_floating(x: Any) -> bool:
@@ -132,7 +158,8 @@ def check(
     if x is None and optional:
         return None
     array = _numbers(owner, what, x, "a real number" if shape == () else "real numbers")
-    if shape is not None and array.shape != shape:
+    batched = _constructing.get() and hasattr(x, "shape")
+    if shape is not None and array.shape != shape and not batched:
         raise ValueError(f"{owner}: {what} must have shape {shape}, got {array.shape}.")
     if isinstance(array, jax.Array) and not is_concrete(array):
         return array
@@ -228,6 +255,39 @@ def _from_host(owner: str, what: str, x: Any, wanted: str) -> Any:
         raise ValueError(
             f"{owner}: {what} must be real numbers of one shape, got {shortened(x)}."
         ) from error
+
+
+def components(owner: str, **given: tuple[Any, tuple[int, ...]]) -> list[Any]:
+    """Real numbers whose first axes enumerate components; values are not read.
+
+    Args:
+        owner: whose numbers they are, for errors.
+        given: by name, the numbers and the sizes of their first axes.
+
+    Returns:
+        Arrays of floating numbers.
+
+    Raises:
+        ValueError: not real numbers, other sizes, or further axes that do not broadcast.
+    """
+    arrays = []
+    for what, (x, sizes) in given.items():
+        array = _numbers(owner, what, x)
+        array = jnp.asarray(float(x) if isinstance(x, int | float) else array)  # weakly typed
+        if array.shape[: len(sizes)] != sizes:
+            wanted = f"({', '.join(map(str, sizes))}, …)" if sizes else "()"
+            raise ValueError(f"{owner}: {what} must have shape {wanted}, got {array.shape}.")
+        floating = jnp.issubdtype(array.dtype, jnp.floating)
+        arrays.append(array if floating else array.astype(jnp.result_type(float)))
+    batches = [x.shape[len(n) :] for x, (_, n) in zip(arrays, given.values(), strict=True)]
+    try:
+        np.broadcast_shapes(*batches)
+    except ValueError as error:
+        shapes = " and ".join(f"{what} {x.shape}" for what, x in zip(given, arrays, strict=True))
+        raise ValueError(
+            f"{owner}: the further axes of {shapes} do not broadcast against each other."
+        ) from error
+    return arrays
 
 
 def shortened(x: Any) -> str:

@@ -31,7 +31,7 @@ from jax.extend.core import ClosedJaxpr, Primitive
 from jax.extend.core.primitives import stop_gradient_p
 from jax.interpreters import ad, batching, mlir, partial_eval
 
-from jaxcon.core import fusion, meshes
+from jaxcon.core import fusion, meshes, notices
 from jaxcon.core.jaxprs import without_unused
 from jaxcon.core.somewhere import asking
 from jaxcon.core.typing import Array, PyTree
@@ -91,7 +91,7 @@ class Native:
         Operations keep the mesh and the default precision under which they were traced.
         """
         mesh, real = jax.sharding.get_abstract_mesh(), jnp.result_type(float)
-        return self.among((mesh, real), *avals)
+        return self.among((mesh, real, notices.is_observing()), *avals)
 
     def _among(self, settings: Any, *avals: Any) -> Any:
         return self._traced(*avals)

@@ -1,6 +1,6 @@
 """Frozen dataclasses that JAX flattens: numbers are leaves, choices are static."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar, dataclass_transform
 
@@ -29,19 +29,47 @@ def pytree(cls: type[T]) -> type[T]:
 
     Instances are compared and hashed by structure and leaves, see `equality`: a method can be a
     static argument of `jax.jit`. Those of classes of the library can be written by `jax.export`.
+    JAX rebuilds an instance without `__post_init__`, which so may check what a user gave.
     """
     cls = dataclass(frozen=True, eq=False)(cls)
     if cls.__eq__ is object.__eq__:
         cls.__eq__, cls.__hash__ = _equal, _hash
     numbers = [f.name for f in fields(cls) if not f.metadata.get("static")]  # type: ignore[arg-type]
     choices = [f.name for f in fields(cls) if f.metadata.get("static")]  # type: ignore[arg-type]
-    jax.tree_util.register_dataclass(cls, numbers, choices)
 
     def rebuilt(known: Any, children: Any) -> T:
         values = *zip(numbers, children, strict=True), *zip(choices, known, strict=True)
-        return cls(**dict(values))
+        if not hasattr(cls, "__post_init__"):
+            return cls(**dict(values))
+        new = object.__new__(cls)
+        for name, x in values:
+            object.__setattr__(new, name, x)
+        return new
 
+    if hasattr(cls, "__post_init__"):
+        _register_without_init(cls, numbers, choices, rebuilt)
+    else:
+        jax.tree_util.register_dataclass(cls, numbers, choices)
     return exportable(cls, rebuilt)
+
+
+def _register_without_init(
+    cls: type, numbers: list[str], choices: list[str], rebuilt: Callable[[Any, Any], Any]
+) -> None:
+    """Registers a dataclass like `register_dataclass`, which would call the constructor.
+
+    JAX rebuilds trees with tracers, gradients, axes and placeholders in the place of numbers.
+    """
+    keys = [jax.tree_util.GetAttrKey(name) for name in numbers]
+
+    def flatten(x: Any) -> tuple[list[Any], tuple[Any, ...]]:
+        return [getattr(x, name) for name in numbers], tuple(getattr(x, name) for name in choices)
+
+    def flatten_with_keys(x: Any) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        children, known = flatten(x)
+        return list(zip(keys, children, strict=True)), known
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, rebuilt, flatten)
 
 
 def exportable(cls: type[T], rebuilt: Any = None) -> type[T]:

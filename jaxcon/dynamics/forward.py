@@ -15,6 +15,7 @@ from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows, linearize_bounds
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import notices, numerics, status
+from jaxcon.core.doubled import Doubled
 from jaxcon.core.lanes import widened
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics import impacts
@@ -131,7 +132,9 @@ class Dynamics:
         impulse = self._impulse(base, law, problem, length, acts)
         e, bounds = bounds.restitution, impulse.rows
         start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
+        seen = None
         if lands:
+            seen = impacts.closing(bounds, start, self.dt) if notices.is_observing() else None
             asked = impacts.landing(bounds, start, self.dt)
             impulse = dataclasses.replace(impulse, rows=asked)
         may = start > 0
@@ -148,8 +151,21 @@ class Dynamics:
             lag = 0.0 if lag is None else lag
             change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
             times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
+            solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
             solution, known = self._struck((q, v, t), solution, known, times, lag)
+        elif seen is not None:
+            solution = self._observed(solution, t, seen, seen, bounds)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone
+
+    def _observed(
+        self, solution: Solution, t: Any, hits: Array, fast: Array, rows: BoundRows
+    ) -> Solution:
+        """The solution; where impacts are observed, what hits in this step is told."""
+        if not notices.is_observing():
+            return solution
+        time, kind = Doubled.of(t).high, impacts.Seen(rows.layout)
+        a = notices.observe(solution.acceleration, kind, hits, fast, time, self.dt)
+        return solution._replace(acceleration=a)
 
     def _struck(
         self, at: Any, solution: Solution, known: Reactions, arrivals: Any, lag: float

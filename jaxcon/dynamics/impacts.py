@@ -4,7 +4,7 @@ An impact at t + τ takes the velocities v⁻ = v + τ a⁻ to v⁺ = v⁻ + Δv
 other accelerations a⁺. At the end of a step h, with r = h − τ the rest of it,
 
     v_end = v + h a⁻ + Δv + r (a⁺ − a⁻),
-    q_end = q ⊕ (h v + h² a⁻/2) ⊕ (r Δv + r² (a⁺ − a⁻)/2).
+    q_end = q ⊕ (h v + h² a⁻/2) ⊕ (r Δv + r² (a⁺ − a⁻)/2 − r² ω × Δω/2).
 
 The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
 an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.bound_layout import BoundLayout
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
 from jaxcon.core.pytree import pytree
@@ -46,6 +47,16 @@ PREFIX = "gradients through impacts: "
 
 SLOW = 2
 """Impacts slower than this many times h |a| do not bounce: the row comes to rest."""
+
+
+class Seen(NamedTuple):
+    """The kind of observations of impacts: rows that hit (n,), those that bounce (n,), time, h.
+
+    Attributes:
+        layout: rows by element.
+    """
+
+    layout: BoundLayout
 
 
 @pytree
@@ -252,6 +263,18 @@ def at_impact(
     return asked, lasts | rows.kinds.by_contact(hard & arrivals.happens[None])
 
 
+def closing(rows: BoundRows, change: Array, dt: Array) -> Array:
+    """Rows without restitution that close within the step and do not rest, (n,).
+
+    Args:
+        rows: the bounded rows at the start of the step.
+        change: h J a without bounded rows, (n,).
+        dt: h, () [s].
+    """
+    fast = rows.rate < -(jnp.abs(change) + slowest(rows, change))
+    return mask(rows.ends, rows) & fast & (rows.gap > 0) & (rows.gap < -dt[None] * rows.rate)
+
+
 def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     """Sets the targets of contacts without restitution for a step in which they may land.
 
@@ -312,7 +335,8 @@ class Impact:
         q, v, t: the state at the start of the step.
         acceleration: a⁻, (n_v,).
         multipliers, joints: λ of bounded rows and of equality rows before it, (n,) and (n_c,).
-        lag: velocities are those of lag · h before the positions.
+        lag: velocities are those of lag · h before the positions; where it is not 0, the travel is
+            added to the displacement of the step before bodies turn by the sum.
         dt: h, () [s].
         arrivals: which rows arrive, and when.
     """
@@ -352,9 +376,20 @@ class Impact:
         # the impact and what follows are one program, which halves what there is to compile
         _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
         struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
-        more = jnp.where(arrivals.touched, after.change - a, 0)
         rest, left = h - τ, (1 - self.lag) * h - τ
-        jump = Jump(struck.change + left * more, rest * struck.change + rest * rest / 2 * more)
+        # a⁻ at the impact, and how both accelerations go on: bodies that spin fast precess
+        first = arrivals.first[None]
+        later = (1 - self.lag) * h - first
+        more = after.change - a - 2 * self._coast(self.q, self.v, first)
+        ahead = self._coast(place, before + struck.change, later)
+        bend = later * (ahead - self._coast(place, before, later))
+        more = jnp.where(arrivals.touched, more, 0)
+        # bodies that turn by τ ω, then by r (ω + Δω), are ahead of the sum of both turns by
+        # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
+        across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
+        swing = (-τ if self.lag else rest) * rest / 2 * across
+        travel = rest * struck.change + rest * rest / 2 * more + swing
+        jump = Jump(struck.change + left * more + bend, travel)
         share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
@@ -365,4 +400,15 @@ class Impact:
         """q*, v⁻ and the time of the impact."""
         h, a, τ = self.dt[None], self.acceleration, arrivals.by_velocity
         place = self.system.retract(self.q, τ * (self.v + (self.lag * h + τ / 2) * a))
-        return place, self.v + (self.lag * h + τ) * a, self.t + arrivals.first
+        first = arrivals.first[None]
+        v = self.v + (self.lag * h + τ) * a + first * self._coast(self.q, self.v, first)
+        return place, v, self.t + arrivals.first
+
+    def _coast(self, q: Array, v: Array, time: Array) -> Array:
+        """By how much free rotation changes a in half of a time (1,) [s], of bodies without joints.
+
+        The mean gyroscopic acceleration over that time, less that at its start.
+        """
+        if not self.system.turns_in_space or self.joints.size:
+            return jnp.zeros_like(v)
+        return self.system.coast(q, v, time)

@@ -3,22 +3,53 @@
 Every function takes arrays whose first axis enumerates components, or Vectors of lanes; trailing
 axes are batches. Angular velocities are in the body frame, so that q̇ = ½ q ⊗ (0, ω).
 
+A ValueError names what is not of real numbers, or of another shape. Values are not read: NaN in an
+argument becomes NaN in the result.
+
 References:
     Solà, Quaternion kinematics for the error-state Kalman filter (2017), sections 1-4.
 """
 
+import functools
+import inspect
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 
-from jaxcon.core import numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Matrix, Vector, componentwise, minus, plus, times
 from jaxcon.core.typing import Array, Lane
 
 IDENTITY = Vector(1.0, 0.0, 0.0, 0.0)
 
 
-@componentwise
+def _of_components(*sizes: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Lets a function of Vectors of these sizes also take arrays, which it checks.
+
+    Raises:
+        ValueError: by the function, of arrays that are not real numbers or of other shapes.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        owner, lanes = f"quaternion.{function.__name__}", componentwise(function)
+        names = tuple(inspect.signature(function).parameters)
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def wrapped(*args: Any, **named: Any) -> Any:
+            values = signature.bind(*args, **named).args
+            if any(isinstance(x, Vector) for x in values):
+                return function(*values)
+            given = zip(values, ((n,) for n in sizes), strict=True)
+            return lanes(*checks.components(owner, **dict(zip(names, given, strict=True))))
+
+        return wrapped
+
+    return decorate
+
+
+@_of_components(4, 4)
 def multiply(p: Any, q: Any) -> Any:
     """p ⊗ q: first turn by q, then by p.
 
@@ -35,7 +66,7 @@ def multiply(p: Any, q: Any) -> Any:
     return Vector(minus(times(scalar, other), vector.dot(direction)), *turned)
 
 
-@componentwise
+@_of_components(4)
 def conjugate(q: Any) -> Any:
     """q*: the inverse of a unit quaternion (4, …).
 
@@ -45,7 +76,7 @@ def conjugate(q: Any) -> Any:
     return Vector(q[0], *(times(-1, x) for x in q[1:]))
 
 
-@componentwise
+@_of_components(4, 3)
 def rotate(q: Any, x: Any) -> Any:
     """q x q*: a vector of the body (3, …) in the world frame.
 
@@ -58,7 +89,7 @@ def rotate(q: Any, x: Any) -> Any:
     return x + twice * scalar + vector.cross(twice)
 
 
-@componentwise
+@_of_components(4)
 def matrix(q: Any) -> Any:
     """The rotation matrix R (3, 3, …) with R x = q x q*.
 
@@ -92,7 +123,7 @@ def rotation(q: Vector) -> Matrix:
     )
 
 
-@componentwise
+@_of_components(4, 3)
 def derivative(q: Any, omega: Any) -> Any:
     """q̇ = ½ q ⊗ (0, ω), ω (3, …) in the body frame [rad/s].
 
@@ -103,7 +134,7 @@ def derivative(q: Any, omega: Any) -> Any:
     return multiply(q, Vector(0.0, *omega)) * 0.5
 
 
-@componentwise
+@_of_components(3)
 def exp(phi: Any) -> Any:
     """The turn by ‖φ‖ about φ (3, …) [rad]: (cos ½‖φ‖, φ sin ½‖φ‖ / ‖φ‖), smooth at φ = 0.
 
@@ -114,7 +145,7 @@ def exp(phi: Any) -> Any:
     return Vector(cos, *(phi * (sinc * 0.5)))
 
 
-@componentwise
+@_of_components(4)
 def log(q: Any) -> Any:
     """The rotation vector φ (3, …) [rad] of the shorter turn: exp(φ) = ± q, smooth at identity.
 
@@ -130,7 +161,7 @@ def log(q: Any) -> Any:
     return vector * jnp.where(scalar < 0, -scale, scale)
 
 
-@componentwise
+@_of_components(4)
 def normalize(q: Any) -> Any:
     """q / ‖q‖ (4, …).
 
@@ -146,7 +177,13 @@ def from_axis_angle(axis: Any, angle: Any) -> Array:
     Args:
         axis: (3,), of any length but zero.
         angle: () [rad].
+
+    Raises:
+        ValueError: not real numbers, or another shape.
     """
+    with checks.without_waiting():
+        checks.check("quaternion.from_axis_angle", "axis", axis, (3,))
+        checks.check("quaternion.from_axis_angle", "angle", angle, ())
     axis = jnp.asarray(axis)
     if not jnp.issubdtype(axis.dtype, jnp.floating):
         axis = axis.astype(jnp.result_type(float))
@@ -161,9 +198,15 @@ def from_matrix(r: Array) -> Array:
     Args:
         r: R, (3, 3).
 
+    Raises:
+        ValueError: not real numbers, or another shape.
+
     References:
         Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978).
     """
+    with checks.without_waiting():
+        r = checks.check("quaternion.from_matrix", "r", r, (3, 3))
+    r = jnp.asarray(r)
     r00, r11, r22 = r[0, 0], r[1, 1], r[2, 2]
     x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
     xy, xz, yz = r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1]

@@ -46,7 +46,7 @@ class Impacts:
 
 
 @pytree
-class Events:
+class Events(checks.Checked):
     """A step is split where a hard stop, rope or contact is hit, at that time.
 
     Let F(x, s) be the method's own step of length s in which open rows do nothing. The first s at

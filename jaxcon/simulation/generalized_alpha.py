@@ -27,7 +27,7 @@ from jaxcon.stabilization.projection import Projection
 
 
 @pytree
-class GeneralizedAlpha:
+class GeneralizedAlpha(checks.Checked):
     """Implicit, second order: holds φ = 0 and φ̇ = 0 at the end of each step, whatever its length.
 
     For scenes that are stiff in their springs or in the ratios of their masses, where an explicit

@@ -66,7 +66,7 @@ TURN = 0.025
 """Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `missed`."""
 
 
-class Explicit:
+class Explicit(checks.Checked):
     """An integrator that needs accelerations only; admits every stabiliser."""
 
     @property

@@ -172,17 +172,12 @@ class Method:
             return "a Recovery leads on from states to which no step leads back"
         return None
 
-    def check(self) -> None:
-        """Checks that each part is a value of its kind.
+    def __post_init__(self) -> None:
+        """Checks that each part is a value of its kind; each has checked its own numbers.
 
         Raises:
             TypeError: a part is a class or a name, not a value like `RK4()`.
         """
-        if hasattr(self.integrator, "check") and not isinstance(self.integrator, type):
-            self.integrator.check()
-        for part in (self.recovery, self.events):
-            if hasattr(part, "check") and not isinstance(part, type):
-                part.check()
         for part, verb, example in PARTS:
             value = getattr(self, part)
             absent = part in OPTIONAL and value is None
@@ -192,7 +187,17 @@ class Method:
                 raise TypeError(
                     f"Method: {part} must be a value such as {example}, got {value!r}{hint}."
                 )
-        for part in (self.stabilizer, self.solver, self.bounded):
+
+    def check(self) -> None:
+        """Checks the parts and their numbers, traced ones and shapes included.
+
+        Raises:
+            TypeError: a part is a class or a name, not a value like `RK4()`.
+            ValueError: a number of a part is out of range.
+        """
+        self.__post_init__()
+        for name, *_ in PARTS:
+            part = getattr(self, name)
             if hasattr(part, "check"):
                 part.check()
 

@@ -22,7 +22,7 @@ from jaxcon.stabilization.baumgarte import asks_nothing
 
 
 @pytree
-class RATTLE:
+class RATTLE(checks.Checked):
     """Kicks by half of the forces, a drift on the constraints, and half of the forces there.
 
     With V the velocity between the two ends, p_φ± = (dexp⁻¹_{±hV})ᵀ M V and F applied forces,

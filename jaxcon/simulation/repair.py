@@ -42,7 +42,7 @@ class Repairs(NamedTuple):
 
 
 @pytree
-class Recovery:
+class Recovery(checks.Checked):
     """What a world does when a step fails, by itself: it rolls back, projects, and relaxes.
 
     A step has failed where its status says so, or where it ends with max |φ| above the limit. The

@@ -25,7 +25,7 @@ Operator = Callable[[Array], Array]
 
 
 @pytree
-class ConjugateGradients:
+class ConjugateGradients(checks.Checked):
     """Solves M a = f + Jᵀλ, J a + C λ = b by conjugate gradients on A = J M⁻¹ Jᵀ + C.
 
     A x is J (M⁻¹ (Jᵀ x)) + C x and the preconditioner is the blocks of A on its diagonal, one for

@@ -17,7 +17,7 @@ from jaxcon.solvers.gauss_jordan import at, put
 
 
 @pytree
-class GaussSeidel:
+class GaussSeidel(checks.Checked):
     """A fixed number of sweeps over rows, contact by contact, from the multipliers of a step ago.
 
     Each row is solved with all others held: λᵢ ← P(λᵢ − uᵢ/Gᵢᵢ), of a contact first the normal and

@@ -34,7 +34,7 @@ NEAREST = 0.99
 
 
 @pytree
-class InteriorPoint:
+class InteriorPoint(checks.Checked):
     """Newton's method on the central path, whose products λ u = τ go to zero; to full precision.
 
     Each contact has two pairs on the path, λ_n u_n = τ, and in the second-order cone

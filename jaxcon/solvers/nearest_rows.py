@@ -16,7 +16,7 @@ from jaxcon.solvers.interior_point import InteriorPoint
 
 
 @pytree
-class Nearest:
+class Nearest(checks.Checked):
     """Solves as many one-sided rows and contacts as asked, those that are nearest to act.
 
     Where many could touch and few do, this saves what bounded rows cost beyond their joints: one

@@ -54,7 +54,7 @@ def Priority(  # noqa: N802
 
 
 @pytree
-class Lexicographic:
+class Lexicographic(checks.Checked):
     """Solves M a = f + Jᵀλ with J a + C λ = b met level by level; `Priority` makes one.
 
     Of all accelerations that meet level 0, by least squares where its rows contradict each other,

@@ -22,7 +22,7 @@ from jaxcon.solvers.sparse import Sparse
 
 
 @pytree
-class RankSafe:
+class RankSafe(checks.Checked):
     """Solves J a + C λ = b also where rows depend on each other, by proximal iteration.
 
     (A + ε W) λ⁺ = r + ε W λ from λ = 0, with r = b − J M⁻¹ f and W = max(diag A, w² max diag A):

@@ -13,7 +13,7 @@ from jaxcon.solvers.saddle import Factored, Mass, Saddle, Solution, free_motion,
 
 
 @pytree
-class Schur:
+class Schur(checks.Checked):
     """Solves M a = f + Jᵀλ, J a + C λ = b through A = J M⁻¹ Jᵀ + C (the Delassus operator).
 
     Eliminating a = M⁻¹(f + Jᵀλ) from the second row leaves A λ = b − J M⁻¹ f, with A symmetric and

@@ -26,7 +26,7 @@ from jaxcon.solvers.schur import Schur
 
 
 @pytree
-class Sparse:
+class Sparse(checks.Checked):
     """Solves M a = f + Jᵀλ, J a + C λ = b by sparse elimination of A = J M⁻¹ Jᵀ + C.
 
     The solution is differentiated implicitly, with A λ written as J (M⁻¹ (Jᵀ λ)) + C λ: forward and

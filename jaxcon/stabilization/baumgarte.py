@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
@@ -36,7 +37,7 @@ class Law(NamedTuple):
 
 
 @pytree
-class Unstabilized:
+class Unstabilized(checks.Checked):
     """b = −γ: constraints hold at the acceleration level only, and errors grow with time."""
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:

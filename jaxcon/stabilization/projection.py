@@ -30,7 +30,7 @@ METRICS = ("mass", "euclidean")
 
 
 @pytree
-class Tolerance:
+class Tolerance(checks.Checked):
     """ε = ε₀ (1 + α ‖v‖ + β ‖F‖): what |φ| may be, more where the motion is fast or forces large.
 
     ‖·‖ is the Euclidean norm over all entries of v and of the applied force F, control left out.
