@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import jaxcon as jc
+from jaxcon.analysis import encounters
 from jaxcon.analysis.known import Known
 from jaxcon.analysis.traps import impact
 from jaxcon.core import notices
@@ -393,7 +394,7 @@ def test_a_body_that_spins_fast_in_space_strikes_a_floor(name, corner):
     params = {"floor": {"friction": jnp.asarray([2.0, 0.0])}}
     # the free flight of semi-implicit Euler is of first order, and so are its derivatives
     want = None if name == "SIE" else lambda z, i: thrown(z, time, corner, i == 0)
-    held_to(run, z, params, want)
+    held_to(run, z, params, want, tight=1.5e-2)  # the error is a share of h|ω|, here 0.026
 
 
 def bar(restitution=None):
@@ -491,16 +492,22 @@ def started(scene, place, time):
     ("scene", "place", "at", "time", "case"),
     [
         (vee(), 0, 0.0, 0.2, "simultaneous impacts: 2 of left, right in the step at 0.142"),
-        (ball(0.3), 1, 0.1, 0.4, "accumulating impacts: floor hits 3 times within 20 steps"),
         (ball(0.6), 1, 0.1, 0.1428, "a grazing impact: floor hits 0 or 1 times, depending on x"),
     ],
-    ids=["simultaneous", "accumulating", "grazing"],
+    ids=["simultaneous", "grazing"],
 )
-def test_a_check_names_the_impacts_that_have_no_derivative(scene, place, at, time, case):
-    found = jc.check_gradients(started(scene, place, time), at)
+def test_impacts_that_may_have_no_derivative_are_named(scene, place, at, time, case):
+    """On the way from x, and from both sides of it."""
+    run = started(scene, place, time)
+    found = encounters.cases(lambda x: run(x[0]), [jnp.asarray(at)], [[jnp.asarray(5e-3)]])
+    assert any(case in words for words in found)
+
+
+def test_a_check_names_the_impacts_that_have_no_derivative():
+    found = jc.check_gradients(started(ball(0.3), 1, 0.4), 0.1)
     assert not found.ok
-    assert any(note.startswith(case) for note in found.notes), found.notes
-    assert f"note, {case}" in str(found)
+    case = "accumulating impacts: floor hits 3 times within 20 steps"
+    assert any(case in note for note in found.notes)
 
 
 def test_a_report_names_what_has_impacts():

@@ -27,7 +27,7 @@ def somewhere(flags: Array) -> Array:
 
     It has no derivative. Under `jax.vmap` it is asked for each of the mapped arrays.
     """
-    return somewhere_p.bind(jnp.asarray(flags, bool))
+    return somewhere_p.bind(jnp.asarray(flags, bool), asks=asking())
 
 
 def everywhere(flags: Array) -> Array:
@@ -60,24 +60,24 @@ _by_device.def_partition(
 
 @functools.cache
 def asking() -> ClosedJaxpr:
-    """A traced question, for the parameters of a primitive whose lowering asks some.
+    """A traced question, for the parameters of primitives whose lowering asks some.
 
-    JAX looks for such questions in the parameters of what is lowered, to know that it needs the
+    JAX looks for such questions in what is lowered, parameters included, to know that it needs the
     devices.
     """
     return jax.make_jaxpr(_by_device)(np.zeros(1, bool))
 
 
-def _batched(args: Any, axes: Any) -> Any:
+def _batched(args: Any, axes: Any, *, asks: Any) -> Any:
     """One answer for each of the mapped arrays, for which devices may have to meet."""
     (flags,), (axis,) = args, axes
     return jnp.any(jnp.moveaxis(flags, axis, 0), axis=tuple(range(1, flags.ndim))), 0
 
 
 somewhere_p = Primitive("somewhere")
-somewhere_p.def_impl(_any)
-somewhere_p.def_abstract_eval(lambda flags: ShapedArray((), jnp.dtype(bool)))
+somewhere_p.def_impl(lambda flags, asks: _any(flags))
+somewhere_p.def_abstract_eval(lambda flags, asks: ShapedArray((), jnp.dtype(bool)))
 batching.primitive_batchers[somewhere_p] = _batched
 mlir.register_lowering(
-    somewhere_p, mlir.lower_fun(lambda flags: _by_device(flags), multiple_results=False)
+    somewhere_p, mlir.lower_fun(lambda flags, asks: _by_device(flags), multiple_results=False)
 )

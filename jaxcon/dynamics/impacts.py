@@ -377,19 +377,15 @@ class Impact:
         _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
         struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
         rest, left = h - τ, (1 - self.lag) * h - τ
-        # a⁻ at the impact, and how both accelerations go on: bodies that spin fast precess
-        first = arrivals.first[None]
-        later = (1 - self.lag) * h - first
-        more = after.change - a - 2 * self._coast(self.q, self.v, first)
-        ahead = self._coast(place, before + struck.change, later)
-        bend = later * (ahead - self._coast(place, before, later))
-        more = jnp.where(arrivals.touched, more, 0)
+        # from the acceleration just before the impact, not from that at the start of the step
+        smooth = self._gyroscopic(before) - self._gyroscopic(self.v)
+        more = jnp.where(arrivals.touched, after.change - a - smooth, 0)
         # bodies that turn by τ ω, then by r (ω + Δω), are ahead of the sum of both turns by
         # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
         travel = rest * struck.change + rest * rest / 2 * more + swing
-        jump = Jump(struck.change + left * more + bend, travel)
+        jump = Jump(struck.change + left * more, travel)
         share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
@@ -400,15 +396,14 @@ class Impact:
         """q*, v⁻ and the time of the impact."""
         h, a, τ = self.dt[None], self.acceleration, arrivals.by_velocity
         place = self.system.retract(self.q, τ * (self.v + (self.lag * h + τ / 2) * a))
-        first = arrivals.first[None]
-        v = self.v + (self.lag * h + τ) * a + first * self._coast(self.q, self.v, first)
-        return place, v, self.t + arrivals.first
+        since = self.lag * h + τ
+        # a body that spins fast precesses on the way, which is of first order in the derivative
+        turned = self._gyroscopic(self.v + since / 2 * a) - self._gyroscopic(self.v)
+        return place, self.v + since * (a + turned), self.t + arrivals.first
 
-    def _coast(self, q: Array, v: Array, time: Array) -> Array:
-        """By how much free rotation changes a in half of a time (1,) [s], of bodies without joints.
-
-        The mean gyroscopic acceleration over that time, less that at its start.
-        """
+    def _gyroscopic(self, v: Array) -> Array:
+        """The gyroscopic acceleration of bodies without joints, (n_v,); of others zero."""
         if not self.system.turns_in_space or self.joints.size:
             return jnp.zeros_like(v)
-        return self.system.coast(q, v, time)
+        mass = self.system.mass(self.q)
+        return mass.solve(self.system.coadjoint(self.q, v, mass.apply(v)))

@@ -67,10 +67,6 @@ class Particle:
         """v + h a: these velocities are rates of coordinates."""
         return v + acceleration * dt
 
-    def coast(self, v: Vector, moments: Any, dt: Lane) -> Vector:
-        """None: these velocities are rates of coordinates."""
-        return v.map(jnp.zeros_like)
-
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
         return Motion(q, None, v, None)
@@ -198,15 +194,6 @@ class SpatialRigid(Particle):
         turned = rotate_freely(turned + applied, moments_, shares, half)
         return Vector(*(Vector(*v[:3]) + Vector(*acceleration[:3]) * dt), *turned)
 
-    def coast(self, v: Vector, moments: Array, dt: Lane) -> Vector:
-        """The mean gyroscopic acceleration of a step of free rotation, less that at its start."""
-        moments_, half = Vector.of(moments), dt / 2
-        shares, ω = shares_of(moments_), Vector(*v[3:])
-        turned = rotate_freely(ω, moments_, shares, half)
-        turned = rotate_freely(turned, moments_, shares, half)
-        mean = (turned - ω).map(lambda x: numerics.safe_divide(x, dt))
-        return Vector(*zeros(3), *(mean + spun(shares, ω)))
-
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
         return Motion(q[:3], q[3:], v[:3], v[3:])
@@ -234,12 +221,15 @@ def spun(shares: Vector, ω: Vector) -> Vector:
 def rotate_freely(ω: Vector, moments: Vector, shares: Vector, dt: Lane) -> Vector:
     """ω after a body has turned without torque: I ω̇ = −ω × Iω by the implicit midpoint rule.
 
-    The rule p⁺ − p = −h ω̄ × (p + p⁺)/2 with p = Iω is a rotation of p by the Cayley map of −h ω̄,
-    so |p| is kept whatever ω̄ is. With ω̄ = (ω + ω⁺)/2 energy is kept as well. One step of Newton's
-    method from ω finds ω̄ up to (h|ω|/2)³.
+    With s̄ = h/2 ω̄, the rule p⁺ − p = −s̄ × (p + p⁺) for p = Iω is a rotation of p, by the Cayley
+    map p⁺ = p + 2 (s̄ × (s̄ × p) − s̄ × p) / (1 + s̄·s̄), so |p| is kept whatever ω̄ is. With
+    ω̄ = (ω + ω⁺)/2 energy is kept as well. One step of Newton's method from ω finds ω̄ up to
+    (h|ω|/2)³.
 
     With s = h/2 ω and G the derivative of g(s) = I⁻¹ (s × Is), it is s̄ = s − (1 + G)⁻¹ g. As g is
-    quadratic, G s = 2 g, and s̄ = (s + (1 + G)⁻¹ s)/2, by Cramer's rule in closed form.
+    quadratic, G s = 2 g, and the change has a closed form by Cramer's rule. Differences of moments
+    are in the shares alone: those of products, divided by a small moment, would spin a thin rod by
+    what rounding leaves.
 
     Args:
         ω: angular velocity in the body's frame [rad/s].
@@ -251,19 +241,28 @@ def rotate_freely(ω: Vector, moments: Vector, shares: Vector, dt: Lane) -> Vect
         Austin, Krishnaprasad, Wang, Almost Poisson integration of rigid body systems, Journal of
             Computational Physics 107 (1993).
     """
-    (a, b, c), (x, y, z) = shares, ω * (dt / 2)
+    (a, b, c), s = shares, ω * (dt / 2)
+    x, y, z = s
     xx, yy, zz = b * c * x * x, a * c * y * y, a * b * z * z
-    inverse = 1 / (1 - xx - yy - zz + 2 * a * b * c * x * y * z)
-    middle = Vector(
-        x + (x * (1 - xx + yy + zz) - 2 * a * y * z) * inverse,
-        y + (y * (1 + xx - yy + zz) - 2 * b * z * x) * inverse,
-        z + (z * (1 + xx + yy - zz) - 2 * c * x * y) * inverse,
+    product = a * b * c * x * y * z
+    inverse = 1 / (1 - xx - yy - zz + 2 * product)
+    torque = spun(shares, ω) * (dt / 2)  # I⁻¹ (s × p)
+    g = torque * (dt / 2)
+    change = Vector(
+        (x * (yy + zz - product) - g[0]) * inverse,
+        (y * (zz + xx - product) - g[1]) * inverse,
+        (z * (xx + yy - product) - g[2]) * inverse,
     )
-    axis, p = middle * -0.5, Vector(*(i * x for i, x in zip(moments, ω, strict=True)))
-    across = axis.cross(p)
-    turned = (across + axis.cross(across)) * (2 / (1 + axis.dot(axis)))
-    # the change alone is divided by I: of a body that hardly precesses ω keeps its last digit
-    return Vector(*(x + y * (1 / i) for x, y, i in zip(ω, turned, moments, strict=True)))
+    middle, p = s + change, Vector(*(i * x for i, x in zip(moments, ω, strict=True)))
+    square = middle.dot(middle)
+    turned = middle * middle.dot(p) - change.cross(p)
+    share = 2 / (1 + square)
+    return Vector(
+        *(
+            ω_i + share * (turned_i * (1 / i) - torque_i - ω_i * square)
+            for ω_i, turned_i, torque_i, i in zip(ω, turned, torque, moments, strict=True)
+        )
+    )
 
 
 def rest(pose: Pose) -> Motion:

@@ -214,24 +214,6 @@ class BodySystem:
         ]
         return _join([kind.kick(*own, dt) for kind, *own in known], q)
 
-    def coast(self, q: Array, v: Array, dt: Any) -> Array:
-        """The mean gyroscopic acceleration of a step of free rotation, less that at its start.
-
-        Args:
-            q: positions, (n_q,).
-            v: velocities before the step, (n_v,).
-            dt: h, (1,) [s].
-        """
-        parts = zip(self.layout.groups, self.inertia, strict=True)
-        known = [(g.kind, g.unpack(q, v)[1], p.moments) for g, p in parts]
-        return _join(
-            [
-                kind.coast(own, moments, dt).map(lambda x, v=own: 0 * v[0] + x)
-                for kind, own, moments in known
-            ],
-            q,
-        )
-
     @property
     def turns_in_space(self) -> bool:
         """True where bodies have an orientation in space."""

@@ -6,7 +6,6 @@ also says how it transforms a constraint error under feedback, which decides whi
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -129,22 +128,14 @@ class SemiImplicitEuler(Explicit):
     ) -> tuple[Array, Solution, Rows]:
         """v⁺, a and λ, and the rows, with the free rotation of bodies split off.
 
-        Where an inequality constraint acts, v⁺ = v + h a, as its law says something of this v⁺. The
-        gyroscopic part of a is then the mean over a step of free rotation.
+        Inequality constraints say something of v + h a, from which v⁺ of a body that they act on
+        differs by a share of (h|ω|)².
         """
         system, h = dynamics.system, dt[None]
-        coasting = 0.0
-        if system.bounds:
-            coasting = system.coast(state.q, state.v, h)
-            dynamics = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
         solution, rows, least = dynamics.factored(*here, dt / 2)
-        v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
-        acts = jnp.zeros((), bool)
-        if rows.reactions is not None:
-            acts = jnp.any(rows.reactions.multipliers != 0, axis=0)
-            v = jnp.where(acts[None], state.v + h * solution.acceleration, v)
+        v = system.kick(state.q, state.v, solution.acceleration, h)
         if least is not None and rows.layout.size:
-            more = missed(system, state, v, solution, rows, least, acts, dt)
+            more = missed(system, state, v, solution, rows, least, dt)
             v, solution = v + h * more.acceleration, added(solution, more)
         if (jump := jump_of(rows.reactions)) is not None:
             v, solution = v + jump.velocity, with_jump(solution, jump, dt)
@@ -187,7 +178,6 @@ def missed(
     solution: Solution,
     rows: Rows,
     least: Callable[[Array], Solution],
-    acts: Array,
     dt: Any,
 ) -> Solution:
     """The acceleration that takes the linearization error out of φ⁺, by one Newton step.
@@ -196,8 +186,8 @@ def missed(
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
 
     Most steps turn bodies by less than `TURN`, where e is about 1e-5 of a lever arm, and pay for
-    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist. Where an
-    inequality constraint acts, nothing is taken out, since that would move its row off its target.
+    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist. A row of
+    an inequality constraint on these bodies moves off its target by e/h with them.
 
     Args:
         system: of bodies in space.
@@ -206,13 +196,12 @@ def missed(
         solution: a and λ at the start.
         rows: the constraints there.
         least: b → the least a with J a + C λ = b.
-        acts: whether an inequality constraint acts, ().
         dt: h, () [s].
     """
     h = dt[None]
     turn = system.turn(state.q, v, h) / TURN**2
     share = jnp.clip((turn - 1) / 3, 0, 1)
-    share = jnp.where(acts, 0, share * share * (3 - 2 * share))
+    share = share * share * (3 - 2 * share)
     held = rows.layout.holds & rows.layout.holonomic
     held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
 

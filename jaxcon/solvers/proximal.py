@@ -200,8 +200,8 @@ def conflicts(
 ) -> Array:
     """CONFLICT where more of b is left open than rounding and a share of b and J M⁻¹ f, by world.
 
-    Rounding is that of the terms of J M⁻¹ f, which may cancel: gravity asks nothing of a joint
-    between bodies that fall together.
+    Where the stabilizer does not say what b may be off by rounding, it is that of the terms of
+    J M⁻¹ f, which may cancel: gravity asks nothing of a joint between bodies that fall together.
 
     Args:
         system: M, J and C.
@@ -214,9 +214,10 @@ def conflicts(
     free = system.mass.solve(force)
     asked = jnp.abs(target) + jnp.abs(system.jacobian.apply(free))
     size = jnp.max(asked / length, axis=0)
-    rounding = 64 * float(jnp.finfo(target.dtype).eps) * system.jacobian.reach(free)
+    rounding = system.noise
+    if rounding is None:
+        rounding = 64 * float(jnp.finfo(target.dtype).eps) * system.jacobian.reach(free)
     allowed = (share * size)[None] * length + rounding
-    allowed = allowed if system.noise is None else allowed + system.noise
     conflict = jnp.any(jnp.abs(left) > allowed, axis=0)
     return jnp.where(conflict, Status.CONFLICT, Status.OK).astype(jnp.int32)
 
