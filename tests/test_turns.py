@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon.model.turning import rewound, unwound
 
 RIGHT = np.pi / 2
 METHODS = {
@@ -160,3 +161,128 @@ def test_stages_tell_less_than_half_a_turn(method):
         start = jc.init(system, method, state.q, state.v)
         end, _ = jc.rollout(system, method, start, None, 2e-3, 5)
         assert int(end.status) == status
+
+
+FLAT = {
+    "euler": jc.Method(),
+    "projection": jc.Method(stabilizer=jc.Projection()),
+    "rk4": jc.Method(integrator=jc.RK4()),
+    "rattle": jc.Method(integrator=jc.RATTLE(), stabilizer=jc.Unstabilized()),
+}
+TURNED = float(np.float32(200 * np.pi))
+
+
+def four_bar(dtype, *elements):
+    """A crank, a coupler and a rocker in the plane."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=dtype)
+    points = np.array([(0, 0), (0.3, 0.4), (1.2, 0.7), (1, 0)])
+    for i, (a, b) in enumerate(zip(points[:-1], points[1:], strict=True)):
+        x, y = b - a
+        scene.add_body(
+            f"bar{i}",
+            mass=1.0,
+            inertia=float(x * x + y * y) / 12,
+            position=tuple((a + b) / 2),
+            angle=float(np.arctan2(y, x)),
+        )
+    for i, (a, b) in enumerate([(jc.WORLD, 0), (0, 1), (1, 2), (2, jc.WORLD)]):
+        a, b = (x if x == jc.WORLD else f"bar{x}" for x in (a, b))
+        scene.add(jc.Revolute(f"pin{i}", a, b, point=points[i]))
+    for element in elements:
+        scene.add(element)
+    return scene.build()
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_a_linkage_turned_a_hundred_times_holds_as_one_that_is_not(name):
+    """φ in float32, where angles as users see them are multiples of 6e-5."""
+    system, state = four_bar(jnp.float32)
+    start = jc.init(system, FLAT[name], state.q.at[6:].add(TURNED), state.v)
+    end, seen = jc.rollout(
+        system,
+        FLAT[name],
+        start,
+        None,
+        1e-3,
+        1000,
+        record=lambda s, info: (info.violation.worst, jc.energy(system, s).total),
+    )
+    assert int(end.status) == jc.Status.OK
+    assert float(seen[0][500:].max()) < 3e-6
+    assert float(jc.violation(system, end).worst) < 3e-6
+    assert float(np.abs(end.q[6:] - TURNED).max()) < 5  # users see angles that go on
+
+
+def test_readers_see_angles_that_go_on():
+    """Joint coordinates, servos and q itself, beside the linkage unturned."""
+    servo = jc.PositionServo("servo", "pin0", 0.3)
+    system, state = four_bar(jnp.float32, servo)
+    ends = []
+    for shift in (0.0, TURNED):
+        start = jc.init(system, jc.Method(), state.q.at[6:].add(shift), state.v)
+        control = jnp.full((300, 1), shift, jnp.float32)
+        end, angles = jc.rollout(
+            system,
+            jc.Method(),
+            start,
+            control,
+            1e-3,
+            300,
+            record=lambda s, info: jc.coordinate(system, s, "pin0"),
+        )
+        ends.append((end, np.asarray(angles) - shift))
+    np.testing.assert_allclose(ends[1][1], ends[0][1], atol=2e-3)
+    np.testing.assert_allclose(ends[1][0].q[6:] - TURNED, ends[0][0].q[6:], atol=2e-3)
+
+
+def test_the_derivative_of_the_reduction_is_one():
+    """By the angle at the start, in both modes and in a batch, beside the linkage unturned."""
+    system, state = four_bar(jnp.float32)
+
+    def end(angle, shift):
+        q = state.q.at[6].set(angle).at[6:].add(shift)
+        start = jc.init(system, jc.Method(), q, state.v)
+        return jc.step(system, jc.Method(), start, None, 1e-3)[0].q[6]
+
+    slopes = [
+        jax.vmap(way(end), in_axes=(None, 0))(state.q[6], jnp.asarray([0.0, TURNED], jnp.float32))
+        for way in (jax.grad, jax.jacfwd)
+    ]
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-4)
+    np.testing.assert_allclose(slopes[0][0], slopes[0][1], rtol=1e-2)
+
+
+def test_states_without_a_remainder_of_angles_step():
+    """Those made by hand and saved before keep their structure."""
+    system, state = four_bar(jnp.float32)
+    bare = jc.State(state.q.at[6:].add(TURNED), state.v, state.time, state.status)
+    end, _ = jc.step(system, jc.Method(), bare, None, 1e-3)
+    assert int(end.status) == jc.Status.OK
+    assert end.angle_remainder == ()
+    assert jax.tree.structure(end) == jax.tree.structure(bare)
+
+
+def test_a_replaced_angle_forgets_its_remainder():
+    reduced, turns = unwound(
+        jnp.asarray([0.5, TURNED], jnp.float32), jnp.full(2, 2e-5, jnp.float32)
+    )
+    assert float(reduced[0]) == 0.5
+    np.testing.assert_array_equal(turns, [0.0, 100.0])
+    angle, remainder = rewound(reduced, turns)
+    np.testing.assert_array_equal(angle, np.float32([0.5, TURNED]))
+    np.testing.assert_allclose(remainder, [0.0, 2e-5], rtol=1e-2)
+
+
+@pytest.mark.parametrize("turns", [0, 1, -3, 100, -5000])
+def test_the_way_back_is_exact(turns):
+    """r and n of θ + ε, and θ + ε of them, by exact arithmetic."""
+    reduced = np.float32([0.1, -3.1, 3.0, 1e-7])
+    angle, remainder = rewound(jnp.asarray(reduced), jnp.full(4, turns, jnp.float32))
+    exact = 2 * np.pi * turns + np.float64(reduced)
+    np.testing.assert_allclose(
+        np.float64(angle) + np.float64(remainder), exact, rtol=1e-10, atol=1e-9
+    )
+    again, counted = unwound(angle, remainder)
+    np.testing.assert_array_equal(counted, turns)
+    # the second part of 2π is one float, and times n it is rounded
+    np.testing.assert_allclose(again, reduced, atol=3e-7 + 2e-10 * abs(turns))

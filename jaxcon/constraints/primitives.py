@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
-from jaxcon.core.lanes import Vector, axes, plus, times
+from jaxcon.core.lanes import Vector, axes, minus, plus, times
 from jaxcon.core.typing import Lane
 from jaxcon.geometry import quaternion
 from jaxcon.model.frames import Direction, Point
@@ -104,6 +104,8 @@ def same_orientation(a: Any, b: Any, reference: Any) -> list[Row]:
     """
     if not isinstance(reference, Vector):
         value = b.angle - a.angle - reference
+        laps = minus(b.laps, a.laps)
+        value = value if isinstance(laps, float) else value + 2 * jnp.pi * laps
         return [Row(value, b.omega - a.omega, 0.0, (a.turn(-1.0), b.turn(1.0)))]
     relative = quaternion.multiply(quaternion.conjugate(a.quaternion), b.quaternion)
     e = quaternion.multiply(relative, quaternion.conjugate(reference))

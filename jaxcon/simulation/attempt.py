@@ -49,9 +49,12 @@ def attempt(
     system: Any, method: Method, state: State, control: PyTree, dt: Array, part: Part | None = None
 ) -> Any:
     """(new state, info) and the status of this step of dt alone, or of a part of it."""
-    dynamics = dynamics_at(system, method, state, control, dt, part)
-    length = dt if part is None else part.length
-    system, memory = dynamics.system, MethodMemory(*state.memory)
+    # a step computes with angles less their whole turns, where floats are dense
+    known = recall(system, state.turns, state.angle_remainder)
+    system, q = known.unwind(state.q)
+    state = dataclasses.replace(state, q=q)
+    dynamics = _dynamics(system, method, state, control, dt, part)
+    length, memory = dt if part is None else part.length, MethodMemory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
     new = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, length))
@@ -73,14 +76,24 @@ def attempt(
         code = status.first(code, lost)
     if method.recovery is not None:
         code = status.first(code, method.recovery.judge(system, new))
+    new = _rewound(system, new)
     seen = (solution.acceleration, solution.multipliers, rows.violation)
     place = None
     if advanced.ends:
         place = at_instant(dataclasses.replace(bare(state), q=q, v=v), reached(state, time, length))
+        place = _rewound(system, place)
     reactions = rows.reactions
     if reactions is not None:
         reactions = dataclasses.replace(reactions, jump=None)
     return (new, StepInfo(*seen, code, reactions, state=place)), code
+
+
+def _rewound(system: Any, state: State) -> State:
+    """The state with whole turns in its angles, and their remainder where it has a place for it."""
+    q, remainder = system.rewind(state.q)
+    if isinstance(state.angle_remainder, tuple):
+        remainder = ()
+    return dataclasses.replace(state, q=q, angle_remainder=remainder)
 
 
 def nothing_seen(info: StepInfo, state: State) -> StepInfo:
@@ -115,10 +128,17 @@ def dynamics_at(
     part: Part | None = None,
 ) -> Dynamics:
     """What an integrator sees of the system during a step from this state, or a part of it."""
+    system = recall(system, state.turns, state.angle_remainder)
+    return _dynamics(system, method, state, control, dt, part)
+
+
+def _dynamics(
+    system: Any, method: Method, state: State, control: PyTree, dt: Array, part: Part | None
+) -> Dynamics:
+    """The same of a system as remembered by the state."""
     stabilizer, memory = method.feedback(dt), MethodMemory(*state.memory)
     if method.recovery is not None:
         stabilizer = method.recovery.relax(stabilizer, memory.recovery)
-    system = recall(system, state.turns)
     own = (system, stabilizer, method.solver, control, memory.stabilizer, dt)
     if not system.bounds:
         return Dynamics(*own)
