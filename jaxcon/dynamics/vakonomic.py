@@ -117,9 +117,9 @@ class Vakonomic:
         system, q = self.system.unwind(q)
         return dataclasses.replace(self, system=system), q
 
-    def rewind(self, q: Array) -> tuple[Array, Any]:
-        """q with its whole turns, and what rounding takes of it."""
-        return self.system.rewind(q)
+    def rewind(self, q: Array, before: Array, after: Array) -> tuple[Array, Any]:
+        """The coordinates after a step with their whole turns, and what rounding takes of them."""
+        return self.system.rewind(q, before, after)
 
     def count(self, q: Array, v: Array, t: Any) -> Any:
         """The angles that the system counts."""

@@ -79,9 +79,9 @@ class GeneralizedCoordinates:
         """Itself and q: what is an angle is not known."""
         return self, q
 
-    def rewind(self, q: Array) -> tuple[Array, PyTree]:
-        """q, without a remainder."""
-        return q, ()
+    def rewind(self, q: Array, before: Array, after: Array) -> tuple[Array, PyTree]:
+        """The coordinates after a step, without a remainder."""
+        return after, ()
 
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
         """Nothing."""

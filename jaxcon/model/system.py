@@ -21,7 +21,7 @@ from jaxcon.model.coordinates import JointCoordinate, count, expected
 from jaxcon.model.frames import WorldFrame
 from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
-from jaxcon.model.turning import coarse, rewound, unwound
+from jaxcon.model.turning import coarse, continued, reduced
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal, Solution
 
@@ -134,19 +134,35 @@ class BodySystem:
         where = self.layout.angles
         if where is None or not coarse(q.dtype):
             return self, q
-        none = isinstance(self.remainder, tuple)
-        remainder = jnp.zeros_like(q[where]) if none else self.remainder
-        reduced, laps = unwound(q[where], remainder)
+        angle, laps = reduced(q[where], self._remainder(q))
         system = dataclasses.replace(self, laps=laps, remainder=())
-        return system, _replaced(q, where, reduced)
+        return system, self._with_angles(q, angle)
 
-    def rewind(self, q: Array) -> tuple[Array, PyTree]:
-        """q with the whole turns, and what rounding takes of its angles."""
+    def rewind(self, q: Array, before: Array, after: Array) -> tuple[Array, PyTree]:
+        """The coordinates after a step with their whole turns, and what rounding takes of them.
+
+        Args:
+            q: at the start of the step, (n_q,).
+            before: q without whole turns, as `unwind` returns it.
+            after: where the step led from there.
+        """
         where = self.layout.angles
-        if where is None or isinstance(self.laps, tuple):
-            return q, ()
-        angle, remainder = rewound(q[where], self.laps)
-        return _replaced(q, where, angle), remainder
+        if where is None or not coarse(q.dtype):
+            return after, ()
+        known = (q[where], self._remainder(q), before[where], after[where])
+        angle, remainder = continued(*known)
+        return self._with_angles(after, angle), remainder
+
+    def _remainder(self, q: Array) -> Array:
+        """What the angles of bodies in the plane lack, (bodies,) [rad]; zero where unknown."""
+        none = isinstance(self.remainder, tuple)
+        return jnp.zeros_like(q[self.layout.angles]) if none else self.remainder
+
+    def _with_angles(self, q: Array, angle: Array) -> Array:
+        """q with other angles of bodies in the plane."""
+        lanes = [Vector.of_rows(q, g.q, g.kind.n_q, len(g.names)) for g in self.layout.groups]
+        pairs = zip(self.layout.groups, lanes, strict=True)
+        return _join([Vector(*x[:-1], angle) if g.kind.turns else x for g, x in pairs], q)
 
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
         """The angles of the joints whose turns are counted, over turns, (n,) [rad]."""
@@ -376,11 +392,6 @@ class BodySystem:
             ValueError: an unknown name or field, a wrong shape, or a value out of range.
         """
         return params.replaced(self, changes)
-
-
-def _replaced(q: Array, where: slice, angle: Array) -> Array:
-    """q with other angles of bodies in the plane."""
-    return jnp.concatenate([q[: where.start], angle, q[where.stop :]])
 
 
 def _join(groups: list[Vector], like: Array) -> Array:

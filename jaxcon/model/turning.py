@@ -1,13 +1,13 @@
 """Angles of bodies in the plane less their whole turns.
 
-A float32 near 200 π is a multiple of 6e-5, too coarse for a constraint. Users see angles that go on
-from turn to turn, θ rounded to a float, and the state holds what they lack, ε. A step computes with
+A float32 near 200 π is a multiple of 6e-5, too coarse for a constraint. Users see continuous angles
+θ, rounded to a float, and the state holds what rounding took from them, ε. A step computes with
 
     r = θ + ε − 2π n,    n the whole turns in θ,
 
-and returns to θ⁺ + ε⁺ = r⁺ + 2π n. Within half a turn of zero all of this is r = θ and ε = 0. The
-derivative of each way is 1. Angles of float64 are left as they are: near 200 π they are multiples
-of 1e-13.
+and returns to θ⁺ + ε⁺ = θ + ε + (r⁺ − r). Within half a turn of zero r is θ, and ε stays below the
+rounding of θ. The derivative of each way is the identity. Angles of float64 are left as they are:
+near 200 π they are multiples of 1e-13.
 """
 
 from __future__ import annotations
@@ -23,50 +23,59 @@ import numpy as np
 from jaxcon.core.doubled import TWO_PI
 from jaxcon.core.typing import Array
 
+DIGITS = 8
+"""Binary digits of the first two parts of 2π: 65 536 times each of them is exact in float32."""
+
 
 def coarse(dtype: Any) -> bool:
-    """Whether angles of this dtype are computed with less their turns."""
+    """Returns True for dtypes whose angles are computed with less their turns."""
     return jnp.finfo(dtype).bits < 64
 
 
 @functools.cache
-def turn(dtype: Any) -> tuple[float, float]:
-    """2π as a sum of two floats, of which the first is short: times 65 536 it is exact."""
-    whole, digits = sum(map(Fraction, TWO_PI)), jnp.finfo(dtype).nmant + 1 - 16
-    short = Fraction(round(whole * 2 ** (digits - 3)), 2 ** (digits - 3))
-    return float(short), float(whole - short)
+def two_pi() -> tuple[float, float, float]:
+    """2π as a sum of three floats, of which the first two have few digits."""
+    left, parts = sum(map(Fraction, TWO_PI)), []
+    for exponent in (2, 2 - DIGITS):  # of the first digit
+        unit = Fraction(2) ** (exponent - DIGITS + 1)
+        parts.append(left // unit * unit)
+        left -= parts[-1]
+    return float(parts[0]), float(parts[1]), float(left)
 
 
 @jax.custom_jvp
-def unwound(angle: Array, remainder: Array) -> tuple[Array, Array]:
+def reduced(angle: Array, remainder: Array) -> tuple[Array, Array]:
     """r and n of θ and ε, all (bodies,).
 
     An ε that no longer fits, since θ was replaced, counts as zero.
     """
-    short, rest = turn(angle.dtype)
     turns = jnp.round(angle * (1 / (2 * np.pi)))
-    remainder = jnp.where(angle + remainder == angle, remainder, 0)
-    return ((angle - turns * short) - turns * rest) + remainder, turns
+    left = angle
+    for part in two_pi():
+        left = left - turns * part
+    return left + _fitting(angle, remainder), turns
 
 
-@unwound.defjvp
+@reduced.defjvp
 def _(primals: Any, tangents: Any) -> Any:
-    reduced, turns = unwound(*primals)
-    return (reduced, turns), (tangents[0], jnp.zeros_like(turns))
+    left, turns = reduced(*primals)
+    return (left, turns), (tangents[0], jnp.zeros_like(turns))
 
 
 @jax.custom_jvp
-def rewound(reduced: Array, turns: Array) -> tuple[Array, Array]:
-    """θ and ε of r and n, all (bodies,)."""
-    short, rest = turn(reduced.dtype)
-    whole = turns * short
-    total = whole + reduced
-    left = (reduced - (total - whole)) + turns * rest
-    angle = total + left
-    return angle, left - (angle - total)
+def continued(angle: Array, remainder: Array, before: Array, after: Array) -> tuple[Array, Array]:
+    """θ⁺ and ε⁺ of θ, ε, r and r⁺, all (bodies,)."""
+    change = (after - before) + _fitting(angle, remainder)
+    new = angle + change
+    return new, change - (new - angle)
 
 
-@rewound.defjvp
+@continued.defjvp
 def _(primals: Any, tangents: Any) -> Any:
-    angle, remainder = rewound(*primals)
-    return (angle, remainder), (tangents[0], jnp.zeros_like(remainder))
+    angle, remainder = continued(*primals)
+    return (angle, remainder), (tangents[3], jnp.zeros_like(remainder))
+
+
+def _fitting(angle: Array, remainder: Array) -> Array:
+    """ε where it is below the rounding of θ, else 0."""
+    return jnp.where(angle + remainder == angle, remainder, 0)

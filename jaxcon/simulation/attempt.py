@@ -52,7 +52,7 @@ def attempt(
     # a step computes with angles less their whole turns, where floats are dense
     known = recall(system, state.turns, state.angle_remainder)
     system, q = known.unwind(state.q)
-    state = dataclasses.replace(state, q=q)
+    given, state = state, dataclasses.replace(state, q=q)
     dynamics = _dynamics(system, method, state, control, dt, part)
     length, memory = dt if part is None else part.length, MethodMemory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
@@ -68,7 +68,8 @@ def attempt(
     kept = (advanced.memory, own, memory.recovery, multipliers)
     kept = MethodMemory(*kept) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
-    code = status.first(judge(new, solution), corrected)
+    wound = _rewound(known, given, state, new)
+    code = status.first(judge(wound, solution), corrected)
     if jax.tree.leaves(own):
         code = status.first(code, judge_memory(own, new))
     if system.counted:
@@ -76,24 +77,30 @@ def attempt(
         code = status.first(code, lost)
     if method.recovery is not None:
         code = status.first(code, method.recovery.judge(system, new))
-    new = _rewound(system, new)
     seen = (solution.acceleration, solution.multipliers, rows.violation)
     place = None
     if advanced.ends:
         place = at_instant(dataclasses.replace(bare(state), q=q, v=v), reached(state, time, length))
-        place = _rewound(system, place)
+        place = _rewound(known, given, state, place)
     reactions = rows.reactions
     if reactions is not None:
         reactions = dataclasses.replace(reactions, jump=None)
-    return (new, StepInfo(*seen, code, reactions, state=place)), code
+    return (wound, StepInfo(*seen, code, reactions, state=place)), code
 
 
-def _rewound(system: Any, state: State) -> State:
-    """The state with whole turns in its angles, and their remainder where it has a place for it."""
-    q, remainder = system.rewind(state.q)
-    if isinstance(state.angle_remainder, tuple):
+def _rewound(system: Any, given: State, before: State, after: State) -> State:
+    """The state after a step with whole turns, and their remainder where it has a place for it.
+
+    Args:
+        system: as the state given remembers it.
+        given: the state at the start of the step.
+        before: the same without whole turns.
+        after: where the step led from there.
+    """
+    q, remainder = system.rewind(given.q, before.q, after.q)
+    if isinstance(given.angle_remainder, tuple):
         remainder = ()
-    return dataclasses.replace(state, q=q, angle_remainder=remainder)
+    return dataclasses.replace(after, q=q, angle_remainder=remainder)
 
 
 def nothing_seen(info: StepInfo, state: State) -> StepInfo:
