@@ -287,7 +287,9 @@ class Couplings(Elements):
         """φ, φ̇, J and γ at one instant."""
         coordinates = [along.read(snapshot) for along in self.along]
         value, slopes, curvature = self.law.relation(self.params, *coordinates)
-        if self.law.linear and any(row.reduced is not None for row in coordinates):
+        if getattr(self.law, "linear", False) and any(
+            row.reduced is not None for row in coordinates
+        ):
             value = self._value(coordinates)
         pairs = list(zip(slopes, coordinates, strict=True))
         pulls: list[Any] = [None] * len(self.places)

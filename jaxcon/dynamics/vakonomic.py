@@ -117,9 +117,9 @@ class Vakonomic:
         system, q = self.system.unwind(q)
         return dataclasses.replace(self, system=system), q
 
-    def rewind(self, q: Array, before: Array, after: Array) -> tuple[Array, Any]:
+    def rewind(self, q: Array, after: Array) -> tuple[Array, Any]:
         """The coordinates after a step with their whole turns, and what rounding takes of them."""
-        return self.system.rewind(q, before, after)
+        return self.system.rewind(q, after)
 
     def count(self, q: Array, v: Array, t: Any) -> Any:
         """The angles that the system counts."""

@@ -79,7 +79,7 @@ class GeneralizedCoordinates:
         """Itself and q: what is an angle is not known."""
         return self, q
 
-    def rewind(self, q: Array, before: Array, after: Array) -> tuple[Array, PyTree]:
+    def rewind(self, q: Array, after: Array) -> tuple[Array, PyTree]:
         """The coordinates after a step, without a remainder."""
         return after, ()
 

@@ -134,29 +134,24 @@ class BodySystem:
         where = self.layout.angles
         if where is None or not coarse(q.dtype):
             return self, q
-        angle, laps = reduced(q[where], self._remainder(q))
+        none = isinstance(self.remainder, tuple)
+        remainder = jnp.zeros_like(q[where]) if none else self.remainder
+        angle, laps = reduced(q[where], remainder)
         system = dataclasses.replace(self, laps=laps, remainder=())
         return system, self._with_angles(q, angle)
 
-    def rewind(self, q: Array, before: Array, after: Array) -> tuple[Array, PyTree]:
+    def rewind(self, q: Array, after: Array) -> tuple[Array, PyTree]:
         """The coordinates after a step with their whole turns, and what rounding takes of them.
 
         Args:
             q: at the start of the step, (n_q,).
-            before: q without whole turns, as `unwind` returns it.
-            after: where the step led from there.
+            after: where the step led, from q without whole turns, (n_q,).
         """
         where = self.layout.angles
         if where is None or not coarse(q.dtype):
             return after, ()
-        known = (q[where], self._remainder(q), before[where], after[where])
-        angle, remainder = continued(*known)
+        angle, remainder = continued(q[where], after[where])
         return self._with_angles(after, angle), remainder
-
-    def _remainder(self, q: Array) -> Array:
-        """What the angles of bodies in the plane lack, (bodies,) [rad]; zero where unknown."""
-        none = isinstance(self.remainder, tuple)
-        return jnp.zeros_like(q[self.layout.angles]) if none else self.remainder
 
     def _with_angles(self, q: Array, angle: Array) -> Array:
         """q with other angles of bodies in the plane."""

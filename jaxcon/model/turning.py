@@ -5,7 +5,7 @@ A float32 near 200 π is a multiple of 6e-5, too coarse for a constraint. Users 
 
     r = θ + ε − 2π n,    n the whole turns in θ,
 
-and returns to θ⁺ + ε⁺ = θ + ε + (r⁺ − r). Within half a turn of zero r is θ, and ε stays below the
+and returns to θ⁺ + ε⁺ = θ + (r⁺ − (θ − 2π n)). Within half a turn of zero r is θ and ε is below the
 rounding of θ. The derivative of each way is the identity. Angles of float64 are left as they are:
 near 200 π they are multiples of 1e-13.
 """
@@ -43,17 +43,23 @@ def two_pi() -> tuple[float, float, float]:
     return float(parts[0]), float(parts[1]), float(left)
 
 
+def _without_turns(angle: Array) -> tuple[Array, Array]:
+    """θ − 2π n and n."""
+    turns = jnp.round(angle * (1 / (2 * np.pi)))
+    left = angle
+    for part in two_pi():
+        left = left - turns * part
+    return left, turns
+
+
 @jax.custom_jvp
 def reduced(angle: Array, remainder: Array) -> tuple[Array, Array]:
     """r and n of θ and ε, all (bodies,).
 
     An ε that no longer fits, since θ was replaced, counts as zero.
     """
-    turns = jnp.round(angle * (1 / (2 * np.pi)))
-    left = angle
-    for part in two_pi():
-        left = left - turns * part
-    return left + _fitting(angle, remainder), turns
+    left, turns = _without_turns(angle)
+    return left + jnp.where(angle + remainder == angle, remainder, 0), turns
 
 
 @reduced.defjvp
@@ -63,9 +69,9 @@ def _(primals: Any, tangents: Any) -> Any:
 
 
 @jax.custom_jvp
-def continued(angle: Array, remainder: Array, before: Array, after: Array) -> tuple[Array, Array]:
-    """θ⁺ and ε⁺ of θ, ε, r and r⁺, all (bodies,)."""
-    change = (after - before) + _fitting(angle, remainder)
+def continued(angle: Array, after: Array) -> tuple[Array, Array]:
+    """θ⁺ and ε⁺ of θ and r⁺, all (bodies,)."""
+    change = after - _without_turns(angle)[0]
     new = angle + change
     return new, change - (new - angle)
 
@@ -73,9 +79,4 @@ def continued(angle: Array, remainder: Array, before: Array, after: Array) -> tu
 @continued.defjvp
 def _(primals: Any, tangents: Any) -> Any:
     angle, remainder = continued(*primals)
-    return (angle, remainder), (tangents[3], jnp.zeros_like(remainder))
-
-
-def _fitting(angle: Array, remainder: Array) -> Array:
-    """ε where it is below the rounding of θ, else 0."""
-    return jnp.where(angle + remainder == angle, remainder, 0)
+    return (angle, remainder), (tangents[1], jnp.zeros_like(remainder))

@@ -68,7 +68,7 @@ def attempt(
     kept = (advanced.memory, own, memory.recovery, multipliers)
     kept = MethodMemory(*kept) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
-    wound = _rewound(known, given, state, new)
+    wound = _rewound(system, given, new)
     code = status.first(judge(wound, solution), corrected)
     if jax.tree.leaves(own):
         code = status.first(code, judge_memory(own, new))
@@ -81,23 +81,22 @@ def attempt(
     place = None
     if advanced.ends:
         place = at_instant(dataclasses.replace(bare(state), q=q, v=v), reached(state, time, length))
-        place = _rewound(known, given, state, place)
+        place = _rewound(system, given, place)
     reactions = rows.reactions
     if reactions is not None:
         reactions = dataclasses.replace(reactions, jump=None)
     return (wound, StepInfo(*seen, code, reactions, state=place)), code
 
 
-def _rewound(system: Any, given: State, before: State, after: State) -> State:
+def _rewound(system: Any, given: State, after: State) -> State:
     """The state after a step with whole turns, and their remainder where it has a place for it.
 
     Args:
-        system: as the state given remembers it.
+        system: of the states.
         given: the state at the start of the step.
-        before: the same without whole turns.
-        after: where the step led from there.
+        after: where the step led, from that state without whole turns.
     """
-    q, remainder = system.rewind(given.q, before.q, after.q)
+    q, remainder = system.rewind(given.q, after.q)
     if isinstance(given.angle_remainder, tuple):
         remainder = ()
     return dataclasses.replace(after, q=q, angle_remainder=remainder)
