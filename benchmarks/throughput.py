@@ -13,6 +13,7 @@ scene. The last table relates the rates to the operations of a step (`benchmarks
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,7 @@ def worlds(state: jc.State, batch: int) -> jc.State:
     speeds = jax.numpy.asarray(peers.speeds(batch), state.v.dtype)
 
     def one(speed: jax.Array) -> jc.State:
-        return jc.State(state.q, speed * state.v, state.time, state.status, state.memory)
+        return dataclasses.replace(state, v=speed * state.v)
 
     return jax.vmap(one)(speeds)
 

@@ -1,11 +1,14 @@
 """Joints that turn far in a step, and how many whole turns they have made."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon.model.turning import continued, reduced
 
 RIGHT = np.pi / 2
 METHODS = {
@@ -160,3 +163,279 @@ def test_stages_tell_less_than_half_a_turn(method):
         start = jc.init(system, method, state.q, state.v)
         end, _ = jc.rollout(system, method, start, None, 2e-3, 5)
         assert int(end.status) == status
+
+
+FLAT = {
+    "euler": jc.Method(),
+    "projection": jc.Method(stabilizer=jc.Projection()),
+    "rk4": jc.Method(integrator=jc.RK4()),
+    "rattle": jc.Method(integrator=jc.RATTLE(), stabilizer=jc.Unstabilized()),
+}
+TURNED = float(np.float32(200 * np.pi))
+
+
+def four_bar(dtype, *elements):
+    """A crank, a coupler and a rocker in the plane."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=dtype)
+    points = np.array([(0, 0), (0.3, 0.4), (1.2, 0.7), (1, 0)])
+    for i, (a, b) in enumerate(zip(points[:-1], points[1:], strict=True)):
+        x, y = b - a
+        scene.add_body(
+            f"bar{i}",
+            mass=1.0,
+            inertia=float(x * x + y * y) / 12,
+            position=tuple((a + b) / 2),
+            angle=float(np.arctan2(y, x)),
+        )
+    for i, (a, b) in enumerate([(jc.WORLD, 0), (0, 1), (1, 2), (2, jc.WORLD)]):
+        a, b = (x if x == jc.WORLD else f"bar{x}" for x in (a, b))
+        scene.add(jc.Revolute(f"pin{i}", a, b, point=points[i]))
+    for element in elements:
+        scene.add(element)
+    return scene.build()
+
+
+@pytest.mark.parametrize("name", FLAT)
+def test_a_linkage_turned_a_hundred_times_holds_as_one_that_is_not(name):
+    """φ in float32, where angles as users see them are multiples of 6e-5."""
+    system, state = four_bar(jnp.float32)
+    start = jc.init(system, FLAT[name], state.q.at[6:].add(TURNED), state.v)
+    end, seen = jc.rollout(
+        system,
+        FLAT[name],
+        start,
+        None,
+        1e-3,
+        1000,
+        record=lambda s, info: (info.violation.worst, jc.energy(system, s).total),
+    )
+    assert int(end.status) == jc.Status.OK
+    assert float(seen[0][500:].max()) < 3e-6
+    assert float(jc.violation(system, end).worst) < 3e-6
+    assert float(np.abs(end.q[6:] - TURNED).max()) < 5  # users see angles that go on
+
+
+def test_readers_see_angles_that_go_on():
+    """Joint coordinates, servos and q itself, beside the linkage unturned."""
+    servo = jc.PositionServo("servo", "pin0", 0.3)
+    system, state = four_bar(jnp.float32, servo)
+    ends = []
+    for shift in (0.0, TURNED):
+        start = jc.init(system, jc.Method(), state.q.at[6:].add(shift), state.v)
+        control = jnp.full((300, 1), shift, jnp.float32)
+        end, angles = jc.rollout(
+            system,
+            jc.Method(),
+            start,
+            control,
+            1e-3,
+            300,
+            record=lambda s, info: jc.coordinate(system, s, "pin0"),
+        )
+        ends.append((end, np.asarray(angles) - shift))
+    np.testing.assert_allclose(ends[1][1], ends[0][1], atol=2e-3)
+    np.testing.assert_allclose(ends[1][0].q[6:] - TURNED, ends[0][0].q[6:], atol=2e-3)
+
+
+def test_the_derivative_of_the_reduction_is_one():
+    """By the angle at the start, in both modes and in a batch, beside the linkage unturned."""
+    system, state = four_bar(jnp.float32)
+
+    def end(angle, shift):
+        q = state.q.at[6].set(angle).at[6:].add(shift)
+        start = jc.init(system, jc.Method(), q, state.v)
+        return jc.step(system, jc.Method(), start, None, 1e-3)[0].q[6]
+
+    slopes = [
+        jax.vmap(way(end), in_axes=(None, 0))(state.q[6], jnp.asarray([0.0, TURNED], jnp.float32))
+        for way in (jax.grad, jax.jacfwd)
+    ]
+    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-4)
+    np.testing.assert_allclose(slopes[0][0], slopes[0][1], rtol=1e-2)
+
+
+def test_states_without_a_remainder_of_angles_step():
+    """Those made by hand and saved before keep their structure."""
+    system, state = four_bar(jnp.float32)
+    bare = jc.State(state.q.at[6:].add(TURNED), state.v, state.time, state.status)
+    end, _ = jc.step(system, jc.Method(), bare, None, 1e-3)
+    assert int(end.status) == jc.Status.OK
+    assert end.angle_remainder == ()
+    assert jax.tree.structure(end) == jax.tree.structure(bare)
+
+
+def test_a_replaced_angle_forgets_its_remainder():
+    angle, remainder = jnp.asarray([0.5, TURNED], jnp.float32), jnp.full(2, 2e-5, jnp.float32)
+    before, turns = reduced(angle, remainder)
+    assert float(before[0]) == 0.5
+    np.testing.assert_array_equal(turns, [0.0, 100.0])
+    angle, remainder = continued(angle, before)
+    np.testing.assert_array_equal(angle, np.float32([0.5, TURNED]))
+    np.testing.assert_array_equal(remainder, np.float32([0.0, 2e-5]))
+
+
+@pytest.mark.parametrize("turns", [0, 1, -3, 100, -5000, 60000])
+def test_reduction_and_return_are_exact_to_rounding(turns):
+    """r of θ + ε, and θ⁺ + ε⁺ of r⁺, by float64."""
+    exact = 2 * np.pi * turns + np.float64(np.float32([0.1, -3.1, 3.0, 1e-7]))
+    angle = np.float32(exact)
+    remainder = np.float32(exact - angle)
+    before, counted = reduced(jnp.asarray(angle), jnp.asarray(remainder))
+    np.testing.assert_array_equal(counted, turns)
+    np.testing.assert_allclose(before, exact - 2 * np.pi * turns, atol=4e-7)
+    step = np.float32([1e-3, -0.2, 0.5, -1e-6])
+    after = before + step
+    change = np.float64(after) - np.float64(before)
+    end = np.sum(np.float64(continued(jnp.asarray(angle), after)), axis=0)
+    np.testing.assert_allclose(
+        end, np.float64(angle) + np.float64(remainder) + change, rtol=1e-13, atol=1e-7
+    )
+
+
+def pendulum(*elements, links=2):
+    """Links of a pendulum that swings in the plane, in float32."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=jnp.float32)
+    for i in range(links):
+        scene.add_body(f"link{i}", mass=1.0, inertia=0.1, position=(i + 0.5, 0.0))
+        before = f"link{i - 1}" if i else jc.WORLD
+        scene.add(jc.Revolute(f"pin{i}", before, f"link{i}", point=(float(i), 0.0)))
+    for element in elements:
+        scene.add(element)
+    return scene.build()
+
+
+def turned_by(system, state, turns):
+    """The state after whole turns of all bodies, with what rounding takes of their angles."""
+    angles = system.layout.angles
+    exact = np.float64(state.q[angles]) + 2 * np.pi * turns
+    rounded = np.float32(exact)
+    return dataclasses.replace(
+        state,
+        q=state.q.at[angles].set(rounded),
+        angle_remainder=jnp.asarray(exact - rounded, jnp.float32),
+    )
+
+
+def test_a_double_pendulum_turned_ten_thousand_times_moves_as_one_that_is_not():
+    system, state = pendulum()
+    ends = []
+    for turns in (0, 10_000):
+        start = turned_by(system, jc.init(system, jc.Method(), state.q, state.v), turns)
+        end, seen = jc.rollout(
+            system,
+            jc.Method(),
+            start,
+            None,
+            1e-3,
+            1000,
+            record=lambda s, info: (info.violation.worst, jc.energy(system, s).total),
+        )
+        angle = np.float64(end.q[system.layout.angles]) + np.float64(end.angle_remainder)
+        ends.append((end, angle - 2 * np.pi * turns, np.asarray(seen[0]), np.asarray(seen[1])))
+    (_, angle, violation, energy), (_, far, far_violation, far_energy) = ends
+    np.testing.assert_allclose(far, angle, atol=1e-4)
+    assert far_violation.max() < 2 * violation.max()
+    np.testing.assert_allclose(far_energy, energy, atol=2e-4)
+
+
+def test_rattle_keeps_the_energy_of_a_linkage_that_turns():
+    """Over 1e5 steps from 200 π, in which the crank makes further turns."""
+    system, state = four_bar(jnp.float32)
+    method = FLAT["rattle"]
+    crank = jnp.asarray([-2.4, 1.8, 12.0], jnp.float32)  # about its pin at the origin
+    v = state.v.at[system.layout.v("bar0")].set(crank)
+    start = jc.assemble(system, state.q, v, hold=("bar0",)).check()
+    drifts = []
+    for turns in (0, 100):
+        begin = turned_by(system, jc.init(system, method, start.q, start.v), turns)
+        end, energy = jc.rollout(
+            system,
+            method,
+            begin,
+            None,
+            1e-3,
+            100_000,
+            record=lambda s, info: jc.energy(system, s).total,
+        )
+        assert int(end.status) == jc.Status.OK
+        assert float(end.q[6] - begin.q[6]) > 100 * 2 * np.pi
+        energy = np.float64(energy)
+        drift = energy[-10_000:].mean() - energy[:10_000].mean()
+        drifts.append(drift / float(jc.energy(system, begin).kinetic))
+    assert np.abs(drifts).max() < 4e-3
+    assert abs(drifts[1] - drifts[0]) < 5e-4
+
+
+def test_a_drive_in_the_plane_is_smooth_after_a_day():
+    """At 1e5 s its target is 2e5 rad, a multiple of 0.016 in float32."""
+    drive = jc.Drive("drive", "pin0", lambda t, speed: speed * t, params=jnp.float32(2.0))
+    system, state = pendulum(drive, links=1)
+    late, target = 1e5, 2e5
+    turns = round(target / (2 * np.pi))
+    start = jc.init(system, jc.Method(), state.q, state.v.at[2].set(2.0), time=late)
+    phase = target - 2 * np.pi * turns
+    q = start.q.at[:3].set(np.float32([np.cos(phase) / 2, np.sin(phase) / 2, phase]))
+    v = start.v.at[:2].set(np.float32([-np.sin(phase), np.cos(phase)]))
+    start = turned_by(system, dataclasses.replace(start, q=q, v=v), turns)
+    end, seen = jc.rollout(
+        system,
+        jc.Method(),
+        start,
+        None,
+        1e-3,
+        1000,
+        record=lambda s, info: (info.violation.worst, s.v[2]),
+    )
+    assert int(end.status) == jc.Status.OK
+    assert float(seen[0].max()) < 4e-6
+    np.testing.assert_allclose(seen[1], 2.0, atol=1e-2)
+
+
+@pytest.mark.parametrize("ratio", [-2.0, 1 / 3])
+def test_gears_mesh_after_many_turns(ratio):
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=jnp.float32)
+    for i in range(2):
+        scene.add_body(f"gear{i}", mass=1.0, inertia=0.1, position=(float(i), 0.0))
+        scene.add(jc.Revolute(f"pin{i}", jc.WORLD, f"gear{i}", point=(float(i), 0.0)))
+    scene.add(jc.Gear("mesh", "pin0", "pin1", ratio=ratio))
+    system, state = scene.build()
+    exact = np.float64(np.float32(ratio)) * 2 * np.pi * 3000
+    angles = np.array([2 * np.pi * 3000, exact])
+    rounded = np.float32(angles)
+    start = jc.init(system, jc.Method(), state.q.at[4:].set(rounded), state.v)
+    left = jnp.asarray(angles - rounded, jnp.float32)
+    start = dataclasses.replace(start, angle_remainder=left)
+    assert float(jc.violation(system, start).worst) < 2e-6
+    v = start.v.at[4:].set(jnp.asarray([1.0, ratio], jnp.float32))
+    start = dataclasses.replace(start, v=v)
+    end, worst = jc.rollout(
+        system, jc.Method(), start, None, 1e-3, 500, record=lambda s, info: info.violation.worst
+    )
+    assert float(worst.max()) < 4e-6
+    np.testing.assert_allclose(end.v[4:], [1.0, ratio], atol=1e-4)
+
+
+def test_users_functions_see_continuous_angles():
+    """A torque of one's own that is the angle, after a hundred turns."""
+
+    def torque(motion, t, control, params):
+        return jnp.stack([*jnp.zeros_like(motion.position), motion.orientation])
+
+    system, state = pendulum(jc.CustomForce("spring", ("link0",), torque), links=1)
+    method = jc.Method(stabilizer=jc.Unstabilized())
+    start = turned_by(system, jc.init(system, method, state.q, state.v), 100)
+    inertia = 0.1 + 0.25  # about the pin
+    expected = (TURNED - 9.81 / 2) / inertia
+    a, _, _ = jc.forward_dynamics(system, start, None, method, 1e-3)
+    np.testing.assert_allclose(a[2], expected, rtol=1e-5)
+    end, _ = jc.step(system, method, start, None, 1e-3)
+    np.testing.assert_allclose(end.v[2], 1e-3 * expected, rtol=1e-5)
+
+
+def test_states_pickled_before_angles_had_a_remainder_load():
+    system, state = four_bar(jnp.float32)
+    fields = {k: v for k, v in vars(state).items() if k != "angle_remainder"}
+    old = jc.State.__new__(jc.State)
+    old.__setstate__(fields)
+    assert old.angle_remainder == ()
+    assert int(jc.step(system, jc.Method(), old, None, 1e-3)[0].status) == jc.Status.OK

@@ -13,11 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.base import RowSet, gather
 from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks
+from jaxcon.core.doubled import Doubled
 from jaxcon.core.lanes import total
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
@@ -47,6 +49,8 @@ class Pair:
     joint_b: str
     coordinate_a: str | None
     coordinate_b: str | None
+    linear = True
+    """Whether φ is a sum of multiples of the coordinates."""
 
     @property
     def along(self) -> tuple[tuple[str, str | None], ...]:
@@ -103,6 +107,7 @@ class RackAndPinion:
     radius: Any
     coordinate_a: str | None = None
     coordinate_b: str | None = None
+    linear = True
 
     @property
     def along(self) -> tuple[tuple[str, str | None], ...]:
@@ -199,6 +204,7 @@ class Differential:
     right: str
     carrier: str
     coordinates: tuple[str | None, str | None, str | None] = (None, None, None)
+    linear = True
 
     @property
     def along(self) -> tuple[tuple[str, str | None], ...]:
@@ -238,6 +244,7 @@ class PolynomialCoupling(Pair):
     coefficients: Any
     coordinate_a: str | None = None
     coordinate_b: str | None = None
+    linear = False
 
     def attach(self, dtype: Any) -> dict[str, Array]:
         """The coefficients.
@@ -280,6 +287,10 @@ class Couplings(Elements):
         """φ, φ̇, J and γ at one instant."""
         coordinates = [along.read(snapshot) for along in self.along]
         value, slopes, curvature = self.law.relation(self.params, *coordinates)
+        if getattr(self.law, "linear", False) and any(
+            row.reduced is not None for row in coordinates
+        ):
+            value = self._value(coordinates)
         pairs = list(zip(slopes, coordinates, strict=True))
         pulls: list[Any] = [None] * len(self.places)
         for (slope, row), sides in zip(pairs, self.sides, strict=True):
@@ -290,6 +301,15 @@ class Couplings(Elements):
         bias = total(slope * row.bias for slope, row in pairs) + curvature
         row = Row(value, rate, bias, tuple(pulls))
         return gather(snapshot, self.places, [row])
+
+    def _value(self, coordinates: list[Row]) -> Lane:
+        """φ of the angles less whole turns, and 2π φ of the turns, whose sum is small again."""
+        pairs = [row.reduced or (row.value, jnp.zeros_like(row.value)) for row in coordinates]
+        rows = list(zip(coordinates, pairs, strict=True))
+        less = [row._replace(value=value) for row, (value, _) in rows]
+        turns = [row._replace(value=Doubled.of(laps)) for row, (_, laps) in rows]
+        value, turned = (self.law.relation(self.params, *x).value for x in (less, turns))
+        return value + 2 * jnp.pi * turned.value
 
     def anchor(self, snapshot: Any, i: int) -> Array | None:
         """None: a coupling acts on several joints."""

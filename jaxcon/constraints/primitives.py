@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
-from jaxcon.core.lanes import Vector, axes, plus, times
+from jaxcon.core.lanes import Vector, axes, minus, plus, times
 from jaxcon.core.typing import Lane
 from jaxcon.geometry import quaternion
 from jaxcon.model.frames import Direction, Point
@@ -33,6 +33,8 @@ class Row(NamedTuple):
         value, rate, bias: φ, φ̇, γ, lanes (element,).
         pulls: ∂φ̇/∂v on each body.
         holonomic: whether there is a φ; without one the row is ψ(q, v, t) = 0, value zero, rate ψ.
+        reduced: the angle φ less whole turns, and these turns, where both are known: a large φ is
+            rounded, and differences of large angles are computed from these.
     """
 
     value: Lane
@@ -40,6 +42,7 @@ class Row(NamedTuple):
     bias: Lane
     pulls: tuple[Vector, ...]
     holonomic: bool = True
+    reduced: tuple[Lane, Lane] | None = None
 
 
 def meet(p: Point, r: Point) -> list[Row]:
@@ -104,7 +107,11 @@ def same_orientation(a: Any, b: Any, reference: Any) -> list[Row]:
     """
     if not isinstance(reference, Vector):
         value = b.angle - a.angle - reference
-        return [Row(value, b.omega - a.omega, 0.0, (a.turn(-1.0), b.turn(1.0)))]
+        laps = minus(b.laps, a.laps)
+        row = Row(value, b.omega - a.omega, 0.0, (a.turn(-1.0), b.turn(1.0)))
+        if isinstance(laps, float):
+            return [row]
+        return [row._replace(value=value + 2 * jnp.pi * laps, reduced=(value, laps))]
     relative = quaternion.multiply(quaternion.conjugate(a.quaternion), b.quaternion)
     e = quaternion.multiply(relative, quaternion.conjugate(reference))
     e = e * jnp.where(e[0] < 0, -1.0, 1.0).astype(e[0].dtype)

@@ -73,6 +73,10 @@ class Doubled:
         rest = rest + (x.high * y.low + x.low * y.high)
         return _carrying(p, rest, self.value * other.value)
 
+    def __rmul__(self, other: Any) -> Doubled:
+        """y x."""
+        return self * jnp.asarray(other, self.high.dtype)
+
     def __truediv__(self, other: Any) -> Doubled:
         """x / y."""
         other = Doubled.of(other)
@@ -86,10 +90,14 @@ class Doubled:
         """`high`, with the derivative by both parts."""
         return self.high + self.low
 
+    @property
+    def turns(self) -> Array:
+        """The whole turns that `reduced` leaves out."""
+        return jnp.round(jax.lax.stop_gradient(self.high) / TWO_PI[0])
+
     def reduced(self) -> Doubled:
         """The number less whole turns, within half a turn of zero; its derivative is 1."""
-        x = jax.lax.stop_gradient(self)
-        turns = jnp.round(x.high / TWO_PI[0])
+        x, turns = jax.lax.stop_gradient(self), self.turns
         for part in two_pi(x.high.dtype):
             x = x - Doubled(*_two_product(turns, jnp.full_like(turns, part)))
         return Doubled(_carry(x.high, self.value), x.low)

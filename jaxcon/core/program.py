@@ -98,8 +98,10 @@ class Program:
         self._inner = inner
         self._known: dict[Any, list[int]] = {}
         self.sizes: dict[int, int] = {}
+        self._lengths: dict[int, list[Any]] = {}  # of the operands of concatenations
         self.inputs = [self._new(x) for x in closed.jaxpr.invars]
         self.outputs = self._inline_closed(closed, list(self.inputs))
+        self._read_parts()
         self.makers = {name: op for op in self.operations for name in op.outputs}
         self._drop_unused()
 
@@ -147,6 +149,22 @@ class Program:
                 operations.append(self.makers[x])
                 todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
         return leaves, operations
+
+    def _read_parts(self) -> None:
+        """Lets slices read the part of a concatenation in which they lie.
+
+        Only where all readers do, so that the concatenation is never stored.
+        """
+        readers, results = self.readers(), {x for x in self.outputs if isinstance(x, int)}
+        for op in self.operations:
+            whole = op.outputs[:1]
+            slices = readers.get(whole[0], []) if op.name == "concatenate" else []
+            if not slices or not results.isdisjoint(whole):
+                continue
+            lengths = self._lengths[whole[0]]
+            parts = [_part(x, op.inputs, lengths, op.params["dimension"]) for x in slices]
+            for x, part in zip(slices, parts if all(parts) else (), strict=False):
+                x.inputs, x.params = part or (x.inputs, x.params)
 
     def _drop_unused(self) -> None:
         """Leaves out operations on which no result depends."""
@@ -220,6 +238,9 @@ class Program:
         if key is not None and key in self._known:
             return self._known[key]
         outputs = [self._new(x) for x in equation.outvars]
+        if primitive.name == "concatenate":
+            axis = params["dimension"]
+            self._lengths[outputs[0]] = [x.aval.shape[axis] for x in equation.invars]
         effects = bool(equation.effects)
         avals = [x.aval for x in (*equation.invars, *equation.outvars)]
         keys = any(map(_is_key, avals))
@@ -229,6 +250,35 @@ class Program:
         if key is not None and not effects:
             self._known[key] = outputs
         return outputs
+
+
+def _part(
+    reader: Operation, operands: list[Operand], lengths: list[Any], axis: int
+) -> tuple[list[Operand], dict[str, Any]] | None:
+    """Operand and parameters of a slice that lies in one operand of a concatenation, or None.
+
+    Args:
+        reader: of the concatenation.
+        operands: of the concatenation.
+        lengths: their sizes along its axis.
+        axis: along which they are joined.
+    """
+    if reader.name != "slice" or not is_known(lengths):
+        return None
+    start = 0
+    low, high = reader.params["start_indices"], reader.params["limit_indices"]
+    for operand, length in zip(operands, lengths, strict=True):
+        if start <= low[axis] and high[axis] <= start + length:
+            shifted = {"start_indices": _shifted(low, axis, start)}
+            shifted["limit_indices"] = _shifted(high, axis, start)
+            return [operand], reader.params | shifted
+        start += length
+    return None
+
+
+def _shifted(indices: Sequence[int], axis: int, by: int) -> tuple[int, ...]:
+    """The indices less a number along one axis."""
+    return tuple(i - by if a == axis else i for a, i in enumerate(indices))
 
 
 def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -> Array:

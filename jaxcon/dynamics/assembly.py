@@ -281,7 +281,9 @@ def _start(system: Any, q: Any, v: Any, time: Any) -> State:
         if isinstance(group, Custom):
             check_function(group, snapshot)
     status = jnp.asarray(Status.OK, jnp.int32)
-    return unshared(State(q, v, t, status, memory, turns), system)
+    start = State(q, v, t, status, memory, turns)
+    start = dataclasses.replace(start, angle_remainder=system.no_remainder(dtype))
+    return unshared(start, system)
 
 
 def _held(system: Any, hold: Any, n_v: int) -> tuple[int, ...]:

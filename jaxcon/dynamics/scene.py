@@ -190,7 +190,8 @@ class Scene:
             counted=along.counted,
             bounds=tuple(gather.bounds(elements, along)),
         )
-        state = dataclasses.replace(self._state(layout, bodies), turns=turns)
+        more = {"turns": turns, "angle_remainder": system.no_remainder(self.dtype)}
+        state = dataclasses.replace(self._state(layout, bodies), **more)
         for group in (*constraints, *system.bounds):
             if isinstance(group, Custom):
                 check_function(group, system.snapshot(state.q, state.v, state.instant))

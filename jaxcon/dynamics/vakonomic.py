@@ -104,9 +104,22 @@ class Vakonomic:
         """Which these are."""
         return self.system.counted
 
-    def remember(self, turns: Any) -> Vakonomic:
-        """With other angles near which those that are counted lie."""
-        return dataclasses.replace(self, system=self.system.remember(turns))
+    def remember(self, turns: Any, remainder: Any = ()) -> Vakonomic:
+        """With other angles near which those that are counted lie, and remainders of others."""
+        return dataclasses.replace(self, system=self.system.remember(turns, remainder))
+
+    def no_remainder(self, dtype: Any) -> Any:
+        """The `angle_remainder` of a state that has made no turns."""
+        return self.system.no_remainder(dtype)
+
+    def unwind(self, q: Array) -> tuple[Vakonomic, Array]:
+        """The system that knows the whole turns in q, and q without them."""
+        system, q = self.system.unwind(q)
+        return dataclasses.replace(self, system=system), q
+
+    def rewind(self, q: Array, after: Array) -> tuple[Array, Any]:
+        """The coordinates after a step with their whole turns, and what rounding takes of them."""
+        return self.system.rewind(q, after)
 
     def count(self, q: Array, v: Array, t: Any) -> Any:
         """The angles that the system counts."""

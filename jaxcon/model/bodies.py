@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 
@@ -20,6 +20,8 @@ class Particle:
     """A point mass: q = x, v = ẋ."""
 
     dim: int
+    turns: ClassVar[bool] = False
+    """Whether the last coordinate is an angle."""
 
     @property
     def n_q(self) -> int:
@@ -81,6 +83,7 @@ class PlanarRigid(Particle):
     """A rigid body in the plane: q = (x, y, θ), v = q̇."""
 
     dim: int = 2
+    turns: ClassVar[bool] = True
 
     @property
     def n_q(self) -> int:

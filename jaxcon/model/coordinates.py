@@ -55,11 +55,19 @@ class JointCoordinate:
         )
 
     def difference(self, snapshot: Any, row: Any, reference: Doubled) -> Any:
-        """value − reference, in [−π, π] where a joint's angle is seen modulo whole turns."""
+        """value − reference, in [−π, π] where a joint's angle is seen modulo whole turns.
+
+        In the plane, in float32, whole turns and what is left of them are subtracted apart: an
+        angle of 1e5 rad is rounded to 8e-3.
+        """
         joint = snapshot.system.constraints[self.group].joint
         wraps = turns_over(joint, self.name, snapshot.system.layout.dim)
         if wraps and jnp.finfo(reference.high.dtype).bits < 64:
             reference = reference.reduced()
+        elif row.reduced is not None:
+            value, laps = row.reduced
+            turns, reference = reference.turns, reference.reduced()
+            return (value - reference.high) - reference.low + 2 * jnp.pi * (laps - turns)
         error = (row.value - reference.high) - reference.low
         return numerics.wrap(error) if wraps else error
 

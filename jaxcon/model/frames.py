@@ -12,6 +12,7 @@ so a force n at p does the work n·ṗ = n·ẋ + (s × Rᵀn)·ω.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -102,6 +103,8 @@ class WorldFrame:
         """No turn (in the plane)."""
         return 0.0
 
+    laps: ClassVar[float] = 0.0
+
     @property
     def quaternion(self) -> Vector:
         """No turn (in space)."""
@@ -128,11 +131,12 @@ class WorldFrame:
 
 @pytree
 class PlanarFrame(Frame):
-    """Rigid bodies in the plane; `angle` [rad], `omega` [rad/s]."""
+    """Rigid bodies in the plane; `angle` [rad] lacks `laps` whole turns, `omega` [rad/s]."""
 
     angle: Lane
     omega: Lane
     rotation: Matrix
+    laps: Lane = 0.0
     oriented: ClassVar[bool] = True
 
     @classmethod
@@ -141,6 +145,10 @@ class PlanarFrame(Frame):
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         rotation = Matrix(Vector(c, -s), Vector(s, c))
         return cls(Vector(*q[:2]), Vector(*v[:2]), q[2], v[2], rotation)
+
+    def after(self, laps: Lane) -> PlanarFrame:
+        """The frames after whole turns that the angle does not have."""
+        return dataclasses.replace(self, laps=laps)
 
     def point(self, anchor: Any) -> Point:
         """p = x + R s, ṗ = ẋ + ω s⊥, bias −ω² R s, pull (n, R s × n)."""

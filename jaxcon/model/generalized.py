@@ -67,9 +67,21 @@ class GeneralizedCoordinates:
         """None."""
         return ()
 
-    def remember(self, turns: PyTree) -> GeneralizedCoordinates:
+    def remember(self, turns: PyTree, remainder: PyTree = ()) -> GeneralizedCoordinates:
         """Itself."""
         return self
+
+    def no_remainder(self, dtype: Any) -> PyTree:
+        """None: what is an angle is not known."""
+        return ()
+
+    def unwind(self, q: Array) -> tuple[GeneralizedCoordinates, Array]:
+        """Itself and q: what is an angle is not known."""
+        return self, q
+
+    def rewind(self, q: Array, after: Array) -> tuple[Array, PyTree]:
+        """The coordinates after a step, without a remainder."""
+        return after, ()
 
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
         """Nothing."""

@@ -78,6 +78,15 @@ class Layout:
     fixed: tuple[str, ...]
     controls: tuple[tuple[str, int, int], ...]
 
+    @cached_property
+    def angles(self) -> slice | None:
+        """Where the angles of rigid bodies in the plane lie in q; None where there are none."""
+        for group in self.groups:
+            if group.kind.turns:
+                end = group.q + group.kind.n_q * len(group.names)
+                return slice(end - len(group.names), end)
+        return None
+
     @property
     def n_q(self) -> int:
         """Number of position coordinates."""

@@ -54,6 +54,9 @@ class State:
         turns: the angles near which those of joints whose whole turns are counted lie, within half
             a turn, (n,) [rad]; empty where there are none.
         time_remainder: what `time` lacks of the sum of all steps, () [s]; zero unless given.
+        angle_remainder: what the angles in q of rigid bodies in the plane lack by rounding after
+            whole turns, (bodies,) [rad]. Empty where there are none, and in states made by hand,
+            whose angles are rounded once a step; `jc.init` makes it.
     """
 
     q: Array
@@ -63,6 +66,7 @@ class State:
     memory: PyTree = ()
     turns: PyTree = ()
     time_remainder: Array = UNSET
+    angle_remainder: PyTree = ()
 
     # written out, since the default of the remainder has the shape of the time
     def __init__(
@@ -74,10 +78,11 @@ class State:
         memory: PyTree = (),
         turns: PyTree = (),
         time_remainder: Any = UNSET,
+        angle_remainder: PyTree = (),
     ) -> None:
         if time_remainder is UNSET:
             time_remainder = _without_remainder(time)
-        fields = (q, v, time, status, memory, turns, time_remainder)
+        fields = (q, v, time, status, memory, turns, time_remainder, angle_remainder)
         for field, value in zip(dataclasses.fields(State), fields, strict=True):
             object.__setattr__(self, field.name, value)
 
@@ -139,7 +144,7 @@ def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:
     for what in ("time", "time_remainder", "status"):
         if got := np.shape(getattr(state, what)):
             raise ValueError(f"state.{what} must have shape (), got {got}.")
-    return recall(system, state.turns)
+    return recall(system, state.turns, state.angle_remainder)
 
 
 def _check_kinds(state: State) -> None:
@@ -150,13 +155,13 @@ def _check_kinds(state: State) -> None:
     Raises:
         ValueError: a field is of another kind, or the status is no `Status`.
     """
-    for what in ("q", "v", "time", "time_remainder", "turns"):
+    for what in ("q", "v", "time", "time_remainder", "turns", "angle_remainder"):
         x: Any = getattr(state, what)
         own: Any = getattr(x, "dtype", None)
         array = own is not None and jnp.issubdtype(own, jnp.floating)
         number = type(x) is float or (type(x) is int and abs(x) < 2**53)
         plain = what.startswith("time") and number
-        plain = plain or what == "turns" and isinstance(x, tuple) and not x
+        plain = plain or what in ("turns", "angle_remainder") and isinstance(x, tuple) and not x
         if not array and not plain:
             raise ValueError(
                 f"state.{what} must be an array of floating numbers, got {_kind(x)};"
@@ -179,8 +184,13 @@ def _kind(x: Any) -> str:
     return f"{x.dtype}{list(x.shape)}" if hasattr(x, "dtype") else checks.shortened(x)
 
 
-def recall(system: Any, turns: PyTree) -> Any:
+def recall(system: Any, turns: PyTree, remainder: PyTree = ()) -> Any:
     """The system with the angles near which those of joints lie whose turns it counts.
+
+    Args:
+        system: of a state.
+        turns: of the state.
+        remainder: its `angle_remainder`.
 
     Raises:
         ValueError: there are not as many as it counts.
@@ -192,7 +202,7 @@ def recall(system: Any, turns: PyTree) -> Any:
             f" of {sum(expected)} joints; go on from a state that counts them, with"
             " dataclasses.replace, or start with jc.init."
         )
-    return system.remember(turns) if sum(got) else system
+    return system.remember(turns if sum(got) else system.turns, remainder)
 
 
 @pytree

@@ -21,6 +21,7 @@ from jaxcon.model.coordinates import JointCoordinate, count, expected
 from jaxcon.model.frames import WorldFrame
 from jaxcon.model.layout import Layout, Place
 from jaxcon.model.state import Energy
+from jaxcon.model.turning import coarse, continued, reduced
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal, Solution
 
@@ -53,8 +54,13 @@ class Snapshot:
     @cached_property
     def frames(self) -> tuple[Any, ...]:
         """The motion of each group of bodies."""
-        groups = self.system.layout.groups
-        return tuple(g.kind.frame(*g.unpack(self.q, self.v)) for g in groups)
+        system, q = self.system, self.q
+        if not isinstance(system.remainder, tuple):
+            system, q = system.unwind(q)
+        frames = [g.kind.frame(*g.unpack(q, self.v)) for g in system.layout.groups]
+        if isinstance(system.laps, tuple):
+            return tuple(frames)
+        return tuple(f.after(system.laps) if hasattr(f, "after") else f for f in frames)
 
     def motion(self, name: str) -> Motion:
         """The motion of one body as arrays, for a user's function."""
@@ -87,6 +93,9 @@ class BodySystem:
         layout: names and indices.
         counted: which these are.
         bounds: groups of equal elements whose multipliers are bounded.
+        remainder: what the angles in q of bodies in the plane lack, (bodies,) [rad]; empty where
+            that is not known.
+        laps: the whole turns that these angles lack, (bodies,); empty where q has them.
     """
 
     gravity: Array
@@ -99,6 +108,8 @@ class BodySystem:
     layout: Layout = static()
     counted: tuple[JointCoordinate, ...] = static(default=())
     bounds: tuple[Any, ...] = ()
+    remainder: Any = ()
+    laps: Any = ()
 
     @property
     def n_v(self) -> int:
@@ -109,9 +120,44 @@ class BodySystem:
         """The system at one instant."""
         return Snapshot(self, q, v, t)
 
-    def remember(self, turns: PyTree) -> BodySystem:
-        """With other angles near which those that are counted lie."""
-        return dataclasses.replace(self, turns=turns)
+    def remember(self, turns: PyTree, remainder: PyTree = ()) -> BodySystem:
+        """With other angles near which those that are counted lie, and remainders of others."""
+        return dataclasses.replace(self, turns=turns, remainder=remainder)
+
+    def no_remainder(self, dtype: Any) -> PyTree:
+        """The `angle_remainder` of a state that has made no turns."""
+        where = self.layout.angles if coarse(dtype) else None
+        return () if where is None else jnp.zeros(where.stop - where.start, dtype)
+
+    def unwind(self, q: Array) -> tuple[BodySystem, Array]:
+        """The system that knows the whole turns of bodies in the plane, and q without them."""
+        where = self.layout.angles
+        if where is None or not coarse(q.dtype):
+            return self, q
+        none = isinstance(self.remainder, tuple)
+        remainder = jnp.zeros_like(q[where]) if none else self.remainder
+        angle, laps = reduced(q[where], remainder)
+        system = dataclasses.replace(self, laps=laps, remainder=())
+        return system, self._with_angles(q, angle)
+
+    def rewind(self, q: Array, after: Array) -> tuple[Array, PyTree]:
+        """The coordinates after a step with their whole turns, and what rounding takes of them.
+
+        Args:
+            q: at the start of the step, (n_q,).
+            after: where the step led, from q without whole turns, (n_q,).
+        """
+        where = self.layout.angles
+        if where is None or not coarse(q.dtype):
+            return after, ()
+        angle, remainder = continued(q[where], after[where])
+        return self._with_angles(after, angle), remainder
+
+    def _with_angles(self, q: Array, angle: Array) -> Array:
+        """q with other angles of bodies in the plane."""
+        lanes = [Vector.of_rows(q, g.q, g.kind.n_q, len(g.names)) for g in self.layout.groups]
+        pairs = zip(self.layout.groups, lanes, strict=True)
+        return _join([Vector(*x[:-1], angle) if g.kind.turns else x for g, x in pairs], q)
 
     def count(self, q: Array, v: Array, t: Any) -> PyTree:
         """The angles of the joints whose turns are counted, over turns, (n,) [rad]."""
@@ -275,8 +321,12 @@ class BodySystem:
 
     def principal_motion(self, name: str, q: Array, v: Array) -> Motion:
         """The motion of a body's principal frame at its centre of mass, as arrays."""
-        kind = self.layout.groups[self.layout.locate(name)[0]].kind
-        return kind.motion(q[self.layout.q(name)], v[self.layout.v(name)])
+        group, index = self.layout.locate(name)
+        own = q[self.layout.q(name)]
+        kind = self.layout.groups[group].kind
+        if not isinstance(self.laps, tuple) and kind.turns:
+            own = own + jnp.asarray((0, 0, 2 * jnp.pi), own.dtype) * self.laps[index]
+        return kind.motion(own, v[self.layout.v(name)])
 
     def energy(self, q: Array, v: Array, t: Any) -> Energy:
         """½ vᵀMv, and the potential of gravity and springs; user forces have none [J]."""

@@ -49,9 +49,12 @@ def attempt(
     system: Any, method: Method, state: State, control: PyTree, dt: Array, part: Part | None = None
 ) -> Any:
     """(new state, info) and the status of this step of dt alone, or of a part of it."""
-    dynamics = dynamics_at(system, method, state, control, dt, part)
-    length = dt if part is None else part.length
-    system, memory = dynamics.system, MethodMemory(*state.memory)
+    # a step computes with angles less their whole turns, where floats are dense
+    known = recall(system, state.turns, state.angle_remainder)
+    system, q = known.unwind(state.q)
+    given, state = state, dataclasses.replace(state, q=q)
+    dynamics = _dynamics(system, method, state, control, dt, part)
+    length, memory = dt if part is None else part.length, MethodMemory(*state.memory)
     advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
     (q, v, time), solution, rows = advanced.point, advanced.solution, advanced.rows
     new = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, length))
@@ -65,7 +68,8 @@ def attempt(
     kept = (advanced.memory, own, memory.recovery, multipliers)
     kept = MethodMemory(*kept) if state.memory else ()
     new = dataclasses.replace(new, turns=turns, memory=kept)
-    code = status.first(judge(new, solution), corrected)
+    wound = _rewound(system, given, new)
+    code = status.first(judge(wound, solution), corrected)
     if jax.tree.leaves(own):
         code = status.first(code, judge_memory(own, new))
     if system.counted:
@@ -77,10 +81,25 @@ def attempt(
     place = None
     if advanced.ends:
         place = at_instant(dataclasses.replace(bare(state), q=q, v=v), reached(state, time, length))
+        place = _rewound(system, given, place)
     reactions = rows.reactions
     if reactions is not None:
         reactions = dataclasses.replace(reactions, jump=None)
-    return (new, StepInfo(*seen, code, reactions, state=place)), code
+    return (wound, StepInfo(*seen, code, reactions, state=place)), code
+
+
+def _rewound(system: Any, given: State, after: State) -> State:
+    """The state after a step with whole turns, and their remainder where it has a place for it.
+
+    Args:
+        system: of the states.
+        given: the state at the start of the step.
+        after: where the step led, from that state without whole turns.
+    """
+    q, remainder = system.rewind(given.q, after.q)
+    if isinstance(given.angle_remainder, tuple):
+        remainder = ()
+    return dataclasses.replace(after, q=q, angle_remainder=remainder)
 
 
 def nothing_seen(info: StepInfo, state: State) -> StepInfo:
@@ -115,10 +134,17 @@ def dynamics_at(
     part: Part | None = None,
 ) -> Dynamics:
     """What an integrator sees of the system during a step from this state, or a part of it."""
+    system = recall(system, state.turns, state.angle_remainder)
+    return _dynamics(system, method, state, control, dt, part)
+
+
+def _dynamics(
+    system: Any, method: Method, state: State, control: PyTree, dt: Array, part: Part | None
+) -> Dynamics:
+    """The same of a system as remembered by the state."""
     stabilizer, memory = method.feedback(dt), MethodMemory(*state.memory)
     if method.recovery is not None:
         stabilizer = method.recovery.relax(stabilizer, memory.recovery)
-    system = recall(system, state.turns)
     solver = stabilizer.suited(method.solver)
     own = (system, stabilizer, solver, control, memory.stabilizer, dt)
     if not system.bounds:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -60,7 +61,9 @@ def init(system: Any, method: Method, q: Any, v: Any, time: Any = 0.0, turns: An
         turns = checks.real("init", "turns", turns, dtype, np.shape(system.turns)[:1])
     turns = system.turns if turns is None else turns
     time = checks.real("init", "time", time, dtype)
-    return unshared(State(q, v, time, status, memory, turns), system)
+    start = State(q, v, time, status, memory, turns)
+    start = dataclasses.replace(start, angle_remainder=system.no_remainder(dtype))
+    return unshared(start, system)
 
 
 def _length(q: Any) -> int:

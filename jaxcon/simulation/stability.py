@@ -182,7 +182,8 @@ def unstable_spring(
 
     A spring k and damper d on the mass m = 1/A_ii obey φ̈ + (d/m) φ̇ + (k/m) φ = 0.
     """
-    rows = linearize(recall(system, state.turns), state.q, state.v, state.instant)
+    here = recall(system, state.turns, state.angle_remainder)
+    rows = linearize(here, state.q, state.v, state.instant)
     rows = dataclasses.replace(rows, mass=system.mass(state.q))
     soft = penalty.soft(rows.layout)
     numbers = (felt(rows), *penalty.constants(rows))

@@ -99,7 +99,7 @@ def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array)
 
 def _repair(system: Any, method: Method, state: State, attempt: Any, dt: Array) -> Any:
     """The same of an attempt that the method repairs where it failed."""
-    system = recall(system, state.turns)
+    system = recall(system, state.turns, state.angle_remainder)
     return _settle(state, method.recovery.repair(system, method.solver, state, attempt, dt))
 
 
