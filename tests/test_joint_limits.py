@@ -293,3 +293,61 @@ def test_a_stop_may_be_moved_out_of_reach(solver):
     np.testing.assert_allclose(speeds, [1.0, 0.5], rtol=1e-9)
     np.testing.assert_allclose(forces, [0.0, 500.0], rtol=1e-9)
     np.testing.assert_allclose(slopes, [[0.0, 500.0], [0.0, -250.0]], rtol=1e-6)
+
+
+def between(start, speed, time, half=0.1):
+    """Where a point is that bounces between ±half without loss."""
+    way = np.mod(start + half + speed * time, 4 * half)
+    return np.where(way <= 2 * half, way, 4 * half - way) - half
+
+
+FAST = {
+    "euler": jc.Method(),
+    "rk4": jc.Method(jc.RK4()),
+    "events": jc.Method(jc.RK4(), events=jc.Events()),
+}
+
+
+@both
+@pytest.mark.parametrize("name", FAST)
+def test_a_rebound_through_the_whole_range_is_a_status(dim, name):
+    """Within the range, and right up to the step that would leave it; other worlds go on."""
+    system, state = slider(dim, jc.Limit("ends", "rail", -0.1, 0.1, restitution=1.0))
+    method = FAST[name]
+    start = jc.init(system, method, state.q, state.v)
+
+    def rolled(speed):
+        began = dataclasses.replace(start, v=start.v.at[0].set(speed))
+        record = lambda s, i: (s.q[0], s.status)  # noqa: E731
+        end, seen = jc.rollout(system, method, began, None, H, 50, record=record)
+        return end, *seen
+
+    speeds = np.asarray([3.0, 199.0, 500.0, -1000.0])
+    end, x, status = jax.jit(jax.vmap(rolled))(speeds)
+    expected = between(0.0, speeds[:, None], H * np.arange(1, 51))
+    expected = np.where(status == 0, expected, 0.0)
+    np.testing.assert_allclose(x, expected, atol=1e-9)
+    np.testing.assert_array_equal(end.status, [0, 0, *[jc.Status.LOST_IMPACTS] * 2])
+    with pytest.raises(jc.SimulationError, match=r"LOST_IMPACTS in 2 of 4 worlds.*rebounds"):
+        jc.raise_for_status(end)
+
+
+@both
+@pytest.mark.parametrize(("e", "lost"), [(0.0, False), (0.5, True), (0.1, False)])
+def test_slow_rebounds_stay_between_the_stops(dim, e, lost):
+    """1000 m/s ends in the range with 0 and 100 m/s, and would not with 500 m/s."""
+    stop = jc.Limit("ends", "rail", -0.1, 0.1, restitution=e)
+    system, state = slider(dim, stop, velocity=1000.0)
+    x, _, _, status = run(system, state, 50)
+    assert np.all(np.abs(x) < 0.1 + 1e-9)
+    assert np.all(status == (jc.Status.LOST_IMPACTS if lost else 0))
+
+
+def test_events_follow_as_many_impacts_as_they_may():
+    """At 500 m/s a step has at most three."""
+    stop = jc.Limit("ends", "rail", -0.1, 0.1, restitution=1.0)
+    system, state = slider(2, stop, velocity=500.0)
+    method = jc.Method(jc.RK4(), events=jc.Events(splits=4))
+    x, _, _, status = run(system, state, 50, method=method)
+    assert np.all(status == 0)
+    np.testing.assert_allclose(x, between(0.0, 500.0, H * np.arange(1, 51)), atol=1e-9)

@@ -34,6 +34,10 @@ class Limit:
     stiffness is a spring and a damper behind the gap, implicit over the step. The farther stop
     acts in place of the nearer one where the step would otherwise pass it.
 
+    A step sees one impact of a stop. A joint that rebounds so fast that it would cross its whole
+    range in the rest of the step ends with the status `LOST_IMPACTS`: with e = 1 between stops
+    0.2 m apart and h = 1 ms, from 200 m/s on. `Events(splits=n)` follows n impacts.
+
     Attributes:
         name: unique in the scene.
         joint: name of the joint.

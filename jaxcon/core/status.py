@@ -18,6 +18,7 @@ class Status(IntEnum):
         NOT_CONVERGED: an iteration did not reach its tolerance.
         VIOLATED: constraints stayed off by more than the limit of a `Recovery`.
         LOST_TURNS: a joint turned further in a step than its count of whole turns can tell.
+        LOST_IMPACTS: a joint rebounds through the whole of its range within a step.
         CONFLICT: constraints contradict each other; least squares go on.
         ROLLED_BACK: a `Recovery` went back to the state before the step.
         PROJECTED: it went to the valid configuration nearest to the state before.
@@ -30,6 +31,7 @@ class Status(IntEnum):
     NOT_CONVERGED = 3
     VIOLATED = 4
     LOST_TURNS = 5
+    LOST_IMPACTS = 6
     CONFLICT = 16
     ROLLED_BACK = 17
     PROJECTED = 18
@@ -64,6 +66,9 @@ MEANING = {
     " that servos, springs, limits and couplings on its angle would be off by turns; likely (a) a"
     " step too large for the speed or the acceleration of the joint, (b) a servo or spring too"
     " stiff for the inertia behind it, (c) a velocity in the wrong unit",
+    Status.LOST_IMPACTS: "a joint rebounds from a stop so fast that it would pass the other one in"
+    " the same step, which sees one impact of a stop; likely (a) a step too large for the speed of"
+    " the joint, (b) a range too small, (c) a velocity in the wrong unit",
     Status.ROLLED_BACK: "a step failed: the world went back to the state before it",
     Status.PROJECTED: "steps failed: the world went back to the valid configuration nearest to the"
     " state before them",

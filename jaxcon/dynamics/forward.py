@@ -130,7 +130,7 @@ class Dynamics:
             length, strikes, lands = self.part.length, False, False
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         impulse = self._impulse(base, law, problem, length, acts)
-        e, bounds = bounds.restitution, impulse.rows
+        both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
         seen = None
         if lands:
@@ -152,6 +152,11 @@ class Dynamics:
             change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
             times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
             solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
+            if e is not None:
+                left = self.dt[None] - times.times
+                speed = impacts.rebound(bounds.rate, e, times, change, lag, self.dt)
+                lost = impacts.passes_range(both_stops, speed, left)
+                solution = solution._replace(status=lost_impacts(solution.status, lost))
             solution, known = self._struck((q, v, t), solution, known, times, lag)
         elif seen is not None:
             solution = self._observed(solution, t, seen, seen, bounds)
@@ -287,6 +292,14 @@ class Dynamics:
         force = force if law.force is None else force + law.force
         force = force if self.held is None else force + self.held
         return rows, law, saddle(self.system, q, law.rows, force, law.target, law.noise)
+
+
+def lost_impacts(code: Array, lost: Array | None) -> Array:
+    """The code, or LOST_IMPACTS where it is no failure and impacts are lost, ()."""
+    if lost is None:
+        return code
+    found = jnp.where(lost, status.Status.LOST_IMPACTS, status.Status.OK)
+    return status.first(code, found.astype(code.dtype))
 
 
 @dataclass(frozen=True)

@@ -237,6 +237,37 @@ def arrive(
     return Arrivals(hits, bounces, all_times, leads, touched, happens)
 
 
+def passes_range(rows: BoundRows, speed: Array, time: Array) -> Array | None:
+    """Whether a joint between two elastic stops crosses its range in a time; None without such.
+
+    Args:
+        rows: as they are linearized, with both stops.
+        speed: |θ̇|, (n,), zero for rows that are not asked for.
+        time: (n,) [s].
+
+    Returns:
+        By world, ().
+    """
+    if rows.far is None or rows.restitution is None:
+        return None
+    return jnp.any((rows.restitution >= 0) & (speed * time > rows.gap + rows.far), axis=0)
+
+
+def rebound(rate: Array, e: Array, arrivals: Arrivals, change: Array, lag: Any, dt: Array) -> Array:
+    """The speeds with which rows leave after an impact, e |φ̇|, (n,); zero for those that stay.
+
+    Args:
+        rate: φ̇ at the start of the step, (n,) [m/s, rad/s].
+        e: restitution, (n,).
+        arrivals: which arrive, and when.
+        change: h c, (n,), with the forces of the other rows.
+        lag: velocities are those of lag · h before the positions.
+        dt: h, () [s].
+    """
+    share = lag + numerics.safe_divide(arrivals.times, dt[None])
+    return jnp.where(arrivals.bounces, e * jnp.abs(rate + share * change), 0)
+
+
 def at_impact(
     rows: BoundRows, arrivals: Arrivals, dt: Array, lasts: Array
 ) -> tuple[BoundRows, Array]:

@@ -16,6 +16,8 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
+from jaxcon.dynamics.forward import lost_impacts
+from jaxcon.dynamics.impacts import passes_range
 from jaxcon.dynamics.parts import Outlook, Part, Struck, look
 from jaxcon.model.state import State, at_instant, recall
 from jaxcon.simulation.arrival import Arrival, Search
@@ -62,9 +64,12 @@ class Events(checks.Checked):
     only grazed the time has no derivative, and is taken to have none. Second derivatives through an
     impact are finite, but not right.
 
-    After so many impacts in one step the rest of it is plain, and so are rows that rest: those
-    whose gap and speed are no more than what accelerations make in a step, ½ h² |J||a| and
-    ½ h |J||a|. There a ball that bounces ever lower comes to lie, within one step of when it would.
+    After so many impacts in one step the rest of it is plain. A joint that would then cross the
+    range between two elastic stops ends with the status `LOST_IMPACTS`.
+
+    Rows that rest are plain, too: those whose gap and speed are no more than what accelerations
+    make in a step, ½ h² |J||a| and ½ h |J||a|. There a ball that bounces ever lower comes to lie,
+    within one step of when it would.
 
     A row that closes and opens again within one step is not seen, nor the first of two crossings by
     the nearest row. Soft stops and contacts, friction in joints and motors are forces, and split
@@ -265,7 +270,10 @@ class World:
         struck = Struck(outlook, chosen(found.row, outlook.open), hit)
         jump, impulses = jax.lax.cond(somewhere(hit), strike, no_strike, self, there, struck)
         final = keep(found.happens, dataclasses.replace(there, v=there.v + jump), passed.state)
-        code = status.first(progress.code, passed.code)
+        rows = still.rows(at)
+        speed = jnp.where(awaited[None], 0, jnp.abs(rows.rate))
+        lost = passes_range(rows, speed, length[None])
+        code = status.first(progress.code, lost_impacts(passed.code, lost))
         new = progress._replace(state=final, left=length - time, active=found.happens, code=code)
         new = new.beyond(passed.impulses).beyond(impulses)
         told = Impact(hit, rounded(state.instant + time), jnp.where(hit, found.row, 0))

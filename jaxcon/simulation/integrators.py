@@ -150,10 +150,15 @@ class SemiImplicitEuler(Explicit):
 
         β² multiplies the rounding of φ into the multipliers. It is therefore held below 0.1/ε, ε
         the precision, where a metre's rounding makes 0.1 m/s²; in float32 this acts below 1.1 ms.
+        `Baumgarte()` lets it rise to 1/h where constraints accelerate fast.
         """
         precision = float(jnp.finfo(jnp.result_type(dt)).eps)
         beta = 1.0 / jnp.maximum(dt, (precision / 0.1) ** 0.5)  # with a derivative at h = 0
         return beta / 2, beta
+
+    def highest_rate(self, dt: Any) -> Any:
+        """β = 1/h [1/s], to which default gains rise in float32 where constraints accelerate."""
+        return 1.0 / jnp.maximum(dt, 1e-9)  # with a derivative at h = 0
 
     def growth(self, alpha: float, beta: float, dt: float) -> float:
         """The factor by which an error (φ, p) may grow in one step: a spectral radius.

@@ -8,6 +8,7 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from jaxcon.constraints.contact_default import default_contact_solver, first_multipliers
 from jaxcon.core import checks
@@ -142,7 +143,10 @@ class Method:
 
     def feedback(self, dt: Any) -> Any:
         """The stabiliser, its missing gains chosen for the integrator at this step."""
-        stabilizer = self.stabilizer.resolve(self.integrator.default_gains(dt))
+        stabilizer = self.stabilizer
+        if hasattr(self.integrator, "highest_rate") and jnp.finfo(jnp.result_type(dt)).bits == 32:
+            stabilizer = stabilizer.rising(self.integrator.highest_rate(dt))
+        stabilizer = stabilizer.resolve(self.integrator.default_gains(dt))
         return stabilizer.bounded(functools.partial(stable_rate, self.integrator, dt))
 
     def check_system(self, system: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import RowLayout, Rows
 from jaxcon.core import checks
-from jaxcon.core.lanes import Vector
+from jaxcon.core.lanes import Vector, total
 from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.typing import Array
 
@@ -104,16 +104,20 @@ def column(mask: np.ndarray, rows: Rows) -> np.ndarray:
     return mask.reshape(-1, *(1,) * (rows.bias.ndim - 1))
 
 
-def squares(x: Array, layout: RowLayout) -> Array:
-    """‖x‖² of the constraint to which a row belongs, by row, (n_c,); smooth where x = 0."""
+def sums(x: Array, layout: RowLayout) -> Array:
+    """Σ x_i over the constraint to which a row belongs, by row, (n_c,)."""
     lanes: list[Array] = []
     place = 0
     while place < len(layout.entries):
         _, first, rows, elements = layout.entries[place]
-        own = Vector.of_rows(x, first, rows, elements)
-        lanes += [own.dot(own)] * rows
+        lanes += [total(Vector.of_rows(x, first, rows, elements))] * rows
         place += elements
     return jnp.concatenate(lanes) if lanes else x
+
+
+def squares(x: Array, layout: RowLayout) -> Array:
+    """‖x‖² of the constraint to which a row belongs, by row, (n_c,); smooth where x = 0."""
+    return sums(x * x, layout)
 
 
 def check_gains(owner: str, strictly: bool = False, optional: bool = True, **gains: Any) -> None:
