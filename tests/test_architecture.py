@@ -110,6 +110,7 @@ MAY_IMPORT = {
     "core/host.py": {"jax.extend"},
     "core/fusion.py": {"jax.experimental"},
     "core/meshes.py": {"jax.core"},
+    "core/notices.py": {"jax.experimental"},
     "core/somewhere.py": {"jax.core", "jax.experimental", "jax.extend", "jax.interpreters"},
     "core/equality.py": {"jax.core"},
     "core/pytree.py": {"jax.core"},

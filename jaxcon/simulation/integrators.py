@@ -191,8 +191,9 @@ def missed(
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
 
     Most steps turn bodies by less than `TURN`, where e is about 1e-5 of a lever arm, and pay for
-    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist. A row of
-    an inequality constraint on these bodies moves off its target by e/h with them.
+    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist, and from
+    1 to √2 rad it fades, since a Newton step from so far away leads nowhere. A row of an inequality
+    constraint on these bodies moves off its target by e/h with them.
 
     Args:
         system: of bodies in space.
@@ -204,9 +205,8 @@ def missed(
         dt: h, () [s].
     """
     h = dt[None]
-    turn = system.turn(state.q, v, h) / TURN**2
-    share = jnp.clip((turn - 1) / 3, 0, 1)
-    share = share * share * (3 - 2 * share)
+    turn = system.turn(state.q, v, h)
+    share = smooth((turn / TURN**2 - 1) / 3) * smooth(2 - turn)
     held = rows.layout.holds & rows.layout.holonomic
     held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
 
@@ -222,6 +222,12 @@ def missed(
         return jax.tree.map(jnp.zeros_like, solution)
 
     return jax.lax.cond(somewhere(share > 0), corrected, nothing)
+
+
+def smooth(x: Array) -> Array:
+    """0 up to x = 0, 1 from x = 1 on, and 3x² − 2x³ between."""
+    x = jnp.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)
 
 
 def added(solution: Solution, more: Solution) -> Solution:
