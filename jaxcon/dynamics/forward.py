@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows, linearize_bounds
@@ -79,7 +80,7 @@ class Dynamics:
 
         With bounded rows these are means over the step, its impacts included.
         """
-        solution, rows, _ = self.factored(q, v, t, age)
+        solution, rows, *_ = self.factored(q, v, t, age)
         return impacts.with_jump(solution, impacts.jump_of(rows.reactions), self.dt), rows
 
     def begun(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows, Dynamics]:
@@ -91,7 +92,7 @@ class Dynamics:
         if self.bounded is None:
             return *self(q, v, t), self
         rows, law, problem = self._problem(q, v, t, None)
-        solution, rows, force, _ = self._reacted(q, v, t, rows, law, problem, None, True)
+        solution, rows, force, *_ = self._reacted(q, v, t, rows, law, problem, None, True)
         return solution, rows, dataclasses.replace(self, bounded=None, held=force)
 
     def _reacted(
@@ -104,8 +105,10 @@ class Dynamics:
         problem: Saddle,
         lag: float | None,
         every: bool,
-    ) -> tuple[Solution, Rows, Array, Factored]:
+    ) -> tuple[Solution, Rows, Array, Factored, Array]:
         """a and λ with bounded rows, the rows with what these do, their force, and the factors.
+
+        The last is the force of the one-sided rows among them.
 
         Args:
             q: positions, (n_q,).
@@ -147,6 +150,8 @@ class Dynamics:
         solution = solution._replace(status=status.first(solution.status, impulse.judge()))
         known = self._judged(impulse, known, solution.acceleration)
         own = impulse.rows.jacobian.transpose(known.multipliers)
+        ends = impacts.mask(bounds.ends, bounds)
+        push = impulse.rows.jacobian.transpose(jnp.where(ends, known.multipliers, 0))
         if strikes:
             lag = 0.0 if lag is None else lag
             change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
@@ -160,7 +165,7 @@ class Dynamics:
             solution, known = self._struck((q, v, t), solution, known, times, lag)
         elif seen is not None:
             solution = self._observed(solution, t, seen, seen, bounds)
-        return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone
+        return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone, push
 
     def _observed(
         self, solution: Solution, t: Any, hits: Array, fast: Array, rows: BoundRows
@@ -226,24 +231,36 @@ class Dynamics:
         solution = self.system.complete(impulse.motion(known.multipliers))
         return solution, self._judged(impulse, known, solution.acceleration)
 
+    def pressed(self, q: Array, v: Array, t: Any) -> np.ndarray:
+        """Whether one-sided rows may act on the body of each velocity, by structure, (n_v,)."""
+        rows = jax.eval_shape(self.bounds, q, v, t, self.dt)
+        ends, found = np.asarray(rows.ends, bool), np.zeros(rows.jacobian.shape[1], bool)
+        for block in rows.jacobian.blocks:
+            m, k = block.shape
+            own = ends[block.start : block.start + m * k].reshape(m, k).any(axis=0)
+            found[block.columns.index()[:, own]] = True
+        return found
+
     def factored(
         self, q: Array, v: Array, t: Any, age: Any = None
-    ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None]:
-        """a and λ, the rows, and b → the least a, in the metric of M, with J a + C λ = b.
+    ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
+        """a and λ, the rows, b → the least a, in the metric of M, with J a + C λ = b, and a force.
 
-        The last uses the factors of the step, and is None where the stabilizer solves by itself.
-        Impacts are not in a: they are the `jump` of the reactions.
+        The third uses the factors of the step, and is None where the stabilizer solves by itself.
+        The force (n_v,) is that of one-sided rows; None where there are no bounded rows. Impacts
+        are not in a: they are the `jump` of the reactions.
         """
         rows, law, problem = self._problem(q, v, t, age)
+        push = None
         if self.bounded is not None:
             lag = None if age is None else 0.5
-            solution, rows, _, solve = self._reacted(q, v, t, rows, law, problem, lag, False)
+            solution, rows, _, solve, push = self._reacted(q, v, t, rows, law, problem, lag, False)
         elif law.solve is not None:
-            return self.system.complete(law.solve(self.solver, problem)), rows, None
+            return self.system.complete(law.solve(self.solver, problem)), rows, None, None
         else:
             solve = self._factors(law, problem)
             solution = self.system.complete(solve(problem.force, law.target))
-        return solution, rows, lambda target: solve(0 * problem.force, target)
+        return solution, rows, lambda target: solve(0 * problem.force, target), push
 
     def _impulse(
         self,

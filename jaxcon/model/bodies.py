@@ -69,6 +69,10 @@ class Particle:
         """v + h a: these velocities are rates of coordinates."""
         return v + acceleration * dt
 
+    def coast(self, v: Vector, moments: Any, dt: Lane) -> Vector:
+        """None: these velocities are rates of coordinates."""
+        return v.map(jnp.zeros_like)
+
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""
         return Motion(q, None, v, None)
@@ -196,6 +200,15 @@ class SpatialRigid(Particle):
         turned = rotate_freely(ω, moments_, shares, half)
         turned = rotate_freely(turned + applied, moments_, shares, half)
         return Vector(*(Vector(*v[:3]) + Vector(*acceleration[:3]) * dt), *turned)
+
+    def coast(self, v: Vector, moments: Array, dt: Lane) -> Vector:
+        """The mean gyroscopic acceleration of a step of free rotation, less that at its start."""
+        moments_, half = Vector.of(moments), dt / 2
+        shares, ω = shares_of(moments_), Vector(*v[3:])
+        turned = rotate_freely(ω, moments_, shares, half)
+        turned = rotate_freely(turned, moments_, shares, half)
+        mean = (turned - ω).map(lambda x: numerics.safe_divide(x, dt))
+        return Vector(*zeros(3), *(mean + spun(shares, ω)))
 
     def motion(self, q: Array, v: Array) -> Motion:
         """The motion of one body for a user's function."""

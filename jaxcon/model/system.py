@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
@@ -259,6 +261,31 @@ class BodySystem:
             (g.kind, g.unpack(q, v)[1], g.unpack(q, acceleration)[1], p.moments) for g, p in parts
         ]
         return _join([kind.kick(*own, dt) for kind, *own in known], q)
+
+    def coast(self, q: Array, v: Array, dt: Any) -> Array:
+        """The mean gyroscopic acceleration of a step of free rotation, less that at its start.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities before the step, (n_v,).
+            dt: h, (1,) [s].
+        """
+        parts = zip(self.layout.groups, self.inertia, strict=True)
+        known = [(g.kind, g.unpack(q, v)[1], p.moments) for g, p in parts]
+        return _join(
+            [
+                kind.coast(own, moments, dt).map(lambda x, v=own: 0 * v[0] + x)
+                for kind, own, moments in known
+            ],
+            q,
+        )
+
+    def by_body(self, q: Array, x: Array) -> Array:
+        """Whether a body has a number that is not zero among its own, for each of them, (n_v,)."""
+        groups = (g.unpack(q, x)[1] for g in self.layout.groups)
+        some = (functools.reduce(operator.or_, (lane != 0 for lane in own)) for own in groups)
+        sizes = (g.kind.n_v for g in self.layout.groups)
+        return jnp.concatenate([x for own, n in zip(some, sizes, strict=True) for x in [own] * n])
 
     @property
     def turns_in_space(self) -> bool:

@@ -6,6 +6,7 @@ also says how it transforms a constraint error under feedback, which decides whi
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -128,12 +129,20 @@ class SemiImplicitEuler(Explicit):
     ) -> tuple[Array, Solution, Rows]:
         """v⁺, a and λ, and the rows, with the free rotation of bodies split off.
 
-        Inequality constraints say something of v + h a, from which v⁺ of a body that they act on
-        differs by a share of (h|ω|)².
+        Of a body on which a one-sided row acts, v⁺ = v + h a, as its law says something of this v⁺.
+        The gyroscopic part of a is then the mean over a step of free rotation.
         """
         system, h = dynamics.system, dt[None]
-        solution, rows, least = dynamics.factored(*here, dt / 2)
-        v = system.kick(state.q, state.v, solution.acceleration, h)
+        coasting: Any = 0.0
+        if system.bounds:
+            pressed = dynamics.pressed(*here).reshape(-1, *(1,) * (state.v.ndim - 1))
+            coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
+            dynamics = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
+        solution, rows, least, push = dynamics.factored(*here, dt / 2)
+        v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
+        if push is not None:
+            straight = state.v + h * solution.acceleration
+            v = jnp.where(system.by_body(state.q, push), straight, v)
         if least is not None and rows.layout.size:
             more = missed(system, state, v, solution, rows, least, dt)
             v, solution = v + h * more.acceleration, added(solution, more)
