@@ -116,7 +116,7 @@ def _accumulating(hits: list[Hit]) -> str | None:
 
 
 def _by_name(hits: list[Hit]) -> dict[str, int]:
-    """How many impacts each element has."""
+    """The number of impacts by element."""
     counts: dict[str, int] = defaultdict(int)
     for hit in hits:
         counts[hit.name] += 1

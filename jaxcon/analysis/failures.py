@@ -187,7 +187,7 @@ class Watched(Dynamics):
     seen: list[tuple[list[Finding], Status]] = field(default_factory=list)
 
     def factored(self, q: Array, v: Array, t: Any, age: Any = None) -> Any:
-        """What `Dynamics.factored` finds at (q, v, t)."""
+        """`Dynamics.factored` at (q, v, t), watched."""
         return self._watched(q, v, t, super().factored(q, v, t, age))
 
     def _watched(self, q: Array, v: Array, t: Any, found: Any) -> Any:

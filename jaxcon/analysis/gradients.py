@@ -16,7 +16,7 @@ from jaxcon.core import checks, functions, notices
 from jaxcon.core.typing import Array, PyTree
 
 NO_DERIVATIVE = "there plain steps have no derivative that differences could confirm"
-"""What is said of the impacts that a wrong gradient meets."""
+"""The words for impacts that a wrong gradient meets."""
 
 
 @dataclass(frozen=True)

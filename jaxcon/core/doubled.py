@@ -346,12 +346,12 @@ ROUNDING = frozenset({"cumsum", "cumprod", "reduce_prod", "conv_general_dilated"
 
 
 def _is_jaxpr(x: Any) -> bool:
-    """Whether a parameter of an equation is a function."""
+    """Returns True for a parameter of an equation that is a function."""
     return hasattr(x, "eqns") or hasattr(x, "jaxpr")
 
 
 def _is_complex(x: Any) -> bool:
-    """Whether the dtype is complex."""
+    """Returns True for complex numbers."""
     return jnp.issubdtype(rounded(x).dtype, jnp.complexfloating)
 
 

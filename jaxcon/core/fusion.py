@@ -123,7 +123,7 @@ class Stages:
 
     @property
     def are_one_kernel(self) -> bool:
-        """Whether a kernel may contain all of it."""
+        """True where one kernel may contain all of it."""
         return len(self.parts) == 1 and all(map(_fits, self.parts[0][0]))
 
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:

@@ -61,8 +61,8 @@ def wrap(angle: Lane) -> Array:
 
 
 TERMS = {32: 6, 64: 11}
-"""Of the series of cos r and sin r / r in r², by the bits of a float: what the next one would add
-for r up to π/2 is below half of its last place."""
+"""The number of terms of the series of cos r and sin r / r in r², by the bits of a float: the next
+term is below half of the last place for r up to π/2."""
 
 
 def cos_sinc(square: Lane) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from jaxcon.core.typing import Array
 
 
 def somewhere(flags: Array) -> Array:
-    """Whether a flag (…) is set in some world that the device holds, ().
+    """Returns True where a flag (…) is set in some world that the device holds, ().
 
     It has no derivative. Under `jax.vmap` it is asked for each of the mapped arrays.
     """
@@ -31,17 +31,17 @@ def somewhere(flags: Array) -> Array:
 
 
 def everywhere(flags: Array) -> Array:
-    """Whether a flag (…) is set in all worlds that the device holds, ()."""
+    """Returns True where a flag (…) is set in all worlds that the device holds, ()."""
     return ~somewhere(~flags)
 
 
 def _any(flags: Array) -> Array:
-    """Whether a flag is set."""
+    """Returns True where a flag is set."""
     return jnp.any(flags)
 
 
 def _partition(mesh: Any, args: Any, result: Any) -> Any:
-    """Where flags lie on several devices: each looks at its own, and the result is its own."""
+    """The function and shardings on several devices: each reads its own flags alone."""
     return mesh, _any, NamedSharding(mesh, PartitionSpec()), (args[0].sharding,)
 
 

@@ -16,7 +16,7 @@ from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows, linearize_bounds
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import notices, numerics, status
-from jaxcon.core.doubled import Doubled
+from jaxcon.core.doubled import rounded
 from jaxcon.core.lanes import widened
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics import impacts
@@ -170,11 +170,9 @@ class Dynamics:
     def _observed(
         self, solution: Solution, t: Any, hits: Array, fast: Array, rows: BoundRows
     ) -> Solution:
-        """The solution; where impacts are observed, what hits in this step is told."""
-        if not notices.is_observing():
-            return solution
-        time, kind = Doubled.of(t).high, impacts.Seen(rows.layout)
-        a = notices.observe(solution.acceleration, kind, hits, fast, time, self.dt)
+        """The solution; `notices` observes the rows that hit in this step."""
+        kind = impacts.Seen(rows.layout)
+        a = notices.observe(solution.acceleration, kind, hits, fast, rounded(t), self.dt)
         return solution._replace(acceleration=a)
 
     def _struck(
@@ -232,7 +230,7 @@ class Dynamics:
         return solution, self._judged(impulse, known, solution.acceleration)
 
     def pressed(self, q: Array, v: Array, t: Any) -> np.ndarray:
-        """Whether one-sided rows may act on the body of each velocity, by structure, (n_v,)."""
+        """A mask of the velocities of bodies on which one-sided rows may act, (n_v,)."""
         rows = jax.eval_shape(self.bounds, q, v, t, self.dt)
         ends, found = np.asarray(rows.ends, bool), np.zeros(rows.jacobian.shape[1], bool)
         for block in rows.jacobian.blocks:

@@ -238,7 +238,7 @@ def arrive(
 
 
 def passes_range(rows: BoundRows, speed: Array, time: Array) -> Array | None:
-    """Whether a joint between two elastic stops crosses its range in a time; None without such.
+    """Returns True where a joint crosses the range between two elastic stops in a time, or None.
 
     Args:
         rows: as they are linearized, with both stops.

@@ -21,7 +21,7 @@ class Particle:
 
     dim: int
     turns: ClassVar[bool] = False
-    """Whether the last coordinate is an angle."""
+    """True where the last coordinate is an angle."""
 
     @property
     def n_q(self) -> int:

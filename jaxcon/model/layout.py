@@ -80,7 +80,7 @@ class Layout:
 
     @cached_property
     def angles(self) -> slice | None:
-        """Where the angles of rigid bodies in the plane lie in q; None where there are none."""
+        """The slice of q with the angles of rigid bodies in the plane, or None."""
         for group in self.groups:
             if group.kind.turns:
                 end = group.q + group.kind.n_q * len(group.names)

@@ -281,7 +281,7 @@ class BodySystem:
         )
 
     def by_body(self, q: Array, x: Array) -> Array:
-        """Whether a body has a number that is not zero among its own, for each of them, (n_v,)."""
+        """A mask of the numbers of bodies that have one that is not zero, (n_v,)."""
         groups = (g.unpack(q, x)[1] for g in self.layout.groups)
         some = (functools.reduce(operator.or_, (lane != 0 for lane in own)) for own in groups)
         sizes = (g.kind.n_v for g in self.layout.groups)

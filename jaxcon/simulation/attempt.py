@@ -141,7 +141,7 @@ def dynamics_at(
 def _dynamics(
     system: Any, method: Method, state: State, control: PyTree, dt: Array, part: Part | None
 ) -> Dynamics:
-    """The same of a system as remembered by the state."""
+    """The dynamics of a system that remembers the turns of the state."""
     stabilizer, memory = method.feedback(dt), MethodMemory(*state.memory)
     if method.recovery is not None:
         stabilizer = method.recovery.relax(stabilizer, memory.recovery)
