@@ -81,9 +81,9 @@ def cos_sinc(square: Lane) -> tuple[Array, Array]:
     return sign * cos, jnp.where(near, sinc, sign * sinc * rest / root)
 
 
-def alternating(s: Array, odd: int) -> Array:
+def alternating(s: Array, odd: int, terms: int | None = None) -> Array:
     """1 − s/(2 + odd)! + s²/(4 + odd)! − …: cos √s, or with odd = 1 sin √s / √s."""
-    terms = TERMS[jnp.finfo(s.dtype).bits]
+    terms = TERMS[jnp.finfo(s.dtype).bits] if terms is None else terms
     total = jnp.full_like(s, (-1) ** terms / math.factorial(2 * terms + odd))
     for k in range(terms - 1, -1, -1):
         total = total * s + (-1) ** k / math.factorial(2 * k + odd)

@@ -18,12 +18,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
 
 from jaxcon.core.lanes import Matrix, Vector, perpendicular, times, zeros
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Lane
 from jaxcon.geometry import quaternion
+from jaxcon.model.turning import cos_sin
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class PlanarFrame(Frame):
     @classmethod
     def of(cls, q: Vector, v: Vector) -> PlanarFrame:
         """From coordinates (x, y, θ) and velocities (ẋ, ẏ, ω)."""
-        c, s = jnp.cos(q[2]), jnp.sin(q[2])
+        c, s = cos_sin(q[2])
         rotation = Matrix(Vector(c, -s), Vector(s, c))
         return cls(Vector(*q[:2]), Vector(*v[:2]), q[2], v[2], rotation)
 
