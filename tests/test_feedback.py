@@ -422,3 +422,30 @@ def test_a_derivative_through_gains_that_rise():
     value, slope = jax.value_and_grad(energy)(speed, jnp.asarray(1e-4, jnp.float32))
     np.testing.assert_allclose(slope, 2 * value / speed, rtol=1e-2)
     assert jnp.isfinite(jax.grad(energy, 1)(speed, jnp.zeros((), jnp.float32)))
+
+
+def test_default_gains_of_a_known_step_are_numbers_where_they_cannot_rise():
+    """At 2 ms 1/h is below 917/s; what is not known, or chosen by the user, stays as it is."""
+    method, own = jc.Method(), jc.Method(stabilizer=jc.Baumgarte(5.0, 10.0))
+    known = method.known_at(2e-3, np.float32)
+    assert type(known.feedback(jnp.float32(2e-3))) is jc.Baumgarte
+    np.testing.assert_allclose(known.stabilizer.fallback, (250.0, 500.0), rtol=1e-6)
+    for same, dt, dtype in (
+        (method, 1e-4, np.float32),
+        (method, 2e-3, np.float64),
+        (own, 2e-3, np.float32),
+        (jc.Method(jc.RK4()), 2e-3, np.float32),
+    ):
+        assert same.known_at(dt, dtype) == same
+    jax.jit(lambda dt: np.testing.assert_(method.known_at(dt, np.float32) is method))(2e-3)
+
+
+def test_a_known_step_and_a_traced_one_lead_to_the_same_state():
+    system, state = whirled(20.0)
+
+    def end(dt):
+        return jc.rollout(system, jc.Method(), state, None, dt, 100)[0]
+
+    known, traced = jax.jit(lambda: end(2e-3))(), jax.jit(end)(2e-3)
+    np.testing.assert_allclose(known.q, traced.q, atol=1e-6)
+    np.testing.assert_allclose(known.v, traced.v, atol=1e-5)

@@ -141,11 +141,32 @@ class Method:
             return self
         return dataclasses.replace(self, bounded=default_contact_solver(system, state.q, state.v))
 
+    def known_at(self, dt: Any, dtype: Any) -> Method:
+        """The same, with the default gains of a known step where they cannot rise.
+
+        Gains that may rise are computed row by row in every step.
+
+        Args:
+            dt: h as it was given, () [s].
+            dtype: of the scene.
+        """
+        if not checks.is_concrete(dt):
+            return self
+        with jax.ensure_compile_time_eval():
+            h = jnp.asarray(dt, dtype)
+            limit = _highest_rate(self.integrator, h)
+            if limit is None:
+                return self
+            gains = self.integrator.default_gains(h)
+            held = bool(gains[1] < limit)
+        stabilizer = self.stabilizer if held else self.stabilizer.steady(gains)
+        return dataclasses.replace(self, stabilizer=stabilizer)
+
     def feedback(self, dt: Any) -> Any:
         """The stabiliser, its missing gains chosen for the integrator at this step."""
-        stabilizer = self.stabilizer
-        if hasattr(self.integrator, "highest_rate") and jnp.finfo(jnp.result_type(dt)).bits == 32:
-            stabilizer = stabilizer.rising(self.integrator.highest_rate(dt))
+        stabilizer, limit = self.stabilizer, _highest_rate(self.integrator, dt)
+        if limit is not None:
+            stabilizer = stabilizer.rising(limit)
         stabilizer = stabilizer.resolve(self.integrator.default_gains(dt))
         return stabilizer.bounded(functools.partial(stable_rate, self.integrator, dt))
 
@@ -224,3 +245,11 @@ def check_method(method: Any, wait: bool = True) -> None:
         )
     with contextlib.nullcontext() if wait else checks.without_waiting():
         method.check()
+
+
+def _highest_rate(integrator: Any, dt: Any) -> Any:
+    """β [1/s] to which default gains may rise; None where precision does not hold them low."""
+    if jnp.finfo(jnp.result_type(dt)).bits > 32:
+        return None
+    highest = getattr(integrator, "highest_rate", None)  # integrators of users have none
+    return None if highest is None else highest(dt)

@@ -85,6 +85,7 @@ def rollout(
     at(system, state, "jc.rollout(system, method, s, controls, dt, steps)")
     check_adjoint(adjoint)
     warn_if_unstable(method, dt, system, state)
+    method = method.known_at(dt, state.q.dtype)
     policy = controls if callable(controls) else None
     if policy is not None:
         checks.takes("rollout", "controls", policy, ("state",))

@@ -48,6 +48,7 @@ def step(
     check_method(method, wait=False)
     with checks.without_waiting():  # of dt as given: under jit an array of it would be traced
         warn_if_unstable(method, dt, system, state)
+        method = method.known_at(dt, state.q.dtype)
     return step_quietly(system, method, state, control, dt)
 
 

@@ -59,6 +59,10 @@ class Unstabilized(checks.Checked):
         """Itself; default gains rise up to β = limit [1/s] where their rows accelerate fast."""
         return self
 
+    def steady(self, gains: tuple[Any, Any]) -> Unstabilized:
+        """Itself; default gains are these (α, β) [1/s] and do not rise."""
+        return self
+
     def bounded(self, stable_rate: Callable[[float], Any]) -> Unstabilized:
         """Itself; one that changes its gains asks here up to which β it may, by least α/β."""
         return self
@@ -153,10 +157,18 @@ class Baumgarte(Unstabilized):
         """
         return cls(jax.tree.map(lambda x: damping_ratio * x, rate), rate)
 
+    @property
+    def is_default(self) -> bool:
+        """True where all gains are left to the integrator."""
+        return type(self) is Baumgarte and self.alpha is self.beta is self.fallback is None
+
     def rising(self, limit: Any) -> Baumgarte:
         """With default gains a `RisingBaumgarte`, with gains of its own itself."""
-        default = type(self) is Baumgarte and self.alpha is self.beta is None
-        return RisingBaumgarte(fallback=self.fallback, limit=limit) if default else self
+        return RisingBaumgarte(limit=limit) if self.is_default else self
+
+    def steady(self, gains: tuple[Any, Any]) -> Baumgarte:
+        """With default gains these (α, β), which do not rise, with gains of its own itself."""
+        return dataclasses.replace(self, fallback=gains) if self.is_default else self
 
     def resolve(self, gains: tuple[Any, Any]) -> Baumgarte:
         """The same with these (α, β) where none were given."""
