@@ -59,13 +59,14 @@ COSTLY = _names(
 )
 """Elementwise operations that are always worth storing."""
 
-OTHERS = _names("concatenate dynamic_update_slice pad gather scan split stack unstack")
+OTHERS = _names(
+    "concatenate dynamic_update_slice pad gather scan cond somewhere split stack unstack"
+)
 """Operations that end a stage and may be part of a kernel."""
 
 
-WHOLE, PART = 100, 24
-"""Steps in one kernel, and in each of several where there are more: compiling a kernel takes longer
-than in proportion to its size."""
+MOST = 100
+"""Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
 
 Step = Operation | list[int]
 """An operation by itself, or the values of a stage."""
@@ -235,8 +236,9 @@ def _in_stages(program: Program, stored: set[int]) -> list[Step]:
 
 
 def _in_parts(steps: list[Step]) -> list[list[Step]]:
-    """Consecutive steps: as many as one kernel may have, or one that no kernel can contain."""
-    most = WHOLE if len(steps) <= WHOLE else PART
+    """Consecutive steps, cut evenly: those of one kernel, or one that no kernel can contain."""
+    count = -(-len(steps) // MOST)  # of kernels, were there nothing that none can contain
+    most = -(-len(steps) // max(count, 1))
     parts: list[list[Step]] = []
     for step in steps:
         if parts and _fits(step) and _fits(parts[-1][-1]) and len(parts[-1]) < most:

@@ -227,8 +227,8 @@ class Program:
             body = self._inner(params["body_jaxpr"])[0]
             return self._emit(equation, params | {"body_jaxpr": body}, args, False)
         if name == "cond":
-            branches = tuple(self._inner(branch)[0] for branch in params["branches"])
-            return self._emit(equation, params | {"branches": branches}, args, False)
+            branches, plain = zip(*map(self._inner, params["branches"]), strict=True)
+            return self._emit(equation, params | {"branches": branches}, args, all(plain))
         return self._emit(equation, params, args, True)
 
     def _emit(self, equation: Any, params: Any, args: list[Operand], plain: bool) -> list[Any]:

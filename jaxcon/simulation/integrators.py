@@ -63,7 +63,7 @@ def reached(state: State, time: Any, dt: Array) -> Doubled:
 
 Pair = tuple[Any, Any]
 TURN = 0.025
-"""Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `missed`."""
+"""Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `closer`."""
 
 
 class Explicit(checks.Checked):
@@ -144,8 +144,7 @@ class SemiImplicitEuler(Explicit):
             straight = state.v + h * solution.acceleration
             v = jnp.where(system.by_body(state.q, push), straight, v)
         if least is not None and rows.layout.size:
-            more = missed(system, state, v, solution, rows, least, dt)
-            v, solution = v + h * more.acceleration, added(solution, more)
+            v, solution = closer(system, state, v, solution, rows, least, dt)
         if (jump := jump_of(rows.reactions)) is not None:
             v, solution = v + jump.velocity, with_jump(solution, jump, dt)
         return v, solution, rows
@@ -185,7 +184,7 @@ class SemiImplicitEuler(Explicit):
         return tuple(zip(places, rates, strict=True))  # type: ignore[return-value]
 
 
-def missed(
+def closer(
     system: Any,
     state: State,
     v: Array,
@@ -193,8 +192,8 @@ def missed(
     rows: Rows,
     least: Callable[[Array], Solution],
     dt: Any,
-) -> Solution:
-    """The acceleration that takes the linearization error out of φ⁺, by one Newton step.
+) -> tuple[Array, Solution]:
+    """v⁺, a and λ without the linearization error of φ⁺, by one Newton step where turns are large.
 
     The rows promise φ⁺ = φ + h p + h² φ̈, with φ̈ = J a + γ and p = φ̇ − ½hγ. At q ⊕ h v⁺ they are
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
@@ -215,22 +214,20 @@ def missed(
     """
     h = dt[None]
     turn = system.turn(state.q, v, h)
-    share = smooth((turn / TURN**2 - 1) / 3) * smooth(2 - turn)
-    held = rows.layout.holds & rows.layout.holonomic
-    held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
 
-    def corrected() -> Solution:
+    def corrected() -> tuple[Array, Solution]:
+        share = smooth((turn / TURN**2 - 1) / 3) * smooth(2 - turn)
+        held = rows.layout.holds & rows.layout.holonomic
+        held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.rate + h * (rows.jacobian.apply(solution.acceleration) + rows.bias / 2)
         promised = rows.residual + h * promised
         q = system.retract(state.q, h * v)
         there = linearize(system, q, v, state.instant + dt).residual
         off = jnp.where(held, there - promised, 0)
-        return least(-share[None] * numerics.safe_divide(off, h * h))
+        more = least(-share[None] * numerics.safe_divide(off, h * h))
+        return v + h * more.acceleration, added(solution, more)
 
-    def nothing() -> Solution:
-        return jax.tree.map(jnp.zeros_like, solution)
-
-    return jax.lax.cond(somewhere(share > 0), corrected, nothing)
+    return jax.lax.cond(somewhere(turn > TURN**2), corrected, lambda: (v, solution))
 
 
 def smooth(x: Array) -> Array:
