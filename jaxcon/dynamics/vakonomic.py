@@ -185,6 +185,11 @@ class Vakonomic:
         """True where bodies of the system have an orientation in space."""
         return self.system.turns_in_space
 
+    @property
+    def turns_bodies(self) -> bool:
+        """True where bodies of the system have an orientation."""
+        return self.system.turns_bodies
+
     def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
         """The velocities after a step of h as those of the system, and μ + h μ̇."""
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)

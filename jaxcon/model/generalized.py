@@ -152,6 +152,11 @@ class GeneralizedCoordinates:
         """No: v is q̇."""
         return False
 
+    @property
+    def turns_bodies(self) -> bool:
+        """No: what coordinates turn is not known."""
+        return False
+
     def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
         """None: v is q̇."""
         return jnp.zeros_like(v)

@@ -292,12 +292,17 @@ class BodySystem:
         """True where bodies have an orientation in space."""
         return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
 
+    @property
+    def turns_bodies(self) -> bool:
+        """True where bodies have an orientation."""
+        return any(g.kind.n_v > g.kind.dim for g in self.layout.groups)
+
     def turn(self, q: Array, v: Array, dt: Any) -> Array:
-        """The largest (h|ω|)² of all bodies in space, () [rad²]."""
+        """The largest (h|ω|)² of all bodies, () [rad²]."""
         most = jnp.zeros(v.shape[1:], v.dtype)
         for g in self.layout.groups:
-            if g.kind.n_q != g.kind.n_v:
-                ω = Vector(*g.unpack(q, v)[1][3:])
+            if g.kind.n_v > g.kind.dim:
+                ω = Vector(*g.unpack(q, v)[1][g.kind.dim :])
                 most = jnp.maximum(most, jnp.max(ω.dot(ω), axis=0))
         return dt[0] * dt[0] * most
 

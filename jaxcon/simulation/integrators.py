@@ -62,8 +62,9 @@ def reached(state: State, time: Any, dt: Array) -> Doubled:
 
 
 Pair = tuple[Any, Any]
-TURN = 0.025
-"""Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `closer`."""
+TURN, TURN_IN_PLANE = 0.025, 0.1
+"""Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `closer`. In
+the plane, where the update is symplectic, smaller turns let energy swing and not grow."""
 
 
 class Explicit(checks.Checked):
@@ -98,10 +99,10 @@ class SemiImplicitEuler(Explicit):
 
     In space, bodies turn freely for half a step before and after the acceleration acts on them
     (`BodySystem.kick`). A free body so keeps |Iω| and its energy up to turns of a radian a step.
-    Where a body turns by more than 0.025 rad in a step, what the linearized rows missed of φ is
-    taken out by a second substitution with the factors of the step, in full from 0.05 rad on. Such
-    a step takes about half as long again. Without it, energy would grow with (h|ω|)³, and motions
-    of a radian in a few steps would end NON_FINITE.
+    Where a body turns by more than 0.025 rad in a step, in the plane by 0.1 rad, what the
+    linearized rows missed of φ is taken out by a second substitution with the factors of the step,
+    in full from twice that turn on. Such a step takes about half as long again. Without it, energy
+    would grow with (h|ω|)³, and motions of a radian in a few steps would end NON_FINITE.
 
     References:
         Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections VII.1.4 and VII.5.
@@ -112,11 +113,11 @@ class SemiImplicitEuler(Explicit):
 
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
-        system, here = dynamics.system, (state.q, state.v, state.instant)
-        if system.turns_in_space:
-            v, solution, rows = self._in_space(dynamics, state, here, dt)
+        system = dynamics.system
+        if system.turns_bodies:
+            v, solution, rows = self._turning(dynamics, state, dt)
         else:
-            solution, rows = dynamics(*here, dt / 2)
+            solution, rows = dynamics(state.q, state.v, state.instant, dt / 2)
             v = state.v + dt[None] * solution.acceleration
         jump, moving = jump_of(rows.reactions), v
         if jump is not None:
@@ -124,13 +125,28 @@ class SemiImplicitEuler(Explicit):
         q = system.retract(state.q, dt[None] * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
+    def _turning(self, dynamics: Dynamics, state: State, dt: Any) -> tuple[Array, Solution, Rows]:
+        """v⁺, a and λ, and the rows, of bodies that have an orientation."""
+        here, h = (state.q, state.v, state.instant), dt[None]
+        if dynamics.system.turns_in_space:
+            v, solution, rows, least = self._in_space(dynamics, state, here, dt)
+        else:
+            solution, rows, least, _ = dynamics.factored(*here, dt / 2)
+            v = state.v + h * solution.acceleration
+        if least is not None and rows.layout.size:
+            v, solution = closer(dynamics.system, state, v, solution, rows, least, dt)
+        if (jump := jump_of(rows.reactions)) is not None:
+            v, solution = v + jump.velocity, with_jump(solution, jump, dt)
+        return v, solution, rows
+
     def _in_space(
         self, dynamics: Dynamics, state: State, here: tuple[Array, Array, Any], dt: Any
-    ) -> tuple[Array, Solution, Rows]:
-        """v⁺, a and λ, and the rows, with the free rotation of bodies split off.
+    ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None]:
+        """The same without the Newton step, of bodies in space, and what it is made by.
 
-        Of a body on which a one-sided row acts, v⁺ = v + h a, as its law says something of this v⁺.
-        The gyroscopic part of a is then the mean over a step of free rotation.
+        Their free rotation is split off. Of a body on which a one-sided row acts, v⁺ = v + h a, as
+        its law says something of this v⁺. The gyroscopic part of a is then the mean over a step of
+        free rotation.
         """
         system, h = dynamics.system, dt[None]
         coasting: Any = 0.0
@@ -143,11 +159,7 @@ class SemiImplicitEuler(Explicit):
         if push is not None:
             straight = state.v + h * solution.acceleration
             v = jnp.where(system.by_body(state.q, push), straight, v)
-        if least is not None and rows.layout.size:
-            v, solution = closer(system, state, v, solution, rows, least, dt)
-        if (jump := jump_of(rows.reactions)) is not None:
-            v, solution = v + jump.velocity, with_jump(solution, jump, dt)
-        return v, solution, rows
+        return v, solution, rows, least
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.
@@ -204,7 +216,7 @@ def closer(
     constraint on these bodies moves off its target by e/h with them.
 
     Args:
-        system: of bodies in space.
+        system: of bodies that have an orientation.
         state: at the start of the step.
         v: v⁺, (n_v,).
         solution: a and λ at the start.
@@ -213,10 +225,10 @@ def closer(
         dt: h, () [s].
     """
     h = dt[None]
-    turn = system.turn(state.q, v, h)
+    turn, from_turn = system.turn(state.q, v, h), TURN if system.turns_in_space else TURN_IN_PLANE
 
     def corrected() -> tuple[Array, Solution]:
-        share = smooth((turn / TURN**2 - 1) / 3) * smooth(2 - turn)
+        share = smooth((turn / from_turn**2 - 1) / 3) * smooth(2 - turn)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.rate + h * (rows.jacobian.apply(solution.acceleration) + rows.bias / 2)
@@ -227,7 +239,7 @@ def closer(
         more = least(-share[None] * numerics.safe_divide(off, h * h))
         return v + h * more.acceleration, added(solution, more)
 
-    return jax.lax.cond(somewhere(turn > TURN**2), corrected, lambda: (v, solution))
+    return jax.lax.cond(somewhere(turn > from_turn**2), corrected, lambda: (v, solution))
 
 
 def smooth(x: Array) -> Array:
