@@ -195,7 +195,7 @@ def _turn(system: Any, state: jc.State, v: jax.Array) -> float:
     steps = round(STEPS * SIZES[-1] / h)
 
     def seen(state: jc.State, _: Any) -> jax.Array:
-        return system.turn(state.q, state.v, jnp.full(1, SIZES[-1]))
+        return system.turn(state.q, state.v, jnp.zeros(0), jnp.full(1, SIZES[-1]))
 
     squares = jax.jit(lambda s: jc.rollout(system, method, s, None, h, steps, record=seen)[1])
     return float(np.sqrt(np.max(squares(start))))

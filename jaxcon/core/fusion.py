@@ -130,12 +130,33 @@ class Stages:
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
         """Computes values, stage by stage."""
         for step in steps:
-            if isinstance(step, Operation):
+            if isinstance(step, Operation) and step.name == "cond":
+                self._branch(step, values)
+            elif isinstance(step, Operation):
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
                 call = _stage_with_arguments if self._may_overwrite(values, step) else _stage
                 self._store(values, step, self._evaluate, call)
+
+    def _branch(self, step: Operation, values: dict[int, Any]) -> None:
+        """Computes the results of a condition; what it alone reads is computed in its branches."""
+        index, *operands = step.inputs
+        read = [x for x in operands if not isinstance(x, Constant)]
+        leaves, _ = self.program.between(values, read)
+
+        def within(branch: Any) -> Any:
+            def function(*given: Array) -> list[Array]:
+                own: dict[int, Any] = dict(zip(leaves, given, strict=True))
+                args = [self.program.evaluate(own, x) for x in operands]
+                return jax.core.eval_jaxpr(branch.jaxpr, branch.consts, *args)
+
+            return jax.make_jaxpr(function)(*(values[x] for x in leaves))
+
+        branches = tuple(map(within, step.params["branches"]))
+        given = [self.program.evaluate(values, index), *(values[x] for x in leaves)]
+        results = step.primitive.bind(*given, **step.params | {"branches": branches})
+        values.update(zip(step.outputs, results, strict=True))
 
     def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
         for x in wanted:
@@ -204,7 +225,10 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
         (name,) = op.outputs
         needed: set[int] = {name} if name in results else set()
         for reader in readers.get(name, ()):
-            needed |= kernels[reader.outputs[0]] if _elementwise(reader) else {name}
+            if _elementwise(reader):
+                needed |= kernels[reader.outputs[0]]
+            elif not _computes(reader, name):
+                needed.add(name)
         if name in needed:
             ends.add(name)
         moves = op.name in MOVES and op.name != "dynamic_slice"
@@ -281,6 +305,11 @@ def _values(step: Step) -> list[int]:
 def _fits(step: Step) -> bool:
     """Whether a kernel may contain it."""
     return not isinstance(step, Operation) or (step.name in OTHERS and step.plain)
+
+
+def _computes(op: Operation, name: int) -> bool:
+    """Returns True for an operand of a condition, whose branches compute it if nobody else does."""
+    return op.name == "cond" and op.inputs[0] != name
 
 
 def _elementwise(op: Operation) -> bool:

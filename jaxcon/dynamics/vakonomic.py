@@ -181,23 +181,23 @@ class Vakonomic:
         return self.system.retract(q, self._split(step)[0])
 
     @property
+    def has_bodies(self) -> bool:
+        """True where the system is one of bodies."""
+        return self.system.has_bodies
+
+    @property
     def turns_in_space(self) -> bool:
         """True where bodies of the system have an orientation in space."""
         return self.system.turns_in_space
-
-    @property
-    def turns_bodies(self) -> bool:
-        """True where bodies of the system have an orientation."""
-        return self.system.turns_bodies
 
     def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
         """The velocities after a step of h as those of the system, and μ + h μ̇."""
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)
         return jnp.concatenate([self.system.kick(q, v, a, dt), μ + dt * rate])
 
-    def turn(self, q: Array, v: Array, dt: Any) -> Array:
-        """The largest (h|ω|)² of all bodies, () [rad²]."""
-        return self.system.turn(q, self._split(v)[0], dt)
+    def turn(self, q: Array, v: Array, bias: Array, dt: Any) -> Array:
+        """The square of the largest turn in a step, as of the system, () [rad²]."""
+        return self.system.turn(q, self._split(v)[0], bias, dt)
 
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -147,14 +147,12 @@ class GeneralizedCoordinates:
         """q + Δ."""
         return q + step
 
+    has_bodies: ClassVar[bool] = False
+    """False: it is not known what coordinates turn."""
+
     @property
     def turns_in_space(self) -> bool:
         """No: v is q̇."""
-        return False
-
-    @property
-    def turns_bodies(self) -> bool:
-        """No: what coordinates turn is not known."""
         return False
 
     def coadjoint(self, q: Array, v: Array, p: Array) -> Array:

@@ -7,11 +7,12 @@ import functools
 import operator
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import numerics
 from jaxcon.core.doubled import rounded
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
@@ -287,23 +288,37 @@ class BodySystem:
         sizes = (g.kind.n_v for g in self.layout.groups)
         return jnp.concatenate([x for own, n in zip(some, sizes, strict=True) for x in [own] * n])
 
+    has_bodies: ClassVar[bool] = True
+    """True for a system of bodies, of which it is known what turns."""
+
     @property
     def turns_in_space(self) -> bool:
         """True where bodies have an orientation in space."""
         return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
 
-    @property
-    def turns_bodies(self) -> bool:
-        """True where bodies have an orientation."""
-        return any(g.kind.n_v > g.kind.dim for g in self.layout.groups)
+    def turn(self, q: Array, v: Array, bias: Array, dt: Any) -> Array:
+        """The square of the largest turn in a step, () [rad²].
 
-    def turn(self, q: Array, v: Array, dt: Any) -> Array:
-        """The largest (h|ω|)² of all bodies, () [rad²]."""
-        most = jnp.zeros(v.shape[1:], v.dtype)
+        Bodies turn by h|ω|. Particles have no ω; a rod of length l between them, whose γ is |v|²/l
+        for a difference v of their velocities, turns by h|γ|/|v|.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            bias: γ of the constraints, (n_c,) [m/s²].
+            dt: h, (1,) [s].
+        """
+        most = speed = jnp.zeros(v.shape[1:], v.dtype)
         for g in self.layout.groups:
+            own = g.unpack(q, v)[1]
             if g.kind.n_v > g.kind.dim:
-                ω = Vector(*g.unpack(q, v)[1][g.kind.dim :])
+                ω = Vector(*own[g.kind.dim :])
                 most = jnp.maximum(most, jnp.max(ω.dot(ω), axis=0))
+            else:
+                speed = jnp.maximum(speed, jnp.max(Vector(*own).dot(Vector(*own)), axis=0))
+        if any(g.kind.n_v == g.kind.dim for g in self.layout.groups):
+            fastest = jnp.max(bias * bias, axis=0, initial=0)
+            most = jnp.maximum(most, numerics.safe_divide(fastest, speed))
         return dt[0] * dt[0] * most
 
     def complete(self, solution: Solution) -> Solution:

@@ -62,9 +62,8 @@ def reached(state: State, time: Any, dt: Array) -> Doubled:
 
 
 Pair = tuple[Any, Any]
-TURN, TURN_IN_PLANE = 0.025, 0.1
-"""Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `closer`. In
-the plane, where the update is symplectic, smaller turns let energy swing and not grow."""
+TURN = 0.025
+"""Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `closer`."""
 
 
 class Explicit(checks.Checked):
@@ -99,10 +98,10 @@ class SemiImplicitEuler(Explicit):
 
     In space, bodies turn freely for half a step before and after the acceleration acts on them
     (`BodySystem.kick`). A free body so keeps |Iω| and its energy up to turns of a radian a step.
-    Where a body turns by more than 0.025 rad in a step, in the plane by 0.1 rad, what the
+    Where a body or a rod between particles turns by more than 0.025 rad in a step, what the
     linearized rows missed of φ is taken out by a second substitution with the factors of the step,
-    in full from twice that turn on. Such a step takes about half as long again. Without it, energy
-    would grow with (h|ω|)³, and motions of a radian in a few steps would end NON_FINITE.
+    in full from 0.05 rad on. Such a step takes about half as long again. Without it, energy would
+    grow with (h|ω|)³, and motions of a radian in a few steps would end NON_FINITE.
 
     References:
         Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections VII.1.4 and VII.5.
@@ -114,8 +113,8 @@ class SemiImplicitEuler(Explicit):
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
         system = dynamics.system
-        if system.turns_bodies:
-            v, solution, rows = self._turning(dynamics, state, dt)
+        if system.has_bodies:
+            v, solution, rows = self._of_bodies(dynamics, state, dt)
         else:
             solution, rows = dynamics(state.q, state.v, state.instant, dt / 2)
             v = state.v + dt[None] * solution.acceleration
@@ -125,8 +124,8 @@ class SemiImplicitEuler(Explicit):
         q = system.retract(state.q, dt[None] * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
-    def _turning(self, dynamics: Dynamics, state: State, dt: Any) -> tuple[Array, Solution, Rows]:
-        """v⁺, a and λ, and the rows, of bodies that have an orientation."""
+    def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> tuple[Array, Solution, Rows]:
+        """v⁺, a and λ, and the rows, of a system of bodies."""
         here, h = (state.q, state.v, state.instant), dt[None]
         if dynamics.system.turns_in_space:
             v, solution, rows, least = self._in_space(dynamics, state, here, dt)
@@ -216,7 +215,7 @@ def closer(
     constraint on these bodies moves off its target by e/h with them.
 
     Args:
-        system: of bodies that have an orientation.
+        system: of bodies.
         state: at the start of the step.
         v: v⁺, (n_v,).
         solution: a and λ at the start.
@@ -225,10 +224,10 @@ def closer(
         dt: h, () [s].
     """
     h = dt[None]
-    turn, from_turn = system.turn(state.q, v, h), TURN if system.turns_in_space else TURN_IN_PLANE
+    turn = system.turn(state.q, v, rows.bias, h)
 
     def corrected() -> tuple[Array, Solution]:
-        share = smooth((turn / from_turn**2 - 1) / 3) * smooth(2 - turn)
+        share = smooth((turn / TURN**2 - 1) / 3) * smooth(2 - turn)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.rate + h * (rows.jacobian.apply(solution.acceleration) + rows.bias / 2)
@@ -239,7 +238,7 @@ def closer(
         more = least(-share[None] * numerics.safe_divide(off, h * h))
         return v + h * more.acceleration, added(solution, more)
 
-    return jax.lax.cond(somewhere(turn > from_turn**2), corrected, lambda: (v, solution))
+    return jax.lax.cond(somewhere(turn > TURN**2), corrected, lambda: (v, solution))
 
 
 def smooth(x: Array) -> Array:
