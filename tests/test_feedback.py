@@ -437,7 +437,12 @@ def test_default_gains_of_a_known_step_are_numbers_where_they_cannot_rise():
         (jc.Method(jc.RK4()), 2e-3, np.float32),
     ):
         assert same.known_at(dt, dtype) == same
-    jax.jit(lambda dt: np.testing.assert_(method.known_at(dt, np.float32) is method))(2e-3)
+
+    @jax.jit
+    def traced(dt):
+        assert method.known_at(dt, np.float32) is method
+
+    traced(2e-3)
 
 
 def test_a_known_step_and_a_traced_one_lead_to_the_same_state():
