@@ -225,6 +225,8 @@ def closer(
         there = linearize(system, q, v, state.instant + dt).residual
         off = jnp.where(held, there - promised, 0)
         more = least(-share[None] * numerics.safe_divide(off, h * h))
+        # rounding over h² may contradict redundant rows; rows that do contradict were noted before
+        more = more._replace(status=status.failures(more.status))
         return v + h * more.acceleration, added(solution, more)
 
     return jax.lax.cond(somewhere(turn > TURN**2), corrected, lambda: (v, solution))
