@@ -241,26 +241,37 @@ def test_rest_is_no_conflict():
             assert jc.forward_dynamics(s, still, None, method, 1e-3).status == Status.OK
 
 
-def falling_leg(turn, dtype):
-    """A torso and a shank in the air, joined by two bars on four parallel hinges."""
+def torso_on_legs(turn, sides, dtype):
+    """A scene with a floating torso whose legs have four-bar knees: shanks on two parallel bars.
+
+    Args:
+        turn: rotation vector of the whole, about the origin.
+        sides: name of each leg and its place beside the middle [m].
+        dtype: of the scene.
+
+    Returns:
+        The scene, and the rotation matrix.
+    """
     scene = jc.Scene(dim=3, dtype=dtype)
     turned = np.asarray(quaternion.matrix(quaternion.exp(jnp.asarray(turn))))
     attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turned)))
-    solids = (
-        ("torso", 10.0, (0.2, 0.4, 0.3), (0.0, 0.0, 1.15)),
-        ("front", 0.3, (0.04, 0.04, 0.2), (0.04, 0.0, 0.9)),
-        ("back", 0.3, (0.04, 0.04, 0.2), (-0.04, 0.0, 0.9)),
-        ("shank", 2.0, (0.3, 0.15, 0.8), (0.0, 0.0, 0.4)),
-    )
-    for name, mass, size, place in solids:
+
+    def add(name, mass, size, place):
         solid = jc.inertia.box(mass, size)
         scene.add_body(name, inertia=solid, position=turned @ place, quaternion=attitude)
+
+    add("torso", 10.0, (0.2, 0.4, 0.3), (0.0, 0.0, 1.15))
     axis = turned @ (0.0, 1.0, 0.0)
-    for bar, x in (("front", 0.04), ("back", -0.04)):
-        upper, lower = turned @ (x, 0.0, 1.0), turned @ (0.8 * x, 0.0, 0.8)
-        scene.add(jc.Revolute(f"{bar}_hip", "torso", bar, point=upper, axis=axis))
-        scene.add(jc.Revolute(f"{bar}_knee", bar, "shank", point=lower, axis=axis))
-    return scene.build()
+    for side, y in sides.items():
+        shank = f"{side}_shank"
+        add(shank, 2.0, (0.3, 0.15, 0.8), (0.0, y, 0.4))
+        for way, x in (("front", 0.04), ("back", -0.04)):
+            bar, size = f"{side}_{way}", (0.04, 0.04, 0.2)
+            add(bar, 0.3, size, (x, y, 0.9))
+            upper, lower = turned @ (x, y, 1.0), turned @ (0.8 * x, y, 0.8)
+            scene.add(jc.Revolute(f"{bar}_hip", "torso", bar, point=upper, axis=axis))
+            scene.add(jc.Revolute(f"{bar}_knee", bar, shank, point=lower, axis=axis))
+    return scene, turned
 
 
 @pytest.mark.parametrize("stabilizer", [jc.Projection(), jc.AugmentedLagrangian()])
@@ -270,9 +281,39 @@ def test_a_free_fall_is_no_conflict(dtype, stabilizer):
     method = jc.Method(stabilizer=stabilizer)
     solve = jax.jit(lambda system, state: jc.forward_dynamics(system, state, None, method, 1e-3))
     for turn in np.random.default_rng(1).normal(size=(10, 3)):
-        system, state = falling_leg(turn, dtype)
+        system, state = torso_on_legs(turn, {"only": 0.0}, dtype)[0].build()
         state = jc.init(system, method, state.q, state.v)
         assert solve(system, state).status == Status.OK
+
+
+@pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
+def test_a_biped_with_four_bar_knees_stands(dtype):
+    """For a second on four points under each foot, its knees held by springs that bend a little."""
+    legs = {"left": 0.15, "right": -0.15}
+    scene, turned = torso_on_legs((0.0, 0.0, 0.7), legs, dtype)
+    for side, y in legs.items():
+        spring = {"stiffness": 400.0, "damping": 20.0, "rest": 0.02}
+        scene.add(jc.JointSpring(f"{side}_spring", f"{side}_front_hip", **spring))
+        sole = [turned @ (x, y + z, 0.0) for x in (-0.15, 0.15) for z in (-0.06, 0.06)]
+        foot = f"{side}_shank"
+        scene.add(jc.PlaneContact(f"{side}_sole", jc.WORLD, foot, center=sole, friction=0.8))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Projection(), solver=SCHUR)
+
+    def seen(state, info):
+        return info.status, jc.position(system, state, "torso"), info.violation.worst
+
+    @jax.jit
+    def run(state):
+        return jc.rollout(system, method, state, None, 1e-3, 1000, record=seen)
+
+    final, (codes, places, off) = run(jc.init(system, method, state.q, state.v))
+    assert final.status == Status.OK
+    np.testing.assert_array_equal(codes, Status.OK)
+    np.testing.assert_allclose(places[:, 2], 1.15, rtol=0, atol=1e-3)
+    travel = np.linalg.norm(places[-1, :2])
+    assert 1e-4 < travel < 0.02
+    assert np.max(off) < 16 * float(jnp.finfo(dtype).eps)
 
 
 def two_lengths(short, long):

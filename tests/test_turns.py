@@ -339,7 +339,7 @@ def test_a_double_pendulum_turned_ten_thousand_times_moves_as_one_that_is_not():
 
 
 def test_rattle_keeps_the_energy_of_a_linkage_that_turns():
-    """Over 1e5 steps from 200 π, in which the crank makes further turns."""
+    """Over 1e5 steps from 0 and from 200 π; momenta solved as wholes would drift by 3e-3."""
     system, state = four_bar(jnp.float32)
     method = FLAT["rattle"]
     crank = jnp.asarray([-2.4, 1.8, 12.0], jnp.float32)  # about its pin at the origin
@@ -362,8 +362,7 @@ def test_rattle_keeps_the_energy_of_a_linkage_that_turns():
         energy = np.float64(energy)
         drift = energy[-10_000:].mean() - energy[:10_000].mean()
         drifts.append(drift / float(jc.energy(system, begin).kinetic))
-    assert np.abs(drifts).max() < 4e-3
-    assert abs(drifts[1] - drifts[0]) < 5e-4
+    assert np.abs(drifts).max() < 2e-4
 
 
 def test_a_drive_in_the_plane_is_smooth_after_a_day():
