@@ -133,12 +133,14 @@ class SemiImplicitEuler(Explicit):
         The gyroscopic part of a is then the mean over a step of free rotation.
         """
         system, h = dynamics.system, dt[None]
+        bounds: Any = None
         coasting: Any = 0.0
         if system.bounds:
-            pressed = dynamics.pressed(*here).reshape(-1, *(1,) * (state.v.ndim - 1))
+            bounds = dynamics.bounds_ahead(*here)
+            pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
             coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
             dynamics = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
-        solution, rows, least, push = dynamics.factored(*here, dt / 2)
+        solution, rows, least, push = dynamics.factored(*here, dt / 2, bounds)
         v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
         if push is not None:
             straight = state.v + h * solution.acceleration
