@@ -43,6 +43,28 @@ def door(hinges):
     return scene.build()
 
 
+OBLIQUE = (0.5, -0.3, 0.8)
+
+
+def doubled_hinges(links, turn, dtype):
+    """A chain of links of half a metre, each on two parallel hinges, and the axis of all of them.
+
+    The chain is level before it is turned by a rotation vector.
+    """
+    scene = jc.Scene(dim=3, dtype=dtype)
+    turned = np.asarray(quaternion.matrix(quaternion.exp(jnp.asarray(turn))))
+    attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turned)))
+    solid, before = jc.inertia.box(1.0, (0.5, 0.2, 0.05)), jc.WORLD
+    for i in range(links):
+        link, middle = f"link{i}", turned @ (0.5 * i + 0.25, 0.0, 0.0)
+        scene.add_body(link, inertia=solid, position=middle, quaternion=attitude)
+        for side in (-0.1, 0.1):
+            name, point = f"hinge{i}{side:+}", turned @ (0.5 * i, side, 0.0)
+            scene.add(jc.Revolute(name, before, link, point=point, axis=turned[:, 1]))
+        before = link
+    return *scene.build(), turned[:, 1]
+
+
 def table(legs):
     scene = jc.Scene(dim=3)
     scene.add_body("table", inertia=jc.inertia.box(30.0, (1.2, 0.8, 0.05)), position=(0, 0, 0.7))
@@ -120,6 +142,52 @@ def test_a_redundant_link_leaves_the_motion_of_a_parallelogram(dtype):
     np.testing.assert_allclose(got, expected, rtol=ACCURACY[dtype])
 
 
+DENSE, SCHUR = jc.RankSafe(jc.Dense()), jc.RankSafe(jc.Schur())
+CREEPING = {
+    "default": (jc.Method(), 2, OBLIQUE, 10_000),
+    "Schur": (jc.Method(solver=SCHUR), 4, OBLIQUE, 10_000),
+    "Dense": (jc.Method(solver=DENSE), 4, OBLIQUE, 1000),
+    "RK4": (jc.Method(jc.RK4(), solver=SCHUR), 4, OBLIQUE, 1000),
+    "RATTLE": (jc.Method(jc.RATTLE(), solver=SCHUR), 4, OBLIQUE, 1000),
+    "alpha": (jc.Method(jc.GeneralizedAlpha(), solver=SCHUR), 4, OBLIQUE, 1000),
+    "projection": (jc.Method(stabilizer=jc.Projection(), solver=SCHUR), 4, OBLIQUE, 1000),
+    "PID": (jc.Method(stabilizer=jc.PID(2500.0, 100.0, 1000.0), solver=SCHUR), 4, OBLIQUE, 1000),
+    "gradients": (jc.Method(solver=jc.ConjugateGradients()), 4, (0.0, 0.0, 0.0), 1000),
+    "priority": (jc.Method(solver=jc.Priority({"hinge*": 0})), 4, OBLIQUE, 1000),
+}
+"""Methods, with a number of links, how the chain is turned, and steps of a millisecond."""
+
+
+@pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
+@pytest.mark.parametrize("name", CREEPING)
+def test_doubled_hinges_do_not_creep_along_their_axis(name, dtype):
+    """1 nm in 10 s in float64; in float32 no more than rounding leaves, and none of it grows.
+
+    A row compares places of up to 2 m, and its rounding of 4 spacings adds up over the hinges.
+    """
+    if name == "default" and dtype == jnp.float32:
+        pytest.skip("its program takes long to compile; that of Schur is compared in float32")
+    method, links, turn, steps = CREEPING[name]
+    system, state, axis = doubled_hinges(links, turn, dtype)
+    axis = jnp.asarray(axis, dtype)
+
+    def along(state, _=None):
+        return jnp.stack([axis @ jc.position(system, state, f"link{i}") for i in range(links)])
+
+    @jax.jit
+    def run(state):
+        return jc.rollout(system, method, state, None, 1e-3, steps, record=along, every=steps // 20)
+
+    final, path = run(jc.init(system, method, state.q, state.v))
+    assert final.status == Status.OK
+    assert np.max(np.abs(final.q - state.q)) > 0.1
+    off = np.abs(np.float64(path) - np.float64(along(state)))
+    rounding = 4 * float(jnp.finfo(dtype).eps) * 0.5 * links * links
+    assert np.max(off) < (1e-9 if dtype == jnp.float64 else rounding)
+    half = len(off) // 2
+    assert np.max(off[half:]) < 2 * np.max(off[:half]) + rounding / 4
+
+
 def test_multipliers_are_of_least_norm_in_the_scaled_rows():
     """λ = D^−½ (D^−½ A D^−½)⁺ D^−½ r, by singular values.
 
@@ -173,26 +241,37 @@ def test_rest_is_no_conflict():
             assert jc.forward_dynamics(s, still, None, method, 1e-3).status == Status.OK
 
 
-def falling_leg(turn, dtype):
-    """A torso and a shank in the air, joined by two bars on four parallel hinges."""
+def torso_on_legs(turn, sides, dtype):
+    """A scene with a floating torso whose legs have four-bar knees: shanks on two parallel bars.
+
+    Args:
+        turn: rotation vector of the whole, about the origin.
+        sides: name of each leg and its place beside the middle [m].
+        dtype: of the scene.
+
+    Returns:
+        The scene, and the rotation matrix.
+    """
     scene = jc.Scene(dim=3, dtype=dtype)
     turned = np.asarray(quaternion.matrix(quaternion.exp(jnp.asarray(turn))))
     attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turned)))
-    solids = (
-        ("torso", 10.0, (0.2, 0.4, 0.3), (0.0, 0.0, 1.15)),
-        ("front", 0.3, (0.04, 0.04, 0.2), (0.04, 0.0, 0.9)),
-        ("back", 0.3, (0.04, 0.04, 0.2), (-0.04, 0.0, 0.9)),
-        ("shank", 2.0, (0.3, 0.15, 0.8), (0.0, 0.0, 0.4)),
-    )
-    for name, mass, size, place in solids:
+
+    def add(name, mass, size, place):
         solid = jc.inertia.box(mass, size)
         scene.add_body(name, inertia=solid, position=turned @ place, quaternion=attitude)
+
+    add("torso", 10.0, (0.2, 0.4, 0.3), (0.0, 0.0, 1.15))
     axis = turned @ (0.0, 1.0, 0.0)
-    for bar, x in (("front", 0.04), ("back", -0.04)):
-        upper, lower = turned @ (x, 0.0, 1.0), turned @ (0.8 * x, 0.0, 0.8)
-        scene.add(jc.Revolute(f"{bar}_hip", "torso", bar, point=upper, axis=axis))
-        scene.add(jc.Revolute(f"{bar}_knee", bar, "shank", point=lower, axis=axis))
-    return scene.build()
+    for side, y in sides.items():
+        shank = f"{side}_shank"
+        add(shank, 2.0, (0.3, 0.15, 0.8), (0.0, y, 0.4))
+        for way, x in (("front", 0.04), ("back", -0.04)):
+            bar, size = f"{side}_{way}", (0.04, 0.04, 0.2)
+            add(bar, 0.3, size, (x, y, 0.9))
+            upper, lower = turned @ (x, y, 1.0), turned @ (0.8 * x, y, 0.8)
+            scene.add(jc.Revolute(f"{bar}_hip", "torso", bar, point=upper, axis=axis))
+            scene.add(jc.Revolute(f"{bar}_knee", bar, shank, point=lower, axis=axis))
+    return scene, turned
 
 
 @pytest.mark.parametrize("stabilizer", [jc.Projection(), jc.AugmentedLagrangian()])
@@ -202,9 +281,39 @@ def test_a_free_fall_is_no_conflict(dtype, stabilizer):
     method = jc.Method(stabilizer=stabilizer)
     solve = jax.jit(lambda system, state: jc.forward_dynamics(system, state, None, method, 1e-3))
     for turn in np.random.default_rng(1).normal(size=(10, 3)):
-        system, state = falling_leg(turn, dtype)
+        system, state = torso_on_legs(turn, {"only": 0.0}, dtype)[0].build()
         state = jc.init(system, method, state.q, state.v)
         assert solve(system, state).status == Status.OK
+
+
+@pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
+def test_a_biped_with_four_bar_knees_stands(dtype):
+    """For a second on four points under each foot, its knees held by springs that bend a little."""
+    legs = {"left": 0.15, "right": -0.15}
+    scene, turned = torso_on_legs((0.0, 0.0, 0.7), legs, dtype)
+    for side, y in legs.items():
+        spring = {"stiffness": 400.0, "damping": 20.0, "rest": 0.02}
+        scene.add(jc.JointSpring(f"{side}_spring", f"{side}_front_hip", **spring))
+        sole = [turned @ (x, y + z, 0.0) for x in (-0.15, 0.15) for z in (-0.06, 0.06)]
+        foot = f"{side}_shank"
+        scene.add(jc.PlaneContact(f"{side}_sole", jc.WORLD, foot, center=sole, friction=0.8))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.Projection(), solver=SCHUR)
+
+    def seen(state, info):
+        return info.status, jc.position(system, state, "torso"), info.violation.worst
+
+    @jax.jit
+    def run(state):
+        return jc.rollout(system, method, state, None, 1e-3, 1000, record=seen)
+
+    final, (codes, places, off) = run(jc.init(system, method, state.q, state.v))
+    assert final.status == Status.OK
+    np.testing.assert_array_equal(codes, Status.OK)
+    np.testing.assert_allclose(places[:, 2], 1.15, rtol=0, atol=1e-3)
+    travel = np.linalg.norm(places[-1, :2])
+    assert 1e-4 < travel < 0.02
+    assert np.max(off) < 16 * float(jnp.finfo(dtype).eps)
 
 
 def two_lengths(short, long):

@@ -242,6 +242,40 @@ def test_functions_of_two_floats(name):
     np.testing.assert_allclose(got, slope, rtol=1e-4, atol=1e-5)
 
 
+PERIOD = np.float32(0.37)
+EXACT_PERIOD = np.float64(PERIOD)
+WHOLE = {
+    "mod": (lambda t: jnp.mod(t, PERIOD), lambda t: np.mod(t, EXACT_PERIOD), 1.0),
+    "mod of −t": (lambda t: jnp.mod(-t, PERIOD), lambda t: np.mod(-t, EXACT_PERIOD), -1.0),
+    "rem": (lambda t: jax.lax.rem(-t, PERIOD), lambda t: -np.mod(t, EXACT_PERIOD), -1.0),
+    "floor": (lambda t: jnp.floor(t / PERIOD), lambda t: np.floor(t / EXACT_PERIOD), 0.0),
+    "ceil": (lambda t: jnp.ceil(t / PERIOD), lambda t: np.ceil(t / EXACT_PERIOD), 0.0),
+    "round": (lambda t: jnp.round(64 * t), lambda t: np.round(64 * t), 0.0),
+    "trunc": (lambda t: jnp.trunc(-128 * t), lambda t: np.trunc(-128 * t), 0.0),
+    "sawtooth": (
+        lambda t: t / PERIOD - jnp.floor(t / PERIOD),
+        lambda t: t / EXACT_PERIOD - np.floor(t / EXACT_PERIOD),
+        1 / EXACT_PERIOD,
+    ),
+}
+"""Functions with jumps: in two floats, exactly, and their slope."""
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_jumps_of_remainders_and_whole_numbers_are_not_rounded(name):
+    """Times within 1 µs of a jump near 1e5 s, where float32 has multiples of 8 ms."""
+    function, exact, expected_slope = WHOLE[name]
+    jumps = EXACT_PERIOD * np.arange(270_000, 270_200)
+    t = np.concatenate([jumps - 1e-6, jumps + 1e-6, np.linspace(1e5, 1e5 + 1, 999)])
+    high = np.float32(t)
+    low = np.float32(t - high)
+    value = jax.jit(jax.vmap(lambda h, x: evaluate(function, Doubled(h, x))))(high, low)
+    found = np.float64(value.high) + np.float64(value.low)
+    np.testing.assert_allclose(found, exact(np.float64(high) + np.float64(low)), atol=1e-8)
+    slope = jax.vmap(jax.grad(lambda h, x: evaluate(function, Doubled(h, x)).high))(high, low)
+    np.testing.assert_allclose(slope, expected_slope, rtol=1e-6)
+
+
 def test_a_derivative_of_its_own():
     """The value of a `jax.custom_jvp`, and its rule in place of the derivative, late."""
     x = Doubled(jnp.asarray(1e5, F32), jnp.asarray(3e-3, F32))

@@ -165,6 +165,13 @@ def test_stages_tell_less_than_half_a_turn(method):
         assert int(end.status) == status
 
 
+def rolled(system, method, state, steps, seen):
+    """The state after steps of a millisecond, which must be OK, and what is seen on the way."""
+    end, path = jc.rollout(system, method, state, None, 1e-3, steps, record=seen)
+    assert int(end.status) == jc.Status.OK
+    return end, path
+
+
 FLAT = {
     "euler": jc.Method(),
     "projection": jc.Method(stabilizer=jc.Projection()),
@@ -200,17 +207,8 @@ def test_a_linkage_turned_a_hundred_times_holds_as_one_that_is_not(name):
     """φ in float32, where angles as users see them are multiples of 6e-5."""
     system, state = four_bar(jnp.float32)
     start = jc.init(system, FLAT[name], state.q.at[6:].add(TURNED), state.v)
-    end, seen = jc.rollout(
-        system,
-        FLAT[name],
-        start,
-        None,
-        1e-3,
-        1000,
-        record=lambda s, info: (info.violation.worst, jc.energy(system, s).total),
-    )
-    assert int(end.status) == jc.Status.OK
-    assert float(seen[0][500:].max()) < 3e-6
+    end, worst = rolled(system, FLAT[name], start, 1000, lambda s, info: info.violation.worst)
+    assert float(worst[500:].max()) < 3e-6
     assert float(jc.violation(system, end).worst) < 3e-6
     assert float(np.abs(end.q[6:] - TURNED).max()) < 5  # users see angles that go on
 
@@ -321,14 +319,12 @@ def test_a_double_pendulum_turned_ten_thousand_times_moves_as_one_that_is_not():
     ends = []
     for turns in (0, 10_000):
         start = turned_by(system, jc.init(system, jc.Method(), state.q, state.v), turns)
-        end, seen = jc.rollout(
+        end, seen = rolled(
             system,
             jc.Method(),
             start,
-            None,
-            1e-3,
             1000,
-            record=lambda s, info: (info.violation.worst, jc.energy(system, s).total),
+            lambda s, info: (info.violation.worst, jc.energy(system, s).total),
         )
         angle = np.float64(end.q[system.layout.angles]) + np.float64(end.angle_remainder)
         ends.append((end, angle - 2 * np.pi * turns, np.asarray(seen[0]), np.asarray(seen[1])))
@@ -339,7 +335,7 @@ def test_a_double_pendulum_turned_ten_thousand_times_moves_as_one_that_is_not():
 
 
 def test_rattle_keeps_the_energy_of_a_linkage_that_turns():
-    """Over 1e5 steps from 200 π, in which the crank makes further turns."""
+    """Over 1e5 steps from 0 and from 200 π; momenta solved as wholes would drift by 3e-3."""
     system, state = four_bar(jnp.float32)
     method = FLAT["rattle"]
     crank = jnp.asarray([-2.4, 1.8, 12.0], jnp.float32)  # about its pin at the origin
@@ -348,22 +344,14 @@ def test_rattle_keeps_the_energy_of_a_linkage_that_turns():
     drifts = []
     for turns in (0, 100):
         begin = turned_by(system, jc.init(system, method, start.q, start.v), turns)
-        end, energy = jc.rollout(
-            system,
-            method,
-            begin,
-            None,
-            1e-3,
-            100_000,
-            record=lambda s, info: jc.energy(system, s).total,
+        end, energy = rolled(
+            system, method, begin, 100_000, lambda s, info: jc.energy(system, s).total
         )
-        assert int(end.status) == jc.Status.OK
         assert float(end.q[6] - begin.q[6]) > 100 * 2 * np.pi
         energy = np.float64(energy)
         drift = energy[-10_000:].mean() - energy[:10_000].mean()
         drifts.append(drift / float(jc.energy(system, begin).kinetic))
-    assert np.abs(drifts).max() < 4e-3
-    assert abs(drifts[1] - drifts[0]) < 5e-4
+    assert np.abs(drifts).max() < 2e-4
 
 
 def test_a_drive_in_the_plane_is_smooth_after_a_day():
@@ -377,16 +365,9 @@ def test_a_drive_in_the_plane_is_smooth_after_a_day():
     q = start.q.at[:3].set(np.float32([np.cos(phase) / 2, np.sin(phase) / 2, phase]))
     v = start.v.at[:2].set(np.float32([-np.sin(phase), np.cos(phase)]))
     start = turned_by(system, dataclasses.replace(start, q=q, v=v), turns)
-    end, seen = jc.rollout(
-        system,
-        jc.Method(),
-        start,
-        None,
-        1e-3,
-        1000,
-        record=lambda s, info: (info.violation.worst, s.v[2]),
+    _, seen = rolled(
+        system, jc.Method(), start, 1000, lambda s, info: (info.violation.worst, s.v[2])
     )
-    assert int(end.status) == jc.Status.OK
     assert float(seen[0].max()) < 4e-6
     np.testing.assert_allclose(seen[1], 2.0, atol=1e-2)
 
@@ -408,9 +389,7 @@ def test_gears_mesh_after_many_turns(ratio):
     assert float(jc.violation(system, start).worst) < 2e-6
     v = start.v.at[4:].set(jnp.asarray([1.0, ratio], jnp.float32))
     start = dataclasses.replace(start, v=v)
-    end, worst = jc.rollout(
-        system, jc.Method(), start, None, 1e-3, 500, record=lambda s, info: info.violation.worst
-    )
+    end, worst = rolled(system, jc.Method(), start, 500, lambda s, info: info.violation.worst)
     assert float(worst.max()) < 4e-6
     np.testing.assert_allclose(end.v[4:], [1.0, ratio], atol=1e-4)
 

@@ -186,9 +186,9 @@ class Watched(Dynamics):
 
     seen: list[tuple[list[Finding], Status]] = field(default_factory=list)
 
-    def factored(self, q: Array, v: Array, t: Any, age: Any = None) -> Any:
+    def factored(self, q: Array, v: Array, t: Any, age: Any = None, ahead: Any = None) -> Any:
         """`Dynamics.factored` at (q, v, t), watched."""
-        return self._watched(q, v, t, super().factored(q, v, t, age))
+        return self._watched(q, v, t, super().factored(q, v, t, age, ahead))
 
     def _watched(self, q: Array, v: Array, t: Any, found: Any) -> Any:
         """What was found, after a look at it."""

@@ -180,9 +180,10 @@ def evaluate(function: Callable[..., Array], x: Doubled, *args: Any) -> Doubled:
     """function(x, *args), computed in sums of two floats where it adds and multiplies.
 
     That holds within branches, loops and called functions, too, and for complex numbers. Sines,
-    cosines and complex exponentials get their argument within half a turn of zero. Every other
-    operation f is linearized, f(high) + f′(high) low; conditions see the rounded number. Where two
-    floats overflow, which is before one does, the result is that of the rounded number.
+    cosines and complex exponentials get their argument within half a turn of zero. Remainders, and
+    the whole numbers of floor, ceil and round, are those of the sum. Every other operation f is
+    linearized, f(high) + f′(high) low; conditions see the rounded number. Where two floats
+    overflow, which is before one does, the result is that of the rounded number.
 
     Args:
         function: pure; returns an array.
@@ -254,6 +255,8 @@ class Evaluation:
             return list(map(Tangent, _bound(jaxpr, equation, list(map(rounded, inputs)))))
         if name in RULES:
             return [RULES[name](*map(_doubled, inputs))]
+        if name == "round":
+            return [_rounded_to_whole(inputs[0], params["rounding_method"])]
         if name == "integer_pow":
             return [_power(inputs[0], params["y"])]
         if name == "reduce_sum":
@@ -477,6 +480,43 @@ def _power(x: Doubled, exponent: int) -> Doubled:
     return result
 
 
+def _remainder(x: Doubled, y: Doubled) -> Doubled:
+    """`jax.lax.rem`: x less whole multiples of y, of the sign of x and smaller than y."""
+    derivative = jax.lax.rem(x.value, y.value)
+    x, y = jax.lax.stop_gradient((x, y))
+    rest = jax.lax.rem(x.high, y.high)
+    multiple = jnp.round((x.high - rest) / y.high)
+    size = Doubled.of(rest) + jax.lax.rem(x.low, y.high) - multiple * y.low
+    # |x| less multiples of |y| lies between −|y| and 2|y|
+    side, period = jnp.where(x.high < 0, -1, 1).astype(rest.dtype), y * jnp.sign(y.high)
+    size = size * side
+    size = _select((size - period).high >= 0, size - period, size)
+    size = _select(size.high < 0, size + period, size) * side
+    return Doubled(_carry(size.high, derivative), size.low)
+
+
+def _select(where: Array, x: Doubled, y: Doubled) -> Doubled:
+    """x where a mask is True, and y elsewhere."""
+    return jax.tree.map(functools.partial(jnp.where, where), x, y)
+
+
+def _floor(x: Doubled) -> Doubled:
+    """The largest whole number that is not above x."""
+    x = jax.lax.stop_gradient(x)
+    whole = jnp.floor(x.high)
+    # |low| is at most half a spacing of `high`: it decides only where `high` is whole
+    return _carrying(whole, jnp.where(whole == x.high, jnp.floor(x.low), 0), whole)
+
+
+def _rounded_to_whole(x: Doubled, ties: Any) -> Doubled:
+    """The whole number nearest to x; `ties` decide where two are."""
+    x = jax.lax.stop_gradient(x)
+    whole, below = jax.lax.round(x.high, ties), jnp.floor(x.high)
+    halfway = (x.high - below == 0.5) & (x.low != 0)
+    whole = jnp.where(halfway, jnp.where(x.low > 0, below + 1, below), whole)
+    return _carrying(whole, jnp.where(whole == x.high, jax.lax.round(x.low, ties), 0), whole)
+
+
 RULES: dict[str, Callable[..., Doubled]] = {
     "add": Doubled.__add__,
     "add_any": Doubled.__add__,
@@ -485,5 +525,8 @@ RULES: dict[str, Callable[..., Doubled]] = {
     "div": _quotient,
     "neg": Doubled.__neg__,
     "square": lambda x: _product(x, x),
+    "rem": _remainder,
+    "floor": _floor,
+    "ceil": lambda x: -_floor(-x),
 }
 """The primitives that are computed in sums of two floats."""

@@ -8,7 +8,7 @@ from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core.typing import Array
 
 
-def rebound(rows: BoundRows, e: Array, dt: Array) -> Array:
+def restitution_gain(rows: BoundRows, e: Array, dt: Array) -> Array:
     """Returns the addition of restitution to u*, (n,): rows that close within dt leave with -e u.
 
     Args:

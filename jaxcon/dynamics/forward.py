@@ -92,7 +92,7 @@ class Dynamics:
         if self.bounded is None:
             return *self(q, v, t), self
         rows, law, problem = self._problem(q, v, t, None)
-        solution, rows, force, *_ = self._reacted(q, v, t, rows, law, problem, None, True)
+        solution, rows, force, *_ = self._reacted(q, v, t, rows, law, problem, None, True, None)
         return solution, rows, dataclasses.replace(self, bounded=None, held=force)
 
     def _reacted(
@@ -105,10 +105,11 @@ class Dynamics:
         problem: Saddle,
         lag: float | None,
         every: bool,
-    ) -> tuple[Solution, Rows, Array, Factored, Array]:
+        ahead: BoundRows | None,
+    ) -> tuple[Solution, Rows, Array, Factored, Array | None]:
         """a and λ with bounded rows, the rows with what these do, their force, and the factors.
 
-        The last is the force of the one-sided rows among them.
+        The last is the force of the one-sided rows among them, where they are given ahead.
 
         Args:
             q: positions, (n_q,).
@@ -119,9 +120,11 @@ class Dynamics:
             problem: the saddle system of both.
             lag: velocities are those of lag · h before the positions; None for none.
             every: whether impacts are told apart in scenes without restitution, too.
+            ahead: the bounded rows, from `bounds_ahead`; None where they are not known yet.
         """
         if self.part is None:
-            bounds, length, acts = self.bounds(q, v, t, self.dt), self.dt, None
+            bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
+            length, acts = self.dt, None
             strikes = any(bounds.ends) and (every or bounds.restitution is not None)
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
@@ -150,8 +153,10 @@ class Dynamics:
         solution = solution._replace(status=status.first(solution.status, impulse.judge()))
         known = self._judged(impulse, known, solution.acceleration)
         own = impulse.rows.jacobian.transpose(known.multipliers)
-        ends = impacts.mask(bounds.ends, bounds)
-        push = impulse.rows.jacobian.transpose(jnp.where(ends, known.multipliers, 0))
+        push = None
+        if ahead is not None:
+            ends = impacts.mask(bounds.ends, bounds)
+            push = impulse.rows.jacobian.transpose(jnp.where(ends, known.multipliers, 0))
         if strikes:
             lag = 0.0 if lag is None else lag
             change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
@@ -159,7 +164,7 @@ class Dynamics:
             solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
             if e is not None:
                 left = self.dt[None] - times.times
-                speed = impacts.rebound(bounds.rate, e, times, change, lag, self.dt)
+                speed = impacts.leaving_speeds(bounds.rate, e, times, change, lag, self.dt)
                 lost = impacts.passes_range(both_stops, speed, left)
                 solution = solution._replace(status=lost_impacts(solution.status, lost))
             solution, known = self._struck((q, v, t), solution, known, times, lag)
@@ -229,9 +234,15 @@ class Dynamics:
         solution = self.system.complete(impulse.motion(known.multipliers))
         return solution, self._judged(impulse, known, solution.acceleration)
 
-    def pressed(self, q: Array, v: Array, t: Any) -> np.ndarray:
+    def bounds_ahead(self, q: Array, v: Array, t: Any) -> BoundRows:
+        """The bounded rows, for `pressed` and `factored`; of a part of a step their structure."""
+        if self.part is None:
+            return self.bounds(q, v, t, self.dt)
+        return jax.eval_shape(self.bounds, q, v, t, self.dt)
+
+    @staticmethod
+    def pressed(rows: BoundRows) -> np.ndarray:
         """A mask of the velocities of bodies on which one-sided rows may act, (n_v,)."""
-        rows = jax.eval_shape(self.bounds, q, v, t, self.dt)
         ends, found = np.asarray(rows.ends, bool), np.zeros(rows.jacobian.shape[1], bool)
         for block in rows.jacobian.blocks:
             m, k = block.shape
@@ -240,19 +251,27 @@ class Dynamics:
         return found
 
     def factored(
-        self, q: Array, v: Array, t: Any, age: Any = None
+        self, q: Array, v: Array, t: Any, age: Any = None, ahead: BoundRows | None = None
     ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
         """a and λ, the rows, b → the least a, in the metric of M, with J a + C λ = b, and a force.
 
         The third uses the factors of the step, and is None where the stabilizer solves by itself.
-        The force (n_v,) is that of one-sided rows; None where there are no bounded rows. Impacts
+        The force (n_v,) is that of one-sided rows; None where no bounded rows are given. Impacts
         are not in a: they are the `jump` of the reactions.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+            age: how long ago feedback sees the rates, () [s]; None for now.
+            ahead: the bounded rows, from `bounds_ahead`; None where they are not known yet.
         """
         rows, law, problem = self._problem(q, v, t, age)
         push = None
         if self.bounded is not None:
             lag = None if age is None else 0.5
-            solution, rows, _, solve, push = self._reacted(q, v, t, rows, law, problem, lag, False)
+            reacted = self._reacted(q, v, t, rows, law, problem, lag, False, ahead)
+            solution, rows, _, solve, push = reacted
         elif law.solve is not None:
             return self.system.complete(law.solve(self.solver, problem)), rows, None, None
         else:

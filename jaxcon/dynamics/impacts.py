@@ -253,7 +253,9 @@ def passes_range(rows: BoundRows, speed: Array, time: Array) -> Array | None:
     return jnp.any((rows.restitution >= 0) & (speed * time > rows.gap + rows.far), axis=0)
 
 
-def rebound(rate: Array, e: Array, arrivals: Arrivals, change: Array, lag: Any, dt: Array) -> Array:
+def leaving_speeds(
+    rate: Array, e: Array, arrivals: Arrivals, change: Array, lag: Any, dt: Array
+) -> Array:
     """The speeds with which rows leave after an impact, e |φ̇|, (n,); zero for those that stay.
 
     Args:

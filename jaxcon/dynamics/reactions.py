@@ -18,7 +18,7 @@ from jaxcon.core import numerics
 from jaxcon.core.lanes import widened
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
-from jaxcon.dynamics.bounces import rebound
+from jaxcon.dynamics.bounces import restitution_gain
 from jaxcon.solvers import gauss_jordan
 from jaxcon.solvers.bounded import Bounded, implicit_multipliers
 from jaxcon.solvers.jacobian import Jacobian
@@ -247,7 +247,7 @@ class Impulse:
         if rows.restitution is None:
             found, left = met(rows.target)
             return Reactions(found, rows.gap, left, jnp.ones_like(left), None, rows.layout)
-        more = rebound(rows, rows.restitution, self.dt)
+        more = restitution_gain(rows, rows.restitution, self.dt)
         (plain, bounced), left = jax.vmap(met)(jnp.stack([rows.target, rows.target + more]))
         without = self.velocity(jnp.zeros_like(more))
         kept = self.harmless(without, plain, bounced - plain)

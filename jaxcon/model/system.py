@@ -60,10 +60,12 @@ class Snapshot:
         system, q = self.system, self.q
         if not isinstance(system.remainder, tuple):
             system, q = system.unwind(q)
-        frames = [g.kind.frame(*g.unpack(q, self.v)) for g in system.layout.groups]
-        if isinstance(system.laps, tuple):
-            return tuple(frames)
-        return tuple(f.after(system.laps) if hasattr(f, "after") else f for f in frames)
+        groups, counted = system.layout.groups, not isinstance(system.laps, tuple)
+        frames = (g.kind.frame(*g.unpack(q, self.v)) for g in groups)
+        return tuple(
+            frame.after(system.laps) if counted and group.kind.turns else frame
+            for group, frame in zip(groups, frames, strict=True)
+        )
 
     def motion(self, name: str) -> Motion:
         """The motion of one body as arrays, for a user's function."""

@@ -148,12 +148,14 @@ class SemiImplicitEuler(Explicit):
         free rotation.
         """
         system, h = dynamics.system, dt[None]
+        bounds: Any = None
         coasting: Any = 0.0
         if system.bounds:
-            pressed = dynamics.pressed(*here).reshape(-1, *(1,) * (state.v.ndim - 1))
+            bounds = dynamics.bounds_ahead(*here)
+            pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
             coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
             dynamics = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
-        solution, rows, least, push = dynamics.factored(*here, dt / 2)
+        solution, rows, least, push = dynamics.factored(*here, dt / 2, bounds)
         v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
         if push is not None:
             straight = state.v + h * solution.acceleration
@@ -236,6 +238,8 @@ def closer(
         there = linearize(system, q, v, state.instant + dt).residual
         off = jnp.where(held, there - promised, 0)
         more = least(-share[None] * numerics.safe_divide(off, h * h))
+        # rounding over h² may contradict redundant rows; rows that do contradict were noted before
+        more = more._replace(status=status.failures(more.status))
         return v + h * more.acceleration, added(solution, more)
 
     return jax.lax.cond(somewhere(turn > TURN**2), corrected, lambda: (v, solution))
