@@ -16,7 +16,7 @@ Joints: Revolute, Prismatic, Spherical, Fixed, Distance, Coincident, Cylindrical
 Couplings: Gear, Belt, RackAndPinion, Pulley, Differential, PolynomialCoupling, Armature.
 Other constraints: Drive; RollingDisc, RollingSphere, RollingCylinder, KnifeEdge; LinearMomentum,
     AngularMomentum; Holonomic, VelocityLevel of one's own.
-Ends, friction and contact: Limit, RateLimit, RateMotor, JointFriction, Rope, PlaneContact,
+Joint limits, friction and contact: Limit, RateLimit, RateMotor, JointFriction, Rope, PlaneContact,
     CapsuleContact, BoxContact, HeightFieldContact, box_corners; Inequality of one's own.
 Forces: Spring, JointSpring, JointDamper, Bending, Flexure, ExternalWrench, CustomForce, Force;
     Motor, PositionServo, VelocityServo, AffineActuator; TurnCounter.

@@ -11,7 +11,7 @@ from test_report import four_bar
 import jaxcon as jc
 from jaxcon.analysis.known import Known
 from jaxcon.analysis.probe import Probe
-from jaxcon.analysis.traps import TRAPS, found
+from jaxcon.analysis.traps import TRAPS, found, listed
 
 DT = 1e-3
 
@@ -28,6 +28,15 @@ def bob(*elements, position=(1.0, 0.0), velocity=(0.0, 0.0), dtype=None):
 def rod(name="rod", point=(0.0, 0.0), length=None):
     """From a point of the world."""
     return jc.Distance(name, jc.WORLD, "bob", length=length, point_a=point)
+
+
+def arm(lower, **stop):
+    """On a hinge with limits, at the angle 0."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
+    scene.add(jc.Limit("stop", "hinge", lower, 1.0, **stop))
+    return scene.build()
 
 
 def flat():
@@ -180,6 +189,9 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
         ("iterations",),
         "sweeps=5000",
     ),
+    "below a limit": (lambda: arm(0.4), with_(), ("range",), "stop (0.4 rad below lower)"),
+    "within limits": (lambda: arm(-0.1), with_(), (), ""),
+    "below a soft limit": (lambda: arm(0.4, stiffness=10.0), with_(), (), ""),
 }
 
 
@@ -194,7 +206,7 @@ def test_a_trap_is_seen_where_it_is(name):
 
 def test_each_trap_of_the_chapter_is_there():
     assert set(TRAPS) == {name for _, _, names, _ in CASES.values() for name in names}
-    assert len(TRAPS) == 9  # eight of the chapter, and gradients through impacts
+    assert len(TRAPS) == 10  # eight of the chapter, gradients through impacts, joint limits
 
 
 def test_a_method_that_remembers_needs_no_state_of_its_own():
@@ -203,6 +215,25 @@ def test_a_method_that_remembers_needs_no_state_of_its_own():
     report = jc.report(system, state, forgets, DT, measure=True)
     assert report.probe.status == jc.Status.OK
     assert "gains" not in str(dataclasses.replace(report, gains=(0.0, 0.0, np.inf), choice=None))
+
+
+def test_a_start_outside_joint_limits_is_told_without_a_method():
+    """And how fast each joint really returns: after a step, 0.3 rad/s or a fifth of the way."""
+    system, state = arm(0.4, recovery=0.3)
+    assert set(jc.report(system, state).warnings) == {"range"}
+    text = str(jc.report(system, state))
+    assert "stop (0.4 rad below lower). They return at 0.3 rad/s at most" in text
+    after, _ = jc.step(system, jc.Method(), state, None, DT)
+    np.testing.assert_allclose(jc.coordinate_rate(system, after, "hinge"), 0.3, rtol=1e-6)
+    inside = dataclasses.replace(state, q=after.q * 0 + jnp.asarray([0.0, 0.5, np.pi / 2]))
+    text = str(jc.report(system, inside))
+    assert "stop (0.57 rad above upper)" in text
+
+
+def test_many_names_are_cut():
+    assert listed(("a", "b", "c")) == "a, b, c"
+    assert listed(("a", "b", "c", "d")) == "a, b, c and 1 other"
+    assert listed(("a", "b", "c", "d", "e")) == "a, b, c and 2 others"
 
 
 def test_float32_is_no_trap():

@@ -30,7 +30,8 @@ def test_the_least_of_a_bowl_is_found_and_its_history_kept():
     assert found.history.shape == (205,)
     assert found.loss == found.history.min()
     np.testing.assert_allclose(found.aux, jnp.sum(found.params["a"]))  # at the best, not the last
-    assert "every step was taken, and it converged" in str(found)
+    assert "every step was taken, and it converged: within " in str(found)
+    assert " (relative) of a minimum, possibly a local one" in str(found)
     short = jc.tune(bowl, BOWL, steps=20, positive="a", optimizer=optax.adam(0.03))
     assert "before it converged" in short.stopped
     assert "ask for more" in str(short)

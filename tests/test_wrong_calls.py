@@ -131,7 +131,12 @@ def test_a_step_reads_no_array_of_jax(monkeypatch):
         (lambda: jc.PID(integral=None), "PID: integral must be real numbers, got None"),
         (lambda: jc.Baumgarte({"rod": True}, 1.0), "Baumgarte: alpha of 'rod' must be a real numb"),
         (lambda: jc.GeneralizedAlpha(rho=2.0), "GeneralizedAlpha: rho must lie between 0 and 1"),
-        (lambda: jc.Method(jc.RK4), "Method: integrator must be a value such as SemiImplicitEuler"),
+        (lambda: jc.Method(jc.RK4), r"Method: integrator .*, got jc\.RK4; call it: jc\.RK4\(\)\.$"),
+        (
+            lambda: jc.Method(jc.RATTLE),
+            r"Method: integrator .*, got jc\.RATTLE; call it: jc\.RATTLE",
+        ),
+        (lambda: jc.Method(jc.Events), r"Method: .* got jc\.Events; that is one for events=\.$"),
     ],
 )
 def test_a_constructor_refuses_what_it_can_see(make, words):

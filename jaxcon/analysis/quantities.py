@@ -20,7 +20,7 @@ from jaxcon.model.state import Energy, State, at
 
 
 def energy(system: Any, state: State) -> Energy:
-    """Kinetic energy ½ vᵀMv and the potential of gravity and springs, () [J] each.
+    """Kinetic energy ½ vᵀMv, potential energy of gravity and springs, and `total`, () [J] each.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
@@ -32,6 +32,8 @@ def energy(system: Any, state: State) -> Energy:
 
 def violation(system: Any, state: State) -> Violation:
     """φ and φ̇ of a state, by constraint.
+
+    Joints and other equality constraints alone: joint limits, friction and contacts are left out.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
@@ -160,7 +162,9 @@ def angular_momentum(
 
     Returns:
         The angular momentum, world frame. About the centre of mass it does not change where no
-        outer torque acts, whatever the bodies do to each other.
+        outer torque acts, whatever the bodies do to each other. With `SemiImplicitEuler`, ω belongs
+        half a step before the orientation: in space the direction of the result wobbles within a
+        bound proportional to h. |I ω| of a free body is exact to rounding.
     """
     found = _momentum(system, state, bodies, "angular_momentum")
     own = found.angular

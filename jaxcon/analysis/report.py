@@ -13,7 +13,7 @@ from jaxcon.analysis.estimate import Cost
 from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.analysis.memory import Memory, memory
 from jaxcon.analysis.probe import Probe
-from jaxcon.analysis.traps import OFF, TRAPS
+from jaxcon.analysis.traps import OF_SCENE, OFF, TRAPS, listed
 from jaxcon.analysis.work import Work, seconds, work
 from jaxcon.core import checks
 from jaxcon.core.status import MEANING, Status
@@ -30,7 +30,8 @@ class Report:
 
     Attributes:
         coordinates, velocities: n_q, n_v.
-        rows: n_c.
+        rows: n_c, of the rows that take away a freedom; rotors do not.
+        rotor_rows: number of rows of rotors (`Armature`).
         rank: number of independent rows.
         degrees_of_freedom: n_v − rank.
         redundant: (constraint, row in it) of each row that depends on those before it.
@@ -54,8 +55,8 @@ class Report:
             a method and a step were given.
         probe: what some steps from the state left open, where it was asked to measure.
         warnings: by trap, "gains", "singular", "order", "over-constrained", "start", "nonlinear",
-            "dense", "iterations" and "impacts", of those in which the scene and the method are; a
-            method is needed, for some a step, and for "order" to measure.
+            "dense", "iterations", "impacts" and "range", of those in which the scene and the method
+            are. All but "range" need a method, some a step, and "order" to measure.
     """
 
     coordinates: int
@@ -78,19 +79,22 @@ class Report:
     warnings: dict[str, str] = field(default_factory=dict)
     cost: Cost | None = None
     impacts: tuple[str, ...] = ()
+    rotor_rows: int = 0
 
     def __str__(self) -> str:
+        kind = "joint" if self.rotor_rows else "constraint"
+        rotors = f" and {several(self.rotor_rows, 'rotor row')}" if self.rotor_rows else ""
         lines = [
             f"{self.coordinates} coordinates, {self.velocities} velocities",
-            f"{self.rows} constraint rows of rank {self.rank}: "
+            f"{self.rows} {kind} rows of rank {self.rank}{rotors}: "
             f"{several(self.degrees_of_freedom, 'degree')} of freedom",
             f"condition of the independent rows: {self.condition:.2g}",
         ]
         if self.bounded:
-            lines.append(f"besides, rows with bounds: {', '.join(self.bounded)}")
+            lines.append(f"besides, rows with bounds: {listed(self.bounded)}")
         if self.impacts:
             lines.append(
-                f"impacts of {_listed(self.impacts)}: gradients are right for one impact at a time,"
+                f"impacts of {listed(self.impacts)}: gradients are right for one impact at a time,"
                 " not where impacts are grazing, simultaneous or accumulating, which"
                 " jc.check_gradients names"
             )
@@ -151,16 +155,6 @@ class Report:
                     f" {self.probe.steps} steps from here, without the first half{ended}"
                 )
         return [*lines, str(self.choice)] if self.choice and self.choice.efforts else lines
-
-
-FEW_NAMES = 6
-"""Names of elements that a line of the report lists."""
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    """The first names, and how many there are besides."""
-    rest = len(names) - FEW_NAMES
-    return ", ".join(names[:FEW_NAMES]) + (f" and {rest} others" if rest > 0 else "")
 
 
 def report(
@@ -228,6 +222,8 @@ def report(
         impacts=traps.colliding(known),
         conflicts=known.conflicts,
         choice=known.choice,
+        rotor_rows=layout.size - len(unit.values),
+        warnings=traps.found(known, OF_SCENE),
     )
     return found if method is None else _with_method(found, known, measure, timed)
 

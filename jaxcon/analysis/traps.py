@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -13,6 +14,8 @@ from jaxcon.analysis.estimate import contact_operations, solved_rows
 from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.constraints.bounds import BoundRows, kinds_of, linearize_bounds
 from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
+from jaxcon.constraints.limits import Limit
+from jaxcon.core import host
 from jaxcon.dynamics.impacts import PREFIX, doubt
 from jaxcon.dynamics.rank import linearized
 from jaxcon.simulation.choice import innermost, several, words
@@ -40,12 +43,29 @@ DEARER = 3.0
 """How many times the operations of elimination are worth a word."""
 MANY = 12
 """Rows from which on that matters."""
+FEW_NAMES = 3
+"""Names of elements that a report lists in one place."""
+OF_SCENE = ("range",)
+"""Traps of a scene and a state alone, whatever the method."""
 
 
-def found(known: Known) -> dict[str, str]:
-    """Warnings by trap, of those of `TRAPS` in which the scene or the method is."""
-    told = ((name, test(known)) for name, (_, test) in TRAPS.items())
+def found(known: Known, only: Iterable[str] | None = None) -> dict[str, str]:
+    """Warnings by trap, of those of `TRAPS` in which the scene or the method is.
+
+    Args:
+        known: the scene and the method.
+        only: names of the traps to look for; all unless given.
+    """
+    told = ((name, TRAPS[name][1](known)) for name in (TRAPS if only is None else only))
     return {name: words for name, words in told if words}
+
+
+def listed(names: Sequence[str]) -> str:
+    """Returns the first names, and how many others there are."""
+    rest = len(names) - FEW_NAMES
+    if rest <= 0:
+        return ", ".join(names)
+    return f"{', '.join(names[:FEW_NAMES])} and {several(rest, 'other')}"
 
 
 def gains(known: Known) -> str | None:
@@ -268,10 +288,50 @@ def impact(known: Known) -> str | None:
     method, rows = known.method, bound_rows(known)
     if method.events is not None or rows is None:
         return None
+    if rows.lands:  # a robot has dozens, and one line names them
+        rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
     some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
     lands = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
     said = doubt(rows, lands, some)
     return None if said is None else said.removeprefix(PREFIX)
+
+
+def outside(known: Known) -> str | None:
+    """Trap 10: a joint that starts outside the range of a hard limit, which moves it in slowly."""
+    beyond, rates = [], []
+    for group, θ in _limited(known):
+        numbers = {field: np.asarray(x) for field, x in group.params.items()}
+        if "stiffness" in numbers:  # a spring brings it back
+            continue
+        joint = known.system.constraints[group.along.group].joint
+        unit = joint.coordinates[group.along.name]
+        below, above = numbers["lower"] - θ, θ - numbers["upper"]
+        for i in np.flatnonzero(np.maximum(below, above) > OFF):
+            side = "below lower" if below[i] > above[i] else "above upper"
+            far = max(below[i], above[i])
+            beyond.append(f"{group.names[i]} ({far:.2g} {unit} {side})")
+            rates.append(f"{numbers['recovery'][i]:.2g} {unit}/s")
+    if not beyond:
+        return None
+    return (
+        f"joints start outside their limits: {listed(beyond)}. They return at"
+        f" {' or '.join(dict.fromkeys(rates))} at most: start within the range, or set recovery= of"
+        " the limit."
+    )
+
+
+def _limited(known: Known) -> list[tuple[Any, np.ndarray]]:
+    """The groups of joint limits, each with the coordinates (elements,) that they limit."""
+    groups = [g for g in known.system.bounds if getattr(g, "law", None) is Limit]
+    if not groups:
+        return []
+    coordinates = [group.along for group in groups]
+
+    def read(system: Any, state: Any) -> list[Any]:
+        snapshot = system.snapshot(state.q, state.v, state.instant)
+        return [coordinate.read(snapshot).value for coordinate in coordinates]
+
+    return list(zip(groups, host.evaluate(read, known.system, known.state), strict=True))
 
 
 TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
@@ -284,6 +344,7 @@ TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
     "dense": ("dense matrices", dense),
     "iterations": ("too many iterations", iterations),
     "impacts": ("gradients through impacts", impact),
+    "range": ("a start outside joint limits", outside),
 }
 """By name: the trap in words, and how it is found."""
 

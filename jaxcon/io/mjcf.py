@@ -85,14 +85,14 @@ class MujocoModel:
         start = restate(self.start, self.system, system)
         return dataclasses.replace(self, system=system, start=start)
 
-    def state(self, qpos: Any, qvel: Any, time: Any = 0.0) -> State:
+    def state(self, qpos: Any, qvel: Any = None, time: Any = 0.0) -> State:
         """The state at MuJoCo's coordinates; pure: jit, vmap and differentiate it.
 
         Args:
             qpos: (nq,), quaternions of any length but zero; angles may hold whole turns. Of three
                 hinges of one body the middle one must stay between gimbal locks; where qpos is
                 traced, that is not checked, and other angles of the same pose are read back.
-            qvel: (nv,).
+            qvel: (nv,); zero unless given.
             time: () [s].
 
         Raises:
@@ -100,7 +100,8 @@ class MujocoModel:
         """
         dtype = self.start.q.dtype
         qpos = checks.real("state", "qpos", qpos, dtype, self.tree.reference.shape)
-        qvel = checks.real("state", "qvel", qvel, dtype, (self.tree.size,))
+        still = jnp.zeros(self.tree.size, dtype)
+        qvel = still if qvel is None else checks.real("state", "qvel", qvel, dtype, still.shape)
         self.tree.check(qpos)
         q, v = self.tree.flat(self.system, qpos, qvel)
         turns = self.tree.turns_of(self.system, qpos)

@@ -189,12 +189,12 @@ class Outlook:
     @property
     def words(self) -> str:
         """The estimate in words."""
-        name = f"'{self.leaf}'" if self.leaf else "the parameter"
         if self.converged:
             return (
-                f", and it converged: by the curvature, {name} is within {self.distance:.1e} of a"
-                " minimum, which may be a local one, relative to its size, and no other is further"
+                f", and it converged: within {self.distance:.1e} (relative) of a minimum, possibly"
+                " a local one"
             )
+        name = f"'{self.leaf}'" if self.leaf else "the parameter"
         if np.isfinite(self.distance):
             far = f"by about {self.distance:.1g}" if self.distance < 1 else "far"
             pace = f"still fell by {self.pace:.1e} a step" if self.pace > 0 else "fell no more"

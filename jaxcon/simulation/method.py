@@ -209,8 +209,11 @@ class Method:
             if not absent and (isinstance(value, type) or not hasattr(value, verb)):
                 fits = [other for other, can, _ in PARTS if hasattr(value, can)]
                 hint = f"; that is one for {fits[0]}=" if fits and fits[0] != part else ""
+                got, name = repr(value), getattr(value, "__name__", "")
+                if name and value.__module__.startswith("jaxcon."):
+                    got, hint = f"jc.{name}", hint or f"; call it: jc.{name}()"
                 raise TypeError(
-                    f"Method: {part} must be a value such as {example}, got {value!r}{hint}."
+                    f"Method: {part} must be a value such as {example}, got {got}{hint}."
                 )
 
     def check(self) -> None:
