@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from jaxcon.core.program import Constant, Operation, Program, traced
+from jaxcon.core.program import Constant, Operation, Program, evaluated, traced
 from jaxcon.core.typing import Array
 
 WORTH = 3
@@ -149,7 +149,7 @@ class Stages:
             def function(*given: Array) -> list[Array]:
                 own: dict[int, Any] = dict(zip(leaves, given, strict=True))
                 args = [self.program.evaluate(own, x) for x in operands]
-                return jax.core.eval_jaxpr(branch.jaxpr, branch.consts, *args)
+                return evaluated(branch, args)
 
             return jax.make_jaxpr(function)(*(values[x] for x in leaves))
 

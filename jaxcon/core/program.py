@@ -76,6 +76,11 @@ def traced(function: Any, args: Sequence[Any]) -> Any:
     return jex.ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
 
 
+def evaluated(closed: Any, args: Sequence[Any]) -> list[Any]:
+    """The results of a closed jaxpr."""
+    return jex.jaxpr_as_fun(closed)(*args)
+
+
 class Program:
     """A function as operations in order.
 
