@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.contact_default import default_contact_solver, first_multipliers
 from jaxcon.core import checks
@@ -150,8 +151,8 @@ class Method:
             dt: h as it was given, () [s].
             dtype: of the scene.
         """
-        if not checks.is_concrete(dt):
-            return self
+        if not checks.is_concrete(dt) or not _is_number(dt):
+            return self  # not known, or to be refused where it is used
         with jax.ensure_compile_time_eval():
             h = jnp.asarray(dt, dtype)
             limit = _highest_rate(self.integrator, h)
@@ -248,6 +249,12 @@ def check_method(method: Any, wait: bool = True) -> None:
         )
     with contextlib.nullcontext() if wait else checks.without_waiting():
         method.check()
+
+
+def _is_number(x: Any) -> bool:
+    """Returns True for one number that can be read."""
+    known = np.asarray(x)
+    return known.shape == () and known.dtype.kind in "fiu"
 
 
 def _highest_rate(integrator: Any, dt: Any) -> Any:
