@@ -100,6 +100,7 @@ class Sweep:
 
     def _measured(self, course: Course, pace: Pace, name: str, method: Method) -> Unit:
         """Errors first, then costs."""
+        course.go(self.problem.dt(1), 1)  # the first run of a program takes longer than later ones
         runs, why = self._refined(course, name, method)
         limit = self._limit(course, name, runs) if runs else None
         timed = tuple(
