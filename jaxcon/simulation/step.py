@@ -99,7 +99,7 @@ def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array)
 
 
 def _repair(system: Any, method: Method, state: State, attempt: Any, dt: Array) -> Any:
-    """The same of an attempt that the method repairs where it failed."""
+    """Steps as `_attempt` does, and repairs an attempt that failed."""
     system = recall(system, state.turns, state.angle_remainder)
     return _settle(state, method.recovery.repair(system, method.solver, state, attempt, dt))
 
@@ -177,7 +177,7 @@ def forward_dynamics(
 
 
 def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Solution:
-    """Of worlds along trailing axes."""
+    """Returns the dynamics of worlds along trailing axes."""
     if not hasattr(system, "layout") and state.q.ndim > 1:
         one = per_world(_dynamics, state.q.ndim - 1)
         return one(system, method, state, control, dt)
