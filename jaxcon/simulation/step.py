@@ -48,7 +48,6 @@ def step(
     check_method(method, wait=False)
     with checks.without_waiting():  # of dt as given: under jit an array of it would be traced
         warn_if_unstable(method, dt, system, state)
-        method = method.known_at(dt, state.q.dtype)
     return step_quietly(system, method, state, control, dt)
 
 
@@ -59,6 +58,7 @@ def step_quietly(
     control = check_step(system, method, state, control)
     with checks.without_waiting():
         h = checks.real("step", "dt", dt, state.q.dtype, least=0)
+        method = method.known_at(dt, state.q.dtype)
     new, info = native.call(contained_step, system, method, state, control, h)
     # put in outside of the step, which so computes what it did; a rollout that does not record it
     # does not carry it either
