@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 SCENES = ("four_bar", "bicycle")
-"""Of `jaxcon.scenes`, by name."""
+"""The scenes of `jaxcon.scenes` that the command line knows, by name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

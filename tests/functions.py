@@ -161,4 +161,4 @@ WIDE = [
     joined_and_cut_again,
     padded_and_cropped,
 ]
-"""Those to be tried on arrays that are large enough for XLA to split them among threads."""
+"""The functions to be tried on arrays that are large enough for XLA to split among threads."""

@@ -39,7 +39,7 @@ class Site:
     other: np.ndarray
     """A second point, for joints that have two."""
     suffix: str = ""
-    """Of the names of the elements."""
+    """The suffix of the names of the elements."""
 
     @property
     def joint(self) -> tuple[str, str, str]:
@@ -371,7 +371,7 @@ def near(place: tuple[float, float], random: Any, dim: int) -> np.ndarray:
 
 
 def start_breathing(system: Any, state: jc.State) -> Any:
-    """The same with the squares of the user's distances as they are at assembly."""
+    """Returns the system with the squares of the user's distances as they are at assembly."""
     changes = {}
     for group in system.constraints:
         if getattr(getattr(group, "law", None), "function", None) is breathing:
@@ -383,7 +383,7 @@ def start_breathing(system: Any, state: jc.State) -> Any:
 
 
 def start_curves(system: Any, state: jc.State) -> Any:
-    """The same with curves that run through their points at assembly."""
+    """Returns the system with curves that run through their points at assembly."""
     snapshot = system.snapshot(state.q, state.v, state.time)
     changes = {}
     for group in system.constraints:

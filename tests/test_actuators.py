@@ -242,7 +242,7 @@ def test_a_cylinder_between_two_points(dim):
 
 
 def test_the_coordinates_of_joints_with_several():
-    """Of bodies turned and moved by hand from where they were assembled."""
+    """Compares coordinates with bodies turned and moved by hand from where they were assembled."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
     names = ("cross", "sleeve", "nut", "puck", "mast", "ball", "bead")
     for name in names:

@@ -24,7 +24,7 @@ DEPENDENT = (jc.RankSafe(), jc.RankSafe(jc.Schur()), jc.ConjugateGradients())
 
 
 def operations(system, state, solver):
-    """Of one solution of one world, counted from its trace; rows taken as independent."""
+    """Returns the operations of one solution of one world, from its trace; rows as independent."""
 
     def problem(s):
         rows = linearize(system, s.q, s.v, s.time)

@@ -235,7 +235,7 @@ def test_every_solver_leaves_only_rounding(name, dtype, monkeypatch):
 
 
 def test_a_solution_of_another_system_is_seen():
-    """Of the regularised one in the place of the plain one, and one whose λ is off."""
+    """Sees the regularized solution in place of the plain one, and one whose λ is off."""
     (plain,) = residuals.systems("four-bar", "float64", [0.0])
     exact = residuals.on_arrays(jc.Dense().solve, plain)
     numbers, which = residuals.Numbers(plain), ("four-bar", "float64", "-", 0.0)

@@ -14,7 +14,7 @@ from jaxcon.solvers.bounded import Bounded, Kinds
 WORLDS = 2000
 dtypes = pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 EXACT = {"float64": 1e-8, "float32": 1e-5}
-"""Of the largest term: what a law may be missed by."""
+"""What a law may be missed by, relative to the largest term."""
 
 
 def problems(kinds, rank, dtype, friction=0.1):
@@ -216,5 +216,5 @@ def _hinge(*elements):
 
 
 def _program(system, state, method):
-    """Of a step, as it is given to the compiler."""
+    """Returns the program of a step, as it is given to the compiler."""
     return jax.jit(lambda s: jc.step(system, method, s, None, 1e-3)).lower(state).as_text()

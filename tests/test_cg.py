@@ -180,7 +180,7 @@ EMPTY = np.concatenate([J, np.zeros((1, 4))])
 
 @pytest.mark.parametrize("rows", [TWICE, EMPTY], ids=["twice", "empty"])
 def test_rows_without_a_solution_are_told_from_redundant_ones(rows):
-    """Of one constraint, so that a block of the preconditioner is singular."""
+    """Uses rows of one constraint, so that a block of the preconditioner is singular."""
     last = {id(TWICE): TARGET[0], id(EMPTY): 0.0}[id(rows)]
     for wrong, status in ((0.0, jc.Status.OK), (1.0, jc.Status.NOT_CONVERGED)):
         system = small(rows, MASS, FORCE, np.append(TARGET, last + wrong))
@@ -219,7 +219,7 @@ def test_the_default_tolerance_leaves_two_thirds_of_the_digits(dtype, bound):
 
 
 def test_a_batch_is_a_loop():
-    """Of worlds that need none, few and all iterations, and of one that fails."""
+    """Steps worlds that need none, few and all iterations, and one that fails."""
     system = assembled(*links(6, True))
     zero, random = jnp.zeros_like(system.force), np.random.default_rng(6)
     force = jnp.asarray(random.normal(size=system.force.shape))
@@ -300,7 +300,7 @@ def test_gradients_of_a_batched_rollout():
 
 
 def equations(jaxpr):
-    """Those of a jaxpr and of all within it."""
+    """Returns the equations of a jaxpr and of all within it."""
     for equation in jaxpr.eqns:
         yield equation
         for inner in jax.tree.leaves(list(equation.params.values())):

@@ -147,7 +147,7 @@ def writable(tree):
 
 
 def registered(cls):
-    """Whether JAX has a name for a class: it refuses to be told a second one."""
+    """Returns True where JAX has a name for a class: it refuses to be told a second one."""
     named = issubclass(cls, tuple)
     how = {} if named else {"serialize_auxdata": encoded, "deserialize_auxdata": decoded}
     register = getattr(export, f"register_{'namedtuple' if named else 'pytree_node'}_serialization")

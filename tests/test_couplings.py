@@ -47,7 +47,7 @@ def idle(_):
 
 
 def accelerations(system, state, *torques):
-    """Of the wheels' angles and the slider, and λ of the coupling."""
+    """Returns the accelerations of the wheels' angles and the slider, and λ of the coupling."""
     control = jnp.zeros(3).at[: len(torques)].set(jnp.asarray(torques, float))
     solution = jc.forward_dynamics(system, state, control, FREE, 1e-3)
     angles = [solution.acceleration[system.layout.v(name)[-1]] for name in MOMENTS]

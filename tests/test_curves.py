@@ -26,7 +26,7 @@ def on_a_circle(s, center, axis):
 
 
 def on_a_rod(s, center, axis):
-    """The same as a massless rod, hinged to a in space."""
+    """The circle as a massless rod, hinged to a in space."""
     if s.dim == 2:
         return jc.Distance(*s.joint, point_a=center, point_b=s.point)
     return jc.RevoluteSpherical(*s.joint, hinge=center, ball=s.point, axis=axis)

@@ -88,7 +88,7 @@ def test_the_first_failure_is_named(scene, what):
 
 
 def test_later_stages_worlds_and_repairs_are_looked_at(scene):
-    """Of three worlds the last two lose their wind, at the last stage of step 2."""
+    """The last two of three worlds lose their wind, at the last stage of step 2."""
     system, state = changed(scene[0], {"wind": EARLY}), scene[1]
     times = jnp.array([-1.0, 0.0, 0.0])
     batch = jax.vmap(lambda t: dataclasses.replace(state, time=t))(times)

@@ -273,7 +273,7 @@ def pump(seen):
 
 
 def period(lengths, masses, moments, last):
-    """Of the slowest small swing of a chain of links below a point, the last body fixed to a link.
+    """The period of the slowest small swing of hanging links, the last body fixed to a link.
 
     M φ̈ + K φ = 0 of the links' angles, with the horizontal arms a of the bodies per angle:
     M = Σ m a aᵀ + moments, K = g Σ m a on the diagonal.
@@ -347,7 +347,7 @@ def test_sweeps_over_stops_and_contact_hop_as_far():
 ENDS = [
     (part, side * x / 2) for part, x in (("thigh", THIGH), ("shank", SHANK)) for side in (-1, 1)
 ]
-"""Of the bars of a leg from the hip down to the foot."""
+"""The ends of the bars of a leg from the hip down to the foot."""
 
 
 def test_a_five_bar_leg_hops_forward():

@@ -286,7 +286,7 @@ def test_time_is_up_for_one_copy_and_for_many():
 
 
 def test_when_copies_are_reset_is_a_choice():
-    """The same motion, told at different times."""
+    """One motion, told at different times."""
     actions = pushes(4)
     seen = {}
     for mode in ("NextStep", "SameStep", "Disabled"):

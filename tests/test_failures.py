@@ -149,7 +149,7 @@ SHARED = {"gravity": np.array([0.3, -9.81]), "arm": 1.3, "gain": 15.0, "stiffnes
 
 
 def loss(scene, shared, x):
-    """Of one world, by numbers that all worlds share."""
+    """Returns the loss of one world, by numbers that all worlds share."""
     system, state = start(*scene, x | {"stiffness": x["stiffness"] * shared["stiffness"]})
     system = system.with_params({"gravity": shared["gravity"], "arm": {"mass": shared["arm"]}})
     method = jc.Method(stabilizer=jc.Baumgarte.critical(rate=shared["gain"]))

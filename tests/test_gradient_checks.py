@@ -196,7 +196,7 @@ def test_ridders_takes_away_every_even_power():
 
 
 def test_differences_know_what_rounding_makes_of_them():
-    """Of noise that no spacing of f foretells, as of many steps of a rollout."""
+    """The noise is what no spacing of f foretells, as that of many steps of a rollout."""
     steps, random = 0.1 * 0.5 ** np.arange(10), np.random.default_rng(0)
     noise = 1e-5 * random.normal(size=(2000, 10)) / steps
     best, uncertainty = ridders(2.0 + 3 * steps**2 - steps**4 + noise)

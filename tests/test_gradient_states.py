@@ -36,7 +36,7 @@ def test_a_ball_that_hardly_leaves_its_plane_has_finite_derivatives():
 
 
 def test_a_bounce_and_its_derivatives_are_the_same_at_every_speed():
-    """Of a rod that strikes with its end, where restitution is held back in a few of many states.
+    """A rod strikes with its end; restitution is held back in a few of many states.
 
     Without gravity the outcome is proportional to the velocities; works of 1e-22 J have squares
     beyond float32.

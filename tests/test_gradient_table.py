@@ -19,7 +19,7 @@ from jaxcon.scenes import four_bar  # noqa: E402
 
 
 def pairs(choice):
-    """Those that differ in code: a solver does not see what stabilises, nor a table how long it is.
+    """Pairs that differ in code: solvers see no stabilizer, and tables not how long they are.
 
     The benchmark takes all pairs, and the whole product.
     """

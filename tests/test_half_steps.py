@@ -218,7 +218,7 @@ def test_forces_are_read_without_feedback():
 
 
 def test_derivatives_at_rest_and_under_way():
-    """Of a projected step, where d = 0 and v = 0, and where neither is."""
+    """Derivatives of a projected step, where d = 0 and v = 0, and where neither is."""
     system, state = pendulum(0.0)
     method = jc.Method(stabilizer=jc.Projection())
 
@@ -376,7 +376,7 @@ def test_a_hinge_and_a_ball_joint_keep_their_energy_at_20_ms(beside, dtype):
 
 @pytest.mark.parametrize("radius", [1e-3, 1e-4])
 def test_a_thin_rod_that_turns_end_over_end_does_not_spin_about_itself(radius):
-    """Of float32: two moments that are equal leave no torque about the third axis."""
+    """In float32 two equal moments of inertia leave no torque about the third axis."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0), dtype=np.float32)
     moments = (radius**2 / 2, 1 / 12, 1 / 12)
     scene.add_body("rod", mass=1.0, inertia=moments, angular_velocity=(0.0, 6.0, 8.0))

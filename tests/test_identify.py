@@ -228,7 +228,7 @@ WAVE = np.asarray(wave({"a": 2.0, "b": 0.4})) + 0.01 * np.random.default_rng(0).
 
 
 def test_a_bound_holds_the_errors_of_the_others_and_has_none():
-    """Those of the others are as if the bound were known."""
+    """The errors of the other numbers are as if the bound were known."""
     found = jc.identify(wave, {"a": 1.0, "b": 0.1}, WAVE, bounds={"b": (0.0, 0.2)})
     given = jc.identify(lambda a: wave({"a": a, "b": 0.2}), 1.0, WAVE)
     np.testing.assert_allclose(found.errors["a"], given.errors, rtol=1e-9)
@@ -504,7 +504,7 @@ def test_restarts_find_the_better_of_two_rates():
 
 
 def test_noise_of_each_number_counts_in_its_own_stretch():
-    """The same for all is as one number; a stretch that hardly counts is as one not seen."""
+    """Equal noise of all is as one number; a stretch that hardly counts is as one not seen."""
     data = long_recording(4).reshape(4, 20)
     nodes = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(4)}
 

@@ -555,5 +555,5 @@ def test_a_tumbling_box_that_lands_on_corners_warns_once(dim, monkeypatch):
 
 
 def notices_of_impacts(warning):
-    """Whether a warning is one of gradients through impacts."""
+    """Returns True for a warning that a gradient through impacts may be wrong."""
     return str(warning.message).startswith("gradients through impacts")

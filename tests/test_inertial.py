@@ -88,7 +88,7 @@ def place(state):
 
 
 def coordinates(system, state):
-    """Of every joint that has some, by joint and name."""
+    """Returns the coordinates of every joint that has some, by joint and name."""
     pairs = [
         (name, coordinate)
         for group in system.constraints
@@ -531,6 +531,6 @@ def test_a_recording_under_known_forces_tells_all_ten():
 
 
 def random_tensor(random):
-    """Of a body of about a metre."""
+    """Returns the inertia of a body of about a metre."""
     axes, _ = np.linalg.qr(random.normal(size=(3, 3)))
     return axes @ np.diag([0.12, 0.2, 0.25]) @ axes.T

@@ -12,7 +12,7 @@ import jaxcon as jc
 from jaxcon import scenes as scenes_of_library
 
 CLOSE = 0.2
-"""Of a batch; the rest is what XLA decides anew for each."""
+"""The relative error of a memory estimate of a batch; XLA decides the rest anew for each."""
 
 
 def chain(links, dtype):
@@ -109,7 +109,7 @@ def bob():
 
 
 def planned_gradient(system, method, state, steps, adjoint, worlds=300):
-    """Of a gradient by positions, as XLA plans it [B]."""
+    """Returns the memory of a gradient by positions, as XLA plans it [B]."""
 
     def end(q, state):
         start = dataclasses.replace(state, q=q)

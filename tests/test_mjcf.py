@@ -181,7 +181,7 @@ def test_a_model_unpacks_and_runs_in_single_precision():
 
 
 def test_a_model_says_which_method_suits_it():
-    """That of its structure, with other parts as they are given; a state of it is enough."""
+    """The solver is that of the structure, other parts are as given, and a state is enough."""
     arm = model(f"<body>{HINGES.format(1, AXES[0], '').format(0)}{BODY}</body>")
     read = jc.from_mjcf(arm)
     found = read.method()

@@ -18,7 +18,7 @@ from benchmarks import legged  # noqa: E402
 from benchmarks import mjcf_agreement as agreement  # noqa: E402
 
 EXACT = 1e-9
-"""Of gaps and their rates, in metres and seconds."""
+"""The accuracy of gaps and their rates, in metres and seconds."""
 
 
 def model(bodies, rest="", default="", flag=""):
@@ -167,7 +167,7 @@ def test_ranges_are_limits():
 
 
 def test_frictionloss_is_dry_friction():
-    """Of hinges along their angle, of balls about the axes of their body."""
+    """Friction of hinges acts along their angle, of balls about the axes of their body."""
     data, found = moved(model(JOINTS.format("", "", RUBS)))
     assert found.kinds.boxes == len(found.rate) == 4
     np.testing.assert_allclose(found.upper, data.efc_frictionloss)

@@ -196,7 +196,7 @@ def length(q, t, p):
 
 
 def test_single_precision_is_traced_anew_where_double_is_off():
-    """The same function and shapes: its own constants follow what JAX now takes for real."""
+    """One function and one shape: its constants follow what JAX now takes for real."""
     x = jnp.ones(2, jnp.float32)
 
     def real(x):

@@ -22,7 +22,7 @@ PLAIN = jc.Method(solver=jc.Sparse())
 
 
 def jaxpr_of(system, state, method=PLAIN):
-    """Of a step, with every number of the system among its arguments."""
+    """Returns the jaxpr of a step, with every number of the system among its arguments."""
     layout = system.layout
     state = jc.init(system, method, state.q, state.v)
     control = jnp.zeros(layout.n_u) if layout.n_u else None
@@ -193,7 +193,7 @@ def test_what_a_model_turns_off_is_not_in_its_system(name):
 
 
 def test_scenes_need_more_the_more_they_have():
-    """Of the study, those that are small."""
+    """Runs the small scenes of the study."""
     found = [needed.measure(name, None) for name in ("particle", "rod", "planar pendulum")]
     assert [(x.positions, x.velocities, x.rows, x.bounded) for x in found] == [
         (2, 2, 0, 0),

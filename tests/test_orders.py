@@ -116,7 +116,7 @@ def differentiated(x, found):
 
 
 def slipping(x):
-    """The same law by law, by Newton's method; two steps from a root have its two derivatives."""
+    """Slips law by law, by Newton's method; two steps from a root have its two derivatives."""
     matrix, offset, most, friction = problem(x)
 
     def unmet(y):

@@ -519,7 +519,7 @@ def norms(x):
 
 
 def test_a_spring_by_its_time_has_one_stiffness_in_all_directions():
-    """Of a meeting point the mean of A_ii over its axes; of a hinge that of its two turns besides.
+    """A meeting point takes the mean of A_ii over its axes, a hinge that of its two turns, too.
 
     The rod of 1.5 kg turns about its middle, 0.5 m from the point: A = 1/m + r²/I across it.
     """

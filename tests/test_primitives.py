@@ -98,7 +98,7 @@ def to_double(x):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_rates_along_a_motion_in_time(dim):
-    """The same by central differences of a motion at constant v."""
+    """Compares rates with central differences of a motion at constant v."""
     built = scenes.build(f"mixed-{dim}d")
     system, s, h = built.system, built.off, 1e-5
     keep = ~level_rows(built)

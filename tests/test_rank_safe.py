@@ -17,9 +17,9 @@ from tests.tolerances import DIFFERENCE
 
 GENTLE = jc.Method(stabilizer=jc.Baumgarte.critical(10.0))
 ACCURACY = {jnp.float64: 1e-9, jnp.float32: 1e-4}
-"""Of accelerations, relative to the largest."""
+"""The accuracy of accelerations, relative to the largest."""
 SHARED = 1e-5
-"""Of multipliers of dependent rows."""
+"""The accuracy of multipliers of dependent rows."""
 
 
 def cast(built, dtype):
@@ -341,7 +341,7 @@ def test_contradicting_rows_are_met_by_least_squares(dtype):
 
 
 def test_a_singular_world_leaves_the_others_as_they_are():
-    """Of three parallelograms one has its rods in line."""
+    """One of three parallelograms has its rods in line."""
     system, state = singular.bars(2)
     angles = jnp.array([0.9, 0.0, 2.5])
     method = jc.Method(jc.SemiImplicitEuler(), jc.Baumgarte.critical(20.0))

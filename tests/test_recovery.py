@@ -47,7 +47,7 @@ def simulate(scene):
 
 
 def numbers(state):
-    """Of healthy worlds."""
+    """Returns the numbers of healthy worlds."""
     return {
         "q": np.tile(state.q, (WORLDS, 1)),
         "control": np.tile([[0.0, 1.0]], (WORLDS, STEPS, 1)) * np.arange(WORLDS)[:, None, None],
@@ -57,7 +57,7 @@ def numbers(state):
 
 
 def sicken(x, **changes):
-    """The same with one world changed."""
+    """Returns the batch with one world changed."""
     x = {name: np.array(value) for name, value in x.items()}
     for name, change in changes.items():
         change(x[name][SICK], x[name])
@@ -160,7 +160,7 @@ def test_gains_that_are_unstable_are_relaxed_until_they_hold(scene):
 
 
 def test_gradients_are_finite_and_those_of_what_was_done(scene, simulate):
-    """Of a batch with a world that was rolled back, one that was projected, and a healthy one."""
+    """A batch has a world that was rolled back, one that was projected, and a healthy one."""
     system, start = scene
     x = numbers(start)
     x["control"][0, 5] = np.nan
@@ -213,7 +213,7 @@ def test_generalized_coordinates_recover_too(dtype):
 
 
 def test_numbers_that_are_arrays_are_checked_inside_a_trace_too():
-    """Those of a method that was tuned are; they are not traced by a function that has them."""
+    """Numbers of a tuned method are arrays, which a function that has them does not trace."""
 
     recovery = jax.tree.map(jnp.asarray, jc.Recovery(limit=0.1, shrink=0.5))
     jax.make_jaxpr(recovery.check)()

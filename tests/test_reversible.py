@@ -67,7 +67,7 @@ def bob(damping=0.0, dtype=jnp.float64):
 
 SYSTEM, STATE = bob(0.3)
 WORLDS = jnp.array([[0.0, 1.0], [0.0, -0.5], [jnp.nan, 0.0]])
-"""Of which the last fails at once."""
+"""Three worlds, the last of which fails at once."""
 
 
 def along(v, mass, adjoint, every=1, steps=12):
@@ -85,7 +85,7 @@ def along(v, mass, adjoint, every=1, steps=12):
 
 
 def test_batches_in_both_orders_strides_and_failed_worlds():
-    """Of a gradient cut every five steps; a world that fails leaves it to the others."""
+    """A gradient is cut every five steps; a world that fails leaves it to the others."""
 
     def one(v, mass, adjoint):
         return jax.grad(along, argnums=(0, 1))(v, mass, adjoint, 3)

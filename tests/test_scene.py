@@ -79,7 +79,7 @@ def test_joints_to_a_fixed_body_hold_at_assembly(dim, kind, wall):
 
 @both
 def test_a_hinge_on_a_fixed_body_is_a_hinge_on_the_world(dim):
-    """The same motion, whichever of the two the user names."""
+    """The motion is the same, whichever of the two the user names."""
     point, finals = np.full(dim, 0.7), []
     axis = None if dim == 2 else (0.0, 1.0, 1.0)
     for base in (jc.WORLD, "wall"):

@@ -40,7 +40,7 @@ def problem(name, dtype="float64"):
 
 
 def residuals(system, solution):
-    """Those of both rows, each relative to the largest of its terms."""
+    """Returns the residuals of both rows, each relative to the largest of its terms."""
     m, j = np.asarray(system.mass.dense(), float), np.asarray(system.jacobian.dense(), float)
     a, multipliers = (np.asarray(x, float) for x in solution[:2])
     first = (m @ a, np.asarray(system.force, float), j.T @ multipliers)

@@ -135,7 +135,7 @@ STEPS = {"pendulum": 2000, "double pendulum": 600, "four-bar": 200, "Andrews": 1
 
 @pytest.mark.parametrize("name", list(motions.MOTIONS))
 def test_both_codes_come_to_the_known_end(name):
-    """Of MuJoCo, which closes loops softly, only where it is installed."""
+    """MuJoCo, which closes loops softly, runs only where it is installed."""
     motion, steps = motions.MOTIONS[name](), STEPS[name]
     for form in motion.forms:
         assert runs.Ours(motion, form, "RK4", "float64").error(steps) < 5e-6

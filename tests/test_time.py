@@ -177,7 +177,7 @@ def loop(t, last):
 
 
 def table(t):
-    """Of all kinds of results of a scan."""
+    """Returns a number made of all kinds of results of a scan."""
     carry, stacked = jax.lax.scan(lambda c, w: (c + w * t, jnp.sin(w * t)), t, MANY)
     return jnp.cos(carry) + stacked[0] + stacked[1]
 

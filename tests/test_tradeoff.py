@@ -37,7 +37,7 @@ def double_pendulum(dtype=None):
 
 
 def by_others(times):
-    """The same in two angles by Dormand and Prince's method of order eight, (times, 2, 2) [m]."""
+    """Returns the motion in two angles by Dormand and Prince's order eight, (times, 2, 2) [m]."""
 
     def rate(_, y):
         a, b, wa, wb = y

@@ -687,7 +687,7 @@ def test_the_stiffness_of_a_constraint_that_is_least_in_expectation():
 
 
 KEY = jax.random.key(9)
-"""Of draws that no search has seen."""
+"""The key of draws that no search has seen."""
 
 
 def test_samples_that_fail_at_first_do_not_end_a_search():

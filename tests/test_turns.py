@@ -253,7 +253,7 @@ def test_the_derivative_of_the_reduction_is_one():
 
 
 def test_states_without_a_remainder_of_angles_step():
-    """Those made by hand and saved before keep their structure."""
+    """States made by hand and saved before keep their structure."""
     system, state = four_bar(jnp.float32)
     bare = jc.State(state.q.at[6:].add(TURNED), state.v, state.time, state.status)
     end, _ = jc.step(system, jc.Method(), bare, None, 1e-3)
@@ -397,7 +397,7 @@ def test_gears_mesh_after_many_turns(ratio):
 @pytest.mark.parametrize("most", [1.0, np.pi, 1e3, 1e5])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_cosines_and_sines_are_right_to_the_last_place(dtype, most):
-    """Of angles between 0.5 and 1 a float32 has multiples of 6e-8."""
+    """A float32 between 0.5 and 1 is a multiple of 6e-8."""
     places = np.linspace(-most, most, 100_001).astype(dtype)
     angle = jnp.asarray(places)
     (cos, sin), rates = jax.jvp(jax.jit(cos_sin), (angle,), (jnp.ones_like(angle),))

@@ -6,7 +6,7 @@ ROUND_OFF = {np.dtype("float64"): 1e-12, np.dtype("float32"): 1e-5}
 """Identities that hold but for rounding: relative, a few operations deep."""
 
 IDENTITY = 1e-12
-"""The same in float64."""
+"""Identities in float64 that hold but for rounding."""
 
 DERIVATIVE = 1e-10
 """Derivatives written by hand against automatic ones: rounding, many operations deep."""

@@ -80,7 +80,7 @@ def _pairs(system: Any, reference: Reference) -> list[tuple[str, Any, Any, Any, 
 
 
 def _rank(system: Any, reference: Reference) -> tuple[bool, bool, int]:
-    """Whether there are loops, whether rows are independent along a motion, and their number."""
+    """Returns whether there are loops, whether rows stay independent, and their number."""
     points = reference.points
     with precision(np.float64):
         own = cast(points, np.float64)

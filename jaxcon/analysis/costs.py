@@ -21,7 +21,7 @@ from jaxcon.simulation.rollout import rollout
 from jaxcon.simulation.step import step_quietly
 
 STEPS = 16
-"""Of the rollouts whose gradients are timed."""
+"""The number of steps of the rollouts whose gradients are timed."""
 LONG = 0.03
 """What one repeat should take [s]; its steps are chosen for that, from `FEW` to `MANY`."""
 FEW, MANY = 4, 1000
@@ -78,11 +78,11 @@ class Pace(Lowered):
 
     @property
     def memory(self) -> float:
-        """Of the batch by world: its states, the new ones, and what lies between [B]."""
+        """The memory of the batch by world: its states, the new ones, and what lies between [B]."""
         return planned(self.program) / self.batch.worlds
 
     def seconds(self, dt: float) -> float:
-        """Of a step of one world: the median of several runs of the batch [s]."""
+        """Returns the time of a step of one world: the median of several runs of the batch [s]."""
         with precision(self.dtype):
 
             def run(count: int) -> Callable[[], Any]:
@@ -121,7 +121,7 @@ class Slope(Lowered):
             self.lowered = jax.jit(many).lower(*self.args, jnp.asarray(1e-3, self.dtype))
 
     def seconds(self, dt: float) -> float:
-        """Of value and gradient by step of one world [s]."""
+        """Returns the time of value and gradient by step of one world [s]."""
         with precision(self.dtype):
             h = jnp.asarray(dt, self.dtype)
 

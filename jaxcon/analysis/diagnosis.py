@@ -35,7 +35,7 @@ METHODS = {
     "conflict": "what least squares leave of φ: no motion takes it away; see report",
     "rank": "what lies in combinations of rows that hardly any motion changes; see report",
 }
-"""Of each source: how it is told from the others, and what helps."""
+"""Each source of an error: how it is told from the others, and what helps."""
 
 
 @dataclass(frozen=True)

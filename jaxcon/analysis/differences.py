@@ -12,7 +12,7 @@ import numpy as np
 from jaxcon.core.typing import Array
 
 LEVELS = 10
-"""Of differences, each with half the step of the one before."""
+"""The number of differences, each with half the step of the one before."""
 ROUNDING = 64
 """What a long computation makes of the rounding of one number, in spacings of the result."""
 

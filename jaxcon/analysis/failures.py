@@ -50,12 +50,12 @@ class Failure:
 
     @property
     def term(self) -> str:
-        """Of the first finding."""
+        """The term of the first finding."""
         return self.findings[0].term
 
     @property
     def name(self) -> str:
-        """Of the first finding."""
+        """The name in the first finding."""
         return self.findings[0].name
 
     def __str__(self) -> str:
@@ -146,7 +146,7 @@ def _replay(
 
 
 def _wrong(codes: Array) -> Array:
-    """Whether a step failed, or would have but for a repair."""
+    """Returns True where a step failed, or would have but for a repair."""
     return failed(codes) | (codes == Status.ROLLED_BACK) | (codes == Status.PROJECTED)
 
 

@@ -14,7 +14,7 @@ from jaxcon.analysis.listing import LEGEND, table
 from jaxcon.simulation.method import Method
 
 OK = "ok"
-"""Of a run that neither failed nor left its bounds."""
+"""The outcome of a run that neither failed nor left its bounds."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Run:
 
     @property
     def ok(self) -> bool:
-        """Whether it did not diverge."""
+        """Returns True where it did not diverge."""
         return self.outcome == OK
 
     def plain(self) -> dict[str, Any]:
@@ -284,7 +284,7 @@ class Tradeoff:
 
 
 def front_of(runs: Iterable[Run]) -> tuple[Run, ...]:
-    """Of some runs those that no other one beats in both error and cost, the cheapest first."""
+    """Returns the runs that no other one beats in both error and cost, the cheapest first."""
     found: list[Run] = []
     able = [run for run in runs if run.ok and math.isfinite(run.cost)]
     for run in sorted(able, key=lambda run: (run.cost, run.error)):

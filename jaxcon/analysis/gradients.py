@@ -1,4 +1,4 @@
-"""Whether the derivatives of a function are right: both modes against differences. Host code."""
+"""Checks of derivatives: both modes against differences. Host code."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ class LeafGradient:
 
     @property
     def undecided(self) -> bool:
-        """Whether the differences are too inexact to tell."""
+        """Returns True where the differences are too inexact to tell."""
         return not self._largest(self.uncertainty) <= self.tolerance
 
     @property
     def agrees(self) -> bool:
-        """Whether all three agree, NaN being no agreement."""
+        """True where all three agree; NaN never agrees."""
         return self.modes_apart <= self.tolerance and self.error <= self.tolerance
 
     @property
     def ok(self) -> bool:
-        """Whether they agree and the differences could tell."""
+        """Returns True where they agree and the differences could tell."""
         return self.agrees and not self.undecided
 
     def _beyond(self, *modes: np.ndarray) -> float:
@@ -121,7 +121,7 @@ class GradientCheck:
 
     @property
     def ok(self) -> bool:
-        """Whether every leaf is right."""
+        """Returns True where every leaf is right."""
         return all(leaf.ok for leaf in self.leaves)
 
     @property
@@ -243,7 +243,7 @@ def _scale(result: tuple[np.ndarray, ...], hidden: float, alone: bool) -> np.nda
 
 
 def _name(path: Any) -> str:
-    """Of a leaf, such as "params.rod.length"."""
+    """Returns the name of a leaf, such as "params.rod.length"."""
     return jax.tree_util.keystr(path, simple=True, separator=".") or "x"
 
 
@@ -265,12 +265,12 @@ def _weighted(f: Callable[[Any], PyTree], results: list[Any], random: Any) -> Ca
 
 
 def _is_floating(x: Any) -> bool:
-    """Whether it has real numbers, and not none of them."""
+    """Returns True where it has real numbers, and not none of them."""
     return bool(checks.is_floating(x) and np.prod(np.shape(x)) > 0)
 
 
 def _directions(leaf: Array, count: int, random: Any) -> Array:
-    """Of one leaf, (n, …), each as long as the leaf, or as 1 where it vanishes."""
+    """Returns random directions (n, …) of a leaf, as long as the leaf, or 1 where it is zero."""
     size = float(jnp.max(jnp.abs(leaf), initial=0)) or 1.0
     if leaf.size <= count:
         ways = np.eye(leaf.size)

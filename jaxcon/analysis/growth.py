@@ -151,7 +151,7 @@ def gradient_growth(
 
 
 def _exponent(time: np.ndarray, growth: np.ndarray) -> float:
-    """Of the second half of what is a number, and neither nothing any more [1/s]."""
+    """Returns the rate of growth over the second half of the positive numbers [1/s]."""
     told = np.isfinite(growth) & (growth > 0)
     time, size = time[told], np.log(growth[told])
     half = len(time) // 2

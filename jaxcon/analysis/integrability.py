@@ -1,4 +1,4 @@
-"""Whether rows of velocities amount to relations between positions (chapter 3.8.1)."""
+"""Integrability: rows of velocities that amount to relations between positions (chapter 3.8.1)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Integrability:
 
     @property
     def integrable(self) -> bool:
-        """Whether brackets of allowed motions are allowed motions (Frobenius)."""
+        """Returns True where brackets of allowed motions are allowed motions (Frobenius)."""
         return len(self.around) == 1
 
     @property

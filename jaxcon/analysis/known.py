@@ -68,7 +68,7 @@ class Known:
         batch: int = 1,
         measured: bool = True,
     ) -> Known:
-        """The same from what a user gives."""
+        """Returns what is known of the system, state, method and step that a user gives."""
         system = at(system, state, "jc.report(system, s)")
         if dt is not None:
             checks.check("report", "dt", dt, (), above=0)
@@ -89,7 +89,7 @@ class Known:
 
     @cached_property
     def even(self) -> UnitRows:
-        """The same if all bodies had one mass and kept their radii of gyration."""
+        """The rows as they would be if all bodies had one mass and kept their radii of gyration."""
         if not hasattr(self.system, "inertia"):
             return self.unit
         groups = tuple(
@@ -150,7 +150,7 @@ class Known:
 
     @cached_property
     def passing(self) -> bool:
-        """Whether fewer rows depend on each other beside this position, where it can be left."""
+        """True where fewer rows depend on each other beside this position, which can be left."""
         _, s, vt = self.unit.svd
         free = vt[int(np.sum(s > self.unit.tolerance)) :]
         if not self.dependent or not len(free):

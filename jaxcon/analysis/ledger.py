@@ -26,7 +26,7 @@ from jaxcon.simulation.method import Method
 
 OWNER = "tradeoff"
 ROOT = Path(files.__file__).parents[1]
-"""Of the package."""
+"""The folder of the package."""
 SLOWER = 1.3
 """How much longer a piece of work may take than the longest one before it."""
 FIRST = 5
@@ -68,7 +68,7 @@ class Ledger:
 
     @classmethod
     def open(cls, file: str | Path | None, course: Course, batch: int) -> Ledger:
-        """That of a file, where there is one, or a new one.
+        """Returns the ledger of a file, where there is one, or a new one.
 
         Raises:
             ValueError: the file holds another comparison; the message says what is not the same.
@@ -164,7 +164,7 @@ class Clock:
         return SLOWER * self.longest.get(work, FIRST * max(self.longest.values(), default=0.0))
 
     def lasts(self, work: str, share: float = 1.0) -> bool:
-        """Whether a share of the budget lasts for one more piece of this kind of work."""
+        """Returns True where a share of the budget lasts for one more piece of this work."""
         return self.spent + self.asks(work) < share * self.budget
 
     @contextlib.contextmanager

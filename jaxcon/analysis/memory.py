@@ -43,7 +43,7 @@ class Memory:
     shared: float
 
     def of(self, worlds: int) -> float:
-        """Of a step of so many worlds, their states included [B].
+        """Returns the memory of a step of some worlds, their states included [B].
 
         Args:
             worlds: how many.
@@ -106,7 +106,7 @@ class GradientMemory:
     shared: float
 
     def of(self, worlds: int, steps: int, adjoint: Any = EVERY_STEP) -> float:
-        """Of a batch, what is recorded and given as control not counted [B].
+        """Returns the memory of a batch, without what is recorded and given as control [B].
 
         Args:
             worlds: of the batch.

@@ -18,7 +18,7 @@ from jaxcon.simulation.method import Method
 from jaxcon.simulation.rollout import rollout
 
 STEPS = 32
-"""Of a probe; what a start was off is gone after the first half of them under default gains."""
+"""The steps of a probe; a start that is off is corrected in the first half by default gains."""
 
 
 @dataclass(frozen=True)

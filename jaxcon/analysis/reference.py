@@ -26,7 +26,7 @@ GOOD = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Errors, of the size of the motion, up to which a part is compared: the least with which at least
 half of the horizon is, or the largest."""
 REST = 1e-4
-"""Of the energy, what a scene that hardly moves may gain before it counts as diverged."""
+"""The share of its energy that a scene at rest may gain before it counts as diverged."""
 ON = 1e-10
 """φ and φ̇ up to which a start is on its constraints, of 1 + max |q| and 1 + max |v|."""
 
@@ -68,7 +68,7 @@ class Ruler:
 
     @classmethod
     def of(cls, observe: Observer, problem: Problem) -> Ruler:
-        """That of a problem."""
+        """Returns the ruler of a problem."""
         with precision(np.float64):
             return cls(observe.system, cast(problem.start.q, np.float64))
 
@@ -87,7 +87,7 @@ class Ruler:
         return far, turned
 
     def size(self, q: np.ndarray) -> float:
-        """Of a motion through configurations (n, n_q) [m]: where places lie, and k."""
+        """Returns the size of a motion through configurations (n, n_q): places and k [m]."""
         if self.layout is None:
             return float(np.max(np.ptp(q, axis=0), initial=0)) or 1.0
         places = [
@@ -150,7 +150,7 @@ class Reference:
 
     @property
     def scale(self) -> float:
-        """Of the energy: how much moves or is exchanged, or may be rounded away at rest [J]."""
+        """The scale of the energy: what moves or is exchanged, or may be rounded away [J]."""
         energy = self.seen.energy
         moved = max(float(np.max(self.seen.kinetic)), float(np.ptp(energy)))
         return max(moved, REST * float(np.max(np.abs(energy))))
@@ -176,7 +176,7 @@ def started(problem: Problem, observe: Observer) -> tuple[Problem, float]:
 
 
 def method_for(system: Any) -> Method:
-    """That of the reference: of order six, or beside bounded rows of order four with events."""
+    """Returns the method of the reference: order six, or four with events beside bounded rows."""
     return Method(RK4(), events=Events()) if system.bounds else Method(butcher())
 
 

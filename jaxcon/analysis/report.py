@@ -229,7 +229,7 @@ def report(
 
 
 def _with_method(found: Report, known: Known, measure: bool, timed: bool) -> Report:
-    """The same with what belongs to the method."""
+    """Returns the report with the findings that belong to the method."""
     args = known.system, known.method, known.state, known.control
     gains = None
     if known.dt is not None:

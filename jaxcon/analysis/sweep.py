@@ -28,15 +28,15 @@ OPEN = 0.05
 GAINED = 1.0
 """Difference in energy from which it does, of what moves or is exchanged."""
 BISECTIONS = 4
-"""Of the gap between a stable and an unstable step, on a logarithmic scale."""
+"""The halvings of the gap between a stable and an unstable step, on a logarithmic scale."""
 SHARE = 1 / 60
-"""Of the budget that one run may take."""
+"""The share of the budget that one run may take."""
 ASKED = 1 / 4
-"""Of the budget that all runs of a method may take, also at steps that were asked for."""
+"""The share of the budget that all runs of a method may take, also at steps that were asked for."""
 FEW = 10
 """Steps in a part by which the time of a first run is foretold."""
 NO_GAIN = 0.8
-"""Of the least error so far: a run above that gains nothing by its shorter step."""
+"""The share of the least error so far above which a run gains nothing by its shorter step."""
 REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeError)
 """What a method that does not fit a scene raises."""
 
@@ -73,7 +73,7 @@ class Sweep:
 
     @cached_property
     def ruler(self) -> Ruler:
-        """Of configurations."""
+        """The ruler of configurations."""
         return Ruler.of(self.observe, self.problem)
 
     @property
@@ -113,7 +113,7 @@ class Sweep:
         return Unit(timed, limit, left)
 
     def gradients(self, unit: Unit) -> Unit:
-        """The same with the costs of gradients."""
+        """Returns the unit with the costs of gradients."""
         able = [run for run in unit.runs if run.ok]
         one = able[0]
         assert one.method is not None
@@ -174,7 +174,7 @@ class Sweep:
         return Run(*known, note=note, method=method)
 
     def _outcome(self, trip: Trip) -> tuple[str, float]:
-        """Whether a trip stayed within its bounds, in words, and how far its energy is off [J]."""
+        """Returns in words how a trip ended, and how far its energy is off [J]."""
         points, reference = trip.points, self.reference
         if trip.failed:
             code = trip.status.name if trip.status else Status.NON_FINITE.name

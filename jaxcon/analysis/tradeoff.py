@@ -25,9 +25,9 @@ from jaxcon.simulation.method import Method, check_method
 DTYPES = ("float64", "float32")
 NO_TIME = "no time was left of the budget"
 REFERENCE_SHARE = 0.1
-"""Of the budget that the runs of the reference may take."""
+"""The share of the budget that the runs of the reference may take."""
 RUNS_SHARE = 0.7
-"""Of the budget after which none but gradients are begun, where the rest lasts for one."""
+"""The share of the budget after which only gradients are begun, where the rest lasts for one."""
 
 
 def tradeoff(
@@ -166,7 +166,7 @@ def _go(
 
 
 def _by_use(ledger: Ledger, wanted: list[Wanted]) -> list[Wanted]:
-    """Of what was measured and did not diverge everywhere, what is on the front first."""
+    """Returns what was measured and did not diverge everywhere, what is on the front first."""
     able = [one for one in wanted if one in ledger and any(run.ok for run in ledger[one].runs)]
     front = {(x.name, x.dtype) for x in front_of(run for one in able for run in ledger[one].runs)}
     return sorted(able, key=lambda one: (one.name, one.dtype) not in front)

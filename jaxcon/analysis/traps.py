@@ -36,7 +36,7 @@ MOVING = 1e-3
 WEAK = 1e-2
 """Singular value of n unit rows, times n, below which a direction is nearly lost."""
 CURVED = 0.1
-"""Of φ, what one linear correction may leave before the way is called curved."""
+"""The share of φ that one linear correction may leave before the way is called curved."""
 SUDDEN = 0.5
 """h β from which on feedback takes an error away in about one step."""
 DEARER = 3.0
@@ -245,7 +245,7 @@ def iterations(known: Known) -> str | None:
 
 
 def _swept(known: Known, rounds: int) -> str | None:
-    """The same of conjugate gradients."""
+    """Returns the warning of more conjugate gradients than bring anything, or None."""
     n, efforts, better = known.rows.layout.size, known.choice.efforts, words(known.choice.solver)
     if 0 < 2 * n + 10 < rounds:
         return (
@@ -358,7 +358,7 @@ def _counted(method: Method) -> list[tuple[Any, str, int]]:
 
 
 def _linear(known: Known) -> bool:
-    """Whether the method makes one linear correction of a start that is off."""
+    """Returns True where the method makes one linear correction of a start that is off."""
     stabilizer = known.method.stabilizer
     if "position" in stabilizer.corrects:
         return getattr(stabilizer, "iterations", 1) == 1

@@ -25,7 +25,7 @@ from jaxcon.simulation.method import Method
 from jaxcon.simulation.step import step_quietly
 
 PARTS = 10
-"""Of a horizon, unless its control inputs change more often."""
+"""The number of parts of a horizon, unless its control inputs change more often."""
 
 
 class Points(NamedTuple):
@@ -38,7 +38,7 @@ class Points(NamedTuple):
 
     @classmethod
     def of(cls, state: State) -> Points:
-        """Those of one state, or of a trajectory."""
+        """Returns the points of one state, or of a trajectory."""
         counted = jax.tree.leaves(state.turns)
         turns = counted[0] if counted else np.zeros((*np.shape(state.time), 0))
         return cls(state.q, state.v, state.time, turns)
@@ -65,7 +65,7 @@ class Inputs:
 
     @classmethod
     def of(cls, system: Any, controls: Any, hold: float | None, horizon: float) -> Inputs:
-        """Those that a user gave.
+        """Returns the controls that a user gave.
 
         Raises:
             ValueError: no array by time, or a function without the time for which it is held.
@@ -128,7 +128,7 @@ class Problem:
 
     @property
     def parts(self) -> int:
-        """Of the horizon."""
+        """The number of parts of the horizon."""
         return self.inputs.parts
 
     def dt(self, count: int) -> float:
@@ -156,7 +156,7 @@ class Trip:
 
     @property
     def failed(self) -> bool:
-        """Whether it stopped, or is not finite."""
+        """Returns True where it stopped, or is not finite."""
         finite = all(np.all(np.isfinite(x)) for x in (self.points.q, self.points.v))
         return bool(failed(jnp.asarray(int(self.status)))) or not finite
 

@@ -21,7 +21,7 @@ WORLDS = 128
 DT = 1e-3
 """A step [s]; costs do not depend on it."""
 REPEATS, LONG = 5, 0.02
-"""Of what is timed, and how long each is at least [s]."""
+"""The number of repeats of what is timed, and how long each is at least [s]."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class Constraint(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the constraints."""
+        """The names of the constraints."""
         ...
 
     def rows(self, snapshot: Any) -> RowSet:

@@ -33,7 +33,7 @@ class BoundLayout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the elements, in the order of their rows."""
+        """The names of the elements, in the order of their rows."""
         return tuple(name for name, *_ in self.entries)
 
     def rows(self, name: str) -> np.ndarray:

@@ -74,7 +74,7 @@ class BoundSet(NamedTuple):
 
     @property
     def hard(self) -> bool:
-        """Whether it answers an impact by an impulse, as no friction, motor or spring does."""
+        """True where it answers an impact by an impulse, as no friction, motor or spring does."""
         return self.law != "box" and isinstance(self.compliance, float)
 
 
@@ -83,7 +83,7 @@ class BoundGroup(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the elements."""
+        """The names of the elements."""
         ...
 
     def bounds(self, snapshot: Any, control: Any, dt: Any) -> BoundSet:
@@ -394,7 +394,7 @@ def linearize_at_rest(system: Any, q: Array, v: Array) -> BoundRows:
 
 
 def has_ends(system: Any, q: Array, v: Array, t: Any, control: Any, dt: Any) -> bool:
-    """Whether a system has hard stops, ropes or contacts: rows that make impacts."""
+    """Returns True where a system has hard stops, ropes or contacts: rows that make impacts."""
     if not system.bounds:
         return False
     return any(jax.eval_shape(linearize_bounds, system, q, v, t, control, dt).ends)

@@ -123,7 +123,7 @@ class Compound:
         return self.kind.coordinates
 
     def rows(self, p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """Those of joints of this kind."""
+        """Returns the rows of joints of this kind."""
         return self.kind.rows(p, a, b)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:

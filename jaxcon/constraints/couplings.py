@@ -50,7 +50,7 @@ class Pair:
     coordinate_a: str | None
     coordinate_b: str | None
     linear = True
-    """Whether φ is a sum of multiples of the coordinates."""
+    """True where φ is a sum of multiples of the coordinates."""
 
     @property
     def along(self) -> tuple[tuple[str, str | None], ...]:

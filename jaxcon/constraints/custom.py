@@ -96,7 +96,7 @@ class Custom:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the constraint."""
+        """The name of the constraint, alone in a tuple."""
         return (self.law.name,)
 
     @property

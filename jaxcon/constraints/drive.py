@@ -62,7 +62,7 @@ class Drives:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the constraint."""
+        """The name of the constraint, alone in a tuple."""
         return (self.law.name,)
 
     def get(self, i: int) -> dict[str, Any]:

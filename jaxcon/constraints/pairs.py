@@ -196,7 +196,7 @@ class Screw(Cylindrical):
     lead: Any = None
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """That of the sleeve, and the lead."""
+        """Returns the numbers of the sleeve, and the lead."""
         if self.lead is None:
             raise ValueError(f"{label(self)}: a lead is needed, the travel in one turn [m].")
         lead = checks.real(label(self), "lead", self.lead, a.position.dtype)
@@ -205,7 +205,7 @@ class Screw(Cylindrical):
 
     @staticmethod
     def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """Those of the sleeve, and s − lead θ/2π = 0."""
+        """Returns the rows of the sleeve, and s − lead θ/2π = 0."""
         s, θ = Prismatic.coordinate("travel", p, a, b), turn_about(p, a, b)
         rise = p["lead"] / (2 * jnp.pi)
         thread = Row(

@@ -17,7 +17,7 @@ from jaxcon.model.elements import Grid, label, own_point
 from jaxcon.model.layout import Place
 
 AXES = ("axis_x", "axis_y", "axis_z")
-"""Of a frame that an element fixes to its body."""
+"""The axes of a frame that an element fixes to its body."""
 
 
 def box_corners(size: Any, position: Any = None, orientation: Any = None) -> Array:
@@ -146,12 +146,12 @@ def _orientation(owner: str, what: str, given: Any, dim: int, dtype: Any) -> Arr
 
 
 def _signs(dim: int) -> np.ndarray:
-    """Of the corners of a box, (2^dim, dim)."""
+    """Returns the signs of the corners of a box, (2^dim, dim)."""
     return np.array(list(itertools.product((-1.0, 1.0), repeat=dim)))
 
 
 def _several(points: Any) -> bool:
-    """Whether these are the points of a set."""
+    """Returns True where these are the points of a set."""
     try:
         return points is not None and jnp.asarray(points).ndim == 2
     except (TypeError, ValueError, OverflowError):

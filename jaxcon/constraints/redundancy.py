@@ -1,4 +1,4 @@
-"""Whether the structure of a scene allows its rows to depend on each other."""
+"""Structures of scenes whose rows may depend on each other."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ WORLD = -1
 
 
 def has_loops(sets: Iterable[RowSet]) -> bool:
-    """Whether constraints close a loop of bodies, or two of them act on the same ones.
+    """Returns True where constraints close a loop of bodies, or two of them act on the same ones.
 
     In a tree of joints no row depends on another. What acts along a freedom that a joint leaves, a
     drive or a rotor, closes no loop.

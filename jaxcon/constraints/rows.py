@@ -52,12 +52,12 @@ class RowLayout:
 
     @property
     def holonomic(self) -> np.ndarray:
-        """Whether each row has a φ, (n_c,)."""
+        """A mask of the rows that have a φ, (n_c,)."""
         return ~np.isin(np.arange(self.size), self.free)
 
     @property
     def holds(self) -> np.ndarray:
-        """Whether each row takes away a freedom, (n_c,): all do but those of rotors."""
+        """A mask of the rows that take away a freedom, (n_c,): all but those of rotors."""
         holds = np.ones(self.size, bool)
         for name in self.inertial:
             holds[self.rows(name)] = False
@@ -70,7 +70,7 @@ class RowLayout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the constraints, in the order in which they were grouped."""
+        """The names of the constraints, in the order in which they were grouped."""
         return tuple(name for name, *_ in self.entries)
 
     def rows(self, name: str) -> np.ndarray:
@@ -182,7 +182,7 @@ class Rows:
         return Violation(self.residual, self.rate, self.layout)
 
     def earlier(self, age: Array) -> Rows:
-        """The same with the rates at t − age, () [s], had v always been what it is.
+        """Returns the rows with their rates at t − age, () [s], had v always been what it is.
 
         φ̇(q ⊖ age v, v, t − age) = φ̇ − age γ to first order. Rows of velocities alone hold ψ at q
         itself, and rotors hold nothing: theirs are as they are.
@@ -193,7 +193,7 @@ class Rows:
         return dataclasses.replace(self, rate=rate)
 
     def only(self, kept: np.ndarray) -> Rows:
-        """The same rows, of which those that are not kept, (n_c,), say λ = b and act on nothing."""
+        """Returns the rows; those that are not kept, (n_c,), say λ = b and act on nothing."""
         if kept.all():
             return self
         open_ = jnp.asarray(~kept, self.bias.dtype).reshape(-1, *(1,) * (self.bias.ndim - 1))

@@ -86,7 +86,7 @@ def read(file: Path, like: PyTree, about: Mapping[str, Any], owner: str) -> PyTr
 
 
 def digest(*parts: Any) -> str:
-    """Of texts and arrays, to tell whether they are the same."""
+    """Returns a digest of texts and arrays, to tell whether they are equal."""
     raw = (x.encode() if isinstance(x, str) else numbers(x).tobytes() for x in parts)
     return hashlib.sha256(b"".join(raw)).hexdigest()
 

@@ -78,7 +78,7 @@ class Checked:
 
 
 def is_floating(x: Any) -> bool:
-    """Whether a leaf is a real number, or an array of such; a name of a dtype is none."""
+    """Returns True for a real number or an array of such; the name of a dtype is none."""
     return isinstance(x, float) or jnp.issubdtype(getattr(x, "dtype", bool), jnp.floating)
 
 
@@ -92,7 +92,7 @@ def chosen_dtype(*trees: Any) -> Any:
 
 
 def plain_zero(x: Any) -> bool:
-    """Whether a user gave the number 0 itself, which leaves no trace in the compiled step."""
+    """Returns True for the plain number 0, which leaves no trace in the compiled step."""
     return isinstance(x, int | float) and not isinstance(x, bool) and x == 0
 
 
@@ -413,6 +413,6 @@ def described(tree: PyTree) -> str:
 
 
 def fits(shape: tuple[int, ...], into: tuple[int, ...]) -> bool:
-    """Whether an array broadcasts to a shape, and that shape to none larger."""
+    """Returns True where an array broadcasts to a shape, and that shape to none larger."""
     pairs = zip(reversed(shape), reversed(into), strict=False)
     return len(shape) <= len(into) and all(n in (1, m) for n, m in pairs)

@@ -1,4 +1,4 @@
-"""Whether a function reads its argument, found by tracing it."""
+"""Dependence of a function on its argument, found by tracing it."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,5 +9,5 @@ from jaxcon.core.jaxprs import read_arguments
 
 
 def depends(function: Callable[[Any], Any], x: Any) -> bool:
-    """Whether some number in the result of function(x) is computed from the numbers in x."""
+    """Returns True where the result of function(x) depends on some number in x."""
     return any(read_arguments(jax.make_jaxpr(function)(x).jaxpr))

@@ -15,7 +15,7 @@ SHARED, APART = PartitionSpec(), PartitionSpec("worlds")
 
 
 def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
-    """The same batch with equal parts of its worlds, the first axis, on each device.
+    """Returns the batch with equal parts of its worlds, the first axis, on each device.
 
     What `jit(vmap(f))` makes of it stays there, and nothing is exchanged: loops and branches of a
     method ask on each device of its own worlds alone. Gradients by numbers that worlds share are
@@ -76,7 +76,7 @@ def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Call
 
 
 def gathered(tree: PyTree, mesh: Mesh) -> PyTree:
-    """The same tree, all of it on every device, inside `jit`."""
+    """Returns the tree with all of it on every device, inside `jit`."""
     return jax.lax.with_sharding_constraint(tree, NamedSharding(_line(mesh), SHARED))
 
 

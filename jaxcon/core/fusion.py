@@ -45,7 +45,7 @@ MOVES = _names(
 """Operations that compute nothing: kernels read through them."""
 
 MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice")
-"""Those of which an entry of the result may be another entry of the operand."""
+"""The primitives whose result has entries from other places of the operand."""
 
 ARITHMETIC = _names(
     "add sub mul neg abs sign square integer_pow max min and or not xor eq ne lt le gt ge"
@@ -95,7 +95,7 @@ def settled(
 
 
 def staged() -> bool:
-    """Whether functions are cut into stages, rather than left to the compiler as they are."""
+    """Returns True where functions are cut into stages, and not left to the compiler whole."""
     return os.environ.get("JAXCON_STAGES") != "off"
 
 
@@ -181,7 +181,7 @@ class Stages:
         values.update(zip(wanted, results, strict=True))
 
     def _may_overwrite(self, known: Any, wanted: list[int]) -> bool:
-        """Whether something is moved in whose place a result of a stage would fit."""
+        """Returns True where something is moved in whose place a result of a stage would fit."""
         sizes = {self.program.sizes[x] for x in wanted}
         operations = self.program.between(known, wanted)[1]
         moved = (x for op in operations if op.name in MOVED for x in op.inputs)
@@ -293,7 +293,7 @@ def _operations(program: Program, step: Step) -> list[Operation]:
 
 
 def _acts(part: list[Step]) -> bool:
-    """Whether it does something besides computing, such as printing."""
+    """Returns True where it does something besides computing, such as printing."""
     return any(isinstance(step, Operation) and step.effects for step in part)
 
 
@@ -303,7 +303,7 @@ def _values(step: Step) -> list[int]:
 
 
 def _fits(step: Step) -> bool:
-    """Whether a kernel may contain it."""
+    """Returns True where a kernel may contain it."""
     return not isinstance(step, Operation) or (step.name in OTHERS and step.plain)
 
 
@@ -313,7 +313,7 @@ def _computes(op: Operation, name: int) -> bool:
 
 
 def _elementwise(op: Operation) -> bool:
-    """Whether it becomes a part of the kernels that read it."""
+    """Returns True where it becomes a part of the kernels that read it."""
     return op.plain and (op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY)
 
 

@@ -257,7 +257,7 @@ def collect(terms: list[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
 
 
 def _gathered(lanes: list[Array], own: list[list[tuple[int, int]]], shape: Any) -> Array:
-    """The same from one array of all terms and a row of zeros, by as many gathers as needed."""
+    """Sums lanes by as many gathers as needed from one array of all terms and a row of zeros."""
     rows = [jnp.broadcast_to(x, (x.shape[0], *shape)) for x in lanes]
     every = jnp.concatenate([*rows, jnp.zeros((1, *shape), rows[0].dtype)])
     first = np.cumsum([0, *(len(x) for x in rows)])

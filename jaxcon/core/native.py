@@ -42,7 +42,7 @@ _TRANSPOSED = ContextVar("transposed", default=False)
 
 
 def order() -> int:
-    """Of the derivative of a native function that is being traced: 0 for the function itself."""
+    """Returns the order of the derivative being traced: 0 for the native function itself."""
     return _ORDER.get()
 
 
@@ -123,7 +123,7 @@ class Tangent(Native):
         self.places = [i for i, flag in enumerate(moved) if flag]
 
     def shapes(self, args: Sequence[Array]) -> list[Any]:
-        """Those of the floating results, as the whole has been traced already."""
+        """Returns the shapes of the floating results, as the whole has been traced already."""
         given: list[Any] = list(args[: self.count])
         for i, x in zip(self.places, args[self.count :], strict=True):
             shape = jnp.broadcast_shapes(x.shape, given[i].shape)
@@ -162,7 +162,7 @@ class Transposed(Native):
         self.fixed = linear.count(False)
 
     def shapes(self, args: Sequence[Array]) -> list[Any]:
-        """Those of the arguments in which it is linear."""
+        """Returns the shapes of the arguments in which it is linear."""
         return [ShapedArray(x.shape, x.dtype) for x in self._arguments(args)]
 
     def _arguments(self, args: Sequence[Array]) -> list[Any]:
@@ -195,7 +195,7 @@ class Part(Native):
         self.whole, self.wanted = whole, wanted
 
     def shapes(self, args: Sequence[Array]) -> list[Any]:
-        """Those of the wanted results."""
+        """Returns the shapes of the wanted results."""
         return self._among_wanted(self.whole.shapes(args))
 
     def _chosen(self, *args: Array) -> list[Array]:
@@ -258,7 +258,7 @@ def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> Py
 
 
 def is_real(x: Any) -> bool:
-    """Whether it is of floating numbers, which have derivatives."""
+    """Returns True where it is of floating numbers, which have derivatives."""
     return jnp.issubdtype(x.dtype, jnp.inexact)
 
 

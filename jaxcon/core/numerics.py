@@ -110,7 +110,7 @@ def inverse_exponential(square: Lane) -> Array:
 
 
 def all_finite(tree: PyTree) -> Array:
-    """Whether every number of a tree is, ()."""
+    """Returns True where every number of a tree is finite, ()."""
     good = jnp.ones((), bool)
     for x in jax.tree.leaves(tree):
         good &= jnp.all(jnp.isfinite(x))

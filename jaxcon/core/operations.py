@@ -135,7 +135,7 @@ def called_by(equation: Any, inputs: list[int]) -> tuple[Any, list[int]] | None:
 
 
 def parameters(equation: Any) -> Any:
-    """Those of an equation, to be compared; none like them where they cannot be."""
+    """Returns the parameters of an equation, to be compared; a new object where they cannot be."""
     params = tuple(sorted(equation.params.items()))
     try:
         hash(params)
@@ -145,7 +145,7 @@ def parameters(equation: Any) -> Any:
 
 
 def operations(equation: Any, branch: Branch = max) -> float:
-    """Of one equation; a loop of unknown length counts as one round."""
+    """Returns the operations of one equation; a loop of unknown length counts as one round."""
     name, params = equation.primitive.name, equation.params
     if name == "scan":
         return params["length"] * count(params["jaxpr"].jaxpr, branch)
@@ -177,7 +177,7 @@ def inside(equation: Any) -> Iterator[Any]:
 
 
 def arithmetic(equation: Any) -> float:
-    """Of one instruction, by its size."""
+    """Returns the arithmetic of one instruction, by its size."""
     if not equation.outvars:
         return 0.0
     name, result = equation.primitive.name, equation.outvars[0].aval

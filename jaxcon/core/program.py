@@ -61,7 +61,7 @@ class Operation:
 
     @property
     def name(self) -> str:
-        """Of the primitive."""
+        """The name of the primitive."""
         return self.primitive.name
 
     def __call__(self, operands: list[Any]) -> list[Any]:
@@ -370,5 +370,5 @@ def _key(primitive: Any, params: Any, args: list[Operand]) -> Any:
 
 
 def _is_key(x: Any) -> bool:
-    """Whether it is a random key, or another array without numbers."""
+    """Returns True where it is a random key, or another array without numbers."""
     return jnp.issubdtype(getattr(x, "dtype", np.float32), jax.dtypes.extended)

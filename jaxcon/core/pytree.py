@@ -134,7 +134,7 @@ class Parts:
 
     @classmethod
     def of(cls, tree: Any) -> "Parts":
-        """Those of a tree, of which shapes and dtypes are enough."""
+        """Returns the parts of a tree, of which shapes and dtypes are enough."""
         leaves, structure = jax.tree.flatten(tree)
         return cls(
             structure, tuple(jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in leaves)

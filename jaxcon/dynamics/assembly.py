@@ -21,7 +21,7 @@ from jaxcon.dynamics import nearest
 from jaxcon.model.state import State, recall
 
 SHARE = 1e-3
-"""Of the worst constraint, from which another one is reported as unmet, too."""
+"""The share of the worst constraint from which another one is reported as unmet, too."""
 
 
 @pytree
@@ -60,7 +60,7 @@ class Assembly:
 
     @property
     def converged(self) -> Array:
-        """Whether every constraint is met, ()."""
+        """Returns True where every constraint is met, ()."""
         return self.status == Status.OK
 
     @property

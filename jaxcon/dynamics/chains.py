@@ -281,7 +281,7 @@ def _points(scene: Scene, owner: str, points: Any) -> tuple[Any, Any]:
 
 
 def _angles(gaps: np.ndarray) -> np.ndarray:
-    """Of links in the plane, without jumps [rad]."""
+    """Returns the angles of links in the plane, without jumps [rad]."""
     return np.unwrap(np.arctan2(gaps[:, 1], gaps[:, 0]))
 
 

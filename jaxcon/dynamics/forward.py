@@ -84,7 +84,7 @@ class Dynamics:
         return impacts.with_jump(solution, impacts.jump_of(rows.reactions), self.dt), rows
 
     def begun(self, q: Array, v: Array, t: Any) -> tuple[Solution, Rows, Dynamics]:
-        """The same at the start of a step, and what the rest of it sees.
+        """Returns a and λ and the rows at the start of a step, and what the rest of it sees.
 
         Bounded rows contain the step: they are solved once, and act as a force that stays. Impacts
         are none: they are the `jump` of the reactions, for the end of the step.
@@ -300,7 +300,7 @@ class Dynamics:
         return dataclasses.replace(known, residual=jnp.maximum(known.residual, missed))
 
     def _leaves_out(self, rows: BoundRows) -> bool:
-        """Whether only some of the rows are solved."""
+        """Returns True where only some of the rows are solved."""
         return isinstance(self.bounded, Nearest) and self.bounded.leaves_out(rows.kinds)
 
     def _factors(self, law: Any, problem: Saddle) -> Factored:

@@ -75,7 +75,7 @@ class Sliding:
 
     @classmethod
     def of(cls, rows: BoundRows, open_: Array, bend: Array, rounding: Array, dt: Array) -> Sliding:
-        """Those of closed contacts; what cannot be told from rolling is none."""
+        """Returns the sliding of closed contacts; what cannot be told from rolling is none."""
         kinds, near = rows.kinds, rows.gap <= jnp.maximum(bend, rounding[None])
         slip, speeds = kinds.split(rows.rate).discs[0], kinds.split(bend).normal
         speed = numerics.norm(slip)
@@ -118,7 +118,7 @@ class Outlook:
     sliding: Sliding | None = None
 
     def watched(self, dt: Array) -> Outlook:
-        """The same of gaps and, behind them, of slips that end, see `Sliding.clearance`."""
+        """Returns the outlook on gaps and, behind them, on slips; see `Sliding.clearance`."""
         if self.sliding is None:
             return self
         speed = self.sliding.speed

@@ -14,7 +14,7 @@ from jaxcon.core.typing import Array
 from jaxcon.model.state import State
 
 SHARE = 1e-2
-"""Of the largest entry, from which a part that least squares leave is called a conflict."""
+"""The share of the largest entry above which a remainder of least squares is a conflict."""
 
 
 class UnitRows:

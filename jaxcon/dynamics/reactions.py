@@ -68,7 +68,7 @@ class Impulse:
         acts: Array | None = None,
         sifts: bool = False,
     ) -> Impulse:
-        """That of a step of h, by the factors of its saddle system.
+        """Returns the impulse of a step of h, by the factors of its saddle system.
 
         Args:
             rows: the bounded rows.
@@ -112,7 +112,7 @@ class Impulse:
         return dataclasses.replace(self, rows=rows, answers=answers)
 
     def _by_velocities(self) -> bool:
-        """Whether there are fewer velocities than rows."""
+        """Returns True where there are fewer velocities than rows."""
         return isinstance(self.rows.jacobian, Jacobian) and len(self.start) < len(self.bare)
 
     def _probing(self) -> Array:
@@ -123,7 +123,7 @@ class Impulse:
         return jnp.broadcast_to(unit, (*unit.shape[:2], *self.start.shape[1:]))
 
     def _sifted(self) -> Impulse:
-        """The same, and of the rows only those act that some multipliers of all rows move.
+        """Returns the impulse in which only those rows act that some multipliers move.
 
         As G is not negative, the row of it of one that nothing moves is zero, and so is G z there.
         Where a row does move that is so for hardly any z, and for two of them hardly ever.
@@ -197,7 +197,7 @@ class Impulse:
         return Solution(a[:, 0], multipliers[:, 0], status[0])
 
     def moves(self, matrix: Array) -> Array:
-        """Whether a row acts and moves at all, (n,).
+        """Returns True where a row acts and moves at all, (n,).
 
         It does not move where the equality rows hold it, but for rounding. Such a row, as of two
         points of one body, can be neither met nor missed: it is left out.
@@ -255,7 +255,7 @@ class Impulse:
         return Reactions(found, rows.gap, jnp.max(left, axis=0), kept, None, rows.layout)
 
     def nearest(self, solver: Nearest, guess: Array | None) -> Reactions:
-        """The same for the rows that are nearest to act; others have λ = 0."""
+        """Returns the reactions of the rows that are nearest to act; others have λ = 0."""
         rows, length = self.rows, jnp.sqrt(self.bare)
         distance = numerics.safe_divide(self.led(self.start) - rows.target, length)
         distance = jnp.where(self.acts, distance, jnp.inf)

@@ -77,12 +77,12 @@ class Vakonomic:
 
     @property
     def constraints(self) -> tuple[Any, ...]:
-        """Those of the system."""
+        """The constraints of the system."""
         return self.system.constraints
 
     @property
     def params(self) -> Any:
-        """Those of the system."""
+        """The parameters of the system."""
         return self.system.params
 
     @property
@@ -204,7 +204,7 @@ class Vakonomic:
         return self.system.normalize(q)
 
     def energy(self, q: Array, v: Array, t: Any) -> Energy:
-        """That of the system [J]; μ, whose rows are homogeneous in v, adds none."""
+        """Returns the energy of the system [J]; μ, whose rows are homogeneous in v, adds none."""
         return self.system.energy(q, self._split(v)[0], t)
 
     def motion(self, name: str, q: Array, v: Array) -> Motion:
@@ -264,5 +264,5 @@ def vakonomic(
 
 
 def _takes(layout: RowLayout, name: str) -> bool:
-    """Whether a constraint has a row without a φ."""
+    """Returns True where a constraint has a row without a φ."""
     return not np.all(layout.holonomic[layout.rows(name)])

@@ -21,7 +21,7 @@ except ImportError as error:
     raise ImportError("Gymnasium's interfaces need gymnasium: pip install 'jaxcon[rl]'.") from error
 
 __all__ = ["AutoresetMode", "FuncEnv", "VectorEnv", "batch_space", "gymnasium"]
-"""Of Gymnasium, whose absence only this module explains."""
+"""The names of Gymnasium, whose absence only this module explains."""
 
 PICTURES = "rgb_array"
 

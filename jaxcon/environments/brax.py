@@ -78,5 +78,5 @@ class BraxEnv(Env):
 
     @property
     def dt(self) -> Array:
-        """Of an action [s]."""
+        """The time of an action [s]."""
         return self.sys.dt * self.sys.skip

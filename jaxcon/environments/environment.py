@@ -94,11 +94,11 @@ class Environment:
     skip: int = static()
     horizon: int | None = static()
     at_once: ClassVar[int] = 128
-    """Of many copies on a CPU, how many are simulated at once, at most."""
+    """How many of many copies are simulated at once on a CPU, at most."""
 
     @property
     def dtype(self) -> Any:
-        """Of every number."""
+        """The dtype of every number."""
         return self.system.gravity.dtype
 
     @property
@@ -162,7 +162,7 @@ class Environment:
         raise NotImplementedError
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether the task is over, ().
+        """Returns True where the task is over, ().
 
         Args:
             episode: where it stands.
@@ -248,7 +248,7 @@ class Environment:
         return reward, self.terminal(after) & ~diverged, late | diverged
 
     def info(self, episode: Episode) -> dict[str, Array]:
-        """Whether the world diverged, why, and how far it was off its constraints."""
+        """Returns whether the world diverged, why, and how far it was off its constraints."""
         status = episode.state.status
         return {"diverged": failed(status), "status": status, "violation": episode.violation}
 

@@ -15,7 +15,7 @@ from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Environment, Episode
 
 ITERATIONS = 30
-"""Of Newton's method; each leaves at most a fifth of μ."""
+"""The iterations of Newton's method; each leaves at most a fifth of μ."""
 INWARD = 0.95
 """How far an iteration goes of the way to the nearest bound."""
 

@@ -53,18 +53,18 @@ class FunctionalEnv(FuncEnv):
         return self._of(params).judge(state, action, next_state)[0]
 
     def terminal(self, state: Episode, rng: Any, params: Any = None) -> Array:
-        """Whether the task is over, or the world diverged: there is no other end here."""
+        """Returns True where the task is over, or the world diverged."""
         environment = self._of(params)
         return environment.terminal(state) | environment.info(state)["diverged"]
 
     def state_info(self, state: Episode, params: Any = None) -> dict[str, Array]:
-        """Whether the world diverged, why, and the violation."""
+        """Returns whether the world diverged, why, and the violation."""
         return self._of(params).info(state)
 
     def transition_info(
         self, state: Episode, action: Any, next_state: Episode, params: Any = None
     ) -> dict[str, Array]:
-        """The same after an action."""
+        """Returns `state_info` of the state after an action."""
         return self._of(params).info(next_state)
 
     def render_init(self, params: Any = None, **kwargs: Any) -> Any:

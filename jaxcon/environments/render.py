@@ -10,7 +10,7 @@ from jaxcon import view
 from jaxcon.environments.environment import Environment, Episode
 
 WIDTH, DPI = 4.8, 100
-"""Of a picture [inch], and its dots per inch."""
+"""The size of a picture [inch], and its dots per inch."""
 
 
 def canvas(environment: Environment) -> Any:

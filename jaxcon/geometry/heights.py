@@ -67,7 +67,7 @@ class Surface:
 
     @property
     def steps(self) -> Vector:
-        """Of the grid, along each axis [m]."""
+        """The steps of the grid, along each axis [m]."""
         return Vector(*(x * (1 / (n - 1)) for x, n in zip(self.size, self._counts, strict=True)))
 
     @property
@@ -185,7 +185,7 @@ def _at_edges(w: Vector, first: Array, last: Array) -> Vector:
 
 
 def _square(shape: Shape, place: Vector, point: Vector) -> Array:
-    """Of the distance, ‖x − X‖² + (h − Z)²."""
+    """Returns the square of the distance, ‖x − X‖² + (h − Z)²."""
     aside, off = place - Vector(*point[:-1]), shape.height - point[-1]
     return total(x * x for x in aside) + off * off
 

@@ -99,7 +99,7 @@ def _law(compiled: Compiled, i: int, name: str, transmission: Transmission) -> A
 
 
 def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
-    """Of the actuator and of its joint, before gear: what passes both, one after the other.
+    """Returns the force that passes both the actuator's range and its joint's, before gear.
 
     Raises:
         NotImplementedError: the joint limits the sum of several actuators.
@@ -119,7 +119,7 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
 
 
 def _acts_on(compiled: Compiled, i: int, joint: int) -> bool:
-    """Whether an actuator acts on a joint."""
+    """Returns True where an actuator acts on a joint."""
     m = compiled.model
     kind = compiled.choice("mjtTrn", m.actuator_trntype[i])
     return kind in ("joint", "jointinparent") and int(m.actuator_trnid[i, 0]) == joint

@@ -68,7 +68,7 @@ class Compiled:
                     raise ValueError(f"from_mjcf: the model's {field} must be numbers, got NaN.")
 
     def name(self, kind: str, i: int) -> str:
-        """Of a "body", "joint", "actuator", …; its kind and number where it has none."""
+        """Returns the name of a "body", "joint", …; kind and number where it has none."""
         code = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         return self.mujoco.mj_id2name(self.model, code, i) or f"{kind} {i}"
 
@@ -77,7 +77,7 @@ class Compiled:
         return getattr(self.mujoco, enum)(int(value)).name.split("_", 1)[1].lower()
 
     def disabled(self, *features: str) -> bool:
-        """Whether a flag of the options, or the user, disables one of these features."""
+        """Returns True where a flag of the options, or the user, disables one of these features."""
         if self.ignored.intersection(features):
             return True
         known = self.mujoco.mjtDisableBit.__members__

@@ -40,7 +40,7 @@ class Scalar(NamedTuple):
 
 
 class Numbers(NamedTuple):
-    """Of joints: ids (n,), and where their coordinates begin in qpos and qvel, (n, 1)."""
+    """Numbers of joints: ids (n,), and where their coordinates begin in qpos and qvel, (n, 1)."""
 
     id: np.ndarray
     q: np.ndarray
@@ -70,7 +70,7 @@ class Tree:
     size: int = static()
 
     def poses(self, qpos: Array) -> Pose:
-        """Of the frames of all links, (links, …): a link's parent's, its offset, and its joints.
+        """Returns the frames of all links, (links, …), by parent, offset and joints.
 
         One move after the other in a scan, so that a program does not grow with the model.
         """
@@ -157,7 +157,7 @@ class Tree:
         return slopes
 
     def motions(self, qpos: Array, qvel: Array) -> Motion:
-        """Of the frames of all links, (links, …); ω = 2 q* ⊗ q̇."""
+        """Returns the motions of the frames of all links, (links, …); ω = 2 q* ⊗ q̇."""
         pose, slope = jax.jvp(self.poses, (qpos,), (self.rates(qpos, qvel),))
         spin = quaternion.multiply(quaternion.conjugate(pose.orientation.T), slope.orientation.T)
         return Motion(pose.position, pose.orientation, slope.position, 2 * spin[1:].T)
@@ -225,7 +225,7 @@ class Tree:
 
 
 KINDS = ("slide", "hinge", "ball", "free")
-"""Of joints, in the order in which `Tree._moved` has them."""
+"""The kinds of joints, in the order in which `Tree._moved` has them."""
 
 
 def _of_kind(nodes: tuple[Node, ...], kind: str) -> list[LinkJoint]:

@@ -73,7 +73,7 @@ class MujocoModel:
         return iter((self.system, self.start))
 
     def with_params(self, changes: Mapping[str, Any]) -> MujocoModel:
-        """The same model with other numbers of its system, and its start restated.
+        """Returns the model with other numbers of its system, and its start restated.
 
         Args:
             changes: as of `BodySystem.with_params`; links lie as MuJoCo's bodies do.
@@ -242,7 +242,7 @@ def from_mjcf(
 
 
 def _gravity(compiled: Compiled) -> np.ndarray:
-    """Of the options [m/s²]."""
+    """Returns the gravity of the options [m/s²]."""
     return compiled.model.opt.gravity * (not compiled.disabled("gravity"))
 
 

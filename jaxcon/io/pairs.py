@@ -33,7 +33,7 @@ class Pair(NamedTuple):
 
 
 def pairs(compiled: Compiled) -> list[Pair]:
-    """Those that the model lists, and then those that its filters let through."""
+    """Returns the pairs that the model lists, and then those that its filters let through."""
     if compiled.disabled("contact", "constraint"):
         return []
     margins = Margins(compiled)
@@ -44,7 +44,7 @@ def pairs(compiled: Compiled) -> list[Pair]:
 
 
 def _acts(compiled: Compiled, pair: Pair) -> bool:
-    """Whether the geoms can move in each other and touch, and the user wants it."""
+    """Returns True where the geoms can move in each other and touch, and the user wants it."""
     first, second = _welded(compiled, pair)
     flat = all(kind in FLAT for kind in shapes(compiled, pair))
     left_out = first and second and "self_contact" in compiled.ignored
@@ -63,7 +63,7 @@ def shapes(compiled: Compiled, pair: Pair) -> tuple[str, str]:
 
 
 def supported(compiled: Compiled, pair: Pair) -> bool:
-    """Whether there is a contact for these shapes."""
+    """Returns True where there is a contact for these shapes."""
     first, second = shapes(compiled, pair)
     return second in ON_PLANE if first == "plane" else {first, second} <= set(ROUND)
 
@@ -126,11 +126,11 @@ class Margins:
         self.by_gap = float(seen % 1 != 0)
 
     def of_geoms(self, margin: np.ndarray, gap: np.ndarray) -> float:
-        """Of two geoms, each (2,)."""
+        """Returns the distance at which contact of two geoms begins, from numbers of each, (2,)."""
         return float(self.together(margin) - self.by_gap * self.together(gap))
 
     def of_pair(self, margin: float, gap: float) -> float:
-        """Of a pair that the model lists."""
+        """Returns the distance at which contact of a listed pair begins."""
         return float(margin - self.by_gap * gap)
 
 
@@ -141,6 +141,6 @@ def _ordered(compiled: Compiled, g: int, h: int) -> tuple[int, int]:
 
 
 def _welded(compiled: Compiled, pair: Pair) -> list[Any]:
-    """Of each geom, the body that it moves with; 0 where it does not move."""
+    """Returns the body that each geom moves with; 0 where it does not move."""
     m = compiled.model
     return [int(m.body_weldid[m.geom_bodyid[g]]) for g in pair[:2]]

@@ -109,12 +109,12 @@ Counters = dict[tuple[int, str], dict[int, int]]
 
 
 def numbered(counted: tuple[JointCoordinate, ...]) -> Counters:
-    """The same by joint."""
+    """Returns the counters by joint."""
     return {(c.group, c.name): dict(zip(c.joints, c.counters, strict=True)) for c in counted}
 
 
 def at(counters: Counters, ends: Iterable[End]) -> JointCoordinate:
-    """The same coordinate of several joints of one group, with the counters of its turns."""
+    """Returns one coordinate of several joints of a group, with the counters of its turns."""
     groups, joints, names = zip(*ends, strict=True)
     known = counters.get((groups[0], names[0]), {})
     own = tuple(known[j] for j in joints if j in known)
@@ -122,7 +122,7 @@ def at(counters: Counters, ends: Iterable[End]) -> JointCoordinate:
 
 
 def turns_over(joint: Any, name: str, dim: int) -> bool:
-    """Whether a coordinate is seen modulo whole turns; in the plane angles are coordinates."""
+    """Returns True where a coordinate is seen modulo whole turns; in the plane angles go on."""
     return dim == 3 and joint.coordinates[name] == "rad"
 
 

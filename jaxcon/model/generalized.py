@@ -183,7 +183,7 @@ class GeneralizedCoordinates:
         return Energy(v @ self.mass(q).apply(v) / 2, potential)
 
     def with_params(self, params: PyTree) -> GeneralizedCoordinates:
-        """The same system with other numbers; nothing is retraced by it.
+        """Returns the system with other numbers; nothing is retraced by it.
 
         Args:
             params: where θ is a mapping, as much of it as changes; another θ elsewhere.

@@ -55,7 +55,7 @@ class Changed(NamedTuple):
 
 
 class Shift(NamedTuple):
-    """Those of the bodies on one side of elements: lanes (element,); no turn where none turns."""
+    """Shifts of the bodies on one side of elements: lanes (element,); no turn where none turns."""
 
     position: Vector
     turn: Vector | None
@@ -150,7 +150,7 @@ def moved(element: Any, shifts: Mapping[str, Pose], layout: Layout) -> Any:
 
 
 def restate(state: State, before: Any, after: Any) -> State:
-    """The same motion in coordinates of another system, whose bodies have other principal frames.
+    """Returns the motion in coordinates of a system with other principal frames.
 
     q and v are those of centres of mass and principal axes. After `with_params` has changed
     `center`, `axes` or a full `inertia`, they are others for the same place and motion of the
@@ -234,7 +234,7 @@ def _identity(moments: Array) -> Pose:
 
 
 def _same(x: Any, y: Any) -> bool:
-    """Whether two arrays are known to be equal."""
+    """Returns True where two arrays are known to be equal."""
     return checks.is_concrete((x, y)) and np.array_equal(x, y)
 
 

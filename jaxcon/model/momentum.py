@@ -42,7 +42,7 @@ class Part(NamedTuple):
 
 
 class Momentum(NamedTuple):
-    """Of some bodies together; lanes of one element.
+    """The momentum of some bodies together; lanes of one element.
 
     Attributes:
         position, velocity: of their centre of mass, world frame [m], [m/s].

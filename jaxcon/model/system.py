@@ -31,7 +31,7 @@ from jaxcon.solvers.saddle import Diagonal, Solution
 
 @pytree
 class MassProperties:
-    """Of the bodies of one group.
+    """Mass and moments of inertia of the bodies of one group.
 
     Attributes:
         mass: (bodies,) [kg].
@@ -72,7 +72,7 @@ class Snapshot:
         return self.system.motion(name, self.q, self.v)
 
     def map(self, function: Any) -> Snapshot:
-        """The same with every number replaced by a function of it."""
+        """Returns the snapshot with every number replaced by a function of it."""
         return Snapshot(*jax.tree.map(function, (self.system, self.q, self.v, self.instant)))
 
     def frame(self, place: Place) -> Any:
@@ -194,7 +194,7 @@ class BodySystem:
         return self._forces(q, v, t, control, gyroscopic)
 
     def _weight(self, group: Any, mass: Lane) -> Vector:
-        """That of the bodies of a group."""
+        """Returns the weight of the bodies of a group."""
         own = [mass * g[None] for g in Vector.of(self.gravity)]
         return Vector(*own, *zeros(group.kind.n_v - self.layout.dim))
 
@@ -402,7 +402,7 @@ class BodySystem:
         return params.read(self)
 
     def with_params(self, changes: Mapping[str, Any]) -> BodySystem:
-        """The same system with other numbers; nothing is retraced by it.
+        """Returns the system with other numbers; nothing is retraced by it.
 
         A mass changed alone leaves the inertia as it is. `inertia` of a body in space may also be a
         tensor (3, 3) about its centre of mass, in the frame in which it was given, or an `Inertia`

@@ -249,7 +249,7 @@ def _given(segments: int | tuple[int, ...]) -> tuple[int, ...]:
 
 
 def faded(state: State, factor: Any) -> State:
-    """The same state, whose tangents and cotangents are multiplied by a factor."""
+    """Returns the state with its tangents and cotangents multiplied by a factor."""
 
     def one(x: Array) -> Array:
         if not jnp.issubdtype(x.dtype, jnp.inexact):

@@ -100,7 +100,7 @@ class Search:
         return jnp.clip(jnp.min(times, axis=0), 0, self.length)
 
     def _nearer(self, known: Bracket, gaps: Array) -> Bracket:
-        """The same after one try more: a secant, or half of what encloses the arrival."""
+        """Returns the bracket after one more try: a secant, or half of the interval."""
         here, (gap, row) = known.here, nearest(gaps)
         low = jnp.where(gap > 0, here, known.low)
         high = jnp.where(gap > 0, known.high, here)

@@ -185,7 +185,7 @@ def _cost(efforts: dict[str, Effort], *names: str) -> str:
 
 
 def _safe(facts: Facts, inner: Any) -> tuple[Any, str]:
-    """The same for rows that may depend on each other, and why."""
+    """Returns a solver for rows that may depend on each other, and why."""
     count = "" if facts.dependent is None else f", and {facts.dependent or 'none'} do here"
     if not facts.loops and not facts.dependent:
         own = several(facts.rows, "row")

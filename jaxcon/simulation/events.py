@@ -135,7 +135,7 @@ class Events(checks.Checked):
 
 
 def list_impacts(told: Impact, layout: BoundLayout) -> Impacts:
-    """Those of all parts of a step, of which the last awaits none."""
+    """Returns the impacts of all parts of a step, of which the last awaits none."""
     happened, times, rows = (x[:-1] for x in told)
     elements = jnp.asarray(layout.owners)[rows]
     return Impacts(
@@ -147,7 +147,7 @@ def list_impacts(told: Impact, layout: BoundLayout) -> Impacts:
 
 
 class Impact(NamedTuple):
-    """Whether there was one, when, and the row that made it, () each."""
+    """An impact: whether there was one, when, and the row that made it, () each."""
 
     happened: Array
     time: Array
@@ -155,7 +155,7 @@ class Impact(NamedTuple):
 
 
 class Impulses(NamedTuple):
-    """Of bounded rows: ∫λ dt (n,), and what is as of `Reactions`, by world."""
+    """Impulses of bounded rows: ∫λ dt (n,), and the other numbers of `Reactions`, by world."""
 
     multipliers: Array
     residual: Array
@@ -199,7 +199,7 @@ class Progress(NamedTuple):
     kept: Array
 
     def beyond(self, impulses: Impulses) -> Progress:
-        """The same with more impulses."""
+        """Returns the progress with more impulses."""
         return self._replace(
             impulses=self.impulses + impulses.multipliers,
             residual=jnp.maximum(self.residual, impulses.residual),
@@ -306,6 +306,6 @@ def strike(world: World, state: State, struck: Struck) -> tuple[Array, Impulses]
 
 
 def no_strike(world: World, state: State, struck: Struck) -> tuple[Array, Impulses]:
-    """The same of none."""
+    """Returns the change and impulses of no impact."""
     none, zero = jnp.zeros_like(struck.outlook.gap), jnp.zeros_like(state.time)
     return jnp.zeros_like(state.v), Impulses(none, zero, zero + 1)

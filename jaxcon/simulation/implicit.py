@@ -59,7 +59,7 @@ class Scheme(NamedTuple):
 
     @classmethod
     def of(cls, rho: Any, dt: Any) -> Scheme:
-        """Those for which the highest frequencies are damped by ρ a step, and low ones least.
+        """Returns the scheme that damps the highest frequencies by ρ a step, and low ones least.
 
         References:
             Chung, Hulbert, A time integration algorithm for structural dynamics with improved

@@ -71,7 +71,7 @@ class Explicit(checks.Checked):
 
     @property
     def bounded(self) -> bool:
-        """Whether limits, friction and contact may act beside it."""
+        """Returns True where limits, friction and contact may act beside it."""
         return True
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:

@@ -143,7 +143,7 @@ class Method:
         return dataclasses.replace(self, bounded=default_contact_solver(system, state.q, state.v))
 
     def known_at(self, dt: Any, dtype: Any) -> Method:
-        """The same, with the default gains of a known step where they cannot rise.
+        """Returns the method with the default gains of a known step where they cannot rise.
 
         Gains that may rise are computed row by row in every step.
 

@@ -64,7 +64,7 @@ class RATTLE(checks.Checked):
 
     @property
     def symmetric(self) -> bool:
-        """Whether a step by −h undoes one by h: both ends enter the equations alike."""
+        """Returns True where a step by −h undoes one by h: both ends enter the equations alike."""
         return True
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:

@@ -65,7 +65,7 @@ def contain(function: Callable[..., Any], args: PyTree) -> Any:
 
 
 def stop_failed(status: Array, tree: PyTree) -> PyTree:
-    """The same values, without a gradient where the world failed."""
+    """Returns the values without a gradient where the world failed."""
     healthy = ~failed(status)
     return keep(healthy, tree, jax.lax.stop_gradient(tree))
 

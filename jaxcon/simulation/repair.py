@@ -25,7 +25,7 @@ from jaxcon.stabilization.penalty import Penalty
 from jaxcon.stabilization.projection import Projection
 
 UNWANTED = Status.NOT_CONVERGED
-"""Of a projection that nobody asked for."""
+"""The status of worlds for which no projection was asked."""
 
 
 @exportable

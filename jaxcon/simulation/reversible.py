@@ -108,7 +108,7 @@ class _Walk:
         return self._merged(self.results, *found)
 
     def begin(self, *given: Any) -> tuple[Any, Any]:
-        """The same before a way back, which needs what was given, and what of it has tangents."""
+        """Begins a run that is to be taken back: what was given, and what has tangents."""
         real, rest = (jax.tree.map(lambda x: x.value, x, is_leaf=_is_primal) for x in given)
         moved = jax.tree.map(lambda x: x.perturbed, given[0], is_leaf=_is_primal)
         found, kept = self.forwards(real, rest)
@@ -208,7 +208,7 @@ class _Moved:
     flags: tuple[tuple[bool, ...], ...]
 
     def parts(self, of: tuple[Parts, ...]) -> tuple[Parts, ...]:
-        """Those of trees by what has a tangent; on its way a state has one throughout."""
+        """Returns the parts of trees with a tangent; a state on its way has one throughout."""
         own = self.flags[0], (True,) * len(self.flags[1]), self.flags[2]
         return tuple(parts.among(flags) for parts, flags in zip(of, own, strict=True))
 
@@ -254,7 +254,7 @@ def _allowed(kept: State, began: Array) -> tuple[Array, Array]:
 
 
 def _far(found: State, known: State, allowed: tuple[Array, Array]) -> Array:
-    """Whether a state was not found again, or not as a number."""
+    """Returns True where a state was not found again, or not as a number."""
     far = jnp.zeros_like(failed(known.status))
     for x, y, most in ((found.q, known.q, allowed[0]), (found.v, known.v, allowed[1])):
         far |= ~(jnp.max(jnp.abs(x - y), initial=0) <= most)

@@ -40,7 +40,7 @@ def whole_levels(steps: int, levels: int) -> tuple[int, ...]:
 
 
 def _divisors(n: int) -> list[int]:
-    """Of a number, itself among them."""
+    """Returns the divisors of a number, itself among them."""
     small = [i for i in range(1, math.isqrt(n) + 1) if n % i == 0]
     return [*small, *(n // i for i in small)]
 
@@ -52,7 +52,7 @@ def kept(steps: int, sizes: Sequence[int]) -> tuple[int, ...]:
 
 
 def bytes_of(tree: PyTree) -> int:
-    """Of all leaves."""
+    """Returns the bytes of all leaves."""
     return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
 
 

@@ -20,7 +20,7 @@ MARGIN = 1e-9
 """Growth per step that counts as marginal, not as unstable."""
 
 SLOW = 1e-3
-"""The same for springs, whose oscillations many an explicit method lets grow very slowly."""
+"""Growth per step of springs that counts as marginal: many explicit methods amplify slowly."""
 
 
 def largest_stable_rate(integrator: Any, dt: float, damping_ratio: float = 1.0) -> float:

@@ -48,7 +48,6 @@ def step(
     check_method(method, wait=False)
     with checks.without_waiting():  # of dt as given: under jit an array of it would be traced
         warn_if_unstable(method, dt, system, state)
-        method = method.known_at(dt, state.q.dtype)
     return step_quietly(system, method, state, control, dt)
 
 
@@ -59,6 +58,7 @@ def step_quietly(
     control = check_step(system, method, state, control)
     with checks.without_waiting():
         h = checks.real("step", "dt", dt, state.q.dtype, least=0)
+        method = method.known_at(dt, state.q.dtype)
     new, info = native.call(contained_step, system, method, state, control, h)
     # put in outside of the step, which so computes what it did; a rollout that does not record it
     # does not carry it either
@@ -99,7 +99,7 @@ def _step(system: Any, method: Method, state: State, control: PyTree, dt: Array)
 
 
 def _repair(system: Any, method: Method, state: State, attempt: Any, dt: Array) -> Any:
-    """The same of an attempt that the method repairs where it failed."""
+    """Steps as `_attempt` does, and repairs an attempt that failed."""
     system = recall(system, state.turns, state.angle_remainder)
     return _settle(state, method.recovery.repair(system, method.solver, state, attempt, dt))
 
@@ -177,7 +177,7 @@ def forward_dynamics(
 
 
 def _dynamics(system: Any, method: Method, state: State, control: PyTree, dt: Array) -> Solution:
-    """Of worlds along trailing axes."""
+    """Returns the dynamics of worlds along trailing axes."""
     if not hasattr(system, "layout") and state.q.ndim > 1:
         one = per_world(_dynamics, state.q.ndim - 1)
         return one(system, method, state, control, dt)

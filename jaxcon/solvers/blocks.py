@@ -18,7 +18,7 @@ Block = list[list[Lane]]
 
 
 def freeze(x: Any) -> Any:
-    """The same values, constant under differentiation."""
+    """Returns the values, constant under differentiation."""
 
     def one(leaf: Any) -> Any:
         return jax.lax.stop_gradient(leaf) if isinstance(leaf, jax.Array) else leaf

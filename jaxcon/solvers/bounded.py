@@ -118,7 +118,7 @@ class Kinds:
         return self.join(parts._replace(discs=discs))
 
     def largest(self, x: Array) -> Array:
-        """Of rows (n, …) that obey a law together, what is largest: normal and slip, or turning."""
+        """Returns the largest of rows (n, …) that obey a law together."""
         parts = self.split(x)
         slip, *turning = parts.discs
         most = functools.reduce(jnp.maximum, slip, parts.normal)
@@ -314,4 +314,4 @@ def implicit_multipliers(
 
 
 ROUNDS = 3
-"""Of refinement of a derivative, whose matrix is inverted without pivoting."""
+"""The rounds of refinement of a derivative, whose matrix is inverted without pivoting."""

@@ -36,13 +36,13 @@ class Dense:
 
 
 def _factor(system: Saddle) -> lu.Factored:
-    """Of one world."""
+    """Factors the matrix of one world."""
     j = system.jacobian.dense()
     return lu.factor(saddle_matrix(system, j), _scale(system, j))
 
 
 def _solve(known: lu.Factored, force: Array, target: Array) -> Solution:
-    """Of one world."""
+    """Solves for one world."""
     solution = known.solve(jnp.concatenate([force, target]))
     n = force.shape[0]
     return Solution(solution[:n], solution[n:], judge(solution, known.singular))

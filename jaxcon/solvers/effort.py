@@ -56,7 +56,7 @@ def entries(structure: Structure) -> int:
 def elimination(
     structure: Structure, order: str, solves: int = 1, most: float = float("inf")
 ) -> Effort | None:
-    """Of `Sparse`: block LDLᵀ along a plan, whose fill is known.
+    """Returns the effort of `Sparse`: block LDLᵀ along a plan, whose fill is known.
 
     Args:
         structure: of J.
@@ -103,7 +103,7 @@ def _substitute(m: float, r: float) -> float:
 
 
 def schur(n_v: int, n_c: int, full: bool, solves: int = 1, elsewhere: float = 30.0) -> Effort:
-    """Of `Schur`: J M⁻¹ Jᵀ as a product of matrices, and Cholesky.
+    """Returns the effort of `Schur`: J M⁻¹ Jᵀ as a product of matrices, and Cholesky.
 
     Args:
         n_v: velocities.
@@ -119,7 +119,7 @@ def schur(n_v: int, n_c: int, full: bool, solves: int = 1, elsewhere: float = 30
 
 
 def saddle(n_v: int, n_c: int, solves: int = 1, elsewhere: float = 20.0) -> Effort:
-    """Of `Dense`: LU of the whole matrix.
+    """Returns the effort of `Dense`: LU of the whole matrix.
 
     Args:
         n_v: velocities.
@@ -132,7 +132,7 @@ def saddle(n_v: int, n_c: int, solves: int = 1, elsewhere: float = 20.0) -> Effo
 
 
 def iterations(structure: Structure, rows: int, rounds: int, solves: int = 1) -> Effort:
-    """Of `ConjugateGradients`: products with J and its transpose, and a block Jacobi step.
+    """Returns the effort of `ConjugateGradients`: products with J and Jᵀ, and a block Jacobi step.
 
     Args:
         structure: of J.

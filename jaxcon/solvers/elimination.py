@@ -81,7 +81,7 @@ class Elimination:
         return BatchFactor(step, factor, gains)
 
     def _run(self, step: Run) -> RunFactor:
-        """The same along a run, carrying the updates of the next node and of the border."""
+        """Factors a run of nodes, carrying the updates of the next node and of the border."""
         nodes, first, later = step.ascending, step.nodes[0], (step.parent, *step.border)
         others = [None if p == first else p for p in nodes]
         whole = self._entries([(p, p) for p in nodes])
@@ -134,7 +134,7 @@ class Elimination:
         return [self.rounding * a[-1] for a in whole] if self.leaves_out else None
 
     def _margin(self, whole: Block, factor: Block) -> Lane:
-        """Of one node or of many; see `margin`."""
+        """Returns the margin of one node or of many; see `margin`."""
         inverse = [row[-1] for row in factor]
         rests = [1 - self.rounding * a[-1] * x for a, x in zip(whole, inverse, strict=True)]
         return functools.reduce(jnp.minimum, [*inverse, *rests])
@@ -237,7 +237,7 @@ class RunFactor:
     gains: list[Block]
 
     def down(self, b: Vectors) -> list[Lane]:
-        """The same, carrying H y to the next node, and its sum to the border."""
+        """Substitutes forwards along the run, carrying H y to the next node and the border."""
 
         def eliminate(taken: Any, right: Any, k: Array) -> Any:
             factor, gains = row_of((self.factor, self.gains), k)
@@ -256,7 +256,7 @@ class RunFactor:
         return y
 
     def back(self, y: list[Lane], x: Vectors) -> None:
-        """The same, carrying the solution of the next node."""
+        """Substitutes backwards along the run, carrying the solution of the next node."""
         border = [[z[0] for z in x.get([g])] for g in self.step.border]
 
         def substitute(following: Any, own: Any, k: Array) -> Any:

@@ -83,6 +83,6 @@ def identity(like: Array) -> Array:
 
 
 def diagonal(matrix: Array) -> Array:
-    """Of a matrix (n, n, …), (n, …)."""
+    """Returns the diagonal of a matrix (n, n, …), (n, …)."""
     n = len(matrix)
     return matrix.reshape(n * n, *matrix.shape[2:])[:: n + 1]

@@ -73,7 +73,7 @@ class Pivots(NamedTuple):
 
 
 def pivots(problem: Bounded) -> Pivots:
-    """The same for all sweeps."""
+    """Returns the pivots of all sweeps."""
     kinds, own = problem.kinds, problem.kinds.split(gauss_jordan.diagonal(problem.matrix))
     free = jnp.zeros((kinds.single, *problem.lower.shape[1:]), problem.lower.dtype)
     tiny = float(jnp.finfo(problem.matrix.dtype).tiny) ** 0.5  # below it a row does not move itself

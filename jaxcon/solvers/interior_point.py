@@ -30,7 +30,7 @@ from jaxcon.solvers.central_path import (
 from jaxcon.solvers.polish import polished
 
 NEAREST = 0.99
-"""Of the way to the boundary, the most that a step goes."""
+"""The largest share of the way to the boundary that a step goes."""
 
 
 @pytree
@@ -119,7 +119,7 @@ def least(problem: Bounded, point: Point) -> tuple[float, list[Array]]:
 
 
 def unfinished(problem: Bounded, point: Point) -> Array:
-    """Whether products or u are not yet near enough to what they should be, by world."""
+    """Returns True where products or u are not yet near enough to what they should be, by world."""
     eps, (plain, ends) = float(jnp.finfo(problem.offset.dtype).eps), least(problem, point)
     numbers, heads = products(problem.kinds, point)
     off = jnp.max(jnp.abs(unmet(problem, point)), axis=0)

@@ -40,7 +40,7 @@ class Nearest(checks.Checked):
 
     @property
     def warm(self) -> bool:
-        """Whether the solver starts where the last step ended."""
+        """Returns True where the solver starts where the last step ended."""
         return self.solver.warm
 
     @property
@@ -65,7 +65,7 @@ class Nearest(checks.Checked):
         self.solver.check()
 
     def leaves_out(self, kinds: Kinds) -> bool:
-        """Whether there are more rows than are solved."""
+        """Returns True where there are more rows than are solved."""
         pairs = ((self.stops, kinds.single), (self.contacts, kinds.contacts))
         return any(most is not None and most < count for most, count in pairs)
 
@@ -106,11 +106,11 @@ class Choice:
     whole: Kinds
 
     def take(self, x: Array) -> Array:
-        """Of an array (n, …), (k, …)."""
+        """Returns the chosen rows (k, …) of an array (n, …)."""
         return jnp.take_along_axis(x, self.rows, axis=0)
 
     def contacts(self, x: Array) -> Array:
-        """Of numbers of each contact."""
+        """Returns the numbers of the chosen contacts."""
         normals = self.kinds.split(self.rows).normal - self.whole.normal
         return jnp.take_along_axis(x, normals, axis=0)
 
@@ -119,7 +119,7 @@ class Choice:
         return jnp.sum(jnp.where(self.places(), x[None], 0), axis=1)
 
     def places(self) -> Array:
-        """Whether a row is the i-th chosen one, (n, k, …)."""
+        """Returns True where a row is the i-th chosen one, (n, k, …)."""
         every = jnp.arange(self.whole.size, dtype=self.rows.dtype)
         return self.rows[None] == every.reshape(-1, *(1,) * self.rows.ndim)
 

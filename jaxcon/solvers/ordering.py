@@ -88,7 +88,7 @@ class Run:
 
     @property
     def descending(self) -> bool:
-        """Whether elements are eliminated from the last to the first."""
+        """Returns True where elements are eliminated from the last to the first."""
         return self.parent.element < self.nodes[-1].element
 
 
@@ -196,7 +196,7 @@ def _single(order: list[Node], later: dict[Node, list[Node]]) -> list[Batch | Ru
 
 
 def _at_once(steps: list[Batch | Run]) -> list[Batch | Run]:
-    """The same elimination with equal nodes that do not wait for each other in one step.
+    """Returns the elimination with equal nodes that do not wait for each other in one step.
 
     A step waits for those that change its nodes; all that wait for equally many are a level.
     """
@@ -223,7 +223,7 @@ def _at_once(steps: list[Batch | Run]) -> list[Batch | Run]:
 
 
 def _continues(order: list[Node], later: Any, kinds: Any, i: int, j: int) -> bool:
-    """Whether a run from i to j may go on: same group, next element, same kind of block."""
+    """Returns True where a run from i to j goes on: same group and kind, next element."""
     node, following = order[j], order[j + 1]
     if later[node] != [following, *later[order[i]][1:]] or node.group != following.group:
         return False

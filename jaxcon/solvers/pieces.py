@@ -69,7 +69,7 @@ class Vectors:
         return self._less(nodes, nodes)
 
     def split(self, nodes: list[Any], first: Any) -> tuple[list[Lane], list[Lane]]:
-        """The same, but what is subtracted from one of them apart from it."""
+        """Returns the sums, with what is subtracted from one of the nodes apart from it."""
         lanes = self._less(nodes, [None if node == first else node for node in nodes])
         taken = self.taken.sum([first])
         return lanes, [jnp.zeros_like(x) for x in lanes] if taken is None else taken[0]

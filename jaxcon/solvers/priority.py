@@ -198,7 +198,7 @@ class Eliminated(NamedTuple):
 def _factor(
     parts: tuple[np.ndarray, ...], system: Saddle, cutoff: Array, damping: Array
 ) -> Eliminated:
-    """Of one world."""
+    """Factors the matrices of one world."""
     order = np.concatenate(parts)
     j = system.jacobian.dense()[order]
     compliance = None if system.compliance is None else system.compliance[order]
@@ -222,7 +222,7 @@ def _factor(
 def _solve(
     parts: tuple[np.ndarray, ...], known: Eliminated, force: Array, target: Array, conflict: Array
 ) -> Solution:
-    """Of one world."""
+    """Solves for one world."""
     order = np.concatenate(parts)
     back = np.argsort(order)
     free = known.mass.solve(force)
@@ -253,7 +253,7 @@ def _substitute(pivots: tuple[Pivot, ...], right: Array) -> Array:
 
 
 def _contradicts(pivots: tuple[Pivot, ...], right: Array, size: Array, bound: Array) -> Array:
-    """Whether some level alone leaves open more than a share of what it asks for."""
+    """Returns True where some level alone leaves open more than a share of what it asks for."""
     found, start = jnp.zeros((), bool), 0
     for pivot in pivots:
         rows = slice(start, start + pivot.inverse.shape[0])

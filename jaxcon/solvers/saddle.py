@@ -52,7 +52,7 @@ class Diagonal:
 
     @property
     def singular(self) -> Array:
-        """Whether an entry is finite and not positive, ()."""
+        """Returns True where an entry is finite and not positive, ()."""
         return jnp.any(jnp.isfinite(self.values) & (self.values <= 0), axis=0)
 
 
@@ -69,7 +69,7 @@ class Full:
 
     @property
     def singular(self) -> Array:
-        """Whether M is finite and not positive definite, ()."""
+        """Returns True where M is finite and not positive definite, ()."""
         finite = jnp.all(jnp.isfinite(self.values))
         return finite & ~jnp.all(jnp.isfinite(self.factor))
 

@@ -67,7 +67,7 @@ class Complement:
 
 
 def _factor(system: Saddle, tikhonov: Any) -> Complement:
-    """Of one world."""
+    """Factors the Schur complement of one world."""
     j = system.jacobian.dense()
     a = delassus(system.mass, j, system.compliance)
     if tikhonov is not None:
@@ -80,7 +80,7 @@ def _factor(system: Saddle, tikhonov: Any) -> Complement:
 
 
 def _solve(known: Complement, force: Array, target: Array) -> Solution:
-    """Of one world."""
+    """Solves for one world."""
     j, free = known.jacobian, known.mass.solve(force)
     multipliers = jax.lax.custom_linear_solve(
         lambda x: known.delassus @ x,
@@ -99,7 +99,7 @@ def delassus(mass: Mass, jacobian: Array, compliance: Array | None) -> Array:
 
 
 def _dependent(factor: Array, a: Array, rounding: float) -> Array:
-    """Whether a row is, to round-off, a combination of the rows before it.
+    """Returns True where a row is, to round-off, a combination of the rows before it.
 
     The square of a Cholesky pivot over the diagonal entry is the part of a row that the earlier
     ones do not explain: 1 for an orthogonal row, round-off for a dependent one.

@@ -152,11 +152,11 @@ class SlidingWindowBaumgarte(Unstabilized):
         return History(jnp.zeros((self.window, n_c), q.dtype), rows, rows, seen)
 
     def resolve(self, gains: tuple[Any, Any]) -> SlidingWindowBaumgarte:
-        """The same with these (α, β) where there is no rate."""
+        """Returns the stabilizer with these (α, β) where there is no rate."""
         return self if self.fallback is not None else dataclasses.replace(self, fallback=gains)
 
     def bounded(self, stable_rate: Callable[[float], Any]) -> SlidingWindowBaumgarte:
-        """The same below the limit of the integrator."""
+        """Returns the stabilizer with its rate below the limit of the integrator."""
         limit = stable_rate(LEAST_RATIO) if self.limit is None else self.limit
         default = jnp.minimum(self.fallback[1], limit / 4)
         rate = default if self.rate is None else self.rate

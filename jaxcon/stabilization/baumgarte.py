@@ -80,7 +80,7 @@ class Unstabilized(checks.Checked):
         return memory
 
     def remember(self, memory: PyTree, solution: Solution) -> PyTree:
-        """The same after what was solved at the start of the step."""
+        """Returns the memory after what was solved at the start of the step."""
         return memory
 
     @property
@@ -91,7 +91,7 @@ class Unstabilized(checks.Checked):
 
     @property
     def remembers(self) -> bool:
-        """Whether it has a memory."""
+        """Returns True where it has a memory."""
         return type(self).init is not Unstabilized.init
 
     def correct(
@@ -171,7 +171,7 @@ class Baumgarte(Unstabilized):
         return dataclasses.replace(self, fallback=gains) if self.is_default else self
 
     def resolve(self, gains: tuple[Any, Any]) -> Baumgarte:
-        """The same with these (α, β) where none were given."""
+        """Returns the stabilizer with these (α, β) where none were given."""
         fallback = gains if self.fallback is None else self.fallback
         alpha = fallback[0] if self.alpha is None else self.alpha
         beta = fallback[1] if self.beta is None else self.beta
@@ -232,6 +232,6 @@ def check_stabilizer(owner: str, what: str, part: Any) -> None:
 
 
 def asks_nothing(stabilizer: Any) -> bool:
-    """Whether it has no gains of its own, and may stand beside what keeps constraints by itself."""
+    """Returns True for a stabilizer without gains, which leaves constraints to others."""
     default = type(stabilizer) is Baumgarte and stabilizer.alpha is stabilizer.beta is None
     return default or type(stabilizer) is Unstabilized

@@ -79,12 +79,12 @@ def keyed(keys: Iterable[str], names: tuple[str, ...], owner: str) -> dict[str, 
 
 
 def stands_for(key: str, name: str) -> bool:
-    """Whether a key is a constraint's name, or a pattern of it."""
+    """Returns True where a key is a constraint's name, or a pattern of it."""
     return key == name or fnmatchcase(name, key)
 
 
 def rows_of(layout: RowLayout, names: Iterable[str]) -> np.ndarray:
-    """Whether each row belongs to one of the constraints, (n_c,)."""
+    """Returns a mask of the rows that belong to one of the constraints, (n_c,)."""
     chosen = np.zeros(layout.size, bool)
     for name in names:
         chosen[layout.rows(name)] = True
@@ -92,7 +92,7 @@ def rows_of(layout: RowLayout, names: Iterable[str]) -> np.ndarray:
 
 
 def named(gain: Any, layout: RowLayout, owner: str) -> np.ndarray:
-    """Whether a gain is given for each row, (n_c,): by all but a mapping for those that hold."""
+    """Returns a mask of the rows, (n_c,), for which a gain is given."""
     if not isinstance(gain, Mapping):
         return layout.holds
     names = keyed(gain, layout.names, owner).values()

@@ -110,7 +110,7 @@ class Hybrid(Unstabilized):
         return self._map(lambda part: part.init(system, q, v))
 
     def resolve(self, gains: tuple[Any, Any]) -> Hybrid:
-        """The same with parts that have all their gains, default ones held to 50/s.
+        """Returns the stabilizer with parts that have all their gains, default ones held to 50/s.
 
         Gains that remove an error in one step do so by a velocity, which springs that take over
         where φ is small would only turn round.
@@ -121,7 +121,7 @@ class Hybrid(Unstabilized):
         return dataclasses.replace(self, small=small, middle=middle, large=large)
 
     def bounded(self, stable_rate: Callable[[float], Any]) -> Hybrid:
-        """The same with parts that know their limits."""
+        """Returns the stabilizer with parts that know their limits."""
         small, middle, large = self._map(lambda part: part.bounded(stable_rate))
         large = None if self.large is None else large
         return dataclasses.replace(self, small=small, middle=middle, large=large)
@@ -173,7 +173,7 @@ class Hybrid(Unstabilized):
 
     @property
     def remembers(self) -> bool:
-        """Whether one of the parts has a memory."""
+        """Returns True where one of the parts has a memory."""
         return any(part.remembers for part in self._parts())
 
     def correct(

@@ -89,11 +89,11 @@ class AugmentedLagrangian(Unstabilized):
         return Held(jnp.zeros(layout.size, q.dtype), self.feedback.init(system, q, v))
 
     def resolve(self, gains: tuple[Any, Any]) -> AugmentedLagrangian:
-        """The same, the gains of the feedback resolved."""
+        """Returns the stabilizer with the gains of the feedback resolved."""
         return dataclasses.replace(self, feedback=self.feedback.resolve(gains))
 
     def bounded(self, stable_rate: Callable[[float], Any]) -> AugmentedLagrangian:
-        """The same, the gains of the feedback bounded."""
+        """Returns the stabilizer with the gains of the feedback bounded."""
         return dataclasses.replace(self, feedback=self.feedback.bounded(stable_rate))
 
     def target(self, rows: Rows, memory: Held, dt: Any) -> Array:

@@ -100,15 +100,15 @@ class Penalty(Unstabilized):
         check_stabilizer("Penalty", "others", self.others)
 
     def init(self, system: Any, q: Array, v: Array) -> PyTree:
-        """That of the stabiliser of the others."""
+        """Returns the memory of the stabilizer of the other rows."""
         return self.others.init(system, q, v)
 
     def resolve(self, gains: tuple[Any, Any]) -> Penalty:
-        """The same, the gains of the others resolved."""
+        """Returns the penalty with the gains of the other rows resolved."""
         return dataclasses.replace(self, others=self.others.resolve(gains))
 
     def bounded(self, stable_rate: Callable[[float], Any]) -> Penalty:
-        """The same, the gains of the others bounded."""
+        """Returns the penalty with the gains of the other rows bounded."""
         return dataclasses.replace(self, others=self.others.bounded(stable_rate))
 
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
@@ -190,7 +190,7 @@ class Penalty(Unstabilized):
 
     @property
     def remembers(self) -> bool:
-        """Whether the others have a memory."""
+        """Returns True where the others have a memory."""
         return self.others.remembers
 
     def correct(

@@ -72,7 +72,7 @@ class PID(Unstabilized):
         return jnp.zeros(layout.size, q.dtype)
 
     def resolve(self, gains: tuple[Any, Any]) -> PID:
-        """The same with K_d = 2α and K_p = β² where none were given."""
+        """Returns the stabilizer with K_d = 2α and K_p = β² where none were given."""
         fallback = gains if self.fallback is None else self.fallback
         proportional = fallback[1] ** 2 if self.proportional is None else self.proportional
         derivative = 2 * fallback[0] if self.derivative is None else self.derivative

@@ -161,7 +161,7 @@ class Projection(Unstabilized):
 
     @property
     def remembers(self) -> bool:
-        """Whether it counts steps."""
+        """Returns True where it counts steps."""
         return self.every != 1
 
     def correct(
@@ -242,7 +242,7 @@ class Projection(Unstabilized):
             return solve(b).acceleration
 
         def goes(left: Array, before: Array) -> Array:
-            """Whether a world is still off, and not yet where only rounding is left."""
+            """Returns True where a world is still off, and not yet where only rounding is left."""
             off = (left > bounds.stays) & ((left < before) | (left > bounds.fails))
             return off & ~status.failed(surface.state.status)
 

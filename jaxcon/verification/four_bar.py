@@ -97,7 +97,7 @@ def angular(bar: Linkage) -> tuple[Any, jc.State]:
 
 
 def four_bar() -> list[Check]:
-    """The same linkage in the plane, in space and by angles moves in the same way."""
+    """Checks that one linkage moves alike in the plane, in space and by angles."""
     case, bar = "four_bar", crank_rocker()
     times, dt = np.linspace(0.1, 1.0, 10).tolist(), 5e-4
     checks, found = [], []

@@ -49,7 +49,7 @@ class Linkage:
 
     @property
     def velocities(self) -> np.ndarray:
-        """Of the centres of mass, (3, 2) [m/s]."""
+        """The velocities of the centres of mass, (3, 2) [m/s]."""
         swing = np.stack([-self.halves[:, 1], self.halves[:, 0]], -1) * self.rates[:, None]
         return swing + np.array([[0, 0], 2 * swing[0], [0, 0]])
 

@@ -138,7 +138,7 @@ def knife_edge_incline() -> list[Check]:
 
 
 def vakonomic_knife_edge() -> list[Check]:
-    """The same skate by variation with μ = 0.1 at the start slides down; what it conserves.
+    """Checks a skate by variation with μ = 0.1 at the start: it slides down; what it conserves.
 
     With ψ = ẋ sin φ − ẏ cos φ, m ẏ − μ cos φ, m ẋ + μ sin φ − m g t sin α, the spin's own momentum
     rate J φ̈ = μ (ẋ cos φ + ẏ sin φ), and the energy. `KnifeEdge` has the opposite ψ, so −μ.

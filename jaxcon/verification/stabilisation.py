@@ -165,7 +165,7 @@ def feedback_limits() -> list[Check]:
 
 
 def warns(integrator: Any, rate: float) -> bool:
-    """Whether a step with critical damping at this rate warns of instability."""
+    """Returns True where a step with critical damping at this rate warns of instability."""
     system, state = particle_off_plane()
     method = jc.Method(integrator, jc.Baumgarte.critical(rate))
     with warnings.catch_warnings(record=True) as caught:

@@ -141,7 +141,7 @@ class CartPole(Environment):
         return q
 
     def angles(self, episode: Episode) -> tuple[Array, Array]:
-        """Of the poles from upright, and their rates, (n,) [rad], [rad/s]."""
+        """Returns the angles of the poles from upright, and their rates, (n,) [rad], [rad/s]."""
         given = self.system, episode.state
         angles = jnp.stack([jc.orientation(*given, name) for name in self.poles])
         return angles, jnp.stack([jc.angular_velocity(*given, name) for name in self.poles])
@@ -178,7 +178,7 @@ class CartPole(Environment):
             foot = tip
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether the cart has come to the end of the track."""
+        """Returns True where the cart has come to the end of the track."""
         return jnp.abs(self.cart(episode)[0]) > TRACK
 
 

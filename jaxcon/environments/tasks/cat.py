@@ -14,7 +14,7 @@ from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Channel, Environment, Episode, near, spread
 
 LENGTH, RADIUS, LEGS = 0.25, 0.07, 0.15
-"""Of each half of the cat, a cylinder, and of the legs [m]."""
+"""Sizes of each half of the cat, a cylinder, and of the legs [m]."""
 SIDES = (("front", 1.0), ("rear", -1.0))
 
 
@@ -201,7 +201,7 @@ class CatRighting(Environment):
         return (1 + self.upright(after)) / 2 * straight * effort
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether it has landed."""
+        """Returns True where it has landed."""
         return jc.center_of_mass(self.system, episode.state)[0][2] < LEGS
 
     def marks(self, axes: Any, episode: Episode) -> None:

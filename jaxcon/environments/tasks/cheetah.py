@@ -27,7 +27,7 @@ MOST = 1e6
 SWEEPS = 30
 """Over the rows of stops and contacts in a step."""
 HINGE = 3
-"""Of MuJoCo's enumeration of joints."""
+"""The number of a hinge in MuJoCo's enumeration of joints."""
 
 
 class Capsule(NamedTuple):
@@ -215,7 +215,7 @@ def model_file(name: str) -> Path:
 
 
 def capsules(compiled: Compiled) -> tuple[Capsule, ...]:
-    """Those of bodies that move, with the ends of their axes in the frames of these."""
+    """Returns the capsules of bodies that move, with the ends of their axes."""
     model, data, found = compiled.model, compiled.data, []
     for geom in np.flatnonzero(model.geom_bodyid):
         body, (radius, half) = int(model.geom_bodyid[geom]), model.geom_size[geom, :2]

@@ -17,7 +17,7 @@ from jaxcon.environments.environment import Channel, Environment, Episode, near
 HIP, THIGH, SHANK, SOLE = 0.05, 0.2, 0.3, 0.02
 """From the middle of the trunk to a hip, of the bars, and of the ball at the foot [m]."""
 DEPTH, LOW = 0.4, 0.2
-"""Of the foot below the hips at the start, and of hips that have fallen above the ground [m]."""
+"""How far the foot is below the hips at the start, and the height of hips that have fallen [m]."""
 SIDES = (("left", -1.0), ("right", 1.0))
 STOPS = (0.15, 1.75)
 """How far a thigh may be turned outwards from straight down [rad]."""
@@ -170,7 +170,7 @@ class FiveBarHopper(Environment):
         return jc.position(*given), jc.velocity(*given)
 
     def clearance(self, episode: Episode) -> Array:
-        """Of the foot above the ground, () [m]."""
+        """Returns the height of the foot above the ground, () [m]."""
         return self.foot(episode)[0][1] - SOLE
 
     def observation(self, episode: Episode) -> Array:
@@ -192,7 +192,7 @@ class FiveBarHopper(Environment):
         return near(speed - after.goal, 0.3) * hop * effort
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether the trunk has fallen."""
+        """Returns True where the trunk has fallen."""
         return jc.position(self.system, episode.state, "trunk")[1] < LOW
 
     def marks(self, axes: Any, episode: Episode) -> None:

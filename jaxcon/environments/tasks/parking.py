@@ -142,7 +142,7 @@ class Parking(Environment):
         return there * turned * (1 + near(speed, 0.5)) / 2
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether the blade has left the lot."""
+        """Returns True where the blade has left the lot."""
         return jnp.max(jnp.abs(self.motion(episode)[0])) > LOT
 
     def marks(self, axes: Any, episode: Episode) -> None:

@@ -195,7 +195,7 @@ class RopeSwing(Environment):
         return self.stroke * action
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether the body is as high as the point that the rope hangs from."""
+        """Returns True where the body is as high as the point that the rope hangs from."""
         return jc.position(self.system, episode.state, "body")[1] > 0
 
     def marks(self, axes: Any, episode: Episode) -> None:

@@ -15,7 +15,7 @@ from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Channel, Environment, Episode, near, spread
 
 HEIGHT, PLATE, THICK = 1.0, 0.4, 0.02
-"""Of the platform at home, of its radius, and of its surface above its centre [m]."""
+"""The height of the platform at home, its radius, and its surface above its centre [m]."""
 LEGS = range(6)
 
 
@@ -180,7 +180,7 @@ class StewartBalancing(Environment):
         return near(away, 0.1) * (1 + near(fast, 0.4)) / 2 * effort
 
     def terminal(self, episode: Episode) -> Array:
-        """Whether the ball has left the plate."""
+        """Returns True where the ball has left the plate."""
         place, _ = self.ball(episode)
         return place @ place > PLATE**2
 
