@@ -117,16 +117,21 @@ def test_what_was_built_before_leaves_nothing():
     assert text(jaxpr_of(*arm())) == before
 
 
-def test_free_rotation_is_split_off_for_bodies_that_turn_in_space_only():
-    """Particles have no branch for fast turns, nor has a body without joints."""
-    free, body, hung = (jc.Scene() for _ in range(3))
-    free.add_particle("bob", mass=1.0, position=(1.0, 0.0, 0.0))
-    free.add(jc.Distance("rod", jc.WORLD, "bob"))
-    for scene in (body, hung):
-        scene.add_body("top", mass=1.0, inertia=(1.0, 2.0, 3.0), position=(0.0, 0.0, -1.0))
-    hung.add(jc.Spherical("tip", jc.WORLD, "top", point=(0.0, 0.0, 0.0)))
-    found = [primitives(jaxpr_of(*scene.build())) for scene in (free, body, hung)]
-    assert ["cond" in x for x in found] == [False, False, True]
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_branch_for_fast_turns_is_only_where_something_is_held(dim):
+    """Nothing that is free has one."""
+    place = (1.0, *(0.0,) * (dim - 1))
+    inertia = 1.0 if dim == 2 else (1.0, 2.0, 3.0)
+    for held in (False, True):
+        bob, body = jc.Scene(dim=dim), jc.Scene(dim=dim)
+        bob.add_particle("bob", mass=1.0, position=place)
+        body.add_body("top", mass=1.0, inertia=inertia, position=place)
+        if held:
+            bob.add(jc.Distance("rod", jc.WORLD, "bob"))
+            joint = jc.Revolute if dim == 2 else jc.Spherical
+            body.add(joint("tip", jc.WORLD, "top", point=(0.0,) * dim))
+        for scene in (bob, body):
+            assert ("cond" in primitives(jaxpr_of(*scene.build()))) == held
 
 
 def force_of(scene):
