@@ -214,7 +214,8 @@ def closer(
     Most steps turn bodies by less than `TURN`, where e is about 1e-5 of a lever arm, and pay for
     the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist, and from
     1 to √2 rad it fades, since a Newton step from so far away leads nowhere. A row of an inequality
-    constraint on these bodies moves off its target by e/h with them.
+    constraint on bodies in space moves off its target by e/h with them. Where no body turns in
+    space, a world in which such rows act goes without.
 
     Args:
         system: of bodies.
@@ -227,6 +228,9 @@ def closer(
     """
     h = dt[None]
     turn = system.turn(state.q, v, rows.bias, h)
+    if rows.reactions is not None and not system.turns_in_space:
+        acts = jnp.any(rows.reactions.multipliers != 0, axis=0)
+        turn = jnp.where(acts, 0, turn)
 
     def corrected() -> tuple[Array, Solution]:
         share = smooth((turn / TURN**2 - 1) / 3) * smooth(2 - turn)
