@@ -118,11 +118,14 @@ class Dynamics:
             law: of the stabilizer.
             problem: the saddle system of both.
             lag: velocities are those of lag · h before the positions; None for none.
-            every: whether impacts are told apart in scenes without restitution, too.
+            every: whether every landing without restitution is an impact; otherwise only where
+                `impacts.resolves_landings`.
         """
         if self.part is None:
             bounds, length, acts = self.bounds(q, v, t, self.dt), self.dt, None
-            strikes = any(bounds.ends) and (every or bounds.restitution is not None)
+            bounces = bounds.restitution is not None
+            resolves = every or bounces or impacts.resolves_landings(bounds, self.bounded)
+            strikes = any(bounds.ends) and resolves
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
             if doubt is not None:
