@@ -146,7 +146,8 @@ class Dynamics:
         may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
-            may = impacts.candidates(bouncy, start, self.dt)
+            reach = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).reach(impulse.start)
+            may = impacts.candidates(bouncy, start, self.dt, reach)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))

@@ -173,7 +173,7 @@ class Arrivals:
         return dataclasses.replace(self, times=self.times + late)
 
 
-def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
+def candidates(rows: BoundRows, change: Array, dt: Array, most: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
@@ -183,9 +183,10 @@ def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
         rows: the bounded rows at the start of the step.
         change: h J a without bounded rows, (n,).
         dt: h, () [s].
+        most: h |J| |a|, (n,), below which a row may rest: bodies of a stack fall alike.
     """
     e, least = rows.restitution, slowest(rows, change)
-    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
+    rests = most if e is None else jnp.where(e >= 0, 0, most)
     least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
