@@ -233,13 +233,16 @@ def closer(
         turn = jnp.where(acts, 0, turn)
 
     def corrected() -> tuple[Array, Solution]:
-        share = smooth((turn / TURN**2 - 1) / 3) * smooth(2 - turn)
+        # a world that blows up must not lend the derivatives of others what is infinite
+        sound = turn < 2
+        a, moving = (jnp.where(sound, x, 0) for x in (solution.acceleration, v))
+        square = system.turn(state.q, moving, rows.bias, h)
+        share = jnp.where(sound, smooth((square / TURN**2 - 1) / 3) * smooth(2 - square), 0)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
-        promised = rows.rate + h * (rows.jacobian.apply(solution.acceleration) + rows.bias / 2)
-        promised = rows.residual + h * promised
-        q = system.retract(state.q, h * v)
-        there = linearize(system, q, v, state.instant + dt).residual
+        promised = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))
+        q = system.retract(state.q, h * moving)
+        there = linearize(system, q, moving, state.instant + dt).residual
         off = jnp.where(held, there - promised, 0)
         more = least(-share[None] * numerics.safe_divide(off, h * h))
         # rounding over h² may contradict redundant rows; rows that do contradict were noted before
