@@ -224,10 +224,11 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
     for op in filter(_elementwise, reversed(program.operations)):
         (name,) = op.outputs
         needed: set[int] = {name} if name in results else set()
-        for reader in readers.get(name, ()):
+        own = readers.get(name, [])
+        for reader in own:
             if _elementwise(reader):
                 needed |= kernels[reader.outputs[0]]
-            elif not _computes(reader, name):
+            elif len(own) > 1 or not _computes(reader, name):
                 needed.add(name)
         if name in needed:
             ends.add(name)
@@ -308,7 +309,7 @@ def _fits(step: Step) -> bool:
 
 
 def _computes(op: Operation, name: int) -> bool:
-    """Returns True for an operand of a condition, whose branches compute it if nobody else does."""
+    """Returns True for an operand of a condition, whose branches compute what nobody else reads."""
     return op.name == "cond" and op.inputs[0] != name
 
 
