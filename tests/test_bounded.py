@@ -14,7 +14,7 @@ from jaxcon.solvers.bounded import Bounded, Kinds
 WORLDS = 2000
 dtypes = pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 EXACT = {"float64": 1e-8, "float32": 1e-5}
-"""What a law may be missed by, relative to the largest term."""
+"""Tolerance of each law by dtype, relative to its largest term."""
 
 
 def problems(kinds, rank, dtype, friction=0.1):

@@ -165,8 +165,6 @@ def test_doubled_hinges_do_not_creep_along_their_axis(name, dtype):
 
     A row compares places of up to 2 m, and its rounding of 4 spacings adds up over the hinges.
     """
-    if name == "default" and dtype == jnp.float32:
-        pytest.skip("its program takes long to compile; that of Schur is compared in float32")
     method, links, turn, steps = CREEPING[name]
     system, state, axis = doubled_hinges(links, turn, dtype)
     axis = jnp.asarray(axis, dtype)

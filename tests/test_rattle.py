@@ -236,7 +236,7 @@ def test_the_energy_of_float32_does_not_drift():
 
 
 def total_energy(system):
-    """What a rollout records: the total energy [J]."""
+    """Returns a record function for rollouts: the total energy [J]."""
     return lambda state, info: jc.energy(system, state).total
 
 

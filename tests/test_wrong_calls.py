@@ -119,6 +119,9 @@ def test_a_step_reads_no_array_of_jax(monkeypatch):
     assert read != []
 
 
+NO_INTEGRATOR = r"Method: integrator must be a value such as SemiImplicitEuler\(\), got "
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -131,12 +134,12 @@ def test_a_step_reads_no_array_of_jax(monkeypatch):
         (lambda: jc.PID(integral=None), "PID: integral must be real numbers, got None"),
         (lambda: jc.Baumgarte({"rod": True}, 1.0), "Baumgarte: alpha of 'rod' must be a real numb"),
         (lambda: jc.GeneralizedAlpha(rho=2.0), "GeneralizedAlpha: rho must lie between 0 and 1"),
-        (lambda: jc.Method(jc.RK4), r"Method: integrator .*, got jc\.RK4; call it: jc\.RK4\(\)\.$"),
+        (lambda: jc.Method(jc.RK4), NO_INTEGRATOR + r"jc\.RK4; call it: jc\.RK4\(\)\.$"),
         (
             lambda: jc.Method(jc.RATTLE),
-            r"Method: integrator .*, got jc\.RATTLE; call it: jc\.RATTLE",
+            NO_INTEGRATOR + r"jc\.RATTLE; call it: jc\.RATTLE\(\)\.$",
         ),
-        (lambda: jc.Method(jc.Events), r"Method: .* got jc\.Events; that is one for events=\.$"),
+        (lambda: jc.Method(jc.Events), NO_INTEGRATOR + r"jc\.Events; that is one for events=\.$"),
     ],
 )
 def test_a_constructor_refuses_what_it_can_see(make, words):

@@ -17,6 +17,7 @@ variable JAXCON_STAGES=off leaves all of it to the compiler.
 from __future__ import annotations
 
 import functools
+import math
 import os
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -262,8 +263,9 @@ def _in_stages(program: Program, stored: set[int]) -> list[Step]:
 
 def _in_parts(steps: list[Step]) -> list[list[Step]]:
     """Consecutive steps, cut evenly: those of one kernel, or one that no kernel can contain."""
-    count = -(-len(steps) // MOST)  # of kernels, were there nothing that none can contain
-    most = -(-len(steps) // max(count, 1))
+    # as many kernels as there would be without steps that none can contain
+    count = max(1, math.ceil(len(steps) / MOST))
+    most = math.ceil(len(steps) / count)
     parts: list[list[Step]] = []
     for step in steps:
         if parts and _fits(step) and _fits(parts[-1][-1]) and len(parts[-1]) < most:

@@ -94,7 +94,7 @@ class Environment:
     skip: int = static()
     horizon: int | None = static()
     at_once: ClassVar[int] = 128
-    """How many of many copies are simulated at once on a CPU, at most."""
+    """The largest number of copies simulated at once on a CPU; more run one chunk after another."""
 
     @property
     def dtype(self) -> Any:

@@ -141,7 +141,7 @@ class SemiImplicitEuler(Explicit):
     def _in_space(
         self, dynamics: Dynamics, state: State, here: tuple[Array, Array, Any], dt: Any
     ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None]:
-        """The same without the Newton step, of bodies in space, and what it is made by.
+        """v⁺, a and λ, rows and `least` of bodies in space, before the Newton step of `closer`.
 
         Their free rotation is split off. Of a body on which a one-sided row acts, v⁺ = v + h a, as
         its law says something of this v⁺. The gyroscopic part of a is then the mean over a step of

@@ -151,17 +151,13 @@ class Method:
             dt: h as it was given, () [s].
             dtype: of the scene.
         """
-        if not checks.is_concrete(dt) or not _is_number(dt):
-            return self  # not known, or to be refused where it is used
-        with jax.ensure_compile_time_eval():
-            h = jnp.asarray(dt, dtype)
-            limit = _highest_rate(self.integrator, h)
-            if limit is None:
-                return self
-            gains = self.integrator.default_gains(h)
-            held = bool(gains[1] < limit)
-        stabilizer = self.stabilizer if held else self.stabilizer.steady(gains)
-        return dataclasses.replace(self, stabilizer=stabilizer)
+        coarse = jnp.finfo(dtype).bits == 32 and hasattr(self.integrator, "highest_rate")
+        if not coarse or not checks.is_concrete(dt) or not _is_number(dt):
+            return self  # a step that is no number is refused where it is used
+        gains = _steady_gains(self.integrator, float(dt), np.dtype(dtype))
+        if gains is None:
+            return self
+        return dataclasses.replace(self, stabilizer=self.stabilizer.steady(gains))
 
     def feedback(self, dt: Any) -> Any:
         """The stabiliser, its missing gains chosen for the integrator at this step."""
@@ -255,6 +251,16 @@ def _is_number(x: Any) -> bool:
     """Returns True for one number that can be read."""
     known = np.asarray(x)
     return known.shape == () and known.dtype.kind in "fiu"
+
+
+@functools.lru_cache(maxsize=64)  # asked in every step outside of jit, which waits for no device
+def _steady_gains(integrator: Any, dt: float, dtype: np.dtype) -> tuple[Any, Any] | None:
+    """Default gains α and β [1/s] at a step of dt [s]; None where they may rise."""
+    with jax.ensure_compile_time_eval():
+        h = jnp.asarray(dt, dtype)
+        alpha, beta = integrator.default_gains(h)
+        rises = bool(beta < integrator.highest_rate(h))
+        return None if rises else (np.asarray(alpha), np.asarray(beta))
 
 
 def _highest_rate(integrator: Any, dt: Any) -> Any:
