@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import jaxcon as jc
 from jaxcon.analysis import encounters
 from jaxcon.analysis.known import Known
-from jaxcon.analysis.traps import impact
+from jaxcon.analysis.traps import impact, listed
 from jaxcon.core import notices
 
 G, R, H = 9.81, 0.1, 1e-3
@@ -550,7 +550,7 @@ def test_a_tumbling_box_that_lands_on_corners_warns_once(dim, monkeypatch):
     assert len(told) == 1
     assert f"a landing of {', '.join(names)} takes two steps" in told[0]
     said = jc.report(system, state, method)
-    assert f"a landing of {', '.join(names)} takes two steps" in said.warnings["impacts"]
+    assert f"a landing of {listed(names)} takes two steps" in said.warnings["impacts"]
     assert said.impacts == tuple(names)
 
 

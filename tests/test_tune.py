@@ -154,7 +154,7 @@ def test_a_search_ends_no_worse_than_it_began_and_converges_to_minima_alone(fact
         curvature, slope = jax.hessian(loss)(log), jax.grad(loss)(log)
         assert np.linalg.eigvalsh(curvature)[0] > 0
         assert np.abs(np.linalg.solve(curvature, slope)).max() < 1e-3
-        assert "may be a local one" in found.stopped
+        assert "possibly a local one" in found.stopped
     else:
         assert "before it converged" in found.stopped
 

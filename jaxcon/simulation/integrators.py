@@ -212,8 +212,9 @@ def closer(
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
 
     Most steps turn bodies by less than `TURN`, where e is about 1e-5 of a lever arm, and pay for
-    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist, and from
-    1 to √2 rad it fades, since a Newton step from so far away leads nowhere. A row of an inequality
+    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist. It fades
+    from 1 to √2 rad, and where its own kinetic energy is ¼ to ½ of the motion's, as near a singular
+    configuration: from so far away a Newton step leads nowhere. A row of an inequality
     constraint on bodies in space moves off its target by e/h with them. Where no body turns in
     space, a world in which such rows act goes without.
 
@@ -234,10 +235,10 @@ def closer(
 
     def corrected() -> tuple[Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
-        sound = turn < 2
-        a, moving = (jnp.where(sound, x, 0) for x in (solution.acceleration, v))
+        asks = (turn > TURN**2) & (turn < 2)
+        a, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, v))
         square = system.turn(state.q, moving, rows.bias, h)
-        share = jnp.where(sound, smooth((square / TURN**2 - 1) / 3) * smooth(2 - square), 0)
+        share = jnp.where(asks, smooth((square / TURN**2 - 1) / 3) * smooth(2 - square), 0)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))
@@ -247,6 +248,10 @@ def closer(
         more = least(-share[None] * numerics.safe_divide(off, h * h))
         # rounding over h² may contradict redundant rows; rows that do contradict were noted before
         more = more._replace(status=status.failures(more.status))
+        change = h * more.acceleration
+        energies = [(x * rows.mass.apply(x)).sum(axis=0) for x in (change, moving)]
+        fades = smooth(2 - 4 * numerics.safe_divide(*energies))[None]
+        more = Solution(fades * more.acceleration, fades * more.multipliers, more.status)
         return v + h * more.acceleration, added(solution, more)
 
     return jax.lax.cond(somewhere(turn > TURN**2), corrected, lambda: (v, solution))

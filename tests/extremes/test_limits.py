@@ -45,7 +45,8 @@ def test_long_chains_of_short_links():
     family = replace(FAMILIES["links"], values=(2, 50, 100), steps=500)
     found = run(family, METHODS["semi-implicit Euler"], "float32")
     assert [x.held for x in found] == [True, True, False], found
-    assert found[-1].status == "NON_FINITE"
+    # whichever comes first as it blows up, numbers that overflow or a pivot that rounds to 0
+    assert found[-1].status in ("NON_FINITE", "SINGULAR")
 
 
 def test_worlds_do_not_notice_those_that_fail():
