@@ -368,12 +368,13 @@ def uninlined(function: Callable[..., list[Array]], args: Sequence[Array]) -> li
     @functools.wraps(function)
     def call(*args: Array) -> tuple[list[Array], list[Array]]:
         results = function(*args)
-        return results, [jnp.zeros((), bool)] if len(results) == 1 else []
+        return results, [jnp.zeros((), bool)] if len(results) < 2 else []
 
-    (first, *others), beside = jax.jit(call)(*args)
+    results, beside = jax.jit(call)(*args)
+    first, *others = *results, *beside
     # what is said of a result of a call is said of the call
-    kept = [set_xla_metadata(first, **KERNEL), *others, *beside]
-    return jax.lax.optimization_barrier(kept)[: 1 + len(others)]
+    kept = jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])
+    return kept[: len(results)]
 
 
 def _settled_body(closed: Any) -> tuple[Any, bool]:
