@@ -119,13 +119,16 @@ class Dynamics:
             law: of the stabilizer.
             problem: the saddle system of both.
             lag: velocities are those of lag · h before the positions; None for none.
-            every: whether impacts are told apart in scenes without restitution, too.
+            every: whether every landing without restitution is an impact; otherwise only where
+                `impacts.resolves_landings`.
             ahead: the bounded rows, from `bounds_ahead`; None where they are not known yet.
         """
         if self.part is None:
             bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
             length, acts = self.dt, None
-            strikes = any(bounds.ends) and (every or bounds.restitution is not None)
+            bounces = bounds.restitution is not None
+            resolves = every or bounces or impacts.resolves_landings(bounds, self.bounded)
+            strikes = any(bounds.ends) and resolves
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
             if doubt is not None:
@@ -146,7 +149,8 @@ class Dynamics:
         may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
-            may = impacts.candidates(bouncy, start, self.dt)
+            reach = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).reach(impulse.start)
+            may = impacts.candidates(bouncy, start, self.dt, reach)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))

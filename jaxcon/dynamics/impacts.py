@@ -9,6 +9,14 @@ other accelerations a⁺. At the end of a step h, with r = h − τ the rest of 
 The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
 an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
 
+A row that lands without restitution leaves with φ̇ = 0, so that what it does next is decided by
+φ̈ = J a⁺ + J̇ v⁺. The acceleration a⁺ therefore obeys 0 ≤ λ ⊥ φ̈ ≥ 0 and Coulomb's law with J̇ v⁺,
+found as (J(q* ⊕ h v⁺) − J(q*)) v⁺ / h. The end of a rod that turns fast lifts off at once; without
+J̇ v⁺ it would be held down for r, an impulse in proportion to r, of which τ has a derivative of
+order 1. Plain steps lack J̇ v, too: they let a gap open to h² J̇ v (½ h² J̇ v beside velocities of
+half a step before) before a row at rest lets go. The travel of a landing therefore begins earlier
+by that gap over −φ̇⁻. This is O(h²), and spares the next step an impulse of O(h) that depends on r.
+
 The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
 step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
 
@@ -37,6 +45,7 @@ from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import mask
+from jaxcon.solvers.gauss_seidel import GaussSeidel
 from jaxcon.solvers.saddle import Solution
 
 ROUNDING = 64
@@ -47,6 +56,13 @@ PREFIX = "gradients through impacts: "
 
 SLOW = 2
 """Impacts slower than this many times h |a| do not bounce: the row comes to rest."""
+
+OVERDUE = 0.25
+"""The share of a step by which an impact may be late: its gap closed just before the step.
+
+A path that bends may close a gap by O(h²) where none was expected. Rows that rest beyond their
+gap are there by half a step or more, and make no impact.
+"""
 
 
 class Seen(NamedTuple):
@@ -153,11 +169,11 @@ class Arrivals:
         """
         closing = self.hits & (rows.rate < -(float(jnp.finfo(rows.rate.dtype).tiny) ** 0.8))
         late = quotient(jnp.where(closing, rows.gap, 0), jnp.where(closing, -rows.rate, 1))
-        late = rows.kinds.by_contact(jnp.where(jnp.abs(late) <= self.times, late, 0))
+        late = rows.kinds.by_contact(jnp.where(jnp.abs(late) <= jnp.abs(self.times), late, 0))
         return dataclasses.replace(self, times=self.times + late)
 
 
-def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
+def candidates(rows: BoundRows, change: Array, dt: Array, most: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
@@ -167,12 +183,15 @@ def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
         rows: the bounded rows at the start of the step.
         change: h J a without bounded rows, (n,).
         dt: h, () [s].
+        most: h |J| |a|, (n,), below which a row may rest: bodies of a stack fall alike.
     """
     e, least = rows.restitution, slowest(rows, change)
-    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
+    rests = most if e is None else jnp.where(e >= 0, 0, most)
     least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
+    if e is None:
+        may &= rows.gap >= -OVERDUE * dt[None] * jnp.abs(rows.rate)
     return jax.lax.stop_gradient(may & (dt[None] > 0))
 
 
@@ -207,7 +226,7 @@ def arrive(
     speed = -(rows.rate + lag * change)
     fast = may & (speed > 0)
     size = jnp.where(fast, speed, 1)
-    gap = jnp.where(fast & (rows.gap > 0), rows.gap, 0)
+    gap = jnp.where(fast & (rows.gap > -OVERDUE * dt[None] * size), rows.gap, 0)
     bend = numerics.safe_divide(change, dt[None])
     whole = quotient(gap, size)
     # the smaller root in a form that subtracts nothing; no root where the row turns round
@@ -315,7 +334,12 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     s u⁻ along the normal, which closes the gap, and as much along the tangents, which holds
     friction back until τ. The next step does the rest of the impact. As both impulses are the
     shares 1 − s and s of one, at the places before and after, the two steps have the time of the
-    impact and its place, and so have their derivatives. That costs nothing, unlike an `Impact`.
+    impact and its place. That costs nothing, unlike an `Impact`.
+
+    The second place is reached with v⁻ + (1 − s) Δv. With Δv = −Q(q) v⁻ and P = 1 − Q, the motion
+    along the contact is so off by h s (1 − s) P (∂Q/∂q · Δv) Δv: O(h), but of order 1 in the
+    derivative, as s changes by 1 within a step. It vanishes where Q does not depend on q along Δv,
+    as for balls on planes.
 
     Args:
         rows: the bounded rows at the start of the step.
@@ -335,6 +359,20 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
 
 
+def resolves_landings(rows: BoundRows, solver: Any) -> bool:
+    """Returns True where a landing without restitution is an `Impact`, not two steps (`landing`).
+
+    An impact solves the contacts twice more, in a large batch in nearly every step. `GaussSeidel`,
+    which is chosen for its speed, keeps landings of two steps.
+
+    Args:
+        rows: the bounded rows; only their static fields are read.
+        solver: of the bounded rows.
+    """
+    inner = getattr(solver, "solver", solver)
+    return bool(rows.lands) and not isinstance(inner, GaussSeidel)
+
+
 def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
     """Why derivatives of plain steps through impacts may be wrong, by structure; None if not.
 
@@ -347,8 +385,8 @@ def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
     if lags and rows.lands:
         reasons.append(
             f"a landing of {', '.join(rows.lands)} takes two steps, so that where a body turns as"
-            " it lands on a corner or on another body, its derivative is right only in the mean"
-            " over the phases of a step; restitution=jnp.zeros(()) or Events() makes it one"
+            " it lands, or moves with others by joints, its derivative is right only in the mean"
+            " over the phases of a step; InteriorPoint() or restitution=jnp.zeros(()) makes it one"
         )
     if some and any(rows.ends):
         reasons.append(
@@ -400,14 +438,16 @@ class Impact:
         place, before, time = self._there(arrivals)
         τ = arrivals.by_velocity
 
-        def find(v: Array, lasts: Array) -> tuple[Array, Found]:
+        def find(v: Array, lasts: Array) -> tuple[Array, tuple[Found, Array, Array]]:
             known = self.laws.rows(place, v, time)
+            bend = self._bend(known, place, v, time)
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
+            rows = dataclasses.replace(rows, rate=rows.rate + jnp.where(lasts, bend, 0))
             found = self.laws.find(place, v, time, rows, acts, lasts)
-            return v + jnp.where(lasts, 0, found.change), found
+            return v + jnp.where(lasts, 0, found.change), (found, known.rate, bend)
 
         # the impact and what follows are one program, which halves what there is to compile
-        _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
+        _, (found, rate, bend) = jax.lax.scan(find, before, jnp.asarray([False, True]))
         struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
         rest, left = h - τ, (1 - self.lag) * h - τ
         # from the acceleration just before the impact, not from that at the start of the step
@@ -417,13 +457,33 @@ class Impact:
         # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
-        travel = rest * struck.change + rest * rest / 2 * more + swing
+        lift = (1 - self.lag) * h * jnp.maximum(bend[1], 0)
+        early = jnp.minimum(numerics.safe_divide(lift, jnp.abs(rate[0])), h)
+        early = jnp.sum(arrivals.leads * jax.lax.stop_gradient(early)[None], axis=1)
+        travel = (rest + early) * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
         share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
         struck = struck._replace(multipliers=impulses, joints=joints)
         return keep(self.arrivals.happens, (jump, struck), still)
+
+    def _bend(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
+        """Returns h J̇ v of rows that arrive and stay, (n,), a constant; zero for others.
+
+        Args:
+            rows: the bounded rows at q, v and t.
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+        """
+        q, v, arrivals = jax.lax.stop_gradient((q, v, self.arrivals))
+        later = self.laws.rows(self.system.retract(q, self.dt[None] * v), v, t + self.dt)
+        stays = arrivals.hits
+        if rows.restitution is not None:
+            stays &= ~(arrivals.bounces & (rows.restitution > 0))
+        stays = rows.kinds.by_contact(stays)
+        return jax.lax.stop_gradient(jnp.where(stays, later.rate - rows.rate, 0))
 
     def _there(self, arrivals: Arrivals) -> tuple[Array, Array, Array]:
         """q*, v⁻ and the time of the impact."""
