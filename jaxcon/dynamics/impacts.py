@@ -64,6 +64,9 @@ A path that bends may close a gap by O(h²) where none was expected. Rows that r
 gap are there by half a step or more, and make no impact.
 """
 
+REFINES, STRIKES, BENDS, GOES_ON = range(4)
+"""The stages of an impact: τ; Δv; φ̇ a step further along v⁺, of which J̇ v⁺ is found; and a⁺."""
+
 
 class Seen(NamedTuple):
     """The kind of observations of impacts: rows that hit (n,), those that bounce (n,), time, h.
@@ -434,21 +437,38 @@ class Impact:
 
     def _strikes(self, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
         h, a = self.dt[None], self.acceleration
-        arrivals = self.arrivals.refined(self.laws.rows(*self._there(self.arrivals)))
-        place, before, time = self._there(arrivals)
+
+        def stage(carry: tuple[Array, Array, Array], number: Array) -> tuple[Any, Any]:
+            times, after, later = carry
+            place, before, time = self._there(dataclasses.replace(self.arrivals, times=times))
+            v = jnp.where(number <= STRIKES, before, after)
+            ahead = jnp.where(number == BENDS, self.dt, 0)
+            place = self.system.retract(place, ahead[None] * v)
+            known = self.laws.rows(place, v, time + ahead)
+            lasts = number == GOES_ON
+            bend = jnp.where(lasts & self._stays(known), later - known.rate, 0)
+            bend = jax.lax.stop_gradient(bend)
+
+            def solved() -> Found:
+                rows, acts = at_impact(known, self.arrivals, self.dt, lasts)
+                rows = dataclasses.replace(rows, rate=rows.rate + bend)
+                return self.laws.find(place, v, time, rows, acts, lasts)
+
+            solves = (number == STRIKES) | lasts
+            found = jax.lax.cond(solves, solved, lambda: still[1])
+            times = jnp.where(number == REFINES, self.arrivals.refined(known).times, times)
+            after = jnp.where(number == STRIKES, v + found.change, v)
+            return (times, after, known.rate), (found, known.rate, bend)
+
+        # the stages are one traced program, in which rows and solution are compiled once
+        start = self.arrivals.times, jnp.zeros_like(self.v), jnp.zeros_like(self.arrivals.times)
+        (times, *_), stages = jax.lax.scan(stage, start, np.arange(GOES_ON + 1))
+        (struck, rate, _), (after, _, bend) = (
+            jax.tree.map(lambda x, i=i: x[i], stages) for i in (STRIKES, GOES_ON)
+        )
+        arrivals = dataclasses.replace(self.arrivals, times=times)
+        place, before, _ = self._there(arrivals)
         τ = arrivals.by_velocity
-
-        def find(v: Array, lasts: Array) -> tuple[Array, tuple[Found, Array, Array]]:
-            known = self.laws.rows(place, v, time)
-            bend = self._bend(known, place, v, time)
-            rows, acts = at_impact(known, arrivals, self.dt, lasts)
-            rows = dataclasses.replace(rows, rate=rows.rate + jnp.where(lasts, bend, 0))
-            found = self.laws.find(place, v, time, rows, acts, lasts)
-            return v + jnp.where(lasts, 0, found.change), (found, known.rate, bend)
-
-        # the impact and what follows are one program, which halves what there is to compile
-        _, (found, rate, bend) = jax.lax.scan(find, before, jnp.asarray([False, True]))
-        struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
         rest, left = h - τ, (1 - self.lag) * h - τ
         # from the acceleration just before the impact, not from that at the start of the step
         smooth = self._gyroscopic(before) - self._gyroscopic(self.v)
@@ -457,8 +477,8 @@ class Impact:
         # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
-        lift = (1 - self.lag) * h * jnp.maximum(bend[1], 0)
-        early = jnp.minimum(numerics.safe_divide(lift, jnp.abs(rate[0])), h)
+        lift = (1 - self.lag) * h * jnp.maximum(bend, 0)
+        early = jnp.minimum(numerics.safe_divide(lift, jnp.abs(rate)), h)
         early = jnp.sum(arrivals.leads * jax.lax.stop_gradient(early)[None], axis=1)
         travel = (rest + early) * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
@@ -468,22 +488,12 @@ class Impact:
         struck = struck._replace(multipliers=impulses, joints=joints)
         return keep(self.arrivals.happens, (jump, struck), still)
 
-    def _bend(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
-        """Returns h J̇ v of rows that arrive and stay, (n,), a constant; zero for others.
-
-        Args:
-            rows: the bounded rows at q, v and t.
-            q: positions, (n_q,).
-            v: velocities, (n_v,).
-            t: time, () [s].
-        """
-        q, v, arrivals = jax.lax.stop_gradient((q, v, self.arrivals))
-        later = self.laws.rows(self.system.retract(q, self.dt[None] * v), v, t + self.dt)
-        stays = arrivals.hits
+    def _stays(self, rows: BoundRows) -> Array:
+        """A mask of the rows that arrive and do not rebound, (n,)."""
+        stays = self.arrivals.hits
         if rows.restitution is not None:
-            stays &= ~(arrivals.bounces & (rows.restitution > 0))
-        stays = rows.kinds.by_contact(stays)
-        return jax.lax.stop_gradient(jnp.where(stays, later.rate - rows.rate, 0))
+            stays &= ~(self.arrivals.bounces & (rows.restitution > 0))
+        return rows.kinds.by_contact(stays)
 
     def _there(self, arrivals: Arrivals) -> tuple[Array, Array, Array]:
         """q*, v⁻ and the time of the impact."""
