@@ -163,15 +163,18 @@ class Dynamics:
             push = impulse.rows.jacobian.transpose(jnp.where(ends, known.multipliers, 0))
         if strikes:
             lag = 0.0 if lag is None else lag
-            change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
-            times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
-            solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
-            if e is not None:
-                left = self.dt[None] - times.times
-                speed = impacts.leaving_speeds(bounds.rate, e, times, change, lag, self.dt)
-                lost = impacts.passes_range(both_stops, speed, left)
-                solution = solution._replace(status=lost_impacts(solution.status, lost))
-            solution, known = self._struck((q, v, t), solution, known, times, lag)
+
+            def approach() -> impacts.Approach:
+                change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
+                asked = impulse.rows, may, change, lag, self.dt, impulse.moved()
+                arrivals = impacts.arrive(*asked)
+                if e is None:
+                    return impacts.Approach(arrivals, None)
+                left = self.dt[None] - arrivals.times
+                speed = impacts.leaving_speeds(bounds.rate, e, arrivals, change, lag, self.dt)
+                return impacts.Approach(arrivals, impacts.passes_range(both_stops, speed, left))
+
+            solution, known = self._struck((q, v, t), solution, known, may, approach, lag)
         elif seen is not None:
             solution = self._observed(solution, t, seen, seen, bounds)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone, push
@@ -185,14 +188,22 @@ class Dynamics:
         return solution._replace(acceleration=a)
 
     def _struck(
-        self, at: Any, solution: Solution, known: Reactions, arrivals: Any, lag: float
+        self,
+        at: Any,
+        solution: Solution,
+        known: Reactions,
+        may: Array,
+        approach: Callable[[], impacts.Approach],
+        lag: float,
     ) -> tuple[Solution, Reactions]:
         """Adds the impacts of the step: their jump, and the mean of their impulses."""
         laws = _Laws(dataclasses.replace(self, guess=None))
         a, λ, joints = solution.acceleration, known.multipliers, solution.multipliers
         q, v, t = at
-        impact = impacts.Impact(laws, self.system, q, v, t, a, λ, joints, lag, self.dt, arrivals)
-        jump, struck = impact.outcome()
+        impact = impacts.Impact(laws, self.system, q, v, t, a, λ, joints, lag, self.dt, may)
+        jump, struck, (hits, bounces), lost = impact.outcome(approach)
+        solution = self._observed(solution, t, hits, bounces, known)
+        solution = solution._replace(status=lost_impacts(solution.status, lost))
         λ, joints = (
             x + numerics.safe_divide(more, self.dt[None])
             for x, more in ((λ, struck.multipliers), (joints, struck.joints))

@@ -30,6 +30,7 @@ References:
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -165,6 +166,13 @@ class Arrivals:
         """τ by velocity, (n_v,) or (1,) [s]."""
         return jnp.sum(self.leads * self.times[None], axis=1)
 
+    def stay(self, rows: BoundRows) -> Array:
+        """A mask of the rows that arrive and do not rebound, (n,)."""
+        stays = self.hits
+        if rows.restitution is not None:
+            stays &= ~(self.bounces & (rows.restitution > 0))
+        return rows.kinds.by_contact(stays)
+
     def refined(self, rows: BoundRows) -> Arrivals:
         """Refines the times by one Newton step on the gaps at the place of the impact.
 
@@ -174,6 +182,34 @@ class Arrivals:
         late = quotient(jnp.where(closing, rows.gap, 0), jnp.where(closing, -rows.rate, 1))
         late = rows.kinds.by_contact(jnp.where(jnp.abs(late) <= jnp.abs(self.times), late, 0))
         return dataclasses.replace(self, times=self.times + late)
+
+
+class Approach(NamedTuple):
+    """How a step ends where rows may arrive.
+
+    Attributes:
+        arrivals: which rows arrive, and when.
+        lost: worlds whose rebounds the step loses, see `passes_range`, (); None for none.
+    """
+
+    arrivals: Arrivals
+    lost: Array | None
+
+
+class Outcome(NamedTuple):
+    """What the impacts of a step come to.
+
+    Attributes:
+        jump: of the velocities and the displacement.
+        found: the impulses that impacts add to those of the step's smooth forces.
+        seen: which rows hit, and which of them are fast enough to bounce, (n,) each.
+        lost: of the `Approach`.
+    """
+
+    jump: Jump
+    found: Found
+    seen: tuple[Array, Array]
+    lost: Array | None
 
 
 def candidates(rows: BoundRows, change: Array, dt: Array, most: Array) -> Array:
@@ -412,7 +448,7 @@ class Impact:
         lag: velocities are those of lag · h before the positions; where it is not 0, the travel is
             added to the displacement of the step before bodies turn by the sum.
         dt: h, () [s].
-        arrivals: which rows arrive, and when.
+        may: the `candidates`, (n,).
     """
 
     laws: Laws
@@ -425,48 +461,62 @@ class Impact:
     joints: Array
     lag: Any
     dt: Array
-    arrivals: Arrivals
+    may: Array
 
-    def outcome(self) -> tuple[Jump, Found]:
-        """The jump, and the impulses that impacts add to those of the step's smooth forces."""
-        happens = self.arrivals.happens
+    def outcome(self, approach: Callable[[], Approach]) -> Outcome:
+        """What impacts add to the step.
+
+        Args:
+            approach: finds the arrivals, and is asked only where there are candidates.
+        """
         none, one = jnp.zeros_like(self.v), jnp.ones(self.v.shape[1:], self.v.dtype)
         rows, joints = jnp.zeros_like(self.multipliers), jnp.zeros_like(self.joints)
         still = Jump(none, none), Found(none, rows, joints, 0 * one, one)
-        return jax.lax.cond(somewhere(happens), lambda: self._strikes(still), lambda: still)
+        nothing = jnp.zeros_like(self.may)
 
-    def _strikes(self, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
+        def arrives() -> Outcome:
+            arrivals, lost = approach()
+            happens = somewhere(arrivals.happens)
+            struck = jax.lax.cond(happens, lambda: self._strikes(arrivals, still), lambda: still)
+            return Outcome(*struck, (arrivals.hits, arrivals.bounces), lost)
+
+        lost = jax.eval_shape(approach).lost
+        lost = None if lost is None else jnp.zeros(lost.shape, bool)
+        quiet = Outcome(*still, (nothing, nothing), lost)
+        return jax.lax.cond(somewhere(self.may), arrives, lambda: quiet)
+
+    def _strikes(self, first: Arrivals, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
         h, a = self.dt[None], self.acceleration
 
         def stage(carry: tuple[Array, Array, Array], number: Array) -> tuple[Any, Any]:
             times, after, later = carry
-            place, before, time = self._there(dataclasses.replace(self.arrivals, times=times))
+            place, before, time = self._there(dataclasses.replace(first, times=times))
             v = jnp.where(number <= STRIKES, before, after)
             ahead = jnp.where(number == BENDS, self.dt, 0)
             place = self.system.retract(place, ahead[None] * v)
             known = self.laws.rows(place, v, time + ahead)
             lasts = number == GOES_ON
-            bend = jnp.where(lasts & self._stays(known), later - known.rate, 0)
+            bend = jnp.where(lasts & first.stay(known), later - known.rate, 0)
             bend = jax.lax.stop_gradient(bend)
 
             def solved() -> Found:
-                rows, acts = at_impact(known, self.arrivals, self.dt, lasts)
+                rows, acts = at_impact(known, first, self.dt, lasts)
                 rows = dataclasses.replace(rows, rate=rows.rate + bend)
                 return self.laws.find(place, v, time, rows, acts, lasts)
 
             solves = (number == STRIKES) | lasts
             found = jax.lax.cond(solves, solved, lambda: still[1])
-            times = jnp.where(number == REFINES, self.arrivals.refined(known).times, times)
+            times = jnp.where(number == REFINES, first.refined(known).times, times)
             after = jnp.where(number == STRIKES, v + found.change, v)
             return (times, after, known.rate), (found, known.rate, bend)
 
         # the stages are one traced program, in which rows and solution are compiled once
-        start = self.arrivals.times, jnp.zeros_like(self.v), jnp.zeros_like(self.arrivals.times)
+        start = first.times, jnp.zeros_like(self.v), jnp.zeros_like(first.times)
         (times, *_), stages = jax.lax.scan(stage, start, np.arange(GOES_ON + 1))
         (struck, rate, _), (after, _, bend) = (
             jax.tree.map(lambda x, i=i: x[i], stages) for i in (STRIKES, GOES_ON)
         )
-        arrivals = dataclasses.replace(self.arrivals, times=times)
+        arrivals = dataclasses.replace(first, times=times)
         place, before, _ = self._there(arrivals)
         τ = arrivals.by_velocity
         rest, left = h - τ, (1 - self.lag) * h - τ
@@ -486,14 +536,7 @@ class Impact:
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
         struck = struck._replace(multipliers=impulses, joints=joints)
-        return keep(self.arrivals.happens, (jump, struck), still)
-
-    def _stays(self, rows: BoundRows) -> Array:
-        """A mask of the rows that arrive and do not rebound, (n,)."""
-        stays = self.arrivals.hits
-        if rows.restitution is not None:
-            stays &= ~(self.arrivals.bounces & (rows.restitution > 0))
-        return rows.kinds.by_contact(stays)
+        return keep(first.happens, (jump, struck), still)
 
     def _there(self, arrivals: Arrivals) -> tuple[Array, Array, Array]:
         """q*, v⁻ and the time of the impact."""
