@@ -304,19 +304,23 @@ def test_a_ball_hits_a_capsule_in_the_plane(order, solver):
     np.testing.assert_allclose(gaps, apart, atol=1e-14)
 
     def flown(time, motions, ball):
-        """Centers of both, the nearest point of the capsule's axis, and how far the ball is."""
+        """Centers of both, and the nearest point of the capsule's axis."""
         centers = [c + time * v[:2] for c, v in zip((middle, ball), motions, strict=True)]
         turn = 0.4 + time * motions[0][2]
         axis = np.array([np.cos(turn), np.sin(turn)])
         foot = centers[0] + np.clip(axis @ (centers[1] - centers[0]), -0.4, 0.6) * axis
-        return centers, foot, np.linalg.norm(centers[1] - foot)
+        return centers, foot
+
+    def gap_after(time, motions, ball):
+        centers, foot = flown(time, motions, ball)
+        return np.linalg.norm(centers[1] - foot) - radii.sum()
 
     for i, n in enumerate(normals):
         motions = [before["capsule"], speeds[i]]
         centers, foot, gap = [middle, balls[i]], feet[i], apart
         if not swept:
-            time = brentq(lambda t: flown(t, motions, balls[i])[2] - radii.sum(), 0, H, xtol=1e-16)
-            centers, foot, _ = flown(time, motions, balls[i])
+            time = brentq(gap_after, 0, H, (motions, balls[i]), xtol=1e-16)
+            centers, foot = flown(time, motions, balls[i])
             n, gap = (centers[1] - foot) / radii.sum(), 0.0
         place = foot + (radii[0] + gap / 2) * n
         arms = [place - center for center in centers]

@@ -176,14 +176,14 @@ class Dynamics:
 
             solution, known = self._struck((q, v, t), solution, known, may, approach, lag)
         elif seen is not None:
-            solution = self._observed(solution, t, seen, seen, bounds)
+            solution = self._observed(solution, t, seen, seen, bounds.layout)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone, push
 
     def _observed(
-        self, solution: Solution, t: Any, hits: Array, fast: Array, rows: BoundRows
+        self, solution: Solution, t: Any, hits: Array, fast: Array, layout: Any
     ) -> Solution:
         """The solution; `notices` observes the rows that hit in this step."""
-        kind = impacts.Seen(rows.layout)
+        kind = impacts.Seen(layout)
         a = notices.observe(solution.acceleration, kind, hits, fast, rounded(t), self.dt)
         return solution._replace(acceleration=a)
 
@@ -201,9 +201,10 @@ class Dynamics:
         a, λ, joints = solution.acceleration, known.multipliers, solution.multipliers
         q, v, t = at
         impact = impacts.Impact(laws, self.system, q, v, t, a, λ, joints, lag, self.dt, may)
-        jump, struck, (hits, bounces), lost = impact.outcome(approach)
-        solution = self._observed(solution, t, hits, bounces, known)
-        solution = solution._replace(status=lost_impacts(solution.status, lost))
+        outcome = impact.outcome(approach)
+        struck = outcome.found
+        solution = self._observed(solution, t, *outcome.seen, known.layout)
+        solution = solution._replace(status=lost_impacts(solution.status, outcome.lost))
         λ, joints = (
             x + numerics.safe_divide(more, self.dt[None])
             for x, more in ((λ, struck.multipliers), (joints, struck.joints))
@@ -213,7 +214,7 @@ class Dynamics:
             multipliers=λ,
             residual=jnp.maximum(known.residual, struck.residual),
             kept=jnp.minimum(known.kept, struck.kept),
-            jump=jump,
+            jump=outcome.jump,
         )
         return solution._replace(multipliers=joints), known
 

@@ -185,7 +185,7 @@ class Arrivals:
 
 
 class Approach(NamedTuple):
-    """How a step ends where rows may arrive.
+    """The arrivals of a step, and the worlds in which it loses rebounds.
 
     Attributes:
         arrivals: which rows arrive, and when.
@@ -197,7 +197,7 @@ class Approach(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What the impacts of a step come to.
+    """The results of the impacts of a step.
 
     Attributes:
         jump: of the velocities and the displacement.
@@ -464,7 +464,7 @@ class Impact:
     may: Array
 
     def outcome(self, approach: Callable[[], Approach]) -> Outcome:
-        """What impacts add to the step.
+        """The changes that impacts make to the step.
 
         Args:
             approach: finds the arrivals, and is asked only where there are candidates.
@@ -478,11 +478,11 @@ class Impact:
             arrivals, lost = approach()
             happens = somewhere(arrivals.happens)
             struck = jax.lax.cond(happens, lambda: self._strikes(arrivals, still), lambda: still)
-            return Outcome(*struck, (arrivals.hits, arrivals.bounces), lost)
+            return Outcome(struck[0], struck[1], (arrivals.hits, arrivals.bounces), lost)
 
         lost = jax.eval_shape(approach).lost
         lost = None if lost is None else jnp.zeros(lost.shape, bool)
-        quiet = Outcome(*still, (nothing, nothing), lost)
+        quiet = Outcome(still[0], still[1], (nothing, nothing), lost)
         return jax.lax.cond(somewhere(self.may), arrives, lambda: quiet)
 
     def _strikes(self, first: Arrivals, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
@@ -512,7 +512,7 @@ class Impact:
 
         # the stages are one traced program, in which rows and solution are compiled once
         start = first.times, jnp.zeros_like(self.v), jnp.zeros_like(first.times)
-        (times, *_), stages = jax.lax.scan(stage, start, np.arange(GOES_ON + 1))
+        (times, *_), stages = jax.lax.scan(stage, start, jnp.arange(GOES_ON + 1))
         (struck, rate, _), (after, _, bend) = (
             jax.tree.map(lambda x, i=i: x[i], stages) for i in (STRIKES, GOES_ON)
         )
