@@ -532,7 +532,9 @@ class Impact:
         early = jnp.sum(arrivals.leads * jax.lax.stop_gradient(early)[None], axis=1)
         travel = (rest + early) * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
-        share = ((1 - self.lag) * self.dt - arrivals.first)[None]
+        # an impact later than the velocities are has no forces after it in them: less than none
+        # would pull at contacts, and leave their cones
+        share = jnp.maximum((1 - self.lag) * self.dt - arrivals.first, 0)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
         struck = struck._replace(multipliers=impulses, joints=joints)
