@@ -244,6 +244,7 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
 def _in_stages(program: Program, stored: set[int]) -> list[Step]:
     """Operations and stages in order: a value joins the last stage unless it depends on it."""
     steps: list[Any] = []
+    last = -1  # stage
     made: dict[int, int] = {}
     for op in program.operations:
         after = max((made.get(x, -1) for x in op.inputs if not isinstance(x, Constant)), default=-1)
@@ -251,12 +252,12 @@ def _in_stages(program: Program, stored: set[int]) -> list[Step]:
             steps.append(op)
             after = len(steps) - 1
         elif op.outputs[0] in stored:
-            joins = steps and isinstance(steps[-1], list) and after < len(steps) - 1
-            if joins:
-                steps[-1].append(op.outputs[0])
+            if after < last:
+                steps[last].append(op.outputs[0])
             else:
                 steps.append([op.outputs[0]])
-            after = len(steps) - 1
+                last = len(steps) - 1
+            after = last
         made.update(dict.fromkeys(op.outputs, after))
     return steps
 
@@ -359,17 +360,20 @@ def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array
 def uninlined(function: Callable[..., list[Array]], args: Sequence[Array]) -> list[Array]:
     """The results of a call that XLA does not inline.
 
-    It has one result more, which the barrier keeps although nobody needs it: a call that ends in
-    one large array would be split among threads, which a call inside a kernel cannot be.
+    A single result is given a second one beside it, which the barrier keeps although nobody needs
+    it: a call that ends in one large array would be split among threads, which a call inside a
+    kernel cannot be. Each result is a buffer, whose address every call of the kernel looks up.
     """
 
     @functools.wraps(function)
-    def call(*args: Array) -> list[Array]:
-        return [*function(*args), jnp.zeros((), bool)]
+    def call(*args: Array) -> tuple[list[Array], list[Array]]:
+        results = function(*args)
+        return results, [jnp.zeros((), bool)] if len(results) == 1 else []
 
-    first, *others = jax.jit(call)(*args)
+    (first, *others), beside = jax.jit(call)(*args)
     # what is said of a result of a call is said of the call
-    return jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])[:-1]
+    kept = [set_xla_metadata(first, **KERNEL), *others, *beside]
+    return jax.lax.optimization_barrier(kept)[: 1 + len(others)]
 
 
 def _settled_body(closed: Any) -> tuple[Any, bool]:

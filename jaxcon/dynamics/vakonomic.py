@@ -190,10 +190,10 @@ class Vakonomic:
         """True where bodies of the system have an orientation in space."""
         return self.system.turns_in_space
 
-    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
+    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any, small: bool = False) -> Array:
         """The velocities after a step of h as those of the system, and μ + h μ̇."""
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)
-        return jnp.concatenate([self.system.kick(q, v, a, dt), μ + dt * rate])
+        return jnp.concatenate([self.system.kick(q, v, a, dt, small), μ + dt * rate])
 
     def turn(self, q: Array, v: Array, bias: Array, dt: Any) -> Array:
         """The square of the largest turn in a step, as of the system, () [rad²]."""

@@ -250,7 +250,7 @@ class BodySystem:
         pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
         return _join([kind.carry(own, momentum) for kind, own, momentum in pairs], q)
 
-    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
+    def kick(self, q: Array, v: Array, acceleration: Array, dt: Any, small: bool = False) -> Array:
         """v after a step of h under a, (n_v,); free rotation in space is split off.
 
         Args:
@@ -258,12 +258,14 @@ class BodySystem:
             v: velocities before the step, (n_v,).
             acceleration: a at q and v, (n_v,), with its gyroscopic part.
             dt: h, (1,) [s].
+            small: whether bodies turn by far less than a radian in a step, which takes less work.
         """
         parts = zip(self.layout.groups, self.inertia, strict=True)
         known = [
             (g.kind, g.unpack(q, v)[1], g.unpack(q, acceleration)[1], p.moments) for g, p in parts
         ]
-        return _join([kind.kick(*own, dt) for kind, *own in known], q)
+        kicked = ((kind.kick_little if small else kind.kick)(*own, dt) for kind, *own in known)
+        return _join(list(kicked), q)
 
     def coast(self, q: Array, v: Array, dt: Any) -> Array:
         """The mean gyroscopic acceleration of a step of free rotation, less that at its start.

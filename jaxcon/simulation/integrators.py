@@ -62,8 +62,12 @@ def reached(state: State, time: Any, dt: Array) -> Doubled:
 
 
 Pair = tuple[Any, Any]
-TURN = 0.025
-"""Turn of a body in a step [rad] from which φ at the end of the step is looked at; see `closer`."""
+LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.025, 0.03)
+"""Turns of a body in a step [rad] between which the Newton step for φ⁺ sets in; see `closer`.
+
+In the plane, energy then drifts by less than 1 % of the largest kinetic energy in a minute; bodies
+in space, which have more ways to exchange it, drift as little if the step sets in sooner.
+"""
 
 
 class Explicit(checks.Checked):
@@ -96,12 +100,13 @@ class SemiImplicitEuler(Explicit):
     share of what bends the path (half, by default gains); `forward_dynamics` without feedback has
     it all.
 
-    In space, bodies turn freely for half a step before and after the acceleration acts on them
+    In space, the free rotation of bodies is split off from what accelerates them
     (`BodySystem.kick`). A free body so keeps |Iω| and its energy up to turns of a radian a step.
-    Where a body or a rod between particles turns by more than 0.025 rad in a step, what the
-    linearized rows missed of φ is taken out by a second substitution with the factors of the step,
-    in full from 0.05 rad on. Such a step takes about half as long again. Without it, energy would
-    grow with (h|ω|)³, and motions of a radian in a few steps would end NON_FINITE.
+    Where a body or a rod between particles turns by more than 0.038 rad in a step, or 0.025 rad if
+    bodies turn in space, what the linearized rows missed of φ is taken out by a second substitution
+    with the factors of the step, in full from 0.042 and 0.03 rad on. Such a step takes about half
+    as long again. Without it, energy would grow with (h|ω|)³, and motions of a radian in a few
+    steps would end NON_FINITE.
 
     References:
         Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections VII.1.4 and VII.5.
@@ -112,50 +117,51 @@ class SemiImplicitEuler(Explicit):
 
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Any) -> Advanced:
         """One step."""
-        system = dynamics.system
+        system, h = dynamics.system, dt[None]
         if system.has_bodies:
-            v, solution, rows = self._of_bodies(dynamics, state, dt)
-        else:
-            solution, rows = dynamics(state.q, state.v, state.instant, dt / 2)
-            v = state.v + dt[None] * solution.acceleration
-        jump, moving = jump_of(rows.reactions), v
-        if jump is not None:
-            moving = v - jump.velocity + numerics.safe_divide(jump.travel, dt[None])
-        q = system.retract(state.q, dt[None] * moving)
+            return self._of_bodies(dynamics, state, dt)
+        solution, rows = dynamics(state.q, state.v, state.instant, dt / 2)
+        v = moving = state.v + h * solution.acceleration
+        if (jump := jump_of(rows.reactions)) is not None:
+            moving = v - jump.velocity + numerics.safe_divide(jump.travel, h)
+        q = system.retract(state.q, h * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
-    def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> tuple[Array, Solution, Rows]:
-        """v⁺, a and λ, and the rows, of a system of bodies."""
-        here, h = (state.q, state.v, state.instant), dt[None]
-        if dynamics.system.turns_in_space:
-            v, solution, rows, least = self._in_space(dynamics, state, here, dt)
-        else:
-            solution, rows, least, _ = dynamics.factored(*here, dt / 2)
-            v = state.v + h * solution.acceleration
-        if least is not None and rows.layout.size:
-            v, solution = closer(dynamics.system, state, v, solution, rows, least, dt)
-        if (jump := jump_of(rows.reactions)) is not None:
-            v, solution = v + jump.velocity, with_jump(solution, jump, dt)
-        return v, solution, rows
-
-    def _in_space(
-        self, dynamics: Dynamics, state: State, here: tuple[Array, Array, Any], dt: Any
-    ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None]:
-        """v⁺, a and λ, rows and `least` of bodies in space, before the Newton step of `closer`.
-
-        Their free rotation is split off. Of a body on which a one-sided row acts, v⁺ = v + h a, as
-        its law says something of this v⁺. The gyroscopic part of a is then the mean over a step of
-        free rotation.
-        """
+    def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
+        """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        bounds: Any = None
-        coasting: Any = 0.0
-        if system.bounds:
-            bounds = dynamics.bounds_ahead(*here)
-            pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
-            coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
-            dynamics = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
-        solution, rows, least, push = dynamics.factored(*here, dt / 2, bounds)
+        v, solution, rows, least = self._promised(dynamics, state, dt)
+        q = system.retract(state.q, h * v)
+        if least is not None and rows.layout.size:
+            q, v, solution = closer(system, state, (q, v), solution, rows, least, dt)
+        if (jump := jump_of(rows.reactions)) is not None:
+            q = system.retract(state.q, h * v + jump.travel)
+            v, solution = v + jump.velocity, with_jump(solution, jump, dt)
+        return Advanced((q, v, state.instant + dt), solution, rows)
+
+    def _promised(
+        self, dynamics: Dynamics, state: State, dt: Any
+    ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None]:
+        """v⁺, a and λ, rows and `least` of a step of bodies, before the Newton step of `closer`.
+
+        In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
+        v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
+        mean over a step of free rotation.
+        """
+        system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
+        if not system.turns_in_space:
+            solution, rows, least, _ = dynamics.factored(*here, dt / 2)
+            return state.v + h * solution.acceleration, solution, rows, least
+        if not system.bounds:
+            solution, rows, least, _ = dynamics.factored(*here, dt / 2)
+            small = least is not None and rows.layout.size > 0  # `closer` does the large ones
+            v = system.kick(state.q, state.v, solution.acceleration, h, small)
+            return v, solution, rows, least
+        bounds = dynamics.bounds_ahead(*here)
+        pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
+        coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
+        held = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
+        solution, rows, least, push = held.factored(*here, dt / 2, bounds)
         v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
         if push is not None:
             straight = state.v + h * solution.acceleration
@@ -200,61 +206,69 @@ class SemiImplicitEuler(Explicit):
 def closer(
     system: Any,
     state: State,
-    v: Array,
+    end: tuple[Array, Array],
     solution: Solution,
     rows: Rows,
     least: Callable[[Array], Solution],
     dt: Any,
-) -> tuple[Array, Solution]:
-    """v⁺, a and λ without the linearization error of φ⁺, by one Newton step where turns are large.
+) -> tuple[Array, Array, Solution]:
+    """q⁺, v⁺, a and λ without the linearization error of φ⁺, by one Newton step for large turns.
 
     The rows promise φ⁺ = φ + h p + h² φ̈, with φ̈ = J a + γ and p = φ̇ − ½hγ. At q ⊕ h v⁺ they are
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
+    Where no one-sided row may act, the free rotation of bodies in space is split more finely, too.
 
-    Most steps turn bodies by less than `TURN`, where e is about 1e-5 of a lever arm, and pay for
-    the branch only. Up to twice that turn it sets in smoothly, so that derivatives exist. It fades
-    from 1 to √2 rad, and where its own kinetic energy is ¼ to ½ of the motion's, as near a singular
-    configuration: from so far away a Newton step leads nowhere. A row of an inequality
+    Most steps turn bodies by less than `LARGE`, where e is about 3e-5 of a lever arm, and pay for
+    the branch only. Between its two turns the step sets in smoothly, so that derivatives exist. It
+    fades from 1 to √2 rad, and where its own kinetic energy is ¼ to ½ of the motion's, as near a
+    singular configuration: from so far away a Newton step leads nowhere. A row of an inequality
     constraint on bodies in space moves off its target by e/h with them. Where no body turns in
     space, a world in which such rows act goes without.
 
     Args:
         system: of bodies.
         state: at the start of the step.
-        v: v⁺, (n_v,).
+        end: q⁺ = q ⊕ h v⁺ and v⁺, (n_q,) and (n_v,).
         solution: a and λ at the start.
         rows: the constraints there.
         least: b → the least a with J a + C λ = b.
         dt: h, () [s].
     """
-    h = dt[None]
+    h, (q, v) = dt[None], end
+    least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
     turn = system.turn(state.q, v, rows.bias, h)
     if rows.reactions is not None and not system.turns_in_space:
         acts = jnp.any(rows.reactions.multipliers != 0, axis=0)
         turn = jnp.where(acts, 0, turn)
 
-    def corrected() -> tuple[Array, Solution]:
+    def corrected() -> tuple[Array, Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
-        asks = (turn > TURN**2) & (turn < 2)
-        a, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, v))
+        asks = (turn > least_turn**2) & (turn < 2)
+        a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
+        place = jnp.where(asks, q, state.q)
         square = system.turn(state.q, moving, rows.bias, h)
-        share = jnp.where(asks, smooth((square / TURN**2 - 1) / 3) * smooth(2 - square), 0)
+        rise = (square - least_turn**2) / (full_turn**2 - least_turn**2)
+        share = jnp.where(asks, smooth(rise) * smooth(2 - square), 0)[None]
+        if system.turns_in_space and not system.bounds:
+            finely = system.kick(state.q, before, a, h)
+            moving = moving + share * (finely - moving)
+            place = system.retract(state.q, h * moving)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))
-        q = system.retract(state.q, h * moving)
-        there = linearize(system, q, moving, state.instant + dt).residual
+        there = linearize(system, place, moving, state.instant + dt).residual
         off = jnp.where(held, there - promised, 0)
-        more = least(-share[None] * numerics.safe_divide(off, h * h))
+        more = least(-share * numerics.safe_divide(off, h * h))
         # rounding over h² may contradict redundant rows; rows that do contradict were noted before
         more = more._replace(status=status.failures(more.status))
-        change = h * more.acceleration
-        energies = [(x * rows.mass.apply(x)).sum(axis=0) for x in (change, moving)]
+        change, mass = h * more.acceleration, system.mass(state.q)
+        energies = [(x * mass.apply(x)).sum(axis=0) for x in (change, moving)]
         fades = smooth(2 - 4 * numerics.safe_divide(*energies))[None]
         more = Solution(fades * more.acceleration, fades * more.multipliers, more.status)
-        return v + h * more.acceleration, added(solution, more)
+        found = jnp.where(asks, moving + fades * change, v)
+        return system.retract(state.q, h * found), found, added(solution, more)
 
-    return jax.lax.cond(somewhere(turn > TURN**2), corrected, lambda: (v, solution))
+    return jax.lax.cond(somewhere(turn > least_turn**2), corrected, lambda: (q, v, solution))
 
 
 def smooth(x: Array) -> Array:
