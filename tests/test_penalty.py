@@ -230,6 +230,66 @@ def test_multipliers_hold_a_closed_loop():
     np.testing.assert_allclose(*ends, atol=1e-4)
 
 
+def boxes_on_hinges(links, dtype):
+    """A chain of boxes in space, its hinges oblique to gravity, released level."""
+    turned = np.asarray(quaternion.matrix(quaternion.exp(jnp.asarray((0.5, -0.3, 0.8)))))
+    attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turned)))
+    scene, before = jc.Scene(dim=3, dtype=dtype), jc.WORLD
+    solid = jc.inertia.box(1.0, (0.5, 0.2, 0.05))
+    for i in range(links):
+        link, middle = f"link{i}", turned @ (0.5 * i + 0.25, 0.0, 0.0)
+        scene.add_body(link, inertia=solid, position=middle, quaternion=attitude)
+        point = turned @ (0.5 * i, 0.0, 0.0)
+        scene.add(jc.Revolute(f"hinge{i}", before, link, point=point, axis=turned[:, 1]))
+        before = link
+    return scene.build()
+
+
+def worst_of(built, law, seconds, dt):
+    """The largest violation of a motion [m], and the status of its end."""
+    system, state = built
+    method = jc.Method(stabilizer=law)
+    start = jc.init(system, method, state.q, state.v)
+
+    def violation(state, _):
+        return jc.violation(system, state).worst
+
+    steps = round(seconds / dt)
+    final, path = jc.rollout(system, method, start, None, dt, steps, record=violation)
+    return jnp.max(path), final.status
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@pytest.mark.parametrize(("dt", "bound"), [(1e-3, 1e-4), (1e-2, 2e-2)])
+def test_multipliers_hold_a_chain_with_default_numbers(dt, bound, dtype):
+    built = boxes_on_hinges(4, dtype)
+    worst, status = jax.jit(lambda: worst_of(built, jc.AugmentedLagrangian(), 3.0, dt))()
+    assert status == jc.Status.OK
+    assert worst < bound
+
+
+@pytest.mark.parametrize("rounds", [1, 2, 4])
+def test_multipliers_hold_a_chain_whatever_the_stiffness(rounds):
+    """From rows softer than themselves to hard ones; what is left shrinks with the stiffness."""
+    built, dt = boxes_on_hinges(4, jnp.float64), 1e-3
+
+    def worst(stiffness):
+        law = jc.AugmentedLagrangian(stiffness, iterations=rounds)
+        return worst_of(built, law, 1.0, dt)
+
+    found, status = jax.jit(jax.vmap(worst))(10.0 ** jnp.arange(-1.0, 7.0))
+    assert np.all(status == jc.Status.OK)
+    assert np.all(found[1:5] < 0.8 * found[:4])
+    assert np.all(found[5:] < 1.01 * found[4])
+
+
+def test_more_rounds_leave_less_of_the_error():
+    built, dt = boxes_on_hinges(4, jnp.float64), 1e-3
+    laws = [jc.AugmentedLagrangian(1.0, iterations=k) for k in (1, 2, 4, 8, 16)]
+    found = [float(jax.jit(lambda law=law: worst_of(built, law, 1.0, dt)[0])()) for law in laws]
+    assert all(after < 0.8 * before for before, after in zip(found[:-1], found[1:], strict=True))
+
+
 @pytree
 class Homing(jc.Unstabilized):
     """A correction that takes the particle to the origin, at rest."""

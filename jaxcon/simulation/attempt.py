@@ -145,8 +145,7 @@ def _dynamics(
     stabilizer, memory = method.feedback(dt), MethodMemory(*state.memory)
     if method.recovery is not None:
         stabilizer = method.recovery.relax(stabilizer, memory.recovery)
-    solver = stabilizer.suited(method.solver)
-    own = (system, stabilizer, solver, control, memory.stabilizer, dt)
+    own = (system, stabilizer, method.solver, control, memory.stabilizer, dt)
     if not system.bounds:
         return Dynamics(*own)
     solver = method.resolve(system, state).bounded

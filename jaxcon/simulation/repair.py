@@ -198,10 +198,6 @@ class Relaxed:
         """The law of the stabiliser for what it sees."""
         return self.stabilizer.impose(self._weak(rows), memory, dt)
 
-    def suited(self, solver: Any) -> Any:
-        """The solver that the stabiliser wants."""
-        return self.stabilizer.suited(solver)
-
     def _weak(self, rows: Rows) -> Rows:
         r = self.factor[None]
         return dataclasses.replace(rows, residual=r * r * rows.residual, rate=r * rows.rate)

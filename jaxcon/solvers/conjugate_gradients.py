@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,10 +18,14 @@ from jaxcon.solvers import blocks
 from jaxcon.solvers.blocks import Block, freeze
 from jaxcon.solvers.delassus import Delassus, diagonal_blocks, softened, weighted
 from jaxcon.solvers.jacobian import Jacobian
+from jaxcon.solvers.proximal import conflicts, scaled
 from jaxcon.solvers.saddle import Diagonal, Factored, Saddle, Solution, free_motion, judge
 from jaxcon.solvers.schur import Schur
 
 Operator = Callable[[Array], Array]
+
+CONTRADICTING = 1e-2
+"""The part of b and J M⁻¹ f that redundant rows may leave open before it is a conflict."""
 
 
 @pytree
@@ -34,9 +38,11 @@ class ConjugateGradients(checks.Checked):
     iterations are enough where each body is near to the ground, while a chain of n links takes more
     than n, and `Sparse` is then faster. Where M is not diagonal A is dense, and `Schur` takes over.
 
-    Redundant rows that agree have a solution, and it is found: λ is shared among them. Rows that
-    contradict each other, if only by rounding that the feedback has amplified, need `tikhonov` or
-    a larger `tolerance`, and so does the gradient of multipliers that are not unique.
+    The variant is that of conjugate residuals, whose residual is the least in the norm of the
+    preconditioner. Redundant rows that agree have a solution, and it is found: λ is shared among
+    them. Off the constraints, and by rounding that feedback amplifies, they do not quite agree:
+    they are met by least squares, with the least λ. Where these leave more than a hundredth of b
+    and J M⁻¹ f, and more than rounding, rows contradict each other, and the status is CONFLICT.
 
     The solution is differentiated implicitly, by one more solve of as many iterations.
 
@@ -72,8 +78,8 @@ class ConjugateGradients(checks.Checked):
     def solve(self, system: Saddle) -> Solution:
         """The acceleration (n_v,), multipliers (n_c,) and status.
 
-        The status is NOT_CONVERGED where the residual is above the tolerance, and SINGULAR where M
-        is not positive definite.
+        The status is NOT_CONVERGED where the residual is neither below the tolerance nor the least,
+        CONFLICT where the least is large, and SINGULAR where M is not positive definite.
         """
         return self.factor(system)(system.force, system.target)
 
@@ -87,18 +93,22 @@ class ConjugateGradients(checks.Checked):
         preconditioner = BlockJacobi(*delassus.matrices)
         tolerance = freeze(self._tolerance(system.force.dtype))
 
-        def iterate(a: Operator, x: Array) -> tuple[Array, Array]:
+        length = jnp.sqrt(scaled(system, 1e-6))
+
+        def iterate(a: Operator, x: Array) -> tuple[Array, Any]:
             return descend(a, preconditioner.solve, x, tolerance, self.iterations)
 
         def solve(force: Array, target: Array) -> Solution:
             free = system.mass.solve(force)
-            multipliers, open_ = jax.lax.custom_linear_solve(
+            multipliers, (left, solved, beyond) = jax.lax.custom_linear_solve(
                 delassus, target - j.apply(free), iterate, symmetric=True, has_aux=True
             )
             acceleration = free + system.mass.solve(j.transpose(multipliers))
             status = judge(acceleration, system.mass.singular)
-            late = jnp.where(open_, Status.NOT_CONVERGED, Status.OK).astype(status.dtype)
-            return Solution(acceleration, multipliers, first(status, late))
+            late = jnp.where(solved | beyond, Status.OK, Status.NOT_CONVERGED).astype(status.dtype)
+            conflict = conflicts(system, force, target, left, length, CONTRADICTING)
+            conflict = jnp.where(solved, Status.OK, conflict).astype(status.dtype)
+            return Solution(acceleration, multipliers, first(status, first(late, conflict)))
 
         return solve
 
@@ -109,43 +119,97 @@ class ConjugateGradients(checks.Checked):
         )
 
 
+class Descent(NamedTuple):
+    """How far an iteration has come.
+
+    Attributes:
+        x: (n_c, …).
+        r: b − A x, (n_c, …).
+        z: P⁻¹ r, (n_c, …).
+        az: A z, (n_c, …).
+        paz: P⁻¹ A z, (n_c, …).
+        p: the direction, (n_c, …).
+        ap: A p, (n_c, …).
+        pap: P⁻¹ A p, (n_c, …).
+    """
+
+    x: Array
+    r: Array
+    z: Array
+    az: Array
+    paz: Array
+    p: Array
+    ap: Array
+    pap: Array
+
+    @property
+    def size(self) -> Array:
+        """‖r‖² = rᵀP⁻¹r, by world."""
+        return _dot(self.r, self.z)
+
+    @property
+    def least(self) -> Array:
+        """Whether ‖r‖ is as small as it can be, by world: ‖A P⁻¹ r‖ is small, or zᵀA z rounding.
+
+        Eigenvalues of P⁻¹A up to the first bound count as zero, as in `RankSafe`.
+        """
+        information = jnp.finfo(self.x.dtype)
+        zero = 1e-9 if information.bits == 64 else 1e-5
+        flat = _dot(self.az, self.paz) <= zero * zero * self.size
+        return flat | (_dot(self.z, self.az) <= 16 * float(information.eps) * self.size)
+
+
 def descend(
     a: Operator, preconditioner: Operator, b: Array, tolerance: Array, iterations: int
-) -> tuple[Array, Array]:
-    """x with A x = b, from x = 0 along directions p conjugate by A, and whether it is not one.
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """The x with the least residual r = b − A x, in the norm of P⁻¹, from x = 0.
 
-    A world whose rᵀP⁻¹r has come down to tolerance² bᵀP⁻¹b stays as it is: in a singular system
-    what is left of r is rounding, which would be divided by a curvature pᵀA p of rounding. A
-    direction without curvature is not followed for the same reason.
+    Conjugate residuals: each iteration makes ‖r‖ least on the directions so far. Its steps
+    zᵀA z / ‖A p‖² do not see the part of r that A cannot reach, as those of plain conjugate
+    gradients, ‖r‖² / pᵀA p, would: once the rest of r is no larger, these go astray.
+
+    A world whose ‖r‖ has come down to the tolerance stays as it is. So does one whose ‖r‖ is the
+    least: r then lies outside of the range of A. Along z, which A does not feel, x has a part in
+    proportion to r and to the condition number; it is taken out, and x is the least in the norm
+    of P.
 
     Args:
         a: x → A x, symmetric and positive semidefinite.
         preconditioner: r → P⁻¹ r.
         b: (n_c, …).
-        tolerance: number or one for each world.
+        tolerance: of ‖r‖, in units of ‖b‖, number or one for each world.
         iterations: how many.
 
     Returns:
-        x (n_c, …), and for each world whether the tolerance is not reached.
+        x (n_c, …), and r (n_c, …), whether the tolerance is reached, and whether ‖r‖ is not below
+        it and yet the least, by world.
+
+    References:
+        Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 6.20.
+        Liu, Milzarek and Roosta, Obtaining pseudo-inverse solutions with MINRES (2023).
     """
-    flat = float(jnp.finfo(b.dtype).eps)
     z = preconditioner(b)
-    size = _dot(b, z)
-    solved = tolerance * tolerance * size
+    az = a(z)
+    paz = preconditioner(az)
+    solved = tolerance * tolerance * _dot(b, z)
 
-    def advance(_: Any, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        x, r, p, rz = state
-        y = a(p)
-        curvature = _dot(p, y)
-        stays = (rz <= solved) | (curvature <= flat * rz)
-        step = safe_divide(jnp.where(stays, 0, rz), curvature)[None]
-        x, r = x + step * p, r - step * y
-        z = preconditioner(r)
-        new = _dot(r, z)
-        return x, r, z + safe_divide(new, rz)[None] * p, new
+    def advance(_: Any, known: Descent) -> Descent:
+        x, r, z, az, _, p, ap, pap = known
+        pull = _dot(z, az)
+        stays = (known.size <= solved) | known.least
+        step = safe_divide(jnp.where(stays, 0, pull), _dot(ap, pap))[None]
+        x, r, z = x + step * p, r - step * ap, z - step * pap
+        az = a(z)
+        paz = preconditioner(az)
+        more = safe_divide(_dot(z, az), pull)[None]
+        return Descent(x, r, z, az, paz, z + more * p, az + more * ap, paz + more * pap)
 
-    x, _, _, rz = jax.lax.fori_loop(0, iterations, advance, (jnp.zeros_like(b), b, z, size))
-    return x, rz > solved
+    start = Descent(jnp.zeros_like(b), b, z, az, paz, z, az, paz)
+    end = jax.lax.fori_loop(0, iterations, advance, start)
+    done = end.size <= solved
+    beyond = ~done & end.least
+    share = safe_divide(jnp.where(beyond, _dot(end.x, end.r), 0), end.size)
+    return end.x - share[None] * end.z, (end.r, done, beyond)
 
 
 class BlockJacobi:

@@ -51,10 +51,6 @@ class Unstabilized(checks.Checked):
         """Itself: there is nothing to choose."""
         return self
 
-    def suited(self, solver: Any) -> Any:
-        """The solver of the saddle system, or one that stands in for it beside this stabilizer."""
-        return solver
-
     def rising(self, limit: Any) -> Unstabilized:
         """Itself; default gains rise up to β = limit [1/s] where their rows accelerate fast."""
         return self

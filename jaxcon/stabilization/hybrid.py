@@ -126,10 +126,6 @@ class Hybrid(Unstabilized):
         large = None if self.large is None else large
         return dataclasses.replace(self, small=small, middle=middle, large=large)
 
-    def suited(self, solver: Any) -> Any:
-        """The solver that the part for large violations wants."""
-        return solver if self.large is None else self.large.suited(solver)
-
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
         """b (n_c,)."""
         return self.impose(rows, memory, dt).target

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, layout_of
 from jaxcon.core import checks
+from jaxcon.core.dependence import depends
 from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import exportable, pytree, static
 from jaxcon.core.status import first
@@ -50,10 +51,23 @@ class AugmentedLagrangian(Unstabilized):
     round: a soft system with the multipliers of a hard one. Every round is solvable, also where
     rows depend on each other or a mechanism passes a singular position, and stiffness bounds how
     stiff it is; rounds share one factorization. Each step starts from the λ of the last one, which
-    is near, so that one or two rounds do. b is that of the feedback. The derivative is that of the
-    rounds as they are. Rotors, which hold nothing, are solved as they are. Rows that
-    contradict each other are met by least squares, and where they leave open more than half of what
-    the rows ask for the status is CONFLICT; their λ, which nothing bounds, grows from step to step.
+    is near, so that one or two rounds do. b is that of the feedback.
+
+    In its k rounds a step meets the share e = 1 − 1/(1 + σ·stiffness)ᵏ of a change of b, so that
+    feedback lags behind by τ = h/e. With the whole of b, an error would obey
+
+        τ φ⃛ + φ̈ + 2α φ̇ + g β² φ = 0, stable for τ g β² < 2α, with g = 1.
+
+    With the default gains 2α = β = 1/h this is e > 1: all errors of small σ, which chains of some
+    links have, would grow. The part of b that is due to φ is therefore taken down to what one round
+    from λ = 0 meets of it, g = σ·stiffness/(1 + σ·stiffness), or g² where k = 1. Then τ g ≤ h/2 for
+    small σ, and g is 1 for large σ: steps are stable for every stiffness and σ for which the gains
+    suit hard rows.
+
+    The derivative is that of the rounds as they are. Rotors, which hold nothing, are solved as they
+    are. Rows that contradict each other are met by least squares, and where they leave open more
+    than half of what the rows ask for the status is CONFLICT; their λ, which nothing bounds, grows
+    from step to step.
 
     Attributes:
         stiffness: in units of the mass that a row feels, 1/A_ii.
@@ -102,10 +116,20 @@ class AugmentedLagrangian(Unstabilized):
 
     def impose(self, rows: Rows, memory: Held, dt: Any) -> Law:
         """The law of the feedback, solved in rounds."""
-        law = self.feedback.impose(rows, memory.feedback, dt)
-        return law._replace(solve=partial(self._rounds, rows, memory.multipliers))
 
-    def _rounds(self, rows: Rows, start: Array, solver: Any, system: Saddle) -> Solution:
+        def asked(residual: Array) -> Law:
+            moved = dataclasses.replace(rows, residual=residual)
+            return self.feedback.impose(moved, memory.feedback, dt)
+
+        law, place = asked(rows.residual), None
+        if depends(lambda residual: asked(residual).target, rows.residual):
+            place = law.target - asked(jnp.zeros_like(rows.residual)).target
+        solve = partial(self._rounds, rows, memory.multipliers, place)
+        return law._replace(solve=solve)
+
+    def _rounds(
+        self, rows: Rows, start: Array, place: Array | None, solver: Any, system: Saddle
+    ) -> Solution:
         if not system.target.size:
             return solver.solve(system)
         solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
@@ -115,6 +139,9 @@ class AugmentedLagrangian(Unstabilized):
         weight = row_weights(system, 1e-6) / stiffness
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
+        if place is not None:
+            within = self._within_reach(solver, system, weight, place)
+            system = dataclasses.replace(system, target=system.target - place + within)
         acts = _acts(system)  # of the others W alone would make λ, huge, for the next step to feel
         target, start = (jnp.where(acts, x, 0) for x in (system.target, start))
         solution = rounds(system.force, target, start)
@@ -124,6 +151,17 @@ class AugmentedLagrangian(Unstabilized):
         length = jnp.sqrt(scaled(system, 1e-6))
         code = conflicts(system, system.force, system.target, left, length, OPEN)
         return solution._replace(status=first(solution.status, code))
+
+    def _within_reach(self, solver: Any, system: Saddle, weight: Array, place: Array) -> Array:
+        """The part of b due to φ that a round from λ = 0 meets, A (A + W)⁻¹ b, (n_c,).
+
+        With a single round a step, it is the part of that part: its lag is twice that of two.
+        """
+        once = proximal(solver, system, weight, 1)
+        rest, still = jnp.zeros_like(place), jnp.zeros_like(system.force)
+        for _ in range(2 if self.iterations == 1 else 1):
+            place = place - weight * once(still, place, rest).multipliers
+        return place
 
     def advance(self, rows: Rows, memory: Held, dt: Any) -> Held:
         """With the memory of the feedback after the step."""

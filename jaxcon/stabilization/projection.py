@@ -21,8 +21,6 @@ from jaxcon.core.worlds import lift
 from jaxcon.dynamics.forward import saddle
 from jaxcon.model.state import State
 from jaxcon.solvers import roots
-from jaxcon.solvers.conjugate_gradients import ConjugateGradients
-from jaxcon.solvers.proximal import RankSafe
 from jaxcon.solvers.saddle import Diagonal, Mass, Saddle, Solution
 from jaxcon.stabilization.baumgarte import Unstabilized
 
@@ -92,9 +90,7 @@ class Projection(Unstabilized):
     differs from the nearest point in the metric of W by O(‖d‖²) along the surface.
 
     Rows that depend on each other do so on the surface only: off it J(q*) has directions too many,
-    by which the point is not unique; the solver's regularization chooses, within O(‖d‖).
-    `ConjugateGradients()` has none. Where there are loops, it works inside of `RankSafe` here,
-    which takes six solves for one.
+    by which the point is not unique; the solver chooses, within O(‖d‖).
 
     Beside semi-implicit Euler it loses energy where jointed bodies in space spin fast. A box on a
     hinge that carries another on a ball joint, the latter at 14 rad/s, loses all of it in 6,000
@@ -145,15 +141,6 @@ class Projection(Unstabilized):
         """One step more, modulo `every`."""
         return memory if self.every == 1 else (memory + 1) % self.every
 
-    def suited(self, solver: Any) -> Any:
-        """The solver; conjugate gradients by proximal iteration, which redundant rows need.
-
-        They contradict each other off the surface, and so do right sides of derivatives, which may
-        be rounding alone. Conjugate gradients by themselves diverge there.
-        """
-        plain = isinstance(solver, ConjugateGradients) and solver.tikhonov is None
-        return RankSafe(solver) if plain else solver
-
     @property
     def corrects(self) -> tuple[str, ...]:
         """Which of q and v are projected."""
@@ -189,7 +176,7 @@ class Projection(Unstabilized):
         self, system: Any, solver: Any, before: State, state: State, dt: Any
     ) -> tuple[State, Array]:
         """The state on the constraints, and a status: failures of the solver, or NOT_CONVERGED."""
-        code, solver = jnp.zeros_like(state.status), self.suited(solver)
+        code = jnp.zeros_like(state.status)
         if self.position:
             start = state
             if self.coupled and self.velocity and before is not state:
