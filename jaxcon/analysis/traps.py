@@ -16,7 +16,7 @@ from jaxcon.constraints.bounds import BoundRows, kinds_of, linearize_bounds
 from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
 from jaxcon.constraints.limits import Limit
 from jaxcon.core import host
-from jaxcon.dynamics.impacts import PREFIX, doubt, resolves_landings
+from jaxcon.dynamics.impacts import PREFIX, doubt
 from jaxcon.dynamics.rank import linearized
 from jaxcon.simulation.choice import innermost, several, words
 from jaxcon.simulation.integrators import SemiImplicitEuler
@@ -292,7 +292,6 @@ def impact(known: Known) -> str | None:
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
     some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
     lands = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
-    lands = lands and not resolves_landings(rows, method.bounded)
     said = doubt(rows, lands, some)
     return None if said is None else said.removeprefix(PREFIX)
 

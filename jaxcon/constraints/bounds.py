@@ -112,7 +112,7 @@ class BoundRows:
         hard: which rows answer an impact, (n,); of a contact its normal says so for all.
         ends: which of these have a gap that closes, (n,).
         paired: which have a second stop, (n,).
-        lands: names of contacts, stops and ropes without restitution on bodies that turn.
+        lands: names of contacts and ropes without restitution on bodies that turn.
     """
 
     gap: Array
@@ -258,11 +258,12 @@ def _not_nan(x: Lane) -> Array:
 
 
 def _lands(system: Any, pairs: list[tuple[tuple[str, ...], BoundSet]]) -> tuple[str, ...]:
-    """The names of contacts, stops and ropes without restitution on bodies that turn."""
+    """The names of contacts and ropes without restitution on bodies that turn."""
     groups = getattr(getattr(system, "layout", None), "groups", ())
     names: list[str] = []
-    for own, rows in pairs:
-        if not (rows.hard and rows.rows[0].holonomic) or rows.restitution is not None:
+    for group, (own, rows) in zip(system.bounds, pairs, strict=True):
+        on_joint = hasattr(group, "along")  # its coordinate is the same wherever the bodies are
+        if on_joint or not (rows.hard and rows.rows[0].holonomic) or rows.restitution is not None:
             continue
         kinds = [groups[p.group].kind for p in rows.places if p.group is not None and groups]
         if any(kind.n_v > system.layout.dim for kind in kinds):

@@ -119,16 +119,13 @@ class Dynamics:
             law: of the stabilizer.
             problem: the saddle system of both.
             lag: velocities are those of lag · h before the positions; None for none.
-            every: whether every landing without restitution is an impact; otherwise only where
-                `impacts.resolves_landings`.
+            every: whether impacts are told apart in scenes without restitution, too.
             ahead: the bounded rows, from `bounds_ahead`; None where they are not known yet.
         """
         if self.part is None:
             bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
             length, acts = self.dt, None
-            bounces = bounds.restitution is not None
-            resolves = every or bounces or impacts.resolves_landings(bounds, self.bounded)
-            strikes = any(bounds.ends) and resolves
+            strikes = any(bounds.ends) and (every or bounds.restitution is not None)
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
             if doubt is not None:
@@ -149,8 +146,7 @@ class Dynamics:
         may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
-            reach = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).reach(impulse.start)
-            may = impacts.candidates(bouncy, start, self.dt, reach)
+            may = impacts.candidates(bouncy, start, self.dt)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
@@ -163,48 +159,36 @@ class Dynamics:
             push = impulse.rows.jacobian.transpose(jnp.where(ends, known.multipliers, 0))
         if strikes:
             lag = 0.0 if lag is None else lag
-
-            def approach() -> impacts.Approach:
-                change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
-                asked = impulse.rows, may, change, lag, self.dt, impulse.moved()
-                arrivals = impacts.arrive(*asked)
-                if e is None:
-                    return impacts.Approach(arrivals, None)
-                left = self.dt[None] - arrivals.times
-                speed = impacts.leaving_speeds(bounds.rate, e, arrivals, change, lag, self.dt)
-                return impacts.Approach(arrivals, impacts.passes_range(both_stops, speed, left))
-
-            solution, known = self._struck((q, v, t), solution, known, may, approach, lag)
+            change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
+            times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
+            solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
+            if e is not None:
+                left = self.dt[None] - times.times
+                speed = impacts.leaving_speeds(bounds.rate, e, times, change, lag, self.dt)
+                lost = impacts.passes_range(both_stops, speed, left)
+                solution = solution._replace(status=lost_impacts(solution.status, lost))
+            solution, known = self._struck((q, v, t), solution, known, times, lag)
         elif seen is not None:
-            solution = self._observed(solution, t, seen, seen, bounds.layout)
+            solution = self._observed(solution, t, seen, seen, bounds)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone, push
 
     def _observed(
-        self, solution: Solution, t: Any, hits: Array, fast: Array, layout: Any
+        self, solution: Solution, t: Any, hits: Array, fast: Array, rows: BoundRows
     ) -> Solution:
         """The solution; `notices` observes the rows that hit in this step."""
-        kind = impacts.Seen(layout)
+        kind = impacts.Seen(rows.layout)
         a = notices.observe(solution.acceleration, kind, hits, fast, rounded(t), self.dt)
         return solution._replace(acceleration=a)
 
     def _struck(
-        self,
-        at: Any,
-        solution: Solution,
-        known: Reactions,
-        may: Array,
-        approach: Callable[[], impacts.Approach],
-        lag: float,
+        self, at: Any, solution: Solution, known: Reactions, arrivals: Any, lag: float
     ) -> tuple[Solution, Reactions]:
         """Adds the impacts of the step: their jump, and the mean of their impulses."""
         laws = _Laws(dataclasses.replace(self, guess=None))
         a, λ, joints = solution.acceleration, known.multipliers, solution.multipliers
         q, v, t = at
-        impact = impacts.Impact(laws, self.system, q, v, t, a, λ, joints, lag, self.dt, may)
-        outcome = impact.outcome(approach)
-        struck = outcome.found
-        solution = self._observed(solution, t, *outcome.seen, known.layout)
-        solution = solution._replace(status=lost_impacts(solution.status, outcome.lost))
+        impact = impacts.Impact(laws, self.system, q, v, t, a, λ, joints, lag, self.dt, arrivals)
+        jump, struck = impact.outcome()
         λ, joints = (
             x + numerics.safe_divide(more, self.dt[None])
             for x, more in ((λ, struck.multipliers), (joints, struck.joints))
@@ -214,7 +198,7 @@ class Dynamics:
             multipliers=λ,
             residual=jnp.maximum(known.residual, struck.residual),
             kept=jnp.minimum(known.kept, struck.kept),
-            jump=outcome.jump,
+            jump=jump,
         )
         return solution._replace(multipliers=joints), known
 

@@ -9,14 +9,6 @@ other accelerations a⁺. At the end of a step h, with r = h − τ the rest of 
 The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
 an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
 
-A row that lands without restitution leaves with φ̇ = 0, so that what it does next is decided by
-φ̈ = J a⁺ + J̇ v⁺. The acceleration a⁺ therefore obeys 0 ≤ λ ⊥ φ̈ ≥ 0 and Coulomb's law with J̇ v⁺,
-found as (J(q* ⊕ h v⁺) − J(q*)) v⁺ / h. The end of a rod that turns fast lifts off at once; without
-J̇ v⁺ it would be held down for r, an impulse in proportion to r, of which τ has a derivative of
-order 1. Plain steps lack J̇ v, too: they let a gap open to h² J̇ v (½ h² J̇ v beside velocities of
-half a step before) before a row at rest lets go. The travel of a landing therefore begins earlier
-by that gap over −φ̇⁻. This is O(h²), and spares the next step an impulse of O(h) that depends on r.
-
 The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
 step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
 
@@ -30,7 +22,6 @@ References:
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -46,7 +37,6 @@ from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import mask
-from jaxcon.solvers.gauss_seidel import GaussSeidel
 from jaxcon.solvers.saddle import Solution
 
 ROUNDING = 64
@@ -57,16 +47,6 @@ PREFIX = "gradients through impacts: "
 
 SLOW = 2
 """Impacts slower than this many times h |a| do not bounce: the row comes to rest."""
-
-OVERDUE = 0.25
-"""The share of a step by which an impact may be late: its gap closed just before the step.
-
-A path that bends may close a gap by O(h²) where none was expected. Rows that rest beyond their
-gap are there by half a step or more, and make no impact.
-"""
-
-REFINES, STRIKES, BENDS, GOES_ON = range(4)
-"""The stages of an impact: τ; Δv; φ̇ a step further along v⁺, of which J̇ v⁺ is found; and a⁺."""
 
 
 class Seen(NamedTuple):
@@ -166,13 +146,6 @@ class Arrivals:
         """τ by velocity, (n_v,) or (1,) [s]."""
         return jnp.sum(self.leads * self.times[None], axis=1)
 
-    def stay(self, rows: BoundRows) -> Array:
-        """A mask of the rows that arrive and do not rebound, (n,)."""
-        stays = self.hits
-        if rows.restitution is not None:
-            stays &= ~(self.bounces & (rows.restitution > 0))
-        return rows.kinds.by_contact(stays)
-
     def refined(self, rows: BoundRows) -> Arrivals:
         """Refines the times by one Newton step on the gaps at the place of the impact.
 
@@ -180,39 +153,11 @@ class Arrivals:
         """
         closing = self.hits & (rows.rate < -(float(jnp.finfo(rows.rate.dtype).tiny) ** 0.8))
         late = quotient(jnp.where(closing, rows.gap, 0), jnp.where(closing, -rows.rate, 1))
-        late = rows.kinds.by_contact(jnp.where(jnp.abs(late) <= jnp.abs(self.times), late, 0))
+        late = rows.kinds.by_contact(jnp.where(jnp.abs(late) <= self.times, late, 0))
         return dataclasses.replace(self, times=self.times + late)
 
 
-class Approach(NamedTuple):
-    """The arrivals of a step, and the worlds in which it loses rebounds.
-
-    Attributes:
-        arrivals: which rows arrive, and when.
-        lost: worlds whose rebounds the step loses, see `passes_range`, (); None for none.
-    """
-
-    arrivals: Arrivals
-    lost: Array | None
-
-
-class Outcome(NamedTuple):
-    """The results of the impacts of a step.
-
-    Attributes:
-        jump: of the velocities and the displacement.
-        found: the impulses that impacts add to those of the step's smooth forces.
-        seen: which rows hit, and which of them are fast enough to bounce, (n,) each.
-        lost: of the `Approach`.
-    """
-
-    jump: Jump
-    found: Found
-    seen: tuple[Array, Array]
-    lost: Array | None
-
-
-def candidates(rows: BoundRows, change: Array, dt: Array, most: Array) -> Array:
+def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
@@ -222,15 +167,12 @@ def candidates(rows: BoundRows, change: Array, dt: Array, most: Array) -> Array:
         rows: the bounded rows at the start of the step.
         change: h J a without bounded rows, (n,).
         dt: h, () [s].
-        most: h |J| |a|, (n,), below which a row may rest: bodies of a stack fall alike.
     """
     e, least = rows.restitution, slowest(rows, change)
-    rests = most if e is None else jnp.where(e >= 0, 0, most)
+    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
     least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
-    if e is None:
-        may &= rows.gap >= -OVERDUE * dt[None] * jnp.abs(rows.rate)
     return jax.lax.stop_gradient(may & (dt[None] > 0))
 
 
@@ -265,7 +207,7 @@ def arrive(
     speed = -(rows.rate + lag * change)
     fast = may & (speed > 0)
     size = jnp.where(fast, speed, 1)
-    gap = jnp.where(fast & (rows.gap > -OVERDUE * dt[None] * size), rows.gap, 0)
+    gap = jnp.where(fast & (rows.gap > 0), rows.gap, 0)
     bend = numerics.safe_divide(change, dt[None])
     whole = quotient(gap, size)
     # the smaller root in a form that subtracts nothing; no root where the row turns round
@@ -373,12 +315,7 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     s u⁻ along the normal, which closes the gap, and as much along the tangents, which holds
     friction back until τ. The next step does the rest of the impact. As both impulses are the
     shares 1 − s and s of one, at the places before and after, the two steps have the time of the
-    impact and its place. That costs nothing, unlike an `Impact`.
-
-    The second place is reached with v⁻ + (1 − s) Δv. With Δv = −Q(q) v⁻ and P = 1 − Q, the motion
-    along the contact is so off by h s (1 − s) P (∂Q/∂q · Δv) Δv: O(h), but of order 1 in the
-    derivative, as s changes by 1 within a step. It vanishes where Q does not depend on q along Δv,
-    as for balls on planes.
+    impact and its place, and so have their derivatives. That costs nothing, unlike an `Impact`.
 
     Args:
         rows: the bounded rows at the start of the step.
@@ -398,20 +335,6 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
 
 
-def resolves_landings(rows: BoundRows, solver: Any) -> bool:
-    """Returns True where a landing without restitution is an `Impact`, not two steps (`landing`).
-
-    An impact solves the contacts twice more, in a large batch in nearly every step. `GaussSeidel`,
-    which is chosen for its speed, keeps landings of two steps.
-
-    Args:
-        rows: the bounded rows; only their static fields are read.
-        solver: of the bounded rows.
-    """
-    inner = getattr(solver, "solver", solver)
-    return bool(rows.lands) and not isinstance(inner, GaussSeidel)
-
-
 def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
     """Why derivatives of plain steps through impacts may be wrong, by structure; None if not.
 
@@ -424,8 +347,8 @@ def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
     if lags and rows.lands:
         reasons.append(
             f"a landing of {', '.join(rows.lands)} takes two steps, so that where a body turns as"
-            " it lands, or moves with others by joints, its derivative is right only in the mean"
-            " over the phases of a step; InteriorPoint() or restitution=jnp.zeros(()) makes it one"
+            " it lands on a corner or on another body, its derivative is right only in the mean"
+            " over the phases of a step; restitution=jnp.zeros(()) or Events() makes it one"
         )
     if some and any(rows.ends):
         reasons.append(
@@ -448,7 +371,7 @@ class Impact:
         lag: velocities are those of lag · h before the positions; where it is not 0, the travel is
             added to the displacement of the step before bodies turn by the sum.
         dt: h, () [s].
-        may: the `candidates`, (n,).
+        arrivals: which rows arrive, and when.
     """
 
     laws: Laws
@@ -461,64 +384,31 @@ class Impact:
     joints: Array
     lag: Any
     dt: Array
-    may: Array
+    arrivals: Arrivals
 
-    def outcome(self, approach: Callable[[], Approach]) -> Outcome:
-        """The changes that impacts make to the step.
-
-        Args:
-            approach: finds the arrivals, and is asked only where there are candidates.
-        """
+    def outcome(self) -> tuple[Jump, Found]:
+        """The jump, and the impulses that impacts add to those of the step's smooth forces."""
+        happens = self.arrivals.happens
         none, one = jnp.zeros_like(self.v), jnp.ones(self.v.shape[1:], self.v.dtype)
         rows, joints = jnp.zeros_like(self.multipliers), jnp.zeros_like(self.joints)
         still = Jump(none, none), Found(none, rows, joints, 0 * one, one)
-        nothing = jnp.zeros_like(self.may)
+        return jax.lax.cond(somewhere(happens), lambda: self._strikes(still), lambda: still)
 
-        def arrives() -> Outcome:
-            arrivals, lost = approach()
-            happens = somewhere(arrivals.happens)
-            struck = jax.lax.cond(happens, lambda: self._strikes(arrivals, still), lambda: still)
-            return Outcome(struck[0], struck[1], (arrivals.hits, arrivals.bounces), lost)
-
-        lost = jax.eval_shape(approach).lost
-        lost = None if lost is None else jnp.zeros(lost.shape, bool)
-        quiet = Outcome(still[0], still[1], (nothing, nothing), lost)
-        return jax.lax.cond(somewhere(self.may), arrives, lambda: quiet)
-
-    def _strikes(self, first: Arrivals, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
+    def _strikes(self, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
         h, a = self.dt[None], self.acceleration
-
-        def stage(carry: tuple[Array, Array, Array], number: Array) -> tuple[Any, Any]:
-            times, after, later = carry
-            place, before, time = self._there(dataclasses.replace(first, times=times))
-            v = jnp.where(number <= STRIKES, before, after)
-            ahead = jnp.where(number == BENDS, self.dt, 0)
-            place = self.system.retract(place, ahead[None] * v)
-            known = self.laws.rows(place, v, time + ahead)
-            lasts = number == GOES_ON
-            bend = jnp.where(lasts & first.stay(known), later - known.rate, 0)
-            bend = jax.lax.stop_gradient(bend)
-
-            def solved() -> Found:
-                rows, acts = at_impact(known, first, self.dt, lasts)
-                rows = dataclasses.replace(rows, rate=rows.rate + bend)
-                return self.laws.find(place, v, time, rows, acts, lasts)
-
-            solves = (number == STRIKES) | lasts
-            found = jax.lax.cond(solves, solved, lambda: still[1])
-            times = jnp.where(number == REFINES, first.refined(known).times, times)
-            after = jnp.where(number == STRIKES, v + found.change, v)
-            return (times, after, known.rate), (found, known.rate, bend)
-
-        # the stages are one traced program, in which rows and solution are compiled once
-        start = first.times, jnp.zeros_like(self.v), jnp.zeros_like(first.times)
-        (times, *_), stages = jax.lax.scan(stage, start, jnp.arange(GOES_ON + 1))
-        (struck, rate, _), (after, _, bend) = (
-            jax.tree.map(lambda x, i=i: x[i], stages) for i in (STRIKES, GOES_ON)
-        )
-        arrivals = dataclasses.replace(first, times=times)
-        place, before, _ = self._there(arrivals)
+        arrivals = self.arrivals.refined(self.laws.rows(*self._there(self.arrivals)))
+        place, before, time = self._there(arrivals)
         τ = arrivals.by_velocity
+
+        def find(v: Array, lasts: Array) -> tuple[Array, Found]:
+            known = self.laws.rows(place, v, time)
+            rows, acts = at_impact(known, arrivals, self.dt, lasts)
+            found = self.laws.find(place, v, time, rows, acts, lasts)
+            return v + jnp.where(lasts, 0, found.change), found
+
+        # the impact and what follows are one program, which halves what there is to compile
+        _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
+        struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
         rest, left = h - τ, (1 - self.lag) * h - τ
         # from the acceleration just before the impact, not from that at the start of the step
         smooth = self._gyroscopic(before) - self._gyroscopic(self.v)
@@ -527,18 +417,13 @@ class Impact:
         # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
-        lift = (1 - self.lag) * h * jnp.maximum(bend, 0)
-        early = jnp.minimum(numerics.safe_divide(lift, jnp.abs(rate)), h)
-        early = jnp.sum(arrivals.leads * jax.lax.stop_gradient(early)[None], axis=1)
-        travel = (rest + early) * struck.change + rest * rest / 2 * more + swing
+        travel = rest * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
-        # an impact later than the velocities are has no forces after it in them: less than none
-        # would pull at contacts, and leave their cones
-        share = jnp.maximum((1 - self.lag) * self.dt - arrivals.first, 0)[None]
+        share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
         struck = struck._replace(multipliers=impulses, joints=joints)
-        return keep(first.happens, (jump, struck), still)
+        return keep(self.arrivals.happens, (jump, struck), still)
 
     def _there(self, arrivals: Arrivals) -> tuple[Array, Array, Array]:
         """q*, v⁻ and the time of the impact."""
