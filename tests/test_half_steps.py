@@ -490,3 +490,28 @@ def test_what_linearized_rows_miss_is_taken_out_smoothly():
         difference = (after(speed + d) - after(speed - d)) / (2 * d)
         np.testing.assert_allclose(forward(speed), difference, rtol=1e-7)
         np.testing.assert_allclose(reverse(speed), forward(speed), rtol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [0.02, 0.1, 1.0, 1.5, 2.5])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_body_on_a_ball_joint_spins_freely(turn, dtype):
+    """About its middle axis, held at its centre: |L| stays, and energy is not gained."""
+    scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0), dtype=dtype)
+    scene.add_body("box", mass=1.0, inertia=(0.01, 0.02, 0.025), position=(0.0, 0.0, 0.0))
+    scene.add(jc.Spherical("ball", jc.WORLD, "box", point=(0.0, 0.0, 0.0)))
+    system, state = scene.build()
+    h = 1 / 60
+    start = np.array([0.02, 1.0, 0.02]) * turn / h
+    state = dataclasses.replace(state, v=state.v.at[3:].set(start.astype(dtype)))
+    final, energy = jax.jit(
+        lambda s: jc.rollout(
+            system, jc.Method(), s, None, h, 2000, record=lambda s, _: jc.energy(system, s).kinetic
+        )
+    )(state)
+    assert final.status == jc.Status.OK
+    ends = np.asarray(final.v[3:], float), start
+    momentum = [np.linalg.norm(np.array([0.01, 0.02, 0.025]) * w) for w in ends]
+    np.testing.assert_allclose(*momentum, rtol=1e-5 if turn <= 1 else 3e-5)  # float32's rounding
+    share = np.asarray(energy, float) / float(energy[0]) - 1
+    assert share.max() < 1e-4
+    assert share.min() > (-2e-3 if turn < 2 else -0.06)

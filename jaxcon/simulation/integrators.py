@@ -243,16 +243,16 @@ def closer(
 
     def corrected() -> tuple[Array, Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
-        asks = (turn > least_turn**2) & (turn < 2)
+        asks = (turn > least_turn**2) & (turn < 1e4)
         a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
         place = jnp.where(asks, q, state.q)
         square = system.turn(state.q, moving, rows.bias, h)
-        rise = (square - least_turn**2) / (full_turn**2 - least_turn**2)
-        share = jnp.where(asks, smooth(rise) * smooth(2 - square), 0)[None]
+        rise = smooth((square - least_turn**2) / (full_turn**2 - least_turn**2))[None]
         if system.turns_in_space and not system.bounds:
             finely = system.kick(state.q, before, a, h)
-            moving = moving + share * (finely - moving)
+            moving = moving + rise * (finely - moving)
             place = system.retract(state.q, h * moving)
+        share = jnp.where(asks, rise * smooth(2 - square)[None], 0)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))
