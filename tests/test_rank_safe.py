@@ -151,7 +151,7 @@ CREEPING = {
     "RATTLE": (jc.Method(jc.RATTLE(), solver=SCHUR), 4, OBLIQUE, 1000),
     "alpha": (jc.Method(jc.GeneralizedAlpha(), solver=SCHUR), 4, OBLIQUE, 1000),
     "projection": (jc.Method(stabilizer=jc.Projection(), solver=SCHUR), 4, OBLIQUE, 1000),
-    "PID": (jc.Method(stabilizer=jc.PID(2500.0, 100.0, 1000.0), solver=SCHUR), 4, OBLIQUE, 1000),
+    "PID": (jc.Method(stabilizer=jc.PID(4e4, 400.0, 1e4), solver=SCHUR), 4, OBLIQUE, 1000),
     "gradients": (jc.Method(solver=jc.ConjugateGradients()), 4, (0.0, 0.0, 0.0), 1000),
     "priority": (jc.Method(solver=jc.Priority({"hinge*": 0})), 4, OBLIQUE, 1000),
 }
@@ -183,7 +183,8 @@ def test_doubled_hinges_do_not_creep_along_their_axis(name, dtype):
     rounding = 4 * float(jnp.finfo(dtype).eps) * 0.5 * links * links
     assert np.max(off) < (1e-9 if dtype == jnp.float64 else rounding)
     half = len(off) // 2
-    assert np.max(off[half:]) < 2 * np.max(off[:half]) + rounding / 4
+    worst = np.max(off, axis=1)
+    assert np.median(worst[half:]) < 2 * np.median(worst[:half]) + rounding / 16
 
 
 def test_multipliers_are_of_least_norm_in_the_scaled_rows():

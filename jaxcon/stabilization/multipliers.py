@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows, layout_of
@@ -14,7 +15,8 @@ from jaxcon.core import checks
 from jaxcon.core.dependence import depends
 from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import exportable, pytree, static
-from jaxcon.core.status import first
+from jaxcon.core.somewhere import everywhere
+from jaxcon.core.status import Status, first
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.model.state import State
 from jaxcon.solvers.proximal import (
@@ -30,8 +32,8 @@ from jaxcon.solvers.saddle import Saddle, Solution
 from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_stabilizer
 from jaxcon.stabilization.gains import check_gains, column
 
-OPEN = 0.5
-"""The part of b that rows may leave open before it is a conflict; rounds that begin leave some."""
+OPEN = 0.25
+"""The part of b that rounds may leave open before it is asked whether all of it can be met."""
 
 
 @exportable
@@ -65,9 +67,9 @@ class AugmentedLagrangian(Unstabilized):
     suit hard rows.
 
     The derivative is that of the rounds as they are. Rotors, which hold nothing, are solved as they
-    are. Rows that contradict each other are met by least squares, and where they leave open more
-    than half of what the rows ask for the status is CONFLICT; their λ, which nothing bounds, grows
-    from step to step.
+    are. Rows that contradict each other are met by least squares. Where more than a quarter of b is
+    left open, `RankSafe` tells, once more and by itself, whether b can be met; if not, the status
+    is CONFLICT.
 
     Attributes:
         stiffness: in units of the mass that a row feels, 1/A_ii.
@@ -139,6 +141,7 @@ class AugmentedLagrangian(Unstabilized):
         weight = row_weights(system, 1e-6) / stiffness
         weight = jnp.where(column(holding, rows), weight, 0)
         rounds = proximal(solver, system, weight, self.iterations)
+        asked = system
         if place is not None:
             within = self._within_reach(solver, system, weight, place)
             system = dataclasses.replace(system, target=system.target - place + within)
@@ -147,10 +150,9 @@ class AugmentedLagrangian(Unstabilized):
         solution = rounds(system.force, target, start)
         if not system.loops:
             return solution
-        left = remainder(system, system.target, solution)
-        length = jnp.sqrt(scaled(system, 1e-6))
-        code = conflicts(system, system.force, system.target, left, length, OPEN)
-        return solution._replace(status=first(solution.status, code))
+        return solution._replace(
+            status=first(solution.status, _contradiction(solver, asked, solution))
+        )
 
     def _within_reach(self, solver: Any, system: Saddle, weight: Array, place: Array) -> Array:
         """The part of b due to φ that a round from λ = 0 meets, A (A + W)⁻¹ b, (n_c,).
@@ -182,6 +184,19 @@ class AugmentedLagrangian(Unstabilized):
     ) -> Any:
         """As the feedback does."""
         return self.feedback.correct(system, solver, before, state, memory.feedback, dt)
+
+
+def _contradiction(solver: Any, system: Saddle, solution: Solution) -> Array:
+    """CONFLICT in worlds whose b cannot be met, which is asked where much of it is left open."""
+    left = remainder(system, system.target, solution)
+    length = jnp.sqrt(scaled(system, 1e-6))
+    met = conflicts(system, system.force, system.target, left, length, OPEN) == Status.OK
+
+    def asked() -> Array:
+        code = RankSafe(solver, always=True).solve(system).status
+        return jnp.where(met | (code != Status.CONFLICT), Status.OK, code).astype(jnp.int32)
+
+    return jax.lax.cond(everywhere(met), lambda: jnp.zeros_like(solution.status), asked)
 
 
 def _acts(system: Saddle) -> Array:
