@@ -1,4 +1,5 @@
 import re
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -230,3 +231,86 @@ def test_functions_that_are_only_called_are_inlined(name):
     np.testing.assert_allclose(found, CALLING[name](jnp.asarray(X)) * 2, rtol=1e-14)
     counted = count(jax.make_jaxpr(CALLING[name])(jnp.asarray(X)).jaxpr)
     assert counted >= X.size
+
+
+def functions_of(name):
+    """Functions of a number that are one operation of this name."""
+    if name == "integer_pow":
+        return [partial(jax.lax.integer_pow, y=y) for y in (-3, 2, 15, 1023)]
+    if name == "round":
+        return [partial(jax.lax.round, rounding_method=x) for x in jax.lax.RoundingMethod]
+    if name in ("not", "and", "or", "xor"):
+        operation = getattr(jnp, f"logical_{name}")
+        return [lambda x: operation(*([x > 0.3, x < 0.6][: 1 if name == "not" else 2]))]
+    if name == "clamp":
+        return [lambda x: jax.lax.clamp(jnp.zeros_like(x), x, jnp.ones_like(x))]
+    if name == "select_n":
+        return [lambda x: jax.lax.select_n(x > 0.3, x, 2 * x)]
+    if name == "add_any":
+        return [lambda x: x + 1]
+    operation = getattr(jax.lax, name)
+    twice = [
+        "add",
+        "sub",
+        "mul",
+        "max",
+        "min",
+        "eq",
+        "ne",
+        "lt",
+        "le",
+        "gt",
+        "ge",
+        "nextafter",
+        "div",
+        "pow",
+        "atan2",
+        "rem",
+    ]
+    return [(lambda x: operation(x, 2 * x)) if name in twice else operation]
+
+
+@pytest.mark.parametrize("name", sorted(fusion.ARITHMETIC | fusion.COSTLY))
+def test_no_operation_costs_more_than_is_said(name):
+    for dtype in ("float32", "float64"):
+        x = jnp.linspace(0.1, 0.9, 128, dtype=dtype)
+        for function in functions_of(name):
+            cost = jax.jit(function).lower(x).compile().cost_analysis()
+            found = cost.get("flops", 0) + 2 * cost.get("transcendentals", 0)
+            assert found <= fusion.work(name) * x.size
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("name", ["asinh", "mul"])
+def test_a_single_result_is_alone_up_to_what_the_compiler_divides_among_threads(name, dtype):
+    """The longest chain that is light compiles alone, and one twice as long with a second."""
+    x = jnp.linspace(0.1, 0.9, 128, dtype=dtype)
+    operation = {"asinh": jnp.arcsinh, "mul": lambda x: x * x + 0.1}[name]
+
+    def chain(x, length):
+        for _ in range(length):
+            x = operation(0.5 * x)
+        return x
+
+    def is_light(length):
+        stages = fusion.Stages(jax.make_jaxpr(chain, static_argnums=1)(x, length))
+        return stages.is_light(stages.program.inputs, stages.program.outputs)
+
+    longest = max(n for n in range(1, 150) if is_light(n))
+    assert 4 < longest < 149
+    for length, light in ((longest, True), (2 * longest, False)):
+
+        def kernel(x, length=length, light=light):
+            (y,) = fusion.uninlined(lambda x: [chain(x, length)], [x], light)
+            return fusion.uninlined(lambda y: [y + 1, y * 2], [y])
+
+        found = jax.jit(lambda x, kernel=kernel: fusion._kernel(kernel, [x]))(x)
+        compare(found, [chain(x, length) + 1, chain(x, length) * 2])
+
+
+def test_a_light_stage_of_one_result_has_no_other():
+    """Each buffer of a kernel costs a look-up in every call."""
+    text = jax.jit(staged(chain_of_shared_values)).lower(X, Y).as_text()
+    alone = re.findall(r"func private @stage\w*\(.*\) -> (\(?tensor<[^{]*)\{?", text)
+    assert alone
+    assert not any("i1" in x for x in alone)

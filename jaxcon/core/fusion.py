@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from jaxcon.core.program import Constant, Operation, Program, evaluated, traced
+from jaxcon.core.program import Constant, Operation, Program, evaluated, is_known, traced
 from jaxcon.core.typing import Array
 
 WORTH = 3
@@ -65,6 +65,13 @@ OTHERS = _names(
 )
 """Operations that end a stage and may be part of a kernel."""
 
+
+LIGHT = 1.5e5
+"""What a call of one result may cost before it needs a second one, by the count of `is_light`.
+
+XLA divides among threads what it takes to cost 2e5 or more: ten for each byte read or written, one
+for each operation on a number and two for each transcendental one.
+"""
 
 MOST = 100
 """Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
@@ -137,7 +144,9 @@ class Stages:
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
-                call = _stage_with_arguments if self._may_overwrite(values, step) else _stage
+                call = functools.partial(_stage, light=self.is_light(values, step))
+                if self._may_overwrite(values, step):
+                    call = _stage_with_arguments
                 self._store(values, step, self._evaluate, call)
 
     def _branch(self, step: Operation, values: dict[int, Any]) -> None:
@@ -181,12 +190,28 @@ class Stages:
         results = call(compute, [values[x] for x in leaves])
         values.update(zip(wanted, results, strict=True))
 
+    def is_light(self, known: Any, wanted: list[int]) -> bool:
+        """Returns True where XLA does not divide the computation of these values among threads."""
+        leaves, operations = self.program.between(known, wanted)
+        sizes = self.program.sizes
+        if not is_known([sizes[x] for x in (*leaves, *wanted)]):
+            return False
+        cost = 80 * sum(sizes[x] for x in (*leaves, *wanted))
+        for op in operations:
+            cost += work(op.name) * sum(sizes[x] for x in op.outputs)
+        return cost < LIGHT
+
     def _may_overwrite(self, known: Any, wanted: list[int]) -> bool:
         """Returns True where something is moved in whose place a result of a stage would fit."""
         sizes = {self.program.sizes[x] for x in wanted}
         operations = self.program.between(known, wanted)[1]
         moved = (x for op in operations if op.name in MOVED for x in op.inputs)
         return any(self.program.sizes[x] in sizes for x in moved if not isinstance(x, Constant))
+
+
+def work(name: str) -> int:
+    """No fewer than the operations that XLA makes of a primitive for a number."""
+    return 32 if name in COSTLY or name in ("integer_pow", "nextafter") else 4
 
 
 def worth_storing(program: Program) -> set[int]:
@@ -338,13 +363,15 @@ def _kernel(function: Callable[..., list[Array]], args: list[Array]) -> list[Arr
     return uninlined(kernel, jax.lax.optimization_barrier(args))
 
 
-def _stage(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
+def _stage(
+    function: Callable[..., list[Array]], args: list[Array], light: bool = False
+) -> list[Array]:
     """Calls a function as a stage of a kernel."""
 
     def stage(*args: Array) -> list[Array]:
         return function(*args)
 
-    return uninlined(stage, args)
+    return uninlined(stage, args, light)
 
 
 def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
@@ -357,18 +384,26 @@ def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array
     return results[: len(results) - len(args)]
 
 
-def uninlined(function: Callable[..., list[Array]], args: Sequence[Array]) -> list[Array]:
+def uninlined(
+    function: Callable[..., list[Array]], args: Sequence[Array], light: bool = False
+) -> list[Array]:
     """The results of a call that XLA does not inline.
 
     A single result is given a second one beside it, which the barrier keeps although nobody needs
-    it: a call that ends in one large array would be split among threads, which a call inside a
-    kernel cannot be. Each result is a buffer, whose address every call of the kernel looks up.
+    it: a call that ends in one array that costs much would be split among threads, which a call
+    inside a kernel cannot be. Each result is a buffer, whose address every call of the kernel looks
+    up, and two of them are three: a light call goes without.
+
+    Args:
+        function: of arrays.
+        args: its arguments.
+        light: whether it costs less than what XLA splits.
     """
 
     @functools.wraps(function)
     def call(*args: Array) -> tuple[list[Array], list[Array]]:
         results = function(*args)
-        return results, [jnp.zeros((), bool)] if len(results) < 2 else []
+        return results, [jnp.zeros((), bool)] if len(results) < 2 and not light else []
 
     results, beside = jax.jit(call)(*args)
     first, *others = *results, *beside
