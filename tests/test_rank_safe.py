@@ -152,7 +152,7 @@ CREEPING = {
     "alpha": (jc.Method(jc.GeneralizedAlpha(), solver=SCHUR), 4, OBLIQUE, 1000),
     "projection": (jc.Method(stabilizer=jc.Projection(), solver=SCHUR), 4, OBLIQUE, 1000),
     "PID": (jc.Method(stabilizer=jc.PID(4e4, 400.0, 1e4), solver=SCHUR), 4, OBLIQUE, 1000),
-    "gradients": (jc.Method(solver=jc.ConjugateGradients()), 4, (0.0, 0.0, 0.0), 1000),
+    "gradients": (jc.Method(solver=jc.ConjugateGradients()), 4, OBLIQUE, 1000),
     "priority": (jc.Method(solver=jc.Priority({"hinge*": 0})), 4, OBLIQUE, 1000),
 }
 """Methods, with a number of links, how the chain is turned, and steps of a millisecond."""

@@ -300,30 +300,48 @@ class BodySystem:
         """True where bodies have an orientation in space."""
         return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
 
-    def turn(self, q: Array, v: Array, bias: Array, dt: Any) -> Array:
+    def squared_turn(self, q: Array, v: Array, jacobian: Any, bias: Array, dt: Any) -> Array:
         """The square of the largest turn in a step, () [rad²].
 
-        Bodies turn by h|ω|. Particles have no ω; a rod of length l between them, whose γ is |v|²/l
-        for a difference v of their velocities, turns by h|γ|/|v|.
+        Bodies turn by h|ω|. Particles have no ω; a rod of length l between two of them, whose γ is
+        |v|²/l for the difference v of their velocities, turns by h|γ|/|v|. That is taken for at
+        most a radian, as a γ that has other reasons makes it as large as one likes.
 
         Args:
             q: positions, (n_q,).
             v: velocities, (n_v,).
+            jacobian: J of the constraints, by blocks.
             bias: γ of the constraints, (n_c,) [m/s²].
             dt: h, (1,) [s].
         """
-        most = speed = jnp.zeros(v.shape[1:], v.dtype)
+        most = rods = jnp.zeros(v.shape[1:], v.dtype)
         for g in self.layout.groups:
-            own = g.unpack(q, v)[1]
             if g.kind.n_v > g.kind.dim:
-                ω = Vector(*own[g.kind.dim :])
+                ω = Vector(*g.unpack(q, v)[1][g.kind.dim :])
                 most = jnp.maximum(most, jnp.max(ω.dot(ω), axis=0))
-            else:
-                speed = jnp.maximum(speed, jnp.max(Vector(*own).dot(Vector(*own)), axis=0))
-        if any(g.kind.n_v == g.kind.dim for g in self.layout.groups):
-            fastest = jnp.max(bias * bias, axis=0, initial=0)
-            most = jnp.maximum(most, numerics.safe_divide(fastest, speed))
-        return dt[0] * dt[0] * most
+        for start, blocks in jacobian.by_rows():
+            if any(x.columns.components != self.layout.dim for x in blocks):
+                continue
+            first, *others = (x.columns.take(v) for x in blocks)
+            apart = [first - other for other in others] or [first]
+            speed = functools.reduce(jnp.maximum, (x.dot(x) for x in apart))
+            own = Vector.of_rows(bias, start, *blocks[0].shape)
+            fastest = functools.reduce(jnp.maximum, (x * x for x in own))
+            rods = jnp.maximum(rods, jnp.max(numerics.safe_divide(fastest, speed), axis=0))
+        return jnp.maximum(dt[0] * dt[0] * most, jnp.minimum(dt[0] * dt[0] * rods, 1))
+
+    def squared_turns(self, v: Array, jacobian: Any, dt: Any) -> Array:
+        """The square of the largest turn of the bodies that each row acts on, (n_c,) [rad²]."""
+        found = []
+        for start, blocks in jacobian.by_rows():
+            rows, elements = blocks[0].shape
+            most = jnp.zeros((elements, *v.shape[1:]), v.dtype)
+            for columns in (x.columns for x in blocks):
+                if columns.components > self.layout.dim:
+                    ω = Vector(*columns.take(v)[self.layout.dim :])
+                    most = jnp.maximum(most, ω.dot(ω))
+            found.append((start, jnp.concatenate([most] * rows)))
+        return dt * dt * jnp.concatenate([x for _, x in sorted(found, key=lambda x: x[0])])
 
     def complete(self, solution: Solution) -> Solution:
         """The solution of the saddle system as it is."""

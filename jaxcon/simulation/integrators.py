@@ -62,6 +62,9 @@ def reached(state: State, time: Any, dt: Array) -> Doubled:
 
 
 Pair = tuple[Any, Any]
+FASTEST_TURN, FASTEST = 100.0, 1e8
+"""Turns in a step [rad] and velocities [m/s, rad/s] from which a world is blowing up."""
+
 LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.025, 0.03)
 """Turns of a body in a step [rad] between which the Newton step for φ⁺ sets in; see `closer`.
 
@@ -220,10 +223,11 @@ def closer(
 
     Most steps turn bodies by less than `LARGE`, where e is about 3e-5 of a lever arm, and pay for
     the branch only. Between its two turns the step sets in smoothly, so that derivatives exist. It
-    fades from 1 to √2 rad, and where its own kinetic energy is ¼ to ½ of the motion's, as near a
-    singular configuration: from so far away a Newton step leads nowhere. A row of an inequality
-    constraint on bodies in space moves off its target by e/h with them. Where no body turns in
-    space, a world in which such rows act goes without.
+    fades for rows of bodies that turn by 1 to √2 rad, and where its own kinetic energy is ¼ to ½ of
+    the motion's, as near a singular configuration: from so far away a Newton step leads nowhere. A
+    row of an inequality constraint on bodies in space moves off its target by e/h with them. Where
+    no body turns in space, a world in which bounded rows act, friction and motors among them, goes
+    without.
 
     Args:
         system: of bodies.
@@ -236,23 +240,25 @@ def closer(
     """
     h, (q, v) = dt[None], end
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
-    turn = system.turn(state.q, v, rows.bias, h)
+    turn = system.squared_turn(state.q, v, rows.jacobian, rows.bias, h)
     if rows.reactions is not None and not system.turns_in_space:
         acts = jnp.any(rows.reactions.multipliers != 0, axis=0)
         turn = jnp.where(acts, 0, turn)
 
     def corrected() -> tuple[Array, Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
-        asks = (turn > least_turn**2) & (turn < 1e4)
+        fastest = jnp.max(jnp.abs(v), axis=0)
+        asks = (turn > least_turn**2) & (turn < FASTEST_TURN**2) & (fastest < FASTEST)
         a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
         place = jnp.where(asks, q, state.q)
-        square = system.turn(state.q, moving, rows.bias, h)
+        square = system.squared_turn(state.q, moving, rows.jacobian, rows.bias, h)
         rise = smooth((square - least_turn**2) / (full_turn**2 - least_turn**2))[None]
         if system.turns_in_space and not system.bounds:
             finely = system.kick(state.q, before, a, h)
             moving = moving + rise * (finely - moving)
             place = system.retract(state.q, h * moving)
-        share = jnp.where(asks, rise * smooth(2 - square)[None], 0)
+        share = rise * smooth(2 - system.squared_turns(moving, rows.jacobian, h))
+        share = jnp.where(asks, share, 0)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))

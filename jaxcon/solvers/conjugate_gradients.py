@@ -96,7 +96,7 @@ class ConjugateGradients(checks.Checked):
         length = jnp.sqrt(scaled(system, 1e-6))
 
         def iterate(a: Operator, x: Array) -> tuple[Array, Any]:
-            return descend(a, preconditioner.solve, x, tolerance, self.iterations)
+            return descend(a, preconditioner.solve, x, tolerance, self.iterations, system.loops)
 
         def solve(force: Array, target: Array) -> Solution:
             free = system.mass.solve(force)
@@ -107,9 +107,12 @@ class ConjugateGradients(checks.Checked):
             status = judge(acceleration, system.mass.singular)
             ended = jnp.logical_or(solved, beyond)
             late = jnp.where(ended, Status.OK, Status.NOT_CONVERGED).astype(status.dtype)
+            late = first(status, late)
+            if not system.loops:
+                return Solution(acceleration, multipliers, late)
             conflict = conflicts(system, force, target, left, length, CONTRADICTING)
             conflict = jnp.where(solved, Status.OK, conflict).astype(status.dtype)
-            return Solution(acceleration, multipliers, first(status, first(late, conflict)))
+            return Solution(acceleration, multipliers, first(late, conflict))
 
         return solve
 
@@ -150,7 +153,7 @@ class Descent(NamedTuple):
 
     @property
     def least(self) -> Array:
-        """Whether ‖r‖ is as small as it can be, by world: ‖A P⁻¹ r‖ is small, or zᵀA z rounding.
+        """Worlds whose ‖r‖ is as small as it can be: ‖A P⁻¹ r‖ is small, or zᵀA z rounding.
 
         Eigenvalues of P⁻¹A up to the first bound count as zero, as in `RankSafe`.
         """
@@ -161,7 +164,12 @@ class Descent(NamedTuple):
 
 
 def descend(
-    a: Operator, preconditioner: Operator, b: Array, tolerance: Array, iterations: int
+    a: Operator,
+    preconditioner: Operator,
+    b: Array,
+    tolerance: Array,
+    iterations: int,
+    singular: bool = True,
 ) -> tuple[Array, tuple[Array, Array, Array]]:
     """The x with the least residual r = b − A x, in the norm of P⁻¹, from x = 0.
 
@@ -180,6 +188,8 @@ def descend(
         b: (n_c, …).
         tolerance: of ‖r‖, in units of ‖b‖, number or one for each world.
         iterations: how many.
+        singular: whether A may be; if not, small eigenvalues are those of heavy loads, and ‖r‖
+            is never the least.
 
     Returns:
         x (n_c, …), and r (n_c, …), whether the tolerance is reached, and whether ‖r‖ is not below
@@ -197,7 +207,9 @@ def descend(
     def advance(_: Any, known: Descent) -> Descent:
         x, r, z, az, _, p, ap, pap = known
         pull = _dot(z, az)
-        stays = (known.size <= solved) | known.least
+        stays = known.size <= solved
+        if singular:
+            stays |= known.least
         step = safe_divide(jnp.where(stays, 0, pull), _dot(ap, pap))[None]
         x, r, z = x + step * p, r - step * ap, z - step * pap
         az = a(z)
@@ -208,6 +220,8 @@ def descend(
     start = Descent(jnp.zeros_like(b), b, z, az, paz, z, az, paz)
     end = jax.lax.fori_loop(0, iterations, advance, start)
     done = end.size <= solved
+    if not singular:
+        return end.x, (end.r, done, jnp.zeros_like(done))
     beyond = ~done & end.least
     share = safe_divide(jnp.where(beyond, _dot(end.x, end.r), 0), end.size)
     return end.x - share[None] * end.z, (end.r, done, beyond)

@@ -79,6 +79,13 @@ class Jacobian:
         counts = {block.start: block.shape[1] for block in self.blocks}
         return join(rows, counts, v)
 
+    def by_rows(self) -> list[tuple[int, list[Block]]]:
+        """The first row of equal constraints and their blocks, one for each of their bodies."""
+        found: dict[int, list[Block]] = {}
+        for block in self.blocks:
+            found.setdefault(block.start, []).append(block)
+        return sorted(found.items())
+
     def reach(self, v: Array) -> Array:
         """|J| |v|, (n_c,): J v as large as it could be if no terms cancelled."""
 

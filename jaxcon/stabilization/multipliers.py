@@ -134,7 +134,8 @@ class AugmentedLagrangian(Unstabilized):
     ) -> Solution:
         if not system.target.size:
             return solver.solve(system)
-        solver = solver.solver if isinstance(solver, RankSafe) else solver  # W is enough
+        judge = solver if isinstance(solver, RankSafe) else RankSafe(solver)
+        solver = judge.solver  # W is enough
         holding = rows.layout.holds
         # few rounds leave a trace of W in the solution, and so in its derivative
         stiffness = finite_or_nan(jnp.asarray(self.stiffness, start.dtype))[None]
@@ -151,7 +152,7 @@ class AugmentedLagrangian(Unstabilized):
         if not system.loops:
             return solution
         return solution._replace(
-            status=first(solution.status, _contradiction(solver, asked, solution))
+            status=first(solution.status, _contradiction(judge, asked, solution))
         )
 
     def _within_reach(self, solver: Any, system: Saddle, weight: Array, place: Array) -> Array:
@@ -186,14 +187,14 @@ class AugmentedLagrangian(Unstabilized):
         return self.feedback.correct(system, solver, before, state, memory.feedback, dt)
 
 
-def _contradiction(solver: Any, system: Saddle, solution: Solution) -> Array:
+def _contradiction(judge: RankSafe, system: Saddle, solution: Solution) -> Array:
     """CONFLICT in worlds whose b cannot be met, which is asked where much of it is left open."""
     left = remainder(system, system.target, solution)
     length = jnp.sqrt(scaled(system, 1e-6))
     met = conflicts(system, system.force, system.target, left, length, OPEN) == Status.OK
 
     def asked() -> Array:
-        code = RankSafe(solver, always=True).solve(system).status
+        code = dataclasses.replace(judge, always=True).solve(system).status
         return jnp.where(met | (code != Status.CONFLICT), Status.OK, code).astype(jnp.int32)
 
     return jax.lax.cond(everywhere(met), lambda: jnp.zeros_like(solution.status), asked)
