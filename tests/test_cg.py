@@ -375,3 +375,21 @@ def test_nothing_in_float32_is_float64():
     dtypes = {str(y.aval.dtype) for x in program for y in x.outvars}
     assert "float32" in dtypes
     assert "float64" not in dtypes
+
+
+@pytest.mark.parametrize("load", [1e4, 1e5])
+def test_a_chain_holds_a_heavy_load_in_float32(load):
+    """Its small eigenvalue is that of the load, and not of a row too many."""
+    scene = jc.Scene(dim=2, dtype=np.float32)
+    for i in range(5):
+        mass = load if i == 4 else 1.0
+        scene.add_body(f"link{i}", mass=mass, inertia=mass / 12, position=(0.0, -i - 0.5))
+        before = f"link{i - 1}" if i else jc.WORLD
+        scene.add(jc.Revolute(f"hinge{i}", before, f"link{i}", point=(0.0, -float(i))))
+    system, state = scene.build()
+    method = jc.Method(solver=jc.ConjugateGradients(iterations=1000))
+    state = jc.init(system, method, state.q, state.v)
+    found = jc.forward_dynamics(system, state, None, method, 1e-2)
+    assert found.status == jc.Status.OK
+    assert np.max(np.abs(found.acceleration)) < 0.2
+    np.testing.assert_allclose(np.max(np.abs(found.multipliers)), 9.81 * (load + 4), rtol=1e-3)

@@ -596,3 +596,16 @@ def test_a_spring_by_its_time_has_one_stiffness_in_all_directions():
     mass = 1 / np.array([lengths] * 3 + [turns] * 2)
     np.testing.assert_allclose(k, mass / 0.1**2, rtol=1e-12)
     np.testing.assert_allclose(d, 2 * 0.3 * mass / 0.1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("conflict", [None, np.inf])
+def test_multipliers_judge_contradictions_as_their_solver_is_told(conflict):
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("short", jc.WORLD, "bob", length=0.8))
+    scene.add(jc.Distance("long", jc.WORLD, "bob", length=1.2))
+    system, state = scene.build()
+    method = jc.Method(stabilizer=jc.AugmentedLagrangian(), solver=jc.RankSafe(conflict=conflict))
+    state = jc.init(system, method, state.q, state.v)
+    _, info = jc.step(system, method, state, None, 1e-3)
+    assert info.status == (jc.Status.CONFLICT if conflict is None else jc.Status.OK)

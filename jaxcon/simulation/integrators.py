@@ -133,10 +133,10 @@ class SemiImplicitEuler(Explicit):
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        v, solution, rows, least = self._promised(dynamics, state, dt)
+        v, solution, rows, least, push = self._promised(dynamics, state, dt)
         q = system.retract(state.q, h * v)
         if least is not None and rows.layout.size:
-            q, v, solution = closer(system, state, (q, v), solution, rows, least, dt)
+            q, v, solution = closer(system, state, (q, v), solution, rows, least, push, dt)
         if (jump := jump_of(rows.reactions)) is not None:
             q = system.retract(state.q, h * v + jump.travel)
             v, solution = v + jump.velocity, with_jump(solution, jump, dt)
@@ -144,8 +144,8 @@ class SemiImplicitEuler(Explicit):
 
     def _promised(
         self, dynamics: Dynamics, state: State, dt: Any
-    ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None]:
-        """v⁺, a and λ, rows and `least` of a step of bodies, before the Newton step of `closer`.
+    ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
+        """v⁺, a and λ, rows, `least` and the force of one-sided rows, before `closer`.
 
         In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
         v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
@@ -153,13 +153,14 @@ class SemiImplicitEuler(Explicit):
         """
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.turns_in_space:
-            solution, rows, least, _ = dynamics.factored(*here, dt / 2)
-            return state.v + h * solution.acceleration, solution, rows, least
+            ahead = dynamics.bounds_ahead(*here) if system.bounds else None
+            solution, rows, least, push = dynamics.factored(*here, dt / 2, ahead)
+            return state.v + h * solution.acceleration, solution, rows, least, push
         if not system.bounds:
             solution, rows, least, _ = dynamics.factored(*here, dt / 2)
             small = least is not None and rows.layout.size > 0  # `closer` does the large ones
             v = system.kick(state.q, state.v, solution.acceleration, h, small)
-            return v, solution, rows, least
+            return v, solution, rows, least, None
         bounds = dynamics.bounds_ahead(*here)
         pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
         coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
@@ -169,7 +170,7 @@ class SemiImplicitEuler(Explicit):
         if push is not None:
             straight = state.v + h * solution.acceleration
             v = jnp.where(system.by_body(state.q, push), straight, v)
-        return v, solution, rows, least
+        return v, solution, rows, least, push
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.
@@ -213,6 +214,7 @@ def closer(
     solution: Solution,
     rows: Rows,
     least: Callable[[Array], Solution],
+    push: Array | None,
     dt: Any,
 ) -> tuple[Array, Array, Solution]:
     """q⁺, v⁺, a and λ without the linearization error of φ⁺, by one Newton step for large turns.
@@ -225,9 +227,9 @@ def closer(
     the branch only. Between its two turns the step sets in smoothly, so that derivatives exist. It
     fades for rows of bodies that turn by 1 to √2 rad, and where its own kinetic energy is ¼ to ½ of
     the motion's, as near a singular configuration: from so far away a Newton step leads nowhere. A
-    row of an inequality constraint on bodies in space moves off its target by e/h with them. Where
-    no body turns in space, a world in which bounded rows act, friction and motors among them, goes
-    without.
+    row of friction or of a motor, or of any inequality constraint on bodies in space, moves off its
+    target by e/h with them. Where no body turns in space, a world in which a one-sided row acts
+    goes without.
 
     Args:
         system: of bodies.
@@ -236,14 +238,14 @@ def closer(
         solution: a and λ at the start.
         rows: the constraints there.
         least: b → the least a with J a + C λ = b.
+        push: the force of one-sided rows, (n_v,); None where there are none.
         dt: h, () [s].
     """
     h, (q, v) = dt[None], end
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
     turn = system.squared_turn(state.q, v, rows.jacobian, rows.bias, h)
-    if rows.reactions is not None and not system.turns_in_space:
-        acts = jnp.any(rows.reactions.multipliers != 0, axis=0)
-        turn = jnp.where(acts, 0, turn)
+    if push is not None and not system.turns_in_space:
+        turn = jnp.where(jnp.any(push != 0, axis=0), 0, turn)
 
     def corrected() -> tuple[Array, Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
