@@ -133,10 +133,10 @@ class SemiImplicitEuler(Explicit):
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        v, solution, rows, least, push = self._promised(dynamics, state, dt)
+        v, solution, rows, least, stays = self._promised(dynamics, state, dt)
         q = system.retract(state.q, h * v)
         if least is not None and rows.layout.size:
-            q, v, solution = closer(system, state, (q, v), solution, rows, least, push, dt)
+            q, v, solution = closer(system, state, (q, v), solution, rows, least, stays, dt)
         if (jump := jump_of(rows.reactions)) is not None:
             q = system.retract(state.q, h * v + jump.travel)
             v, solution = v + jump.velocity, with_jump(solution, jump, dt)
@@ -145,7 +145,7 @@ class SemiImplicitEuler(Explicit):
     def _promised(
         self, dynamics: Dynamics, state: State, dt: Any
     ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
-        """v⁺, a and λ, rows, `least` and the force of one-sided rows, before `closer`.
+        """v⁺, a and λ, rows, `least`, and the worlds that stay as they are, before `closer`.
 
         In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
         v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
@@ -154,8 +154,11 @@ class SemiImplicitEuler(Explicit):
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.turns_in_space:
             ahead = dynamics.bounds_ahead(*here) if system.bounds else None
-            solution, rows, least, push = dynamics.factored(*here, dt / 2, ahead)
-            return state.v + h * solution.acceleration, solution, rows, least, push
+            solution, rows, least, _ = dynamics.factored(*here, dt / 2, ahead)
+            stays = None
+            if ahead is not None and rows.reactions is not None:
+                stays = ahead.kinds.one_sided(rows.reactions.multipliers)
+            return state.v + h * solution.acceleration, solution, rows, least, stays
         if not system.bounds:
             solution, rows, least, _ = dynamics.factored(*here, dt / 2)
             small = least is not None and rows.layout.size > 0  # `closer` does the large ones
@@ -170,7 +173,7 @@ class SemiImplicitEuler(Explicit):
         if push is not None:
             straight = state.v + h * solution.acceleration
             v = jnp.where(system.by_body(state.q, push), straight, v)
-        return v, solution, rows, least, push
+        return v, solution, rows, least, None
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.
@@ -214,7 +217,7 @@ def closer(
     solution: Solution,
     rows: Rows,
     least: Callable[[Array], Solution],
-    push: Array | None,
+    stays: Array | None,
     dt: Any,
 ) -> tuple[Array, Array, Solution]:
     """q⁺, v⁺, a and λ without the linearization error of φ⁺, by one Newton step for large turns.
@@ -238,14 +241,14 @@ def closer(
         solution: a and λ at the start.
         rows: the constraints there.
         least: b → the least a with J a + C λ = b.
-        push: the force of one-sided rows, (n_v,); None where there are none.
+        stays: worlds that go without, (); None for none.
         dt: h, () [s].
     """
     h, (q, v) = dt[None], end
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
     turn = system.squared_turn(state.q, v, rows.jacobian, rows.bias, h)
-    if push is not None and not system.turns_in_space:
-        turn = jnp.where(jnp.any(push != 0, axis=0), 0, turn)
+    if stays is not None:
+        turn = jnp.where(stays, 0, turn)
 
     def corrected() -> tuple[Array, Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite

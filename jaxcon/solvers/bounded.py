@@ -90,6 +90,16 @@ class Kinds:
         """The row of the first normal."""
         return self.single + self.boxes
 
+    def one_sided(self, multipliers: Array) -> Array:
+        """Worlds in which a stop or contact acts, which is not so of friction and motors alone, ().
+
+        Args:
+            multipliers: (n,).
+        """
+        normals = multipliers[self.normal : self.normal + self.contacts]
+        acts = jnp.concatenate([multipliers[: self.single], normals]) != 0
+        return jnp.any(acts, axis=0)
+
     def split(self, x: Array) -> Parts:
         """An array (n, …) by law."""
         box, normal = x[self.single : self.normal], x[self.normal : self.starts[0]]
