@@ -195,9 +195,12 @@ class Vakonomic:
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)
         return jnp.concatenate([self.system.kick(q, v, a, dt, small), μ + dt * rate])
 
-    def squared_turn(self, q: Array, v: Array, jacobian: Any, bias: Array, dt: Any) -> Array:
+    def squared_turn(
+        self, q: Array, v: Array, before: Array, jacobian: Any, bias: Array, dt: Any
+    ) -> Array:
         """The square of the largest turn in a step, as of the system, () [rad²]."""
-        return self.system.squared_turn(q, self._split(v)[0], jacobian, bias, dt)
+        v, before = self._split(v)[0], self._split(before)[0]
+        return self.system.squared_turn(q, v, before, jacobian, bias, dt)
 
     def squared_turns(self, v: Array, jacobian: Any, dt: Any) -> Array:
         """The square of the largest turn of the bodies of each row, as of the system, (n_c,)."""

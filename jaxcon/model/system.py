@@ -12,7 +12,6 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core import numerics
 from jaxcon.core.doubled import rounded
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
@@ -27,6 +26,9 @@ from jaxcon.model.state import Energy
 from jaxcon.model.turning import coarse, continued, reduced
 from jaxcon.solvers.jacobian import Columns
 from jaxcon.solvers.saddle import Diagonal, Solution
+
+STILL = 1e-9
+"""The speed [m/s] of the ends of a rod against each other below which it is not taken to turn."""
 
 
 @pytree
@@ -300,7 +302,9 @@ class BodySystem:
         """True where bodies have an orientation in space."""
         return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
 
-    def squared_turn(self, q: Array, v: Array, jacobian: Any, bias: Array, dt: Any) -> Array:
+    def squared_turn(
+        self, q: Array, v: Array, before: Array, jacobian: Any, bias: Array, dt: Any
+    ) -> Array:
         """The square of the largest turn in a step, () [rad²].
 
         Bodies turn by h|ω|. Particles have no ω; a rod of length l between two of them, whose γ is
@@ -309,7 +313,8 @@ class BodySystem:
 
         Args:
             q: positions, (n_q,).
-            v: velocities, (n_v,).
+            v: velocities of the step, (n_v,).
+            before: velocities at which γ is known, (n_v,).
             jacobian: J of the constraints, by blocks.
             bias: γ of the constraints, (n_c,) [m/s²].
             dt: h, (1,) [s].
@@ -322,12 +327,12 @@ class BodySystem:
         for start, blocks in jacobian.by_rows():
             if any(x.columns.components != self.layout.dim for x in blocks):
                 continue
-            first, *others = (x.columns.take(v) for x in blocks)
+            first, *others = (x.columns.take(before) for x in blocks)
             apart = [first - other for other in others] or [first]
             speed = functools.reduce(jnp.maximum, (x.dot(x) for x in apart))
             own = Vector.of_rows(bias, start, *blocks[0].shape)
             fastest = functools.reduce(jnp.maximum, (x * x for x in own))
-            rods = jnp.maximum(rods, jnp.max(numerics.safe_divide(fastest, speed), axis=0))
+            rods = jnp.maximum(rods, jnp.max(fastest / (speed + STILL**2), axis=0))
         return jnp.maximum(dt[0] * dt[0] * most, jnp.minimum(dt[0] * dt[0] * rods, 1))
 
     def squared_turns(self, v: Array, jacobian: Any, dt: Any) -> Array:

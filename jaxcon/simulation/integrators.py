@@ -246,7 +246,7 @@ def closer(
     """
     h, (q, v) = dt[None], end
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
-    turn = system.squared_turn(state.q, v, rows.jacobian, rows.bias, h)
+    turn = system.squared_turn(state.q, v, state.v, rows.jacobian, rows.bias, h)
     if stays is not None:
         turn = jnp.where(stays, 0, turn)
 
@@ -256,7 +256,7 @@ def closer(
         asks = (turn > least_turn**2) & (turn < FASTEST_TURN**2) & (fastest < FASTEST)
         a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
         place = jnp.where(asks, q, state.q)
-        square = system.squared_turn(state.q, moving, rows.jacobian, rows.bias, h)
+        square = system.squared_turn(state.q, moving, before, rows.jacobian, rows.bias, h)
         rise = smooth((square - least_turn**2) / (full_turn**2 - least_turn**2))[None]
         if system.turns_in_space and not system.bounds:
             finely = system.kick(state.q, before, a, h)
