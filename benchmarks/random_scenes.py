@@ -34,6 +34,7 @@ import numpy as np
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
+from jaxcon.solvers.jacobian import Jacobian
 
 STEPS = 600
 """The number of steps of a motion."""
@@ -195,7 +196,8 @@ def _turn(system: Any, state: jc.State, v: jax.Array) -> float:
     steps = round(STEPS * SIZES[-1] / h)
 
     def seen(state: jc.State, _: Any) -> jax.Array:
-        return system.turn(state.q, state.v, jnp.zeros(0), jnp.full(1, SIZES[-1]))
+        none, h = Jacobian((), (0, state.v.size)), jnp.full(1, SIZES[-1])
+        return system.squared_turn(state.q, state.v, state.v, none, jnp.zeros(0), h)
 
     squares = jax.jit(lambda s: jc.rollout(system, method, s, None, h, steps, record=seen)[1])
     return float(np.sqrt(np.max(squares(start))))
