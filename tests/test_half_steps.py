@@ -569,7 +569,7 @@ BESIDE = {
 
 @pytest.mark.parametrize("name", [None, *BESIDE])
 def test_two_rods_in_the_plane_gain_no_energy_whatever_is_beside_them(name):
-    """Of 20 J at most; without the Newton step it would be 8 J and more."""
+    """The mean energy drifts by less than 0.2 J in a minute; without the Newton step, by 8 J."""
     scene = jc.Scene(dim=2)
     for i in range(2):
         scene.add_body(f"link{i}", mass=1.0, inertia=1 / 12, position=(i + 0.5, 0.0))
@@ -592,7 +592,7 @@ def test_two_rods_in_the_plane_gain_no_energy_whatever_is_beside_them(name):
 
 
 def test_a_dumbbell_is_as_rigid_in_fast_flight():
-    """What a rod turns by depends on how its ends move against each other alone."""
+    """The length of a rod is kept as well at 500 m/s as at rest: its turn is a relative motion."""
 
     def length(along):
         scene = jc.Scene(dim=2, gravity=(0.0, 0.0))

@@ -67,7 +67,7 @@ OTHERS = _names(
 
 
 LIGHT = 1.5e5
-"""What a call of one result may cost before it needs a second one, by the count of `is_light`.
+"""The cost, as `Stages.is_light` counts it, from which a call of one result gets a second one.
 
 XLA divides among threads what it takes to cost 2e5 or more: ten for each byte read or written, one
 for each operation on a number and two for each transcendental one.

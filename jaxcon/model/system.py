@@ -337,16 +337,16 @@ class BodySystem:
 
     def squared_turns(self, v: Array, jacobian: Any, dt: Any) -> Array:
         """The square of the largest turn of the bodies that each row acts on, (n_c,) [rad²]."""
-        found = []
-        for start, blocks in jacobian.by_rows():
+        found: list[Array] = []
+        for _, blocks in jacobian.by_rows():
             rows, elements = blocks[0].shape
             most = jnp.zeros((elements, *v.shape[1:]), v.dtype)
             for columns in (x.columns for x in blocks):
                 if columns.components > self.layout.dim:
                     ω = Vector(*columns.take(v)[self.layout.dim :])
                     most = jnp.maximum(most, ω.dot(ω))
-            found.append((start, jnp.concatenate([most] * rows)))
-        return dt * dt * jnp.concatenate([x for _, x in sorted(found, key=lambda x: x[0])])
+            found += [most] * rows
+        return dt * dt * jnp.concatenate(found)
 
     def complete(self, solution: Solution) -> Solution:
         """The solution of the saddle system as it is."""
