@@ -144,10 +144,21 @@ class Stages:
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
-                call = functools.partial(_stage, light=self.is_light(values, step))
-                if self._may_overwrite(values, step):
-                    call = _stage_with_arguments
-                self._store(values, step, self._evaluate, call)
+                self._stage(values, step)
+
+    def _stage(self, values: dict[int, Any], wanted: list[int]) -> None:
+        """Computes the values of a stage: light ones each in a call of its own.
+
+        A call of several results fills a table of their places, which costs more than the call.
+        """
+        light = [x for x in wanted if self.is_light(values, [x])]
+        light = [x for x in light if not self._may_overwrite(values, [x])]
+        others = [x for x in wanted if x not in light]
+        for x in light:
+            self._store(values, [x], self._evaluate, functools.partial(_stage, light=True))
+        if others:
+            call = _stage_with_arguments if self._may_overwrite(values, others) else _stage
+            self._store(values, others, self._evaluate, call)
 
     def _branch(self, step: Operation, values: dict[int, Any]) -> None:
         """Computes the results of a condition; what it alone reads is computed in its branches."""

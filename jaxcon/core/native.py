@@ -22,10 +22,11 @@ import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, Primitive
 from jax.extend.core.primitives import stop_gradient_p
@@ -36,6 +37,9 @@ from jaxcon.core.jaxprs import without_unused
 from jaxcon.core.somewhere import asking
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import spread
+
+FEW = 64
+"""Numbers up to which an array whose value is known becomes a part of the program."""
 
 _ORDER = ContextVar("order", default=0)
 _TRANSPOSED = ContextVar("transposed", default=False)
@@ -218,17 +222,59 @@ def bound(args: Iterable[Any], fun: Native) -> list[Array]:
     return native_p.bind(*args, fun=fun, asks=asking())
 
 
+class Known(NamedTuple):
+    """An array whose value is a part of the program, compared by value.
+
+    Attributes:
+        shape: of the array.
+        dtype: its name.
+        data: its bytes.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    data: bytes
+
+    def lanes(self, axes: int) -> Array:
+        """The array with so many trailing axes of one, as a value of the trace."""
+        value = np.frombuffer(self.data, self.dtype).reshape(*self.shape, *(1,) * axes)
+        return jax.lax.stop_gradient(jnp.asarray(value))
+
+
+def _known(x: Any) -> Known | None:
+    """The value of an array of at most `FEW` numbers; None of others."""
+    if isinstance(x, Tracer) or np.size(x) > FEW:
+        return None
+    dtype = jnp.result_type(x)
+    if not jnp.issubdtype(dtype, np.number):
+        return None
+    value = np.asarray(x, dtype)
+    return Known(value.shape, dtype.name, value.tobytes())
+
+
+def _is_tracing() -> bool:
+    """Returns True where a program is being written, and not run at once."""
+    return isinstance(jax.lax.full((), 0.0), Tracer)
+
+
 @functools.lru_cache(maxsize=256)
 def _native(
-    function: Callable[..., Any], structure: Any, shapes: Any, staged: bool
+    function: Callable[..., Any],
+    structure: Any,
+    shapes: Any,
+    known: tuple[Known | None, ...],
+    staged: bool,
 ) -> tuple[Native, list[Any]]:
-    """The function of leaves, and a place where its result's structure is left when tracing.
+    """The function of unknown leaves, and a place where its result's structure is left in tracing.
 
     What a result holds beside arrays may depend on shapes, such as the number of rows.
     """
     result: list[Any] = [None]
 
-    def flat(*leaves: Array) -> list[Array]:
+    def flat(*given: Array) -> list[Array]:
+        axes = given[0].ndim - len(next(s for s, x in zip(shapes, known, strict=True) if x is None))
+        moving = iter(given)
+        leaves = [next(moving) if x is None else x.lanes(axes) for x in known]
         output = function(*jax.tree.unflatten(structure, leaves))
         arrays, result[0] = jax.tree.flatten(output)
         return [jnp.asarray(x) for x in arrays]
@@ -238,6 +284,9 @@ def _native(
 
 def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> PyTree:
     """function(*args), batched natively under `vmap`.
+
+    In a program that is being traced, small arrays that are not traced are constants of it, as they
+    are in JAX: the compiler then leaves out what does nothing, such as a product with 1.
 
     Args:
         function: pure, defined once; takes pytrees of arrays and returns one. Given trailing batch
@@ -250,8 +299,12 @@ def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> Py
         What the function returns.
     """
     leaves, structure = jax.tree.flatten(args)
-    arrays = [jnp.asarray(x) for x in leaves]
-    native, result = _native(function, structure, tuple(x.shape for x in arrays), staged)
+    known = [None] * len(leaves)
+    if any(isinstance(x, Tracer) for x in leaves) and _is_tracing():
+        known = [_known(x) for x in leaves]
+    shapes = tuple(np.shape(x) for x in leaves)
+    native, result = _native(function, structure, shapes, tuple(known), staged)
+    arrays = [jnp.asarray(x) for x, value in zip(leaves, known, strict=True) if value is None]
     arrays = meshes.together(arrays)
     arrays = bound(arrays, native)  # its trace leaves the structure
     return jax.tree.unflatten(result[0], arrays)

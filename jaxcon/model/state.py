@@ -113,7 +113,8 @@ def at_instant(state: State, instant: Doubled) -> State:
 
 def is_finite(state: State) -> Array:
     """Returns True where all positions and velocities of a world are finite, ()."""
-    return jnp.all(jnp.isfinite(state.q), axis=0) & jnp.all(jnp.isfinite(state.v), axis=0)
+    # 0 · x is NaN where x is not finite; a sum takes less time than a test of each number
+    return jnp.sum(0 * state.q, axis=0) + jnp.sum(0 * state.v, axis=0) == 0
 
 
 def at(system: Any, state: Any, call: str = "f(system, s)") -> Any:
