@@ -207,3 +207,49 @@ def test_single_precision_is_traced_anew_where_double_is_off():
         with jax.enable_x64(double):
             found.append(float(jax.vmap(lambda y: native.call(real, y))(x)[0]))
     assert found == [8, 4, 8]
+
+
+def test_numbers_that_a_program_knows_are_constants_of_it():
+    """Of a step under jit only the state and h are arguments; values and tangents are the same."""
+    system, state = scenes_of_library.four_bar()
+    method, h = jc.Method(), 1e-3
+
+    def one(system, state):
+        return jc.step(system, method, state, None, h)[0]
+
+    def arguments(function, *args):
+        called = [x for x in jax.make_jaxpr(function)(*args).eqns if x.primitive.name == "native"]
+        return len(called[0].invars)
+
+    moving = len(jax.tree.leaves(state)) + 1
+    assert arguments(lambda s: one(system, s), state) == moving
+    assert arguments(one, system, state) == moving + len(jax.tree.leaves(system))
+
+    inside, outside = jax.jit(lambda s: one(system, s)), jax.jit(one)
+    close(inside(state), outside(system, state))
+    tangent = dataclasses.replace(
+        jax.tree.map(jnp.zeros_like, state),
+        v=jnp.ones_like(state.v),
+        **{n: np.zeros(getattr(state, n).shape, jax.dtypes.float0) for n in ["status"]},
+    )
+    expected = jax.jvp(lambda s: outside(system, s).q, (state,), (tangent,))[1]
+    close(jax.jvp(lambda s: inside(s).q, (state,), (tangent,))[1], expected)
+
+
+def test_equal_constants_share_a_trace():
+    before = native._native.cache_info().misses
+    for _ in range(3):
+        jax.make_jaxpr(lambda q: native.call(swing, q, {"stiffness": 1.37, "gain": P["gain"]}))(
+            Q[0]
+        )
+    assert native._native.cache_info().misses == before + 1
+
+
+def test_a_batch_outside_jit_compiles_once_for_all_values():
+    """Nothing is a constant where a function runs at once: another number costs no compilation."""
+    compiled = []
+    for stiffness in (1.1, 1.2):
+        p = {"stiffness": jnp.asarray(stiffness), "gain": P["gain"]}
+        close(jax.vmap(lambda q, p=p: called(q, p))(Q), jax.vmap(lambda q, p=p: swing(q, p))(Q))
+        compiled.append(native._native.cache_info().misses)
+    assert compiled[0] == compiled[1]

@@ -99,6 +99,11 @@ def test_the_front_falls_and_nothing_cheaper_is_as_accurate(result):
         result.recommend(error=1e-16)
     with pytest.raises(ValueError, match="either error"):
         result.recommend()
+    for wrong in (True, -1.0, 0.0, math.nan, "1e-3", [1e-3]):
+        with pytest.raises(ValueError, match="recommend: error= "):
+            result.recommend(error=wrong)
+        with pytest.raises(ValueError, match="recommend: cost= "):
+            result.recommend(cost=wrong)
 
 
 def test_the_limit_of_stability_is_that_of_the_exact_law():

@@ -11,6 +11,7 @@ from typing import Any
 
 from jaxcon.analysis.diagram import draw
 from jaxcon.analysis.listing import LEGEND, table
+from jaxcon.core.checks import check
 from jaxcon.simulation.method import Method
 
 OK = "ok"
@@ -169,8 +170,11 @@ class Tradeoff:
             The run; its `method`, `dt` and `dtype` are ready to use.
 
         Raises:
-            ValueError: none meets it; the message says what the best one reaches.
+            ValueError: none meets it; the message says what the best one reaches. Or not a positive
+                number.
         """
+        check("recommend", "error= [m]", error, (), above=0, finite=False, optional=True)
+        check("recommend", "cost= [s/s]", cost, (), above=0, finite=False, optional=True)
         if (error is None) == (cost is None):
             raise ValueError("recommend: give either error= [m] or cost= [s/s].")
         front = self.front

@@ -210,7 +210,8 @@ class SpatialRigid(Particle):
 
         With ω̄ = (ω + ω⁺)/2 it is ω⁺ = ω + h (a + g(ω) − g(ω̄)) and g = I⁻¹ (ω × Iω), which would
         keep |Iω| and ½ ω·Iω of a free body. ω̄ is found by two iterations, the second one half the
-        way. Both so swing by about (h|ω|)²/50, and drift by less than (h|ω|)⁶/64 a step.
+        way. The energy so swings by up to (h|ω|)²/16, |Iω| by half as much, and both drift by less
+        than (h|ω|)⁶/64 a step.
 
         Args:
             v: velocities before the step.

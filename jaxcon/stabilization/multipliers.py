@@ -33,7 +33,10 @@ from jaxcon.stabilization.baumgarte import Baumgarte, Law, Unstabilized, check_s
 from jaxcon.stabilization.gains import check_gains, column
 
 OPEN = 0.25
-"""The part of b that rounds may leave open before it is asked whether all of it can be met."""
+"""The part of b that rounds may leave open before it is asked whether all of it can be met.
+
+A smaller `conflict` of a `RankSafe` takes its place.
+"""
 
 
 @exportable
@@ -191,7 +194,8 @@ def _contradiction(judge: RankSafe, system: Saddle, solution: Solution) -> Array
     """CONFLICT in worlds whose b cannot be met, which is asked where much of it is left open."""
     left = remainder(system, system.target, solution)
     length = jnp.sqrt(scaled(system, 1e-6))
-    met = conflicts(system, system.force, system.target, left, length, OPEN) == Status.OK
+    share = OPEN if judge.conflict is None else jnp.minimum(OPEN, judge.conflict)
+    met = conflicts(system, system.force, system.target, left, length, share) == Status.OK
 
     def asked() -> Array:
         code = dataclasses.replace(judge, always=True).solve(system).status
