@@ -33,7 +33,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
+from jaxcon.constraints.rows import RowLayout, Rows, linearize
 from jaxcon.solvers.jacobian import Jacobian
 
 STEPS = 600
@@ -196,8 +196,9 @@ def _turn(system: Any, state: jc.State, v: jax.Array) -> float:
     steps = round(STEPS * SIZES[-1] / h)
 
     def seen(state: jc.State, _: Any) -> jax.Array:
-        none, h = Jacobian((), (0, state.v.size)), jnp.full(1, SIZES[-1])
-        return system.squared_turn(state.q, state.v, state.v, none, jnp.zeros(0), h)
+        zero, none = jnp.zeros(0), Jacobian((), (0, state.v.size))
+        rows = Rows(zero, zero, none, zero, RowLayout(()))
+        return system.squared_turn(state.q, state.v, state.v, rows, jnp.full(1, SIZES[-1]))
 
     squares = jax.jit(lambda s: jc.rollout(system, method, s, None, h, steps, record=seen)[1])
     return float(np.sqrt(np.max(squares(start))))

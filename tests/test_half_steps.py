@@ -591,6 +591,37 @@ def test_two_rods_in_the_plane_gain_no_energy_whatever_is_beside_them(name):
     assert abs(found[-600:].mean() - found[:600].mean()) < 0.2
 
 
+@pytest.mark.parametrize("body", [False, True], ids=["particles", "bodies"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_rods_gain_no_energy_whatever_they_join(dim, body):
+    """Two rods of 1 m let go from the horizontal: 2 % of the largest kinetic energy in a minute.
+
+    Where the rods of bodies, which hardly turn themselves, were not seen to turn, it was 56 %.
+    """
+    aside = (0.0,) * (dim - 1)
+    scene = jc.Scene(dim=dim, gravity=(*aside, -9.81))
+    for i in range(2):
+        place = (i + 1.0, *aside)
+        if body:
+            scene.add_body(f"bob{i}", 1.0, 0.05 if dim == 2 else (0.05,) * 3, position=place)
+        else:
+            scene.add_particle(f"bob{i}", 1.0, position=place)
+    scene.add(jc.Distance("rod0", jc.WORLD, "bob0", point_a=(0.0, *aside)))
+    scene.add(jc.Distance("rod1", "bob0", "bob1"))
+    system, state = scene.build()
+    method = jc.Method()
+
+    def energy(state, info):
+        found = jc.energy(system, state)
+        return found.total, found.kinetic
+
+    final, (total, kinetic) = jax.jit(
+        lambda s: jc.rollout(system, method, s, None, 0.02, 3000, record=energy)
+    )(jc.init(system, method, state.q, state.v))
+    assert final.status == jc.Status.OK
+    assert abs(total[-300:].mean() - total[:300].mean()) < 0.02 * kinetic.max()
+
+
 def test_a_dumbbell_is_as_rigid_in_fast_flight():
     """The length of a rod is kept as well at 500 m/s as at rest: its turn is a relative motion."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
@@ -24,6 +26,7 @@ class RowSet(NamedTuple):
         jacobian: for each body, its columns and its part of every row.
         holonomic: by row, whether it has a φ or is one of velocities alone.
         compliance: C by row, lanes (element,); None where it is zero.
+        swings: of the rows that are rods, see `Row.swing`.
     """
 
     value: tuple[Lane, ...]
@@ -32,6 +35,7 @@ class RowSet(NamedTuple):
     jacobian: tuple[tuple[Columns, tuple[Vector, ...]], ...]
     holonomic: tuple[bool, ...]
     compliance: tuple[Lane, ...] | None = None
+    swings: Mapping[int, Lane] = MappingProxyType({})
 
 
 class Constraint(Protocol):
@@ -114,4 +118,5 @@ def gather(
         tuple(sides),
         tuple(row.holonomic for row in rows),
         compliance,
+        {r: row.swing for r, row in enumerate(rows) if row.swing is not None},
     )

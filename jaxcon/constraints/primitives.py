@@ -35,6 +35,7 @@ class Row(NamedTuple):
         holonomic: whether there is a φ; without one the row is ψ(q, v, t) = 0, value zero, rate ψ.
         reduced: the angle φ less whole turns, and these turns, where both are known: a large φ is
             rounded, and differences of large angles are computed from these.
+        swing: the square of the rate at which the direction of a rod turns [rad²/s²].
     """
 
     value: Lane
@@ -43,6 +44,7 @@ class Row(NamedTuple):
     pulls: tuple[Vector, ...]
     holonomic: bool = True
     reduced: tuple[Lane, Lane] | None = None
+    swing: Lane | None = None
 
 
 def meet(p: Point, r: Point) -> list[Row]:
@@ -91,7 +93,8 @@ def distance(p: Point, r: Point, length: Lane) -> Row:
     across = ḋ.dot(ḋ) - speed * speed
     # the derivative of a quotient would multiply this by that of the span, beyond float32
     bias = n.dot(r.bias - p.bias) + across * inverse
-    return Row(span - length, speed, bias, (-p.pull(n), r.pull(n)))
+    swing = across * inverse * inverse
+    return Row(span - length, speed, bias, (-p.pull(n), r.pull(n)), swing=swing)
 
 
 def same_orientation(a: Any, b: Any, reference: Any) -> list[Row]:

@@ -165,6 +165,7 @@ class Rows:
         compliance: the diagonal of C, (n_c,); None where it is zero.
         mass: M, where a step tells it to those who weigh rows.
         reactions: what bounded rows did, where there are any.
+        swings: squares of the rates at which rods turn, (element,) [rad²/s²], by first row.
     """
 
     residual: Array
@@ -175,6 +176,7 @@ class Rows:
     compliance: Array | None = None
     mass: Mass | None = None
     reactions: Any = None
+    swings: dict[int, Array] = dataclasses.field(default_factory=dict)
 
     @property
     def violation(self) -> Violation:
@@ -220,12 +222,14 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     blocks: list[Block] = []
     entries: list[tuple[str, int, int, int]] = []
     free: list[int] = []
+    swings: dict[int, Array] = {}
     vectors: list[tuple[int, int, tuple[int, ...]]] = []
     start = 0
     for group, rows in zip(system.constraints, sets, strict=True):
         k = len(group.names)
         if isinstance(group, Joints):
             vectors += [(start, k, own) for own in components(rows, snapshot.system.layout.dim)]
+        swings |= {start + k * r: jnp.asarray(x) for r, x in rows.swings.items()}
         blocks += [Block(value, start, columns) for columns, value in rows.jacobian]
         if rows.value:  # a joint may be there to be read and driven only
             entries += [(name, start + i, len(rows.value), k) for i, name in enumerate(group.names)]
@@ -249,7 +253,7 @@ def linearize(system: Any, q: Array, v: Array, t: Any) -> Rows:
     loops |= len(set(driven)) < len(driven)
     loops |= any(isinstance(group, Custom) and len(rows.value) > 1 for group, rows in pairs)
     layout = RowLayout(tuple(entries), tuple(free), inertial, loops, tuple(vectors))
-    return Rows(residual, rate, jacobian, bias, layout, compliance)
+    return Rows(residual, rate, jacobian, bias, layout, compliance, swings=swings)
 
 
 def components(rows: RowSet, dim: int) -> list[tuple[int, ...]]:

@@ -195,16 +195,14 @@ class Vakonomic:
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)
         return jnp.concatenate([self.system.kick(q, v, a, dt, small), μ + dt * rate])
 
-    def squared_turn(
-        self, q: Array, v: Array, before: Array, jacobian: Any, bias: Array, dt: Any
-    ) -> Array:
+    def squared_turn(self, q: Array, v: Array, before: Array, rows: Any, dt: Any) -> Array:
         """The square of the largest turn in a step, as of the system, () [rad²]."""
         v, before = self._split(v)[0], self._split(before)[0]
-        return self.system.squared_turn(q, v, before, jacobian, bias, dt)
+        return self.system.squared_turn(q, v, before, rows, dt)
 
-    def squared_turns(self, v: Array, jacobian: Any, dt: Any) -> Array:
+    def squared_turns(self, v: Array, rows: Any, dt: Any) -> Array:
         """The square of the largest turn of the bodies of each row, as of the system, (n_c,)."""
-        return self.system.squared_turns(self._split(v)[0], jacobian, dt)
+        return self.system.squared_turns(self._split(v)[0], rows, dt)
 
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""

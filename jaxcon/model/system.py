@@ -302,50 +302,52 @@ class BodySystem:
         """True where bodies have an orientation in space."""
         return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
 
-    def squared_turn(
-        self, q: Array, v: Array, before: Array, jacobian: Any, bias: Array, dt: Any
-    ) -> Array:
-        """The square of the largest turn in a step, () [rad²].
+    def squared_turn(self, q: Array, v: Array, before: Array, rows: Any, dt: Any) -> Array:
+        """The square of the largest turn in a step, of bodies and of rods, () [rad²].
 
-        Bodies turn by h|ω|. Particles have no ω; a rod of length l between two of them, whose γ is
-        |v|²/l for the difference v of their velocities, turns by h|γ|/|v|. That is taken for at
-        most a radian, as a γ that has other reasons makes it as large as one likes.
+        Other constraints between particles alone, such as a curve of curvature κ, have a γ of κ|v|²
+        for the difference v of their velocities, and turn by h|γ|/|v|. That is taken for at most a
+        radian, as a γ that has other reasons makes it as large as one likes.
 
         Args:
             q: positions, (n_q,).
             v: velocities of the step, (n_v,).
-            before: velocities at which γ is known, (n_v,).
-            jacobian: J of the constraints, by blocks.
-            bias: γ of the constraints, (n_c,) [m/s²].
+            before: velocities at which the rows are known, (n_v,).
+            rows: the constraints.
             dt: h, (1,) [s].
         """
-        most = rods = jnp.zeros(v.shape[1:], v.dtype)
+        most = bends = jnp.zeros(v.shape[1:], v.dtype)
         for g in self.layout.groups:
             if g.kind.n_v > g.kind.dim:
                 ω = Vector(*g.unpack(q, v)[1][g.kind.dim :])
                 most = jnp.maximum(most, jnp.max(ω.dot(ω), axis=0))
-        for start, blocks in jacobian.by_rows():
-            if any(x.columns.components != self.layout.dim for x in blocks):
+        for swing in rows.swings.values():
+            most = jnp.maximum(most, jnp.max(swing, axis=0))
+        for start, blocks in rows.jacobian.by_rows():
+            dims = {x.columns.components for x in blocks}
+            if start in rows.swings or dims != {self.layout.dim}:
                 continue
             first, *others = (x.columns.take(before) for x in blocks)
             apart = [first - other for other in others] or [first]
             speed = functools.reduce(jnp.maximum, (x.dot(x) for x in apart))
-            own = Vector.of_rows(bias, start, *blocks[0].shape)
+            own = Vector.of_rows(rows.bias, start, *blocks[0].shape)
             fastest = functools.reduce(jnp.maximum, (x * x for x in own))
-            rods = jnp.maximum(rods, jnp.max(fastest / (speed + STILL**2), axis=0))
-        return jnp.maximum(dt[0] * dt[0] * most, jnp.minimum(dt[0] * dt[0] * rods, 1))
+            bends = jnp.maximum(bends, jnp.max(fastest / (speed + STILL**2), axis=0))
+        return jnp.maximum(dt[0] * dt[0] * most, jnp.minimum(dt[0] * dt[0] * bends, 1))
 
-    def squared_turns(self, v: Array, jacobian: Any, dt: Any) -> Array:
-        """The square of the largest turn of the bodies that each row acts on, (n_c,) [rad²]."""
+    def squared_turns(self, v: Array, rows: Any, dt: Any) -> Array:
+        """The square of the largest turn of a row's bodies, or of the rod it is, (n_c,) [rad²]."""
         found: list[Array] = []
-        for _, blocks in jacobian.by_rows():
-            rows, elements = blocks[0].shape
+        for start, blocks in rows.jacobian.by_rows():
+            count, elements = blocks[0].shape
             most = jnp.zeros((elements, *v.shape[1:]), v.dtype)
             for columns in (x.columns for x in blocks):
                 if columns.components > self.layout.dim:
                     ω = Vector(*columns.take(v)[self.layout.dim :])
                     most = jnp.maximum(most, ω.dot(ω))
-            found += [most] * rows
+            if start in rows.swings:
+                most = jnp.maximum(most, rows.swings[start])
+            found += [most] * count
         return dt * dt * jnp.concatenate(found)
 
     def complete(self, solution: Solution) -> Solution:

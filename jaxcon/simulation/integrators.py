@@ -68,7 +68,7 @@ FASTEST_TURN, FASTEST = 100.0, 1e8
 LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.025, 0.03)
 """Turns of a body in a step [rad] between which the Newton step for φ⁺ sets in; see `closer`.
 
-In the plane, energy then drifts by less than 1 % of the largest kinetic energy in a minute; bodies
+In the plane, energy then drifts by less than 2 % of the largest kinetic energy in a minute; bodies
 in space, which have more ways to exchange it, drift as little if the step sets in sooner.
 """
 
@@ -105,7 +105,7 @@ class SemiImplicitEuler(Explicit):
 
     In space, the free rotation of bodies is split off from what accelerates them
     (`BodySystem.kick`). A free body so keeps |Iω| and its energy up to turns of a radian a step.
-    Where a body or a rod between particles turns by more than 0.038 rad in a step, or 0.025 rad if
+    Where a body or a rod turns by more than 0.038 rad in a step, or 0.025 rad if
     bodies turn in space, what the linearized rows missed of φ is taken out by a second substitution
     with the factors of the step, in full from 0.042 and 0.03 rad on. Such a step takes about half
     as long again. Without it, energy would grow with (h|ω|)³, and motions of a radian in a few
@@ -246,7 +246,7 @@ def closer(
     """
     h, (q, v) = dt[None], end
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
-    turn = system.squared_turn(state.q, v, state.v, rows.jacobian, rows.bias, h)
+    turn = system.squared_turn(state.q, v, state.v, rows, h)
     if stays is not None:
         turn = jnp.where(stays, 0, turn)
 
@@ -256,13 +256,15 @@ def closer(
         asks = (turn > least_turn**2) & (turn < FASTEST_TURN**2) & (fastest < FASTEST)
         a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
         place = jnp.where(asks, q, state.q)
-        square = system.squared_turn(state.q, moving, before, rows.jacobian, rows.bias, h)
+        swings = {i: jnp.where(asks, x, 0) for i, x in rows.swings.items()}
+        turning = dataclasses.replace(rows, swings=swings)
+        square = system.squared_turn(state.q, moving, before, turning, h)
         rise = smooth((square - least_turn**2) / (full_turn**2 - least_turn**2))[None]
         if system.turns_in_space and not system.bounds:
             finely = system.kick(state.q, before, a, h)
             moving = moving + rise * (finely - moving)
             place = system.retract(state.q, h * moving)
-        share = rise * smooth(2 - system.squared_turns(moving, rows.jacobian, h))
+        share = rise * smooth(2 - system.squared_turns(moving, turning, h))
         share = jnp.where(asks, share, 0)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
