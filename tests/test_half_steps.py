@@ -603,9 +603,10 @@ def test_rods_gain_no_energy_whatever_they_join(dim, body):
     for i in range(2):
         place = (i + 1.0, *aside)
         if body:
-            scene.add_body(f"bob{i}", 1.0, 0.05 if dim == 2 else (0.05,) * 3, position=place)
+            inertia = 0.05 if dim == 2 else (0.05,) * 3
+            scene.add_body(f"bob{i}", mass=1.0, inertia=inertia, position=place)
         else:
-            scene.add_particle(f"bob{i}", 1.0, position=place)
+            scene.add_particle(f"bob{i}", mass=1.0, position=place)
     scene.add(jc.Distance("rod0", jc.WORLD, "bob0", point_a=(0.0, *aside)))
     scene.add(jc.Distance("rod1", "bob0", "bob1"))
     system, state = scene.build()
