@@ -35,7 +35,7 @@ class Row(NamedTuple):
         holonomic: whether there is a φ; without one the row is ψ(q, v, t) = 0, value zero, rate ψ.
         reduced: the angle φ less whole turns, and these turns, where both are known: a large φ is
             rounded, and differences of large angles are computed from these.
-        swing: the square of the rate at which the direction of a rod turns [rad²/s²].
+        swing: of a rod, the square of the rate at which its direction turns [rad²/s²].
     """
 
     value: Lane

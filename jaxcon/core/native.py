@@ -43,6 +43,7 @@ FEW = 64
 
 _ORDER = ContextVar("order", default=0)
 _TRANSPOSED = ContextVar("transposed", default=False)
+_CONSTANTS = ContextVar("constants", default=True)
 
 
 def order() -> int:
@@ -252,12 +253,22 @@ def _known(x: Any) -> Known | None:
     return Known(value.shape, dtype.name, value.tobytes())
 
 
+@contextmanager
+def as_it_is_called() -> Iterator[None]:
+    """Values are no constants of the loops within, unless the caller is being traced itself.
+
+    The body of a loop is traced, too, where the loop runs at once; other numbers must not cost a
+    compilation there.
+    """
+    with during(_CONSTANTS, _CONSTANTS.get() and _is_tracing()):
+        yield
+
+
 def _is_tracing() -> bool:
     """Returns True where a program is being written, and not run at once."""
     return isinstance(jax.lax.full((), 0.0), Tracer)
 
 
-@functools.lru_cache(maxsize=256)
 def _native(
     function: Callable[..., Any],
     structure: Any,
@@ -265,9 +276,10 @@ def _native(
     known: tuple[Known | None, ...],
     staged: bool,
 ) -> tuple[Native, list[Any]]:
-    """The function of unknown leaves, and a place where its result's structure is left in tracing.
+    """The function of the leaves that are not `known`, of which there is at least one.
 
-    What a result holds beside arrays may depend on shapes, such as the number of rows.
+    With it comes a place where the structure of the result is left in tracing: what a result holds
+    beside arrays may depend on shapes, such as the number of rows.
     """
     result: list[Any] = [None]
 
@@ -282,11 +294,16 @@ def _native(
     return Native(flat, staged), result
 
 
+_shared = functools.lru_cache(maxsize=256)(_native)
+_with_constants = functools.lru_cache(maxsize=64)(_native)
+"""Apart, as every other value makes another function."""
+
+
 def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> PyTree:
     """function(*args), batched natively under `vmap`.
 
-    In a program that is being traced, small arrays that are not traced are constants of it, as they
-    are in JAX: the compiler then leaves out what does nothing, such as a product with 1.
+    In a program that is being traced, small arrays whose values are known are constants of the
+    function: the compiler then leaves out what does nothing, such as a product with 1.
 
     Args:
         function: pure, defined once; takes pytrees of arrays and returns one. Given trailing batch
@@ -300,10 +317,11 @@ def call(function: Callable[..., Any], *args: PyTree, staged: bool = True) -> Py
     """
     leaves, structure = jax.tree.flatten(args)
     known = [None] * len(leaves)
-    if any(isinstance(x, Tracer) for x in leaves) and _is_tracing():
+    if _CONSTANTS.get() and any(isinstance(x, Tracer) for x in leaves) and _is_tracing():
         known = [_known(x) for x in leaves]
     shapes = tuple(np.shape(x) for x in leaves)
-    native, result = _native(function, structure, shapes, tuple(known), staged)
+    cached = _with_constants if any(x is not None for x in known) else _shared
+    native, result = cached(function, structure, shapes, tuple(known), staged)
     arrays = [jnp.asarray(x) for x, value in zip(leaves, known, strict=True) if value is None]
     arrays = meshes.together(arrays)
     arrays = bound(arrays, native)  # its trace leaves the structure

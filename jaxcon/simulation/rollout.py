@@ -107,7 +107,8 @@ def rollout(
 
     reason = FEEDBACK if policy else method.irreversible()
     path = Path(one, _recorded(record), state, inputs, steps, every, reason or back)
-    final, trajectory = adjoint.scan(path)
+    with native.as_it_is_called():
+        final, trajectory = adjoint.scan(path)
     return stop_failed(final.status, final), stop_failed(final.status, trajectory)
 
 
