@@ -23,6 +23,7 @@ from jaxcon.dynamics import impacts
 from jaxcon.dynamics.parts import Part, Struck
 from jaxcon.dynamics.reactions import Impulse
 from jaxcon.solvers.nearest_rows import Nearest
+from jaxcon.solvers.proximal import own_diagonal
 from jaxcon.solvers.saddle import Factored, Saddle, Solution
 
 
@@ -143,6 +144,11 @@ class Dynamics:
         if lands:
             assert self.approach is not None
             seen = self.approach.lands
+            first, aim = impulse.start, impulse.target
+            if aim.size:  # what feedback makes of the way to the place depends on its time
+                live = impulse.alone(impulse.saddle.force, aim).acceleration
+                first = impacts.with_tangent(first, live)
+                start = self.dt[None] * bounds.jacobian.apply(first)
             asked, refined = self.approach.targets(bounds, start, self.dt)
             impulse = dataclasses.replace(impulse, rows=asked)
         may = start > 0
@@ -172,7 +178,7 @@ class Dynamics:
             solution, known = self._struck((q, v, t), solution, known, times, lag)
         elif lands:
             solution = self._observed(solution, t, seen, seen, bounds)
-            smooth = jnp.where(refined.supported(known.multipliers), 0, impulse.start)
+            smooth = jnp.where(refined.supported(known.multipliers), 0, first)
             change = self.dt[None] * (solution.acceleration - smooth)
             travel = refined.travel(v, change, self.approach)
             known = dataclasses.replace(known, jump=impacts.Jump(jnp.zeros_like(v), travel))
@@ -192,10 +198,23 @@ class Dynamics:
         if not impacts.resolves_landings(shape):
             return q, t, self
         rows = self.bounds(q, v, t, self.dt)
-        a = self.system.mass(q).solve(self.system.force(q, v, t, self.control))
-        change = jax.lax.stop_gradient(self.dt[None] * rows.jacobian.apply(a))
-        islands = impacts.Islands.of(rows, bool(self.system.constraints))
-        approach = impacts.Approach.of(rows, change, self.dt, islands)
+        h, mass, held = self.dt[None], self.system.mass(q), bool(self.system.constraints)
+        force = self.system.force(q, v, t, self.control)
+        a = mass.solve(force)
+        if held:
+            # by Gauss' principle joints make no acceleration larger, but for turns
+            size = jnp.sum(a * force, axis=0)
+            if self.system.has_bodies:
+                turn = jnp.max(self.system.squared_turns(v, rows.jacobian, 1), axis=0)
+                size += turn * jnp.sum(v * mass.apply(v), axis=0)
+            light = own_diagonal(mass, rows.jacobian, v.ndim - 1)
+            most, change = h * numerics.safe_sqrt(light * size), jnp.zeros_like(rows.rate)
+        else:
+            change = h * rows.jacobian.apply(a)
+            most = jnp.abs(change)
+        change, most = jax.lax.stop_gradient((change, most))
+        islands = impacts.Islands.of(rows, held)
+        approach = impacts.Approach.of(rows, change, most, self.dt, islands)
         place = self.system.retract(q, approach.by_velocity * v)
         return place, t + approach.last, dataclasses.replace(self, approach=approach)
 
