@@ -208,7 +208,7 @@ class Dynamics:
                 turn = jnp.max(self.system.squared_turns(v, rows.jacobian, 1), axis=0)
                 size += turn * jnp.sum(v * mass.apply(v), axis=0)
             light = own_diagonal(mass, rows.jacobian, v.ndim - 1)
-            most, change = h * numerics.safe_sqrt(light * size), jnp.zeros_like(rows.rate)
+            most, change = h * numerics.safe_sqrt(light * size[None]), jnp.zeros_like(rows.rate)
         else:
             change = h * rows.jacobian.apply(a)
             most = jnp.abs(change)

@@ -131,9 +131,7 @@ class SemiImplicitEuler(Explicit):
         q = system.retract(here.q, h * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
-    def _approached(
-        self, dynamics: Dynamics, state: State, dt: Any
-    ) -> tuple[State, Dynamics, Any]:
+    def _approached(self, dynamics: Dynamics, state: State, dt: Any) -> tuple[State, Dynamics, Any]:
         """The state at the first landings of the step, the dynamics there, and the age of v."""
         q, t, dynamics = dynamics.approached(state.q, state.v, state.instant)
         if dynamics.approach is None:
