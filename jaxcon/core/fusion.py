@@ -144,15 +144,16 @@ class Stages:
                 operands = [self.program.evaluate(values, x) for x in step.inputs]
                 values.update(zip(step.outputs, step(operands), strict=True))
             else:
-                self._stage(values, step)
+                self._store_stage(values, step)
 
-    def _stage(self, values: dict[int, Any], wanted: list[int]) -> None:
+    def _store_stage(self, values: dict[int, Any], wanted: list[int]) -> None:
         """Computes the values of a stage: light ones each in a call of its own.
 
         A call of several results fills a table of their places, which costs more than the call.
         """
-        light = [x for x in wanted if self.is_light(values, [x])]
-        light = [x for x in light if not self._may_overwrite(values, [x])]
+        light = [
+            x for x in wanted if self.is_light(values, [x]) and not self._may_overwrite(values, [x])
+        ]
         others = [x for x in wanted if x not in light]
         for x in light:
             self._store(values, [x], self._evaluate, functools.partial(_stage, light=True))

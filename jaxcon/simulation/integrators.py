@@ -105,10 +105,10 @@ class SemiImplicitEuler(Explicit):
 
     In space, the free rotation of bodies is split off from what accelerates them
     (`BodySystem.kick`). A free body so keeps |Iω| and its energy up to turns of a radian a step.
-    Where a body or a rod turns by more than 0.038 rad in a step, or 0.025 rad if
-    bodies turn in space, what the linearized rows missed of φ is taken out by a second substitution
-    with the factors of the step, in full from 0.042 and 0.03 rad on. Such a step takes about half
-    as long again. Without it, energy would grow with (h|ω|)³, and motions of a radian in a few
+    Where a body or a rod turns by more than 0.038 rad in a step, or 0.025 rad if bodies turn in
+    space, what the linearized rows missed of φ is taken out by a second substitution with the
+    factors of the step, in full from 0.042 and 0.03 rad on. Such a step takes about half as long
+    again. Without it, energy would grow with (h|ω|)³, and motions of a radian in a few
     steps would end NON_FINITE.
 
     References:
