@@ -208,7 +208,7 @@ class Stages:
         sizes = self.program.sizes
         if not is_known([sizes[x] for x in (*leaves, *wanted)]):
             return False
-        cost = 80 * sum(sizes[x] for x in (*leaves, *wanted))
+        cost = 10 * sum(self.program.bytes[x] for x in (*leaves, *wanted))
         for op in operations:
             cost += work(op.name) * sum(sizes[x] for x in op.outputs)
         return cost < LIGHT

@@ -90,6 +90,7 @@ class Program:
         outputs: of the results.
         makers: the operation that makes a value.
         sizes: how many entries a value has.
+        bytes: how many bytes they are.
     """
 
     def __init__(self, closed: Any, inner: Callable[[Any], tuple[Any, bool]]) -> None:
@@ -103,6 +104,7 @@ class Program:
         self._inner = inner
         self._known: dict[Any, list[int]] = {}
         self.sizes: dict[int, int] = {}
+        self.bytes: dict[int, int] = {}
         self._lengths: dict[int, list[Any]] = {}  # of the operands of concatenations
         self.inputs = [self._new(x) for x in closed.jaxpr.invars]
         self.outputs = self._inline_closed(closed, list(self.inputs))
@@ -184,6 +186,7 @@ class Program:
     def _new(self, variable: Any) -> int:
         name = len(self.sizes)
         self.sizes[name] = variable.aval.size
+        self.bytes[name] = variable.aval.size * variable.aval.dtype.itemsize
         return name
 
     def _inline_closed(self, jaxpr: Any, args: list[Operand]) -> list[Operand]:

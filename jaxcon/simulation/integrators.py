@@ -134,12 +134,13 @@ class SemiImplicitEuler(Explicit):
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
         v, solution, rows, least, stays = self._promised(dynamics, state, dt)
-        q = system.retract(state.q, h * v)
         if least is not None and rows.layout.size:
-            q, v, solution = closer(system, state, (q, v), solution, rows, least, stays, dt)
+            v, solution = closer(system, state, v, solution, rows, least, stays, dt)
+        travel = h * v
         if (jump := jump_of(rows.reactions)) is not None:
-            q = system.retract(state.q, h * v + jump.travel)
-            v, solution = v + jump.velocity, with_jump(solution, jump, dt)
+            travel, v = travel + jump.travel, v + jump.velocity
+            solution = with_jump(solution, jump, dt)
+        q = system.retract(state.q, travel)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
     def _promised(
@@ -213,14 +214,14 @@ class SemiImplicitEuler(Explicit):
 def closer(
     system: Any,
     state: State,
-    end: tuple[Array, Array],
+    v: Array,
     solution: Solution,
     rows: Rows,
     least: Callable[[Array], Solution],
     stays: Array | None,
     dt: Any,
-) -> tuple[Array, Array, Solution]:
-    """q⁺, v⁺, a and λ without the linearization error of φ⁺, by one Newton step for large turns.
+) -> tuple[Array, Solution]:
+    """v⁺, a and λ without the linearization error of φ⁺, by one Newton step for large turns.
 
     The rows promise φ⁺ = φ + h p + h² φ̈, with φ̈ = J a + γ and p = φ̇ − ½hγ. At q ⊕ h v⁺ they are
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
@@ -237,25 +238,24 @@ def closer(
     Args:
         system: of bodies.
         state: at the start of the step.
-        end: q⁺ = q ⊕ h v⁺ and v⁺, (n_q,) and (n_v,).
+        v: v⁺, (n_v,), with q⁺ = q ⊕ h v⁺.
         solution: a and λ at the start.
         rows: the constraints there.
         least: b → the least a with J a + C λ = b.
         stays: worlds that go without, (); None for none.
         dt: h, () [s].
     """
-    h, (q, v) = dt[None], end
+    h = dt[None]
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
     turn = system.squared_turn(state.q, v, state.v, rows, h)
     if stays is not None:
         turn = jnp.where(stays, 0, turn)
 
-    def corrected() -> tuple[Array, Array, Solution]:
+    def corrected() -> tuple[Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
         fastest = jnp.max(jnp.abs(v), axis=0)
         asks = (turn > least_turn**2) & (turn < FASTEST_TURN**2) & (fastest < FASTEST)
         a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
-        place = jnp.where(asks, q, state.q)
         swings = {i: jnp.where(asks, x, 0) for i, x in rows.swings.items()}
         turning = dataclasses.replace(rows, swings=swings)
         square = system.squared_turn(state.q, moving, before, turning, h)
@@ -263,7 +263,7 @@ def closer(
         if system.turns_in_space and not system.bounds:
             finely = system.kick(state.q, before, a, h)
             moving = moving + rise * (finely - moving)
-            place = system.retract(state.q, h * moving)
+        place = system.retract(state.q, h * moving)
         share = rise * smooth(2 - system.squared_turns(moving, turning, h))
         share = jnp.where(asks, share, 0)
         held = rows.layout.holds & rows.layout.holonomic
@@ -279,9 +279,9 @@ def closer(
         fades = smooth(2 - 4 * numerics.safe_divide(*energies))[None]
         more = Solution(fades * more.acceleration, fades * more.multipliers, more.status)
         found = jnp.where(asks, moving + fades * change, v)
-        return system.retract(state.q, h * found), found, added(solution, more)
+        return found, added(solution, more)
 
-    return jax.lax.cond(somewhere(turn > least_turn**2), corrected, lambda: (q, v, solution))
+    return jax.lax.cond(somewhere(turn > least_turn**2), corrected, lambda: (v, solution))
 
 
 def smooth(x: Array) -> Array:
