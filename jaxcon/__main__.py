@@ -115,7 +115,8 @@ def run_tradeoff(options: argparse.Namespace) -> int:
         if most is not None:
             try:
                 chosen = result.recommend(**{what: most})
-                print(f"\nat most {most:g} in {what}: {chosen}")
+                unit = chosen.unit if what == "error" else "s/s"
+                print(f"\n{what} of at most {most:g} {unit}: {chosen}")
             except ValueError as error:
                 print(error)
                 return 1

@@ -23,6 +23,8 @@ from jaxcon.simulation.choice import Choice, several
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import largest_stable_rate
 
+CONFLICT_ADVICE = "; keep those that agree, or rank them by jc.Priority"
+
 
 @dataclass(frozen=True)
 class Report:
@@ -98,7 +100,7 @@ class Report:
                 " not where impacts are grazing, simultaneous or accumulating, which"
                 " jc.check_gradients names"
             )
-        if self.redundant:
+        if self.redundant and not self._redundancy_warned:
             named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
             lines.append(
                 f"redundant rows (each depends on rows before it here): {named}; the default"
@@ -108,8 +110,8 @@ class Report:
             )
         if self.conflicts:
             lines.append(
-                "contradicting constraints, and what no motion can take away of them; keep those"
-                " that agree, or rank them by jc.Priority"
+                "contradicting constraints, and what no motion can take away of them"
+                + ("" if "over-constrained" in self.warnings else CONFLICT_ADVICE)
             )
             lines += [
                 f"  {name}: {phi:.2e} of φ, {rate:.2e} of φ̇, {bias:.2e} of φ̈"
@@ -120,13 +122,20 @@ class Report:
             f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
             for name, (phi, rate) in self.violation.items()
         ]
-        if self.off:
+        if self.off and "start" not in self.warnings:
             lines.append(
                 f"off {', '.join(self.off)}: print(jc.assemble(system, state)) takes it to the"
                 " nearest positions that meet them, or names those that cannot be met"
             )
         lines += [f"warning, {TRAPS[name][0]}: {said}" for name, said in self.warnings.items()]
         return "\n".join(lines)
+
+    @property
+    def _redundancy_warned(self) -> bool:
+        """Returns True where a warning names the redundant rows."""
+        return "singular" in self.warnings or (
+            "over-constrained" in self.warnings and not self.conflicts
+        )
 
     def _of_method(self) -> list[str]:
         """What is said of cost, gains and what is to be expected, and which solver suits."""

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxcon.analysis.costs import Batch, Pace, Slope
-from jaxcon.analysis.front import OK, LeftOut, Limit, Run
+from jaxcon.analysis.front import COORDINATES, METERS, OK, LeftOut, Limit, Run
 from jaxcon.analysis.reference import Reference, Ruler
 from jaxcon.analysis.trials import Course, Observer, Problem, Trip
 from jaxcon.core.status import Status
@@ -171,7 +171,8 @@ class Sweep:
         alone = trip.seconds / self.problem.horizon
         note = trip.status.name if trip.status and outcome == OK else ""
         known = (name, dtype, trip.dt, outcome, error, told, angle, trip.violation, energy, alone)
-        return Run(*known, note=note, method=method)
+        unit = METERS if self.ruler.layout is not None else COORDINATES
+        return Run(*known, note=note, unit=unit, method=method)
 
     def _outcome(self, trip: Trip) -> tuple[str, float]:
         """Returns in words how a trip ended, and how far its energy is off [J]."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxcon.analysis import reference as references
 from jaxcon.analysis.choices import methods_for
 from jaxcon.analysis.costs import Batch
-from jaxcon.analysis.front import LeftOut, Tradeoff, front_of
+from jaxcon.analysis.front import COORDINATES, METERS, LeftOut, Tradeoff, front_of
 from jaxcon.analysis.ledger import Clock, Ledger, Wanted
 from jaxcon.analysis.sweep import Sweep
 from jaxcon.analysis.trials import Course, Inputs, Observer, Points, Problem
@@ -176,7 +176,7 @@ def _words(sweep: Sweep) -> tuple[str, ...]:
     """What a result says of the reference and of the device."""
     reference, problem = sweep.reference, sweep.problem
     device = f"{jax.devices()[0].device_kind} ({jax.default_backend()})"
-    unit = "m" if hasattr(problem.system, "layout") else "of q"
+    unit = METERS if hasattr(problem.system, "layout") else COORDINATES
     lines = [
         f"{problem.horizon:g} s; cost: time on {device} for a simulated second of one world,"
         f" alone or of {sweep.batch.worlds}",

@@ -80,7 +80,7 @@ def singular(known: Known) -> str | None:
     if known.dependent:
         if not known.passing:
             return None
-        names = _names(known, known.dependent)
+        names = _numbered(known, known.dependent)
         return (
             f"rows of {names} depend on others here, but not beside this position: it is singular."
             f" Its forces are not unique, and the motion may branch. {_taken(known)}"
@@ -133,11 +133,11 @@ def overconstrained(known: Known) -> str | None:
         )
     if not known.dependent or known.passing:
         return None
-    count, names = len(known.dependent), _names(known, known.dependent)
+    count, names = len(known.dependent), _numbered(known, known.dependent)
     return (
-        f"{several(count, 'row')} of {names} repeat what others say. The motion is right, but how"
-        " forces are shared among these rows is not determined: take joints with fewer rows if"
-        f" you need them. {_taken(known)}"
+        f"redundant: {several(count, 'row')} of {names} repeat what others say. The motion is"
+        " right, but how forces are shared among these rows is not determined: take joints with"
+        f" fewer rows if you need them. {_taken(known)}"
     )
 
 
@@ -378,3 +378,12 @@ def _taken(known: Known) -> str:
 def _names(known: Known, rows: list[int]) -> str:
     """The constraints of some unit rows, each once."""
     return ", ".join(dict.fromkeys(known.unit.owners[i][0] for i in rows))
+
+
+def _numbered(known: Known, rows: list[int]) -> str:
+    """The constraints of some unit rows, each with the numbers of these rows in it."""
+    numbers: dict[str, list[str]] = {}
+    for i in rows:
+        name, row = known.unit.owners[i]
+        numbers.setdefault(name, []).append(str(row))
+    return ", ".join(f"{name}[{', '.join(rows)}]" for name, rows in numbers.items())
