@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon import demo, view
 from jaxcon.analysis.front import COORDINATES, Run, Tradeoff
 from jaxcon.core import checks
 
@@ -76,3 +77,18 @@ def test_redundant_rows_are_named_once():
     assert text.count("again[0") == 1
     assert "redundant rows" not in text
     assert "redundant rows" in str(jc.report(system, state))
+
+
+def test_each_error_in_the_picture_says_on_which_linkages():
+    """The same number may stand in both panels, of the linkages tuned on and of others."""
+    plt = pytest.importorskip("matplotlib.pyplot")
+    figure, axes = plt.subplots(1, 2)
+    history = np.array([3e-7, 2e-7, 1e-7])
+    view._draw_loss(axes[0], demo.Tuning({}, {}, history, 4.72e-7, 64))
+    rms = np.full((2, 5, 8), 4.72e-7)
+    view._draw_errors(axes[1], demo.Validation(np.arange(5.0), rms, np.ones(2)))
+    legends = [[x.get_text() for x in a.get_legend().get_texts()] for a in axes]
+    plt.close(figure)
+    assert "default gains on these 64: 472 nm" in legends[0]
+    assert "tried, from default + integral: 300 nm" in legends[0]
+    assert "default gains on these 8: 472 nm" in legends[1]
