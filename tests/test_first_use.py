@@ -92,3 +92,51 @@ def test_each_error_in_the_picture_says_on_which_linkages():
     assert "default gains on these 64: 472 nm" in legends[0]
     assert "tried, from default + integral: 300 nm" in legends[0]
     assert "default gains on these 8: 472 nm" in legends[1]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5 * np.pi, np.pi])
+@pytest.mark.parametrize("kind", ["particle", "body"])
+def test_a_report_says_how_far_a_pendulum_swings_in_a_step(kind, angle):
+    """h √(g/l) = 3.13, whether it hangs, is released level or stands."""
+    scene = jc.Scene(dim=2)
+    place = (np.sin(angle), -np.cos(angle))
+    if kind == "particle":
+        scene.add_particle("bob", mass=1.0, position=place)
+        scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    else:
+        scene.add_body("bob", mass=1.0, inertia=1e-4, position=place)
+        scene.add(jc.Revolute("pin", jc.WORLD, "bob", point=(0.0, 0.0)))
+    report = jc.report(*scene.build(), jc.Method(), 1.0)
+    assert report.angle.swing == pytest.approx(np.sqrt(9.81), rel=1e-3)
+    assert report.angle.turn == 0
+    said = report.warnings["step"]
+    assert "'bob' at 3.13 rad/s, h ω = 3.1, where oscillations are stable" in said
+    assert "SemiImplicitEuler below 2" in said
+    assert "Take dt of 0.064 s or less" in said
+    assert "status OK" in said
+
+
+def test_a_rotor_slows_what_it_turns_with():
+    """ω² = m g l / (m l² + I)."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("bob", mass=1.0, inertia=1e-9, position=(0.0, -1.0))
+    scene.add(jc.Revolute("pin", jc.WORLD, "bob", point=(0.0, 0.0)))
+    scene.add(jc.Armature("rotor", "pin", inertia=3.0))
+    report = jc.report(*scene.build(), jc.Method(), 0.1)
+    assert report.angle.swing == pytest.approx(0.1 * np.sqrt(9.81 / 4.0), rel=1e-3)
+
+
+def test_a_report_knows_the_frequencies_of_springs():
+    """Two masses between springs, k/m and 3 k/m for equal ones."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    for name, x in (("a", 1.0), ("b", 2.0)):
+        scene.add_particle(name, mass=2.0, position=(x, 0.0))
+        scene.add(jc.PointOnLine(f"{name} line", jc.WORLD, name, axis=(1.0, 0.0)))
+    scene.add(jc.Spring("left", jc.WORLD, "a", stiffness=8.0, point_a=(0.0, 0.0)))
+    scene.add(jc.Spring("middle", "a", "b", stiffness=8.0))
+    scene.add(jc.Spring("right", "b", jc.WORLD, stiffness=8.0, point_b=(3.0, 0.0)))
+    report = jc.report(*scene.build(), jc.Method(), 0.1)
+    assert report.angle.swing == pytest.approx(0.1 * np.sqrt(12.0), rel=1e-5)
+    assert "step" not in report.warnings
+    assert "h ω = 0.35 by gravity and springs" in str(report)
+    assert jc.report(*scene.build(), jc.Method()).angle is None

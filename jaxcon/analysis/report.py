@@ -12,6 +12,7 @@ from jaxcon.analysis import traps
 from jaxcon.analysis.estimate import Cost
 from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.analysis.memory import Memory, memory
+from jaxcon.analysis.motion import StepAngle
 from jaxcon.analysis.probe import Probe
 from jaxcon.analysis.traps import OF_SCENE, OFF, TRAPS, listed
 from jaxcon.analysis.work import Work, seconds, work
@@ -56,9 +57,11 @@ class Report:
         gains: α and β of the feedback, and the largest β that is stable at their ratio [1/s], where
             a method and a step were given.
         probe: what some steps from the state left open, where it was asked to measure.
-        warnings: by trap, "gains", "singular", "order", "over-constrained", "start", "nonlinear",
-            "dense", "iterations", "impacts" and "range", of those in which the scene and the method
-            are. All but "range" need a method, some a step, and "order" to measure.
+        angle: how far the fastest motion turns or swings in a step, where a method and a step were
+            given.
+        warnings: by trap, "gains", "step", "singular", "order", "over-constrained", "start",
+            "nonlinear", "dense", "iterations", "impacts" and "range", of those in which the scene
+            and the method are. All but "range" need a method, some a step, and "order" to measure.
     """
 
     coordinates: int
@@ -77,6 +80,7 @@ class Report:
     work: Work | None = None
     seconds: float | None = None
     gains: tuple[float, float, float] | None = None
+    angle: StepAngle | None = None
     probe: Probe | None = None
     warnings: dict[str, str] = field(default_factory=dict)
     cost: Cost | None = None
@@ -150,6 +154,8 @@ class Report:
                 f"gains α = {α:.4g}, β = {β:.4g} 1/s; at this ratio β is stable up to"
                 f" {most:.4g} 1/s"
             )
+        if self.angle:
+            lines.append(str(self.angle))
         if self.probe:
             code = self.probe.status
             if Status.OK < code < Status.CONFLICT:
@@ -252,6 +258,7 @@ def _with_method(found: Report, known: Known, measure: bool, timed: bool) -> Rep
         work=work(*args) if measure else None,
         seconds=seconds(*args, known.batch) if timed else None,
         gains=gains,
+        angle=known.angle,
         probe=known.probe,
         warnings=traps.found(known),
     )
