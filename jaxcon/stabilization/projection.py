@@ -199,13 +199,16 @@ class Projection(Unstabilized):
             return q, state.v, jnp.zeros_like(state.status)
         problem = self._problem(system, start.q, rows, held, rotors)
         off = rows if start is state else linearize(system, q, still, state.instant)
-        surface = _Surface(system, state, off.residual, problem, held)
+        surface = _Surface(system, start, state, off.residual, problem, held)
         factored, bounds = solver.factor(problem), self._bounds(system, state)
         step, left, code = self._step(surface, partial(factored, still), bounds)
         late = jnp.where(left > bounds.fails, Status.NOT_CONVERGED, Status.OK)
         code = status.first(status.failures(code), late.astype(jnp.int32))
-        v = state.v if start is state else state.v + _missed(problem.mass, state.v, step, dt)
-        return system.retract(q, step), v, code
+        v = state.v
+        if start is not state:
+            change = _missed(problem.mass, v, step, dt)
+            v = v + system.carry(q, -dt[None] * v, change)
+        return surface.moved(step), v, code
 
     def _step(
         self, surface: _Surface, solve: Callable[[Array], Solution], bounds: Bounds
@@ -324,23 +327,37 @@ def _missed(mass: Mass, v: Array, step: Array, dt: Any) -> Array:
 class _Surface:
     """φ(q* ⊕ d) of the rows that are projected, zero for the others.
 
+    d is in the frames of bodies where the step began, as J₀ is, and turned into theirs at q*.
+
     Attributes:
         problem: M, J₀ and C.
         start: φ(q*), (n_c,).
     """
 
     def __init__(
-        self, system: Any, state: State, start: Array, problem: Saddle, held: np.ndarray
+        self,
+        system: Any,
+        before: State,
+        state: State,
+        start: Array,
+        problem: Saddle,
+        held: np.ndarray,
     ) -> None:
-        self.system, self.state, self.problem = system, state, problem
+        self.system, self.before, self.state, self.problem = system, before, state, problem
         self.held = jnp.asarray(held).reshape(-1, *(1,) * (start.ndim - 1))
         self.start = start  # rows of velocities and rotors have φ = 0
 
     def residual(self, d: Array) -> Array:
         """φ(q* ⊕ d), (n_c,)."""
-        moved = self.system.retract(self.state.q, d)
         still = jnp.zeros_like(d)
-        return linearize(self.system, moved, still, self.state.instant).residual
+        return linearize(self.system, self.moved(d), still, self.state.instant).residual
+
+    def moved(self, d: Array) -> Array:
+        """q* ⊕ d."""
+        q = self.state.q
+        if self.before is not self.state:
+            d = self.system.seen_from(q, self.before.q, d)
+        return self.system.retract(q, d)
 
     def apply(self, d: Array) -> Array:
         """J₀ d, (n_c,)."""
