@@ -200,9 +200,10 @@ class Vakonomic:
         v, before = self._split(v)[0], self._split(before)[0]
         return self.system.squared_turn(q, v, before, rows, dt)
 
-    def squared_turns(self, v: Array, rows: Any, dt: Any) -> Array:
+    def squared_turns(self, v: Array, before: Array, rows: Any, dt: Any) -> Array:
         """The square of the largest turn of the bodies of each row, as of the system, (n_c,)."""
-        return self.system.squared_turns(self._split(v)[0], rows, dt)
+        v, before = self._split(v)[0], self._split(before)[0]
+        return self.system.squared_turns(v, before, rows, dt)
 
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""

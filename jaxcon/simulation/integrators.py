@@ -25,6 +25,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.impacts import jump_of, with_jump
+from jaxcon.dynamics.islands import largest_by_island, rows_beside_contact
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
 
@@ -62,8 +63,8 @@ def reached(state: State, time: Any, dt: Array) -> Doubled:
 
 
 Pair = tuple[Any, Any]
-FASTEST_TURN, FASTEST = 100.0, 1e8
-"""Turns in a step [rad] and velocities [m/s, rad/s] from which a world is blowing up."""
+FASTEST = 1e8
+"""Velocities [m/s, rad/s] from which a world is blowing up."""
 
 LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.025, 0.03)
 """Turns of a body in a step [rad] between which the Newton step for φ⁺ sets in; see `closer`.
@@ -146,7 +147,7 @@ class SemiImplicitEuler(Explicit):
     def _promised(
         self, dynamics: Dynamics, state: State, dt: Any
     ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
-        """v⁺, a and λ, rows, `least`, and the worlds that stay as they are, before `closer`.
+        """v⁺, a and λ, rows, `least`, and the rows that `closer` leaves as they are.
 
         In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
         v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
@@ -158,7 +159,7 @@ class SemiImplicitEuler(Explicit):
             solution, rows, least, _ = dynamics.factored(*here, dt / 2, ahead)
             stays = None
             if ahead is not None and rows.reactions is not None:
-                stays = ahead.kinds.one_sided(rows.reactions.multipliers)
+                stays = rows_beside_contact(rows.jacobian, ahead, rows.reactions.multipliers)
             return state.v + h * solution.acceleration, solution, rows, least, stays
         if not system.bounds:
             solution, rows, least, _ = dynamics.factored(*here, dt / 2)
@@ -218,22 +219,25 @@ def closer(
     solution: Solution,
     rows: Rows,
     least: Callable[[Array], Solution],
-    stays: Array | None,
+    skip: Array | None,
     dt: Any,
 ) -> tuple[Array, Solution]:
     """v⁺, a and λ without the linearization error of φ⁺, by one Newton step for large turns.
 
     The rows promise φ⁺ = φ + h p + h² φ̈, with φ̈ = J a + γ and p = φ̇ − ½hγ. At q ⊕ h v⁺ they are
     off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
-    Where no one-sided row may act, the free rotation of bodies in space is split more finely, too.
+    Without inequality rows, the free rotation of bodies in space is split more finely, too.
 
     Most steps turn bodies by less than `LARGE`, where e is about 3e-5 of a lever arm, and pay for
-    the branch only. Between its two turns the step sets in smoothly, so that derivatives exist. It
-    fades for rows of bodies that turn by 1 to √2 rad, and where its own kinetic energy is ¼ to ½ of
-    the motion's, as near a singular configuration: from so far away a Newton step leads nowhere. A
-    row of friction or of a motor, or of any inequality constraint on bodies in space, moves off its
-    target by e/h with them. Where no body turns in space, a world in which a one-sided row acts
-    goes without.
+    the branch only. The correction is made island by island, an island being the bodies that
+    equality rows connect. It sets in smoothly between the two turns of `LARGE`, so that derivatives
+    exist. Rounding over h² therefore does not reach rows of islands that turn slowly.
+
+    The correction fades for rows of bodies that turn by 1 to √2 rad, and where its own kinetic
+    energy is ¼ to ½ of the motion's, as near a singular configuration: from so far away a Newton
+    step leads nowhere. A row of friction or of a motor, or of any inequality constraint on bodies
+    in space, moves off its target by e/h with them. Where no body turns in space, islands in which
+    a stop or contact acts go without.
 
     Args:
         system: of bodies.
@@ -242,30 +246,46 @@ def closer(
         solution: a and λ at the start.
         rows: the constraints there.
         least: b → the least a with J a + C λ = b.
-        stays: worlds that go without, (); None for none.
+        skip: rows that go without, (n_c,); None for none.
         dt: h, () [s].
     """
     h = dt[None]
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
-    turn = system.squared_turn(state.q, v, state.v, rows, h)
-    if stays is not None:
-        turn = jnp.where(stays, 0, turn)
+    splits_finely = system.turns_in_space and not system.bounds
+    if skip is None:
+        turn = system.squared_turn(state.q, v, state.v, rows, h)
+    else:
+        turn = jnp.max(jnp.where(skip, 0, system.squared_turns(v, state.v, rows, h)), axis=0)
+    is_fast = turn > least_turn**2
+    if splits_finely:  # `kick_little` may overflow where `kick` does not
+        is_fast |= jnp.isnan(turn)
 
     def corrected() -> tuple[Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
-        fastest = jnp.max(jnp.abs(v), axis=0)
-        asks = (turn > least_turn**2) & (turn < FASTEST_TURN**2) & (fastest < FASTEST)
+        sizes = jnp.abs(state.v), jnp.abs(h * solution.acceleration), jnp.abs(v)
+        v_start, change, v_end = (jnp.max(x, axis=0) for x in sizes)
+        asks = is_fast & (v_start < FASTEST)
+        asks &= (change < FASTEST**1.5) if splits_finely else (v_end < FASTEST)
         a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
         swings = {i: jnp.where(asks, x, 0) for i, x in rows.swings.items()}
         turning = dataclasses.replace(rows, swings=swings)
-        square = system.squared_turn(state.q, moving, before, turning, h)
-        rise = smooth((square - least_turn**2) / (full_turn**2 - least_turn**2))[None]
-        if system.turns_in_space and not system.bounds:
+
+        def rise(squares: Array) -> Array:
+            return smooth((squares - least_turn**2) / (full_turn**2 - least_turn**2))
+
+        if splits_finely:
             finely = system.kick(state.q, before, a, h)
-            moving = moving + rise * (finely - moving)
+            # `kick_little` diverges for large turns: there nothing of it may be left
+            moving = jnp.where(turn < 4 * full_turn**2, moving, finely)
+        square = system.squared_turn(state.q, moving, before, turning, h)
+        if splits_finely:
+            moving = moving + rise(square)[None] * (finely - moving)
         place = system.retract(state.q, h * moving)
-        share = rise * smooth(2 - system.squared_turns(moving, turning, h))
-        share = jnp.where(asks, share, 0)
+        squares = system.squared_turns(moving, before, turning, h)
+        largest = largest_by_island(rows.jacobian, squares)
+        largest = square[None] if largest is None else largest
+        share = rise(largest) * smooth(2 - squares)
+        share = jnp.where(asks if skip is None else asks[None] & ~skip, share, 0)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
         promised = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))
@@ -281,7 +301,7 @@ def closer(
         found = jnp.where(asks, moving + fades * change, v)
         return found, added(solution, more)
 
-    return jax.lax.cond(somewhere(turn > least_turn**2), corrected, lambda: (v, solution))
+    return jax.lax.cond(somewhere(is_fast), corrected, lambda: (v, solution))
 
 
 def smooth(x: Array) -> Array:
