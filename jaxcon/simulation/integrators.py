@@ -256,9 +256,8 @@ def closer(
         turn = system.squared_turn(state.q, v, state.v, rows, h)
     else:
         turn = jnp.max(jnp.where(skip, 0, system.squared_turns(v, state.v, rows, h)), axis=0)
-    is_fast = turn > least_turn**2
-    if splits_finely:  # `kick_little` may overflow where `kick` does not
-        is_fast |= jnp.isnan(turn)
+    # `kick_little` may overflow where `kick` does not: NaN counts as fast
+    is_fast = ~(turn <= least_turn**2) if splits_finely else turn > least_turn**2
 
     def corrected() -> tuple[Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
