@@ -723,6 +723,30 @@ def test_a_dumbbell_is_as_rigid_in_fast_flight():
     assert length(0.0) < 2e-6
 
 
+@pytest.mark.parametrize(("turn", "off"), [(0.5, 1e-3), (1.0, 0.07), (1.4, 0.4)])
+def test_a_rod_that_turns_too_fast_leaves_its_length_and_recovery_says_so(turn, off):
+    """As documented: the status alone is OK, and VIOLATED by the limit of a Recovery."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0), velocity=(0.0, turn / 0.01))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+
+    def run(method):
+        def worst(state, info):
+            return jc.violation(system, state).worst
+
+        start = jc.init(system, method, state.q, state.v)
+        return jax.jit(lambda s: jc.rollout(system, method, s, None, 0.01, 300, record=worst))(
+            start
+        )
+
+    final, found = run(jc.Method())
+    assert final.status == jc.Status.OK
+    np.testing.assert_allclose(found.max(), off, rtol=0.05)
+    final, _ = run(jc.Method(recovery=jc.Recovery(limit=off / 2)))
+    assert final.status == jc.Status.VIOLATED
+
+
 def test_a_stop_in_the_plane_holds_on_what_turns_fast():
     """Pressed onto its stop by a turn of 0.1 rad a step, a link stays there.
 

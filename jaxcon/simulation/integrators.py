@@ -110,7 +110,11 @@ class SemiImplicitEuler(Explicit):
     space, what the linearized rows missed of φ is taken out by a second substitution with the
     factors of the step, in full from 0.042 and 0.03 rad on. Such a step takes about half as long
     again. Without it, energy would grow with (h|ω|)³, and motions of a radian in a few
-    steps would end NON_FINITE.
+    steps would end NON_FINITE. In the plane, bodies on which a limit or contact acts go without it,
+    and so do bodies that joints connect to them.
+
+    A rod (`Distance`) that turns too fast leaves its length with the status OK: by 0.1 % at 0.5 rad
+    a step, 7 % at 1 rad, 40 % at 1.4 rad. `Recovery(limit=…)` ends such a run as VIOLATED.
 
     References:
         Hairer, Lubich, Wanner, Geometric Numerical Integration (2006), sections VII.1.4 and VII.5.
