@@ -66,11 +66,12 @@ def rows_beside_contact(jacobian: Jacobian, bounds: Any, multipliers: Array) -> 
     touches[of_velocities[columns], rows] = True
     touches[:, ~bounds.kinds.one_sided] = False
     touched = touches[of_rows]
-    if not touched.any():
+    reaching = np.flatnonzero(touched.any(axis=0))
+    if not reaching.size:
         return None
     acting = multipliers != 0
-    if touched.all(axis=0)[touched.any(axis=0)].all():  # each of them touches all islands
-        acting = jnp.any(acting[touched.any(axis=0)], axis=0)
+    if touched[:, reaching].all():  # each of them touches all islands
+        acting = jnp.any(acting[reaching], axis=0)
         return jnp.broadcast_to(acting, (len(of_rows), *acting.shape))
     patterns, which = np.unique(touched, axis=0, return_inverse=True)
     worlds = acting.reshape(len(acting), -1).astype(jnp.float32)

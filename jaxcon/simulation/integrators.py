@@ -67,7 +67,7 @@ FASTEST = 1e8
 """Velocities [m/s, rad/s] from which a world is blowing up."""
 
 LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.025, 0.03)
-"""Turns of a body in a step [rad] between which the Newton step for φ⁺ sets in; see `closer`.
+"""Turns of a body in a step [rad] between which `newton_correction` sets in.
 
 In the plane, energy then drifts by less than 2 % of the largest kinetic energy in a minute; bodies
 in space, which have more ways to exchange it, drift as little if the step sets in sooner.
@@ -138,9 +138,11 @@ class SemiImplicitEuler(Explicit):
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        v, solution, rows, least, stays = self._promised(dynamics, state, dt)
-        if least is not None and rows.layout.size:
-            v, solution = closer(system, state, v, solution, rows, least, stays, dt)
+        v, solution, rows, solve_rows, skip_newton = self._linearized_step(dynamics, state, dt)
+        if solve_rows is not None and rows.layout.size:
+            v, solution = newton_correction(
+                system, state, v, solution, rows, solve_rows, skip_newton, dt
+            )
         travel = h * v
         if (jump := jump_of(rows.reactions)) is not None:
             travel, v = travel + jump.travel, v + jump.velocity
@@ -148,10 +150,10 @@ class SemiImplicitEuler(Explicit):
         q = system.retract(state.q, travel)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
-    def _promised(
+    def _linearized_step(
         self, dynamics: Dynamics, state: State, dt: Any
     ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
-        """v⁺, a and λ, rows, `least`, and the rows that `closer` leaves as they are.
+        """v⁺, a and λ, rows, `solve_rows` and `skip_newton` of `newton_correction`.
 
         In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
         v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
@@ -160,26 +162,26 @@ class SemiImplicitEuler(Explicit):
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.turns_in_space:
             ahead = dynamics.bounds_ahead(*here) if system.bounds else None
-            solution, rows, least, _ = dynamics.factored(*here, dt / 2, ahead)
-            stays = None
+            solution, rows, solve_rows, _ = dynamics.factored(*here, dt / 2, ahead)
+            skip_newton = None
             if ahead is not None and rows.reactions is not None:
-                stays = rows_beside_contact(rows.jacobian, ahead, rows.reactions.multipliers)
-            return state.v + h * solution.acceleration, solution, rows, least, stays
+                skip_newton = rows_beside_contact(rows.jacobian, ahead, rows.reactions.multipliers)
+            return state.v + h * solution.acceleration, solution, rows, solve_rows, skip_newton
         if not system.bounds:
-            solution, rows, least, _ = dynamics.factored(*here, dt / 2)
-            small = least is not None and rows.layout.size > 0  # `closer` does the large ones
+            solution, rows, solve_rows, _ = dynamics.factored(*here, dt / 2)
+            small = solve_rows is not None and rows.layout.size > 0  # others are corrected later
             v = system.kick(state.q, state.v, solution.acceleration, h, small)
-            return v, solution, rows, least, None
+            return v, solution, rows, solve_rows, None
         bounds = dynamics.bounds_ahead(*here)
         pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
         coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
         held = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
-        solution, rows, least, push = held.factored(*here, dt / 2, bounds)
+        solution, rows, solve_rows, push = held.factored(*here, dt / 2, bounds)
         v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
         if push is not None:
             straight = state.v + h * solution.acceleration
             v = jnp.where(system.by_body(state.q, push), straight, v)
-        return v, solution, rows, least, None
+        return v, solution, rows, solve_rows, None
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.
@@ -216,21 +218,22 @@ class SemiImplicitEuler(Explicit):
         return tuple(zip(places, rates, strict=True))  # type: ignore[return-value]
 
 
-def closer(
+def newton_correction(
     system: Any,
     state: State,
     v: Array,
     solution: Solution,
     rows: Rows,
-    least: Callable[[Array], Solution],
-    skip: Array | None,
+    solve_rows: Callable[[Array], Solution],
+    skip_newton: Array | None,
     dt: Any,
 ) -> tuple[Array, Solution]:
-    """v⁺, a and λ without the linearization error of φ⁺, by one Newton step for large turns.
+    """Corrects v⁺, a and λ for the linearization error of φ⁺, by one Newton step for large turns.
 
-    The rows promise φ⁺ = φ + h p + h² φ̈, with φ̈ = J a + γ and p = φ̇ − ½hγ. At q ⊕ h v⁺ they are
-    off by e = O(h³), and the work of e on the motion adds up. J a + C λ = −e/h² leaves O(h⁴) of it.
-    Without inequality rows, the free rotation of bodies in space is split more finely, too.
+    The linearized rows predict φ⁺ = φ + h p + h² φ̈, with φ̈ = J a + γ and p = φ̇ − ½hγ. At q ⊕ h v⁺
+    φ differs from it by e = O(h³), and the work of e on the motion adds up. The correction solves
+    J a + C λ = −e/h², which leaves O(h⁴). Without inequality rows, the free rotation of
+    bodies in space is split more finely, too.
 
     Most steps turn bodies by less than `LARGE`, where e is about 3e-5 of a lever arm, and pay for
     the branch only. The correction is made island by island, an island being the bodies that
@@ -249,60 +252,61 @@ def closer(
         v: v⁺, (n_v,), with q⁺ = q ⊕ h v⁺.
         solution: a and λ at the start.
         rows: the constraints there.
-        least: b → the least a with J a + C λ = b.
-        skip: rows that go without, (n_c,); None for none.
+        solve_rows: b → the least a with J a + C λ = b.
+        skip_newton: rows that go without, (n_c,); None for none.
         dt: h, () [s].
     """
     h = dt[None]
     least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
     splits_finely = system.turns_in_space and not system.bounds
-    if skip is None:
+    if skip_newton is None:
         turn = system.squared_turn(state.q, v, state.v, rows, h)
     else:
-        turn = jnp.max(jnp.where(skip, 0, system.squared_turns(v, state.v, rows, h)), axis=0)
+        turn = jnp.max(jnp.where(skip_newton, 0, system.squared_turns(v, state.v, rows, h)), axis=0)
     # `kick_little` may overflow where `kick` does not: NaN counts as fast
     is_fast = ~(turn <= least_turn**2) if splits_finely else turn > least_turn**2
 
     def corrected() -> tuple[Array, Solution]:
         # a world that blows up must not lend the derivatives of others what is infinite
         sizes = jnp.abs(state.v), jnp.abs(h * solution.acceleration), jnp.abs(v)
-        v_start, change, v_end = (jnp.max(x, axis=0) for x in sizes)
-        asks = is_fast & (v_start < FASTEST)
-        asks &= (change < FASTEST**1.5) if splits_finely else (v_end < FASTEST)
-        a, before, moving = (jnp.where(asks, x, 0) for x in (solution.acceleration, state.v, v))
-        swings = {i: jnp.where(asks, x, 0) for i, x in rows.swings.items()}
+        start_size, change_size, end_size = (jnp.max(x, axis=0) for x in sizes)
+        corrects = is_fast & (start_size < FASTEST)
+        corrects &= (change_size < FASTEST**1.5) if splits_finely else (end_size < FASTEST)
+        finite = [jnp.where(corrects, x, 0) for x in (solution.acceleration, state.v, v)]
+        a, v_start, v_end = finite
+        swings = {i: jnp.where(corrects, x, 0) for i, x in rows.swings.items()}
         turning = dataclasses.replace(rows, swings=swings)
 
         def rise(squares: Array) -> Array:
             return smooth((squares - least_turn**2) / (full_turn**2 - least_turn**2))
 
+        kicked = system.kick(state.q, v_start, a, h) if splits_finely else v_end
         if splits_finely:
-            finely = system.kick(state.q, before, a, h)
             # `kick_little` diverges for large turns: there nothing of it may be left
-            moving = jnp.where(turn < 4 * full_turn**2, moving, finely)
-        square = system.squared_turn(state.q, moving, before, turning, h)
+            v_end = jnp.where(turn < 4 * full_turn**2, v_end, kicked)
+        square = system.squared_turn(state.q, v_end, v_start, turning, h)
         if splits_finely:
-            moving = moving + rise(square)[None] * (finely - moving)
-        place = system.retract(state.q, h * moving)
-        squares = system.squared_turns(moving, before, turning, h)
+            v_end = v_end + rise(square)[None] * (kicked - v_end)
+        q_end = system.retract(state.q, h * v_end)
+        squares = system.squared_turns(v_end, v_start, turning, h)
         largest = largest_by_island(rows.jacobian, squares)
         largest = square[None] if largest is None else largest
-        share = rise(largest) * smooth(2 - squares)
-        share = jnp.where(asks if skip is None else asks[None] & ~skip, share, 0)
+        weight = rise(largest) * smooth(2 - squares)
+        corrected_rows = corrects if skip_newton is None else corrects[None] & ~skip_newton
+        weight = jnp.where(corrected_rows, weight, 0)
         held = rows.layout.holds & rows.layout.holonomic
         held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
-        promised = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))
-        there = linearize(system, place, moving, state.instant + dt).residual
-        off = jnp.where(held, there - promised, 0)
-        more = least(-share * numerics.safe_divide(off, h * h))
+        predicted = rows.residual + h * (rows.rate + h * (rows.jacobian.apply(a) + rows.bias / 2))
+        residual = linearize(system, q_end, v_end, state.instant + dt).residual
+        error = jnp.where(held, residual - predicted, 0)
+        correction = solve_rows(-weight * numerics.safe_divide(error, h * h))
         # rounding over h² may contradict redundant rows; rows that do contradict were noted before
-        more = more._replace(status=status.failures(more.status))
-        change, mass = h * more.acceleration, system.mass(state.q)
-        energies = [(x * mass.apply(x)).sum(axis=0) for x in (change, moving)]
-        fades = smooth(2 - 4 * numerics.safe_divide(*energies))[None]
-        more = Solution(fades * more.acceleration, fades * more.multipliers, more.status)
-        found = jnp.where(asks, moving + fades * change, v)
-        return found, added(solution, more)
+        code = status.failures(correction.status)
+        change, mass = h * correction.acceleration, system.mass(state.q)
+        energies = [(x * mass.apply(x)).sum(axis=0) for x in (change, v_end)]
+        fade = smooth(2 - 4 * numerics.safe_divide(*energies))[None]
+        faded = Solution(fade * correction.acceleration, fade * correction.multipliers, code)
+        return jnp.where(corrects, v_end + fade * change, v), added(solution, faded)
 
     return jax.lax.cond(somewhere(is_fast), corrected, lambda: (v, solution))
 
