@@ -269,13 +269,18 @@ def _draw_loss(axes: Any, tuning: Any) -> None:
     """The loss of each iteration, the best so far, and that of the default gains."""
     seen = NM * np.where(np.isfinite(tuning.history), tuning.history, np.nan)
     best, default = np.fmin.accumulate(seen), NM * tuning.before
-    axes.plot(seen, "o", ms=4, color=AFTER, alpha=0.4, mew=0, label="tried")
-    axes.step(np.arange(len(best)), best, where="post", color=AFTER, lw=2, label="best so far")
-    axes.axhline(default, color=BEFORE, ls="--", lw=1.8, label=f"default gains: {default:.3g} nm")
-    axes.set(xlabel="iteration", title=f"Loss on the {tuning.copies} linkages tuned on")
+    label = f"default gains on these {tuning.copies}: {default:.3g} nm"
+    axes.axhline(default, color=BEFORE, ls="--", lw=1.8, label=label)
+    tried = f"tried, from default + integral: {seen[0]:.3g} nm"
+    axes.plot(seen, "o", ms=4, color=AFTER, alpha=0.4, mew=0, label=tried)
+    label = f"best so far, at last {best[-1]:.3g} nm"
+    axes.step(np.arange(len(best)), best, where="post", color=AFTER, lw=2, label=label)
+    title = f"Tuning: error of the {tuning.copies} linkages tuned on"
+    axes.set(xlabel="iteration of tuning", title=title)
     _error_axis(axes)
-    axes.set_ylim(None, 1.1 * max(default, np.nanmax(seen)))
-    axes.legend(loc="upper right", bbox_to_anchor=(1, 0.92))
+    low, high = np.nanmin(seen), max(default, np.nanmax(seen))
+    axes.set_ylim(0.9 * low, high * (high / low) ** 0.3)  # room for the legend
+    axes.legend(loc="upper right")
 
 
 def _draw_errors(axes: Any, fresh: Any) -> None:
@@ -285,15 +290,15 @@ def _draw_errors(axes: Any, fresh: Any) -> None:
     ):
         low, middle, high = NM * np.quantile(rms, (0.05, 0.5, 0.95), axis=1)
         axes.fill_between(fresh.times, low, high, color=color, alpha=0.25, lw=0)
-        label = f"{label} gains: {NM * mean:.3g} nm rms"
+        label = f"{label} gains on these {rms.shape[1]}: {NM * mean:.3g} nm"
         axes.plot(fresh.times, middle, color=color, lw=1.6, label=label)
     copies, less = fresh.rms.shape[2], fresh.mean[0] / fresh.mean[1]
-    axes.set(xlabel="time [s]", title=f"{copies} linkages not tuned on: {less:.1f} times less")
+    axes.set(xlabel="time [s]", title=f"Check: {copies} other linkages, {less:.1f} times less")
     _error_axis(axes)
     axes.set_xlim(0, None)
     low, high = axes.get_ylim()
     axes.set_ylim(low, high * (high / low) ** 0.35)  # room for the legend
-    axes.legend(loc="upper right", title="median, and 90 % of the linkages")
+    axes.legend(loc="upper right", title="line: median; band: 90 % of the linkages")
 
 
 def _error_axis(axes: Any) -> None:

@@ -14,8 +14,9 @@ from scipy.integrate import solve_ivp
 import jaxcon as jc
 from jaxcon.__main__ import main
 from jaxcon.analysis import ledger, reference, sweep
-from jaxcon.analysis.front import LeftOut
+from jaxcon.analysis.front import LeftOut, Run
 from jaxcon.analysis.listing import table
+from jaxcon.analysis.tradeoff import _go
 from jaxcon.analysis.trials import Course, Inputs, Observer, Points, Problem, Trip
 
 G, HORIZON = 9.81, 1.0
@@ -197,7 +198,7 @@ def test_the_table_names_its_numbers_above_them(result):
     for unit in ("[m, or of q]", "[rad]", "[J]", "one world [s]", "[B]"):
         assert unit in str(result)
     run = result.front[0]
-    assert f"h = {run.dt:.3g} s: error {run.error:.2g}, violation" in str(run)
+    assert f"h = {run.dt:.3g} s: error {run.error:.2g} m, violation" in str(run)
     late = dataclasses.replace(run, gradient=math.nan, name="a" * 60, told=False)
     assert re.search(
         rf"^a{{60}}  .* <{run.error:.2e} .* - ", "\n".join(table([late])), re.MULTILINE
@@ -423,6 +424,52 @@ def test_the_first_gradient_is_not_begun_where_it_may_outlast_the_budget():
     assert not clock.lasts("gradients")
     clock.longest["gradients"] = 80.0
     assert clock.lasts("gradients")
+
+
+class Watch:
+    """A clock by hand, in place of `time`."""
+
+    now = 0.0
+
+    def perf_counter(self):
+        return self.now
+
+
+@pytest.mark.parametrize(
+    ("slow", "runs", "gradients"),
+    [
+        (1.0, ["a", "b", "c"], ["a", "b", "c"]),
+        (2.0, ["a", "b", "c"], ["a", "b"]),
+        (4.0, ["a", "b", "c"], []),
+        (10.0, ["a"], []),
+        (20.0, [], []),
+    ],
+)
+def test_the_budget_bounds_all_of_it(monkeypatch, slow, runs, gradients):
+    """On a machine on which each piece takes so many times longer; what is left out is listed."""
+    watch, done, slopes = Watch(), [], []
+    monkeypatch.setattr(ledger, "time", watch)
+    run = Run("", "float64", 0.1, "ok", 1e-3, True, 0.0, 0.0, 0.0, 1.0, cost=1.0)
+
+    class Timed:
+        def measure(self, name, method, dtype):
+            done.append(name)
+            watch.now += slow
+            return sweep.Unit((dataclasses.replace(run, name=name),), compiling=0.7 * slow)
+
+        def gradients(self, unit):
+            slopes.append(unit.runs[0].name)
+            watch.now += 2 * slow
+            return dataclasses.replace(unit, differentiated=True)
+
+    clock = ledger.Clock(20.0)
+    with clock.timing("reference"):
+        watch.now += slow
+    wanted = [ledger.Wanted(name, jc.Method(), "float64", None) for name in "abc"]
+    late = _go(Timed(), ledger.Ledger(None, {}), clock, wanted, (True, False))
+    assert (done, slopes) == (runs, gradients)
+    assert clock.spent <= 1.5 * 20.0
+    assert {x.name for x in late} == set("abc") - set(gradients)
 
 
 def test_one_step_and_one_precision_need_no_list_and_one_world_no_batch():

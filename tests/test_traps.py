@@ -117,6 +117,7 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
     "pendulum": (lambda: bob(rod()), with_(), (), ""),
     "four-bar": (lambda: four_bar(2), with_(), (), ""),
     "rope": (lambda: rope(14), with_(), (), ""),
+    "too fast": (lambda: bob(rod(), velocity=(0.0, 2e3)), with_(), ("step",), "turns by 2 rad"),
     "gains": (
         lambda: bob(rod()),
         with_(stabilizer=jc.Baumgarte.critical(rate=5e3)),
@@ -129,7 +130,8 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
         ("singular",),
         "Move away from this position",
     ),
-    "masses": (weight, with_(), ("singular",), "not by their position but by the masses"),
+    "masses": (weight, with_(), ("step", "singular"), "not by their position but by the masses"),
+    "masses damped": (weight, with_(integrator=jc.GeneralizedAlpha()), ("singular",), "masses"),
     "passes": (flat, with_(), ("singular",), "RankSafe takes them"),
     "stops": (flat, with_(**SPARSE), ("singular",), "refuses them as SINGULAR"),
     "sweeps": (hung, with_(bounded=SWEEPS), ("order",), "2 sweeps leave"),
@@ -206,7 +208,7 @@ def test_a_trap_is_seen_where_it_is(name):
 
 def test_each_trap_of_the_chapter_is_there():
     assert set(TRAPS) == {name for _, _, names, _ in CASES.values() for name in names}
-    assert len(TRAPS) == 10  # eight of the chapter, gradients through impacts, joint limits
+    assert len(TRAPS) == 11  # eight of the chapter, long steps, impacts, joint limits
 
 
 def test_a_method_that_remembers_needs_no_state_of_its_own():

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
+from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics.rank import UnitRows, dependent_rows
 from jaxcon.model.state import State
@@ -43,14 +44,14 @@ def given(system: Any, state: State, control: PyTree) -> Iterator[Finding]:
     for name, start, stop in channels:
         parts = [np.asarray(x)[start:stop] for x in jax.tree.leaves(control) if np.ndim(x)]
         if any(not np.all(np.isfinite(x)) for x in parts):
-            yield Finding("control", name, f"is {np.concatenate(parts).tolist()}")
+            yield Finding("control", name, f"is {checks.numerals(np.concatenate(parts))}")
     params = system.params if isinstance(system.params, dict) else {"params": system.params}
     for name, fields in params.items():
         for path, leaf in jax.tree_util.tree_flatten_with_path(fields)[0]:
             if not np.all(np.isfinite(leaf)):
                 key = jax.tree_util.keystr(path, simple=True, separator=".")
                 whole = f"{name}.{key}" if key else name
-                yield Finding("parameter", whole, f"is {np.asarray(leaf).tolist()}")
+                yield Finding("parameter", whole, f"is {checks.numerals(leaf)}")
 
 
 def positions(system: Any, q: Array) -> Iterator[Finding]:
@@ -69,7 +70,7 @@ def _infinite(term: str, x: Array, layout: Any, kind: str) -> Iterator[Finding]:
         own = {name: getattr(layout, kind)(name) for name in layout.bodies}
     for name, indices in own.items():
         if not np.all(np.isfinite(x[indices])):
-            yield Finding(term, name, f"is {x[indices].tolist()}")
+            yield Finding(term, name, f"is {checks.numerals(x[indices])}")
 
 
 def masses(system: Any, q: Array) -> Iterator[Finding]:
@@ -105,7 +106,7 @@ def terms(rows: Rows) -> Iterator[Finding]:
         for name in rows.layout.names:
             own = np.asarray(value)[rows.layout.rows(name)]
             if not np.all(np.isfinite(own)):
-                yield Finding(term, name, f"is {own.tolist()}")
+                yield Finding(term, name, f"is {checks.numerals(own)}")
 
 
 def dependent(system: Any, q: Array, rows: Rows) -> list[Finding]:

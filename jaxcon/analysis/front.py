@@ -14,6 +14,8 @@ from jaxcon.analysis.listing import LEGEND, table
 from jaxcon.core.checks import check
 from jaxcon.simulation.method import Method
 
+METERS, COORDINATES = "m", "of q"
+"""Units of the error: of bodies, and of generalized coordinates."""
 OK = "ok"
 """The outcome of a run that neither failed nor left its bounds."""
 
@@ -41,6 +43,7 @@ class Run:
         gradient: the same as `cost` of value and gradient of a rollout; NaN where not measured.
         memory: of a world in the batch [B].
         note: a status that does not end a run, such as CONFLICT.
+        unit: of `error`: "m" for bodies, "of q" for generalized coordinates.
         method: the method itself.
     """
 
@@ -58,6 +61,7 @@ class Run:
     memory: float = math.nan
     gradient: float = math.nan
     note: str = ""
+    unit: str = METERS
     method: Method | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -75,12 +79,13 @@ class Run:
         head = f"{self.name}, {self.dtype}, h = {self.dt:.3g} s"
         if not self.ok:
             return f"{head}: diverged, {self.outcome}"
-        costs = "" if math.isnan(self.cost) else f"; {self.cost:.3g} s for a simulated second"
+        costs = f"; {self.cost:.3g} s of computing per simulated second of one world"
+        costs = "" if math.isnan(self.cost) else costs
         below = "" if self.told else "<"
         note = f"; {self.note}" if self.note else ""
         return (
-            f"{head}: error {below}{self.error:.2g}, violation {self.violation:.2g},"
-            f" energy off by {self.energy:.2g} J{costs}{note}"
+            f"{head}: error {below}{self.error:.2g} {self.unit}, violation {self.violation:.2g} m"
+            f" or rad, energy off by {self.energy:.2g} J{costs}{note}"
         )
 
 
@@ -182,20 +187,20 @@ class Tradeoff:
             raise ValueError(f"recommend: {self.without}.")
         if error is not None and error < self.floor:
             raise ValueError(
-                f"recommend: an error of {error:.2g} cannot be told, as the reference itself may be"
-                f" off by {self.floor:.2g} after {self.until:.3g} s; ask for more, or take a"
-                " shorter horizon or a larger budget."
+                f"recommend: an error of {error:.2g} {front[0].unit} cannot be told, as the"
+                f" reference itself may be off by {self.floor:.2g} {front[0].unit} after"
+                f" {self.until:.3g} s; ask for more, or take a shorter horizon or a larger budget."
             )
         if error is not None:
             able = [run for run in front if run.error <= error]
-            best, what = front[-1].error, f"of an error of at most {error:.2g}; the least"
+            best, unit, what = front[-1].error, front[-1].unit, f"an error of at most {error:.2g}"
         else:
             able = [run for run in front if run.cost <= (cost or 0.0)][-1:]
-            best, what = front[0].cost, f"of a cost of at most {cost:.2g}; the least"
+            best, unit, what = front[0].cost, "s/s", f"a cost of at most {cost:.2g}"
         if not able:
             raise ValueError(
-                f"recommend: there is no run {what} is {best:.2g}. Other steps are tried by dts=,"
-                " other methods by methods=, and more of them with a larger budget."
+                f"recommend: no run has {what} {unit}; the least is {best:.2g} {unit}. Other steps"
+                " are tried by dts=, other methods by methods=, and more with a larger budget."
             )
         return able[0]
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.estimate import Cost, cost
+from jaxcon.analysis.motion import StepAngle, step_angle
 from jaxcon.analysis.probe import Probe, begun, probe
 from jaxcon.constraints.rows import Rows
 from jaxcon.core import checks, host
@@ -129,6 +130,11 @@ class Known:
     def cost(self) -> Cost:
         """The operations of the accelerations under the method, estimated from the structure."""
         return cost(self.system, self.method, self.state, self.choice)
+
+    @cached_property
+    def angle(self) -> StepAngle | None:
+        """The angles of the fastest motions in a step; None where no step is known."""
+        return step_angle(self)
 
     @cached_property
     def probe(self) -> Probe | None:

@@ -33,6 +33,10 @@ FIRST = 5
 """How much longer than those of others the first of a kind may take, as to compile a gradient: of
 RK4 on five bodies in space three minutes, where its runs in both batches took half of one."""
 
+GRADIENT = 3
+"""How much longer than compiling the runs of a method its gradient may take: 1.5 to 2.2 on a
+four-bar. This is for the first one; the next are judged by it."""
+
 
 @dataclass(frozen=True)
 class Wanted:
@@ -126,6 +130,7 @@ class Ledger:
             Limit(**known["limit"]) if known["limit"] else None,
             tuple(LeftOut(**x) for x in known["left_out"]),
             known["differentiated"],
+            known["compiling"],
         )
 
     def __setitem__(self, wanted: Wanted, unit: Unit) -> None:
@@ -159,13 +164,25 @@ class Clock:
         """So far [s]."""
         return time.perf_counter() - self.begin
 
-    def asks(self, work: str) -> float:
-        """What one more piece of this kind of work may take [s]; nothing before any was done."""
-        return SLOWER * self.longest.get(work, FIRST * max(self.longest.values(), default=0.0))
+    @property
+    def left(self) -> float:
+        """What is left of the budget [s]; negative beyond it."""
+        return self.budget - self.spent
 
-    def lasts(self, work: str, share: float = 1.0) -> bool:
+    def asks(self, work: str, guess: float | None = None) -> float:
+        """What one more piece of this kind of work may take [s].
+
+        Args:
+            work: its kind.
+            guess: for the first of its kind [s]; from the longest of other kinds unless given.
+        """
+        if guess is None:
+            guess = FIRST * max(self.longest.values(), default=0.0)
+        return SLOWER * self.longest.get(work, guess)
+
+    def lasts(self, work: str, share: float = 1.0, guess: float | None = None) -> bool:
         """Returns True where a share of the budget lasts for one more piece of this work."""
-        return self.spent + self.asks(work) < share * self.budget
+        return self.spent + self.asks(work, guess) < share * self.budget
 
     @contextlib.contextmanager
     def timing(self, work: str) -> Iterator[None]:

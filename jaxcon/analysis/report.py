@@ -12,6 +12,7 @@ from jaxcon.analysis import traps
 from jaxcon.analysis.estimate import Cost
 from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.analysis.memory import Memory, memory
+from jaxcon.analysis.motion import StepAngle
 from jaxcon.analysis.probe import Probe
 from jaxcon.analysis.traps import OF_SCENE, OFF, TRAPS, listed
 from jaxcon.analysis.work import Work, seconds, work
@@ -22,6 +23,8 @@ from jaxcon.model.state import State
 from jaxcon.simulation.choice import Choice, several
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import largest_stable_rate
+
+CONFLICT_ADVICE = "; keep those that agree, or rank them by jc.Priority"
 
 
 @dataclass(frozen=True)
@@ -54,9 +57,11 @@ class Report:
         gains: α and β of the feedback, and the largest β that is stable at their ratio [1/s], where
             a method and a step were given.
         probe: what some steps from the state left open, where it was asked to measure.
-        warnings: by trap, "gains", "singular", "order", "over-constrained", "start", "nonlinear",
-            "dense", "iterations", "impacts" and "range", of those in which the scene and the method
-            are. All but "range" need a method, some a step, and "order" to measure.
+        angle: how far the fastest motion turns or swings in a step, where a method and a step were
+            given.
+        warnings: by trap, "gains", "step", "singular", "order", "over-constrained", "start",
+            "nonlinear", "dense", "iterations", "impacts" and "range", of those in which the scene
+            and the method are. All but "range" need a method, some a step, and "order" to measure.
     """
 
     coordinates: int
@@ -75,6 +80,7 @@ class Report:
     work: Work | None = None
     seconds: float | None = None
     gains: tuple[float, float, float] | None = None
+    angle: StepAngle | None = None
     probe: Probe | None = None
     warnings: dict[str, str] = field(default_factory=dict)
     cost: Cost | None = None
@@ -98,7 +104,7 @@ class Report:
                 " not where impacts are grazing, simultaneous or accumulating, which"
                 " jc.check_gradients names"
             )
-        if self.redundant:
+        if self.redundant and not self._redundancy_warned:
             named = ", ".join(f"{name}[{row}]" for name, row in self.redundant)
             lines.append(
                 f"redundant rows (each depends on rows before it here): {named}; the default"
@@ -108,8 +114,8 @@ class Report:
             )
         if self.conflicts:
             lines.append(
-                "contradicting constraints, and what no motion can take away of them; keep those"
-                " that agree, or rank them by jc.Priority"
+                "contradicting constraints, and what no motion can take away of them"
+                + ("" if "over-constrained" in self.warnings else CONFLICT_ADVICE)
             )
             lines += [
                 f"  {name}: {phi:.2e} of φ, {rate:.2e} of φ̇, {bias:.2e} of φ̈"
@@ -120,13 +126,20 @@ class Report:
             f"  {name}: violation {phi:.2e}, rate {rate:.2e}"
             for name, (phi, rate) in self.violation.items()
         ]
-        if self.off:
+        if self.off and "start" not in self.warnings:
             lines.append(
                 f"off {', '.join(self.off)}: print(jc.assemble(system, state)) takes it to the"
                 " nearest positions that meet them, or names those that cannot be met"
             )
         lines += [f"warning, {TRAPS[name][0]}: {said}" for name, said in self.warnings.items()]
         return "\n".join(lines)
+
+    @property
+    def _redundancy_warned(self) -> bool:
+        """Returns True where a warning names the redundant rows."""
+        return "singular" in self.warnings or (
+            "over-constrained" in self.warnings and not self.conflicts
+        )
 
     def _of_method(self) -> list[str]:
         """What is said of cost, gains and what is to be expected, and which solver suits."""
@@ -141,6 +154,8 @@ class Report:
                 f"gains α = {α:.4g}, β = {β:.4g} 1/s; at this ratio β is stable up to"
                 f" {most:.4g} 1/s"
             )
+        if self.angle:
+            lines.append(str(self.angle))
         if self.probe:
             code = self.probe.status
             if Status.OK < code < Status.CONFLICT:
@@ -243,6 +258,7 @@ def _with_method(found: Report, known: Known, measure: bool, timed: bool) -> Rep
         work=work(*args) if measure else None,
         seconds=seconds(*args, known.batch) if timed else None,
         gains=gains,
+        angle=known.angle,
         probe=known.probe,
         warnings=traps.found(known),
     )

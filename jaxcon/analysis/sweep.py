@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxcon.analysis.costs import Batch, Pace, Slope
-from jaxcon.analysis.front import OK, LeftOut, Limit, Run
+from jaxcon.analysis.front import COORDINATES, METERS, OK, LeftOut, Limit, Run
 from jaxcon.analysis.reference import Reference, Ruler
 from jaxcon.analysis.trials import Course, Observer, Problem, Trip
 from jaxcon.core.status import Status
@@ -43,12 +44,21 @@ REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeErro
 
 @dataclass(frozen=True)
 class Unit:
-    """What was found of one method in one precision."""
+    """What was found of one method in one precision.
+
+    Attributes:
+        runs: at all steps.
+        limit: of stability.
+        left_out: what was not run, and why.
+        differentiated: whether gradients were tried.
+        compiling: the time until its programs were compiled [s].
+    """
 
     runs: tuple[Run, ...] = ()
     limit: Limit | None = None
     left_out: tuple[LeftOut, ...] = ()
     differentiated: bool = False
+    compiling: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,6 +72,7 @@ class Sweep:
         batch: in which costs are measured.
         dts: steps that were asked for [s]; None for those of the default.
         budget: for all of it [s].
+        left: returns what is left of it [s].
     """
 
     problem: Problem
@@ -70,6 +81,7 @@ class Sweep:
     batch: Batch
     dts: tuple[float, ...] | None
     budget: float
+    left: Callable[[], float] = lambda: math.inf
 
     @cached_property
     def ruler(self) -> Ruler:
@@ -87,14 +99,17 @@ class Sweep:
 
     def measure(self, name: str, method: Method, dtype: str) -> Unit:
         """Runs a method at all steps; one that does not fit the scene says why."""
+        begin = time.perf_counter()
         try:
             course, pace = compiled_side_by_side(
                 lambda: Course(self.problem, method, dtype), lambda: Pace(self.batch, method, dtype)
             )
         except REFUSED as error:
             return Unit(left_out=(LeftOut(name, dtype, first_line(error)),))
+        spent = time.perf_counter() - begin
         try:
-            return self._measured(course, pace, name, method)
+            unit = self._measured(course, pace, name, method)
+            return dataclasses.replace(unit, compiling=spent)
         except jax.errors.JaxRuntimeError as error:  # as where memory runs out
             return Unit(left_out=(LeftOut(name, dtype, first_line(error)),))
 
@@ -103,14 +118,27 @@ class Sweep:
         course.go(self.problem.dt(1), 1)  # the first run of a program takes longer than later ones
         runs, why = self._refined(course, name, method)
         limit = self._limit(course, name, runs) if runs else None
-        timed = tuple(
-            dataclasses.replace(run, cost=pace.seconds(run.dt) / run.dt, memory=pace.memory)
-            if run.ok
-            else run
-            for run in runs
-        )
-        left = (LeftOut(name, course.dtype.name, why),) if why else ()
-        return Unit(timed, limit, left)
+        timed, late = self._timed(pace, runs)
+        dtype = course.dtype.name
+        left = [LeftOut(name, dtype, reason) for reason in (why, late) if reason]
+        return Unit(timed, limit, tuple(left))
+
+    def _timed(self, pace: Pace, runs: list[Run]) -> tuple[tuple[Run, ...], str]:
+        """Returns the runs with costs while time is left, and why some have none.
+
+        The first is timed in any case, and then the others from both ends of the steps in turn.
+        """
+        able = [i for i, run in enumerate(runs) if run.ok]
+        order = [able.pop(0 if k % 2 else -1) for k in range(len(able))]
+        timed, late = list(runs), ""
+        for k, i in enumerate(order):
+            if k and self.left() <= 0:
+                late = f"costs of {len(order) - k} of its runs: no time was left of the budget"
+                break
+            run = runs[i]
+            cost = pace.seconds(run.dt) / run.dt
+            timed[i] = dataclasses.replace(run, cost=cost, memory=pace.memory)
+        return tuple(timed), late
 
     def gradients(self, unit: Unit) -> Unit:
         """Returns the unit with the costs of gradients."""
@@ -125,7 +153,9 @@ class Sweep:
             left = (*unit.left_out, why)
             return dataclasses.replace(unit, left_out=left, differentiated=True)
         runs = tuple(
-            dataclasses.replace(run, gradient=slope.seconds(run.dt) / run.dt) if run.ok else run
+            dataclasses.replace(run, gradient=slope.seconds(run.dt) / run.dt)
+            if run is one or run.ok and self.left() > 0
+            else run
             for run in unit.runs
         )
         return dataclasses.replace(unit, runs=runs, differentiated=True)
@@ -138,7 +168,9 @@ class Sweep:
             dt = self.problem.dt(count)
             longer = self._seconds(course, trip, dt, count)
             spent += longer
-            if spent > self.budget * ASKED or longer > self.budget * SHARE and self.dts is None:
+            late = bool(runs) and longer > self.left() / 2  # the other half is for costs
+            late = late or longer > self.budget * SHARE and self.dts is None
+            if late or spent > self.budget * ASKED:
                 return runs, f"steps from {dt:.3g} s on: each run would take {longer:.2g} s"
             if runs and self.dts is None:
                 if runs[-1].ok and not runs[-1].told:
@@ -171,7 +203,8 @@ class Sweep:
         alone = trip.seconds / self.problem.horizon
         note = trip.status.name if trip.status and outcome == OK else ""
         known = (name, dtype, trip.dt, outcome, error, told, angle, trip.violation, energy, alone)
-        return Run(*known, note=note, method=method)
+        unit = METERS if self.ruler.layout is not None else COORDINATES
+        return Run(*known, note=note, unit=unit, method=method)
 
     def _outcome(self, trip: Trip) -> tuple[str, float]:
         """Returns in words how a trip ended, and how far its energy is off [J]."""
@@ -197,6 +230,8 @@ class Sweep:
         if bad is not None and good is not None:
             part = self.problem.horizon / self.problem.parts
             for _ in range(BISECTIONS):
+                if self.left() <= 0:
+                    break
                 middle = math.sqrt(good * bad)
                 trip = course.go(middle, max(1, round(part / middle)))
                 stable = self._outcome(trip)[0] == OK

@@ -12,8 +12,8 @@ import numpy as np
 from jaxcon.analysis import reference as references
 from jaxcon.analysis.choices import methods_for
 from jaxcon.analysis.costs import Batch
-from jaxcon.analysis.front import LeftOut, Tradeoff, front_of
-from jaxcon.analysis.ledger import Clock, Ledger, Wanted
+from jaxcon.analysis.front import COORDINATES, METERS, LeftOut, Tradeoff, front_of
+from jaxcon.analysis.ledger import GRADIENT, Clock, Ledger, Wanted
 from jaxcon.analysis.sweep import Sweep
 from jaxcon.analysis.trials import Course, Inputs, Observer, Points, Problem
 from jaxcon.core import checks
@@ -26,6 +26,10 @@ DTYPES = ("float64", "float32")
 NO_TIME = "no time was left of the budget"
 REFERENCE_SHARE = 0.1
 """The share of the budget that the runs of the reference may take."""
+EARLY = 0.75
+"""The share of the budget up to which the gradient of the first method may last."""
+OVER = 1.5
+"""The share of the budget up to which the first method may last: without it there is no result."""
 RUNS_SHARE = 0.7
 """The share of the budget after which only gradients are begun, where the rest lasts for one."""
 
@@ -72,8 +76,10 @@ def tradeoff(
         dts: steps, or one, each shortened until it divides a part of the horizon [s]; unless given
             a tenth of the horizon, and 1/2, 1/5, 1/10, … of that as long as errors fall.
         batch: how many worlds share the device where costs are measured.
-        budget: of time [s]. Methods for which it does not last are listed, not run.
-        gradients: whether gradients are timed, after all else and those of the front first.
+        budget: of time [s]. What it would not last for, judged by what was measured before, is
+            listed and not run. Only a compilation that was begun may outlast it.
+        gradients: whether gradients are timed: of the first method where three quarters of the
+            budget last for it, and after all else those of the front first.
         file: written after each method. Where it exists what it holds is not run again.
         progress: whether a bar of tqdm is shown; if None, in terminals and notebooks.
 
@@ -106,11 +112,12 @@ def tradeoff(
     ledger = Ledger.open(file, course, batch)
     reference = ledger.reference
     if reference is None:
-        reference = references.make(course, observe, moved, REFERENCE_SHARE * budget)
+        with clock.timing("reference"):
+            reference = references.make(course, observe, moved, REFERENCE_SHARE * budget)
         ledger.keep(reference)
     steps = None if dts is None else tuple(map(float, dts))
     shared = Batch.of(problem, reference, batch)
-    sweep = Sweep(problem, reference, observe, shared, steps, budget)
+    sweep = Sweep(problem, reference, observe, shared, steps, budget, lambda: clock.left)
     own = methods_for(observe.system, reference) if methods is None else methods
     wanted = [Wanted(name, m, np.dtype(x).name, steps) for name, m in own.items() for x in dtypes]
     left = _go(sweep, ledger, clock, wanted, (gradients, progress))
@@ -143,18 +150,21 @@ def _go(
         with shown:
             for i, one in enumerate(wanted):
                 shown.set_postfix_str(f"{one.name}, {one.dtype}")
-                kept = gradients and clock.asks("gradients") < (1 - RUNS_SHARE) * clock.budget
+                first = ledger[wanted[0]].compiling if wanted[0] in ledger else 0.0
+                slope = clock.asks("gradients", GRADIENT * first or None)
+                kept = gradients and slope < (1 - RUNS_SHARE) * clock.budget
                 # the first gets all there is, as without any run there is nothing to say
-                share = RUNS_SHARE if kept and i else 1.0
-                if one not in ledger and clock.lasts("runs", share):
+                share = OVER if i == 0 else RUNS_SHARE if kept else 1.0
+                guess = clock.longest.get("reference", 0.0)
+                if one not in ledger and clock.lasts("runs", share, guess):
                     with clock.timing("runs"):
                         ledger[one] = sweep.measure(one.name, one.method, one.dtype)
+                if gradients and i == 0:  # later there may be no time for any gradient
+                    _differentiate(sweep, ledger, clock, one, EARLY)
                 shown.update()
             for one in _by_use(ledger, wanted) if gradients else ():
                 shown.set_postfix_str(f"gradient of {one.name}, {one.dtype}")
-                if not ledger[one].differentiated and clock.lasts("gradients"):
-                    with clock.timing("gradients"):
-                        ledger[one] = sweep.gradients(ledger[one])
+                _differentiate(sweep, ledger, clock, one)
                 shown.update()
     except ENDS as error:
         reason = words(error)
@@ -163,6 +173,21 @@ def _go(
         if not ledger[one].differentiated:
             late.append(LeftOut(one.name, one.dtype, f"its gradient: {reason}"))
     return late
+
+
+def _differentiate(
+    sweep: Sweep, ledger: Ledger, clock: Clock, one: Wanted, share: float = 1.0
+) -> None:
+    """Measures the gradients of a method that has runs, where a share of the budget lasts."""
+    if one not in ledger:
+        return
+    unit = ledger[one]
+    if unit.differentiated or not any(run.ok for run in unit.runs):
+        return
+    guess = GRADIENT * unit.compiling or None
+    if clock.lasts("gradients", share, guess):
+        with clock.timing("gradients"):
+            ledger[one] = sweep.gradients(unit)
 
 
 def _by_use(ledger: Ledger, wanted: list[Wanted]) -> list[Wanted]:
@@ -176,7 +201,7 @@ def _words(sweep: Sweep) -> tuple[str, ...]:
     """What a result says of the reference and of the device."""
     reference, problem = sweep.reference, sweep.problem
     device = f"{jax.devices()[0].device_kind} ({jax.default_backend()})"
-    unit = "m" if hasattr(problem.system, "layout") else "of q"
+    unit = METERS if hasattr(problem.system, "layout") else COORDINATES
     lines = [
         f"{problem.horizon:g} s; cost: time on {device} for a simulated second of one world,"
         f" alone or of {sweep.batch.worlds}",

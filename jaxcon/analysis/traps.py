@@ -39,6 +39,10 @@ CURVED = 0.1
 """The share of φ that one linear correction may leave before the way is called curved."""
 SUDDEN = 0.5
 """h β from which on feedback takes an error away in about one step."""
+COARSE = 1.0
+"""Angle of the fastest motion in a step [rad] above which the step is called too long."""
+FINE = 0.2
+"""Angle of the fastest motion in a step [rad] that is recommended."""
 DEARER = 3.0
 """How many times the operations of elimination are worth a word."""
 MANY = 12
@@ -75,12 +79,37 @@ def gains(known: Known) -> str | None:
     return instability(known.method, known.dt, known.system, known.state)
 
 
+def coarse(known: Known) -> str | None:
+    """Trap 11: a step too long for the motion, whatever the constraints are held by."""
+    angle = known.angle
+    if not angle or max(angle.turn, angle.swing) <= COARSE:
+        return None
+    said = []
+    if angle.turn > COARSE:
+        said.append(f"'{angle.turning.name}' turns by {angle.turn:.2g} rad in a step")
+    if angle.swing > COARSE:
+        where = ""
+        if angle.limit and angle.swing > angle.limit:
+            name = type(known.method.integrator).__name__
+            where = f", where oscillations are stable with {name} below {angle.limit:.3g}"
+        said.append(
+            f"gravity and springs can move '{angle.swinging.name}' at"
+            f" {angle.swinging.value:.3g} rad/s, h ω = {angle.swing:.2g}{where}"
+        )
+    fastest = max(angle.turning.value, angle.swinging.value)
+    return (
+        f"{'; '.join(said)}. Take dt of {FINE / fastest:.2g} s or less. A step that is too long may"
+        " end with status OK: a status tells failures, not errors. Watch info.violation and"
+        " jc.energy, or give the method a Recovery with a limit, which ends as VIOLATED."
+    )
+
+
 def singular(known: Known) -> str | None:
     """Trap 2: a position, or masses, in which rows lose their rank, or nearly do."""
     if known.dependent:
         if not known.passing:
             return None
-        names = _names(known, known.dependent)
+        names = _numbered(known, known.dependent)
         return (
             f"rows of {names} depend on others here, but not beside this position: it is singular."
             f" Its forces are not unique, and the motion may branch. {_taken(known)}"
@@ -133,11 +162,11 @@ def overconstrained(known: Known) -> str | None:
         )
     if not known.dependent or known.passing:
         return None
-    count, names = len(known.dependent), _names(known, known.dependent)
+    count, names = len(known.dependent), _numbered(known, known.dependent)
     return (
-        f"{several(count, 'row')} of {names} repeat what others say. The motion is right, but how"
-        " forces are shared among these rows is not determined: take joints with fewer rows if"
-        f" you need them. {_taken(known)}"
+        f"redundant: {several(count, 'row')} of {names} repeat what others say. The motion is"
+        " right, but how forces are shared among these rows is not determined: take joints with"
+        f" fewer rows if you need them. {_taken(known)}"
     )
 
 
@@ -336,6 +365,7 @@ def _limited(known: Known) -> list[tuple[Any, np.ndarray]]:
 
 TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
     "gains": ("gains too large for the step", gains),
+    "step": ("a step too long for the motion", coarse),
     "singular": ("rows that are singular, or nearly", singular),
     "order": ("the order of rows matters", order),
     "over-constrained": ("more rows than freedoms to take", overconstrained),
@@ -378,3 +408,12 @@ def _taken(known: Known) -> str:
 def _names(known: Known, rows: list[int]) -> str:
     """The constraints of some unit rows, each once."""
     return ", ".join(dict.fromkeys(known.unit.owners[i][0] for i in rows))
+
+
+def _numbered(known: Known, rows: list[int]) -> str:
+    """The constraints of some unit rows, each with the numbers of these rows in it."""
+    numbers: dict[str, list[str]] = {}
+    for i in rows:
+        name, row = known.unit.owners[i]
+        numbers.setdefault(name, []).append(str(row))
+    return ", ".join(f"{name}[{', '.join(rows)}]" for name, rows in numbers.items())

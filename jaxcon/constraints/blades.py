@@ -53,8 +53,8 @@ class KnifeEdge:
             n = normal(self, a)
             if checks.is_concrete((e, n)) and float(numerics.norm(jnp.cross(e, n))) < PERPENDICULAR:
                 raise ValueError(
-                    f"{label(self)}: its edge {e.tolist()} must not be the normal of the ice"
-                    f" {n.tolist()}, across which a blade points nowhere."
+                    f"{label(self)}: its edge {checks.numerals(e)} must not be the normal of the"
+                    f" ice {checks.numerals(n)}, across which a blade points nowhere."
                 )
             axes = surface(n, a)
         elif self.normal is None:

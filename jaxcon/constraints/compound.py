@@ -182,6 +182,7 @@ class Compound:
             volume = np.sqrt(max(np.linalg.det(few @ few.T), 0.0))
             if volume < DEPENDENT:
                 raise ValueError(
-                    f"{label(self)}: its {what} must have independent axes, got {few.tolist()}."
+                    f"{label(self)}: its {what} must have independent axes, got"
+                    f" {checks.numerals(few)}."
                 )
         return axes

@@ -154,7 +154,8 @@ class Curves(Joints):
         rank = np.linalg.matrix_rank(np.asarray(gradient, float))
         if rank < len(g):
             raise ValueError(
-                f"{label(self.joint)}: the gradients ∂g/∂x at the point, {gradient.tolist()}, have"
+                f"{label(self.joint)}: the gradients ∂g/∂x at the point,"
+                f" {checks.numerals(gradient)}, have"
                 f" rank {rank}, but {len(g)} is needed: the zeros of g must be crossed there, not"
                 " touched."
             )

@@ -54,8 +54,8 @@ def check_ends(owner: str, lower: Any, upper: Any) -> None:
     """
     if checks.is_concrete((lower, upper)) and not lower < upper:
         raise ValueError(
-            f"{owner}: lower must be below upper, got {float(lower)} and {float(upper)}; what does"
-            " not move at all is a Fixed joint or a Drive."
+            f"{owner}: lower must be below upper, got {checks.numerals(lower)} and"
+            f" {checks.numerals(upper)}; what does not move at all is a Fixed joint or a Drive."
         )
 
 

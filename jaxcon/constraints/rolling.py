@@ -182,7 +182,7 @@ class RollingDisc:
         if checks.is_concrete(sine) and float(sine) < PERPENDICULAR:
             raise ValueError(
                 f"{label(self)}: it lies flat on its plane, where no point is the lowest; its axis"
-                f" {e.tolist()} must not be the normal {n.tolist()}."
+                f" {checks.numerals(e)} must not be the normal {checks.numerals(n)}."
             )
         return touch(self, a, b, sine) | {"axis": b.local_direction(e)}
 

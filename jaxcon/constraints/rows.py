@@ -16,7 +16,7 @@ from jaxcon.constraints.base import Joints, RowSet
 from jaxcon.constraints.custom import Custom
 from jaxcon.constraints.drive import Drives
 from jaxcon.constraints.redundancy import has_loops
-from jaxcon.core import numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.solvers.jacobian import Block, Jacobian
@@ -131,6 +131,22 @@ class Violation:
     def worst_rate(self) -> Array:
         """max |φ̇| over rows, ()."""
         return jnp.max(jnp.abs(self.velocity), axis=-1, initial=0)
+
+    def __repr__(self) -> str:
+        """A line for each constraint of one world; shapes while tracing and in batches."""
+        known = checks.is_concrete((self.position, self.velocity))
+        if np.ndim(self.position) != 1 or not known:
+            shapes = f"position {np.shape(self.position)}, velocity {np.shape(self.velocity)}"
+            return f"Violation({shapes} of {', '.join(self.layout.names)})"
+        φ, rate = (np.asarray(x, float) for x in (self.position, self.velocity))
+        lines = []
+        for name in self.layout.names:
+            rows = self.layout.rows(name)
+            size, fast = (f"{np.linalg.norm(x[rows]):.3g}" for x in (φ, rate))
+            moving = f"{fast} m/s or rad/s"
+            whole = name in self.layout.velocity_level
+            lines.append(f"{name}: {moving if whole else f'{size} m or rad, rate {moving}'}")
+        return "\n".join(lines) or "no constraints"
 
     def __getitem__(self, name: str) -> Array:
         """‖φ‖ of a constraint, over the rows that have a φ; ‖ψ‖ where none has, ()."""

@@ -296,15 +296,32 @@ def shortened(x: Any) -> str:
         text = repr(x)
     except Exception:  # an integer of too many digits, or a faulty object of the user's
         return f"a value of type {type(x).__name__}"
+    return clipped(text)
+
+
+def clipped(text: str) -> str:
+    """The text, cut where it is long."""
     return text if len(text) <= LONG else f"{text[:LONG]}…"
+
+
+def numerals(x: Any) -> str:
+    """Numbers as a message shows them: seven digits, without the noise of float32.
+
+    Args:
+        x: an array, nested lists or a number.
+    """
+    if np.ndim(x):
+        return f"[{', '.join(map(numerals, x))}]"
+    text = f"{float(x):.7g}"
+    return f"{text}.0" if text.lstrip("-").isdigit() else text
 
 
 def _shown(values: np.ndarray, good: np.ndarray) -> str:
     """Numbers in words: all where they are few, else the first that is not good and its place."""
     if values.size <= FEW:
-        return str(values.tolist())
+        return numerals(values)
     place = tuple(int(i) for i in np.argwhere(~good)[0])
-    return f"{values[place]} at {list(place)} of an array {values.shape}"
+    return f"{numerals(values[place])} at {list(place)} of an array {values.shape}"
 
 
 def count(owner: str, what: str, x: Any, least: int = 1, most: int = 2**31 - 1) -> None:
@@ -342,7 +359,7 @@ def nonzero(owner: str, what: str, x: Any) -> None:
     if is_concrete(values):
         values = np.asarray(values, float)
         if not np.all(np.isfinite(values)) or not np.linalg.norm(values) > 0:
-            raise ValueError(f"{owner}: {what} must have a length, got {values.tolist()}.")
+            raise ValueError(f"{owner}: {what} must have a length, got {numerals(values)}.")
 
 
 def radians(owner: str, what: str, x: Any) -> None:

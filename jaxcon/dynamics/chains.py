@@ -275,7 +275,7 @@ def _points(scene: Scene, owner: str, points: Any) -> tuple[Any, Any]:
             i = int(np.argmin(gaps > 0))
             raise ValueError(
                 f"{owner}: points {i} and {i + 1} must be apart and finite, got"
-                f" {points[i].tolist()} and {points[i + 1].tolist()}."
+                f" {checks.numerals(points[i])} and {checks.numerals(points[i + 1])}."
             )
     return xp, points
 

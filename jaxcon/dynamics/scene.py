@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import difflib
+import inspect
+from collections.abc import Callable
+from typing import Any, Never
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +25,9 @@ from jaxcon.model.elements import side_by_side
 from jaxcon.model.layout import WORLD
 from jaxcon.model.state import MethodMemory, State
 from jaxcon.model.system import BodySystem
+
+ORIENTATIONS = ("angle", "quaternion", "orientation", "rotation", "attitude", "quat")
+"""Names of arguments by which someone may mean how a body is turned."""
 
 
 def _dtype(given: Any) -> Any:
@@ -79,6 +85,7 @@ class Scene:
         velocity: Any = None,
         angular_velocity: Any = None,
         fixed: bool = False,
+        **unknown: Never,
     ) -> None:
         """Adds a rigid body.
 
@@ -94,10 +101,15 @@ class Scene:
             velocity: of the body's frame, world, (dim,) [m/s].
             angular_velocity: () in the plane, (3,) in the body frame in space [rad/s].
             fixed: whether it is part of the world; it then needs no mass and has no coordinates.
+            unknown: anything else is refused by name.
 
         Raises:
             ValueError: the name is taken, or `quaternion` in the plane or `angle` in space.
+            TypeError: an argument of another name, such as `orientation`.
         """
+        right = "angle=, () [rad]" if self.dim == 2 else "quaternion=, wxyz (4,), body to world"
+        hint = f"The orientation is {right}."
+        self._refuse(f"body '{name}'", self.add_body, unknown, hint)
         if (quaternion if self.dim == 2 else angle) is not None:
             wrong, right = ("quaternion", "angle") if self.dim == 2 else ("angle", "quaternion")
             raise ValueError(
@@ -119,7 +131,13 @@ class Scene:
         self._bodies[name] = dataclasses.replace(self._bodies[name], winds=True)
 
     def add_particle(
-        self, name: str, *, mass: Any, position: Any = None, velocity: Any = None
+        self,
+        name: str,
+        *,
+        mass: Any,
+        position: Any = None,
+        velocity: Any = None,
+        **unknown: Never,
     ) -> None:
         """Adds a point mass: `dim` coordinates, no orientation.
 
@@ -128,10 +146,14 @@ class Scene:
             mass: () [kg].
             position: world, (dim,) [m].
             velocity: world, (dim,) [m/s].
+            unknown: anything else is refused by name.
 
         Raises:
             ValueError: the name is taken.
+            TypeError: an argument of another name, such as `inertia`.
         """
+        hint = "A particle has no orientation; add_body adds a body that turns."
+        self._refuse(f"particle '{name}'", self.add_particle, unknown, hint)
         self._take_name(name)
         self._bodies[name] = BodyInput(
             name, mass, None, position, None, velocity, None, False, False
@@ -212,6 +234,32 @@ class Scene:
             raise ValueError("Scene: there is no body that moves; add one with add_body.")
         status = jnp.asarray(Status.OK, jnp.int32)
         return State(jnp.concatenate(q), jnp.concatenate(v), jnp.zeros((), self.dtype), status)
+
+    def _refuse(
+        self, owner: str, method: Callable[..., None], unknown: dict[str, Any], turned: str
+    ) -> None:
+        """Refuses keyword arguments that a method does not have.
+
+        Args:
+            owner: what is added, for the error.
+            method: that adds it.
+            unknown: the arguments by name.
+            turned: what to say of an argument that means an orientation.
+
+        Raises:
+            TypeError: there are some; the message lists the names that the method takes.
+        """
+        for name, value in unknown.items():
+            known = list(inspect.signature(method).parameters)[1:-1]
+            close = difflib.get_close_matches(name, known, 1)
+            hint = f" Did you mean {close[0]}=?" if close else ""
+            if name in ORIENTATIONS:
+                hint = f" {turned}"
+            raise TypeError(
+                f"{owner}: {method.__name__} has no argument {name}=, got"
+                f" {name}={checks.shortened(value)}; it takes"
+                f" {', '.join(f'{x}=' for x in known)}.{hint}"
+            )
 
     def _take_name(self, name: str) -> None:
         if not isinstance(name, str) or not name:

@@ -244,7 +244,7 @@ def _check(solid: str, **values: Any) -> None:
 def _check_tensor(owner: str, tensor: Array, moments: Array) -> None:
     known = np.asarray(tensor)
     if np.max(np.abs(known - known.T)) > 1e-6 * np.max(np.abs(known)):
-        raise ValueError(f"{owner}: the tensor must be symmetric, got {known.tolist()}.")
+        raise ValueError(f"{owner}: the tensor must be symmetric, got {checks.numerals(known)}.")
     checks.check(owner, "the principal moments", moments, above=0)
     check_triangle(owner, moments)
 
@@ -263,6 +263,6 @@ def check_triangle(owner: str, moments: Any) -> None:
         values = np.sort(np.asarray(moments)).tolist()
         if values[2] > (values[0] + values[1]) * (1 + 1e-5):
             raise ValueError(
-                f"{owner}: principal moments {values} violate the triangle inequality"
-                " I₁ + I₂ ≥ I₃, which every distribution of mass satisfies."
+                f"{owner}: principal moments {checks.numerals(values)} violate the triangle"
+                " inequality I₁ + I₂ ≥ I₃, which every distribution of mass satisfies."
             )

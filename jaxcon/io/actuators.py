@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
 from jaxcon.io.links import Link, LinkJoint
@@ -138,7 +139,7 @@ def _vector(
     if force.any() and torque.any():
         raise NotImplementedError(
             f"from_mjcf: actuator '{own}' has a gear with a force and a"
-            f" torque, {gear.tolist()}; give each an actuator of its own."
+            f" torque, {checks.numerals(gear)}; give each an actuator of its own."
         )
     axis = force if force.any() else torque
     size = float(np.linalg.norm(axis))

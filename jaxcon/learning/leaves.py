@@ -225,10 +225,10 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
     what = f"{owner}: '{name}'" if name else f"{owner}: the parameter"
     start = jnp.asarray(start)
     if not np.all(np.isfinite(start)):
-        raise ValueError(f"{what} must be finite at the start, got {np.asarray(start).tolist()}.")
+        raise ValueError(f"{what} must be finite at the start, got {checks.numerals(start)}.")
     if log and not np.all(np.asarray(start) >= jnp.finfo(start.dtype).tiny):
         raise ValueError(
-            f"{what} is to stay positive and must start so, got {np.asarray(start).tolist()}."
+            f"{what} is to stay positive and must start so, got {checks.numerals(start)}."
         )
     try:
         low, high = pair
@@ -246,7 +246,7 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
         raise ValueError(f"{what} needs bounds (low, high) with low ≤ high, got {pair!r}.")
     if not np.all((np.asarray(low) <= start) & (start <= np.asarray(high))):
         raise ValueError(
-            f"{what} must start within its bounds {np.asarray(low).tolist()} to"
-            f" {np.asarray(high).tolist()}, got {np.asarray(start).tolist()}."
+            f"{what} must start within its bounds {checks.numerals(low)} to"
+            f" {checks.numerals(high)}, got {checks.numerals(start)}."
         )
     return low, high

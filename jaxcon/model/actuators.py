@@ -293,6 +293,6 @@ def ranges(element: Any, dtype: Any, *fields: str) -> dict[str, Array]:
     for field, x in result.items():
         if checks.is_concrete(x) and not x[0] <= x[1]:
             raise ValueError(
-                f"{label(element)}: {field} must be (lowest, highest), got {x.tolist()}."
+                f"{label(element)}: {field} must be (lowest, highest), got {checks.numerals(x)}."
             )
     return result

@@ -166,7 +166,7 @@ def own_point(element: Any, what: str, point: Any, pose: Pose) -> Array:
     known = pose.orientation is None and checks.is_concrete((point, pose.position))
     if known and not np.allclose(point, pose.position, rtol=1e-5, atol=1e-6):
         raise ValueError(
-            f"{owner}: {what} is {point.tolist()}, but a particle has no other point than its"
-            f" position {pose.position.tolist()}."
+            f"{owner}: {what} is {checks.numerals(point)}, but a particle has no other point than"
+            f" its position {checks.numerals(pose.position)}."
         )
     return point

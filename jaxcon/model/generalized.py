@@ -124,7 +124,7 @@ class GeneralizedCoordinates:
             if not np.max(np.abs(known - known.T), initial=0) <= 1e-6 * np.max(np.abs(known)):
                 raise ValueError(
                     "GeneralizedSystem: mass must return a symmetric matrix, got"
-                    f" {checks.shortened(known.tolist())} at q = {q.tolist()}."
+                    f" {checks.clipped(checks.numerals(known))} at q = {checks.numerals(q)}."
                 )
 
     def applied(self, q: Array, v: Array, t: Any, control: Any = None) -> Array:

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import numerics
 from jaxcon.core.doubled import rounded
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
@@ -29,6 +30,12 @@ from jaxcon.solvers.saddle import Diagonal, Solution
 
 STILL = 1e-9
 """The speed [m/s] of the ends of a rod against each other below which it is not taken to turn."""
+
+FARTHEST = 4.0
+"""The turn of a body in a step [rad] from which it counts whatever its axis.
+
+Where it turns by 2π, its end hardly depends on small changes of ω.
+"""
 
 
 @pytree
@@ -247,7 +254,9 @@ class BodySystem:
     def carry(self, q: Array, step: Array, p: Array) -> Array:
         """(dexp⁻¹_Δ)ᵀ p (n_v,): a momentum along a step Δ = h v, as seen from where it begins.
 
-        With −Δ it is as seen from where it ends. Where velocities are rates of coordinates it is p.
+        With −Δ it is as seen from where it ends, and dexp⁻¹_Δ p: the change of Δ that turns the end
+        of the step by p in the frame of its start. Where velocities are rates of coordinates it is
+        p.
         """
         pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
         return _join([kind.carry(own, momentum) for kind, own, momentum in pairs], q)
@@ -324,23 +333,38 @@ class BodySystem:
                 bends = jnp.maximum(bends, jnp.max(bending(before, start, blocks, rows), axis=0))
         return jnp.maximum(dt[0] * dt[0] * most, jnp.minimum(dt[0] * dt[0] * bends, 1))
 
-    def squared_turns(self, v: Array, before: Array, rows: Any, dt: Any) -> Array:
-        """The square of the largest turn of a row's bodies, or of the rod it is, (n_c,) [rad²].
+    def squared_turns(
+        self, v: Array, before: Array, rows: Any, dt: Any, whole: bool = False
+    ) -> Array:
+        """The square of the largest turn of what a row holds of its bodies, (n_c,) [rad²].
+
+        What a row holds of a body is an arm or an axis, r, or the row itself is a rod. In space a
+        body may spin about r without turning it. The part J_ω of the row is across r, and so the
+        part of ω along J_ω, at its largest among the rows of a constraint, is that which turns r.
+        Of a body that turns by more than `FARTHEST` all of ω counts.
 
         Args:
             v: velocities of the step, (n_v,).
             before: velocities at which the rows are known, (n_v,).
             rows: the constraints.
             dt: h, (1,) [s].
+            whole: whether all of ω counts, not only what turns r.
         """
         found: list[Array] = []
         for start, blocks in rows.jacobian.by_rows():
             count, elements = blocks[0].shape
             most = jnp.zeros((elements, *v.shape[1:]), v.dtype)
-            for columns in (x.columns for x in blocks):
-                if columns.components > self.layout.dim:
-                    ω = Vector(*columns.take(v)[self.layout.dim :])
-                    most = jnp.maximum(most, ω.dot(ω))
+            for block in blocks:
+                if block.columns.components <= self.layout.dim:
+                    continue
+                ω = Vector(*block.columns.take(v)[self.layout.dim :])
+                square = ω.dot(ω)
+                if self.turns_in_space and not whole:
+                    most = jnp.maximum(most, square / FARTHEST**2)
+                    across = (Vector(*row[self.layout.dim :]) for row in block.value)
+                    parts = (numerics.safe_divide(x.dot(ω) ** 2, x.dot(x)) for x in across)
+                    square = functools.reduce(jnp.maximum, parts)
+                most = jnp.maximum(most, square)
             if start in rows.swings:
                 most = jnp.maximum(most, rows.swings[start])
             most = dt * dt * most
