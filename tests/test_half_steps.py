@@ -517,6 +517,73 @@ def test_a_body_on_a_ball_joint_spins_freely(turn, dtype):
     assert share.min() > (-2e-3 if turn < 2 else -0.06)
 
 
+@pytest.mark.parametrize("turn", [8.0, 12.0, 1e3, 3e4])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_body_turns_on_however_fast_beside_a_constraint(turn, dtype):
+    """By 12 rad a step, the implicit midpoint rule of small turns overflows in four steps."""
+    h = 1 / 60
+
+    def spun(*, beside, held):
+        scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0), dtype=dtype)
+        spin = np.array([0.02, 1.0, 0.02]) * turn / h
+        scene.add_body("box", mass=1.0, inertia=(0.01, 0.02, 0.025), angular_velocity=spin)
+        if held:
+            scene.add(jc.Spherical("ball", jc.WORLD, "box", point=(0.0, 0.0, 0.0)))
+        if beside:
+            scene.add_particle("lamp", mass=1.0, position=(5.0, 0.0, -1.0))
+            scene.add(jc.Distance("cord", jc.WORLD, "lamp", point_a=(5.0, 0.0, 0.0)))
+        system, state = scene.build()
+        method = jc.Method()
+        start = jc.init(system, method, state.q, state.v)
+        run = jax.jit(lambda s: jc.rollout(system, method, s, None, h, 500)[0])
+        final = run(start)
+        assert final.status == jc.Status.OK
+        few = jax.jit(lambda s: jc.rollout(system, method, s, None, h, 3)[0])
+        return jc.angular_velocity(system, few(start), "box") / (turn / h)
+
+    alone = spun(beside=False, held=False)
+    rounding = 1e4 * float(jnp.finfo(dtype).eps)  # a chaotic motion, of which three steps are left
+    for beside, held in ((True, False), (False, True)):
+        found = spun(beside=beside, held=held)
+        if turn < 100:
+            np.testing.assert_allclose(found, alone, atol=rounding)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_fast_wheel_adds_no_noise_to_the_forces_of_a_distant_weight(dim):
+    """In float32 at 0.1 ms the hook at 50 m bears what it bears without the wheel, to rounding."""
+
+    def forces(*, wheel):
+        scene = jc.Scene(dim=dim, gravity=(*(0.0,) * (dim - 1), -G), dtype=np.float32)
+
+        def at(x, z):
+            return (x, z) if dim == 2 else (x, 0.0, z)
+
+        def body(name, inertia, place, spin, **more):
+            inertia = inertia if dim == 2 else (inertia, 2 * inertia, inertia)
+            spin = spin if dim == 2 else (0.0, spin, 0.0)
+            scene.add_body(name, inertia=inertia, position=place, angular_velocity=spin, **more)
+
+        axis = {} if dim == 2 else {"axis": (0.0, 1.0, 0.0)}
+        body("weight", 0.1, at(50.123, -1.0371), 0.01, mass=1.0, velocity=at(0.010371, 0.0))
+        scene.add(jc.Revolute("hook", jc.WORLD, "weight", point=at(50.123, 0.0), **axis))
+        if wheel:
+            body("wheel", 1e-3, at(0.0, 0.0), 1000.0, mass=1.0)
+            scene.add(jc.Revolute("axle", jc.WORLD, "wheel", point=at(0.0, 0.0), **axis))
+        system, state = scene.build()
+        method = jc.Method()
+        start = jc.init(system, method, state.q, state.v)
+        hook = linearize(system, state.q, state.v, state.time).layout.rows("hook")
+        return jax.jit(
+            lambda s: jc.rollout(
+                system, method, s, None, 1e-4, 1000, record=lambda s, i: i.multipliers[hook]
+            )[1]
+        )(start)
+
+    alone, beside = forces(wheel=False), forces(wheel=True)
+    assert jnp.max(jnp.abs(beside - alone)) < 1.0  # it was 50 N
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_a_top_may_spin_by_three_radians_a_step(dtype):
     """Its axis leans by 45° and goes round: by a third of a radian a step as it should.
@@ -596,9 +663,24 @@ def fast_wheel(scene):
     scene.add(jc.Revolute("axle", jc.WORLD, "wheel", point=(5.0, 0.0)))
 
 
+def leaning_door(scene, **stop):
+    scene.add_body("door", mass=1.0, inertia=1 / 12, position=(5.5, 0.0))
+    scene.add(jc.Revolute("post", jc.WORLD, "door", point=(5.0, 0.0)))
+    scene.add(jc.Limit("stop", "post", 0.0, 1.0, **stop))
+
+
+def box_on_a_floor(scene):
+    scene.add_body("box", mass=1.0, inertia=0.1, position=(5.0, 0.0))
+    corners = (4.8, 0.0), (5.2, 0.0)
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "box", center=corners, friction=0.5))
+
+
 BESIDE = {
     "lamp": hanging_lamp,
     "wheel": fast_wheel,
+    "stop": leaning_door,
+    "soft stop": lambda scene: leaning_door(scene, stiffness=300.0, damping=1.0),
+    "floor": box_on_a_floor,
     "friction": lambda scene: scene.add(jc.JointFriction("rub", "hinge0", 1e-9)),
 }
 
@@ -675,6 +757,30 @@ def test_a_dumbbell_is_as_rigid_in_fast_flight():
 
     assert length(500.0) < 2e-6
     assert length(0.0) < 2e-6
+
+
+@pytest.mark.parametrize(("turn", "off"), [(0.5, 1e-3), (1.0, 0.07), (1.4, 0.4)])
+def test_a_rod_that_turns_too_fast_leaves_its_length_and_recovery_says_so(turn, off):
+    """As documented: the status alone is OK, and VIOLATED by the limit of a Recovery."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0), velocity=(0.0, turn / 0.01))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob"))
+    system, state = scene.build()
+
+    def run(method):
+        def worst(state, info):
+            return jc.violation(system, state).worst
+
+        start = jc.init(system, method, state.q, state.v)
+        return jax.jit(lambda s: jc.rollout(system, method, s, None, 0.01, 300, record=worst))(
+            start
+        )
+
+    final, found = run(jc.Method())
+    assert final.status == jc.Status.OK
+    np.testing.assert_allclose(found.max(), off, rtol=0.05)
+    final, _ = run(jc.Method(recovery=jc.Recovery(limit=off / 2)))
+    assert final.status == jc.Status.VIOLATED
 
 
 def test_a_stop_in_the_plane_holds_on_what_turns_fast():

@@ -200,9 +200,17 @@ class Vakonomic:
         v, before = self._split(v)[0], self._split(before)[0]
         return self.system.squared_turn(q, v, before, rows, dt)
 
-    def squared_turns(self, v: Array, rows: Any, dt: Any) -> Array:
-        """The square of the largest turn of the bodies of each row, as of the system, (n_c,)."""
-        return self.system.squared_turns(self._split(v)[0], rows, dt)
+    def squared_turns(
+        self, v: Array, before: Array, rows: Any, dt: Any, whole: bool = False
+    ) -> Array:
+        """The square of the largest turn of what each row holds, as of the system, (n_c,)."""
+        v, before = self._split(v)[0], self._split(before)[0]
+        return self.system.squared_turns(v, before, rows, dt, whole)
+
+    def carry(self, q: Array, step: Array, p: Array) -> Array:
+        """A momentum along a step as that of the system, and what goes with μ as it is."""
+        (step, _), (p, rest) = self._split(step), self._split(p)
+        return jnp.concatenate([self.system.carry(q, step, p), rest])
 
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""

@@ -320,10 +320,6 @@ class BodySystem:
     def squared_turn(self, q: Array, v: Array, before: Array, rows: Any, dt: Any) -> Array:
         """The square of the largest turn in a step, of bodies and of rods, () [rad²].
 
-        Other constraints between particles alone, such as a curve of curvature κ, have a γ of κ|v|²
-        for the difference v of their velocities, and turn by h|γ|/|v|. That is taken for at most a
-        radian, as a γ that has other reasons makes it as large as one likes.
-
         Args:
             q: positions, (n_q,).
             v: velocities of the step, (n_v,).
@@ -339,24 +335,26 @@ class BodySystem:
         for swing in rows.swings.values():
             most = jnp.maximum(most, jnp.max(swing, axis=0))
         for start, blocks in rows.jacobian.by_rows():
-            dims = {x.columns.components for x in blocks}
-            if start in rows.swings or dims != {self.layout.dim}:
-                continue
-            first, *others = (x.columns.take(before) for x in blocks)
-            apart = [first - other for other in others] or [first]
-            speed = functools.reduce(jnp.maximum, (x.dot(x) for x in apart))
-            own = Vector.of_rows(rows.bias, start, *blocks[0].shape)
-            fastest = functools.reduce(jnp.maximum, (x * x for x in own))
-            bends = jnp.maximum(bends, jnp.max(fastest / (speed + STILL**2), axis=0))
+            if self._bends(start, blocks, rows):
+                bends = jnp.maximum(bends, jnp.max(bending(before, start, blocks, rows), axis=0))
         return jnp.maximum(dt[0] * dt[0] * most, jnp.minimum(dt[0] * dt[0] * bends, 1))
 
-    def squared_turns(self, v: Array, rows: Any, dt: Any) -> Array:
+    def squared_turns(
+        self, v: Array, before: Array, rows: Any, dt: Any, whole: bool = False
+    ) -> Array:
         """The square of the largest turn of what a row holds of its bodies, (n_c,) [rad²].
 
         What a row holds of a body is an arm or an axis, r, or the row itself is a rod. In space a
         body may spin about r without turning it. The part J_ω of the row is across r, and so the
         part of ω along J_ω, at its largest among the rows of a constraint, is that which turns r.
         Of a body that turns by more than `FARTHEST` all of ω counts.
+
+        Args:
+            v: velocities of the step, (n_v,).
+            before: velocities at which the rows are known, (n_v,).
+            rows: the constraints.
+            dt: h, (1,) [s].
+            whole: whether all of ω counts, not only what turns r.
         """
         found: list[Array] = []
         for start, blocks in rows.jacobian.by_rows():
@@ -367,7 +365,7 @@ class BodySystem:
                     continue
                 ω = Vector(*block.columns.take(v)[self.layout.dim :])
                 square = ω.dot(ω)
-                if self.turns_in_space:
+                if self.turns_in_space and not whole:
                     most = jnp.maximum(most, square / FARTHEST**2)
                     across = (Vector(*row[self.layout.dim :]) for row in block.value)
                     parts = (numerics.safe_divide(x.dot(ω) ** 2, x.dot(x)) for x in across)
@@ -375,8 +373,18 @@ class BodySystem:
                 most = jnp.maximum(most, square)
             if start in rows.swings:
                 most = jnp.maximum(most, rows.swings[start])
+            most = dt * dt * most
+            if self._bends(start, blocks, rows):
+                bends = dt * dt * bending(before, start, blocks, rows)
+                most = jnp.maximum(most, jnp.minimum(bends, 1))
             found += [most] * count
-        return dt * dt * jnp.concatenate(found)
+        return jnp.concatenate(found)
+
+    def _bends(self, start: int, blocks: list[Any], rows: Any) -> bool:
+        """True for rows between particles alone that are no rods."""
+        return start not in rows.swings and {x.columns.components for x in blocks} == {
+            self.layout.dim
+        }
 
     def complete(self, solution: Solution) -> Solution:
         """The solution of the saddle system as it is."""
@@ -473,6 +481,27 @@ class BodySystem:
             ValueError: an unknown name or field, a wrong shape, or a value out of range.
         """
         return params.replaced(self, changes)
+
+
+def bending(v: Array, start: int, blocks: list[Any], rows: Any) -> Array:
+    """The square of the rate at which the direction of particles' motion turns, (element,).
+
+    A constraint between particles alone, such as a curve of curvature κ, has a γ of κ|v|² for the
+    difference v of their velocities, and turns it at |γ|/|v|. A γ that has other reasons makes this
+    as large as one likes; callers take at most a radian a step.
+
+    Args:
+        v: velocities at which the rows are known, (n_v,).
+        start: the first row of the constraints.
+        blocks: of their Jacobian, one for each particle.
+        rows: all constraints.
+    """
+    first, *others = (x.columns.take(v) for x in blocks)
+    apart = [first - other for other in others] or [first]
+    speed = functools.reduce(jnp.maximum, (x.dot(x) for x in apart))
+    own = Vector.of_rows(rows.bias, start, *blocks[0].shape)
+    fastest = functools.reduce(jnp.maximum, (x * x for x in own))
+    return fastest / (speed + STILL**2)
 
 
 def _join(groups: list[Vector], like: Array) -> Array:

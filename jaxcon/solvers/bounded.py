@@ -27,6 +27,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector
@@ -90,15 +91,11 @@ class Kinds:
         """The row of the first normal."""
         return self.single + self.boxes
 
-    def one_sided(self, multipliers: Array) -> Array:
-        """Worlds in which a stop or contact acts, which is not so of friction and motors alone, ().
-
-        Args:
-            multipliers: (n,).
-        """
-        normals = multipliers[self.normal : self.normal + self.contacts]
-        acts = jnp.concatenate([multipliers[: self.single], normals]) != 0
-        return jnp.any(acts, axis=0)
+    @property
+    def one_sided(self) -> np.ndarray:
+        """A mask of the rows of stops and of normals of contacts, (n,)."""
+        rows = np.arange(self.size)
+        return (rows < self.single) | (rows >= self.normal) & (rows < self.normal + self.contacts)
 
     def split(self, x: Array) -> Parts:
         """An array (n, …) by law."""

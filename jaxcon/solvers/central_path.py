@@ -170,7 +170,7 @@ def _nothing(like: Array, columns: int) -> Array:
     return jnp.zeros((len(like), columns, *like.shape[1:]), like.dtype)
 
 
-def asked(kinds: Kinds, point: Point, aim: Target) -> Parts:
+def complementarity_step(kinds: Kinds, point: Point, aim: Target) -> Parts:
     """The change of u, with λ held, that brings all products to the target, by law."""
     x, τ = point.primal, aim.plain
     low, high = point.below, point.above
@@ -178,10 +178,10 @@ def asked(kinds: Kinds, point: Point, aim: Target) -> Parts:
     single = (τ - x.single * point.single) / x.single
     normal = (τ - x.normal * point.normal) / x.normal
     sets = zip(cones(kinds, point), aim.cone, strict=True)
-    return Parts(single, box, normal, tuple(_slip_asked(cone, head) for cone, head in sets))
+    return Parts(single, box, normal, tuple(_slip_change(cone, head) for cone, head in sets))
 
 
-def _slip_asked(cone: Cone, head: Array) -> Vector:
+def _slip_change(cone: Cone, head: Array) -> Vector:
     """The change of the slip that brings its product to (head, 0)."""
     across = cone.slip * cone.normal + cone.tail * cone.head
     left = (head - _product(cone)) / cone.normal
@@ -189,7 +189,7 @@ def _slip_asked(cone: Cone, head: Array) -> Vector:
 
 
 def moved(kinds: Kinds, point: Point, wanted: Parts, change: Parts, aim: Target) -> Point:
-    """The step of all parts that goes with a change of λ, `wanted` being what was asked."""
+    """The step of all parts that goes with a change of λ, `wanted` being the change of u."""
     x, τ = point.primal, aim.plain
     low, high = point.below, point.above
     heads, slips = [], []

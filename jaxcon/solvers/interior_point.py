@@ -18,8 +18,8 @@ from jaxcon.solvers.central_path import (
     Cone,
     Point,
     Target,
-    asked,
     center,
+    complementarity_step,
     cones,
     moved,
     normalized,
@@ -139,7 +139,7 @@ def iterate(problem: Bounded, point: Point) -> Point:
     off = unmet(problem, point)
 
     def toward(aim: Target) -> Point:
-        wanted = asked(kinds, point, aim)
+        wanted = complementarity_step(kinds, point, aim)
         primal = gauss_jordan.apply(known, kinds.join(wanted) - off)
         return moved(kinds, point, wanted, kinds.split(primal), aim)
 
