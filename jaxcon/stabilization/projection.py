@@ -93,8 +93,8 @@ class Projection(Unstabilized):
     by which the point is not unique; the solver chooses, within O(‖d‖).
 
     Beside semi-implicit Euler it loses energy where jointed bodies in space spin fast. A box on a
-    hinge that carries another on a ball joint, the latter at 14 rad/s, loses all of it in 6,000
-    steps of 20 ms and half of it in as many of 5 ms; `RK4()` loses at most 6 % and nothing.
+    hinge that carries another on a ball joint, the latter at 14 rad/s, loses 69 % of the largest
+    kinetic energy in 3,000 steps of 20 ms and 30 % in 6,000 of 5 ms; `RK4()` loses 1 % and nothing.
 
     Rows of velocities alone are part of the second projection only. Rotors are inertia of the mass
     metric. The derivative is that of the root, in every world, and not of the iterations.
