@@ -25,7 +25,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.impacts import jump_of, with_jump
-from jaxcon.model.state import State
+from jaxcon.model.state import State, at_instant
 from jaxcon.solvers.saddle import Solution
 
 
@@ -123,27 +123,38 @@ class SemiImplicitEuler(Explicit):
         system, h = dynamics.system, dt[None]
         if system.has_bodies:
             return self._of_bodies(dynamics, state, dt)
-        solution, rows = dynamics(state.q, state.v, state.instant, dt / 2)
+        here, dynamics, age = self._approached(dynamics, state, dt)
+        solution, rows = dynamics(here.q, here.v, here.instant, age)
         v = moving = state.v + h * solution.acceleration
         if (jump := jump_of(rows.reactions)) is not None:
             moving = v - jump.velocity + numerics.safe_divide(jump.travel, h)
-        q = system.retract(state.q, h * moving)
+        q = system.retract(here.q, h * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
+
+    def _approached(self, dynamics: Dynamics, state: State, dt: Any) -> tuple[State, Dynamics, Any]:
+        """The state at the first landings of the step, the dynamics there, and the age of v."""
+        q, t, dynamics = dynamics.approached(state.q, state.v, state.instant)
+        if dynamics.approach is None:
+            return state, dynamics, dt / 2
+        here = at_instant(dataclasses.replace(state, q=q), t)
+        return here, dynamics, dt / 2 + dynamics.approach.last
 
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        v, solution, rows, least, stays = self._promised(dynamics, state, dt)
+        end = state.instant + dt
+        state, dynamics, age = self._approached(dynamics, state, dt)
+        v, solution, rows, least, stays = self._promised(dynamics, state, dt, age)
         q = system.retract(state.q, h * v)
         if least is not None and rows.layout.size:
             q, v, solution = closer(system, state, (q, v), solution, rows, least, stays, dt)
         if (jump := jump_of(rows.reactions)) is not None:
             q = system.retract(state.q, h * v + jump.travel)
             v, solution = v + jump.velocity, with_jump(solution, jump, dt)
-        return Advanced((q, v, state.instant + dt), solution, rows)
+        return Advanced((q, v, end), solution, rows)
 
     def _promised(
-        self, dynamics: Dynamics, state: State, dt: Any
+        self, dynamics: Dynamics, state: State, dt: Any, age: Any
     ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
         """v⁺, a and λ, rows, `least`, and the worlds that stay as they are, before `closer`.
 
@@ -154,13 +165,13 @@ class SemiImplicitEuler(Explicit):
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.turns_in_space:
             ahead = dynamics.bounds_ahead(*here) if system.bounds else None
-            solution, rows, least, _ = dynamics.factored(*here, dt / 2, ahead)
+            solution, rows, least, _ = dynamics.factored(*here, age, ahead)
             stays = None
             if ahead is not None and rows.reactions is not None:
                 stays = ahead.kinds.one_sided(rows.reactions.multipliers)
             return state.v + h * solution.acceleration, solution, rows, least, stays
         if not system.bounds:
-            solution, rows, least, _ = dynamics.factored(*here, dt / 2)
+            solution, rows, least, _ = dynamics.factored(*here, age)
             small = least is not None and rows.layout.size > 0  # `closer` does the large ones
             v = system.kick(state.q, state.v, solution.acceleration, h, small)
             return v, solution, rows, least, None
@@ -168,7 +179,7 @@ class SemiImplicitEuler(Explicit):
         pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
         coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
         held = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
-        solution, rows, least, push = held.factored(*here, dt / 2, bounds)
+        solution, rows, least, push = held.factored(*here, age, bounds)
         v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
         if push is not None:
             straight = state.v + h * solution.acceleration
