@@ -129,17 +129,20 @@ def measure(name: str, dtype: Any, solver: Any, worlds: int) -> Laws:
         place, t, dynamics = dynamics_at(system, method, start, None, h).approached(
             start.q, start.v, start.instant
         )
-        rows, age = dynamics.bounds(place, start.v, t, h), h / 2
+        rows, age, end = dynamics.bounds(place, start.v, t, h), h / 2, new.v
         if dynamics.approach is not None:
             age += dynamics.approach.last
             without = dynamics_at(bare, method, alone, None, h)
-            change = h * without(place, start.v, t, age)[0].acceleration
-            change += h * system.coast(place, start.v, h[None])  # as the step has it in space
+            coasting = system.coast(place, start.v, h[None])  # as the step has it in space
+            change = h * (without(place, start.v, t, age)[0].acceleration + coasting)
+            held = dataclasses.replace(dynamics, held=system.mass(place).apply(coasting))
+            # contacts are solved before gyroscopic forces become those after the landing
+            end -= held(place, start.v, t, age)[1].reactions.jump.velocity
             rows, _ = dynamics.approach.targets(rows, rows.jacobian.apply(change), h)
         free, _ = jc.step(bare, method, dataclasses.replace(alone, q=place), None, h)
         speed, energy = jnp.max(jnp.abs(start.v)), jc.energy(system, start).kinetic
         size = speed, h * moved(system, start, rows), energy
-        found = judged(rows, info.reactions.multipliers, (free.v, new.v), size)
+        found = judged(rows, info.reactions.multipliers, (free.v, end), size)
         return jax.tree.map(lambda x: jnp.where(failed(new.status), jnp.inf, x), found)
 
     run = jax.jit(jax.vmap(one))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -140,16 +141,14 @@ class Dynamics:
         impulse = self._impulse(base, law, problem, length, acts)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
-        seen = None
-        if lands:
-            assert self.approach is not None
-            seen = self.approach.lands
-            first, aim = impulse.start, impulse.target
+        approach, refined = self.approach if lands else None, None
+        first, aim = impulse.start, impulse.target
+        if approach is not None:
             if aim.size:  # what feedback makes of the way to the place depends on its time
                 live = impulse.alone(impulse.saddle.force, aim).acceleration
                 first = impacts.with_tangent(first, live)
                 start = self.dt[None] * bounds.jacobian.apply(first)
-            asked, refined = self.approach.targets(bounds, start, self.dt)
+            asked, refined = approach.targets(bounds, start, self.dt)
             impulse = dataclasses.replace(impulse, rows=asked)
         may = start > 0
         if strikes:
@@ -176,12 +175,16 @@ class Dynamics:
                 lost = impacts.passes_range(both_stops, speed, left)
                 solution = solution._replace(status=lost_impacts(solution.status, lost))
             solution, known = self._struck((q, v, t), solution, known, times, lag)
-        elif lands:
-            solution = self._observed(solution, t, seen, seen, bounds)
+        elif approach is not None and refined is not None:
+            solution = self._observed(solution, t, approach.lands, approach.lands, bounds)
             smooth = jnp.where(refined.supported(known.multipliers), 0, first)
             change = self.dt[None] * (solution.acceleration - smooth)
-            travel = refined.travel(v, change, self.approach)
-            known = dataclasses.replace(known, jump=impacts.Jump(jnp.zeros_like(v), travel))
+            # gyroscopic forces and damping are those after the landing from τ on
+            end = v + self.dt[None] * solution.acceleration
+            forces = (self.system.force(q, x, t, self.control) for x in (end, v))
+            later = self.system.mass(q).solve(operator.sub(*forces))
+            jump = impacts.Jump(refined.left(self.dt) * later, refined.travel(v, change, approach))
+            known = dataclasses.replace(known, jump=jump)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone, push
 
     def approached(self, q: Array, v: Array, t: Any) -> tuple[Array, Any, Dynamics]:

@@ -404,6 +404,7 @@ class Approach:
 
     Attributes:
         times: τ of the first landing by island, (islands,) [s]; zero where nothing lands.
+        happens: islands in which a row lands, (islands,).
         lands: rows that land, with the tangents of their contacts, (n,).
         waits: rows that land in the next step, (n,).
         early: how much earlier the travel with v⁺ begins, (islands,) [s]; see `targets`.
@@ -411,6 +412,7 @@ class Approach:
     """
 
     times: Array
+    happens: Array
     lands: Array
     waits: Array
     early: Array
@@ -437,8 +439,9 @@ class Approach:
         lands = jax.lax.stop_gradient(may & (τ <= dt[None]) & (τ > -OVERDUE * dt[None]))
         waits = jax.lax.stop_gradient(may & (τ > dt[None]))
         first = islands.least(jnp.where(lands, τ, 2 * dt[None]))
-        times = jnp.where(first < 2 * dt[None], first, 0)
-        return cls(times, rows.kinds.by_contact(lands), waits, jnp.zeros_like(times), islands)
+        happens = first < 2 * dt[None]
+        times, lands = jnp.where(happens, first, 0), rows.kinds.by_contact(lands)
+        return cls(times, happens, lands, waits, jnp.zeros_like(times), islands)
 
     @property
     def by_velocity(self) -> Array:
@@ -490,6 +493,10 @@ class Approach:
         """Velocities of islands in which rows act that do not land, (n_v,) or (1,)."""
         acts = jnp.where(self.lands, 0, multipliers) != 0
         return self.islands.velocities(self.islands.least(jnp.where(acts, 0, 1)) == 0)
+
+    def left(self, dt: Array) -> Array:
+        """The time from a landing to that of the velocities, h/2 − τ, (n_v,) or (1,) [s]."""
+        return self.islands.velocities(jnp.where(self.happens, dt[None] / 2 - self.times, 0))
 
     def travel(self, v: Array, change: Array, before: Approach) -> Array:
         """What is to be added to h v⁺ from the place on, (n_v,)."""
