@@ -135,10 +135,11 @@ def measure(name: str, dtype: Any, solver: Any, worlds: int) -> Laws:
             without = dynamics_at(bare, method, alone, None, h)
             coasting = system.coast(place, start.v, h[None])  # as the step has it in space
             change = h * (without(place, start.v, t, age)[0].acceleration + coasting)
-            held = dataclasses.replace(dynamics, held=system.mass(place).apply(coasting))
-            # contacts are solved before gyroscopic forces become those after the landing
-            end -= held(place, start.v, t, age)[1].reactions.jump.velocity
-            rows, _ = dynamics.approach.targets(rows, rows.jacobian.apply(change), h)
+            rows, refined = dynamics.approach.targets(rows, rows.jacobian.apply(change), h)
+            before, left = system.force(place, start.v, t, None), refined.left(h)
+            for _ in range(5):  # contacts act before gyroscopic forces become those after a landing
+                more = system.force(place, end, t, None) - before
+                end = new.v - left * system.mass(place).solve(more)
         free, _ = jc.step(bare, method, dataclasses.replace(alone, q=place), None, h)
         speed, energy = jnp.max(jnp.abs(start.v)), jc.energy(system, start).kinetic
         size = speed, h * moved(system, start, rows), energy
