@@ -218,6 +218,9 @@ class Dynamics:
         islands = impacts.Islands.of(rows, held)
         approach = impacts.Approach.of(rows, change, most, self.dt, islands)
         place = self.system.retract(q, approach.by_velocity * v)
+        there = self.bounds(place, v, t + approach.last, self.dt)
+        approach = approach.refined(there, change, self.dt)
+        place = self.system.retract(q, approach.by_velocity * v)
         return place, t + approach.last, dataclasses.replace(self, approach=approach)
 
     def _observed(

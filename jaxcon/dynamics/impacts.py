@@ -466,15 +466,8 @@ class Approach:
             change: h J a without bounded rows, (n,), a constant.
             dt: h, () [s].
         """
-        h, known = dt[None], self.islands.rows(self.times)
-        ends = mask(rows.ends, rows) & self.lands
-        speed = -(rows.rate + change / 2 + numerics.safe_divide(known, h) * change)
-        fast = ends & (speed > 0)
-        gap = rows.gap + known * (change / 2 + numerics.safe_divide(known, h) * change / 2)
-        late = quotient(jnp.where(fast, gap, 0), jnp.where(fast, speed, 1))
-        late = jnp.where(fast & (jnp.abs(late) <= h), late, 0)
-        first = self.islands.least(jnp.where(fast, late, 2 * h))
-        delay = jnp.where(first < 2 * h, first, 0)
+        h = dt[None]
+        fast, speed, late, delay = self._delays(rows, change, dt)
         # the derivative has the refined time; the value keeps one time for all that act on each
         # other, which keeps their angular momentum
         times = self.times + (delay - jax.lax.stop_gradient(delay))
@@ -488,6 +481,34 @@ class Approach:
         target = jnp.where(self.lands, target, rows.target)
         target = jnp.where(self.waits, target + OVERDUE / 2 * rows.rate, target)
         return dataclasses.replace(rows, target=target), found
+
+    def refined(self, rows: BoundRows, change: Array, dt: Array) -> Approach:
+        """Returns the approach with times whose derivative knows how a normal turns on the way.
+
+        Args:
+            rows: the bounded rows at the place of the first landing of their island.
+            change: h J a with an estimate of a without bounded rows, (n,), a constant.
+            dt: h, () [s].
+        """
+        *_, delay = self._delays(rows, change, dt)
+        return dataclasses.replace(self, times=with_tangent(self.times, self.times + delay))
+
+    def _delays(
+        self, rows: BoundRows, change: Array, dt: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Rows that land there, their speeds, by how much they are late, and the least by island.
+
+        Velocities are those of half a step before the step, and falls are parabolas.
+        """
+        h, known = dt[None], self.islands.rows(self.times)
+        since = numerics.safe_divide(known, h)
+        speed = -(rows.rate + (0.5 + since) * change)
+        fast = mask(rows.ends, rows) & self.lands & (speed > 0)
+        gap = rows.gap + known * (1 + since) * change / 2
+        late = quotient(jnp.where(fast, gap, 0), jnp.where(fast, speed, 1))
+        late = jnp.where(fast & (jnp.abs(late) <= h), late, 0)
+        first = self.islands.least(jnp.where(fast, late, 2 * h))
+        return fast, speed, late, jnp.where(first < 2 * h, first, 0)
 
     def supported(self, multipliers: Array) -> Array:
         """Velocities of islands in which rows act that do not land, (n_v,) or (1,)."""

@@ -142,16 +142,15 @@ class SemiImplicitEuler(Explicit):
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        end = state.instant + dt
-        state, dynamics, age = self._approached(dynamics, state, dt)
-        v, solution, rows, least, stays = self._promised(dynamics, state, dt, age)
-        q = system.retract(state.q, h * v)
+        here, dynamics, age = self._approached(dynamics, state, dt)
+        v, solution, rows, least, stays = self._promised(dynamics, here, dt, age)
+        q = system.retract(here.q, h * v)
         if least is not None and rows.layout.size:
-            q, v, solution = closer(system, state, (q, v), solution, rows, least, stays, dt)
+            q, v, solution = closer(system, here, (q, v), solution, rows, least, stays, dt)
         if (jump := jump_of(rows.reactions)) is not None:
-            q = system.retract(state.q, h * v + jump.travel)
+            q = system.retract(here.q, h * v + jump.travel)
             v, solution = v + jump.velocity, with_jump(solution, jump, dt)
-        return Advanced((q, v, end), solution, rows)
+        return Advanced((q, v, state.instant + dt), solution, rows)
 
     def _promised(
         self, dynamics: Dynamics, state: State, dt: Any, age: Any
