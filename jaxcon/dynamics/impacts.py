@@ -468,13 +468,10 @@ class Approach:
         """
         h = dt[None]
         fast, speed, late, delay = self._delays(rows, change, dt)
-        # the derivative has the refined time; the value keeps one time for all that act on each
-        # other, which keeps their angular momentum
-        times = self.times + (delay - jax.lax.stop_gradient(delay))
         slow = jnp.where(fast, h * jnp.maximum(-change, 0) / 2, 0) / jnp.where(fast, speed, 1)
         early = -self.islands.least(-jax.lax.stop_gradient(slow))
-        found = dataclasses.replace(self, times=times, early=early)
-        s = numerics.safe_divide(self.islands.rows(times), h)
+        found = dataclasses.replace(self, early=early)
+        s = numerics.safe_divide(self.islands.rows(self.times), h)
         # what lands later in the step than the first of its island takes two steps
         later = jnp.maximum(jnp.where(fast, late - self.islands.rows(delay), 0), 0)
         target = (0.5 - s) * change - numerics.safe_divide(later, h) * speed
@@ -483,7 +480,7 @@ class Approach:
         return dataclasses.replace(rows, target=target), found
 
     def refined(self, rows: BoundRows, change: Array, dt: Array) -> Approach:
-        """Returns the approach with times whose derivative knows how a normal turns on the way.
+        """Returns the approach with times by one Newton step, as normals turn on the way.
 
         Args:
             rows: the bounded rows at the place of the first landing of their island.
@@ -491,7 +488,7 @@ class Approach:
             dt: h, () [s].
         """
         *_, delay = self._delays(rows, change, dt)
-        return dataclasses.replace(self, times=with_tangent(self.times, self.times + delay))
+        return dataclasses.replace(self, times=self.times + delay)
 
     def _delays(
         self, rows: BoundRows, change: Array, dt: Array
