@@ -214,7 +214,7 @@ class Dynamics:
         else:
             change = h * rows.jacobian.apply(a)
             most = jnp.abs(change)
-        change, most = jax.lax.stop_gradient((change, most))
+        most = jax.lax.stop_gradient(most)
         islands = impacts.Islands.of(rows, held)
         approach = impacts.Approach.of(rows, change, most, self.dt, islands)
         place = self.system.retract(q, approach.by_velocity * v)

@@ -431,7 +431,7 @@ class Approach:
             dt: h, () [s].
             islands: of bodies.
         """
-        speed = -(rows.rate + jax.lax.stop_gradient(change))
+        speed = -(rows.rate + change)
         least = 2 * most + slowest(rows, change)
         may = mask(rows.ends, rows) & (rows.rate < -least)
         τ = quotient(jnp.where(may, rows.gap, 0), jnp.where(may, speed, 1))
@@ -469,7 +469,7 @@ class Approach:
         h = dt[None]
         fast, speed, late, delay = self._delays(rows, change, dt)
         slow = jnp.where(fast, h * jnp.maximum(-change, 0) / 2, 0) / jnp.where(fast, speed, 1)
-        early = -self.islands.least(-jax.lax.stop_gradient(slow))
+        early = -self.islands.least(-slow)
         found = dataclasses.replace(self, early=early)
         s = numerics.safe_divide(self.islands.rows(self.times), h)
         # what lands later in the step than the first of its island takes two steps
