@@ -212,11 +212,6 @@ class Vakonomic:
         (step, _), (p, rest) = self._split(step), self._split(p)
         return jnp.concatenate([self.system.carry(q, step, p), rest])
 
-    def seen_from(self, q: Array, before: Array, x: Array) -> Array:
-        """A velocity as that of the system, and what goes with μ as it is."""
-        x, rest = self._split(x)
-        return jnp.concatenate([self.system.seen_from(q, before, x), rest])
-
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""
         return self.system.normalize(q)

@@ -65,10 +65,6 @@ class Particle:
         """p: these velocities are rates of coordinates."""
         return p
 
-    def seen_from(self, q: Vector, before: Vector, x: Vector) -> Vector:
-        """x: these velocities are rates of coordinates."""
-        return x
-
     def kick(self, v: Vector, acceleration: Vector, moments: Any, dt: Lane) -> Vector:
         """v + h a: these velocities are rates of coordinates."""
         return v + acceleration * dt
@@ -185,11 +181,6 @@ class SpatialRigid(Particle):
         across = φ.cross(p_φ)
         turned = p_φ + across * 0.5 + φ.cross(across) * numerics.inverse_exponential(φ.dot(φ))
         return Vector(*p[:3], *turned)
-
-    def seen_from(self, q: Vector, before: Vector, x: Vector) -> Vector:
-        """A velocity in the body's frame at q, where it is x in that at another place."""
-        turn = quaternion.multiply(quaternion.conjugate(Vector(*q[3:])), Vector(*before[3:]))
-        return Vector(*x[:3], *quaternion.rotate(turn, Vector(*x[3:])))
 
     def kick(self, v: Vector, acceleration: Vector, moments: Array, dt: Lane) -> Vector:
         """Half a step of free rotation, h times all that is not gyroscopic in a, half a step more.

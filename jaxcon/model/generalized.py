@@ -135,10 +135,6 @@ class GeneralizedCoordinates:
         """p: v is q̇."""
         return p
 
-    def seen_from(self, q: Array, before: Array, x: Array) -> Array:
-        """x: v is q̇."""
-        return x
-
     def extent(self, q: Array) -> Array:
         """max |q|."""
         return jnp.max(jnp.abs(q), axis=0, initial=0)

@@ -261,12 +261,6 @@ class BodySystem:
         pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
         return _join([kind.carry(own, momentum) for kind, own, momentum in pairs], q)
 
-    def seen_from(self, q: Array, before: Array, x: Array) -> Array:
-        """A velocity (n_v,) in the frames of bodies at q, where it is x in those at `before`."""
-        groups = self.layout.groups
-        pairs = [(g.kind, g.unpack(q, x), g.unpack(before, x)[0]) for g in groups]
-        return _join([kind.seen_from(own, old, v) for kind, (own, v), old in pairs], q)
-
     def kick(self, q: Array, v: Array, acceleration: Array, dt: Any, small: bool = False) -> Array:
         """v after a step of h under a, (n_v,); free rotation in space is split off.
 
