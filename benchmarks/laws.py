@@ -15,18 +15,18 @@ import numpy as np
 
 import jaxcon as jc
 from benchmarks.bounded import SCENES, STEP
-from jaxcon.constraints.bounds import BoundRows
+from jaxcon.constraints.bounds import BoundRows, linearize_bounds
 from jaxcon.constraints.rows import linearize
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.status import failed
-from jaxcon.simulation.attempt import dynamics_at
+from jaxcon.dynamics.impacts import landing
 
 
 class Laws(NamedTuple):
     """By how much a step misses each law of its bounded rows, at worst, in proportion.
 
-    A step in which contacts land is judged at the place of the landing, see `impacts.Approach`.
+    What a contact wants of the step in which it lands is that of `impacts.landing`.
     Velocities are related to the largest at the start, V, and so are multipliers, as the velocities
     that they give to their own rows, λ̂ = h g λ/V with g as of `moved`. With û = (J v⁺ − u*)/V, û_t
     the slip, and r̂ = μ λ̂_n or the bound of a joint's friction:
@@ -125,25 +125,13 @@ def measure(name: str, dtype: Any, solver: Any, worlds: int) -> Laws:
 
     def one(key: jax.Array) -> Laws:
         start, alone = (drawn(key, system, x) for x in given)
+        rows = linearize_bounds(system, start.q, start.v, start.time, None, h)
         new, info = jc.step(system, method, start, None, h)
-        place, t, dynamics = dynamics_at(system, method, start, None, h).approached(
-            start.q, start.v, start.instant
-        )
-        rows, age, end = dynamics.bounds(place, start.v, t, h), h / 2, new.v
-        if dynamics.approach is not None:
-            age += dynamics.approach.last
-            without = dynamics_at(bare, method, alone, None, h)
-            coasting = system.coast(place, start.v, h[None])  # as the step has it in space
-            change = h * (without(place, start.v, t, age)[0].acceleration + coasting)
-            rows, refined = dynamics.approach.targets(rows, rows.jacobian.apply(change), h)
-            before, left = system.force(place, start.v, t, None), refined.left(h)
-            for _ in range(5):  # contacts act before gyroscopic forces become those after a landing
-                more = system.force(place, end, t, None) - before
-                end = new.v - left * system.mass(place).solve(more)
-        free, _ = jc.step(bare, method, dataclasses.replace(alone, q=place), None, h)
+        free, _ = jc.step(bare, method, alone, None, h)
+        rows = landing(rows, rows.jacobian.apply(free.v - start.v), h)
         speed, energy = jnp.max(jnp.abs(start.v)), jc.energy(system, start).kinetic
         size = speed, h * moved(system, start, rows), energy
-        found = judged(rows, info.reactions.multipliers, (free.v, end), size)
+        found = judged(rows, info.reactions.multipliers, (free.v, new.v), size)
         return jax.tree.map(lambda x: jnp.where(failed(new.status), jnp.inf, x), found)
 
     run = jax.jit(jax.vmap(one))

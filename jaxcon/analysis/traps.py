@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -18,6 +19,7 @@ from jaxcon.core import host
 from jaxcon.dynamics.impacts import PREFIX, doubt
 from jaxcon.dynamics.rank import linearized
 from jaxcon.simulation.choice import innermost, several, words
+from jaxcon.simulation.integrators import SemiImplicitEuler
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import instability, parts
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
@@ -315,8 +317,11 @@ def impact(known: Known) -> str | None:
     method, rows = known.method, bound_rows(known)
     if method.events is not None or rows is None:
         return None
+    if rows.lands:  # a robot has dozens, and one line names them
+        rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
     some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
-    said = doubt(rows, some)
+    lands = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
+    said = doubt(rows, lands, some)
     return None if said is None else said.removeprefix(PREFIX)
 
 

@@ -70,7 +70,7 @@ class Reactions(Mapping[str, Array]):
 
     Attributes:
         multipliers: λ (n,) [N, N m], means over the step: of an impact, its impulse over h.
-        gap: φ at its start, (n,), or where its first landing is; zero where a row has none.
+        gap: φ at its start, (n,); zero where a row has none.
         residual: by how much the laws are missed, as a velocity, ().
         kept: the part of the bounce that adds no energy, from 0 to 1, (): 1 unless it was capped.
         jump: what impacts within the step change at its end; None where there are none to come,

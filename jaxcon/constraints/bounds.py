@@ -112,6 +112,7 @@ class BoundRows:
         hard: which rows answer an impact, (n,); of a contact its normal says so for all.
         ends: which of these have a gap that closes, (n,).
         paired: which have a second stop, (n,).
+        lands: names of contacts and ropes without restitution on bodies that turn.
     """
 
     gap: Array
@@ -130,6 +131,7 @@ class BoundRows:
     hard: tuple[bool, ...] = static(default=())
     ends: tuple[bool, ...] = static(default=())
     paired: tuple[bool, ...] = static(default=())
+    lands: tuple[str, ...] = static(default=())
 
     def finite(self, bare: Array) -> Array:
         """True where all numbers of the rows are finite, ().
@@ -188,6 +190,7 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
     pairs = [
         (group.names, _told(group, group.bounds(snapshot, control, dt))) for group in system.bounds
     ]
+    lands = _lands(system, pairs)
     pairs.sort(key=lambda pair: pair[1].order)
     sets = [own for _, own in pairs]
     sizes = [len(names) * (own.points or 1) for names, own in pairs]
@@ -230,6 +233,7 @@ def linearize_bounds(system: Any, q: Array, v: Array, t: Any, control: Any, dt: 
         _by_row([s.hard for s in sets], sizes, kinds),
         _by_row([s.hard and s.rows[0].holonomic for s in sets], sizes, kinds),
         _by_row([s.far is not None for s in sets], sizes, kinds),
+        lands,
     )
 
 
@@ -251,6 +255,20 @@ def _told(group: Any, own: BoundSet) -> BoundSet:
 
 def _not_nan(x: Lane) -> Array:
     return ~jnp.isnan(x)
+
+
+def _lands(system: Any, pairs: list[tuple[tuple[str, ...], BoundSet]]) -> tuple[str, ...]:
+    """The names of contacts and ropes without restitution on bodies that turn."""
+    groups = getattr(getattr(system, "layout", None), "groups", ())
+    names: list[str] = []
+    for group, (own, rows) in zip(system.bounds, pairs, strict=True):
+        on_joint = hasattr(group, "along")  # its coordinate is the same wherever the bodies are
+        if on_joint or not (rows.hard and rows.rows[0].holonomic) or rows.restitution is not None:
+            continue
+        kinds = [groups[p.group].kind for p in rows.places if p.group is not None and groups]
+        if any(kind.n_v > system.layout.dim for kind in kinds):
+            names += own
+    return tuple(names)
 
 
 class _Column:

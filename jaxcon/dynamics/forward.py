@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -24,7 +23,6 @@ from jaxcon.dynamics import impacts
 from jaxcon.dynamics.parts import Part, Struck
 from jaxcon.dynamics.reactions import Impulse
 from jaxcon.solvers.nearest_rows import Nearest
-from jaxcon.solvers.proximal import own_diagonal
 from jaxcon.solvers.saddle import Factored, Saddle, Solution
 
 
@@ -76,7 +74,6 @@ class Dynamics:
     guess: Any = None
     held: Any = None
     part: Part | None = None
-    approach: impacts.Approach | None = None
 
     def __call__(self, q: Array, v: Array, t: Any, age: Any = None) -> tuple[Solution, Rows]:
         """a and λ at (q, v, t), and the rows there; feedback sees their rates `age` [s] ago.
@@ -129,8 +126,8 @@ class Dynamics:
             bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
             length, acts = self.dt, None
             strikes = any(bounds.ends) and (every or bounds.restitution is not None)
-            lands = self.approach is not None
-            doubt = impacts.doubt(bounds, self._leaves_out(bounds))
+            lands = lag is not None and not strikes
+            doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
             if doubt is not None:
                 gap = notices.when_differentiated(bounds.gap, doubt)
                 bounds = dataclasses.replace(bounds, gap=gap)
@@ -141,14 +138,10 @@ class Dynamics:
         impulse = self._impulse(base, law, problem, length, acts)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
-        approach, refined = self.approach if lands else None, None
-        first, aim = impulse.start, impulse.target
-        if approach is not None:
-            if aim.size:  # what feedback makes of the way to the place depends on its time
-                live = impulse.alone(impulse.saddle.force, aim).acceleration
-                first = impacts.with_tangent(first, live)
-                start = self.dt[None] * bounds.jacobian.apply(first)
-            asked, refined = approach.targets(bounds, start, self.dt)
+        seen = None
+        if lands:
+            seen = impacts.closing(bounds, start, self.dt) if notices.is_observing() else None
+            asked = impacts.landing(bounds, start, self.dt)
             impulse = dataclasses.replace(impulse, rows=asked)
         may = start > 0
         if strikes:
@@ -175,53 +168,9 @@ class Dynamics:
                 lost = impacts.passes_range(both_stops, speed, left)
                 solution = solution._replace(status=lost_impacts(solution.status, lost))
             solution, known = self._struck((q, v, t), solution, known, times, lag)
-        elif approach is not None and refined is not None:
-            solution = self._observed(solution, t, approach.lands, approach.lands, bounds)
-            smooth = jnp.where(refined.supported(known.multipliers), 0, first)
-            change = self.dt[None] * (solution.acceleration - smooth)
-            # gyroscopic forces and damping are those after the landing from τ on
-            end = v + self.dt[None] * solution.acceleration
-            forces = (self.system.force(q, x, t, self.control) for x in (end, v))
-            later = self.system.mass(q).solve(operator.sub(*forces))
-            jump = impacts.Jump(refined.left(self.dt) * later, refined.travel(v, change, approach))
-            known = dataclasses.replace(known, jump=jump)
+        elif seen is not None:
+            solution = self._observed(solution, t, seen, seen, bounds)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone, push
-
-    def approached(self, q: Array, v: Array, t: Any) -> tuple[Array, Any, Dynamics]:
-        """q and t of the first landings of a step, and the dynamics there.
-
-        Args:
-            q: positions at the start of the step, (n_q,).
-            v: velocities, (n_v,).
-            t: time, () [s].
-        """
-        if self.bounded is None or self.part is not None:
-            return q, t, self
-        shape = jax.eval_shape(self.bounds, q, v, t, self.dt)
-        if not impacts.resolves_landings(shape):
-            return q, t, self
-        rows = self.bounds(q, v, t, self.dt)
-        h, mass, held = self.dt[None], self.system.mass(q), bool(self.system.constraints)
-        force = self.system.force(q, v, t, self.control)
-        a = mass.solve(force)
-        if held:
-            # by Gauss' principle joints make no acceleration larger, but for turns
-            size = jnp.sum(a * force, axis=0)
-            if self.system.has_bodies:
-                size += self.system.squared_spin(q, v) * jnp.sum(v * mass.apply(v), axis=0)
-            light = own_diagonal(mass, rows.jacobian, v.ndim - 1)
-            most, change = h * numerics.safe_sqrt(light * size[None]), jnp.zeros_like(rows.rate)
-        else:
-            change = h * rows.jacobian.apply(a)
-            most = jnp.abs(change)
-        most = jax.lax.stop_gradient(most)
-        islands = impacts.Islands.of(rows, held)
-        approach = impacts.Approach.of(rows, change, most, self.dt, islands)
-        place = self.system.retract(q, approach.by_velocity * v)
-        there = self.bounds(place, v, t + approach.last, self.dt)
-        approach = approach.refined(there, change, self.dt)
-        place = self.system.retract(q, approach.by_velocity * v)
-        return place, t + approach.last, dataclasses.replace(self, approach=approach)
 
     def _observed(
         self, solution: Solution, t: Any, hits: Array, fast: Array, rows: BoundRows

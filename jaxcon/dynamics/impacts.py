@@ -9,15 +9,6 @@ other accelerations a⁺. At the end of a step h, with r = h − τ the rest of 
 The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
 an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
 
-A row that lands without restitution leaves with φ̇ = 0, so that φ̈ = J a⁺ + J̇ v⁺ decides what it
-does next. The contact forces after the impact obey 0 ≤ λ ⊥ φ̈ ≥ 0 and Coulomb's law, with
-J̇ v⁺ ≈ (J(q* ⊕ h v⁺) − J(q*)) v⁺ / h. The end of a rod that turns fast so lifts off at once. Without
-J̇ v⁺ it would be held down for r, by an impulse in proportion to r.
-
-The next plain step has no J̇ v: it holds a gap closed that is smaller than h² J̇ v, or ½ h² J̇ v where
-velocities are those of half a step before. The travel of a landing therefore begins earlier by
-this gap over −φ̇⁻. That changes q by O(h²), and spares the next step an impulse that depends on r.
-
 The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
 step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
 
@@ -41,12 +32,11 @@ import numpy as np
 from jaxcon.constraints.bound_layout import BoundLayout
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import pytree
 from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 from jaxcon.core.worlds import keep
 from jaxcon.dynamics.parts import mask
-from jaxcon.solvers.jacobian import Jacobian
 from jaxcon.solvers.saddle import Solution
 
 ROUNDING = 64
@@ -54,9 +44,6 @@ ROUNDING = 64
 
 PREFIX = "gradients through impacts: "
 """How the warning begins."""
-
-OVERDUE = 1 / 8
-"""The part of a step by which a landing may be late, as the step before did not foresee it."""
 
 SLOW = 2
 """Impacts slower than this many times h |a| do not bounce: the row comes to rest."""
@@ -158,13 +145,6 @@ class Arrivals:
     def by_velocity(self) -> Array:
         """τ by velocity, (n_v,) or (1,) [s]."""
         return jnp.sum(self.leads * self.times[None], axis=1)
-
-    def stay(self, rows: BoundRows) -> Array:
-        """A mask of the rows that arrive and do not rebound, (n,)."""
-        stays = self.hits
-        if rows.restitution is not None:
-            stays &= ~(self.bounces & (rows.restitution > 0))
-        return rows.kinds.by_contact(stays)
 
     def refined(self, rows: BoundRows) -> Arrivals:
         """Refines the times by one Newton step on the gaps at the place of the impact.
@@ -328,233 +308,54 @@ def closing(rows: BoundRows, change: Array, dt: Array) -> Array:
     return mask(rows.ends, rows) & fast & (rows.gap > 0) & (rows.gap < -dt[None] * rows.rate)
 
 
-@dataclass(frozen=True)
-class Islands:
-    """Sets of bodies between which nothing can act.
+def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
+    """Sets the targets of contacts without restitution for a step in which they may land.
 
-    Attributes:
-        by_row: the island of each bounded row, (n,).
-        by_velocity: the island of each velocity, (n_v,).
-    """
-
-    by_row: np.ndarray
-    by_velocity: np.ndarray
-
-    @classmethod
-    def of(cls, rows: BoundRows, joined: bool) -> Islands:
-        """Returns the islands of a system by the structure of its bounded rows.
-
-        Args:
-            rows: the bounded rows; only their static fields are read.
-            joined: whether bodies are held by joints, too: one island has them all.
-        """
-        n, n_v = rows.jacobian.shape
-        if joined or not isinstance(rows.jacobian, Jacobian):
-            return cls(np.zeros(n, int), np.zeros(n_v, int))
-        links = []
-        for block in rows.jacobian.blocks:
-            m, k = block.shape
-            own = block.start + np.arange(m * k).reshape(m, k)
-            links += [
-                (np.broadcast_to(own[i], columns.shape), n + columns)
-                for i in range(m)
-                for columns in [block.columns.index()]
-            ]
-        ones = [[x.ravel() for x in pair] for pair in zip(*links, strict=True)]
-        ends = [np.concatenate(x) for x in ones]
-        names = np.arange(n + n_v)
-        while True:  # the least number of those that are linked, until none changes
-            before = names.copy()
-            least = np.minimum(*(names[x] for x in ends))
-            for x in ends:
-                np.minimum.at(names, x, least)
-            if np.array_equal(names, before):
-                break
-        known = np.unique(names[:n])
-        found = np.searchsorted(known, names)
-        lonely = ~np.isin(names, known)
-        return cls(found[:n], np.where(lonely, 0, found)[n:])
-
-    @property
-    def count(self) -> int:
-        """How many there are."""
-        return int(self.by_row.max(initial=0)) + 1
-
-    def least(self, values: Array) -> Array:
-        """The least of the values of the rows of each island, (islands,)."""
-        if self.count == 1:
-            return jnp.min(values, axis=0, keepdims=True)
-        return jnp.stack([jnp.min(values[self.by_row == i], axis=0) for i in range(self.count)])
-
-    def rows(self, values: Array) -> Array:
-        """Values of islands by row, (n,) or (1,)."""
-        return values if self.count == 1 else values[self.by_row]
-
-    def velocities(self, values: Array) -> Array:
-        """Values of islands by velocity, (n_v,) or (1,)."""
-        return values if self.count == 1 else values[self.by_velocity]
-
-
-@pytree
-class Approach:
-    """The first landings without restitution in a step of semi-implicit Euler.
-
-    Forces and constraints are evaluated at q* = q ⊕ τ v, and q_end = q* ⊕ (h − τ) v⁺. Both parts of
-    the way and the impulse between them keep momentum and angular momentum.
-
-    Attributes:
-        times: τ of the first landing by island, (islands,) [s]; zero where nothing lands.
-        happens: islands in which a row lands, (islands,).
-        lands: rows that land, with the tangents of their contacts, (n,).
-        waits: rows that land in the next step, (n,).
-        early: how much earlier the travel with v⁺ begins, (islands,) [s]; see `targets`.
-        islands: of bodies.
-    """
-
-    times: Array
-    happens: Array
-    lands: Array
-    waits: Array
-    early: Array
-    islands: Islands = static()
-
-    @classmethod
-    def of(
-        cls, rows: BoundRows, change: Array, most: Array, dt: Array, islands: Islands
-    ) -> Approach:
-        """Returns which rows land within a step, and when the first of each island does.
-
-        Args:
-            rows: the bounded rows at the start of the step.
-            change: h J a with an estimate of a without bounded rows, (n,).
-            most: h |J a|, at most, (n,): a row that is no faster than twice as much may rest.
-            dt: h, () [s].
-            islands: of bodies.
-        """
-        speed = -(rows.rate + change)
-        least = 2 * most + slowest(rows, change)
-        may = mask(rows.ends, rows) & (rows.rate < -least)
-        τ = quotient(jnp.where(may, rows.gap, 0), jnp.where(may, speed, 1))
-        may &= jnp.abs(τ) <= 2 * dt[None]
-        lands = jax.lax.stop_gradient(may & (τ <= dt[None]) & (τ > -OVERDUE * dt[None]))
-        waits = jax.lax.stop_gradient(may & (τ > dt[None]))
-        first = islands.least(jnp.where(lands, τ, 2 * dt[None]))
-        happens = first < 2 * dt[None]
-        times, lands = jnp.where(happens, first, 0), rows.kinds.by_contact(lands)
-        return cls(times, happens, lands, waits, jnp.zeros_like(times), islands)
-
-    @property
-    def by_velocity(self) -> Array:
-        """τ by velocity, (n_v,) or (1,) [s]."""
-        return self.islands.velocities(self.times)
-
-    @property
-    def last(self) -> Array:
-        """The last τ of all islands, () [s]."""
-        return jnp.max(self.times, axis=0)
-
-    def targets(self, rows: BoundRows, change: Array, dt: Array) -> tuple[BoundRows, Approach]:
-        """Returns the rows with the targets of a landing, and the approach with refined times.
-
-        Velocities belong half a step before positions. A row that comes to rest at τ and then
-        accelerates with c therefore ends the step with (½ − τ/h) h c. The next step holds a gap
-        closed that is smaller than what c makes in it, so the travel with v⁺ begins earlier by
-        h |c| h/2 over the speed of the landing where c presses.
-
-        Args:
-            rows: the bounded rows at the place of the first landing of their island.
-            change: h J a without bounded rows, (n,), a constant.
-            dt: h, () [s].
-        """
-        h = dt[None]
-        fast, speed, late, delay = self._delays(rows, change, dt)
-        slow = jnp.where(fast, h * jnp.maximum(-change, 0) / 2, 0) / jnp.where(fast, speed, 1)
-        early = -self.islands.least(-slow)
-        found = dataclasses.replace(self, early=early)
-        s = numerics.safe_divide(self.islands.rows(self.times), h)
-        # what lands later in the step than the first of its island takes two steps
-        later = jnp.maximum(jnp.where(fast, late - self.islands.rows(delay), 0), 0)
-        target = (0.5 - s) * change - numerics.safe_divide(later, h) * speed
-        target = jnp.where(self.lands, target, rows.target)
-        target = jnp.where(self.waits, target + OVERDUE / 2 * rows.rate, target)
-        return dataclasses.replace(rows, target=target), found
-
-    def refined(self, rows: BoundRows, change: Array, dt: Array) -> Approach:
-        """Returns the approach with times by one Newton step, as normals turn on the way.
-
-        Args:
-            rows: the bounded rows at the place of the first landing of their island.
-            change: h J a with an estimate of a without bounded rows, (n,), a constant.
-            dt: h, () [s].
-        """
-        *_, delay = self._delays(rows, change, dt)
-        return dataclasses.replace(self, times=self.times + delay)
-
-    def _delays(
-        self, rows: BoundRows, change: Array, dt: Array
-    ) -> tuple[Array, Array, Array, Array]:
-        """Rows that land there, their speeds, by how much they are late, and the least by island.
-
-        Velocities are those of half a step before the step, and falls are parabolas.
-        """
-        h, known = dt[None], self.islands.rows(self.times)
-        since = numerics.safe_divide(known, h)
-        speed = -(rows.rate + (0.5 + since) * change)
-        fast = mask(rows.ends, rows) & self.lands & (speed > 0)
-        gap = rows.gap + known * (1 + since) * change / 2
-        late = quotient(jnp.where(fast, gap, 0), jnp.where(fast, speed, 1))
-        late = jnp.where(fast & (jnp.abs(late) <= h), late, 0)
-        first = self.islands.least(jnp.where(fast, late, 2 * h))
-        return fast, speed, late, jnp.where(first < 2 * h, first, 0)
-
-    def supported(self, multipliers: Array) -> Array:
-        """Velocities of islands in which rows act that do not land, (n_v,) or (1,)."""
-        acts = jnp.where(self.lands, 0, multipliers) != 0
-        return self.islands.velocities(self.islands.least(jnp.where(acts, 0, 1)) == 0)
-
-    def left(self, dt: Array) -> Array:
-        """The time from a landing to that of the velocities, h/2 − τ, (n_v,) or (1,) [s]."""
-        return self.islands.velocities(jnp.where(self.happens, dt[None] / 2 - self.times, 0))
-
-    def travel(self, v: Array, change: Array, before: Approach) -> Array:
-        """What is to be added to h v⁺ from the place on, (n_v,)."""
-        late = self.islands.velocities(self.times - self.early)
-        return -late * change - before.by_velocity * v
-
-
-@jax.custom_jvp
-def with_tangent(x: Array, live: Array) -> Array:
-    """Returns x with the derivative of another computation of it, which nothing else evaluates."""
-    return x
-
-
-@with_tangent.defjvp
-def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return primals[0], tangents[1]
-
-
-def resolves_landings(rows: BoundRows) -> bool:
-    """Returns True where landings without restitution begin at their place.
+    A contact that closes after τ = s h is to end the step with the mean of its velocity over it:
+    s u⁻ along the normal, which closes the gap, and as much along the tangents, which holds
+    friction back until τ. The next step does the rest of the impact. As both impulses are the
+    shares 1 − s and s of one, at the places before and after, the two steps have the time of the
+    impact and its place, and so have their derivatives. That costs nothing, unlike an `Impact`.
 
     Args:
-        rows: the bounded rows; only their static fields are read.
+        rows: the bounded rows at the start of the step.
+        change: h J a without bounded rows, (n,), a constant: what is no faster rests.
+        dt: h, () [s].
     """
-    return any(rows.ends) and rows.restitution is None
+    kinds = rows.kinds
+    if not kinds.contacts:
+        return rows
+    gap, rate = kinds.split(rows.gap).normal, kinds.split(rows.rate)
+    least = kinds.split(jnp.abs(change) + slowest(rows, change)).normal
+    way = -dt[None] * rate.normal
+    closes = (rate.normal < -least) & (gap > 0) & (gap < way)
+    share = quotient(jnp.where(closes, gap, 0), jnp.where(closes, way, 1))
+    parts = kinds.split(rows.target)
+    discs = tuple(u * disc.of(share) for disc, u in zip(kinds.discs, rate.discs, strict=True))
+    return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
 
 
-def doubt(rows: BoundRows, some: bool) -> str | None:
+def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
     """Why derivatives of plain steps through impacts may be wrong, by structure; None if not.
 
     Args:
         rows: the bounded rows; only their static fields are read.
+        lags: whether velocities are those of half a step before the positions.
         some: whether the solver leaves rows out.
     """
-    if not (some and any(rows.ends)):
-        return None
-    return (
-        f"{PREFIX}beside Nearest, impacts of several bodies within one step have the time of the"
-        " first; InteriorPoint() alone, or Events(), tells them apart."
-    )
+    reasons = []
+    if lags and rows.lands:
+        reasons.append(
+            f"a landing of {', '.join(rows.lands)} takes two steps, so that where a body turns as"
+            " it lands on a corner or on another body, its derivative is right only in the mean"
+            " over the phases of a step; restitution=jnp.zeros(()) or Events() makes it one"
+        )
+    if some and any(rows.ends):
+        reasons.append(
+            "beside Nearest, impacts of several bodies within one step have the time of the first;"
+            " InteriorPoint() alone, or Events(), tells them apart"
+        )
+    return f"{PREFIX}{'; '.join(reasons)}." if reasons else None
 
 
 @dataclass(frozen=True)
@@ -599,20 +400,15 @@ class Impact:
         place, before, time = self._there(arrivals)
         τ = arrivals.by_velocity
 
-        def find(v: Array, lasts: Array) -> tuple[Array, Any]:
+        def find(v: Array, lasts: Array) -> tuple[Array, Found]:
             known = self.laws.rows(place, v, time)
-            ahead = self.laws.rows(self.system.retract(place, h * v), v, time + self.dt)
-            bend = jnp.where(lasts & arrivals.stay(known), ahead.rate - known.rate, 0)
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
-            rows = dataclasses.replace(rows, rate=rows.rate + jax.lax.stop_gradient(bend))
             found = self.laws.find(place, v, time, rows, acts, lasts)
-            return v + jnp.where(lasts, 0, found.change), (found, known.rate, bend)
+            return v + jnp.where(lasts, 0, found.change), found
 
         # the impact and what follows are one program, which halves what there is to compile
-        _, stages = jax.lax.scan(find, before, jnp.asarray([False, True]))
-        (struck, rate, _), (after, _, bend) = (
-            jax.tree.map(lambda x, i=i: x[i], stages) for i in range(2)
-        )
+        _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
+        struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
         rest, left = h - τ, (1 - self.lag) * h - τ
         # from the acceleration just before the impact, not from that at the start of the step
         smooth = self._gyroscopic(before) - self._gyroscopic(self.v)
@@ -621,10 +417,7 @@ class Impact:
         # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
-        lift = (1 - self.lag) * h * jnp.maximum(bend, 0)
-        early = jnp.minimum(numerics.safe_divide(lift, jnp.abs(rate)), h)
-        early = jnp.sum(arrivals.leads * jax.lax.stop_gradient(early)[None], axis=1)
-        travel = (rest + early) * struck.change + rest * rest / 2 * more + swing
+        travel = rest * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
         share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)

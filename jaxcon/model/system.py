@@ -311,15 +311,6 @@ class BodySystem:
         """True where bodies have an orientation in space."""
         return any(g.kind.n_q != g.kind.n_v for g in self.layout.groups)
 
-    def squared_spin(self, q: Array, v: Array) -> Array:
-        """The square of the largest angular velocity of a body, () [rad²/s²]."""
-        most = jnp.zeros(v.shape[1:], v.dtype)
-        for g in self.layout.groups:
-            if g.kind.n_v > g.kind.dim:
-                ω = Vector(*g.unpack(q, v)[1][g.kind.dim :])
-                most = jnp.maximum(most, jnp.max(ω.dot(ω), axis=0))
-        return most
-
     def squared_turn(self, q: Array, v: Array, before: Array, rows: Any, dt: Any) -> Array:
         """The square of the largest turn in a step, of bodies and of rods, () [rad²].
 
@@ -330,7 +321,11 @@ class BodySystem:
             rows: the constraints.
             dt: h, (1,) [s].
         """
-        most, bends = self.squared_spin(q, v), jnp.zeros(v.shape[1:], v.dtype)
+        most = bends = jnp.zeros(v.shape[1:], v.dtype)
+        for g in self.layout.groups:
+            if g.kind.n_v > g.kind.dim:
+                ω = Vector(*g.unpack(q, v)[1][g.kind.dim :])
+                most = jnp.maximum(most, jnp.max(ω.dot(ω), axis=0))
         for swing in rows.swings.values():
             most = jnp.maximum(most, jnp.max(swing, axis=0))
         for start, blocks in rows.jacobian.by_rows():

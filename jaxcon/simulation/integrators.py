@@ -26,7 +26,7 @@ from jaxcon.core.worlds import keep
 from jaxcon.dynamics.forward import Dynamics
 from jaxcon.dynamics.impacts import jump_of, with_jump
 from jaxcon.dynamics.islands import largest_by_island, rows_beside_contact
-from jaxcon.model.state import State, at_instant
+from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
 
 
@@ -131,40 +131,30 @@ class SemiImplicitEuler(Explicit):
         system, h = dynamics.system, dt[None]
         if system.has_bodies:
             return self._of_bodies(dynamics, state, dt)
-        here, dynamics, age = self._approached(dynamics, state, dt)
-        solution, rows = dynamics(here.q, here.v, here.instant, age)
+        solution, rows = dynamics(state.q, state.v, state.instant, dt / 2)
         v = moving = state.v + h * solution.acceleration
         if (jump := jump_of(rows.reactions)) is not None:
             moving = v - jump.velocity + numerics.safe_divide(jump.travel, h)
-        q = system.retract(here.q, h * moving)
+        q = system.retract(state.q, h * moving)
         return Advanced((q, v, state.instant + dt), solution, rows)
-
-    def _approached(self, dynamics: Dynamics, state: State, dt: Any) -> tuple[State, Dynamics, Any]:
-        """The state at the first landings of the step, the dynamics there, and the age of v."""
-        q, t, dynamics = dynamics.approached(state.q, state.v, state.instant)
-        if dynamics.approach is None:
-            return state, dynamics, dt / 2
-        here = at_instant(dataclasses.replace(state, q=q), t)
-        return here, dynamics, dt / 2 + dynamics.approach.last
 
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        here, dynamics, age = self._approached(dynamics, state, dt)
-        v, solution, rows, solve_rows, skip_newton = self._linearized_step(dynamics, here, dt, age)
+        v, solution, rows, solve_rows, skip_newton = self._linearized_step(dynamics, state, dt)
         if solve_rows is not None and rows.layout.size:
             v, solution = newton_correction(
-                system, here, v, solution, rows, solve_rows, skip_newton, dt
+                system, state, v, solution, rows, solve_rows, skip_newton, dt
             )
         travel = h * v
         if (jump := jump_of(rows.reactions)) is not None:
             travel, v = travel + jump.travel, v + jump.velocity
             solution = with_jump(solution, jump, dt)
-        q = system.retract(here.q, travel)
+        q = system.retract(state.q, travel)
         return Advanced((q, v, state.instant + dt), solution, rows)
 
     def _linearized_step(
-        self, dynamics: Dynamics, state: State, dt: Any, age: Any
+        self, dynamics: Dynamics, state: State, dt: Any
     ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
         """v⁺, a and λ, rows, `solve_rows` and `skip_newton` of `newton_correction`.
 
@@ -175,13 +165,13 @@ class SemiImplicitEuler(Explicit):
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.turns_in_space:
             ahead = dynamics.bounds_ahead(*here) if system.bounds else None
-            solution, rows, solve_rows, _ = dynamics.factored(*here, age, ahead)
+            solution, rows, solve_rows, _ = dynamics.factored(*here, dt / 2, ahead)
             skip_newton = None
             if ahead is not None and rows.reactions is not None:
                 skip_newton = rows_beside_contact(rows.jacobian, ahead, rows.reactions.multipliers)
             return state.v + h * solution.acceleration, solution, rows, solve_rows, skip_newton
         if not system.bounds:
-            solution, rows, solve_rows, _ = dynamics.factored(*here, age)
+            solution, rows, solve_rows, _ = dynamics.factored(*here, dt / 2)
             small = solve_rows is not None and rows.layout.size > 0  # others are corrected later
             v = system.kick(state.q, state.v, solution.acceleration, h, small)
             return v, solution, rows, solve_rows, None
@@ -189,7 +179,7 @@ class SemiImplicitEuler(Explicit):
         pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
         coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
         held = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
-        solution, rows, solve_rows, push = held.factored(*here, age, bounds)
+        solution, rows, solve_rows, push = held.factored(*here, dt / 2, bounds)
         v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
         if push is not None:
             straight = state.v + h * solution.acceleration
