@@ -140,3 +140,15 @@ def test_a_report_knows_the_frequencies_of_springs():
     assert "step" not in report.warnings
     assert "h ω = 0.35 by gravity and springs" in str(report)
     assert jc.report(*scene.build(), jc.Method()).angle is None
+
+
+def test_a_drive_near_its_turning_point_is_no_turn():
+    """A cart on a rail accelerates from rest: it cannot turn, however slow it is."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("c", mass=1.0, inertia=0.1, position=(0.0, 0.0), velocity=(1e-6, 0.0))
+    rail = jc.Prismatic("rail", jc.WORLD, "c", point=(0.0, 0.0), axis=(1.0, 0.0))
+    scene.add(rail)
+    scene.add(jc.Drive("drive", "rail", lambda t, _: 0.5 * t**2 + 1e-6 * t))
+    system, state = scene.build()
+    angle = jc.report(system, state, jc.Method(), 1e-3).angle
+    assert angle.turning.value < 1e-6

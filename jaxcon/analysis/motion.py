@@ -145,12 +145,18 @@ def _curved(
     v: np.ndarray,
     inverse: np.ndarray | None,
 ) -> Rate:
-    """|Jᵀλ(γ)| / |v| in the metric of M: how fast constraints turn the direction of v."""
+    """|Jᵀλ(γ)| / |v| in the metric of M: how fast constraints turn the direction of v.
+
+    What is left of γ at v = 0 is a drive's own acceleration, which turns nothing.
+    """
     if inverse is None:
         return Rate(0.0, "")
     held, factor = metric
     rows = known.rows if state is known.state else linearized(known.system, state)[0]
-    γ = np.asarray(rows.bias, np.float64)[held.numbers] / held.length
+    still = dataclasses.replace(state, v=np.zeros_like(np.asarray(state.v)))
+    γ = np.asarray(rows.bias, np.float64)
+    γ = γ - np.asarray(linearized(known.system, still)[0].bias, np.float64)
+    γ = γ[held.numbers] / held.length
     bend = inverse @ -γ
     speed = float(np.linalg.norm(factor.T @ v))
     if speed < LEAST:
