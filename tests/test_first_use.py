@@ -1,4 +1,4 @@
-"""What the library tells a first-time user: units, names and short numbers in its messages."""
+"""Messages for a first-time user have units, names and short numbers."""
 
 import jax
 import numpy as np
@@ -80,7 +80,7 @@ def test_redundant_rows_are_named_once():
 
 
 def test_each_error_in_the_picture_says_on_which_linkages():
-    """The same number may stand in both panels, of the linkages tuned on and of others."""
+    """Legends name the linkages, as errors on both sets may round to one number."""
     plt = pytest.importorskip("matplotlib.pyplot")
     figure, axes = plt.subplots(1, 2)
     history = np.array([3e-7, 2e-7, 1e-7])

@@ -166,11 +166,11 @@ class Clock:
 
     @property
     def left(self) -> float:
-        """What is left of the budget [s]; negative beyond it."""
+        """The rest of the budget [s]; negative beyond it."""
         return self.budget - self.spent
 
     def asks(self, work: str, guess: float | None = None) -> float:
-        """What one more piece of this kind of work may take [s].
+        """The longest time that one more piece of this kind of work may take [s].
 
         Args:
             work: its kind.

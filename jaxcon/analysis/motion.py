@@ -92,11 +92,15 @@ def step_angle(known: Known) -> StepAngle | None:
     reaction = np.zeros(0) if inverse is None else -(pull @ inverse)
     along = pull if inverse is None else pull + held.values.T @ reaction
     a = np.linalg.solve(factor.T, along)
-    turning = max(_spin(system, v), _curved(known, (held, factor), state, v, inverse), key=_value)
+    at_rest = dataclasses.replace(state, v=np.zeros(len(v), dtype))
+    driven = np.asarray(linearized(system, at_rest)[0].bias, np.float64)
+    bends = np.asarray(known.rows.bias, np.float64) - driven
+    turning = max(_spin(system, v), _curved(known, (held, factor), bends, v, inverse), key=_value)
     falling = _spin(system, a)
     swinging = [Rate(float(np.sqrt(falling.value)), falling.name)]
     at_a = dataclasses.replace(state, v=np.asarray(a, dtype))
-    swinging.append(_root(_curved(known, (held, factor), at_a, a, inverse)))
+    bends = np.asarray(linearized(system, at_a)[0].bias, np.float64) - driven
+    swinging.append(_root(_curved(known, (held, factor), bends, a, inverse)))
     limit = largest_stable_rate(known.method.integrator, 1.0, 0.0)
     # what is stable at every step damps stiff springs and light masses, and is taken for that
     if len(v) <= MOST_VELOCITIES and np.isfinite(limit):
@@ -141,23 +145,23 @@ def _spin(system: Any, v: np.ndarray) -> Rate:
 def _curved(
     known: Known,
     metric: tuple[UnitRows, np.ndarray],
-    state: State,
+    bends: np.ndarray,
     v: np.ndarray,
     inverse: np.ndarray | None,
 ) -> Rate:
     """|Jᵀλ(γ)| / |v| in the metric of M: how fast constraints turn the direction of v.
 
-    What is left of γ at v = 0 is a drive's own acceleration, which turns nothing.
+    Args:
+        known: the scene.
+        metric: the rows at unit length, and L of M = L Lᵀ.
+        bends: γ(v) − γ(0), (n_c,): without a drive's own acceleration, which turns nothing.
+        v: velocities, (n_v,).
+        inverse: the pseudoinverse of the rows; None without any.
     """
     if inverse is None:
         return Rate(0.0, "")
     held, factor = metric
-    rows = known.rows if state is known.state else linearized(known.system, state)[0]
-    still = dataclasses.replace(state, v=np.zeros_like(np.asarray(state.v)))
-    γ = np.asarray(rows.bias, np.float64)
-    γ = γ - np.asarray(linearized(known.system, still)[0].bias, np.float64)
-    γ = γ[held.numbers] / held.length
-    bend = inverse @ -γ
+    bend = inverse @ -(bends[held.numbers] / held.length)
     speed = float(np.linalg.norm(factor.T @ v))
     if speed < LEAST:
         return Rate(0.0, "")

@@ -44,7 +44,7 @@ REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeErro
 
 @dataclass(frozen=True)
 class Unit:
-    """What was found of one method in one precision.
+    """The results of one method in one precision.
 
     Attributes:
         runs: at all steps.
