@@ -119,13 +119,15 @@ class Dynamics:
             law: of the stabilizer.
             problem: the saddle system of both.
             lag: velocities are those of lag · h before the positions; None for none.
-            every: whether impacts are told apart in scenes without restitution, too.
+            every: whether landings without restitution are impacts beside every solver.
             ahead: the bounded rows, from `bounds_ahead`; None where they are not known yet.
         """
         if self.part is None:
             bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
             length, acts = self.dt, None
-            strikes = any(bounds.ends) and (every or bounds.restitution is not None)
+            # an impact takes two more solves, which sweeps save where nothing can bounce
+            apart = every or self.bounded.exact or bounds.restitution is not None
+            strikes = any(bounds.ends) and apart
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
             if doubt is not None:
