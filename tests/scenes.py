@@ -550,6 +550,8 @@ def core(dim: int, topology: str) -> tuple[str, ...]:
 ALL = tuple(name for dim in PARTS for topology in TOPOLOGIES for name in parts(dim, topology))
 """Scenes that together hold every joint in every place."""
 NAMES = (*ALL, *OTHERS)
+SELECTED = (*parts(2, "loop"), *core(3, "loop"), *OTHERS)
+"""Scenes that together hold every kind of row, in the plane and in space."""
 
 
 def names(*topologies: str) -> tuple[str, ...]:
