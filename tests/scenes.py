@@ -306,6 +306,8 @@ CORE = (
 """Joints of every kind of row, for tests in which compiling all of them would take minutes."""
 PARTS = {2: 2, 3: 5}
 """Scenes among which the joints of one place are shared out: compiling grows faster than they."""
+CORE_PARTS = {2: 1, 3: 3}
+"""Scenes among which those of the core are shared out."""
 TOPOLOGIES = ("tree", "between", "loop")
 
 
@@ -533,14 +535,23 @@ OTHERS = {
     "polar": polar_scene,
     "arm": arm_scene,
 }
-ALL = tuple(
-    f"part{i}-{dim}d-{topology}"
-    for dim, parts in PARTS.items()
-    for topology in TOPOLOGIES
-    for i in range(parts)
-)
+
+
+def parts(dim: int, topology: str) -> tuple[str, ...]:
+    """The scenes that together hold every joint in this place."""
+    return tuple(f"part{i}-{dim}d-{topology}" for i in range(PARTS[dim]))
+
+
+def core(dim: int, topology: str) -> tuple[str, ...]:
+    """The scenes that together hold the joints of the core in this place."""
+    return tuple(f"core{i}-{dim}d-{topology}" for i in range(CORE_PARTS[dim]))
+
+
+ALL = tuple(name for dim in PARTS for topology in TOPOLOGIES for name in parts(dim, topology))
 """Scenes that together hold every joint in every place."""
 NAMES = (*ALL, *OTHERS)
+SELECTED = (*parts(2, "loop"), *core(3, "loop"), *OTHERS)
+"""Scenes that together hold every kind of row, in the plane and in space."""
 
 
 def names(*topologies: str) -> tuple[str, ...]:
@@ -564,11 +575,12 @@ def build(name: str, dtype: str = "float64") -> Built:
 
 
 def kinds_of(kind: str, dim: int) -> tuple[str, ...]:
-    """The joints of a scene: one, those of the core, all, or a part of all."""
+    """The joints of a scene: one, a part of the core, or a part of all."""
     if kind in JOINTS:
         return (kind,)
-    kinds = tuple(key for key in (CORE if kind == "core" else JOINTS) if dim in JOINTS[key].dims)
-    return kinds[int(kind[4:]) :: PARTS[dim]] if kind.startswith("part") else kinds
+    table, count = (CORE, CORE_PARTS) if kind.startswith("core") else (JOINTS, PARTS)
+    kinds = tuple(key for key in table if dim in JOINTS[key].dims)
+    return kinds[int(kind[4:]) :: count[dim]]
 
 
 def finish(

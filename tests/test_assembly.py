@@ -221,7 +221,7 @@ def test_the_derivative_by_a_length_and_by_the_start():
         jax.tree.map(lambda a, b: (a - b) / 2e-5, closed(x + s), closed(x - s)) for s in steps
     ]
     expected = [np.stack(column, -1) for column in zip(*columns, strict=True)]
-    for found in (jax.jacfwd(closed)(x), jax.jacrev(closed)(x)):
+    for found in jax.jit(lambda x: (jax.jacfwd(closed)(x), jax.jacrev(closed)(x)))(x):
         for a, b in zip(found, expected, strict=True):
             np.testing.assert_allclose(a, b, rtol=DIFFERENCE, atol=DIFFERENCE)
 
@@ -245,7 +245,7 @@ def test_the_derivative_beside_redundant_rows():
 def test_second_derivatives():
     """The nearest point of a circle of radius r: q = r n, so ∂q/∂q₀ = r (1 − n nᵀ)/‖q₀‖."""
     system, state = bead((3.0, 4.0))
-    hessian = jax.jacfwd(jax.jacrev(lambda q: jc.assemble(system, q).q))(state.q)
+    hessian = jax.jit(jax.jacfwd(jax.jacrev(lambda q: jc.assemble(system, q).q)))(state.q)
     expected = jax.jacfwd(jax.jacrev(lambda q: q / jnp.sqrt(q @ q)))(state.q)
     np.testing.assert_allclose(hessian, expected, atol=1e-10)
 

@@ -55,7 +55,7 @@ def close(got, expected, tolerance=DERIVATIVE):
         np.testing.assert_allclose(x, y, atol=tolerance * scale, rtol=0)
 
 
-PLACES = [f"part{i}-{d}d-{t}" for d, n in scenes.PARTS.items() for i in range(n) for t in ("loop",)]
+PLACES = [name for dim in (2, 3) for name in scenes.parts(dim, "loop")]
 
 
 @pytest.mark.parametrize("name", [*PLACES, "mixed-2d", "mixed-3d"])
@@ -105,8 +105,11 @@ def coordinates(system, state):
 
 def elements():
     """All groups of elements between bodies of the joints' table, contacts and forces."""
-    for name in [f"all-{dim}d-between" for dim in (2, 3)]:
-        yield from scenes.build(name).system.constraints
+    for dim in (2, 3):
+        scene = jc.Scene(dim=dim)
+        for kind in [kind for kind, joint in scenes.JOINTS.items() if dim in joint.dims]:
+            scenes.add_joint(scene, kind, "between", "_" + kind, scenes.seeded(kind, dim))
+        yield from scene.build()[0].constraints
     for system in (contacts_scene()[0], pushed_scene()[0], twisted()[0]):
         yield from (*system.constraints, *system.forces, *system.bounds)
 
