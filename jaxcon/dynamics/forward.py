@@ -148,7 +148,8 @@ class Dynamics:
         may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
-            may = impacts.candidates(bouncy, start, self.dt)
+            most = self.dt[None] * bounds.jacobian.reach(impulse.start)
+            may = impacts.candidates(bouncy, start, most, self.dt)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))

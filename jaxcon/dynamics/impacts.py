@@ -175,19 +175,21 @@ class Arrivals:
         return dataclasses.replace(self, times=self.times + late)
 
 
-def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
+def candidates(rows: BoundRows, change: Array, most: Array, dt: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
-    what accelerations make in a step: slower ones rest, and bear what presses on them.
+    what accelerations can make in a step: slower ones rest, and bear what presses on them. In a
+    stack, whose blocks fall together without contacts, J a is zero, and rates are rounding.
 
     Args:
         rows: the bounded rows at the start of the step.
         change: h J a without bounded rows, (n,).
+        most: h |J| |a| without bounded rows, (n,).
         dt: h, () [s].
     """
     e, least = rows.restitution, slowest(rows, change)
-    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
+    rests = most if e is None else jnp.where(e >= 0, 0, most)
     least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
@@ -449,7 +451,8 @@ class Impact:
         longer = jnp.sum(arrivals.leads * jax.lax.stop_gradient(longer)[None], axis=1)
         travel = (rest + longer) * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
-        share = ((1 - self.lag) * self.dt - arrivals.first)[None]
+        # forces of half a step before positions may end before the impact, and then have no share
+        share = jnp.maximum((1 - self.lag) * self.dt - arrivals.first, 0)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
         struck = struck._replace(multipliers=impulses, joints=joints)
