@@ -13,10 +13,10 @@ A contact that lands without rebound has φ̇ = 0 after the impact. Its accelera
 decides what follows: the contact forces obey 0 ≤ λ ⊥ J a⁺ + J̇ v⁺ ≥ 0 and Coulomb's law. The end of
 a rod that turns fast so lifts off at once. J̇ v⁺ is the difference (J(q* ⊕ h v⁺) − J(q*)) v⁺ / h.
 
-The plain step that follows has no J̇ v. It would close again a gap below h² J̇ v, or below ½h² J̇ v
-where velocities are those of half a step before, by an impulse that depends on r. The displacement
-after the impact is therefore that of a time longer by h² J̇ v / |φ̇⁻|, or half of it. This is a
-change of O(h²).
+The plain step that follows has no J̇ v. Where J a⁺ < 0 presses, it would close again a small gap, by
+an impulse that depends on r. The displacement after the impact is therefore that of a time longer
+by h² min(−J a⁺, J̇ v⁺) / |φ̇⁻|, or half of it where velocities are those of half a step before. This
+is a change of O(h²).
 
 The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
 step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
@@ -430,11 +430,13 @@ class Impact:
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
             rows = dataclasses.replace(rows, rate=rows.rate + jax.lax.stop_gradient(curvature))
             found = self.laws.find(place, v, time, rows, acts, lasts)
-            return v + jnp.where(lasts, 0, found.change), (found, known.rate, curvature)
+            pressing = -h * known.jacobian.apply(found.change)
+            opening = jnp.clip(pressing, 0, jnp.maximum(curvature, 0))
+            return v + jnp.where(lasts, 0, found.change), (found, known.rate, opening)
 
         # the impact and what follows are one program, which halves what there is to compile
         _, stages = jax.lax.scan(find, before, jnp.asarray([False, True]))
-        (struck, rate, _), (after, _, curvature) = (
+        (struck, rate, _), (after, _, opening) = (
             jax.tree.map(lambda x, i=i: x[i], stages) for i in range(2)
         )
         rest, left = h - τ, (1 - self.lag) * h - τ
@@ -446,8 +448,8 @@ class Impact:
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
         # the next step is to find open what lifts off; see the docstring of the module
-        opening = (1 - self.lag) * h * jnp.maximum(curvature, 0)
-        longer = jnp.minimum(numerics.safe_divide(opening, jnp.abs(rate)), h)
+        longer = (1 - self.lag) * h * numerics.safe_divide(opening, jnp.abs(rate))
+        longer = jnp.minimum(longer, h)
         longer = jnp.sum(arrivals.leads * jax.lax.stop_gradient(longer)[None], axis=1)
         travel = (rest + longer) * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
