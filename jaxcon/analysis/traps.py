@@ -320,9 +320,8 @@ def impact(known: Known) -> str | None:
     if rows.lands:  # a robot has dozens, and one line names them
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
     some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
-    sweeps = not method.resolve(known.system, known.state).bounded.exact
-    shared = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
-    said = doubt(rows, shared and sweeps, some)
+    lands = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
+    said = doubt(rows, lands, some)
     return None if said is None else said.removeprefix(PREFIX)
 
 

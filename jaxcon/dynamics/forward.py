@@ -119,15 +119,13 @@ class Dynamics:
             law: of the stabilizer.
             problem: the saddle system of both.
             lag: velocities are those of lag · h before the positions; None for none.
-            every: whether landings without restitution are impacts beside every solver.
+            every: whether impacts are told apart in scenes without restitution, too.
             ahead: the bounded rows, from `bounds_ahead`; None where they are not known yet.
         """
         if self.part is None:
             bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
             length, acts = self.dt, None
-            # an impact takes two more solves, which sweeps save where nothing can bounce
-            apart = every or self.bounded.exact or bounds.restitution is not None
-            strikes = any(bounds.ends) and apart
+            strikes = any(bounds.ends) and (every or bounds.restitution is not None)
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
             if doubt is not None:
@@ -148,8 +146,7 @@ class Dynamics:
         may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
-            most = self.dt[None] * bounds.jacobian.reach(impulse.start)
-            may = impacts.candidates(bouncy, start, most, self.dt)
+            may = impacts.candidates(bouncy, start, self.dt)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))

@@ -9,15 +9,6 @@ other accelerations a⁺. At the end of a step h, with r = h − τ the rest of 
 The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
 an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
 
-A contact that lands without rebound has φ̇ = 0 after the impact. Its acceleration J a⁺ + J̇ v⁺ then
-decides what follows: the contact forces obey 0 ≤ λ ⊥ J a⁺ + J̇ v⁺ ≥ 0 and Coulomb's law. The end of
-a rod that turns fast so lifts off at once. J̇ v⁺ is the difference (J(q* ⊕ h v⁺) − J(q*)) v⁺ / h.
-
-The plain step that follows has no J̇ v. Where J a⁺ < 0 presses, it would close again a small gap, by
-an impulse that depends on r. The displacement after the impact is therefore that of a time longer
-by h² min(−J a⁺, J̇ v⁺) / |φ̇⁻|, or half of it where velocities are those of half a step before. This
-is a change of O(h²).
-
 The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
 step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
 
@@ -155,15 +146,6 @@ class Arrivals:
         """τ by velocity, (n_v,) or (1,) [s]."""
         return jnp.sum(self.leads * self.times[None], axis=1)
 
-    def without_rebound(self, rows: BoundRows) -> Array:
-        """A mask of the rows that arrive and stay, (n,)."""
-        rebounds = self.bounces
-        if rows.restitution is not None:
-            rebounds &= rows.restitution > 0
-        else:
-            rebounds = jnp.zeros_like(rebounds)
-        return rows.kinds.by_contact(self.hits & ~rebounds)
-
     def refined(self, rows: BoundRows) -> Arrivals:
         """Refines the times by one Newton step on the gaps at the place of the impact.
 
@@ -175,21 +157,19 @@ class Arrivals:
         return dataclasses.replace(self, times=self.times + late)
 
 
-def candidates(rows: BoundRows, change: Array, most: Array, dt: Array) -> Array:
+def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
-    what accelerations can make in a step: slower ones rest, and bear what presses on them. In a
-    stack, whose blocks fall together without contacts, J a is zero, and rates are rounding.
+    what accelerations make in a step: slower ones rest, and bear what presses on them.
 
     Args:
         rows: the bounded rows at the start of the step.
         change: h J a without bounded rows, (n,).
-        most: h |J| |a| without bounded rows, (n,).
         dt: h, () [s].
     """
     e, least = rows.restitution, slowest(rows, change)
-    rests = most if e is None else jnp.where(e >= 0, 0, most)
+    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
     least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
@@ -335,8 +315,7 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     s u⁻ along the normal, which closes the gap, and as much along the tangents, which holds
     friction back until τ. The next step does the rest of the impact. As both impulses are the
     shares 1 − s and s of one, at the places before and after, the two steps have the time of the
-    impact and its place in the mean. That costs nothing, unlike an `Impact`, and is for solvers
-    that trade accuracy for speed.
+    impact and its place, and so have their derivatives. That costs nothing, unlike an `Impact`.
 
     Args:
         rows: the bounded rows at the start of the step.
@@ -356,21 +335,20 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
 
 
-def doubt(rows: BoundRows, shared: bool, some: bool) -> str | None:
+def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
     """Why derivatives of plain steps through impacts may be wrong, by structure; None if not.
 
     Args:
         rows: the bounded rows; only their static fields are read.
-        shared: whether a landing is shared over two steps, as by `landing`.
+        lags: whether velocities are those of half a step before the positions.
         some: whether the solver leaves rows out.
     """
     reasons = []
-    if shared and rows.lands:
+    if lags and rows.lands:
         reasons.append(
-            f"beside GaussSeidel, a landing of {', '.join(rows.lands)} takes two steps, so that"
-            " where a body turns as it lands on a corner or on another body, its derivative is"
-            " right only in the mean over the phases of a step; Method(bounded=InteriorPoint()),"
-            " restitution=jnp.zeros(()) or Events() makes it one"
+            f"a landing of {', '.join(rows.lands)} takes two steps, so that where a body turns as"
+            " it lands on a corner or on another body, its derivative is right only in the mean"
+            " over the phases of a step; restitution=jnp.zeros(()) or Events() makes it one"
         )
     if some and any(rows.ends):
         reasons.append(
@@ -422,23 +400,15 @@ class Impact:
         place, before, time = self._there(arrivals)
         τ = arrivals.by_velocity
 
-        def find(v: Array, lasts: Array) -> tuple[Array, tuple[Found, Array, Array]]:
+        def find(v: Array, lasts: Array) -> tuple[Array, Found]:
             known = self.laws.rows(place, v, time)
-            ahead = self.laws.rows(self.system.retract(place, h * v), v, time + self.dt)
-            stays = lasts & arrivals.without_rebound(known)
-            curvature = jnp.where(stays, ahead.rate - known.rate, 0)  # h J̇ v⁺
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
-            rows = dataclasses.replace(rows, rate=rows.rate + jax.lax.stop_gradient(curvature))
             found = self.laws.find(place, v, time, rows, acts, lasts)
-            pressing = -h * known.jacobian.apply(found.change)
-            opening = jnp.clip(pressing, 0, jnp.maximum(curvature, 0))
-            return v + jnp.where(lasts, 0, found.change), (found, known.rate, opening)
+            return v + jnp.where(lasts, 0, found.change), found
 
         # the impact and what follows are one program, which halves what there is to compile
-        _, stages = jax.lax.scan(find, before, jnp.asarray([False, True]))
-        (struck, rate, _), (after, _, opening) = (
-            jax.tree.map(lambda x, i=i: x[i], stages) for i in range(2)
-        )
+        _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
+        struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
         rest, left = h - τ, (1 - self.lag) * h - τ
         # from the acceleration just before the impact, not from that at the start of the step
         smooth = self._gyroscopic(before) - self._gyroscopic(self.v)
@@ -447,14 +417,9 @@ class Impact:
         # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
-        # the next step is to find open what lifts off; see the docstring of the module
-        longer = (1 - self.lag) * h * numerics.safe_divide(opening, jnp.abs(rate))
-        longer = jnp.minimum(longer, h)
-        longer = jnp.sum(arrivals.leads * jax.lax.stop_gradient(longer)[None], axis=1)
-        travel = (rest + longer) * struck.change + rest * rest / 2 * more + swing
+        travel = rest * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
-        # forces of half a step before positions may end before the impact, and then have no share
-        share = jnp.maximum((1 - self.lag) * self.dt - arrivals.first, 0)[None]
+        share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
         struck = struck._replace(multipliers=impulses, joints=joints)

@@ -44,11 +44,6 @@ class Nearest(checks.Checked):
         return self.solver.warm
 
     @property
-    def exact(self) -> bool:
-        """Returns True where the solver finds the multipliers to full precision."""
-        return self.solver.exact
-
-    @property
     def smoothing(self) -> Any:
         """The width of smoothed corners of the laws, for the derivative only [m/s, rad/s]."""
         return getattr(self.solver, "smoothing", None)  # what has none is refused by `check`
