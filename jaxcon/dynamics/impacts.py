@@ -9,14 +9,10 @@ other accelerations a⁺. At the end of a step h, with r = h − τ the rest of 
 The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
 an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
 
-A contact that lands without rebound has φ̇ = 0 after the impact. Its acceleration J a⁺ + J̇ v⁺ then
-decides what follows: the contact forces obey 0 ≤ λ ⊥ J a⁺ + J̇ v⁺ ≥ 0 and Coulomb's law. The end of
-a rod that turns fast so lifts off at once. J̇ v⁺ is the difference (J(q* ⊕ h v⁺) − J(q*)) v⁺ / h.
-
-The plain step that follows has no J̇ v. Where J a⁺ < 0 presses, it would close again a small gap, by
-an impulse that depends on r. The displacement after the impact is therefore that of a time longer
-by h² min(−J a⁺, J̇ v⁺) / |φ̇⁻|, or half of it where velocities are those of half a step before. This
-is a change of O(h²).
+After an impact without rebound φ̇ = 0, and φ̈ = J a⁺ + J̇ v⁺ decides what follows: the contact
+forces obey 0 ≤ λ ⊥ φ̈ ≥ 0 and Coulomb's law. The end of a rod that turns fast lifts off at once.
+Plain steps of rows that make impacts contain J̇ v, too, so that the next step comes to the same
+decision, however long the rest r is.
 
 The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
 step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
@@ -118,6 +114,10 @@ class Laws(Protocol):
         """The bounded rows at a state."""
         ...
 
+    def curvature(self, q: Array, v: Array, t: Any) -> Array:
+        """J̇ v, (n,), of rows that make impacts; zero of others."""
+        ...
+
     def find(self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array) -> Found:
         """The impulses of the rows that act; or, where it lasts, (), the forces over a step."""
         ...
@@ -154,15 +154,6 @@ class Arrivals:
     def by_velocity(self) -> Array:
         """τ by velocity, (n_v,) or (1,) [s]."""
         return jnp.sum(self.leads * self.times[None], axis=1)
-
-    def without_rebound(self, rows: BoundRows) -> Array:
-        """A mask of the rows that arrive and stay, (n,)."""
-        rebounds = self.bounces
-        if rows.restitution is not None:
-            rebounds &= rows.restitution > 0
-        else:
-            rebounds = jnp.zeros_like(rebounds)
-        return rows.kinds.by_contact(self.hits & ~rebounds)
 
     def refined(self, rows: BoundRows) -> Arrivals:
         """Refines the times by one Newton step on the gaps at the place of the impact.
@@ -422,23 +413,17 @@ class Impact:
         place, before, time = self._there(arrivals)
         τ = arrivals.by_velocity
 
-        def find(v: Array, lasts: Array) -> tuple[Array, tuple[Found, Array, Array]]:
+        def find(v: Array, lasts: Array) -> tuple[Array, Found]:
             known = self.laws.rows(place, v, time)
-            ahead = self.laws.rows(self.system.retract(place, h * v), v, time + self.dt)
-            stays = lasts & arrivals.without_rebound(known)
-            curvature = jnp.where(stays, ahead.rate - known.rate, 0)  # h J̇ v⁺
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
-            rows = dataclasses.replace(rows, rate=rows.rate + jax.lax.stop_gradient(curvature))
+            curvature = jax.lax.stop_gradient(self.laws.curvature(place, v, time))
+            rows = dataclasses.replace(rows, turning=jnp.where(lasts, h * curvature, 0))
             found = self.laws.find(place, v, time, rows, acts, lasts)
-            pressing = -h * known.jacobian.apply(found.change)
-            opening = jnp.clip(pressing, 0, jnp.maximum(curvature, 0))
-            return v + jnp.where(lasts, 0, found.change), (found, known.rate, opening)
+            return v + jnp.where(lasts, 0, found.change), found
 
         # the impact and what follows are one program, which halves what there is to compile
-        _, stages = jax.lax.scan(find, before, jnp.asarray([False, True]))
-        (struck, rate, _), (after, _, opening) = (
-            jax.tree.map(lambda x, i=i: x[i], stages) for i in range(2)
-        )
+        _, found = jax.lax.scan(find, before, jnp.asarray([False, True]))
+        struck, after = (jax.tree.map(lambda x, i=i: x[i], found) for i in range(2))
         rest, left = h - τ, (1 - self.lag) * h - τ
         # from the acceleration just before the impact, not from that at the start of the step
         smooth = self._gyroscopic(before) - self._gyroscopic(self.v)
@@ -447,16 +432,13 @@ class Impact:
         # ½ τ r ω × Δω, and behind h ω followed by r Δω by ½ r² ω × Δω
         across = self.system.coadjoint(place, before, struck.change)  # Δω × ω
         swing = (-τ if self.lag else rest) * rest / 2 * across
-        # the next step is to find open what lifts off; see the docstring of the module
-        longer = (1 - self.lag) * h * numerics.safe_divide(opening, jnp.abs(rate))
-        longer = jnp.minimum(longer, h)
-        longer = jnp.sum(arrivals.leads * jax.lax.stop_gradient(longer)[None], axis=1)
-        travel = (rest + longer) * struck.change + rest * rest / 2 * more + swing
+        travel = rest * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
-        # forces of half a step before positions may end before the impact, and then have no share
-        share = jnp.maximum((1 - self.lag) * self.dt - arrivals.first, 0)[None]
-        impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
+        share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         joints = struck.joints + share * (after.joints - self.joints)
+        # forces of half a step before positions may end before the impact, and then have no share
+        share = jnp.maximum(share, 0)
+        impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         struck = struck._replace(multipliers=impulses, joints=joints)
         return keep(self.arrivals.happens, (jump, struck), still)
 
