@@ -66,7 +66,7 @@ class OneProblem(jc.InteriorPoint):
 
 
 JUDGED = {"GaussSeidel(30)": jc.GaussSeidel(), "InteriorPoint(30)": OneProblem()}
-"""Both solvers as they are by default."""
+"""Both solvers with their numbers by default; a landing is shared with the next step."""
 BLOCK = 1000
 """How many worlds are stepped at once."""
 

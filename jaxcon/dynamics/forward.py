@@ -22,6 +22,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics import impacts
 from jaxcon.dynamics.parts import Part, Struck
 from jaxcon.dynamics.reactions import Impulse
+from jaxcon.solvers.bounded import is_exact
 from jaxcon.solvers.nearest_rows import Nearest
 from jaxcon.solvers.saddle import Factored, Saddle, Solution
 
@@ -126,7 +127,7 @@ class Dynamics:
             bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
             length, acts = self.dt, None
             # an impact takes two more solves, which sweeps save where nothing can bounce
-            apart = every or self.bounded.exact or bounds.restitution is not None
+            apart = every or is_exact(self.bounded) or bounds.restitution is not None
             strikes = any(bounds.ends) and apart
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))

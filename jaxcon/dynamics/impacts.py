@@ -170,17 +170,19 @@ def candidates(rows: BoundRows, change: Array, most: Array, dt: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
-    what accelerations can make in a step: slower ones rest, and bear what presses on them. In a
-    stack, whose blocks fall together without contacts, J a is zero, and rates are rounding.
+    what accelerations make in a step: slower ones rest, and bear what presses on them. Rows that
+    touch must be faster than what accelerations could make. In a stack, whose blocks fall together
+    without contacts, J a is zero, and rates are rounding.
 
     Args:
         rows: the bounded rows at the start of the step.
-        change: h J a without bounded rows, (n,).
-        most: h |J| |a| without bounded rows, (n,).
+        change: h (J a + J̇ v) without bounded rows, (n,).
+        most: h (|J| |a| + |J̇ v|) without bounded rows, (n,).
         dt: h, () [s].
     """
     e, least = rows.restitution, slowest(rows, change)
-    rests = most if e is None else jnp.where(e >= 0, 0, most)
+    rests = jnp.where(rows.gap > dt[None] * most, jnp.abs(change), most)
+    rests = rests if e is None else jnp.where(e >= 0, 0, rests)
     least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
@@ -358,7 +360,7 @@ def doubt(rows: BoundRows, shared: bool, some: bool) -> str | None:
     reasons = []
     if shared and rows.lands:
         reasons.append(
-            f"beside GaussSeidel, a landing of {', '.join(rows.lands)} takes two steps, so that"
+            f"beside GaussSeidel() a landing of {', '.join(rows.lands)} takes two steps, so that"
             " where a body turns as it lands on a corner or on another body, its derivative is"
             " right only in the mean over the phases of a step; Method(bounded=InteriorPoint()),"
             " restitution=jnp.zeros(()) or Events() makes it one"
