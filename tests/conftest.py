@@ -8,11 +8,14 @@ otherwise: half the time. Without fusion emitters small programs, such as operat
 import gc
 import os
 import sys
+from importlib.metadata import version
 
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    " --xla_cpu_use_fusion_emitters=false",
+    # jaxlib 0.12 has none of these, and stops at the name of an option that it does not know
+    + " --xla_cpu_use_fusion_emitters=false"
+    * (tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 11)),
 )
 
 import jax

@@ -11,10 +11,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "many_devices.py"
-CHEAP = (
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    " --xla_cpu_use_fusion_emitters=false"
-)
+CHEAP = os.environ["XLA_FLAGS"]
 LIMIT = 400
 """On a process [s], for a machine that does much else."""
 

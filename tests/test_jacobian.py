@@ -66,9 +66,7 @@ def test_no_rows():
     np.testing.assert_array_equal(empty.transpose(jnp.ones(0)), np.zeros(3))
 
 
-@pytest.mark.parametrize(
-    "name", [*scenes.parts(2, "loop"), *scenes.core(3, "loop"), *scenes.OTHERS]
-)
+@pytest.mark.parametrize("name", scenes.SELECTED)
 def test_products_are_those_of_the_dense_matrix(name):
     built = scenes.build(name)
     rows = scenes.linearized(built.system, built.off.q, built.off.v, built.off.time)

@@ -25,9 +25,7 @@ def ideal_scene(dim, topology):
     return kinds, scenes.joints_scene(kinds, dim, topology, jnp.dtype("float64"))
 
 
-@pytest.mark.parametrize(
-    "name", [*scenes.parts(2, "loop"), *scenes.core(3, "loop"), *scenes.OTHERS]
-)
+@pytest.mark.parametrize("name", scenes.SELECTED)
 def test_virtual_power(name):
     """v · (M a − f) = λ · (J v), and both vanish where no constraint moves in time."""
     built = scenes.build(name)

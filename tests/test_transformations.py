@@ -276,9 +276,7 @@ def test_no_float64_in_the_derivative_of_a_float32_step():
     assert "f64" not in str(jax.make_jaxpr(jax.grad(value))(built.state.v))
 
 
-@pytest.mark.parametrize(
-    "name", [*scenes.parts(2, "loop"), *scenes.core(3, "loop"), *scenes.OTHERS]
-)
+@pytest.mark.parametrize("name", scenes.SELECTED)
 def test_a_float32_world_survives_a_thousand_steps(name):
     built = scenes.build(name, "float32")
     method, dt = jc.Method(), jnp.asarray(DT, jnp.float32)
