@@ -66,7 +66,7 @@ def test_more_sweeps_and_iterations_miss_less():
 @pytest.mark.parametrize(("scene", "slides"), [("box", 0.3), ("chain", 0.7)])
 def test_no_law_of_bounded_rows_is_missed_at_random_states(scene, slides):
     """Signorini's and Coulomb's, each by itself; none makes energy but recovery, none fails."""
-    found = laws.measure(scene, jnp.dtype("float64"), jc.InteriorPoint(), 600)
+    found = laws.measure(scene, jnp.dtype("float64"), laws.OneProblem(), 600)
     assert laws.beyond(found, "float64") == laws.Laws(0, 0, 0, 0, 0)
     assert np.mean(found.direction > 0) > slides  # what rests has none to miss
 

@@ -131,7 +131,7 @@ def test_a_disc_bounces_or_lands_sticking_and_sliding(name, mode, dtype):
 
 @pytest.mark.parametrize("name", ["SIE", "RK4"])
 def test_a_disc_lands_without_restitution(name):
-    """Without a number for it: beside semi-implicit Euler the landing takes two steps."""
+    """The landing of a contact that has no restitution is an impact, too."""
     system, state = disc()
     run = landed(system, state, INTEGRATORS[name], 0.9, by_height, lambda s: s.q[:1])
     params = {"floor": {"friction": jnp.asarray([0.5, 0.02])}}
@@ -420,7 +420,8 @@ def test_a_gradient_that_lacks_the_time_of_impacts_warns_once(monkeypatch):
     """Where it is traced, not where the step is; and is named by the report and the check."""
     monkeypatch.setattr(notices, "_given", set())
     system, state = bar()
-    height = height_by(system, state, jc.Method())
+    method = jc.Method(bounded=jc.GaussSeidel())
+    height = height_by(system, state, method)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         jax.jit(height).lower(0.5)
@@ -428,16 +429,18 @@ def test_a_gradient_that_lacks_the_time_of_impacts_warns_once(monkeypatch):
         for _ in range(2):
             jax.jit(jax.grad(height)).lower(0.5)
     assert len(caught) == 1
-    assert "gradients through impacts: a landing of tip takes two steps" in str(caught[0].message)
+    assert "gradients through impacts: beside GaussSeidel() a landing of tip takes two" in str(
+        caught[0].message
+    )
     check = jc.check_gradients(height, 0.5)
     assert len(check.notes) == 1
-    assert "note, gradients through impacts: a landing of tip" in str(check)
-    said = jc.report(system, state, method=jc.Method(), dt=H)
+    assert "note, gradients through impacts: beside GaussSeidel() a landing of tip" in str(check)
+    said = jc.report(system, state, method=method, dt=H)
     assert "a landing of tip takes two steps" in said.warnings["impacts"]
-    assert "warning, gradients through impacts: a landing" in str(said)
+    assert "warning, gradients through impacts: beside GaussSeidel" in str(said)
 
 
-@pytest.mark.parametrize("case", ["restitution", "RK4", "events", "particle"])
+@pytest.mark.parametrize("case", ["default", "restitution", "RK4", "events", "particle"])
 def test_no_gradient_warns_that_has_the_time_of_impacts(case, monkeypatch):
     monkeypatch.setattr(notices, "_given", set())
     system, state = bar(jnp.zeros(()) if case == "restitution" else None)
@@ -446,8 +449,10 @@ def test_no_gradient_warns_that_has_the_time_of_impacts(case, monkeypatch):
         scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
         scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", friction=0.5))
         system, state = scene.build()
-    parts = {"RK4": {"integrator": jc.RK4()}, "events": {"events": jc.Events()}}
-    method = jc.Method(**parts.get(case, {}))
+    sweeps = {"bounded": jc.GaussSeidel()}
+    parts = {"default": {}, "RK4": sweeps | {"integrator": jc.RK4()}}
+    parts["events"] = sweeps | {"events": jc.Events()}
+    method = jc.Method(**parts.get(case, sweeps))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jax.jit(jax.grad(height_by(system, state, method))).lower(0.5)

@@ -22,6 +22,7 @@ from jaxcon.simulation.choice import innermost, several, words
 from jaxcon.simulation.integrators import SemiImplicitEuler
 from jaxcon.simulation.method import Method
 from jaxcon.simulation.stability import instability, parts
+from jaxcon.solvers.bounded import is_exact
 from jaxcon.solvers.conjugate_gradients import ConjugateGradients
 from jaxcon.solvers.gauss_seidel import GaussSeidel
 from jaxcon.solvers.interior_point import InteriorPoint
@@ -320,8 +321,9 @@ def impact(known: Known) -> str | None:
     if rows.lands:  # a robot has dozens, and one line names them
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
     some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
-    lands = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
-    said = doubt(rows, lands, some)
+    sweeps = not is_exact(method.resolve(known.system, known.state).bounded)
+    shared = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
+    said = doubt(rows, shared and sweeps, some)
     return None if said is None else said.removeprefix(PREFIX)
 
 

@@ -113,6 +113,8 @@ class BoundRows:
         ends: which of these have a gap that closes, (n,).
         paired: which have a second stop, (n,).
         lands: names of contacts and ropes without restitution on bodies that turn.
+        turning: what J̇ v adds to φ̇ on the way to the velocities at the end of a step, (n,); None
+            where it is left out.
     """
 
     gap: Array
@@ -132,6 +134,7 @@ class BoundRows:
     ends: tuple[bool, ...] = static(default=())
     paired: tuple[bool, ...] = static(default=())
     lands: tuple[str, ...] = static(default=())
+    turning: Array | None = None
 
     def finite(self, bare: Array) -> Array:
         """True where all numbers of the rows are finite, ().
@@ -155,6 +158,7 @@ class BoundRows:
             jacobian=Gathered(self.jacobian.pulls(choice.places().astype(self.rate.dtype))),
             restitution=None if e is None else choice.take(e),
             far=None if far is None else choice.take(far),
+            turning=None if self.turning is None else choice.take(self.turning),
             kinds=choice.kinds,
         )
 
@@ -178,6 +182,7 @@ class BoundRows:
             self,
             gap=jnp.where(second, gap, self.gap),
             rate=sign * self.rate,
+            turning=None if self.turning is None else sign * self.turning,
             target=jnp.where(second, -numerics.safe_divide(gap, dt[None]), self.target),
             jacobian=self.jacobian.scaled(sign, np.array(self.paired)),  # type: ignore[union-attr]
             far=None,

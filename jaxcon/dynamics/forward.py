@@ -22,6 +22,7 @@ from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics import impacts
 from jaxcon.dynamics.parts import Part, Struck
 from jaxcon.dynamics.reactions import Impulse
+from jaxcon.solvers.bounded import is_exact
 from jaxcon.solvers.nearest_rows import Nearest
 from jaxcon.solvers.saddle import Factored, Saddle, Solution
 
@@ -119,13 +120,15 @@ class Dynamics:
             law: of the stabilizer.
             problem: the saddle system of both.
             lag: velocities are those of lag · h before the positions; None for none.
-            every: whether impacts are told apart in scenes without restitution, too.
+            every: whether landings without restitution are impacts beside every solver.
             ahead: the bounded rows, from `bounds_ahead`; None where they are not known yet.
         """
         if self.part is None:
             bounds = self.bounds(q, v, t, self.dt) if ahead is None else ahead
             length, acts = self.dt, None
-            strikes = any(bounds.ends) and (every or bounds.restitution is not None)
+            # an impact takes two more solves, which sweeps save where nothing can bounce
+            apart = every or is_exact(self.bounded) or bounds.restitution is not None
+            strikes = any(bounds.ends) and apart
             lands = lag is not None and not strikes
             doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
             if doubt is not None:
@@ -134,6 +137,10 @@ class Dynamics:
         else:
             bounds, acts = self.part.ask(lambda dt: self.bounds(q, v, t, dt), self.dt)
             length, strikes, lands = self.part.length, False, False
+        share = 1.0 if lag is None else 0.5  # velocities at the end of a step belong to its middle
+        if strikes:
+            turning = share * self.dt[None] * self.curvature(q, v, t)
+            bounds = dataclasses.replace(bounds, turning=turning)
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         impulse = self._impulse(base, law, problem, length, acts)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
@@ -146,7 +153,9 @@ class Dynamics:
         may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
-            may = impacts.candidates(bouncy, start, self.dt)
+            turning = bounds.turning / share
+            most = self.dt[None] * bounds.jacobian.reach(impulse.start) + jnp.abs(turning)
+            may = impacts.candidates(bouncy, start + turning, most, self.dt)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
@@ -160,6 +169,7 @@ class Dynamics:
         if strikes:
             lag = 0.0 if lag is None else lag
             change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
+            change += impulse.rows.turning / share
             times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
             solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
             if e is not None:
@@ -205,6 +215,21 @@ class Dynamics:
     def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
         """The bounded rows, and what a step of dt wants of them."""
         return linearize_bounds(self.system, q, v, t, self.control, dt)
+
+    def curvature(self, q: Array, v: Array, t: Any) -> Array:
+        """J̇ v, (n,): how fast the rates of bounded rows change where v does not.
+
+        Of rows that make impacts, and of the tangents of their contacts; zero of others.
+        """
+
+        def rates(time: Array) -> tuple[Array, BoundRows]:
+            rows = self.bounds(self.system.retract(q, time[None] * v), v, t + time, self.dt)
+            return rows.rate, rows
+
+        none, one = jnp.zeros_like(self.dt), jnp.ones_like(self.dt)
+        _, bent, rows = jax.jvp(rates, (none,), (one,), has_aux=True)
+        ends = rows.kinds.by_contact(impacts.mask(rows.ends, rows))
+        return jnp.where(ends, bent, 0)
 
     def unbounded(self, q: Array, v: Array, t: Any) -> Array:
         """a without bounded rows."""
@@ -345,6 +370,10 @@ class _Laws:
     def rows(self, q: Array, v: Array, t: Any) -> BoundRows:
         """The bounded rows at a state."""
         return self.dynamics.bounds(q, v, t, self.dynamics.dt)
+
+    def curvature(self, q: Array, v: Array, t: Any) -> Array:
+        """J̇ v, (n,), of rows that make impacts."""
+        return self.dynamics.curvature(q, v, t)
 
     def find(
         self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array

@@ -9,6 +9,11 @@ other accelerations a⁺. At the end of a step h, with r = h − τ the rest of 
 The derivative of the last term in each line by τ is what a saltation matrix adds: everything that
 an impulse moves, along tangents and through joints too, moves with v⁻ before τ and with v⁺ after.
 
+After an impact without rebound φ̇ = 0, and φ̈ = J a⁺ + J̇ v⁺ decides what follows: the contact
+forces obey 0 ≤ λ ⊥ φ̈ ≥ 0 and Coulomb's law. The end of a rod that turns fast lifts off at once.
+Plain steps of rows that make impacts contain J̇ v, too, so that the next step comes to the same
+decision, however long the rest r is.
+
 The impulse is found at the place of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the start of the
 step: a normal that turns on the way would turn the impulse with it, by the phase of τ in the step.
 
@@ -109,6 +114,10 @@ class Laws(Protocol):
         """The bounded rows at a state."""
         ...
 
+    def curvature(self, q: Array, v: Array, t: Any) -> Array:
+        """J̇ v, (n,), of rows that make impacts; zero of others."""
+        ...
+
     def find(self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array) -> Found:
         """The impulses of the rows that act; or, where it lasts, (), the forces over a step."""
         ...
@@ -157,19 +166,23 @@ class Arrivals:
         return dataclasses.replace(self, times=self.times + late)
 
 
-def candidates(rows: BoundRows, change: Array, dt: Array) -> Array:
+def candidates(rows: BoundRows, change: Array, most: Array, dt: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
-    what accelerations make in a step: slower ones rest, and bear what presses on them.
+    what accelerations make in a step: slower ones rest, and bear what presses on them. Rows that
+    touch must be faster than what accelerations could make. In a stack, whose blocks fall together
+    without contacts, J a is zero, and rates are rounding.
 
     Args:
         rows: the bounded rows at the start of the step.
-        change: h J a without bounded rows, (n,).
+        change: h (J a + J̇ v) without bounded rows, (n,).
+        most: h (|J| |a| + |J̇ v|) without bounded rows, (n,).
         dt: h, () [s].
     """
     e, least = rows.restitution, slowest(rows, change)
-    rests = jnp.abs(change) if e is None else jnp.where(e >= 0, 0, jnp.abs(change))
+    rests = jnp.where(rows.gap > dt[None] * most, jnp.abs(change), most)
+    rests = rests if e is None else jnp.where(e >= 0, 0, rests)
     least = least + rests
     reach = dt[None] * (jnp.abs(rows.rate) + 2 * jnp.abs(change))
     may = mask(rows.ends, rows) & (rows.rate < -least) & (rows.gap <= reach)
@@ -315,7 +328,8 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     s u⁻ along the normal, which closes the gap, and as much along the tangents, which holds
     friction back until τ. The next step does the rest of the impact. As both impulses are the
     shares 1 − s and s of one, at the places before and after, the two steps have the time of the
-    impact and its place, and so have their derivatives. That costs nothing, unlike an `Impact`.
+    impact and its place in the mean. That costs nothing, unlike an `Impact`, and is for solvers
+    that trade accuracy for speed.
 
     Args:
         rows: the bounded rows at the start of the step.
@@ -335,20 +349,21 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
 
 
-def doubt(rows: BoundRows, lags: bool, some: bool) -> str | None:
+def doubt(rows: BoundRows, shared: bool, some: bool) -> str | None:
     """Why derivatives of plain steps through impacts may be wrong, by structure; None if not.
 
     Args:
         rows: the bounded rows; only their static fields are read.
-        lags: whether velocities are those of half a step before the positions.
+        shared: whether a landing is shared over two steps, as by `landing`.
         some: whether the solver leaves rows out.
     """
     reasons = []
-    if lags and rows.lands:
+    if shared and rows.lands:
         reasons.append(
-            f"a landing of {', '.join(rows.lands)} takes two steps, so that where a body turns as"
-            " it lands on a corner or on another body, its derivative is right only in the mean"
-            " over the phases of a step; restitution=jnp.zeros(()) or Events() makes it one"
+            f"beside GaussSeidel() a landing of {', '.join(rows.lands)} takes two steps, so that"
+            " where a body turns as it lands on a corner or on another body, its derivative is"
+            " right only in the mean over the phases of a step; Method(bounded=InteriorPoint()),"
+            " restitution=jnp.zeros(()) or Events() makes it one"
         )
     if some and any(rows.ends):
         reasons.append(
@@ -403,6 +418,8 @@ class Impact:
         def find(v: Array, lasts: Array) -> tuple[Array, Found]:
             known = self.laws.rows(place, v, time)
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
+            curvature = jax.lax.stop_gradient(self.laws.curvature(place, v, time))
+            rows = dataclasses.replace(rows, turning=jnp.where(lasts, h * curvature, 0))
             found = self.laws.find(place, v, time, rows, acts, lasts)
             return v + jnp.where(lasts, 0, found.change), found
 
@@ -420,8 +437,10 @@ class Impact:
         travel = rest * struck.change + rest * rest / 2 * more + swing
         jump = Jump(struck.change + left * more, travel)
         share = ((1 - self.lag) * self.dt - arrivals.first)[None]
-        impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         joints = struck.joints + share * (after.joints - self.joints)
+        # forces of half a step before positions may end before the impact, and then have no share
+        share = jnp.maximum(share, 0)
+        impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         struck = struck._replace(multipliers=impulses, joints=joints)
         return keep(self.arrivals.happens, (jump, struck), still)
 

@@ -161,7 +161,8 @@ class Impulse:
 
     def led(self, acceleration: Array) -> Array:
         """φ̇ + h J_b a, (n,)."""
-        return self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
+        rates = self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
+        return rates if self.rows.turning is None else rates + self.rows.turning
 
     def moved(self) -> Array | None:
         """∂a/∂λ, (n_v, n), a constant; None where it is not known."""

@@ -36,6 +36,14 @@ from jaxcon.core.typing import Array
 from jaxcon.solvers import gauss_jordan, roots
 
 
+def is_exact(solver: Any) -> bool:
+    """Returns True for a solver that finds the multipliers to full precision.
+
+    Landings are then impacts within a step. A solver of a user says so by an attribute `exact`.
+    """
+    return getattr(solver, "exact", False)
+
+
 @dataclass(frozen=True)
 class Disc:
     """What is bounded by the normals of contacts in succession.

@@ -38,6 +38,7 @@ class GaussSeidel(checks.Checked):
     sweeps: int = static(default=30)
     warm: bool = static(default=True)
     smoothing: Any = None
+    exact = False  # a landing without restitution is shared between two steps
 
     def check(self) -> None:
         """Checks the numbers.

@@ -59,6 +59,7 @@ class InteriorPoint(checks.Checked):
     polish: int = static(default=12)
     smoothing: Any = None
     warm = False
+    exact = True  # so a landing without restitution is an impact within the step, too
 
     def check(self) -> None:
         """Checks the numbers.

@@ -194,6 +194,10 @@ class Gathered:
         """J v, (n,)."""
         return jnp.sum(self.transposed * v[:, None], axis=0)
 
+    def reach(self, v: Array) -> Array:
+        """|J| |v|, (n,): J v as large as it could be if no terms cancelled."""
+        return jnp.sum(jnp.abs(self.transposed * v[:, None]), axis=0)
+
     def transpose(self, multipliers: Array) -> Array:
         """Jᵀ λ, (n_v,)."""
         return jnp.sum(self.transposed * multipliers[None], axis=1)

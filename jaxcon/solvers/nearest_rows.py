@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
-from jaxcon.solvers.bounded import Kinds
+from jaxcon.solvers.bounded import Kinds, is_exact
 from jaxcon.solvers.interior_point import InteriorPoint
 
 
@@ -42,6 +42,11 @@ class Nearest(checks.Checked):
     def warm(self) -> bool:
         """Returns True where the solver starts where the last step ended."""
         return self.solver.warm
+
+    @property
+    def exact(self) -> bool:
+        """Returns True where the solver finds the multipliers to full precision."""
+        return is_exact(self.solver)
 
     @property
     def smoothing(self) -> Any:

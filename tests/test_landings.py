@@ -1,0 +1,223 @@
+"""Landings without restitution in plain steps: values and derivatives beside exact motions.
+
+A rod falls onto one end, which sticks or slides in the impact. Then the end stays on the floor. Or
+it lifts off at once, because the rod turns so fast that the end accelerates upward.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import jaxcon as jc
+
+G, H = 9.81, 1e-3
+ONE_PERCENT, TWO_PERCENT = 1e-2, 2e-2
+"""Bounds of derivatives at 1 ms, and of central differences over 5 mm."""
+INTEGRATORS = {"SIE": jc.SemiImplicitEuler(), "RK4": jc.RK4()}
+ARM, RADIUS, INERTIA = 0.3, 0.05, 0.03
+FRICTION = 0.05, 2.0
+"""With the first the end slides in the impact, with the second it sticks."""
+EXACTLY = {"rtol": 1e-11, "atol": 1e-12}
+
+
+def run_of(system, state, integrator, time, start, read=lambda q: q):
+    """Returns (x, params) → what is read of q at the end of a rollout."""
+    method = jc.Method(integrator)
+
+    def run(x, params):
+        changed = system.with_params(params)
+        first = jc.init(changed, method, *start(state, x))
+        steps = round(time / H)
+        last = jc.rollout(changed, method, first, None, H, steps, record=lambda s, i: None)[0]
+        return read(last.q)
+
+    return run
+
+
+def check(run, x, params, want, reverse=False):
+    """Compares derivatives at 5 phases of a step, and differences over 5 mm, with exact ones.
+
+    Args:
+        run: (x, params) → (n,).
+        x: a number.
+        params: by case, with a leading axis.
+        want: by case, functions x → (n,), exactly.
+        reverse: whether derivatives are taken in reverse mode.
+    """
+    phases = x + np.linspace(0, 1.5e-3, 5)
+    points = np.concatenate([phases, phases - 2.5e-3, phases + 2.5e-3])
+
+    def both(params, x):
+        if reverse:
+            return jax.jacrev(lambda x: (run(x, params),) * 2, has_aux=True)(x)[::-1]
+        return jax.jvp(lambda x: run(x, params), (x,), (jnp.ones_like(x),))
+
+    every = jax.vmap(jax.vmap(both, in_axes=(None, 0)), in_axes=(0, None))
+    found = jax.jit(every)(params, jnp.asarray(points))
+    for exactly, values, slopes in zip(want, *map(np.asarray, found), strict=True):
+        exact = np.array([(exactly(y + 1e-6) - exactly(y - 1e-6)) / 2e-6 for y in phases])
+        size = np.abs(exact).max()
+        apart = (values[10:] - values[5:10]) / 5e-3
+        np.testing.assert_allclose(slopes[:5], exact, atol=ONE_PERCENT * size, rtol=0)
+        np.testing.assert_allclose(apart, slopes[:5], atol=TWO_PERCENT * size, rtol=0)
+
+
+def rod(dim, angle, spin):
+    """A rod of 1 kg with a ball at its left end, over a floor, moving sideways in a plane."""
+    scene = jc.Scene(dim=dim)
+    place, end = (0.0, 1.0), (-ARM * np.cos(angle), 1 - ARM * np.sin(angle))
+    turns = {"inertia": INERTIA, "angle": angle, "angular_velocity": spin}
+    if dim == 3:  # in the plane of x and z, about −y
+        place, end = (0.0, 0.0, 1.0), (end[0], 0.0, end[1])
+        half = (np.cos(angle / 2), 0.0, -np.sin(angle / 2), 0.0)
+        moments = (0.01, INERTIA, 0.02)
+        turns = {"inertia": moments, "quaternion": half, "angular_velocity": (0.0, -spin, 0.0)}
+    sideways = (1.0, *(0.0,) * (dim - 1))
+    scene.add_body("rod", mass=1.0, position=place, velocity=sideways, **turns)
+    ball = {"center": end, "radius": RADIUS, "friction": FRICTION[0]}
+    scene.add(jc.PlaneContact("end", jc.WORLD, "rod", **ball))
+    return scene.build()
+
+
+def in_plane(q):
+    """(x, z, θ) of the rod, (3,)."""
+    if len(q) == 3:
+        return q
+    return jnp.stack([q[0], q[2], -2 * jnp.arctan2(q[5], q[3])])
+
+
+def rows(θ):
+    """J of the normal and the tangent of the end, (2, 3)."""
+    return np.array([[0, 1, -ARM * np.cos(θ)], [1, 0, ARM * np.sin(θ) + RADIUS]])
+
+
+def pulls(softness, wanted, friction):
+    """The multipliers that change normal and slip as wanted, (2,), and the sign of what slides.
+
+    The tangent sticks if friction is enough; else it slides the way it would without friction.
+    """
+    λ = np.linalg.solve(softness, wanted)
+    if abs(λ[1]) <= friction * λ[0]:
+        return λ, 0
+    way = np.sign(-λ[1])
+    normal = wanted[0] / (softness[0, 0] - way * friction * softness[0, 1])
+    return np.array([normal, -way * friction * normal]), way
+
+
+def landed(height, friction, angle, spin, time, lifts):
+    """(x, z, θ) at the end by Newton's and Euler's equations, one impact, and contact after it."""
+    inverse = np.array([1, 1, 1 / INERTIA])
+    fall = np.array([0, -G, 0])
+
+    def free(_, y):
+        return np.concatenate([y[3:], fall])
+
+    def gap(_, y):
+        return y[1] - ARM * np.sin(y[2]) - RADIUS
+
+    gap.terminal, gap.direction = True, -1
+    start = [0, height, angle, 1, 0, spin]
+    down = solve_ivp(free, (0, 2), start, events=gap, **EXACTLY)
+    y = down.y[:, -1]
+    j = rows(y[2])
+    softness = j * inverse @ j.T
+    impulse, slides = pulls(softness, -j @ y[3:], friction)
+    y[3:] += inverse * (j.T @ impulse)
+
+    def bent(y):
+        """J a + J̇ v without contact, (2,)."""
+        return rows(y[2]) @ fall + ARM * y[5] ** 2 * np.array([np.sin(y[2]), np.cos(y[2])])
+
+    assert (bent(y)[0] > 0) == lifts
+    way = slides or pulls(softness, -bent(y), friction)[1]
+
+    def rests(_, y):
+        j = rows(y[2])
+        softness, wanted = j * inverse @ j.T, -bent(y)
+        if way == 0:
+            λ, _ = pulls(softness, wanted, friction)
+        else:
+            normal = wanted[0] / (softness[0, 0] - way * friction * softness[0, 1])
+            λ = np.array([normal, -way * friction * normal])
+        assert λ[0] > 0
+        return np.concatenate([y[3:], fall + inverse * (j.T @ λ)])
+
+    after = free if lifts else rests
+    return solve_ivp(after, (down.t[-1], time), y, **EXACTLY).y[:3, -1]
+
+
+STAYS = {"angle": 0.15, "spin": 0.0, "height": 1.0, "time": 0.47, "lifts": False}
+LIFTS = {"angle": 0.2, "spin": 0.9, "height": 2.0, "time": 0.68, "lifts": True}
+
+
+@pytest.mark.parametrize(
+    ("name", "dim", "case", "friction", "reverse"),
+    [
+        pytest.param("SIE", 2, STAYS, FRICTION, True, id="SIE stays"),
+        pytest.param("SIE", 3, LIFTS, FRICTION, False, id="SIE lifts in space"),
+        pytest.param("RK4", 2, STAYS, FRICTION[:1], False, id="RK4 slides and stays"),
+        pytest.param("RK4", 2, LIFTS, FRICTION, False, id="RK4 lifts"),
+    ],
+)
+def test_a_rod_lands_on_one_end(name, dim, case, friction, reverse):
+    """After the impact it turns at 9 to 17 rad/s; the end lifts off where sin θ is large."""
+    angle, spin, height, time, lifts = case.values()
+    system, state = rod(dim, angle, spin)
+
+    def start(state, z):
+        return state.q.at[dim - 1].set(z), state.v
+
+    run = run_of(system, state, INTEGRATORS[name], time, start, in_plane)
+    params = {"end": {"friction": jnp.asarray(friction)}}
+    want = [lambda z, μ=μ: landed(z, μ, angle, spin, time, lifts) for μ in friction]
+    check(run, height, params, want, reverse)
+
+
+def test_an_arm_of_two_links_lands_on_its_stop():
+    """The impulse at the stop depends on how the second link hangs, though J of the stop does not.
+
+    Exact numbers are those of `RK4` beside `Events`, whose steps are split at the impact.
+    """
+    scene = jc.Scene(dim=2)
+    scene.add_body("upper", mass=1.0, inertia=0.06, position=(0.4, 0.5))
+    scene.add_body("lower", mass=0.5, inertia=0.02, position=(1.0, 0.5))
+    scene.add(jc.Revolute("shoulder", jc.WORLD, "upper", point=(0.0, 0.5)))
+    scene.add(jc.Revolute("elbow", "upper", "lower", point=(0.8, 0.5)))
+    scene.add(jc.Limit("stop", "shoulder", lower=-0.5))
+    system, state = scene.build()
+
+    def start(state, x):
+        return state.q, -x * jnp.array([0.0, 0.0, 0.4, 1.0, 1.0, 1.0])
+
+    time = 0.4
+    method = jc.Method(jc.RK4(), events=jc.Events())
+
+    @jax.jit
+    def exact(x):
+        first = jc.init(system, method, *start(state, x))
+        steps = round(time / H)
+        return jc.rollout(system, method, first, None, H, steps, record=lambda s, i: None)[0].q
+
+    run, params = run_of(system, state, jc.SemiImplicitEuler(), time, start), jnp.asarray([-0.5])
+    check(run, 1.0, {"stop": {"lower": params}}, [exact])
+
+
+def test_a_body_at_rest_makes_no_impact():
+    """A box that slides to rest on two corners moves as with sweeps, which make no impacts."""
+    ends = {}
+    for solver in (jc.InteriorPoint(), jc.GaussSeidel(200)):
+        scene = jc.Scene(dim=2)
+        scene.add_body("box", mass=1.0, inertia=0.01, position=(0.0, 0.1), velocity=(1.0, 0.0))
+        for side in (-0.1, 0.1):
+            touch = {"center": (side, 0.0), "friction": 0.3}
+            scene.add(jc.PlaneContact(f"{side}", jc.WORLD, "box", **touch))
+        system, state = scene.build()
+        method = jc.Method(bounded=solver)
+        first = jc.init(system, method, state.q, state.v)
+        last = jc.rollout(system, method, first, None, H, 400, record=lambda s, i: i.reactions)
+        ends[solver] = last[0].q, last[1].multipliers
+    (one, forces), (other, _) = ends.values()
+    np.testing.assert_allclose(one, other, atol=1e-9)
+    assert np.abs(forces).max() < 20  # an impact of a step would be hundreds of newtons
