@@ -69,7 +69,9 @@ class Reactions(Mapping[str, Array]):
     A mapping from names of elements to their forces: `in`, `iter`, `len`, `items()` and `get`.
 
     Attributes:
-        multipliers: λ (n,) [N, N m], means over the step: of an impact, its impulse over h.
+        multipliers: λ (n,) [N, N m], means over the step: of an impact, its impulse over h. If the
+            impact comes in the second half of a semi-implicit step, they lack what a one-sided row
+            bore before it.
         gap: φ at its start, (n,); zero where a row has none.
         residual: by how much the laws are missed, as a velocity, ().
         kept: the part of the bounce that adds no energy, from 0 to 1, (): 1 unless it was capped.

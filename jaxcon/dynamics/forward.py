@@ -139,8 +139,7 @@ class Dynamics:
             length, strikes, lands = self.part.length, False, False
         share = 1.0 if lag is None else 0.5  # velocities at the end of a step belong to its middle
         if strikes:
-            turning = share * self.dt[None] * self.curvature(q, v, t)
-            bounds = dataclasses.replace(bounds, turning=turning)
+            bounds = self.turning_bounds(q, v, t, share * self.dt)
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         impulse = self._impulse(base, law, problem, length, acts)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
@@ -216,20 +215,21 @@ class Dynamics:
         """The bounded rows, and what a step of dt wants of them."""
         return linearize_bounds(self.system, q, v, t, self.control, dt)
 
-    def curvature(self, q: Array, v: Array, t: Any) -> Array:
-        """J̇ v, (n,): how fast the rates of bounded rows change where v does not.
+    def turning_bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
+        """The bounded rows with dt J̇ v: how much their rates change in dt where v does not.
 
         Of rows that make impacts, and of the tangents of their contacts; zero of others.
         """
 
-        def rates(time: Array) -> tuple[Array, BoundRows]:
-            rows = self.bounds(self.system.retract(q, time[None] * v), v, t + time, self.dt)
+        def rates(q: Array, time: Array) -> tuple[Array, BoundRows]:
+            rows = self.bounds(q, v, t + time, self.dt)
             return rows.rate, rows
 
-        none, one = jnp.zeros_like(self.dt), jnp.ones_like(self.dt)
-        _, bent, rows = jax.jvp(rates, (none,), (one,), has_aux=True)
+        now = (q, jnp.zeros_like(self.dt))
+        along = (self.system.kinematics(q, v), jnp.ones_like(self.dt))
+        _, curvature, rows = jax.jvp(rates, now, along, has_aux=True)
         ends = rows.kinds.by_contact(impacts.mask(rows.ends, rows))
-        return jnp.where(ends, bent, 0)
+        return dataclasses.replace(rows, turning=jnp.where(ends, dt[None] * curvature, 0))
 
     def unbounded(self, q: Array, v: Array, t: Any) -> Array:
         """a without bounded rows."""
@@ -371,9 +371,9 @@ class _Laws:
         """The bounded rows at a state."""
         return self.dynamics.bounds(q, v, t, self.dynamics.dt)
 
-    def curvature(self, q: Array, v: Array, t: Any) -> Array:
-        """J̇ v, (n,), of rows that make impacts."""
-        return self.dynamics.curvature(q, v, t)
+    def turning_rows(self, q: Array, v: Array, t: Any) -> BoundRows:
+        """The bounded rows at a state, with h J̇ v."""
+        return self.dynamics.turning_bounds(q, v, t, self.dynamics.dt)
 
     def find(
         self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array

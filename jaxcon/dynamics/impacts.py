@@ -114,8 +114,8 @@ class Laws(Protocol):
         """The bounded rows at a state."""
         ...
 
-    def curvature(self, q: Array, v: Array, t: Any) -> Array:
-        """J̇ v, (n,), of rows that make impacts; zero of others."""
+    def turning_rows(self, q: Array, v: Array, t: Any) -> BoundRows:
+        """The bounded rows at a state, with h J̇ v of those that make impacts."""
         ...
 
     def find(self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array) -> Found:
@@ -416,10 +416,10 @@ class Impact:
         τ = arrivals.by_velocity
 
         def find(v: Array, lasts: Array) -> tuple[Array, Found]:
-            known = self.laws.rows(place, v, time)
+            known = self.laws.turning_rows(place, v, time)
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
-            curvature = jax.lax.stop_gradient(self.laws.curvature(place, v, time))
-            rows = dataclasses.replace(rows, turning=jnp.where(lasts, h * curvature, 0))
+            turning = jnp.where(lasts, jax.lax.stop_gradient(known.turning), 0)
+            rows = dataclasses.replace(rows, turning=turning)
             found = self.laws.find(place, v, time, rows, acts, lasts)
             return v + jnp.where(lasts, 0, found.change), found
 
