@@ -139,9 +139,10 @@ class Dynamics:
             length, strikes, lands = self.part.length, False, False
         share = 1.0 if lag is None else 0.5  # velocities at the end of a step belong to its middle
         if strikes:
-            bounds = self.turning_bounds(q, v, t, share * self.dt)
+            bounds, curvature = self.bounds_and_curvature(q, v, t)
+            bounds = dataclasses.replace(bounds, curvature=curvature)
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
-        impulse = self._impulse(base, law, problem, length, acts)
+        impulse = self._impulse(base, law, problem, length, acts, share)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
         seen = None
@@ -152,9 +153,7 @@ class Dynamics:
         may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
-            turning = bounds.turning / share
-            most = self.dt[None] * bounds.jacobian.reach(impulse.start) + jnp.abs(turning)
-            may = impacts.candidates(bouncy, start + turning, most, self.dt)
+            may = impacts.candidates(bouncy, impulse.start, self.dt)
             impulse = impulse.without(bounds.kinds.by_contact(may))
         known = impulse.react(self.bounded, self.guess)
         solution = self.system.complete(impulse.motion(known.multipliers))
@@ -167,8 +166,7 @@ class Dynamics:
             push = impulse.rows.jacobian.transpose(jnp.where(ends, known.multipliers, 0))
         if strikes:
             lag = 0.0 if lag is None else lag
-            change = self.dt[None] * impulse.rows.jacobian.apply(solution.acceleration)
-            change += impulse.rows.turning / share
+            change = impulse.rows.change(solution.acceleration, self.dt)
             times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
             solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
             if e is not None:
@@ -215,8 +213,8 @@ class Dynamics:
         """The bounded rows, and what a step of dt wants of them."""
         return linearize_bounds(self.system, q, v, t, self.control, dt)
 
-    def turning_bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
-        """The bounded rows with dt J̇ v: how much their rates change in dt where v does not.
+    def bounds_and_curvature(self, q: Array, v: Array, t: Any) -> tuple[BoundRows, Array]:
+        """The bounded rows, and J̇ v (n,): how fast their rates change where v does not.
 
         Of rows that make impacts, and of the tangents of their contacts; zero of others.
         """
@@ -229,7 +227,7 @@ class Dynamics:
         along = (self.system.kinematics(q, v), jnp.ones_like(self.dt))
         _, curvature, rows = jax.jvp(rates, now, along, has_aux=True)
         ends = rows.kinds.by_contact(impacts.mask(rows.ends, rows))
-        return dataclasses.replace(rows, turning=jnp.where(ends, dt[None] * curvature, 0))
+        return rows, jnp.where(ends, curvature, 0)
 
     def unbounded(self, q: Array, v: Array, t: Any) -> Array:
         """a without bounded rows."""
@@ -311,11 +309,12 @@ class Dynamics:
         problem: Saddle,
         dt: Any,
         acts: Any,
+        share: float = 1.0,
     ) -> Impulse:
         """How bounded rows act, by factors of wide lanes, to which the solver's numbers belong."""
         wide = dataclasses.replace(self, solver=widened(self.solver, problem.force.ndim - 1))
         factor = partial(wide._factors, law)
-        return Impulse.of(rows, factor, problem, dt, acts, self._leaves_out(rows))
+        return Impulse.of(rows, factor, problem, dt, acts, self._leaves_out(rows), share)
 
     def _judged(self, impulse: Impulse, known: Reactions, acceleration: Array) -> Reactions:
         """The reactions with what is missed by rows that were left out."""
@@ -371,9 +370,9 @@ class _Laws:
         """The bounded rows at a state."""
         return self.dynamics.bounds(q, v, t, self.dynamics.dt)
 
-    def turning_rows(self, q: Array, v: Array, t: Any) -> BoundRows:
-        """The bounded rows at a state, with h J̇ v."""
-        return self.dynamics.turning_bounds(q, v, t, self.dynamics.dt)
+    def rows_and_curvature(self, q: Array, v: Array, t: Any) -> tuple[BoundRows, Array]:
+        """The bounded rows at a state, and J̇ v (n,)."""
+        return self.dynamics.bounds_and_curvature(q, v, t)
 
     def find(
         self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array

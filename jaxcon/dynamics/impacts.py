@@ -114,8 +114,8 @@ class Laws(Protocol):
         """The bounded rows at a state."""
         ...
 
-    def turning_rows(self, q: Array, v: Array, t: Any) -> BoundRows:
-        """The bounded rows at a state, with h J̇ v of those that make impacts."""
+    def rows_and_curvature(self, q: Array, v: Array, t: Any) -> tuple[BoundRows, Array]:
+        """The bounded rows at a state, and J̇ v (n,) of those that make impacts."""
         ...
 
     def find(self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array) -> Found:
@@ -166,7 +166,7 @@ class Arrivals:
         return dataclasses.replace(self, times=self.times + late)
 
 
-def candidates(rows: BoundRows, change: Array, most: Array, dt: Array) -> Array:
+def candidates(rows: BoundRows, free: Array, dt: Array) -> Array:
     """Rows that may arrive within the step, (n,): they make an impact, and bear nothing till then.
 
     One too many does no harm where it stays open. Rows without restitution must be faster than
@@ -176,10 +176,10 @@ def candidates(rows: BoundRows, change: Array, most: Array, dt: Array) -> Array:
 
     Args:
         rows: the bounded rows at the start of the step.
-        change: h (J a + J̇ v) without bounded rows, (n,).
-        most: h (|J| |a| + |J̇ v|) without bounded rows, (n,).
+        free: a without bounded rows, (n_v,).
         dt: h, () [s].
     """
+    change, most = rows.change(free, dt), rows.largest_change(free, dt)
     e, least = rows.restitution, slowest(rows, change)
     rests = jnp.where(rows.gap > dt[None] * most, jnp.abs(change), most)
     rests = rests if e is None else jnp.where(e >= 0, 0, rests)
@@ -416,10 +416,10 @@ class Impact:
         τ = arrivals.by_velocity
 
         def find(v: Array, lasts: Array) -> tuple[Array, Found]:
-            known = self.laws.turning_rows(place, v, time)
+            known, curvature = self.laws.rows_and_curvature(place, v, time)
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
-            turning = jnp.where(lasts, jax.lax.stop_gradient(known.turning), 0)
-            rows = dataclasses.replace(rows, turning=turning)
+            curvature = jnp.where(lasts, jax.lax.stop_gradient(curvature), 0)
+            rows = dataclasses.replace(rows, curvature=curvature)
             found = self.laws.find(place, v, time, rows, acts, lasts)
             return v + jnp.where(lasts, 0, found.change), found
 

@@ -32,9 +32,9 @@ class Impulse:
     """How bounded multipliers act within a step, the equality rows being eliminated.
 
     M a = f + Jᵀλ_e + J_bᵀλ and J a + C λ_e = b hold by the factors at hand, so that one solution
-    tells the velocities u = φ̇ + h J_b a that multipliers λ lead to, and several of them, done at
-    once, G = ∂u/∂λ: those of what each row pulls, or, where there are more rows than velocities,
-    those of a unit force along each velocity, between J_b and J_bᵀ.
+    tells the velocities u = φ̇ + h (J_b a + s J̇_b v) that multipliers λ lead to, and several of
+    them, done at once, G = ∂u/∂λ: those of what each row pulls, or, where there are more rows than
+    velocities, those of a unit force along each velocity, between J_b and J_bᵀ.
 
     Attributes:
         rows: the bounded rows.
@@ -46,6 +46,7 @@ class Impulse:
         bare: J_b M⁻¹ J_bᵀ on the diagonal, (n,): what rows would move without the equality rows.
         acts: which rows act, (n,), tangents where their normal does; None for all.
         answers: a of `probing` forces, (n_v, k, …), a constant; None where that is not known yet.
+        share: s, ½ where the velocities at the end of a step belong to its middle.
     """
 
     rows: BoundRows
@@ -57,6 +58,7 @@ class Impulse:
     bare: Array
     acts: Any = None
     answers: Any = None
+    share: float = 1.0
 
     @classmethod
     def of(
@@ -67,6 +69,7 @@ class Impulse:
         dt: Any,
         acts: Array | None = None,
         sifts: bool = False,
+        share: float = 1.0,
     ) -> Impulse:
         """Returns the impulse of a step of h, by the factors of its saddle system.
 
@@ -77,10 +80,12 @@ class Impulse:
             dt: h, () [s].
             acts: which rows act, (n,); None for all.
             sifts: whether rows that nothing moves are left out, as `nearest` needs it.
+            share: s.
         """
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
         solve = factor(widened(saddle, saddle.force.ndim - 1))
-        own = cls(rows, solve, saddle, saddle.target, dt, 0 * saddle.force, bare, acts)
+        start = 0 * saddle.force
+        own = cls(rows, solve, saddle, saddle.target, dt, start, bare, acts, share=share)
         return (own._sifted() if sifts else own._begun())._facing()
 
     def _begun(self) -> Impulse:
@@ -160,9 +165,8 @@ class Impulse:
         return self.led(self.motion(multipliers).acceleration)
 
     def led(self, acceleration: Array) -> Array:
-        """φ̇ + h J_b a, (n,)."""
-        rates = self.rows.rate + self.dt[None] * self.rows.jacobian.apply(acceleration)
-        return rates if self.rows.turning is None else rates + self.rows.turning
+        """φ̇ + h (J_b a + s J̇_b v), (n,)."""
+        return self.rows.rate + self.rows.change(acceleration, self.dt, self.share)
 
     def moved(self) -> Array | None:
         """∂a/∂λ, (n_v, n), a constant; None where it is not known."""
