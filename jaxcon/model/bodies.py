@@ -65,6 +65,18 @@ class Particle:
         """p: these velocities are rates of coordinates."""
         return p
 
+    def turn(self, step: Vector, p: Vector) -> Vector:
+        """p: these velocities are rates of coordinates."""
+        return p
+
+    def accelerate(self, v: Vector, acceleration: Vector, moments: Any, dt: Lane) -> Vector:
+        """v + h a: these velocities are rates of coordinates."""
+        return v + acceleration * dt
+
+    def rotate(self, v: Vector, moments: Any, dt: Lane) -> Vector:
+        """v: these velocities are rates of coordinates."""
+        return v
+
     def kick(self, v: Vector, acceleration: Vector, moments: Any, dt: Lane) -> Vector:
         """v + h a: these velocities are rates of coordinates."""
         return v + acceleration * dt
@@ -181,6 +193,24 @@ class SpatialRigid(Particle):
         across = φ.cross(p_φ)
         turned = p_φ + across * 0.5 + φ.cross(across) * numerics.inverse_exponential(φ.dot(φ))
         return Vector(*p[:3], *turned)
+
+    def turn(self, step: Vector, p: Vector) -> Vector:
+        """(p_x, exp(−Δφ) p_φ): p_φ in the frame of the body after it has turned by Δφ."""
+        back = quaternion.exp(Vector(*step[3:]) * -1.0)
+        return Vector(*p[:3], *quaternion.rotate(back, Vector(*p[3:])))
+
+    def accelerate(self, v: Vector, acceleration: Vector, moments: Array, dt: Lane) -> Vector:
+        """v + h (a + I⁻¹ (ω × Iω)): without the gyroscopic part of a."""
+        linear = Vector(*v[:3]) + Vector(*acceleration[:3]) * dt
+        ω = Vector(*v[3:])
+        applied = Vector(*acceleration[3:]) + spun(shares_of(Vector.of(moments)), ω)
+        return Vector(*linear, *(ω + applied * dt))
+
+    def rotate(self, v: Vector, moments: Array, dt: Lane) -> Vector:
+        """v after a free rotation of h."""
+        moments_ = Vector.of(moments)
+        ω = rotate_freely(Vector(*v[3:]), moments_, shares_of(moments_), dt)
+        return Vector(*v[:3], *ω)
 
     def kick(self, v: Vector, acceleration: Vector, moments: Array, dt: Lane) -> Vector:
         """Half a step of free rotation, h times all that is not gyroscopic in a, half a step more.

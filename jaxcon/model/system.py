@@ -278,6 +278,32 @@ class BodySystem:
         kicked = ((kind.kick_little if small else kind.kick)(*own, dt) for kind, *own in known)
         return _join(list(kicked), q)
 
+    def turn(self, q: Array, step: Array, p: Array) -> Array:
+        """A momentum p (n_v,), as seen from bodies after they have moved by Δ (n_v,)."""
+        pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
+        return _join([kind.turn(own, momentum) for kind, own, momentum in pairs], q)
+
+    def accelerate(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
+        """v after h of what accelerates bodies, (n_v,), without their free rotation.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities before, (n_v,).
+            acceleration: a at q and v, (n_v,), with its gyroscopic part.
+            dt: h, (1,) [s].
+        """
+        parts = zip(self.layout.groups, self.inertia, strict=True)
+        known = [
+            (g.kind, g.unpack(q, v)[1], g.unpack(q, acceleration)[1], p.moments) for g, p in parts
+        ]
+        return _join([kind.accelerate(*own, dt) for kind, *own in known], q)
+
+    def rotate(self, q: Array, v: Array, dt: Any) -> Array:
+        """v (n_v,) after a free rotation of h (1,) [s]."""
+        parts = zip(self.layout.groups, self.inertia, strict=True)
+        known = [(g.kind, g.unpack(q, v)[1], p.moments) for g, p in parts]
+        return _join([kind.rotate(own, moments, dt) for kind, own, moments in known], q)
+
     def coast(self, q: Array, v: Array, dt: Any) -> Array:
         """The mean gyroscopic acceleration of a step of free rotation, less that at its start.
 

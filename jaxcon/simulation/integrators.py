@@ -142,6 +142,8 @@ class SemiImplicitEuler(Explicit):
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
+        if system.turns_in_space and dynamics.stabilizer.completes:
+            return self._completed_step(dynamics, state, dt)
         v, solution, rows, solve_rows, skip_newton = self._linearized_step(dynamics, state, dt)
         if solve_rows is not None and rows.layout.size:
             v, solution = newton_correction(
@@ -157,12 +159,7 @@ class SemiImplicitEuler(Explicit):
     def _linearized_step(
         self, dynamics: Dynamics, state: State, dt: Any
     ) -> tuple[Array, Solution, Rows, Callable[[Array], Solution] | None, Array | None]:
-        """v⁺, a and λ, rows, `solve_rows` and `skip_newton` of `newton_correction`.
-
-        In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
-        v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
-        mean over a step of free rotation.
-        """
+        """v⁺, a and λ, rows, `solve_rows` and `skip_newton` of `newton_correction`."""
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.turns_in_space:
             ahead = dynamics.bounds_ahead(*here) if system.bounds else None
@@ -171,21 +168,74 @@ class SemiImplicitEuler(Explicit):
             if ahead is not None and rows.reactions is not None:
                 skip_newton = rows_beside_contact(rows.jacobian, ahead, rows.reactions.multipliers)
             return state.v + h * solution.acceleration, solution, rows, solve_rows, skip_newton
+        forces = self._forces_in_space(dynamics, state, dt)
+        solution, rows, solve_rows, coasting, pushed = forces
+        a = solution.acceleration
+        if coasting is None:
+            small = solve_rows is not None and rows.layout.size > 0  # others are corrected later
+            return system.kick(state.q, state.v, a, h, small), solution, rows, solve_rows, None
+        v = system.kick(state.q, state.v, a - coasting, h)
+        if pushed is not None:
+            v = jnp.where(pushed, state.v + h * a, v)
+        return v, solution, rows, solve_rows, None
+
+    def _forces_in_space(
+        self, dynamics: Dynamics, state: State, dt: Any
+    ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None, Array | None, Array | None]:
+        """a and λ, rows, `solve_rows`, and how bodies turn on which one-sided rows may act.
+
+        In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
+        v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
+        mean over a step of free rotation. The fourth result is what this adds to a, (n_v,), and the
+        fifth a mask of the velocities of these bodies, (n_v,); None without one-sided rows.
+        """
+        system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.bounds:
             solution, rows, solve_rows, _ = dynamics.factored(*here, dt / 2)
-            small = solve_rows is not None and rows.layout.size > 0  # others are corrected later
-            v = system.kick(state.q, state.v, solution.acceleration, h, small)
-            return v, solution, rows, solve_rows, None
+            return solution, rows, solve_rows, None, None
         bounds = dynamics.bounds_ahead(*here)
-        pressed = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
-        coasting = jnp.where(pressed, system.coast(state.q, state.v, h), 0)
+        may_press = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
+        coasting = jnp.where(may_press, system.coast(state.q, state.v, h), 0)
         held = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
         solution, rows, solve_rows, push = held.factored(*here, dt / 2, bounds)
-        v = system.kick(state.q, state.v, solution.acceleration - coasting, h)
-        if push is not None:
-            straight = state.v + h * solution.acceleration
-            v = jnp.where(system.by_body(state.q, push), straight, v)
-        return v, solution, rows, solve_rows, None
+        pushed = None if push is None else system.by_body(state.q, push)
+        return solution, rows, solve_rows, coasting, pushed
+
+    def _completed_step(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
+        """One step in space whose constraint forces are completed afterwards; v belongs to q.
+
+        With R half a step of free rotation, and g the gyroscopic part of a,
+
+            V = R(v + h (a − g)),   q⁺ = q ⊕ h V,   v⁺ = R(V).
+
+        At q⁺, φ⁺ = φ + h φ̇ + h² (J a − ½ J g + ½ γ) + O(h³). So the motion takes the constraint
+        forces with J a = −½ γ + ½ J g, and the projection of v does the rest. Those of J a = −γ are
+        reported. If the projection of q had to do more than O(h³), its impulses would change R.
+        """
+        system, h = dynamics.system, dt[None]
+        forces = self._forces_in_space(dynamics, state, dt)
+        solution, rows, solve_rows, coasting, pushed = forces
+        a, q, v = solution.acceleration, state.q, state.v
+        if solve_rows is not None and rows.layout.size:
+            gyroscopic = v - system.accelerate(q, v, jnp.zeros_like(v), h)
+            if pushed is not None:
+                gyroscopic = jnp.where(pushed, 0, gyroscopic)
+            turning = numerics.safe_divide(rows.jacobian.apply(gyroscopic), h)
+            held = rows.layout.holds & rows.layout.holonomic
+            held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
+            a = a + solve_rows(jnp.where(held, (rows.bias + turning) / 2, 0)).acceleration
+        middle = system.accelerate(q, v, a if coasting is None else a - coasting, h)
+        middle = system.rotate(q, middle, h / 2)
+        if pushed is not None:
+            middle = jnp.where(pushed, v + h * a, middle)
+        end = system.rotate(q, middle, h / 2)
+        if pushed is not None:
+            end = jnp.where(pushed, middle, end)
+        travel = h * middle
+        if (jump := jump_of(rows.reactions)) is not None:
+            travel, end = travel + jump.travel, end + jump.velocity
+            solution = with_jump(solution, jump, dt)
+        return Advanced((system.retract(q, travel), end, state.instant + dt), solution, rows)
 
     def default_gains(self, dt: Any) -> tuple[Any, Any]:
         """α = 1/(2h), β = 1/h [1/s]: the gains for which an error is gone after one step.

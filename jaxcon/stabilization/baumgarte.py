@@ -86,6 +86,14 @@ class Unstabilized(checks.Checked):
         return ("position", "velocity") if moves else ()
 
     @property
+    def completes(self) -> bool:
+        """Returns True where it completes each step, as `Projection()` does.
+
+        It then finds the constraint forces by which q⁺ keeps φ = 0, and v⁺ keeps φ̇ = 0 at q⁺.
+        """
+        return False
+
+    @property
     def remembers(self) -> bool:
         """Returns True where it has a memory."""
         return type(self).init is not Unstabilized.init

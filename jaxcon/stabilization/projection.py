@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -147,6 +148,11 @@ class Projection(Unstabilized):
         return ("position",) * self.position + ("velocity",) * self.velocity
 
     @property
+    def completes(self) -> bool:
+        """Returns True where q and v are projected after each step, and d/h is a part of v."""
+        return self.every == 1 and self.coupled and self.position and self.velocity
+
+    @property
     def remembers(self) -> bool:
         """Returns True where it counts steps."""
         return self.every != 1
@@ -199,13 +205,19 @@ class Projection(Unstabilized):
             return q, state.v, jnp.zeros_like(state.status)
         problem = self._problem(system, start.q, rows, held, rotors)
         off = rows if start is state else linearize(system, q, still, state.instant)
-        surface = _Surface(system, state, off.residual, problem, held)
+        frames = None
+        if start is not state and system.turns_in_space:
+            frames = _Frames(system, q, problem.mass, dt[None] / 2 * state.v)
+        surface = _Surface(system, state, off.residual, problem, held, frames)
         factored, bounds = solver.factor(problem), self._bounds(system, state)
         step, left, code = self._step(surface, partial(factored, still), bounds)
         late = jnp.where(left > bounds.fails, Status.NOT_CONVERGED, Status.OK)
         code = status.first(status.failures(code), late.astype(jnp.int32))
-        v = state.v if start is state else state.v + _missed(problem.mass, state.v, step, dt)
-        return system.retract(q, step), v, code
+        v = state.v
+        if start is not state:
+            change = step if frames is None else frames.change(step)
+            v = v + _missed(problem.mass, v, change, dt)
+        return surface.moved(step), v, code
 
     def _step(
         self, surface: _Surface, solve: Callable[[Array], Solution], bounds: Bounds
@@ -321,26 +333,69 @@ def _missed(mass: Mass, v: Array, step: Array, dt: Any) -> Array:
     return gain * numerics.safe_divide(present**2, present**2 + own**2)[None]
 
 
+@dataclass(frozen=True)
+class _Frames:
+    """Moves d = W⁻¹ J₀ᵀ μ from the start of a step to its end, where bodies turn in space.
+
+    J₀ᵀ μ contains torques in the frames of the bodies at the start, and bodies turn by h ω till the
+    end. In the middle of the step they change the velocity that leads from q to q⁺.
+
+    Attributes:
+        system: with `turn`.
+        q: positions at the end, (n_q,).
+        mass: W.
+        half: h v/2, (n_v,) [m, rad].
+    """
+
+    system: Any
+    q: Array
+    mass: Mass
+    half: Array
+
+    def displacement(self, d: Array) -> Array:
+        """What d displaces at the end of the step, (n_v,)."""
+        return self.system.turn(self.q, self.half, self._turned(d))
+
+    def change(self, d: Array) -> Array:
+        """The change of h v at the end of the step, (n_v,)."""
+        return self._turned(self._turned(d))
+
+    def _turned(self, d: Array) -> Array:
+        """W⁻¹ J₀ᵀ μ half a step later."""
+        return self.mass.solve(self.system.turn(self.q, self.half, self.mass.apply(d)))
+
+
 class _Surface:
     """φ(q* ⊕ d) of the rows that are projected, zero for the others.
 
     Attributes:
         problem: M, J₀ and C.
         start: φ(q*), (n_c,).
+        frames: from those of d to those at q*; None where they are the same.
     """
 
     def __init__(
-        self, system: Any, state: State, start: Array, problem: Saddle, held: np.ndarray
+        self,
+        system: Any,
+        state: State,
+        start: Array,
+        problem: Saddle,
+        held: np.ndarray,
+        frames: _Frames | None,
     ) -> None:
-        self.system, self.state, self.problem = system, state, problem
+        self.system, self.state, self.problem, self.frames = system, state, problem, frames
         self.held = jnp.asarray(held).reshape(-1, *(1,) * (start.ndim - 1))
         self.start = start  # rows of velocities and rotors have φ = 0
 
+    def moved(self, d: Array) -> Array:
+        """q* ⊕ d, (n_q,)."""
+        d = d if self.frames is None else self.frames.displacement(d)
+        return self.system.retract(self.state.q, d)
+
     def residual(self, d: Array) -> Array:
         """φ(q* ⊕ d), (n_c,)."""
-        moved = self.system.retract(self.state.q, d)
         still = jnp.zeros_like(d)
-        return linearize(self.system, moved, still, self.state.instant).residual
+        return linearize(self.system, self.moved(d), still, self.state.instant).residual
 
     def apply(self, d: Array) -> Array:
         """J₀ d, (n_c,)."""
