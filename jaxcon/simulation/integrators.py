@@ -107,7 +107,7 @@ class SemiImplicitEuler(Explicit):
     In space, the free rotation of bodies is split off from what accelerates them
     (`BodySystem.kick`). A free body so keeps |Iω| and its energy up to turns of a radian a step. A
     top on its point may spin by 4 rad a step; its axis goes round 3 % too slowly where it spins by
-    0.3 rad, and a fifth where it spins by one.
+    0.3 rad, and a fifth where it spins by one. Beside `Projection()` v belongs to the time of q.
 
     Where a body or a rod turns by more than 0.038 rad in a step, or 0.025 rad if bodies turn in
     space, what the linearized rows missed of φ is taken out by a second substitution with the
