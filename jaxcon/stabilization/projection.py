@@ -93,10 +93,10 @@ class Projection(Unstabilized):
     Rows that depend on each other do so on the surface only: off it J(q*) has directions too many,
     by which the point is not unique; the solver chooses, within O(‖d‖).
 
-    Where bodies turn in space, J₀ᵀ μ contains torques in their frames at the start of the step. They
-    turn with the bodies: by h ω/2 until they change a velocity, and by h ω till the end. Beside
-    semi-implicit Euler a top may so spin by 3 rad a step, and the energy of two boxes on a hinge and
-    a ball joint stays as near its start as by default.
+    Where bodies turn in space, J₀ᵀ μ contains torques in their frames at the start of the step.
+    They turn with the bodies: by h ω/2 until they change a velocity, and by h ω till the end.
+    Beside semi-implicit Euler a top may so spin by 3 rad a step, and the energy of two boxes on a
+    hinge and a ball joint stays as near its start as by default.
 
     Rows of velocities alone are part of the second projection only. Rotors are inertia of the mass
     metric. The derivative is that of the root, in every world, and not of the iterations.
