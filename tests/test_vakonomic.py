@@ -69,6 +69,34 @@ def test_momentum_of_a_body_with_a_forbidden_spin_is_constant_in_space():
     np.testing.assert_allclose(jax.vmap(momentum)(path), np.tile(expected, (5, 1)), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("integrator", "change"), [(jc.RK4(), 1e-8), (jc.SemiImplicitEuler(), 0.15)], ids=["RK4", "SIE"]
+)
+def test_a_body_on_a_point_with_a_forbidden_spin_is_projected(integrator, change):
+    """It stays on its point to rounding; energy is that of the order of the method [J]."""
+    axis, place = np.array([0.3, -0.5, 0.8]), np.array([0.1, 0.0, 0.0])
+    spin = np.cross(axis, [10.0, 20.0, 5.0])
+    moving = {"velocity": np.cross(spin, place), "angular_velocity": spin, "position": place}
+    scene = jc.Scene()
+    scene.add_body("body", mass=1.0, inertia=(0.01, 0.014, 0.021), **moving)
+    scene.add(jc.Spherical("point", jc.WORLD, "body", point=(0.0, 0.0, 0.0)))
+    scene.add(jc.VelocityLevel(suslov, ("body",), name="spin", params=axis))
+    system, state = jc.vakonomic(*scene.build(), {"spin": 0.05})
+    method = jc.Method(integrator, jc.Projection())
+
+    def seen(state, info):
+        off = jc.violation(system, state)
+        return jc.energy(system, state).total, off.worst, off.worst_rate
+
+    start = jc.init(system, method, state.q, state.v)
+    final, (energy, *off) = jax.jit(
+        lambda s: jc.rollout(system, method, s, None, 1e-3, 200, record=seen)
+    )(start)
+    assert final.status == jc.Status.OK
+    assert np.ptp(energy) < change
+    assert np.max(off) < 1e-12
+
+
 def test_rolling_in_space_keeps_energy_and_the_momenta_of_its_symmetries():
     """A disc on a level plane: L + μ·ψ does not change when the plane is shifted."""
     scene = jc.Scene()

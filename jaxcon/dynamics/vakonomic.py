@@ -195,6 +195,21 @@ class Vakonomic:
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)
         return jnp.concatenate([self.system.kick(q, v, a, dt, small), μ + dt * rate])
 
+    def accelerate(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
+        """The velocities without free rotation as those of the system, and μ + h μ̇."""
+        (v, μ), (a, rate) = self._split(v), self._split(acceleration)
+        return jnp.concatenate([self.system.accelerate(q, v, a, dt), μ + dt * rate])
+
+    def rotate(self, q: Array, v: Array, dt: Any) -> Array:
+        """The velocities after a free rotation as those of the system, and μ as it is."""
+        v, μ = self._split(v)
+        return jnp.concatenate([self.system.rotate(q, v, dt), μ])
+
+    def turn(self, q: Array, step: Array, p: Array) -> Array:
+        """A momentum as that of the system, and what goes with μ as it is."""
+        (step, _), (p, rest) = self._split(step), self._split(p)
+        return jnp.concatenate([self.system.turn(q, step, p), rest])
+
     def squared_turn(self, q: Array, v: Array, before: Array, rows: Any, dt: Any) -> Array:
         """The square of the largest turn in a step, as of the system, () [rad²]."""
         v, before = self._split(v)[0], self._split(before)[0]
@@ -211,6 +226,10 @@ class Vakonomic:
         """A momentum along a step as that of the system, and what goes with μ as it is."""
         (step, _), (p, rest) = self._split(step), self._split(p)
         return jnp.concatenate([self.system.carry(q, step, p), rest])
+
+    def extent(self, q: Array) -> Array:
+        """The largest place, as of the system, ()."""
+        return self.system.extent(q)
 
     def normalize(self, q: Array) -> Array:
         """q with its quaternions brought back to unit length."""
