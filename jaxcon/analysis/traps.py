@@ -321,9 +321,10 @@ def impact(known: Known) -> str | None:
     if rows.lands:  # a robot has dozens, and one line names them
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
     some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
-    sweeps = not is_exact(method.resolve(known.system, known.state).bounded)
+    solver = method.resolve(known.system, known.state).bounded
     shared = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
-    said = doubt(rows, shared and sweeps, some)
+    shares = type(solver).__name__ if shared and not is_exact(solver) else None
+    said = doubt(rows, shares, some)
     return None if said is None else said.removeprefix(PREFIX)
 
 

@@ -113,8 +113,8 @@ class BoundRows:
         ends: which of these have a gap that closes, (n,).
         paired: which have a second stop, (n,).
         lands: names of contacts and ropes without restitution on bodies that turn.
-        curvature: J̇ v, (n,) [m/s², rad/s²]: the change of φ̇ with time where v does not change, of
-            rows that make impacts; zero of others. None where it is left out.
+        turn: h J̇ v (n,), the change of φ̇ in a step of constant v, as of `Dynamics.turn`. Of rows
+            that make impacts; zero of others. None where it is left out.
     """
 
     gap: Array
@@ -134,17 +134,17 @@ class BoundRows:
     ends: tuple[bool, ...] = static(default=())
     paired: tuple[bool, ...] = static(default=())
     lands: tuple[str, ...] = static(default=())
-    curvature: Array | None = None
+    turn: Array | None = None
 
     def change(self, acceleration: Array, dt: Array, share: float = 1.0) -> Array:
-        """h (J a + s J̇ v), (n,): the change of φ̇ in a step of h, or in its share s."""
+        """h J a + s h J̇ v, (n,): the change of φ̇ in a step of h."""
         change = dt[None] * self.jacobian.apply(acceleration)
-        return change if self.curvature is None else change + share * dt[None] * self.curvature
+        return change if self.turn is None else change + share * self.turn
 
     def largest_change(self, acceleration: Array, dt: Array) -> Array:
         """h (|J| |a| + |J̇ v|), (n,): the change of φ̇ if no terms cancelled."""
         most = dt[None] * self.jacobian.reach(acceleration)
-        return most if self.curvature is None else most + dt[None] * jnp.abs(self.curvature)
+        return most if self.turn is None else most + jnp.abs(self.turn)
 
     def finite(self, bare: Array) -> Array:
         """True where all numbers of the rows are finite, ().
@@ -168,7 +168,7 @@ class BoundRows:
             jacobian=Gathered(self.jacobian.pulls(choice.places().astype(self.rate.dtype))),
             restitution=None if e is None else choice.take(e),
             far=None if far is None else choice.take(far),
-            curvature=None if self.curvature is None else choice.take(self.curvature),
+            turn=None if self.turn is None else choice.take(self.turn),
             kinds=choice.kinds,
         )
 
@@ -192,7 +192,7 @@ class BoundRows:
             self,
             gap=jnp.where(second, gap, self.gap),
             rate=sign * self.rate,
-            curvature=None if self.curvature is None else sign * self.curvature,
+            turn=None if self.turn is None else sign * self.turn,
             target=jnp.where(second, -numerics.safe_divide(gap, dt[None]), self.target),
             jacobian=self.jacobian.scaled(sign, np.array(self.paired)),  # type: ignore[union-attr]
             far=None,

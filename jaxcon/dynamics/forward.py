@@ -130,7 +130,8 @@ class Dynamics:
             apart = every or is_exact(self.bounded) or bounds.restitution is not None
             strikes = any(bounds.ends) and apart
             lands = lag is not None and not strikes
-            doubt = impacts.doubt(bounds, lands, self._leaves_out(bounds))
+            shares = type(self.bounded).__name__ if lands else None
+            doubt = impacts.doubt(bounds, shares, self._leaves_out(bounds))
             if doubt is not None:
                 gap = notices.when_differentiated(bounds.gap, doubt)
                 bounds = dataclasses.replace(bounds, gap=gap)
@@ -139,8 +140,7 @@ class Dynamics:
             length, strikes, lands = self.part.length, False, False
         share = 1.0 if lag is None else 0.5  # velocities at the end of a step belong to its middle
         if strikes:
-            bounds, curvature = self.bounds_and_curvature(q, v, t)
-            bounds = dataclasses.replace(bounds, curvature=curvature)
+            bounds = dataclasses.replace(bounds, turn=self.turn(bounds, q, v, t))
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         impulse = self._impulse(base, law, problem, length, acts, share)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
@@ -213,21 +213,27 @@ class Dynamics:
         """The bounded rows, and what a step of dt wants of them."""
         return linearize_bounds(self.system, q, v, t, self.control, dt)
 
-    def bounds_and_curvature(self, q: Array, v: Array, t: Any) -> tuple[BoundRows, Array]:
-        """The bounded rows, and J̇ v (n,): how fast their rates change where v does not.
+    def turn(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
+        """The `turn` of the bounded rows at (q, v, t), (n,).
 
-        Of rows that make impacts, and of the tangents of their contacts; zero of others.
+        h J̇ v has no bound: a slack rope that passes its anchor at a distance d has J̇ v = −v²/d. The
+        change of φ̇ over the step is at most 2 |J| |v|, but where a contact goes from one end of a
+        body to the other it says nothing of either. So the smaller of the two counts, and nothing
+        where they disagree in sign. The derivative is that of the change.
         """
+        dt, fixed = self.dt, jax.lax.stop_gradient
 
-        def rates(q: Array, time: Array) -> tuple[Array, BoundRows]:
-            rows = self.bounds(q, v, t + time, self.dt)
-            return rows.rate, rows
+        def rate(q: Array, time: Array) -> Array:
+            return self.bounds(q, v, t + time, dt).rate
 
-        now = (q, jnp.zeros_like(self.dt))
-        along = (self.system.kinematics(q, v), jnp.ones_like(self.dt))
-        _, curvature, rows = jax.jvp(rates, now, along, has_aux=True)
+        along = (dt[None] * self.system.kinematics(q, v), dt)
+        _, local = jax.jvp(rate, (q, jnp.zeros_like(dt)), along)
+        change = rate(self.system.retract(q, dt[None] * v), dt) - rows.rate
         ends = rows.kinds.by_contact(impacts.mask(rows.ends, rows))
-        return rows, jnp.where(ends, curvature, 0)
+        same = local * change > 0  # not where one is not a number
+        least = jnp.where(same & (jnp.abs(local) < jnp.abs(change)), local, change)
+        change += fixed(jnp.where(same, least, 0) - change)
+        return jnp.where(ends, change, 0)
 
     def unbounded(self, q: Array, v: Array, t: Any) -> Array:
         """a without bounded rows."""
@@ -370,9 +376,9 @@ class _Laws:
         """The bounded rows at a state."""
         return self.dynamics.bounds(q, v, t, self.dynamics.dt)
 
-    def rows_and_curvature(self, q: Array, v: Array, t: Any) -> tuple[BoundRows, Array]:
-        """The bounded rows at a state, and J̇ v (n,)."""
-        return self.dynamics.bounds_and_curvature(q, v, t)
+    def turn(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
+        """The `turn` of the bounded rows at a state, (n,)."""
+        return self.dynamics.turn(rows, q, v, t)
 
     def find(
         self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array

@@ -114,8 +114,8 @@ class Laws(Protocol):
         """The bounded rows at a state."""
         ...
 
-    def rows_and_curvature(self, q: Array, v: Array, t: Any) -> tuple[BoundRows, Array]:
-        """The bounded rows at a state, and J̇ v (n,) of those that make impacts."""
+    def turn(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
+        """The `turn` of the bounded rows at a state, (n,)."""
         ...
 
     def find(self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array) -> Found:
@@ -349,18 +349,18 @@ def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     return dataclasses.replace(rows, target=kinds.join(parts._replace(discs=discs)))
 
 
-def doubt(rows: BoundRows, shared: bool, some: bool) -> str | None:
+def doubt(rows: BoundRows, shares: str | None, some: bool) -> str | None:
     """Why derivatives of plain steps through impacts may be wrong, by structure; None if not.
 
     Args:
         rows: the bounded rows; only their static fields are read.
-        shared: whether a landing is shared over two steps, as by `landing`.
+        shares: the solver beside which `landing` shares a landing over two steps; None if none.
         some: whether the solver leaves rows out.
     """
     reasons = []
-    if shared and rows.lands:
+    if shares is not None and rows.lands:
         reasons.append(
-            f"beside GaussSeidel() a landing of {', '.join(rows.lands)} takes two steps, so that"
+            f"beside {shares} a landing of {', '.join(rows.lands)} takes two steps, so that"
             " where a body turns as it lands on a corner or on another body, its derivative is"
             " right only in the mean over the phases of a step; Method(bounded=InteriorPoint()),"
             " restitution=jnp.zeros(()) or Events() makes it one"
@@ -416,10 +416,11 @@ class Impact:
         τ = arrivals.by_velocity
 
         def find(v: Array, lasts: Array) -> tuple[Array, Found]:
-            known, curvature = self.laws.rows_and_curvature(place, v, time)
+            known = self.laws.rows(place, v, time)
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
-            curvature = jnp.where(lasts, jax.lax.stop_gradient(curvature), 0)
-            rows = dataclasses.replace(rows, curvature=curvature)
+            # its derivative would add O(r) to that of the motion after the impact
+            turn = jax.lax.stop_gradient(self.laws.turn(known, place, v, time))
+            rows = dataclasses.replace(rows, turn=jnp.where(lasts, turn, 0))
             found = self.laws.find(place, v, time, rows, acts, lasts)
             return v + jnp.where(lasts, 0, found.change), found
 
