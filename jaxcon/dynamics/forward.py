@@ -221,7 +221,7 @@ class Dynamics:
         body to the other it says nothing of either. So the smaller of the two counts, and nothing
         where they disagree in sign. The derivative is that of the change.
         """
-        dt, fixed = self.dt, jax.lax.stop_gradient
+        dt = self.dt
 
         def rate(q: Array, time: Array) -> Array:
             return self.bounds(q, v, t + time, dt).rate
@@ -229,11 +229,12 @@ class Dynamics:
         along = (dt[None] * self.system.kinematics(q, v), dt)
         _, local = jax.jvp(rate, (q, jnp.zeros_like(dt)), along)
         change = rate(self.system.retract(q, dt[None] * v), dt) - rows.rate
+        change = jnp.where(jnp.isfinite(change), change, 0)  # φ may not exist there
+        agree = local * change > 0  # false where J̇ v is not a number
+        smaller = jnp.where(agree & (jnp.abs(local) < jnp.abs(change)), local, change)
+        value = jnp.where(agree, smaller, 0)
         ends = rows.kinds.by_contact(impacts.mask(rows.ends, rows))
-        same = local * change > 0  # not where one is not a number
-        least = jnp.where(same & (jnp.abs(local) < jnp.abs(change)), local, change)
-        change += fixed(jnp.where(same, least, 0) - change)
-        return jnp.where(ends, change, 0)
+        return jnp.where(ends, change + jax.lax.stop_gradient(value - change), 0)
 
     def unbounded(self, q: Array, v: Array, t: Any) -> Array:
         """a without bounded rows."""
