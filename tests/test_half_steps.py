@@ -393,6 +393,40 @@ def test_a_hinge_and_a_ball_joint_keep_their_energy_at_20_ms(beside, stabilizer,
     assert np.all(off < 1e-3)
 
 
+def end_of(system, state, method, dt, time):
+    """q after a time."""
+    steps = round(time / dt)
+    run = jax.jit(
+        lambda s: jc.rollout(system, method, s, None, dt, steps, record=lambda s, i: None)
+    )
+    final = run(jc.init(system, method, state.q, state.v))[0]
+    assert final.status == jc.Status.OK
+    return final.q
+
+
+def test_a_projected_start_off_the_velocities_is_right_to_first_order():
+    """Two boxes in space whose joints would come apart: each step turns them by 0.03 rad."""
+    system, state = hinge_and_ball()
+    state = dataclasses.replace(state, v=thrown(system, 1.0, (2.0, -3.0, 6.0)).at[:3].add(1.0))
+    assert jc.violation(system, state).worst_rate > 0.5
+    exact = end_of(system, state, jc.Method(jc.RK4(), PROJECTED), 1e-4, 0.5)
+    for method in (jc.Method(stabilizer=PROJECTED), jc.Method(jc.RK4(), PROJECTED)):
+        off = np.abs(end_of(system, state, method, 4e-3, 0.5) - exact)
+        assert np.max(off) < 4e-3
+
+
+def test_a_rolling_ball_of_three_moments_is_projected_as_precisely_as_by_default():
+    scene = jc.Scene()
+    moving = {"angular_velocity": (3.0, 8.0, 5.0), "velocity": (0.8, -0.3, 0.0)}
+    scene.add_body("ball", mass=1.0, inertia=(0.01, 0.014, 0.02), position=(0, 0, 0.1), **moving)
+    scene.add(jc.RollingSphere("roll", jc.WORLD, "ball", radius=0.1))
+    system, state = scene.build()
+    exact = end_of(system, state, jc.Method(jc.RK4(), PROJECTED), 1e-3, 2.0)
+    for stabilizer in (FED, PROJECTED):
+        off = np.abs(end_of(system, state, jc.Method(stabilizer=stabilizer), 4e-3, 2.0) - exact)
+        assert np.max(off) < 6e-3
+
+
 @pytest.mark.parametrize("radius", [1e-3, 1e-4])
 def test_a_thin_rod_that_turns_end_over_end_does_not_spin_about_itself(radius):
     """In float32 two equal moments of inertia leave no torque about the third axis."""

@@ -113,8 +113,9 @@ class BoundRows:
         ends: which of these have a gap that closes, (n,).
         paired: which have a second stop, (n,).
         lands: names of contacts and ropes without restitution on bodies that turn.
-        turn: h J̇ v (n,), the change of φ̇ in a step of constant v, as of `Dynamics.turn`. Of rows
-            that make impacts; zero of others. None where it is left out.
+        rate_change: h J̇ v (n,), the change of φ̇ in a step of constant v, as of
+            `Dynamics.rate_change`. Of rows that make impacts; zero of others. None where it is left
+            out.
     """
 
     gap: Array
@@ -134,17 +135,17 @@ class BoundRows:
     ends: tuple[bool, ...] = static(default=())
     paired: tuple[bool, ...] = static(default=())
     lands: tuple[str, ...] = static(default=())
-    turn: Array | None = None
+    rate_change: Array | None = None
 
     def change(self, acceleration: Array, dt: Array, share: float = 1.0) -> Array:
         """h J a + s h J̇ v, (n,): the change of φ̇ in a step of h."""
         change = dt[None] * self.jacobian.apply(acceleration)
-        return change if self.turn is None else change + share * self.turn
+        return change if self.rate_change is None else change + share * self.rate_change
 
     def largest_change(self, acceleration: Array, dt: Array) -> Array:
         """h (|J| |a| + |J̇ v|), (n,): the change of φ̇ if no terms cancelled."""
         most = dt[None] * self.jacobian.reach(acceleration)
-        return most if self.turn is None else most + jnp.abs(self.turn)
+        return most if self.rate_change is None else most + jnp.abs(self.rate_change)
 
     def finite(self, bare: Array) -> Array:
         """True where all numbers of the rows are finite, ().
@@ -168,7 +169,7 @@ class BoundRows:
             jacobian=Gathered(self.jacobian.pulls(choice.places().astype(self.rate.dtype))),
             restitution=None if e is None else choice.take(e),
             far=None if far is None else choice.take(far),
-            turn=None if self.turn is None else choice.take(self.turn),
+            rate_change=None if self.rate_change is None else choice.take(self.rate_change),
             kinds=choice.kinds,
         )
 
@@ -192,7 +193,7 @@ class BoundRows:
             self,
             gap=jnp.where(second, gap, self.gap),
             rate=sign * self.rate,
-            turn=None if self.turn is None else sign * self.turn,
+            rate_change=None if self.rate_change is None else sign * self.rate_change,
             target=jnp.where(second, -numerics.safe_divide(gap, dt[None]), self.target),
             jacobian=self.jacobian.scaled(sign, np.array(self.paired)),  # type: ignore[union-attr]
             far=None,

@@ -140,7 +140,7 @@ class Dynamics:
             length, strikes, lands = self.part.length, False, False
         share = 1.0 if lag is None else 0.5  # velocities at the end of a step belong to its middle
         if strikes:
-            bounds = dataclasses.replace(bounds, turn=self.turn(bounds, q, v, t))
+            bounds = dataclasses.replace(bounds, rate_change=self.rate_change(bounds, q, v, t))
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         impulse = self._impulse(base, law, problem, length, acts, share)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
@@ -213,8 +213,8 @@ class Dynamics:
         """The bounded rows, and what a step of dt wants of them."""
         return linearize_bounds(self.system, q, v, t, self.control, dt)
 
-    def turn(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
-        """The `turn` of the bounded rows at (q, v, t), (n,).
+    def rate_change(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
+        """The `rate_change` of the bounded rows at (q, v, t), (n,).
 
         h J̇ v has no bound: a slack rope that passes its anchor at a distance d has J̇ v = −v²/d. The
         change of φ̇ over the step is at most 2 |J| |v|, but where a contact goes from one end of a
@@ -377,9 +377,9 @@ class _Laws:
         """The bounded rows at a state."""
         return self.dynamics.bounds(q, v, t, self.dynamics.dt)
 
-    def turn(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
-        """The `turn` of the bounded rows at a state, (n,)."""
-        return self.dynamics.turn(rows, q, v, t)
+    def rate_change(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
+        """The `rate_change` of the bounded rows at a state, (n,)."""
+        return self.dynamics.rate_change(rows, q, v, t)
 
     def find(
         self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array

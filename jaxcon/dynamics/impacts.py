@@ -114,8 +114,8 @@ class Laws(Protocol):
         """The bounded rows at a state."""
         ...
 
-    def turn(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
-        """The `turn` of the bounded rows at a state, (n,)."""
+    def rate_change(self, rows: BoundRows, q: Array, v: Array, t: Any) -> Array:
+        """The `rate_change` of the bounded rows at a state, (n,)."""
         ...
 
     def find(self, q: Array, v: Array, t: Any, rows: BoundRows, acts: Array, lasts: Array) -> Found:
@@ -419,8 +419,8 @@ class Impact:
             known = self.laws.rows(place, v, time)
             rows, acts = at_impact(known, arrivals, self.dt, lasts)
             # its derivative would add O(r) to that of the motion after the impact
-            turn = jax.lax.stop_gradient(self.laws.turn(known, place, v, time))
-            rows = dataclasses.replace(rows, turn=jnp.where(lasts, turn, 0))
+            change = jax.lax.stop_gradient(self.laws.rate_change(known, place, v, time))
+            rows = dataclasses.replace(rows, rate_change=jnp.where(lasts, change, 0))
             found = self.laws.find(place, v, time, rows, acts, lasts)
             return v + jnp.where(lasts, 0, found.change), found
 

@@ -205,10 +205,10 @@ class Vakonomic:
         v, μ = self._split(v)
         return jnp.concatenate([self.system.rotate(q, v, dt), μ])
 
-    def turn(self, q: Array, step: Array, p: Array) -> Array:
-        """A momentum as that of the system, and what goes with μ as it is."""
+    def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
+        """Velocities as those of the system, and μ as it is."""
         (step, _), (p, rest) = self._split(step), self._split(p)
-        return jnp.concatenate([self.system.turn(q, step, p), rest])
+        return jnp.concatenate([self.system.in_turned_frames(q, step, p), rest])
 
     def squared_turn(self, q: Array, v: Array, before: Array, rows: Any, dt: Any) -> Array:
         """The square of the largest turn in a step, as of the system, () [rad²]."""

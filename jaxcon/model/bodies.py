@@ -65,7 +65,7 @@ class Particle:
         """p: these velocities are rates of coordinates."""
         return p
 
-    def turn(self, step: Vector, p: Vector) -> Vector:
+    def in_turned_frames(self, step: Vector, p: Vector) -> Vector:
         """p: these velocities are rates of coordinates."""
         return p
 
@@ -194,8 +194,8 @@ class SpatialRigid(Particle):
         turned = p_φ + across * 0.5 + φ.cross(across) * numerics.inverse_exponential(φ.dot(φ))
         return Vector(*p[:3], *turned)
 
-    def turn(self, step: Vector, p: Vector) -> Vector:
-        """(p_x, exp(−Δφ) p_φ): p_φ in the frame of the body after it has turned by Δφ."""
+    def in_turned_frames(self, step: Vector, p: Vector) -> Vector:
+        """(p_x, exp(−Δφ) p_φ): p_φ in the frame of the body that has turned by Δφ."""
         back = quaternion.exp(Vector(*step[3:]) * -1.0)
         return Vector(*p[:3], *quaternion.rotate(back, Vector(*p[3:])))
 

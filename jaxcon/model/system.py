@@ -278,10 +278,10 @@ class BodySystem:
         kicked = ((kind.kick_little if small else kind.kick)(*own, dt) for kind, *own in known)
         return _join(list(kicked), q)
 
-    def turn(self, q: Array, step: Array, p: Array) -> Array:
-        """A momentum p (n_v,), as seen from bodies after they have moved by Δ (n_v,)."""
+    def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
+        """The change p (n_v,) of velocities in body frames that have turned by Δ (n_v,)."""
         pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
-        return _join([kind.turn(own, momentum) for kind, own, momentum in pairs], q)
+        return _join([kind.in_turned_frames(own, momentum) for kind, own, momentum in pairs], q)
 
     def accelerate(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
         """v after h of what accelerates bodies, (n_v,), without their free rotation.

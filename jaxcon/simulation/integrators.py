@@ -91,6 +91,34 @@ class Explicit(checks.Checked):
         return None
 
 
+class ForcesInSpace(NamedTuple):
+    """The forces of a step of bodies in space.
+
+    Attributes:
+        solution: a and λ.
+        rows: the equality rows.
+        solve_rows: b → the least a with J a + C λ = b; None where the stabilizer solves by itself.
+        coasting: what a contains for free rotation during the step, of bodies on which one-sided
+            rows may act, (n_v,); None without such rows.
+        pushed: a mask of the velocities of bodies on which one-sided rows act, (n_v,); None without
+            such rows.
+    """
+
+    solution: Solution
+    rows: Rows
+    solve_rows: Callable[[Array], Solution] | None
+    coasting: Array | None
+    pushed: Array | None
+
+    def without_coasting(self, acceleration: Array) -> Array:
+        """a without what it contains for free rotation during the step, (n_v,)."""
+        return acceleration if self.coasting is None else acceleration - self.coasting
+
+    def where_pushed(self, pushed: Array, others: Array) -> Array:
+        """Velocities of bodies on which one-sided rows act, and of the others, (n_v,)."""
+        return others if self.pushed is None else jnp.where(self.pushed, pushed, others)
+
+
 @pytree
 class SemiImplicitEuler(Explicit):
     """v⁺ = v + h a(q, v), q⁺ = q ⊕ h v⁺: first order, one solve, symplectic without constraints.
@@ -169,37 +197,31 @@ class SemiImplicitEuler(Explicit):
                 skip_newton = rows_beside_contact(rows.jacobian, ahead, rows.reactions.multipliers)
             return state.v + h * solution.acceleration, solution, rows, solve_rows, skip_newton
         forces = self._forces_in_space(dynamics, state, dt)
-        solution, rows, solve_rows, coasting, pushed = forces
-        a = solution.acceleration
-        if coasting is None:
-            small = solve_rows is not None and rows.layout.size > 0  # others are corrected later
-            return system.kick(state.q, state.v, a, h, small), solution, rows, solve_rows, None
-        v = system.kick(state.q, state.v, a - coasting, h)
-        if pushed is not None:
-            v = jnp.where(pushed, state.v + h * a, v)
+        solution, rows, solve_rows = forces.solution, forces.rows, forces.solve_rows
+        # small turns do for what is corrected later
+        small = forces.coasting is None and solve_rows is not None and rows.layout.size > 0
+        v = system.kick(state.q, state.v, forces.without_coasting(solution.acceleration), h, small)
+        v = forces.where_pushed(state.v + h * solution.acceleration, v)
         return v, solution, rows, solve_rows, None
 
-    def _forces_in_space(
-        self, dynamics: Dynamics, state: State, dt: Any
-    ) -> tuple[Solution, Rows, Callable[[Array], Solution] | None, Array | None, Array | None]:
-        """a and λ, rows, `solve_rows`, and how bodies turn on which one-sided rows may act.
+    def _forces_in_space(self, dynamics: Dynamics, state: State, dt: Any) -> ForcesInSpace:
+        """a and λ at the start of a step in space.
 
-        In space, the free rotation of bodies is split off. Of a body on which a one-sided row acts,
+        The free rotation of bodies is split off. Of a body on which a one-sided row acts,
         v⁺ = v + h a, as its law says something of this v⁺. The gyroscopic part of a is then the
-        mean over a step of free rotation. The fourth result is what this adds to a, (n_v,), and the
-        fifth a mask of the velocities of these bodies, (n_v,); None without one-sided rows.
+        mean over a step of free rotation.
         """
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.bounds:
             solution, rows, solve_rows, _ = dynamics.factored(*here, dt / 2)
-            return solution, rows, solve_rows, None, None
+            return ForcesInSpace(solution, rows, solve_rows, None, None)
         bounds = dynamics.bounds_ahead(*here)
         may_press = dynamics.pressed(bounds).reshape(-1, *(1,) * (state.v.ndim - 1))
         coasting = jnp.where(may_press, system.coast(state.q, state.v, h), 0)
         held = dataclasses.replace(dynamics, held=system.mass(state.q).apply(coasting))
         solution, rows, solve_rows, push = held.factored(*here, dt / 2, bounds)
         pushed = None if push is None else system.by_body(state.q, push)
-        return solution, rows, solve_rows, coasting, pushed
+        return ForcesInSpace(solution, rows, solve_rows, coasting, pushed)
 
     def _completed_step(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step in space whose constraint forces are completed afterwards; v belongs to q.
@@ -208,29 +230,27 @@ class SemiImplicitEuler(Explicit):
 
             V = R(v + h (a − g)),   q⁺ = q ⊕ h V,   v⁺ = R(V).
 
-        At q⁺, φ⁺ = φ + h φ̇ + h² (J a − ½ J g + ½ γ) + O(h³). So the motion takes the constraint
-        forces with J a = −½ γ + ½ J g, and the projection of v does the rest. Those of J a = −γ are
-        reported. If the projection of q had to do more than O(h³), its impulses would change R.
+        So φ⁺ = φ + h φ̇ + h² (J a − ½ J g + ½ γ) + O(h³), and V obeys rows of velocities half a step
+        later where J a − ½ J g + ½ γ = 0. The motion therefore takes the constraint forces with
+        J a = −½ γ + ½ J g − φ̇/h, and the projection of v does the rest. Those of J a = −γ are
+        reported. Without this, the projection of q would have to do O(h²), or O(h) after a start
+        with φ̇ ≠ 0, whose impulses would change R.
         """
         system, h = dynamics.system, dt[None]
         forces = self._forces_in_space(dynamics, state, dt)
-        solution, rows, solve_rows, coasting, pushed = forces
-        a, q, v = solution.acceleration, state.q, state.v
-        if solve_rows is not None and rows.layout.size:
-            gyroscopic = v - system.accelerate(q, v, jnp.zeros_like(v), h)
-            if pushed is not None:
-                gyroscopic = jnp.where(pushed, 0, gyroscopic)
+        solution, rows, q, v = forces.solution, forces.rows, state.q, state.v
+        a = solution.acceleration
+        if forces.solve_rows is not None and rows.layout.size:
+            gyroscopic = v - system.accelerate(q, v, jnp.zeros_like(v), h)  # h g
+            gyroscopic = forces.where_pushed(jnp.zeros_like(v), gyroscopic)
             turning = numerics.safe_divide(rows.jacobian.apply(gyroscopic), h)
-            held = rows.layout.holds & rows.layout.holonomic
-            held = held.reshape(-1, *(1,) * (rows.bias.ndim - 1))
-            a = a + solve_rows(jnp.where(held, (rows.bias + turning) / 2, 0)).acceleration
-        middle = system.accelerate(q, v, a if coasting is None else a - coasting, h)
-        middle = system.rotate(q, middle, h / 2)
-        if pushed is not None:
-            middle = jnp.where(pushed, v + h * a, middle)
-        end = system.rotate(q, middle, h / 2)
-        if pushed is not None:
-            end = jnp.where(pushed, middle, end)
+            held = rows.layout.holds.reshape(-1, *(1,) * (rows.bias.ndim - 1))
+            missing = (rows.bias + turning) / 2 - numerics.safe_divide(rows.rate, h)
+            missing = jnp.where(held, missing, 0)
+            a = a + forces.solve_rows(missing).acceleration
+        middle = system.accelerate(q, v, forces.without_coasting(a), h)
+        middle = forces.where_pushed(v + h * a, system.rotate(q, middle, h / 2))
+        end = forces.where_pushed(middle, system.rotate(q, middle, h / 2))
         travel = h * middle
         if (jump := jump_of(rows.reactions)) is not None:
             travel, end = travel + jump.travel, end + jump.velocity

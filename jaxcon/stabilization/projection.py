@@ -93,10 +93,10 @@ class Projection(Unstabilized):
     Rows that depend on each other do so on the surface only: off it J(q*) has directions too many,
     by which the point is not unique; the solver chooses, within O(‖d‖).
 
-    Where bodies turn in space, J₀ᵀ μ contains torques in their frames at the start of the step.
-    They turn with the bodies: by h ω/2 until they change a velocity, and by h ω till the end.
-    Beside semi-implicit Euler a top may so spin by 3 rad a step, and the energy of two boxes on a
-    hinge and a ball joint stays as near its start as by default.
+    Where bodies turn in space, J₀ belongs to their frames at the start of the step, and d changes
+    with their free rotation. Beside semi-implicit Euler, with default options, a top may so spin by
+    3 rad a step, and the energy of two boxes on a hinge and a ball joint stays as near its start as
+    by default. With `every`, or as a part of `Hybrid` or `AugmentedLagrangian`, they lose energy.
 
     Rows of velocities alone are part of the second projection only. Rotors are inertia of the mass
     metric. The derivative is that of the root, in every world, and not of the iterations.
@@ -208,7 +208,7 @@ class Projection(Unstabilized):
         off = rows if start is state else linearize(system, q, still, state.instant)
         frames = None
         if start is not state and system.turns_in_space:
-            frames = _Frames(system, q, problem.mass, dt[None] / 2 * state.v)
+            frames = _Frames(system, problem.mass, q, state.v, dt[None])
         surface = _Surface(system, state, off.residual, problem, held, frames)
         factored, bounds = solver.factor(problem), self._bounds(system, state)
         step, left, code = self._step(surface, partial(factored, still), bounds)
@@ -216,8 +216,7 @@ class Projection(Unstabilized):
         code = status.first(status.failures(code), late.astype(jnp.int32))
         v = state.v
         if start is not state:
-            change = step if frames is None else frames.change(step)
-            v = v + _missed(problem.mass, v, change, dt)
+            v = v + _missed(problem.mass, v, step, dt, frames)
         return surface.moved(step), v, code
 
     def _step(
@@ -325,12 +324,20 @@ class Projection(Unstabilized):
             checks.check("Projection", "tolerance", self.tolerance, (), least=0, optional=True)
 
 
-def _missed(mass: Mass, v: Array, step: Array, dt: Any) -> Array:
-    """The velocity d/h, as far as its kinetic energy is small beside that of v."""
+def _missed(mass: Mass, v: Array, step: Array, dt: Any, frames: _Frames | None) -> Array:
+    """The velocity d/h, as far as its kinetic energy is small beside that of v.
+
+    It turns with the bodies where it is a thousandth or less. A larger one belongs to a start with
+    φ̇ ≠ 0, and the free rotation, which depends on it, takes most of its turn back.
+    """
     gain = numerics.safe_divide(step, dt[None])
     own, present = (jnp.sum(x * mass.apply(x), axis=0) for x in (gain, v))
     scale = jax.lax.stop_gradient(jnp.maximum(own, present))
     own, present = (numerics.safe_divide(x, scale) for x in (own, present))
+    if frames is not None:
+        turned = numerics.safe_divide(frames.change(step), dt[None])
+        share = numerics.safe_divide(present**2, present**2 + (1e3 * own) ** 2)
+        gain = gain + share[None] * (turned - gain)
     return gain * numerics.safe_divide(present**2, present**2 + own**2)[None]
 
 
@@ -338,32 +345,34 @@ def _missed(mass: Mass, v: Array, step: Array, dt: Any) -> Array:
 class _Frames:
     """Moves d = W⁻¹ J₀ᵀ μ from the start of a step to its end, where bodies turn in space.
 
-    J₀ᵀ μ contains torques in the frames of the bodies at the start, and bodies turn by h ω till the
-    end. In the middle of the step they change the velocity that leads from q to q⁺.
+    J₀ᵀ μ contains torques in the frames of the bodies at the start. Bodies turn by h ω till the
+    end, and by half of it until the middle of the step, where W⁻¹ belongs.
 
     Attributes:
-        system: with `turn`.
-        q: positions at the end, (n_q,).
+        system: with `rotate` and `in_turned_frames`.
         mass: W.
-        half: h v/2, (n_v,) [m, rad].
+        q: positions at the end, (n_q,).
+        v: velocities at the end, (n_v,).
+        dt: h, (1,) [s].
     """
 
     system: Any
-    q: Array
     mass: Mass
-    half: Array
+    q: Array
+    v: Array
+    dt: Array
 
     def displacement(self, d: Array) -> Array:
-        """What d displaces at the end of the step, (n_v,)."""
-        return self.system.turn(self.q, self.half, self._turned(d))
+        """The displacement of q by d at the end of the step, (n_v,)."""
+        half = self.dt / 2 * self.v
+        torque = self.system.in_turned_frames(self.q, half, self.mass.apply(d))
+        return self.system.in_turned_frames(self.q, half, self.mass.solve(torque))
 
     def change(self, d: Array) -> Array:
-        """The change of h v at the end of the step, (n_v,)."""
-        return self._turned(self._turned(d))
-
-    def _turned(self, d: Array) -> Array:
-        """W⁻¹ J₀ᵀ μ half a step later."""
-        return self.mass.solve(self.system.turn(self.q, self.half, self.mass.apply(d)))
+        """The change of h v by d at the end of the step, (n_v,)."""
+        full = self.dt * self.v
+        torque = self.system.in_turned_frames(self.q, full, self.mass.apply(d))
+        return self.mass.solve(torque)
 
 
 class _Surface:
