@@ -142,7 +142,7 @@ class SemiImplicitEuler(Explicit):
     factors of the step, in full from 0.042 and 0.03 rad on. Such a step takes about half as long
     again. Without it, energy would grow with (h|ω|)³, and motions of a radian in a few
     steps would end NON_FINITE. In the plane, bodies on which a limit or contact acts go without it,
-    and so do bodies that joints connect to them.
+    and so do bodies that joints connect to them. In space `Projection()` takes its place.
 
     A rod (`Distance`) that turns too fast leaves its length with the status OK: by 0.1 % at 0.5 rad
     a step, 7 % at 1 rad, 40 % at 1.4 rad. `Recovery(limit=…)` ends such a run as VIOLATED. Two
@@ -235,6 +235,8 @@ class SemiImplicitEuler(Explicit):
         J a = −½ γ + ½ J g − φ̇/h, and the projection of v does the rest. Those of J a = −γ are
         reported. Without this, the projection of q would have to do O(h²), or O(h) after a start
         with φ̇ ≠ 0, whose impulses would change R.
+
+        Impacts see v half a step before q, as without a projection: the displacement is h V.
         """
         system, h = dynamics.system, dt[None]
         forces = self._forces_in_space(dynamics, state, dt)
