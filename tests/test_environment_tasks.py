@@ -387,7 +387,7 @@ def test_a_five_bar_leg_hops_forward():
         (_, knee, hinge, foot), (_, other, hung, met) = legs
         for a, b in ((knee, hinge), (other, hung), (foot, met)):
             assert np.abs(a - b)[:, 1:][alive].max() < 1e-3
-        assert low.min() > -1e-9
+        assert low.min() > -1e-4  # a step leaves φ = O(h³), on either side of the ground
         normal = (np.diff(up) + 9.81 * (sum(weights.values()) - 0.2) * 0.01)[alive]
         along = np.abs(np.diff(ahead))[alive]
         assert normal.min() > -1e-12
