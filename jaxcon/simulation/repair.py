@@ -190,6 +190,11 @@ class Relaxed:
     stabilizer: Any
     factor: Array
 
+    @property
+    def completes(self) -> bool:
+        """Returns True where the stabilizer completes each step."""
+        return self.stabilizer.completes
+
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
         """b (n_c,)."""
         return self.stabilizer.target(self._weak(rows), memory, dt)
