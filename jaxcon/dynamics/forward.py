@@ -144,13 +144,12 @@ class Dynamics:
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         impulse = self._impulse(base, law, problem, length, acts, share)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
-        start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
-        seen = None
+        seen, may = None, jnp.zeros_like(bounds.rate, bool)
         if lands:
+            start = self.dt[None] * jax.lax.stop_gradient(bounds.jacobian).apply(impulse.start)
             seen = impacts.closing(bounds, start, self.dt) if notices.is_observing() else None
             asked = impacts.landing(bounds, start, self.dt)
             impulse = dataclasses.replace(impulse, rows=asked)
-        may = start > 0
         if strikes:
             bouncy = dataclasses.replace(bounds, restitution=e)
             may = impacts.candidates(bouncy, impulse.start, self.dt)

@@ -195,10 +195,10 @@ class Vakonomic:
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)
         return jnp.concatenate([self.system.kick(q, v, a, dt, small), μ + dt * rate])
 
-    def accelerate(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
-        """The velocities without free rotation as those of the system, and μ + h μ̇."""
-        (v, μ), (a, rate) = self._split(v), self._split(acceleration)
-        return jnp.concatenate([self.system.accelerate(q, v, a, dt), μ + dt * rate])
+    def gyroscopic_acceleration(self, q: Array, v: Array) -> Array:
+        """The gyroscopic part of a as that of the system, and none of μ̇."""
+        v, μ = self._split(v)
+        return jnp.concatenate([self.system.gyroscopic_acceleration(q, v), jnp.zeros_like(μ)])
 
     def rotate(self, q: Array, v: Array, dt: Any) -> Array:
         """The velocities after a free rotation as those of the system, and μ as it is."""

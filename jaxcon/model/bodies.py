@@ -69,9 +69,9 @@ class Particle:
         """p: these velocities are rates of coordinates."""
         return p
 
-    def accelerate(self, v: Vector, acceleration: Vector, moments: Any, dt: Lane) -> Vector:
-        """v + h a: these velocities are rates of coordinates."""
-        return v + acceleration * dt
+    def gyroscopic_acceleration(self, v: Vector, moments: Any) -> Vector:
+        """None: these velocities are rates of coordinates."""
+        return v.map(jnp.zeros_like)
 
     def rotate(self, v: Vector, moments: Any, dt: Lane) -> Vector:
         """v: these velocities are rates of coordinates."""
@@ -199,12 +199,10 @@ class SpatialRigid(Particle):
         back = quaternion.exp(Vector(*step[3:]) * -1.0)
         return Vector(*p[:3], *quaternion.rotate(back, Vector(*p[3:])))
 
-    def accelerate(self, v: Vector, acceleration: Vector, moments: Array, dt: Lane) -> Vector:
-        """v + h (a + I⁻¹ (ω × Iω)): without the gyroscopic part of a."""
-        linear = Vector(*v[:3]) + Vector(*acceleration[:3]) * dt
-        ω = Vector(*v[3:])
-        applied = Vector(*acceleration[3:]) + spun(shares_of(Vector.of(moments)), ω)
-        return Vector(*linear, *(ω + applied * dt))
+    def gyroscopic_acceleration(self, v: Vector, moments: Array) -> Vector:
+        """(0, −I⁻¹ (ω × Iω)), by the shares of `spun`."""
+        shares = shares_of(Vector.of(moments))
+        return Vector(*zeros(3), *(spun(shares, Vector(*v[3:])) * -1.0))
 
     def rotate(self, v: Vector, moments: Array, dt: Lane) -> Vector:
         """v after a free rotation of h."""

@@ -283,20 +283,17 @@ class BodySystem:
         pairs = [(g.kind, g.unpack(q, step)[1], g.unpack(q, p)[1]) for g in self.layout.groups]
         return _join([kind.in_turned_frames(own, momentum) for kind, own, momentum in pairs], q)
 
-    def accelerate(self, q: Array, v: Array, acceleration: Array, dt: Any) -> Array:
-        """v after h of what accelerates bodies, (n_v,), without their free rotation.
-
-        Args:
-            q: positions, (n_q,).
-            v: velocities before, (n_v,).
-            acceleration: a at q and v, (n_v,), with its gyroscopic part.
-            dt: h, (1,) [s].
-        """
+    def gyroscopic_acceleration(self, q: Array, v: Array) -> Array:
+        """The part of a, (n_v,), by which bodies without forces turn in space."""
         parts = zip(self.layout.groups, self.inertia, strict=True)
-        known = [
-            (g.kind, g.unpack(q, v)[1], g.unpack(q, acceleration)[1], p.moments) for g, p in parts
-        ]
-        return _join([kind.accelerate(*own, dt) for kind, *own in known], q)
+        known = [(g.kind, g.unpack(q, v)[1], p.moments) for g, p in parts]
+        return _join(
+            [
+                kind.gyroscopic_acceleration(own, moments).map(lambda x, v=own: 0 * v[0] + x)
+                for kind, own, moments in known
+            ],
+            q,
+        )
 
     def rotate(self, q: Array, v: Array, dt: Any) -> Array:
         """v (n_v,) after a free rotation of h (1,) [s]."""

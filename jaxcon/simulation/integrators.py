@@ -241,16 +241,13 @@ class SemiImplicitEuler(Explicit):
         system, h = dynamics.system, dt[None]
         forces = self._forces_in_space(dynamics, state, dt)
         solution, rows, q, v = forces.solution, forces.rows, state.q, state.v
-        a = solution.acceleration
+        a, g = solution.acceleration, system.gyroscopic_acceleration(q, v)
         if forces.solve_rows is not None and rows.layout.size:
-            gyroscopic = v - system.accelerate(q, v, jnp.zeros_like(v), h)  # h g
-            gyroscopic = forces.where_pushed(jnp.zeros_like(v), gyroscopic)
-            turning = numerics.safe_divide(rows.jacobian.apply(gyroscopic), h)
+            turning = rows.jacobian.apply(forces.where_pushed(jnp.zeros_like(g), g))
             held = rows.layout.holds.reshape(-1, *(1,) * (rows.bias.ndim - 1))
             missing = (rows.bias + turning) / 2 - numerics.safe_divide(rows.rate, h)
-            missing = jnp.where(held, missing, 0)
-            a = a + forces.solve_rows(missing).acceleration
-        middle = system.accelerate(q, v, forces.without_coasting(a), h)
+            a = a + forces.solve_rows(jnp.where(held, missing, 0)).acceleration
+        middle = v + h * (forces.without_coasting(a) - g)
         middle = forces.where_pushed(v + h * a, system.rotate(q, middle, h / 2))
         end = forces.where_pushed(middle, system.rotate(q, middle, h / 2))
         travel = h * middle

@@ -93,10 +93,10 @@ class Projection(Unstabilized):
     Rows that depend on each other do so on the surface only: off it J(q*) has directions too many,
     by which the point is not unique; the solver chooses, within O(‖d‖).
 
-    Where bodies turn in space, J₀ belongs to their frames at the start of the step, and d changes
-    with their free rotation. Beside semi-implicit Euler, with default options, a top may so spin by
-    3 rad a step, and the energy of two boxes on a hinge and a ball joint stays as near its start as
-    by default. With `every`, or as a part of `Hybrid` or `AugmentedLagrangian`, they lose energy.
+    Where bodies turn in space, the torques J₀ᵀ μ belong to their frames at the start of the step,
+    and turn with them. Beside semi-implicit Euler, with default options, a top may so spin by 3 rad
+    a step, and the energy of two boxes on a hinge and a ball joint stays as near its start as by
+    default. With other options, or as a part of `Hybrid` or `AugmentedLagrangian`, it does not.
 
     Rows of velocities alone are part of the second projection only. Rotors are inertia of the mass
     metric. The derivative is that of the root, in every world, and not of the iterations.
@@ -365,14 +365,15 @@ class _Frames:
     def displacement(self, d: Array) -> Array:
         """The displacement of q by d at the end of the step, (n_v,)."""
         half = self.dt / 2 * self.v
-        torque = self.system.in_turned_frames(self.q, half, self.mass.apply(d))
-        return self.system.in_turned_frames(self.q, half, self.mass.solve(torque))
+        return self.system.in_turned_frames(self.q, half, self._by_torques(d, half))
 
     def change(self, d: Array) -> Array:
         """The change of h v by d at the end of the step, (n_v,)."""
-        full = self.dt * self.v
-        torque = self.system.in_turned_frames(self.q, full, self.mass.apply(d))
-        return self.mass.solve(torque)
+        return self._by_torques(d, self.dt * self.v)
+
+    def _by_torques(self, d: Array, step: Array) -> Array:
+        """W⁻¹ J₀ᵀ μ of bodies that have turned by a step, (n_v,)."""
+        return self.mass.solve(self.system.in_turned_frames(self.q, step, self.mass.apply(d)))
 
 
 class _Surface:
