@@ -387,8 +387,15 @@ def test_a_five_bar_leg_hops_forward():
         (_, knee, hinge, foot), (_, other, hung, met) = legs
         for a, b in ((knee, hinge), (other, hung), (foot, met)):
             assert np.abs(a - b)[:, 1:][alive].max() < 1e-3
-        assert low.min() > -1e-4  # a step leaves φ = O(h³), on either side of the ground
-        normal = (np.diff(up) + 9.81 * (sum(weights.values()) - 0.2) * 0.01)[alive]
+        normal = np.diff(up) + 9.81 * (sum(weights.values()) - 0.2) * 0.01
+        # a step leaves φ = O(h³) on either side of the ground; without J̇ v it leaves O(h²), always
+        # above it for a foot that swings: 91 µm where a leg pushes, and millimetres under noise
+        pushes = alive & (normal > 0.02)
+        assert pushes.sum() > 40
+        if kind == "by hand":
+            assert np.abs(low[:, 1:][pushes]).max() < 2e-6
+        assert low.min() > -4e-5
+        normal = normal[alive]
         along = np.abs(np.diff(ahead))[alive]
         assert normal.min() > -1e-12
         assert np.max(along - 0.8 * normal) < 1e-12
