@@ -13,7 +13,9 @@ from tolerances import IDENTITY
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
+from jaxcon.core.pytree import pytree
 from jaxcon.scenes import four_bar
+from jaxcon.stabilization.baumgarte import Law
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
@@ -678,6 +680,78 @@ def test_a_top_may_spin_by_three_radians_a_step(stabilizer, most, dtype):
     angles = np.arctan2(places[:, 1], places[:, 0]) % (2 * np.pi)
     np.testing.assert_allclose(angles[0], turned[0], rtol=0.03)
     assert 0.75 < angles[1] / turned[1] < 1
+
+
+def test_a_floor_that_is_not_touched_does_not_move_a_projected_top():
+    """Bodies that a contact may press on are stepped apart, and end where they would without it."""
+
+    def run(rate, floor):
+        scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -9.81))
+        q = np.array([np.cos(np.pi / 8), 0.0, np.sin(np.pi / 8), 0.0])
+        place = 0.1 * np.array([np.sin(np.pi / 4), 0.0, np.cos(np.pi / 4)])
+        moving = {"quaternion": q, "angular_velocity": jnp.stack([0 * rate, 0 * rate, rate])}
+        scene.add_body("top", mass=1.0, inertia=(1e-3, 1e-3, 2e-3), position=place, **moving)
+        scene.add(jc.Spherical("point", jc.WORLD, "top", point=(0.0, 0.0, 0.0)))
+        if floor:
+            scene.add(jc.PlaneContact("floor", jc.WORLD, "top", point=(0.0, 0.0, -5.0)))
+        system, state = scene.build()
+        method = jc.Method(stabilizer=PROJECTED)
+        state = jc.init(system, method, state.q, state.v)
+        return jc.rollout(system, method, state, None, 1e-3, 200, record=lambda s, i: None)[0].q
+
+    rates = np.array([300.0, 3000.0])
+    alone, above = (jax.jit(jax.vmap(lambda r, f=f: run(r, f)))(rates) for f in (False, True))
+    np.testing.assert_allclose(above, alone, atol=1e-10)
+
+
+@pytree
+class Held:
+    """A stabilizer of a user, which asks for J a = −γ and does nothing afterwards."""
+
+    remembers, corrects = False, ()
+
+    def init(self, system, q, v):
+        """No memory."""
+        return ()
+
+    def resolve(self, gains):
+        """No gains to be found."""
+        return self
+
+    rising = steady = bounded = resolve
+
+    def target(self, rows, memory, dt):
+        """b (n_c,)."""
+        return -rows.bias
+
+    def impose(self, rows, memory, dt):
+        """The law."""
+        return Law(rows, -rows.bias)
+
+    def advance(self, rows, memory, dt):
+        """No memory."""
+        return memory
+
+    def remember(self, memory, solution):
+        """No memory."""
+        return memory
+
+    def correct(self, system, solver, before, state, memory, dt):
+        """Nothing."""
+        return state, jnp.zeros_like(state.status)
+
+
+def test_a_stabilizer_of_a_user_need_not_say_that_it_does_not_complete_steps():
+    scene = jc.Scene(dim=3)
+    scene.add_body("top", mass=1.0, inertia=(0.01, 0.01, 0.02), position=(0.1, 0.0, 0.0))
+    scene.add(jc.Spherical("point", jc.WORLD, "top", point=(0.0, 0.0, 0.0)))
+    system, state = scene.build()
+    user, known = (
+        jc.step(system, m, jc.init(system, m, state.q, state.v), None, 1e-3)[0]
+        for m in (jc.Method(stabilizer=Held()), jc.Method(stabilizer=jc.Unstabilized()))
+    )
+    assert user.status == jc.Status.OK
+    np.testing.assert_array_equal(user.q, known.q)
 
 
 def spinning_box(beside, turn=0.3, dt=1 / 60):

@@ -243,6 +243,51 @@ def test_a_landing_leaves_no_gap():
         assert np.abs(gap[after : after + 5]).max() < 1e-6
 
 
+@pytest.mark.parametrize(("angle", "spin"), [(1.0, 10.0), (2.3, -10.0)])
+def test_a_landing_late_in_a_step_belongs_to_that_step(angle, spin):
+    """However late it is: 400 phases of steps of 5 ms, and a rod that turns as it lands."""
+    scene = jc.Scene(dim=2)
+    moving = {"angle": angle, "angular_velocity": spin, "velocity": (0.0, -2.0)}
+    scene.add_body("rod", mass=1.0, inertia=INERTIA, position=(0.0, 1.0), **moving)
+    end = (-ARM * np.cos(angle), 1 - ARM * np.sin(angle))
+    scene.add(jc.PlaneContact("end", jc.WORLD, "rod", center=end, radius=RADIUS))
+    system, state = scene.build()
+    method = jc.Method()
+
+    def run(height):
+        start = jc.init(system, method, state.q.at[1].set(height), state.v)
+        last, gaps = jc.rollout(
+            system, method, start, None, 5e-3, 30, record=lambda s, i: i.reactions.gap[0]
+        )
+        return last.q[1], gaps.min()
+
+    heights, gaps = map(np.asarray, jax.jit(jax.vmap(run))(0.55 + np.linspace(0, 0.02, 400)))
+    assert gaps.min() > -1e-6  # it was −3.5e-4 m
+    steps = np.abs(np.diff(heights))
+    assert steps.max() < 5 * np.median(steps)  # the value moves with the phase
+
+
+@pytest.mark.parametrize("name", INTEGRATORS)
+def test_a_function_that_ends_within_a_step_has_a_derivative(name):
+    """A dome over −1 < x < 1: q lies on it, q ⊕ h v does not."""
+
+    def dome(body, t, params):
+        x, y = body.position
+        return (y - jnp.sqrt(1 - x * x))[None]
+
+    scene = jc.Scene(dim=2)
+    scene.add_particle("p", mass=1.0, position=(0.9995, 2.0), velocity=(1.0, 0.0))
+    scene.add(jc.Inequality(dome, ("p",), name="dome"))
+    system, state = scene.build()
+    method = jc.Method(INTEGRATORS[name])
+
+    def height(x):
+        start = jc.init(system, method, state.q.at[0].set(x), state.v)
+        return jc.step(system, method, start, None, 1e-3)[0].q[1]
+
+    assert jax.grad(height)(0.9995) == 0
+
+
 def test_a_capsule_lands_on_a_capsule():
     """One end sticks: the energy of ½ uᵀ K⁻¹ u is lost, u the velocity there, K its mobility."""
     arm, fall = 0.3, 0.45

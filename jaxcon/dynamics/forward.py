@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows, linearize_bounds
+from jaxcon.constraints.inequality import OneSided
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import notices, numerics, status
 from jaxcon.core.doubled import rounded
@@ -170,7 +171,7 @@ class Dynamics:
             solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
             if e is not None:
                 left = self.dt[None] - times.times
-                speed = impacts.leaving_speeds(bounds.rate, e, times, change, lag, self.dt)
+                speed = impacts.leaving_speeds(impulse.rows, e, times, change, lag, self.dt)
                 lost = impacts.passes_range(both_stops, speed, left)
                 solution = solution._replace(status=lost_impacts(solution.status, lost))
             solution, known = self._struck((q, v, t), solution, known, times, lag)
@@ -227,8 +228,12 @@ class Dynamics:
 
         along = (dt[None] * self.system.kinematics(q, v), dt)
         _, local = jax.jvp(rate, (q, jnp.zeros_like(dt)), along)
-        change = rate(self.system.retract(q, dt[None] * v), dt) - rows.rate
-        change = jnp.where(jnp.isfinite(change), change, 0)  # φ may not exist there
+        end, length = self.system.retract(q, dt[None] * v), dt
+        if any(isinstance(group, OneSided) for group in self.system.bounds):
+            # a user's φ may not exist there, and must not be differentiated where it does not
+            exists = jax.lax.stop_gradient(jnp.all(jnp.isfinite(rate(end, dt)), axis=0))
+            end, length = jnp.where(exists[None], end, q), jnp.where(exists, dt, 0)
+        change = rate(end, length) - rows.rate
         agree = local * change > 0  # false where J̇ v is not a number
         smaller = jnp.where(agree & (jnp.abs(local) < jnp.abs(change)), local, change)
         value = jnp.where(agree, smaller, 0)

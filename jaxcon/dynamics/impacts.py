@@ -206,7 +206,7 @@ def quotient(x: Array, y: Array) -> Array:
 def arrive(
     rows: BoundRows, may: Array, change: Array, lag: Any, dt: Array, response: Array | None
 ) -> Arrivals:
-    """Which rows arrive, after φ + τ (u + lag h c) + ½ τ² c = 0 with u = φ̇ and c = J a⁻.
+    """Which rows arrive, after φ + τ u + ½ τ² c = 0 with u from `at_start` and c = J a⁻ + J̇ v.
 
     Args:
         rows: the bounded rows at the start of the step.
@@ -217,7 +217,7 @@ def arrive(
         response: ∂a/∂λ, (n_v, n), whose pattern says which row moves which velocity; None where
             that is not known.
     """
-    speed = -(rows.rate + lag * change)
+    speed = -at_start(rows, change, lag)
     fast = may & (speed > 0)
     size = jnp.where(fast, speed, 1)
     gap = jnp.where(fast & (rows.gap > 0), rows.gap, 0)
@@ -267,20 +267,29 @@ def passes_range(rows: BoundRows, speed: Array, time: Array) -> Array | None:
 
 
 def leaving_speeds(
-    rate: Array, e: Array, arrivals: Arrivals, change: Array, lag: Any, dt: Array
+    rows: BoundRows, e: Array, arrivals: Arrivals, change: Array, lag: Any, dt: Array
 ) -> Array:
     """The speeds with which rows leave after an impact, e |φ̇|, (n,); zero for those that stay.
 
     Args:
-        rate: φ̇ at the start of the step, (n,) [m/s, rad/s].
+        rows: the bounded rows at the start of the step.
         e: restitution, (n,).
         arrivals: which arrive, and when.
         change: h c, (n,), with the forces of the other rows.
         lag: velocities are those of lag · h before the positions.
         dt: h, () [s].
     """
-    share = lag + numerics.safe_divide(arrivals.times, dt[None])
-    return jnp.where(arrivals.bounces, e * jnp.abs(rate + share * change), 0)
+    rate = at_start(rows, change, lag) + change * numerics.safe_divide(arrivals.times, dt[None])
+    return jnp.where(arrivals.bounces, e * jnp.abs(rate), 0)
+
+
+def at_start(rows: BoundRows, change: Array, lag: Any) -> Array:
+    """φ̇ at the start of the step, (n,), of rows whose velocities are those of lag · h before.
+
+    Only forces have changed it since, as J of `rows.rate` = J v is that of the start already.
+    """
+    forced = change if rows.rate_change is None else change - rows.rate_change
+    return rows.rate + lag * forced
 
 
 def at_impact(
@@ -411,7 +420,8 @@ class Impact:
 
     def _strikes(self, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
         h, a = self.dt[None], self.acceleration
-        arrivals = self.arrivals.refined(self.laws.rows(*self._there(self.arrivals)))
+        rows = self.laws.rows(*self._there(self.arrivals))
+        arrivals = self.arrivals.refined(rows)
         place, before, time = self._there(arrivals)
         τ = arrivals.by_velocity
 
@@ -439,8 +449,10 @@ class Impact:
         jump = Jump(struck.change + left * more, travel)
         share = ((1 - self.lag) * self.dt - arrivals.first)[None]
         joints = struck.joints + share * (after.joints - self.joints)
-        # forces of half a step before positions may end before the impact, and then have no share
-        share = jnp.maximum(share, 0)
+        # forces of half a step before positions may end before the impact; one-sided rows then have
+        # no share in it, as they would pull
+        one_sided = rows.kinds.by_contact(mask(rows.ends, rows))
+        share = jnp.where(one_sided, jnp.maximum(share, 0), share)
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         struck = struck._replace(multipliers=impulses, joints=joints)
         return keep(self.arrivals.happens, (jump, struck), still)

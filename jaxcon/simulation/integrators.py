@@ -28,6 +28,7 @@ from jaxcon.dynamics.impacts import jump_of, with_jump
 from jaxcon.dynamics.islands import largest_by_island, rows_beside_contact
 from jaxcon.model.state import State
 from jaxcon.solvers.saddle import Solution
+from jaxcon.stabilization.baumgarte import completes_steps
 
 
 class Advanced(NamedTuple):
@@ -170,7 +171,7 @@ class SemiImplicitEuler(Explicit):
     def _of_bodies(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step of a system of bodies."""
         system, h = dynamics.system, dt[None]
-        if system.turns_in_space and dynamics.stabilizer.completes:
+        if system.turns_in_space and completes_steps(dynamics.stabilizer):
             return self._completed_step(dynamics, state, dt)
         v, solution, rows, solve_rows, skip_newton = self._linearized_step(dynamics, state, dt)
         if solve_rows is not None and rows.layout.size:
@@ -226,14 +227,14 @@ class SemiImplicitEuler(Explicit):
     def _completed_step(self, dynamics: Dynamics, state: State, dt: Any) -> Advanced:
         """One step in space whose constraint forces are completed afterwards; v belongs to q.
 
-        With R half a step of free rotation, and g the gyroscopic part of a,
+        With R half a step of free rotation, g the gyroscopic part of a, and c the `coasting`,
 
-            V = R(v + h (a − g)),   q⁺ = q ⊕ h V,   v⁺ = R(V).
+            V = R(v + h (a − c − g)),   q⁺ = q ⊕ h V,   v⁺ = R(V).
 
-        So φ⁺ = φ + h φ̇ + h² (J a − ½ J g + ½ γ) + O(h³), and V obeys rows of velocities half a step
-        later where J a − ½ J g + ½ γ = 0. The motion therefore takes the constraint forces with
-        J a = −½ γ + ½ J g − φ̇/h, and the projection of v does the rest. Those of J a = −γ are
-        reported. Without this, the projection of q would have to do O(h²), or O(h) after a start
+        So φ⁺ = φ + h φ̇ + h² (J (a − c) − ½ J g + ½ γ) + O(h³), and V obeys rows of velocities half
+        a step later where J (a − c) − ½ J g + ½ γ = 0. The motion therefore takes the constraint
+        forces with J a = −½ γ + J (½ g + c) − φ̇/h, and the projection of v does the rest. Those of
+        J a = −γ are reported. Without this, the projection of q would have to do O(h²), or O(h) after a start
         with φ̇ ≠ 0, whose impulses would change R.
 
         Impacts see v half a step before q, as without a projection: the displacement is h V.
@@ -243,10 +244,14 @@ class SemiImplicitEuler(Explicit):
         solution, rows, q, v = forces.solution, forces.rows, state.q, state.v
         a, g = solution.acceleration, system.gyroscopic_acceleration(q, v)
         if forces.solve_rows is not None and rows.layout.size:
-            turning = rows.jacobian.apply(forces.where_pushed(jnp.zeros_like(g), g))
+            free = g if forces.coasting is None else g + 2 * forces.coasting
+            turning = rows.jacobian.apply(forces.where_pushed(jnp.zeros_like(g), free))
             held = rows.layout.holds.reshape(-1, *(1,) * (rows.bias.ndim - 1))
             missing = (rows.bias + turning) / 2 - numerics.safe_divide(rows.rate, h)
-            a = a + forces.solve_rows(jnp.where(held, missing, 0)).acceleration
+            more = forces.solve_rows(jnp.where(held, missing, 0))
+            a = a + more.acceleration
+            code = status.first(solution.status, status.failures(more.status))
+            solution = solution._replace(status=code)
         middle = v + h * (forces.without_coasting(a) - g)
         middle = forces.where_pushed(v + h * a, system.rotate(q, middle, h / 2))
         end = forces.where_pushed(middle, system.rotate(q, middle, h / 2))

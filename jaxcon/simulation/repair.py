@@ -19,7 +19,7 @@ from jaxcon.core.worlds import keep
 from jaxcon.model.state import State, is_finite
 from jaxcon.simulation.attempt import nothing_seen
 from jaxcon.simulation.recovery import contain
-from jaxcon.stabilization.baumgarte import Law, check_stabilizer
+from jaxcon.stabilization.baumgarte import Law, check_stabilizer, completes_steps
 from jaxcon.stabilization.hybrid import Hybrid
 from jaxcon.stabilization.penalty import Penalty
 from jaxcon.stabilization.projection import Projection
@@ -193,7 +193,7 @@ class Relaxed:
     @property
     def completes(self) -> bool:
         """Returns True where the stabilizer completes each step."""
-        return self.stabilizer.completes
+        return completes_steps(self.stabilizer)
 
     def target(self, rows: Rows, memory: PyTree, dt: Any) -> Array:
         """b (n_c,)."""

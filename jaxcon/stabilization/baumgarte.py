@@ -235,6 +235,11 @@ def check_stabilizer(owner: str, what: str, part: Any) -> None:
         part.check()
 
 
+def completes_steps(stabilizer: Any) -> bool:
+    """Returns True for a stabilizer that completes each step; one of a user's need not say so."""
+    return getattr(stabilizer, "completes", False)
+
+
 def asks_nothing(stabilizer: Any) -> bool:
     """Returns True for a stabilizer without gains, which leaves constraints to others."""
     default = type(stabilizer) is Baumgarte and stabilizer.alpha is stabilizer.beta is None
