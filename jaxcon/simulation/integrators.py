@@ -234,8 +234,8 @@ class SemiImplicitEuler(Explicit):
         So φ⁺ = φ + h φ̇ + h² (J (a − c) − ½ J g + ½ γ) + O(h³), and V obeys rows of velocities half
         a step later where J (a − c) − ½ J g + ½ γ = 0. The motion therefore takes the constraint
         forces with J a = −½ γ + J (½ g + c) − φ̇/h, and the projection of v does the rest. Those of
-        J a = −γ are reported. Without this, the projection of q would have to do O(h²), or O(h) after a start
-        with φ̇ ≠ 0, whose impulses would change R.
+        J a = −γ are reported. Without this, the projection of q would have to do O(h²), or O(h)
+        after a start with φ̇ ≠ 0, whose impulses would change R.
 
         Impacts see v half a step before q, as without a projection: the displacement is h V.
         """
