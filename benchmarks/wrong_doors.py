@@ -1311,6 +1311,10 @@ SPECIAL: dict[str, Special] = {
         lambda _: step(state=dataclasses.replace(motor()[1], status=99)),
         ("status",),
     ),
+    "a status of 99 in an array": (
+        lambda _: step(state=dataclasses.replace(motor()[1], status=np.array(99, np.int32))),
+        ("status",),
+    ),
     "states with the status 99": (lambda _: jc.raise_for_status(np.array([0, 99])), ("99",)),
     "a path that is too long": (
         lambda _: jc.tune(jnp.sum, jnp.ones(2), steps=1, checkpoint="x" * 5000),

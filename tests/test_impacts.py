@@ -128,6 +128,29 @@ def test_a_disc_bounces_or_lands_sticking_and_sliding(name, mode, dtype):
     held_to(run, 1.1, params, want, mode)
 
 
+@pytest.mark.parametrize("name", ["SIE", "RK4"])
+def test_a_ball_bounces(name):
+    """At 0.8 s its height has the derivative 0.7617 by that of the start."""
+    scene = jc.Scene(dim=3)
+    scene.add_body("ball", mass=1.0, inertia=(4e-3,) * 3, position=(0.0, 0.0, 1.0))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=R, restitution=0.8))
+    system, state = scene.build()
+
+    def where(state, z):
+        return state.q.at[2].set(z), state.v
+
+    def want(z, _):
+        v = np.sqrt(2 * G * (z - R))
+        rest = 0.8 - v / G
+        return np.array([R + 0.8 * v * rest - G * rest * rest / 2])
+
+    exact = (want(1.0 + 1e-6, 0) - want(1.0 - 1e-6, 0)) / 2e-6
+    np.testing.assert_allclose(exact, 0.7617, atol=1e-4)
+    held_to(
+        landed(system, state, INTEGRATORS[name], 0.8, where, lambda s: s.q[2:3]), 1.0, None, want
+    )
+
+
 def test_a_disc_lands_without_restitution():
     """The landing of a contact that has no restitution is an impact, too."""
     system, state = disc()
@@ -245,10 +268,13 @@ def test_a_weight_on_a_rope_jerks(e):
     held_to(run, -0.5, None, want)
 
 
-@pytest.mark.parametrize(("name", "frictions"), [("SIE", (0.05, 1.0)), ("RK4", (1.0,))])
-def test_two_discs_strike_aslant(name, frictions):
+@pytest.mark.parametrize(
+    ("name", "frictions", "e"),
+    [("SIE", (0.05, 1.0), 0.7), ("RK4", (1.0,), 0.7), ("SIE", (0.05, 1.0), 0.0)],
+)
+def test_two_discs_strike_aslant(name, frictions, e):
     """Sliding and sticking along a tangent that turns as they approach each other."""
-    m, inertia, e, time = np.array([1.0, 0.7]), np.array([5e-3, 4e-3]), 0.7, 0.8
+    m, inertia, time = np.array([1.0, 0.7]), np.array([5e-3, 4e-3]), 0.8
     p0, v0 = np.array([[0.0, 0.0], [0.8, 0.08]]), np.array([[2.0, 0.0], [-0.5, 0.1]])
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     for k, body in enumerate("ab"):

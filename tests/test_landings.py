@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 
 import jaxcon as jc
 from jaxcon.core.pytree import pytree
@@ -286,6 +287,37 @@ def test_a_function_that_ends_within_a_step_has_a_derivative(name):
         return jc.step(system, method, start, None, 1e-3)[0].q[1]
 
     assert jax.grad(height)(0.9995) == 0
+
+
+@pytest.mark.parametrize(("dtype", "mode"), [(np.float32, jax.jacrev), (np.float64, jax.jacfwd)])
+def test_a_box_lands_on_four_corners_and_slides_to_rest(dtype, mode):
+    """Its corners bear more rows than it has freedoms, and rounding leaves some above the floor.
+
+    The derivatives by the speed add up to what it changes.
+    """
+    scene = jc.Scene(dim=3, dtype=dtype)
+    tilt = np.array([1.0, 0.04, 0.03, 0.0]) / np.linalg.norm([1.0, 0.04, 0.03])
+    place = np.array([0.0, 0.0, 0.12])
+    moving = {"velocity": (0.5, 0.2, 0.0), "angular_velocity": (0.0, 0.0, 1.0)}
+    inertia = (0.02, 0.015, 0.01)
+    scene.add_body("box", mass=1.0, inertia=inertia, position=place, quaternion=tilt, **moving)
+    corners = np.array([(x, y, -0.1) for x in (-0.1, 0.1) for y in (-0.15, 0.15)])
+    centers = place + Rotation.from_quat(tilt, scalar_first=True).apply(corners)
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "box", center=centers, friction=0.4))
+    system, state = scene.build()
+    method = jc.Method()
+
+    def run(speed):
+        start = jc.init(system, method, state.q, state.v.at[0].set(speed))
+        last = jc.rollout(system, method, start, None, H, 500, record=lambda s, i: None)[0]
+        return last.q[:2], (last.q[:2], last.status, jnp.max(jnp.abs(last.v)))
+
+    speeds = jnp.asarray(0.5 + np.linspace(0, 0.02, 5), dtype)
+    slopes, (ends, codes, speed) = jax.jit(jax.vmap(mode(run, has_aux=True)))(speeds)
+    assert np.all(codes == jc.Status.OK)
+    assert speed.max() < 1e-3  # it rests
+    mean = (slopes[1:] + slopes[:-1]).mean(axis=0) / 2
+    np.testing.assert_allclose(mean, (ends[-1] - ends[0]) / 0.02, atol=1.3e-3)  # 1 % of the larger
 
 
 def test_a_capsule_lands_on_a_capsule():

@@ -95,7 +95,7 @@ class Scene:
             inertia: about the centre of mass [kg m²]: () in the plane; in space principal moments
                 (3,) or a full tensor (3, 3); or an `Inertia`, which also brings mass and centre.
             position: of the body's frame, world, (dim,) [m]. The frame lies at the centre of mass
-                unless an `Inertia` says otherwise.
+                unless an `Inertia` says otherwise. Poses and velocities are zero unless given.
             quaternion: body to world, wxyz, (4,); in space.
             angle: () [rad]; in the plane. `build` warns of more than a turn: degrees, most likely.
             velocity: of the body's frame, world, (dim,) [m/s].

@@ -112,7 +112,8 @@ class MujocoModel:
         """Returns the method that suits the model by its structure: `Method.auto` at the start.
 
         `Method.auto` chooses the solver of the joints. That of stops, friction and contacts is left
-        to `Method`, which takes sweeps where they have many rows.
+        to `Method`, which takes sweeps where they have many rows. The start of a method with other
+        parts is `jc.init(system, method, state.q, state.v)`.
 
         Args:
             parts: other parts, such as `integrator=jc.RK4()`, and the arguments `batch` and

@@ -176,6 +176,7 @@ def _check_kinds(state: State) -> None:
     code = state.status
     known = isinstance(code, int | np.integer) and not isinstance(code, bool | np.timedelta64)
     whole = known or getattr(getattr(code, "dtype", None), "kind", "?") in "iu"
+    known = known or whole and isinstance(code, np.ndarray) and code.ndim == 0
     if not whole or (known and int(code) not in Status.__members__.values()):
         raise ValueError(f"state.status must be a code of jc.Status, got {_kind(code)}.")
 

@@ -188,10 +188,15 @@ class Bounded:
         live = (self.lower, self.upper, self.coefficients)
         return laws(self.kinds, self.diagonal(), multipliers, self.velocity(multipliers), live)
 
-    def slope(self, multipliers: Array, width: Any = None) -> Array:
+    def slope(self, multipliers: Array, velocity: Array, width: Any = None) -> Array:
         """∂(residual)/∂λ, (n, n), a little regularised; `width` as of `laws`.
 
         A law takes from u its own rows alone, so that a column of G goes through it like a vector.
+
+        Args:
+            multipliers: λ, (n,).
+            velocity: G λ + c, (n,).
+            width: of smoothed corners, (1,) [m/s, rad/s]; None leaves them sharp.
         """
         scale = self.diagonal()
         live = (self.lower, self.upper, self.coefficients)
@@ -202,7 +207,7 @@ class Bounded:
             return laws(self.kinds, scale, x, u, live, width)
 
         def along(direction: Array, column: Array) -> Array:
-            here = multipliers, self.velocity(multipliers)
+            here = multipliers, velocity
             return jax.jvp(law, here, (jnp.broadcast_to(direction, column.shape), column))[1]
 
         return jax.vmap(along, (1, 1), 1)(every, self.matrix) + share * every
@@ -311,13 +316,18 @@ def implicit_multipliers(
     kinds, scale = problem.kinds, problem.diagonal()
     corner = None if width is None else jnp.asarray(width, scale.dtype)[None]
 
+    here = problem.velocity(multipliers)
+
     def law(x: Array) -> Array:
         # choices without a derivative, which is stopped in here, see `roots.implicit`
-        fixed, smooth = jax.lax.stop_gradient((scale, corner))
-        return laws(kinds, fixed, x, velocity(x), live, smooth)
+        fixed, smooth, there = jax.lax.stop_gradient((scale, corner, here))
+        # u as the matrix below has it: a contact at the corner of its law, which rounding alone
+        # says to press or to open, must do the same in both
+        u = velocity(x)
+        return laws(kinds, fixed, x, there + (u - jax.lax.stop_gradient(u)), live, smooth)
 
     def prepared() -> tuple[roots.Operator, roots.Operator]:
-        known = gauss_jordan.inverse(problem.slope(multipliers, corner))
+        known = gauss_jordan.inverse(problem.slope(multipliers, here, corner))
         return partial(gauss_jordan.apply, known), partial(
             gauss_jordan.apply, jnp.swapaxes(known, 0, 1)
         )

@@ -68,7 +68,8 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     def once(known: tuple[Any, Tried, Tried]) -> tuple[Any, Tried, Tried]:
         count, here, best = known
         here = chosen(count == rounds, best, chosen(count == 2 * rounds, zero, here))
-        inverse = gauss_jordan.inverse(problem.slope(here.multipliers))
+        x = here.multipliers
+        inverse = gauss_jordan.inverse(problem.slope(x, problem.velocity(x)))
         new = tried(here.multipliers - gauss_jordan.apply(inverse, here.residual))
         swept = sweep(problem, here.multipliers, pivot)
         farther = (count >= rounds) & (count < 2 * rounds) & (count % 2 == 1)
