@@ -1092,7 +1092,9 @@ def _others() -> Iterator[Row]:
     none = frozenset({"none"})
     for what in ("qpos", "qvel", "time"):
         good = 0.0 if what == "time" else np.zeros(1)
-        yield f"MujocoModel.state.{what}", functools.partial(_model_state, what), real(good)
+        optional = ("none",) if what == "qvel" else ()
+        takes = real(good, "any", *optional)
+        yield f"MujocoModel.state.{what}", functools.partial(_model_state, what), takes
     for what, takes in {"ignore": Takes("other"), "count_turns": flag()}.items():
         read = functools.partial(_with, jc.from_mjcf, {"source": _text()})
         yield f"from_mjcf.{what}", functools.partial(read, what), takes

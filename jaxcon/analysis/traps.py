@@ -320,8 +320,8 @@ def impact(known: Known) -> str | None:
         return None
     if rows.lands:  # a robot has dozens, and one line names them
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
-    some = isinstance(method.bounded, Nearest) and method.bounded.leaves_out(rows.kinds)
     solver = method.resolve(known.system, known.state).bounded
+    some = isinstance(solver, Nearest) and solver.leaves_out(rows.kinds)
     shared = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
     shares = type(solver).__name__ if shared and not is_exact(solver) else None
     said = doubt(rows, shares, some)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -35,6 +35,17 @@ def called(equation: Any) -> Any:
     if hasattr(primitive, "expand"):
         return jax.make_jaxpr(primitive.expand)(*primitive.in_avals)
     return None
+
+
+def each(function: Callable[[Any], Any], xs: Any) -> Any:
+    """`jax.vmap(function)(xs)`, of functions that contain a `lax.custom_root`.
+
+    JAX 0.11 maps it to a primitive without a derivative in the branches of `lax.cond`; there the
+    function runs once for each x.
+    """
+    if jax.__version_info__[:2] == (0, 11):
+        return jax.lax.map(function, xs)
+    return jax.vmap(function)(xs)
 
 
 def without_unused(jaxpr: Any, wanted: Sequence[bool] | None = None) -> Any:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxcon.constraints.bound_layout import Reactions
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
+from jaxcon.core.jaxprs import each
 from jaxcon.core.lanes import widened
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
@@ -253,7 +254,7 @@ class Impulse:
             found, left = met(rows.target)
             return Reactions(found, rows.gap, left, jnp.ones_like(left), None, rows.layout)
         more = restitution_gain(rows, rows.restitution, self.dt)
-        (plain, bounced), left = jax.vmap(met)(jnp.stack([rows.target, rows.target + more]))
+        (plain, bounced), left = each(met, jnp.stack([rows.target, rows.target + more]))
         without = self.velocity(jnp.zeros_like(more))
         kept = self.harmless(without, plain, bounced - plain)
         found = plain + kept[None] * (bounced - plain)

@@ -248,9 +248,10 @@ def check_method(method: Any, wait: bool = True) -> None:
 
 
 def _is_number(x: Any) -> bool:
-    """Returns True for one number that can be read."""
-    known = np.asarray(x)
-    return known.shape == () and known.dtype.kind in "fiu"
+    """Returns True for one number that can be read; others are refused where they are used."""
+    if type(x) is float or (type(x) is int and abs(x) < 2**53):
+        return True
+    return getattr(x, "shape", None) == () and getattr(x.dtype, "kind", None) in ("f", "i", "u")
 
 
 @functools.lru_cache(maxsize=64)  # asked in every step outside of jit, which waits for no device

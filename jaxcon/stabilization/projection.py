@@ -27,6 +27,9 @@ from jaxcon.stabilization.baumgarte import Unstabilized
 
 METRICS = ("mass", "euclidean")
 
+SMALL = 1e-3
+"""The share of the kinetic energy below which what a projection moves is a correction."""
+
 
 @pytree
 class Tolerance(checks.Checked):
@@ -327,8 +330,9 @@ class Projection(Unstabilized):
 def _missed(mass: Mass, v: Array, step: Array, dt: Any, frames: _Frames | None) -> Array:
     """The velocity d/h, as far as its kinetic energy is small beside that of v.
 
-    It turns with the bodies where it is a thousandth or less. A larger one belongs to a start with
-    φ̇ ≠ 0, and the free rotation, which depends on it, takes most of its turn back.
+    It turns with the bodies as far as its energy is below `SMALL` of theirs, half of it there. A
+    larger one belongs to a start with φ̇ ≠ 0, and the free rotation, which depends on it, takes most
+    of its turn back.
     """
     gain = numerics.safe_divide(step, dt[None])
     own, present = (jnp.sum(x * mass.apply(x), axis=0) for x in (gain, v))
@@ -336,7 +340,7 @@ def _missed(mass: Mass, v: Array, step: Array, dt: Any, frames: _Frames | None) 
     own, present = (numerics.safe_divide(x, scale) for x in (own, present))
     if frames is not None:
         turned = numerics.safe_divide(frames.change(step), dt[None])
-        share = numerics.safe_divide(present**2, present**2 + (1e3 * own) ** 2)
+        share = numerics.safe_divide(present**2, present**2 + (own / SMALL) ** 2)
         gain = gain + share[None] * (turned - gain)
     return gain * numerics.safe_divide(present**2, present**2 + own**2)[None]
 
