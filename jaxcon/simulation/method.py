@@ -251,7 +251,8 @@ def _is_number(x: Any) -> bool:
     """Returns True for one number that can be read; others are refused where they are used."""
     if type(x) is float or (type(x) is int and abs(x) < 2**53):
         return True
-    return getattr(x, "shape", None) == () and getattr(x.dtype, "kind", None) in ("f", "i", "u")
+    kind = getattr(getattr(x, "dtype", None), "kind", None)
+    return kind in ("f", "i", "u") and np.shape(x) == ()
 
 
 @functools.lru_cache(maxsize=64)  # asked in every step outside of jit, which waits for no device
