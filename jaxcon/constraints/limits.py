@@ -23,8 +23,8 @@ from jaxcon.model.elements import label
 RECOVERED = 0.2
 """The part of a penetration that a step takes back."""
 
-AT_ONCE = 1e-3
-"""The speed [m/s, rad/s] up to which a step takes all of it back."""
+AT_ONCE = {32: 1e-3, 64: 1e-5}
+"""The speed [m/s, rad/s] up to which a step takes all of it back, by bits of a number."""
 
 
 @dataclass(frozen=True)
@@ -33,10 +33,10 @@ class Limit:
 
     At the nearer stop, with gap φ ≥ 0, a step ends with φ̇ ≥ −φ/h: it may reach the stop and not
     pass it. What has passed it comes back by a fifth in each step, no faster than `recovery`, and
-    at once where 1 mm/s or 1 mrad/s suffices for that. What would arrive within the step leaves
-    with −e φ̇, at the time at which it arrives. A stop with a stiffness is a spring and a damper
-    behind the gap, implicit over the step. The farther stop acts in place of the nearer one where
-    the step would otherwise pass it.
+    at once where 1 mm/s or 1 mrad/s suffices for that (a hundredth of it in float64). What would
+    arrive within the step leaves with −e φ̇, at the time at which it arrives. A stop with a
+    stiffness is a spring and a damper behind the gap, implicit over the step. The farther stop
+    acts in place of the nearer one where the step would otherwise pass it.
 
     A step sees one impact of a stop. A joint that rebounds so fast that it would cross its whole
     range in the rest of the step ends with the status `LOST_IMPACTS`: with e = 1 between stops
@@ -233,7 +233,8 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
     closing = numerics.safe_divide(-row.value, h)
     # rounding leaves some corners of a box above the floor and some below it: were the derivative
     # of u* another one there, no motion of the box could answer to all of them
-    back = jnp.maximum(RECOVERED * closing, jnp.minimum(closing, AT_ONCE))
+    least = AT_ONCE[jnp.finfo(closing.dtype).bits]
+    back = jnp.maximum(RECOVERED * closing, jnp.minimum(closing, least))
     back = jnp.minimum(back, not_negative(p["recovery"]))
     target = jnp.where(row.value > 0, closing, back)
     asked = {"target": target}
