@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
+from jaxcon.core.jaxprs import has_loop
 from jaxcon.core.program import Constant, Operation, Program, evaluated, is_known, traced
 from jaxcon.core.typing import Array
 
@@ -76,6 +77,15 @@ for each operation on a number and two for each transcendental one.
 MOST = 100
 """Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
 
+PARTS = 5
+"""Parts up to which branches with loops are no part of a kernel.
+
+A kernel is given the address of every buffer in it, those of branches that are not taken as well.
+That of a branch with loops costs more than the launch of two kernels instead of one. But XLA runs
+no more than eight launches in a row one after another, and a rollout has two or three of its own;
+more of them go to threads, which costs microseconds.
+"""
+
 Step = Operation | list[int]
 """An operation by itself, or the values of a stage."""
 
@@ -92,7 +102,7 @@ def settled(
     """
     if not staged():
         return function(*args) if last is None else last(*function(*args))
-    stages = Stages(traced(function, args))
+    stages = Stages(traced(function, args), apart=True)
     if last is None:
         return stages(*args)
 
@@ -115,9 +125,17 @@ class Stages:
             operation, or the values that a stage computes.
     """
 
-    def __init__(self, closed: Any) -> None:
+    def __init__(self, closed: Any, apart: bool = False) -> None:
+        """Cuts a closed jaxpr into stages.
+
+        Args:
+            closed: the jaxpr.
+            apart: whether branches with loops may be parts of their own.
+        """
         self.program = Program(closed, _settled_body)
         steps = _in_stages(self.program, worth_storing(self.program))
+        if apart:
+            _set_apart(steps)
         self.parts = _with_results(self.program, _in_parts(steps))
 
     def __call__(self, *args: Array) -> list[Array]:
@@ -311,6 +329,21 @@ def _in_parts(steps: list[Step]) -> list[list[Step]]:
         else:
             parts.append([step])
     return parts
+
+
+def _set_apart(steps: list[Step]) -> None:
+    """Makes branches with loops parts of their own, where the parts stay few."""
+    ops = [x for x in steps if isinstance(x, Operation) and _fits(x) and _has_loop(x)]
+    for op in ops:
+        op.plain = False
+    if len(_in_parts(steps)) > PARTS:
+        for op in ops:
+            op.plain = True
+
+
+def _has_loop(op: Operation) -> bool:
+    """Returns True for a condition with a loop in a branch."""
+    return op.name == "cond" and any(has_loop(x.jaxpr) for x in op.params["branches"])
 
 
 def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[Step], list[int]]]:

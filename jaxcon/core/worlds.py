@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import prod
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
+
+FEWEST, PARTS = 8, 8
+"""Of how many worlds a part of a batch is at least, and into how many parts one is divided."""
 
 
 def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
@@ -66,3 +72,80 @@ def keep(chosen: Array, x: PyTree, y: PyTree) -> PyTree:
 def lift(x: Array, like: Array) -> Array:
     """A number of each world, (…), with leading axes to meet an array (n, …)."""
     return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)
+
+
+def where_wanted(
+    wanted: Array, function: Callable[[PyTree], PyTree], args: PyTree, others: PyTree
+) -> PyTree:
+    """function(args) in the worlds that want it, and `others` in the rest of them.
+
+    Where no world wants it, only a branch is paid for. On one CPU a batch in which few worlds want
+    it pays for those and some beside them, by `_in_parts`. Accelerators take the whole batch at
+    once, as their time hardly depends on its size; and so do several devices, which would have to
+    exchange worlds.
+
+    Args:
+        wanted: by world, (…).
+        function: of worlds that do not read each other.
+        args: a pytree of arrays (n, …), of the batch's size along each trailing axis or of size 1.
+        others: a pytree like the results, (n, …), some of which are floats.
+    """
+
+    def found() -> PyTree:
+        alone = jax.default_backend() != "cpu" or jax.device_count() > 1 or wanted.size <= FEWEST
+        results = function(args) if alone else _in_parts(wanted, function, args, others)
+        return keep(wanted, results, others)
+
+    return jax.lax.cond(somewhere(wanted), found, lambda: others)
+
+
+def _in_parts(
+    wanted: Array, function: Callable[[PyTree], PyTree], args: PyTree, like: PyTree
+) -> PyTree:
+    """function(args) of the worlds that want it, which are gathered, an eighth of a batch at a time.
+
+    What is returned of the others may be anything.
+    """
+    batch, count = wanted.shape, wanted.size
+    size = max(FEWEST, -(-count // PARTS))
+    parts = -(-count // size)
+    order = jnp.argsort(~wanted.reshape(count))  # stable: those that want it come first
+    padded = jnp.pad(order, (0, parts * size - count), mode="edge")
+    leaves, structure = jax.tree.flatten(like)
+    lengths = [prod(x.shape[: x.ndim - len(batch)]) for x in leaves]
+    real = next(x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating))
+
+    def part(_: None, i: Array) -> tuple[None, Array]:
+        index = jax.lax.dynamic_slice(padded, (i * size,), (size,))
+
+        def own() -> Array:
+            # one array in place of many, each of which the loop would copy
+            found = jax.tree.leaves(function(_taken(args, index, batch)))
+            return jnp.concatenate([x.astype(real).reshape(-1, size) for x in found])
+
+        def nothing() -> Array:
+            return jnp.zeros((sum(lengths), size), real)
+
+        return None, jax.lax.cond(i * size < jnp.sum(wanted), own, nothing)
+
+    _, found = jax.lax.scan(part, None, jnp.arange(parts))
+    place = jnp.zeros_like(order).at[order].set(jnp.arange(count))
+    found = jnp.moveaxis(found, 0, 1).reshape(-1, parts * size)[:, place]
+    arrays = jnp.split(found, np.cumsum(lengths)[:-1])
+    arrays = [y.reshape(x.shape).astype(x.dtype) for x, y in zip(leaves, arrays, strict=True)]
+    return jax.tree.unflatten(structure, arrays)
+
+
+def _taken(tree: PyTree, index: Array, batch: tuple[int, ...]) -> PyTree:
+    """The worlds of an index (k,), along the first of the trailing axes; the others are of one."""
+    rank = len(batch)
+    shape = (len(index), *(1,) * (rank - 1))
+
+    def one(x: Any) -> Any:
+        if jnp.ndim(x) < rank or prod(jnp.shape(x)[jnp.ndim(x) - rank :]) == 1:
+            return x
+        own = x.shape[: x.ndim - rank]
+        x = jnp.broadcast_to(x, (*own, *batch)).reshape(*own, prod(batch))
+        return x[..., index].reshape(*own, *shape)
+
+    return jax.tree.map(one, tree)

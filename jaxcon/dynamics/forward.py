@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -19,6 +18,7 @@ from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import notices, numerics, status
 from jaxcon.core.doubled import rounded
 from jaxcon.core.lanes import widened
+from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.dynamics import impacts
 from jaxcon.dynamics.parts import Part, Struck
@@ -49,7 +49,7 @@ def saddle(
     return Saddle(mass, force, rows.jacobian, target, compliance, noise, layout.loops, layout)
 
 
-@dataclass(frozen=True)
+@pytree
 class Dynamics:
     """What an integrator sees of a system under control and feedback, during one step.
 
@@ -165,16 +165,27 @@ class Dynamics:
             ends = impacts.mask(bounds.ends, bounds)
             push = impulse.rows.jacobian.transpose(jnp.where(ends, known.multipliers, 0))
         if strikes:
-            lag = 0.0 if lag is None else lag
-            change = impulse.rows.change(solution.acceleration, self.dt)
-            times = impacts.arrive(impulse.rows, may, change, lag, self.dt, impulse.moved())
-            solution = self._observed(solution, t, times.hits, times.bounces, impulse.rows)
-            if e is not None:
-                left = self.dt[None] - times.times
-                speed = impacts.leaving_speeds(impulse.rows, e, times, change, lag, self.dt)
-                lost = impacts.passes_range(both_stops, speed, left)
-                solution = solution._replace(status=lost_impacts(solution.status, lost))
-            solution, known = self._struck((q, v, t), solution, known, times, lag)
+            facing = dataclasses.replace(impulse.rows, restitution=e)
+            impact = impacts.Impact(
+                laws=_Laws(dataclasses.replace(self, guess=None)),
+                system=self.system,
+                q=q,
+                v=v,
+                t=t,
+                rows=facing,
+                stops=both_stops,
+                may=may,
+                acceleration=solution.acceleration,
+                multipliers=known.multipliers,
+                joints=solution.multipliers,
+                lag=0.0 if lag is None else lag,
+                dt=self.dt,
+                response=impulse.moved(),
+            )
+            if notices.is_observing():
+                arrivals = impact.arrivals()
+                solution = self._observed(solution, t, arrivals.hits, arrivals.bounces, bounds)
+            solution, known = self._struck(impact, solution, known)
         elif seen is not None:
             solution = self._observed(solution, t, seen, seen, bounds)
         return solution, dataclasses.replace(rows, reactions=known), own, impulse.alone, push
@@ -188,17 +199,16 @@ class Dynamics:
         return solution._replace(acceleration=a)
 
     def _struck(
-        self, at: Any, solution: Solution, known: Reactions, arrivals: Any, lag: float
+        self, impact: impacts.Impact, solution: Solution, known: Reactions
     ) -> tuple[Solution, Reactions]:
         """Adds the impacts of the step: their jump, and the mean of their impulses."""
-        laws = _Laws(dataclasses.replace(self, guess=None))
-        a, λ, joints = solution.acceleration, known.multipliers, solution.multipliers
-        q, v, t = at
-        impact = impacts.Impact(laws, self.system, q, v, t, a, λ, joints, lag, self.dt, arrivals)
-        jump, struck = impact.outcome()
+        jump, struck, lost = impact.outcome()
         λ, joints = (
             x + numerics.safe_divide(more, self.dt[None])
-            for x, more in ((λ, struck.multipliers), (joints, struck.joints))
+            for x, more in (
+                (known.multipliers, struck.multipliers),
+                (solution.multipliers, struck.joints),
+            )
         )
         known = dataclasses.replace(
             known,
@@ -207,7 +217,8 @@ class Dynamics:
             kept=jnp.minimum(known.kept, struck.kept),
             jump=jump,
         )
-        return solution._replace(multipliers=joints), known
+        code = lost_impacts(solution.status, lost)
+        return solution._replace(multipliers=joints, status=code), known
 
     def bounds(self, q: Array, v: Array, t: Any, dt: Any) -> BoundRows:
         """The bounded rows, and what a step of dt wants of them."""
@@ -226,9 +237,9 @@ class Dynamics:
         def rate(q: Array, time: Array) -> Array:
             return self.bounds(q, v, t + time, dt).rate
 
-        along = (dt[None] * self.system.kinematics(q, v), dt)
-        _, local = jax.jvp(rate, (q, jnp.zeros_like(dt)), along)
-        end, length = self.system.retract(q, dt[None] * v), dt
+        way = dt[None] * self.system.kinematics(q, v)
+        _, local = jax.jvp(rate, (q, jnp.zeros_like(dt)), (way, dt))
+        end, length = self.system.normalize(q + way), dt
         if any(isinstance(group, OneSided) for group in self.system.bounds):
             # a user's φ may not exist there, and must not be differentiated where it does not
             exists = jax.lax.stop_gradient(jnp.all(jnp.isfinite(rate(end, dt)), axis=0))
@@ -371,7 +382,7 @@ def lost_impacts(code: Array, lost: Array | None) -> Array:
     return status.first(code, found.astype(code.dtype))
 
 
-@dataclass(frozen=True)
+@pytree
 class _Laws:
     """The `impacts.Laws` of these dynamics."""
 

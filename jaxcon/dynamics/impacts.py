@@ -27,7 +27,6 @@ References:
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -37,10 +36,9 @@ import numpy as np
 from jaxcon.constraints.bound_layout import BoundLayout
 from jaxcon.constraints.bounds import BoundRows
 from jaxcon.core import numerics
-from jaxcon.core.pytree import pytree
-from jaxcon.core.somewhere import somewhere
+from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array
-from jaxcon.core.worlds import keep
+from jaxcon.core.worlds import keep, where_wanted
 from jaxcon.dynamics.parts import mask
 from jaxcon.solvers.saddle import Solution
 
@@ -382,7 +380,21 @@ def doubt(rows: BoundRows, shares: str | None, some: bool) -> str | None:
     return f"{PREFIX}{'; '.join(reasons)}." if reasons else None
 
 
-@dataclass(frozen=True)
+class Outcome(NamedTuple):
+    """What impacts do within a step.
+
+    Attributes:
+        jump: at its end.
+        impulses: what they add to those of the step's smooth forces.
+        lost: what `passes_range` says of the rebound, (); None where nothing can be lost.
+    """
+
+    jump: Jump
+    impulses: Found
+    lost: Array | None
+
+
+@pytree
 class Impact:
     """The impact of a step, between what leads to it and what follows.
 
@@ -390,12 +402,15 @@ class Impact:
         laws: of the dynamics.
         system: with `retract`.
         q, v, t: the state at the start of the step.
+        rows: the bounded rows there, with the stops that they face and their restitution.
+        stops: the rows as they are linearized, with both stops of a joint.
+        may: the `candidates`, (n,).
         acceleration: a⁻, (n_v,).
         multipliers, joints: λ of bounded rows and of equality rows before it, (n,) and (n_c,).
+        dt: h, () [s].
+        response: ∂a/∂λ, (n_v, n); None where it is not known.
         lag: velocities are those of lag · h before the positions; where it is not 0, the travel is
             added to the displacement of the step before bodies turn by the sum.
-        dt: h, () [s].
-        arrivals: which rows arrive, and when.
     """
 
     laws: Laws
@@ -403,25 +418,38 @@ class Impact:
     q: Array
     v: Array
     t: Any
+    rows: BoundRows
+    stops: BoundRows
+    may: Array
     acceleration: Array
     multipliers: Array
     joints: Array
-    lag: Any
     dt: Array
-    arrivals: Arrivals
+    response: Array | None
+    lag: float = static(default=0.0)
 
-    def outcome(self) -> tuple[Jump, Found]:
-        """The jump, and the impulses that impacts add to those of the step's smooth forces."""
-        happens = self.arrivals.happens
+    def arrivals(self) -> Arrivals:
+        """Which rows arrive within the step, and when."""
+        change = self.rows.change(self.acceleration, self.dt)
+        return arrive(self.rows, self.may, change, self.lag, self.dt, self.response)
+
+    def outcome(self) -> Outcome:
+        """What the impact does; steps in which no row may arrive pay for a branch only."""
+        return where_wanted(jnp.any(self.may, axis=0), Impact._strikes, self, self._still())
+
+    def _still(self) -> Outcome:
+        """Nothing."""
         none, one = jnp.zeros_like(self.v), jnp.ones(self.v.shape[1:], self.v.dtype)
         rows, joints = jnp.zeros_like(self.multipliers), jnp.zeros_like(self.joints)
-        still = Jump(none, none), Found(none, rows, joints, 0 * one, one)
-        return jax.lax.cond(somewhere(happens), lambda: self._strikes(still), lambda: still)
+        lost = None if self.stops.far is None or self.rows.restitution is None else one < 0
+        return Outcome(Jump(none, none), Found(none, rows, joints, 0 * one, one), lost)
 
-    def _strikes(self, still: tuple[Jump, Found]) -> tuple[Jump, Found]:
+    def _strikes(self) -> Outcome:
         h, a = self.dt[None], self.acceleration
-        rows = self.laws.rows(*self._there(self.arrivals))
-        arrivals = self.arrivals.refined(rows)
+        arrivals = self.arrivals()
+        lost = self._lost(arrivals)
+        rows = self.laws.rows(*self._there(arrivals))
+        arrivals = arrivals.refined(rows)
         place, before, time = self._there(arrivals)
         τ = arrivals.by_velocity
 
@@ -455,7 +483,15 @@ class Impact:
         share = jnp.where(one_sided, jnp.maximum(share, 0), share)
         impulses = struck.multipliers + share * (after.multipliers - self.multipliers)
         struck = struck._replace(multipliers=impulses, joints=joints)
-        return keep(self.arrivals.happens, (jump, struck), still)
+        return keep(arrivals.happens, Outcome(jump, struck, lost), self._still())
+
+    def _lost(self, arrivals: Arrivals) -> Array | None:
+        """Whether a joint crosses the range between two elastic stops after its impact, ()."""
+        e, change = self.rows.restitution, self.rows.change(self.acceleration, self.dt)
+        if e is None:
+            return None
+        speed = leaving_speeds(self.rows, e, arrivals, change, self.lag, self.dt)
+        return passes_range(self.stops, speed, self.dt[None] - arrivals.times)
 
     def _there(self, arrivals: Arrivals) -> tuple[Array, Array, Array]:
         """q*, v⁻ and the time of the impact."""
