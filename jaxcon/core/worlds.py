@@ -102,7 +102,7 @@ def where_wanted(
 def _in_parts(
     wanted: Array, function: Callable[[PyTree], PyTree], args: PyTree, like: PyTree
 ) -> PyTree:
-    """function(args) of the worlds that want it, which are gathered, an eighth of a batch at a time.
+    """function(args) of the worlds that want it, gathered, for an eighth of the batch at a time.
 
     What is returned of the others may be anything.
     """
