@@ -289,6 +289,25 @@ def test_a_function_that_ends_within_a_step_has_a_derivative(name):
     assert jax.grad(height)(0.9995) == 0
 
 
+@pytest.mark.parametrize("gap", [0.0, 1e-12, -1e-12, -1e-9, 1e-7])
+def test_a_box_on_the_floor_stays_there_wherever_it_was_put(gap):
+    """A step closes gaps and small overlaps whole: nothing is left of a change of height."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("box", mass=1.0, inertia=0.01, position=(0.0, 0.1))
+    corners = np.array([(-0.1, 0.0), (0.1, 0.0)])
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "box", center=corners, friction=0.5))
+    system, state = scene.build()
+    method = jc.Method()
+
+    def end(pose):
+        start = jc.init(system, method, pose, state.v)
+        return jc.rollout(system, method, start, None, 1e-3, 3)[0].q
+
+    slopes = jax.jacfwd(end)(state.q.at[1].add(gap))
+    np.testing.assert_allclose(slopes[1:], 0, atol=1e-9)  # of height and tilt
+    assert abs(slopes[0, 2] - 0.1) < 1e-3  # it comes down about its middle
+
+
 @pytest.mark.parametrize(("dtype", "mode"), [(np.float32, jax.jacrev), (np.float64, jax.jacfwd)])
 def test_a_box_lands_on_four_corners_and_slides_to_rest(dtype, mode):
     """Its corners bear more rows than it has freedoms, and rounding leaves some above the floor.

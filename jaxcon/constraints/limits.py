@@ -24,7 +24,10 @@ RECOVERED = 0.2
 """The part of a penetration that a step takes back."""
 
 AT_ONCE = {32: 1e-3, 64: 1e-5}
-"""The speed [m/s, rad/s] up to which a step takes all of it back, by bits of a number."""
+"""The speed [m/s, rad/s] up to which a step takes all of it back, by bits of a number.
+
+Of what is left beyond it, a step takes back the fifth.
+"""
 
 
 @dataclass(frozen=True)
@@ -32,8 +35,9 @@ class Limit:
     """A joint's coordinate stays between two stops, lower ≤ θ ≤ upper.
 
     At the nearer stop, with gap φ ≥ 0, a step ends with φ̇ ≥ −φ/h: it may reach the stop and not
-    pass it. What has passed it comes back by a fifth in each step, no faster than `recovery`, and
-    at once where 1 mm/s or 1 mrad/s suffices for that (a hundredth of it in float64). What would
+    pass it. What has passed it comes back at once where 1 mm/s or 1 mrad/s suffices for that (a
+    hundredth of it in float64), and otherwise by that and a fifth of the rest in each step, no
+    faster than `recovery`. What would
     arrive within the step leaves with −e φ̇, at the time at which it arrives. A stop with a
     stiffness is a spring and a damper behind the gap, implicit over the step. The farther stop
     acts in place of the nearer one where the step would otherwise pass it.
@@ -232,9 +236,9 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
     h = dt[None]
     closing = numerics.safe_divide(-row.value, h)
     # rounding leaves some corners of a box above the floor and some below it: were the derivative
-    # of u* another one there, no motion of the box could answer to all of them
+    # of u* another one below it, no motion of the box would be that of all its corners
     least = AT_ONCE[jnp.finfo(closing.dtype).bits]
-    back = jnp.maximum(RECOVERED * closing, jnp.minimum(closing, least))
+    back = jnp.where(closing <= least, closing, least + RECOVERED * (closing - least))
     back = jnp.minimum(back, not_negative(p["recovery"]))
     target = jnp.where(row.value > 0, closing, back)
     asked = {"target": target}

@@ -26,8 +26,15 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from jaxcon.core.jaxprs import has_loop
-from jaxcon.core.program import Constant, Operation, Program, evaluated, is_known, traced
+from jaxcon.core.program import (
+    Constant,
+    Operation,
+    Program,
+    evaluated,
+    has_loop,
+    is_known,
+    traced,
+)
 from jaxcon.core.typing import Array
 
 WORTH = 3
@@ -77,13 +84,13 @@ for each operation on a number and two for each transcendental one.
 MOST = 100
 """Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
 
-PARTS = 5
+FEW_PARTS = 5
 """Parts up to which branches with loops are no part of a kernel.
 
-A kernel is given the address of every buffer in it, those of branches that are not taken as well.
-That of a branch with loops costs more than the launch of two kernels instead of one. But XLA runs
-no more than eight launches in a row one after another, and a rollout has two or three of its own;
-more of them go to threads, which costs microseconds.
+A kernel is given the address of every buffer in it, of branches that are not taken as well. The
+addresses of a branch with loops cost more than a second kernel. But XLA launches no more than eight
+kernels one after another, and a rollout has two or three of its own; where there are more, it
+launches them from several threads, which costs microseconds.
 """
 
 Step = Operation | list[int]
@@ -336,7 +343,7 @@ def _set_apart(steps: list[Step]) -> None:
     ops = [x for x in steps if isinstance(x, Operation) and _fits(x) and _has_loop(x)]
     for op in ops:
         op.plain = False
-    if len(_in_parts(steps)) > PARTS:
+    if len(_in_parts(steps)) > FEW_PARTS:
         for op in ops:
             op.plain = True
 

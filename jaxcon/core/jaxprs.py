@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jax.extend import core as jex
 from jax.interpreters import partial_eval
 
 CALLS = {
@@ -36,18 +35,6 @@ def called(equation: Any) -> Any:
     if hasattr(primitive, "expand"):
         return jax.make_jaxpr(primitive.expand)(*primitive.in_avals)
     return None
-
-
-def has_loop(jaxpr: Any) -> bool:
-    """Returns True where an open jaxpr contains a loop, at any depth."""
-    if any(x.primitive.name in ("scan", "while") for x in jaxpr.eqns):
-        return True
-    values = jax.tree.leaves([list(x.params.values()) for x in jaxpr.eqns], is_leaf=_is_jaxpr)
-    return any(has_loop(getattr(x, "jaxpr", x)) for x in values if _is_jaxpr(x))
-
-
-def _is_jaxpr(x: Any) -> bool:
-    return isinstance(x, jex.Jaxpr | jex.ClosedJaxpr)
 
 
 def each(function: Callable[[Any], Any], xs: Any) -> Any:

@@ -81,6 +81,18 @@ def evaluated(closed: Any, args: Sequence[Any]) -> list[Any]:
     return jex.jaxpr_as_fun(closed)(*args)
 
 
+def has_loop(jaxpr: Any) -> bool:
+    """Returns True where an open jaxpr has a loop, or one that its equations hold."""
+    if any(x.primitive.name in ("scan", "while") for x in jaxpr.eqns):
+        return True
+    values = jax.tree.leaves([list(x.params.values()) for x in jaxpr.eqns], is_leaf=_is_jaxpr)
+    return any(has_loop(getattr(x, "jaxpr", x)) for x in values if _is_jaxpr(x))
+
+
+def _is_jaxpr(x: Any) -> bool:
+    return isinstance(x, jex.Jaxpr | jex.ClosedJaxpr)
+
+
 class Program:
     """A function as operations in order.
 

@@ -13,8 +13,8 @@ import numpy as np
 from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
 
-FEWEST, PARTS = 8, 8
-"""Of how many worlds a part of a batch is at least, and into how many parts one is divided."""
+FEWEST, MOST_PARTS = 8, 8
+"""The least worlds of a part of a batch, and the most parts of one, in `where_wanted`."""
 
 
 def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
@@ -79,35 +79,36 @@ def where_wanted(
 ) -> PyTree:
     """function(args) in the worlds that want it, and `others` in the rest of them.
 
-    Where no world wants it, only a branch is paid for. On one CPU a batch in which few worlds want
-    it pays for those and some beside them, by `_in_parts`. Accelerators take the whole batch at
-    once, as their time hardly depends on its size; and so do several devices, which would have to
-    exchange worlds.
+    Where no world wants it, only a branch is paid for. In a process whose one device is a CPU, a
+    batch in which few worlds want it pays for those and some beside them: they are gathered, and
+    the function is evaluated for an eighth of the batch at a time. Accelerators take the whole
+    batch at once, as their time hardly depends on its size; and so do several devices, which would
+    have to exchange worlds.
 
     Args:
         wanted: by world, (…).
         function: of worlds that do not read each other.
         args: a pytree of arrays (n, …), of the batch's size along each trailing axis or of size 1.
-        others: a pytree like the results, (n, …), some of which are floats.
+        others: a pytree like the results, (n, …), with at least one array of floats.
     """
 
     def found() -> PyTree:
-        alone = jax.default_backend() != "cpu" or jax.device_count() > 1 or wanted.size <= FEWEST
-        results = function(args) if alone else _in_parts(wanted, function, args, others)
+        whole = jax.default_backend() != "cpu" or jax.device_count() > 1 or wanted.size <= FEWEST
+        results = function(args) if whole else _gathered(wanted, function, args, others)
         return keep(wanted, results, others)
 
     return jax.lax.cond(somewhere(wanted), found, lambda: others)
 
 
-def _in_parts(
+def _gathered(
     wanted: Array, function: Callable[[PyTree], PyTree], args: PyTree, like: PyTree
 ) -> PyTree:
-    """function(args) of the worlds that want it, gathered, for an eighth of the batch at a time.
+    """function(args) in the worlds that want it, evaluated for one part of the batch after another.
 
-    What is returned of the others may be anything.
+    Worlds that do not want it have arbitrary results.
     """
     batch, count = wanted.shape, wanted.size
-    size = max(FEWEST, -(-count // PARTS))
+    size = max(FEWEST, -(-count // MOST_PARTS))
     parts = -(-count // size)
     order = jnp.argsort(~wanted.reshape(count))  # stable: those that want it come first
     padded = jnp.pad(order, (0, parts * size - count), mode="edge")
@@ -118,34 +119,33 @@ def _in_parts(
     def part(_: None, i: Array) -> tuple[None, Array]:
         index = jax.lax.dynamic_slice(padded, (i * size,), (size,))
 
-        def own() -> Array:
+        def evaluated() -> Array:
             # one array in place of many, each of which the loop would copy
-            found = jax.tree.leaves(function(_taken(args, index, batch)))
-            return jnp.concatenate([x.astype(real).reshape(-1, size) for x in found])
+            results = jax.tree.leaves(function(_gather_worlds(args, index, batch)))
+            return jnp.concatenate([x.astype(real).reshape(-1, size) for x in results])
 
-        def nothing() -> Array:
+        def skipped() -> Array:
             return jnp.zeros((sum(lengths), size), real)
 
-        return None, jax.lax.cond(i * size < jnp.sum(wanted), own, nothing)
+        return None, jax.lax.cond(i * size < jnp.sum(wanted), evaluated, skipped)
 
-    _, found = jax.lax.scan(part, None, jnp.arange(parts))
+    _, results = jax.lax.scan(part, None, jnp.arange(parts))
     place = jnp.zeros_like(order).at[order].set(jnp.arange(count))
-    found = jnp.moveaxis(found, 0, 1).reshape(-1, parts * size)[:, place]
-    arrays = jnp.split(found, np.cumsum(lengths)[:-1])
+    results = jnp.moveaxis(results, 0, 1).reshape(-1, parts * size)[:, place]
+    arrays = jnp.split(results, np.cumsum(lengths)[:-1])
     arrays = [y.reshape(x.shape).astype(x.dtype) for x, y in zip(leaves, arrays, strict=True)]
     return jax.tree.unflatten(structure, arrays)
 
 
-def _taken(tree: PyTree, index: Array, batch: tuple[int, ...]) -> PyTree:
-    """The worlds of an index (k,), along the first of the trailing axes; the others are of one."""
+def _gather_worlds(tree: PyTree, index: Array, batch: tuple[int, ...]) -> PyTree:
+    """The worlds of an index (k,) of the flattened batch, with trailing axes (k, 1, …)."""
     rank = len(batch)
-    shape = (len(index), *(1,) * (rank - 1))
 
-    def one(x: Any) -> Any:
+    def gather(x: Any) -> Any:
         if jnp.ndim(x) < rank or prod(jnp.shape(x)[jnp.ndim(x) - rank :]) == 1:
-            return x
+            return x  # shared by all worlds
         own = x.shape[: x.ndim - rank]
         x = jnp.broadcast_to(x, (*own, *batch)).reshape(*own, prod(batch))
-        return x[..., index].reshape(*own, *shape)
+        return x[..., index].reshape(*own, len(index), *(1,) * (rank - 1))
 
-    return jax.tree.map(one, tree)
+    return jax.tree.map(gather, tree)

@@ -237,14 +237,15 @@ class Dynamics:
         def rate(q: Array, time: Array) -> Array:
             return self.bounds(q, v, t + time, dt).rate
 
-        way = dt[None] * self.system.kinematics(q, v)
-        _, local = jax.jvp(rate, (q, jnp.zeros_like(dt)), (way, dt))
-        end, length = self.system.normalize(q + way), dt
+        path = dt[None] * self.system.kinematics(q, v)
+        _, local = jax.jvp(rate, (q, jnp.zeros_like(dt)), (path, dt))
+        # this turns bodies in space by 2 atan(h|ω|/2) for h|ω|, and saves a step's sine and cosine
+        end, elapsed = self.system.normalize(q + path), dt
         if any(isinstance(group, OneSided) for group in self.system.bounds):
             # a user's φ may not exist there, and must not be differentiated where it does not
             exists = jax.lax.stop_gradient(jnp.all(jnp.isfinite(rate(end, dt)), axis=0))
-            end, length = jnp.where(exists[None], end, q), jnp.where(exists, dt, 0)
-        change = rate(end, length) - rows.rate
+            end, elapsed = jnp.where(exists[None], end, q), jnp.where(exists, dt, 0)
+        change = rate(end, elapsed) - rows.rate
         agree = local * change > 0  # false where J̇ v is not a number
         smaller = jnp.where(agree & (jnp.abs(local) < jnp.abs(change)), local, change)
         value = jnp.where(agree, smaller, 0)

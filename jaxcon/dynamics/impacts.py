@@ -384,7 +384,7 @@ class Outcome(NamedTuple):
     """What impacts do within a step.
 
     Attributes:
-        jump: at its end.
+        jump: what they change at its end.
         impulses: what they add to those of the step's smooth forces.
         lost: what `passes_range` says of the rebound, (); None where nothing can be lost.
     """
@@ -400,7 +400,7 @@ class Impact:
 
     Attributes:
         laws: of the dynamics.
-        system: with `retract`.
+        system: of bodies or generalized coordinates.
         q, v, t: the state at the start of the step.
         rows: the bounded rows there, with the stops that they face and their restitution.
         stops: the rows as they are linearized, with both stops of a joint.
@@ -438,10 +438,10 @@ class Impact:
         return where_wanted(jnp.any(self.may, axis=0), Impact._strikes, self, self._still())
 
     def _still(self) -> Outcome:
-        """Nothing."""
+        """The outcome of a step without an impact."""
         none, one = jnp.zeros_like(self.v), jnp.ones(self.v.shape[1:], self.v.dtype)
         rows, joints = jnp.zeros_like(self.multipliers), jnp.zeros_like(self.joints)
-        lost = None if self.stops.far is None or self.rows.restitution is None else one < 0
+        lost = passes_range(self.stops, 0 * self.stops.gap, 0 * self.stops.gap)
         return Outcome(Jump(none, none), Found(none, rows, joints, 0 * one, one), lost)
 
     def _strikes(self) -> Outcome:
@@ -486,11 +486,11 @@ class Impact:
         return keep(arrivals.happens, Outcome(jump, struck, lost), self._still())
 
     def _lost(self, arrivals: Arrivals) -> Array | None:
-        """Whether a joint crosses the range between two elastic stops after its impact, ()."""
+        """What `passes_range` says of the rebound."""
         e, change = self.rows.restitution, self.rows.change(self.acceleration, self.dt)
-        if e is None:
-            return None
-        speed = leaving_speeds(self.rows, e, arrivals, change, self.lag, self.dt)
+        speed = 0 * arrivals.times
+        if e is not None:
+            speed = leaving_speeds(self.rows, e, arrivals, change, self.lag, self.dt)
         return passes_range(self.stops, speed, self.dt[None] - arrivals.times)
 
     def _there(self, arrivals: Arrivals) -> tuple[Array, Array, Array]:
