@@ -27,8 +27,8 @@ class Inequality:
     The function is that of `Holonomic`: `function(q, t, params)` on generalized coordinates, with
     the system's params, and `function(*poses, t, params)` on bodies, with the `Pose` of each. It
     returns φ, (m,); J is found by automatic differentiation. A step treats each row as `Limit` does
-    its gap: it may close and not open backwards, what is behind comes back by a fifth in each step,
-    and what arrives leaves with −e φ̇.
+    its gap. It may close and not become negative, a negative φ closes like a penetration there, at
+    speeds in the unit of φ per second, and a row that arrives leaves with −e φ̇.
 
     Attributes:
         function: pure and hashable; define it once, since every new function object is a new trace.

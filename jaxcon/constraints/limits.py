@@ -24,9 +24,9 @@ RECOVERED = 0.2
 """The part of a penetration that a step takes back."""
 
 AT_ONCE = {32: 1e-3, 64: 1e-5}
-"""The speed [m/s, rad/s] up to which a step takes all of it back, by bits of a number.
+"""The speed [m/s, rad/s] up to which a step closes a whole penetration, by bits of a number.
 
-Of what is left beyond it, a step takes back the fifth.
+A faster closing speed is reduced to this speed plus a fifth of the excess.
 """
 
 
@@ -35,9 +35,9 @@ class Limit:
     """A joint's coordinate stays between two stops, lower ≤ θ ≤ upper.
 
     At the nearer stop, with gap φ ≥ 0, a step ends with φ̇ ≥ −φ/h: it may reach the stop and not
-    pass it. What has passed it comes back at once where 1 mm/s or 1 mrad/s suffices for that (a
-    hundredth of it in float64), and otherwise by that and a fifth of the rest in each step, no
-    faster than `recovery`. What would
+    pass it. A penetration closes within a step if 1 mm/s or 1 mrad/s suffices (10 µm/s or 10 µrad/s
+    in float64). Otherwise it closes at this speed plus a fifth of the excess over it, no faster
+    than `recovery`. What would
     arrive within the step leaves with −e φ̇, at the time at which it arrives. A stop with a
     stiffness is a spring and a damper behind the gap, implicit over the step. The farther stop
     acts in place of the nearer one where the step would otherwise pass it.
@@ -235,8 +235,9 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
     """
     h = dt[None]
     closing = numerics.safe_divide(-row.value, h)
-    # rounding leaves some corners of a box above the floor and some below it: were the derivative
-    # of u* another one below it, no motion of the box would be that of all its corners
+    # rounding leaves some corners of a resting box above the floor and others below it. The
+    # derivative of u* must be the same on both sides, and at zero, or no rigid motion meets all of
+    # them; jnp.minimum would halve it at the tie
     least = AT_ONCE[jnp.finfo(closing.dtype).bits]
     back = jnp.where(closing <= least, closing, least + RECOVERED * (closing - least))
     back = jnp.minimum(back, not_negative(p["recovery"]))

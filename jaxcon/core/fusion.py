@@ -85,12 +85,12 @@ MOST = 100
 """Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
 
 FEW_PARTS = 5
-"""Parts up to which branches with loops are no part of a kernel.
+"""The most parts of a program whose branches with loops are kept out of its kernels.
 
-A kernel is given the address of every buffer in it, of branches that are not taken as well. The
-addresses of a branch with loops cost more than a second kernel. But XLA launches no more than eight
-kernels one after another, and a rollout has two or three of its own; where there are more, it
-launches them from several threads, which costs microseconds.
+Each launch of a kernel resolves the addresses of all its buffers, including those of branches that
+are not taken. For a branch with loops this costs more than a second launch. But XLA runs a sequence
+of more than eight launches on several threads, which costs microseconds, and a rollout adds two or
+three launches of its own.
 """
 
 Step = Operation | list[int]
@@ -137,7 +137,7 @@ class Stages:
 
         Args:
             closed: the jaxpr.
-            apart: whether branches with loops may be parts of their own.
+            apart: whether branches with loops may stay out of kernels; False within a kernel.
         """
         self.program = Program(closed, _settled_body)
         steps = _in_stages(self.program, worth_storing(self.program))
@@ -339,7 +339,7 @@ def _in_parts(steps: list[Step]) -> list[list[Step]]:
 
 
 def _set_apart(steps: list[Step]) -> None:
-    """Makes branches with loops parts of their own, where the parts stay few."""
+    """Keeps branches with loops out of kernels if that leaves at most `FEW_PARTS` parts."""
     ops = [x for x in steps if isinstance(x, Operation) and _fits(x) and _has_loop(x)]
     for op in ops:
         op.plain = False

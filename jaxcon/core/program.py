@@ -82,7 +82,7 @@ def evaluated(closed: Any, args: Sequence[Any]) -> list[Any]:
 
 
 def has_loop(jaxpr: Any) -> bool:
-    """Returns True where an open jaxpr has a loop, or one that its equations hold."""
+    """Returns True if an open jaxpr, or a jaxpr inside its equations, contains a loop."""
     if any(x.primitive.name in ("scan", "while") for x in jaxpr.eqns):
         return True
     values = jax.tree.leaves([list(x.params.values()) for x in jaxpr.eqns], is_leaf=_is_jaxpr)

@@ -14,7 +14,7 @@ from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
 
 FEWEST, MOST_PARTS = 8, 8
-"""The least worlds of a part of a batch, and the most parts of one, in `where_wanted`."""
+"""Chunks of `where_wanted`: the fewest worlds in a chunk, and the most chunks of a batch."""
 
 
 def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
@@ -77,19 +77,22 @@ def lift(x: Array, like: Array) -> Array:
 def where_wanted(
     wanted: Array, function: Callable[[PyTree], PyTree], args: PyTree, others: PyTree
 ) -> PyTree:
-    """function(args) in the worlds that want it, and `others` in the rest of them.
+    """Evaluates function(args) in the worlds where `wanted` is set; the others keep `others`.
 
-    Where no world wants it, only a branch is paid for. In a process whose one device is a CPU, a
-    batch in which few worlds want it pays for those and some beside them: they are gathered, and
-    the function is evaluated for an eighth of the batch at a time. Accelerators take the whole
-    batch at once, as their time hardly depends on its size; and so do several devices, which would
-    have to exchange worlds.
+    If no world is set, the function is skipped. In a process with a single CPU device, the set
+    worlds are gathered and evaluated in chunks of an eighth of the batch, so that one world does
+    not cost a whole batch. Accelerators evaluate the whole batch, because their time hardly
+    depends on its size. Several devices do so too, because gathering would move worlds between
+    them.
 
     Args:
-        wanted: by world, (…).
-        function: of worlds that do not read each other.
+        wanted: a boolean for each world, (…).
+        function: a function of a batch in which no world reads another.
         args: a pytree of arrays (n, …), of the batch's size along each trailing axis or of size 1.
-        others: a pytree like the results, (n, …), with at least one array of floats.
+        others: a pytree with the structure and shapes of the result; at least one leaf is floating.
+
+    Returns:
+        A pytree like `others`.
     """
 
     def found() -> PyTree:
@@ -103,14 +106,14 @@ def where_wanted(
 def _gathered(
     wanted: Array, function: Callable[[PyTree], PyTree], args: PyTree, like: PyTree
 ) -> PyTree:
-    """function(args) in the worlds that want it, evaluated for one part of the batch after another.
+    """Evaluates function(args) in chunks that hold the wanted worlds first.
 
-    Worlds that do not want it have arbitrary results.
+    The results of the other worlds are arbitrary.
     """
     batch, count = wanted.shape, wanted.size
     size = max(FEWEST, -(-count // MOST_PARTS))
     parts = -(-count // size)
-    order = jnp.argsort(~wanted.reshape(count))  # stable: those that want it come first
+    order = jnp.argsort(~wanted.reshape(count))  # wanted worlds come first
     padded = jnp.pad(order, (0, parts * size - count), mode="edge")
     leaves, structure = jax.tree.flatten(like)
     lengths = [prod(x.shape[: x.ndim - len(batch)]) for x in leaves]
@@ -120,7 +123,7 @@ def _gathered(
         index = jax.lax.dynamic_slice(padded, (i * size,), (size,))
 
         def evaluated() -> Array:
-            # one array in place of many, each of which the loop would copy
+            # the loop copies each of its outputs in every iteration: one array is cheaper
             results = jax.tree.leaves(function(_gather_worlds(args, index, batch)))
             return jnp.concatenate([x.astype(real).reshape(-1, size) for x in results])
 
@@ -138,7 +141,7 @@ def _gathered(
 
 
 def _gather_worlds(tree: PyTree, index: Array, batch: tuple[int, ...]) -> PyTree:
-    """The worlds of an index (k,) of the flattened batch, with trailing axes (k, 1, …)."""
+    """Gathers worlds by their index (k,) in the flattened batch; trailing axes become (k, 1, …)."""
     rank = len(batch)
 
     def gather(x: Any) -> Any:

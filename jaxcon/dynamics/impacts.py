@@ -381,12 +381,12 @@ def doubt(rows: BoundRows, shares: str | None, some: bool) -> str | None:
 
 
 class Outcome(NamedTuple):
-    """What impacts do within a step.
+    """The effect of the impacts within a step.
 
     Attributes:
-        jump: what they change at its end.
-        impulses: what they add to those of the step's smooth forces.
-        lost: what `passes_range` says of the rebound, (); None where nothing can be lost.
+        jump: the change of velocity and displacement at the end of the step.
+        impulses: the impulses added to those of the smooth forces.
+        lost: the result of `passes_range` for the rebound, (); None if no joint has two elastic stops.
     """
 
     jump: Jump
@@ -429,12 +429,12 @@ class Impact:
     lag: float = static(default=0.0)
 
     def arrivals(self) -> Arrivals:
-        """Which rows arrive within the step, and when."""
+        """The rows that arrive within the step, with their times."""
         change = self.rows.change(self.acceleration, self.dt)
         return arrive(self.rows, self.may, change, self.lag, self.dt, self.response)
 
     def outcome(self) -> Outcome:
-        """What the impact does; steps in which no row may arrive pay for a branch only."""
+        """Computes the impact in the worlds that have candidates for one; others skip it."""
         return where_wanted(jnp.any(self.may, axis=0), Impact._strikes, self, self._still())
 
     def _still(self) -> Outcome:
@@ -486,7 +486,7 @@ class Impact:
         return keep(arrivals.happens, Outcome(jump, struck, lost), self._still())
 
     def _lost(self, arrivals: Arrivals) -> Array | None:
-        """What `passes_range` says of the rebound."""
+        """The result of `passes_range` for the rebound."""
         e, change = self.rows.restitution, self.rows.change(self.acceleration, self.dt)
         speed = 0 * arrivals.times
         if e is not None:
