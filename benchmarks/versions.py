@@ -33,7 +33,10 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 PYTHONS = ("3.11", "3.13", "3.14")
-TESTS = ("native", "fusion", "composition", "needed", "numerics", "lanes", "quaternion", "layout")
+TESTS = (
+    *("native", "fusion", "worlds", "composition"),
+    *("needed", "numerics", "lanes", "quaternion", "layout"),
+)
 """Modules of tests that lean on JAX's inner workings, or hold them at arm's length."""
 TOOLS = ("pytest>=8", "pytest-xdist>=3.5", "flatbuffers")
 STAGES = ("import", "README", "guide", "tests")

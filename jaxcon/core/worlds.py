@@ -83,7 +83,7 @@ def where_wanted(
     worlds are gathered and evaluated in chunks of an eighth of the batch, so that one world does
     not cost a whole batch. Accelerators evaluate the whole batch, because their time hardly
     depends on its size. Several devices do so too, because gathering would move worlds between
-    them.
+    them, and so does a program for batches of any size.
 
     Args:
         wanted: a boolean for each world, (…).
@@ -96,8 +96,10 @@ def where_wanted(
     """
 
     def found() -> PyTree:
-        whole = jax.default_backend() != "cpu" or jax.device_count() > 1 or wanted.size <= FEWEST
-        results = function(args) if whole else _gathered(wanted, function, args, others)
+        one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
+        is_known = isinstance(wanted.size, int)  # not where a batch of any size is exported
+        gathers = one_cpu and is_known and wanted.size > FEWEST
+        results = _gathered(wanted, function, args, others) if gathers else function(args)
         return keep(wanted, results, others)
 
     return jax.lax.cond(somewhere(wanted), found, lambda: others)

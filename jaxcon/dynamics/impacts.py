@@ -386,7 +386,7 @@ class Outcome(NamedTuple):
     Attributes:
         jump: the change of velocity and displacement at the end of the step.
         impulses: the impulses added to those of the smooth forces.
-        lost: the result of `passes_range` for the rebound, (); None if no joint has two elastic stops.
+        lost: the result of `passes_range` for the rebound, (); None without elastic stops in pairs.
     """
 
     jump: Jump
