@@ -26,7 +26,7 @@ RECOVERED = 0.2
 AT_ONCE = {32: 1e-3, 64: 1e-5}
 """The speed [m/s, rad/s] up to which a step closes a whole penetration, by bits of a number.
 
-A faster closing speed is reduced to this speed plus a fifth of the excess.
+A faster closing speed is reduced to a fifth of it, but not below this speed.
 """
 
 
@@ -36,8 +36,8 @@ class Limit:
 
     At the nearer stop, with gap φ ≥ 0, a step ends with φ̇ ≥ −φ/h: it may reach the stop and not
     pass it. A penetration closes within a step if 1 mm/s or 1 mrad/s suffices (10 µm/s or 10 µrad/s
-    in float64). Otherwise it closes at this speed plus a fifth of the excess over it, no faster
-    than `recovery`. What would
+    in float64). Otherwise it closes by a fifth, but at least at this speed, and no faster than
+    `recovery`. What would
     arrive within the step leaves with −e φ̇, at the time at which it arrives. A stop with a
     stiffness is a spring and a damper behind the gap, implicit over the step. The farther stop
     acts in place of the nearer one where the step would otherwise pass it.
@@ -239,7 +239,7 @@ def one_sided(p: dict[str, Any], row: Row, dt: Any) -> tuple[Row, dict[str, Any]
     # derivative of u* must be the same on both sides, and at zero, or no rigid motion meets all of
     # them; jnp.minimum would halve it at the tie
     least = AT_ONCE[jnp.finfo(closing.dtype).bits]
-    back = jnp.where(closing <= least, closing, least + RECOVERED * (closing - least))
+    back = jnp.where(closing <= least, closing, jnp.maximum(RECOVERED * closing, least))
     back = jnp.minimum(back, not_negative(p["recovery"]))
     target = jnp.where(row.value > 0, closing, back)
     asked = {"target": target}
