@@ -37,10 +37,10 @@ class Limit:
     At the nearer stop, with gap φ ≥ 0, a step ends with φ̇ ≥ −φ/h: it may reach the stop and not
     pass it. A penetration closes within a step if 1 mm/s or 1 mrad/s suffices (10 µm/s or 10 µrad/s
     in float64). Otherwise it closes by a fifth, but at least at this speed, and no faster than
-    `recovery`. What would
-    arrive within the step leaves with −e φ̇, at the time at which it arrives. A stop with a
-    stiffness is a spring and a damper behind the gap, implicit over the step. The farther stop
-    acts in place of the nearer one where the step would otherwise pass it.
+    `recovery`. A coordinate that would arrive within the step leaves with −e φ̇, at the time at
+    which it arrives. A stop with a stiffness is a spring and a damper behind the gap, implicit over
+    the step. The farther stop acts in place of the nearer one where the step would otherwise pass
+    it.
 
     A step sees one impact of a stop. A joint that rebounds so fast that it would cross its whole
     range in the rest of the step ends with the status `LOST_IMPACTS`: with e = 1 between stops
