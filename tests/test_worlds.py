@@ -1,4 +1,4 @@
-"""What a few worlds of a batch want is done for them, and leaves the others as they are."""
+"""`where_wanted` evaluates a function in the chosen worlds of a batch and keeps the others."""
 
 from functools import partial
 
@@ -14,7 +14,7 @@ BATCHES = [(), (1,), (5,), (64,), (67, 1), (5, 13)]
 
 
 def squares(args):
-    """x² + y, how often it is called with what, and whether x is positive."""
+    """Returns x² + 2 y, and whether the first x is positive."""
     x, shared, y = args
     return x * x + shared * y, x[0] > 0
 
@@ -49,7 +49,7 @@ def test_worlds_get_what_they_want_and_others_what_is_given(batch, share):
 
 
 def test_few_worlds_are_evaluated_for_few():
-    """Of 64, 8 at a time, as long as some are left."""
+    """Of 64 worlds, chunks of 8 are evaluated; chunks without a wanted world are skipped."""
     seen = []
 
     def function(args):
@@ -67,7 +67,7 @@ def test_few_worlds_are_evaluated_for_few():
 
 
 def test_landings_of_some_worlds_are_those_of_each_alone():
-    """Forty balls, of which about one lands in each step, with their reverse derivatives."""
+    """Final states and reverse derivatives of forty balls that land one after another."""
     scene = jc.Scene(dim=3)
     scene.add_body("ball", mass=1.3, inertia=(0.005,) * 3, position=(0.0, 0.0, 0.6))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", friction=0.5, radius=0.1))

@@ -26,15 +26,8 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from jaxcon.core.program import (
-    Constant,
-    Operation,
-    Program,
-    evaluated,
-    has_loop,
-    is_known,
-    traced,
-)
+from jaxcon.core.operations import primitives
+from jaxcon.core.program import Constant, Operation, Program, evaluated, is_known, traced
 from jaxcon.core.typing import Array
 
 WORTH = 3
@@ -350,7 +343,8 @@ def _set_apart(steps: list[Step]) -> None:
 
 def _has_loop(op: Operation) -> bool:
     """Returns True for a condition with a loop in a branch."""
-    return op.name == "cond" and any(has_loop(x.jaxpr) for x in op.params["branches"])
+    branches = op.params["branches"] if op.name == "cond" else ()
+    return any(not primitives(x.jaxpr).isdisjoint({"scan", "while"}) for x in branches)
 
 
 def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[Step], list[int]]]:

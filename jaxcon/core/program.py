@@ -81,18 +81,6 @@ def evaluated(closed: Any, args: Sequence[Any]) -> list[Any]:
     return jex.jaxpr_as_fun(closed)(*args)
 
 
-def has_loop(jaxpr: Any) -> bool:
-    """Returns True if an open jaxpr, or a jaxpr inside its equations, contains a loop."""
-    if any(x.primitive.name in ("scan", "while") for x in jaxpr.eqns):
-        return True
-    values = jax.tree.leaves([list(x.params.values()) for x in jaxpr.eqns], is_leaf=_is_jaxpr)
-    return any(has_loop(getattr(x, "jaxpr", x)) for x in values if _is_jaxpr(x))
-
-
-def _is_jaxpr(x: Any) -> bool:
-    return isinstance(x, jex.Jaxpr | jex.ClosedJaxpr)
-
-
 class Program:
     """A function as operations in order.
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core.program import is_known
 from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, PyTree
 
@@ -97,8 +98,7 @@ def where_wanted(
 
     def found() -> PyTree:
         one_cpu = jax.default_backend() == "cpu" and jax.device_count() == 1
-        is_known = isinstance(wanted.size, int)  # not where a batch of any size is exported
-        gathers = one_cpu and is_known and wanted.size > FEWEST
+        gathers = one_cpu and is_known(wanted.shape) and wanted.size > FEWEST
         results = _gathered(wanted, function, args, others) if gathers else function(args)
         return keep(wanted, results, others)
 
@@ -150,7 +150,7 @@ def _gather_worlds(tree: PyTree, index: Array, batch: tuple[int, ...]) -> PyTree
         if jnp.ndim(x) < rank or prod(jnp.shape(x)[jnp.ndim(x) - rank :]) == 1:
             return x  # shared by all worlds
         own = x.shape[: x.ndim - rank]
-        x = jnp.broadcast_to(x, (*own, *batch)).reshape(*own, prod(batch))
+        x = spread(x, batch).reshape(*own, prod(batch))
         return x[..., index].reshape(*own, len(index), *(1,) * (rank - 1))
 
     return jax.tree.map(gather, tree)

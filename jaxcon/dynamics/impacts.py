@@ -487,9 +487,9 @@ class Impact:
 
     def _lost(self, arrivals: Arrivals) -> Array | None:
         """The result of `passes_range` for the rebound."""
-        e, change = self.rows.restitution, self.rows.change(self.acceleration, self.dt)
-        speed = 0 * arrivals.times
+        e, speed = self.rows.restitution, 0 * arrivals.times
         if e is not None:
+            change = self.rows.change(self.acceleration, self.dt)
             speed = leaving_speeds(self.rows, e, arrivals, change, self.lag, self.dt)
         return passes_range(self.stops, speed, self.dt[None] - arrivals.times)
 
