@@ -74,7 +74,7 @@ XLA divides among threads what it takes to cost 2e5 or more: ten for each byte r
 for each operation on a number and two for each transcendental one.
 """
 
-MOST = 100
+MOST = 130
 """Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
 
 FEW_PARTS = 5
