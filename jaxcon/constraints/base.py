@@ -89,9 +89,15 @@ class Joints(Elements):
         """φ, φ̇, J and γ at one instant."""
         return gather(snapshot, self.places, self.joint.rows(self.params, *self.frames(snapshot)))
 
-    def coordinate(self, snapshot: Any, name: str) -> Row:
-        """A coordinate of the joints, zero at assembly, with its rate, bias and pulls."""
-        return self.joint.coordinate(name, self.params, *self.frames(snapshot))
+    def coordinates_with(self, snapshot: Any, name: str) -> dict[str, Row]:
+        """A coordinate of the joints, zero at assembly, with its rate, bias and pulls.
+
+        With it come those that are found along with it, as the three angles of a gimbal are.
+        """
+        frames = self.frames(snapshot)
+        if hasattr(self.joint, "coordinates_with"):
+            return self.joint.coordinates_with(name, self.params, *frames)
+        return {name: self.joint.coordinate(name, self.params, *frames)}
 
     def anchor(self, snapshot: Any, i: int) -> Array | None:
         """The anchor of one joint on its second body, world frame, (dim,); None without a point."""

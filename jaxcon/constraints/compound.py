@@ -63,15 +63,21 @@ class Freedoms:
         sides = (b.direction(p["first_b"]), b.direction(p["second_b"]))
         return rows + [primitives.angle_between(n, u) for u in sides]
 
-    def coordinate(self, name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
-        """A travel since assembly [m], or an angle about a hinge [rad]."""
+    def coordinates_with(self, name: str, p: dict[str, Any], a: Any, b: Any) -> dict[str, Row]:
+        """A travel since assembly [m], or an angle about a hinge [rad]; three angles at once."""
+        if self.hinges == 3 and name.startswith("angle"):
+            angles = gimbal.three_angles(p, a, b)
+            return {f"angle_{i}": row for i, row in enumerate(angles, 1)}
+        return {name: self._coordinate(name, p, a, b)}
+
+    def _coordinate(self, name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
+        """A coordinate that shares nothing with others."""
         kind, _, index = name.partition("_")
         if kind == "travel":
             points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
             return primitives.travel(a.direction(p[name]), *points)
-        if self.hinges > 1:
-            angles = gimbal.two_angles if self.hinges == 2 else gimbal.three_angles
-            return angles(int(index), p, a, b)
+        if self.hinges == 2:
+            return gimbal.two_angles(int(index), p, a, b)
         first, second = a.direction(p["first_1"]), a.direction(p["second_1"])
         return primitives.turn(first, second, b.direction(p["first_b"]))
 

@@ -65,8 +65,8 @@ def attach_three(axes: list[Array], a: Pose, b: Pose) -> dict[str, Array]:
     return in_a | {f"{name}_b": b.local_direction(n) for name, n in named.items()}
 
 
-def three_angles(i: int, p: dict[str, Any], a: Any, b: Any) -> Row:
-    """θᵢ, on the dual basis of the axes as they stand: ω_b − ω_a = n₁ θ̇₁ + n₂ θ̇₂ + n₃ θ̇₃.
+def three_angles(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
+    """θ₁, θ₂, θ₃, on the dual basis of the axes: ω_b − ω_a = n₁ θ̇₁ + n₂ θ̇₂ + n₃ θ̇₃.
 
     With d₁ = n₂ × n₃ / (n₁·(n₂ × n₃)) and so on, θ̇ᵢ = dᵢ·(ω_b − ω_a). Differentiated,
 
@@ -83,8 +83,11 @@ def three_angles(i: int, p: dict[str, Any], a: Any, b: Any) -> Row:
     rates = [d.dot(relative) * scale for d in duals]
     between = (spin + n_1 * rates[0]).cross(n_2)
     drift = n[0].velocity * rates[0] + between * rates[1] + n[2].velocity * rates[2]
-    d = duals[i - 1] * scale
-    return Row(θ[i - 1], rates[i - 1], -d.dot(drift), (a.torque(-d), b.torque(d)))
+    scaled = [d * scale for d in duals]
+    return [
+        Row(angle, rate, -d.dot(drift), (a.torque(-d), b.torque(d)))
+        for angle, rate, d in zip(θ, rates, scaled, strict=True)
+    ]
 
 
 def _angles(p: dict[str, Any], a: Any, b: Any) -> Any:

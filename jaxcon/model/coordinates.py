@@ -37,8 +37,11 @@ class JointCoordinate:
 
     def read(self, snapshot: Any) -> Any:
         """Value, rate, bias and pulls by element, the value over turns where they are counted."""
-        group = snapshot.system.constraints[self.group]
-        row = group.select(self.joints).coordinate(snapshot, self.name)
+        known = snapshot.coordinates.setdefault((self.group, self.joints), {})
+        if self.name not in known:
+            group = snapshot.system.constraints[self.group]
+            known |= group.select(self.joints).coordinates_with(snapshot, self.name)
+        row = known[self.name]
         if not self.counters:
             return row
         before = take(snapshot.system.turns, self.counters)
