@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from jaxcon.core.operations import primitives
+from jaxcon.core.operations import instructions, primitives
 from jaxcon.core.program import Constant, Operation, Program, evaluated, is_known, traced
 from jaxcon.core.typing import Array
 
@@ -77,13 +77,20 @@ for each operation on a number and two for each transcendental one.
 MOST = 130
 """Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
 
-FEW_PARTS = 5
+FEW_PARTS = 8
 """The most parts of a program whose branches with loops are kept out of its kernels.
 
-Each launch of a kernel resolves the addresses of all its buffers, including those of branches that
-are not taken. For a branch with loops this costs more than a second launch. But XLA runs a sequence
-of more than eight launches on several threads, which costs microseconds, and a rollout adds two or
-three launches of its own.
+XLA runs a sequence of more than eight launches on several threads, which costs microseconds.
+"""
+
+PER_OPERAND = 20
+"""Instructions of branches for each operand, above which branches with loops are kept out.
+
+A branch that is not taken makes the kernel that holds it slower, by up to a quarter, and longer to
+compile. Out of the kernel it costs launches, its operands are stored, and where it is taken it runs
+slower. Chains of links or particles have 15 to 17 instructions for each operand, take their branch
+often, and run faster with it in the kernel; linkages with loops have 23 to 44, and run faster with
+it outside.
 """
 
 Step = Operation | list[int]
@@ -332,8 +339,11 @@ def _in_parts(steps: list[Step]) -> list[list[Step]]:
 
 
 def _set_apart(steps: list[Step]) -> None:
-    """Keeps branches with loops out of kernels if that leaves at most `FEW_PARTS` parts."""
+    """Keeps large branches with loops out of kernels where few launches result."""
     ops = [x for x in steps if isinstance(x, Operation) and _fits(x) and _has_loop(x)]
+    inside = sum(instructions(x.jaxpr) for op in ops for x in op.params["branches"])
+    if inside <= PER_OPERAND * sum(len(op.inputs) for op in ops):
+        return
     for op in ops:
         op.plain = False
     if len(_in_parts(steps)) > FEW_PARTS:
