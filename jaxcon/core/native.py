@@ -238,7 +238,7 @@ class Known(NamedTuple):
 
     def lanes(self, axes: int) -> Array:
         """The array with so many trailing axes of one, as a value of the trace."""
-        value = np.frombuffer(self.data, self.dtype).reshape(*self.shape, *(1,) * axes)
+        value = np.frombuffer(self.data, self.dtype).reshape((*self.shape, *(1,) * axes))
         return jax.lax.stop_gradient(jnp.asarray(value))
 
 
