@@ -63,6 +63,23 @@ def loops_with_branches(x, y):
     return [jax.lax.fori_loop(0, 3, body, start)]
 
 
+def loops_in_branches(x, y):
+    """The first branch for the x and y of the tests, the second one for −x."""
+
+    def turned(z):
+        return jax.lax.fori_loop(0, 5, lambda i, a: jnp.sin(a) * 1.1 - jnp.cos(a * 0.3), z)
+
+    z = jnp.exp(-x * x) + y
+    a, b = jax.lax.cond(
+        jnp.sum(x) > 0,
+        lambda a, b: (turned(a) + b, a * b),
+        lambda a, b: (a - b, turned(b * 2.0)),
+        z,
+        jnp.sin(y) * z,
+    )
+    return [a * z, b + x]
+
+
 def loops_of_one_round(x, y):
     def body(carry, row):
         a, b = carry
@@ -142,6 +159,7 @@ FUNCTIONS = [
     loops_with_unused_parts,
     loops_of_what_no_kernel_holds,
     loops_with_branches,
+    loops_in_branches,
     loops_of_one_round,
     equal_loops,
     random_keys,

@@ -77,6 +77,21 @@ def test_coordinates_are_those_that_were_composed(slides, hinges):
     np.testing.assert_allclose(found, rates, rtol=1e-9, atol=1e-12)
 
 
+def test_springs_on_three_hinges_add_up():
+    """Angles that are computed together are those that each spring alone sees."""
+    springs = [
+        jc.JointSpring(f"spring{i}", "joint", float(i), coordinate=f"angle_{i}") for i in (1, 2, 3)
+    ]
+
+    def force(*elements):
+        system, state = arm(0, 3, *elements)
+        q = placed(system, state, (), (2.1, -1.1, -2.9))
+        return system.force(q, jnp.zeros(6), state.instant)
+
+    np.testing.assert_allclose(force(*springs), sum(map(force, springs)), rtol=1e-12, atol=1e-12)
+    assert np.linalg.norm(force(*springs)) > 1
+
+
 def test_perpendicular_hinges_up_to_gimbal_lock():
     """Euler angles of the middle hinge up to ±90°, where everything stays finite."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))

@@ -10,6 +10,7 @@ from functions import (
     WIDE,
     arguments_that_do_not_matter,
     chain_of_shared_values,
+    loops_in_branches,
     rows_and_loops,
 )
 
@@ -41,6 +42,16 @@ def test_the_results_are_those_of_the_function(function, dtype, constant):
     else:
         found, expected = jax.jit(staged(function))(x, y), function(x, y)
     compare(found, expected)
+
+
+@pytest.mark.parametrize("per_operand", [0, 10**9], ids=["outside", "inside"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_branches_with_loops_may_be_inside_or_outside_of_kernels(per_operand, sign, monkeypatch):
+    monkeypatch.setattr(fusion, "PER_OPERAND", per_operand)
+    x, y = sign * jnp.asarray(X), jnp.asarray(Y)
+    stages = fusion.Stages(jax.make_jaxpr(loops_in_branches)(x, y), apart=True)
+    assert stages.are_one_kernel == (per_operand > 0)
+    compare(jax.jit(stages)(x, y), loops_in_branches(x, y))
 
 
 @pytest.mark.parametrize("function", WIDE, ids=lambda f: f.__name__)

@@ -119,6 +119,7 @@ def test_a_failed_world_has_no_loss():
     rows = jc.losses.unless_failed({"each": jnp.ones((2, 3)), "mean": one}, batch)
     np.testing.assert_array_equal(np.isnan(rows["each"]), [[False] * 3, [True] * 3])
     assert jnp.isnan(rows["mean"])
+    assert jnp.isnan(jc.losses.unless_failed(1.0, jax.device_get(failed)))
 
 
 @pytest.mark.parametrize(

@@ -56,8 +56,10 @@ class Joint(Protocol):
 
     A joint that can be driven and read also has `coordinates`, the unit of each by its name ("rad",
     counted over turns, "m", or "rotation" where the rate is the derivative of no coordinate), and
-    `coordinate(name, p, a, b)`, the row of one. Joints of one class that move in different ways
-    also have `kind`, a hashable value which then stands for the class.
+    `coordinate(name, p, a, b)`, the row of one. A joint whose coordinates need a common computation
+    has `coordinate_rows(name, p, a, b)` instead, a mapping that contains that row and may contain
+    others. Joints of one class that move in different ways also have `kind`, a hashable value which
+    then stands for the class.
 
     What `attach` keeps of a body goes along with it by its name: points are called anchor, start or
     end, directions axis, first, second, normal, travel or edge, and the orientation of b in a is
@@ -89,14 +91,14 @@ class Joints(Elements):
         """φ, φ̇, J and γ at one instant."""
         return gather(snapshot, self.places, self.joint.rows(self.params, *self.frames(snapshot)))
 
-    def coordinates_with(self, snapshot: Any, name: str) -> dict[str, Row]:
-        """A coordinate of the joints, zero at assembly, with its rate, bias and pulls.
+    def coordinate_rows(self, snapshot: Any, name: str) -> dict[str, Row]:
+        """The row of a coordinate, and of others that the same computation yields, by name.
 
-        With it come those that are found along with it, as the three angles of a gimbal are.
+        A row has the coordinate, zero at assembly, its rate, its bias and its pulls.
         """
         frames = self.frames(snapshot)
-        if hasattr(self.joint, "coordinates_with"):
-            return self.joint.coordinates_with(name, self.params, *frames)
+        if hasattr(self.joint, "coordinate_rows"):
+            return self.joint.coordinate_rows(name, self.params, *frames)
         return {name: self.joint.coordinate(name, self.params, *frames)}
 
     def anchor(self, snapshot: Any, i: int) -> Array | None:

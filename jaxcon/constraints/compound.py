@@ -63,7 +63,7 @@ class Freedoms:
         sides = (b.direction(p["first_b"]), b.direction(p["second_b"]))
         return rows + [primitives.angle_between(n, u) for u in sides]
 
-    def coordinates_with(self, name: str, p: dict[str, Any], a: Any, b: Any) -> dict[str, Row]:
+    def coordinate_rows(self, name: str, p: dict[str, Any], a: Any, b: Any) -> dict[str, Row]:
         """A travel since assembly [m], or an angle about a hinge [rad]; three angles at once."""
         if self.hinges == 3 and name.startswith("angle"):
             angles = gimbal.three_angles(p, a, b)
@@ -71,7 +71,7 @@ class Freedoms:
         return {name: self._coordinate(name, p, a, b)}
 
     def _coordinate(self, name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
-        """A coordinate that shares nothing with others."""
+        """The row of one travel or angle."""
         kind, _, index = name.partition("_")
         if kind == "travel":
             points = a.point(p["anchor_a"]), b.point(p["anchor_b"])

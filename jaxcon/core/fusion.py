@@ -78,19 +78,21 @@ MOST = 130
 """Steps in one kernel: compiling a kernel takes longer than in proportion to its size."""
 
 FEW_PARTS = 8
-"""The most parts of a program whose branches with loops are kept out of its kernels.
+"""Branches with loops stay out of kernels only if the program then has at most this many parts.
 
-XLA runs a sequence of more than eight launches on several threads, which costs microseconds.
+XLA runs a sequence of more than eight launches on several threads, which costs microseconds. A
+rollout adds two or three launches of its own. The Stewart platform has seven parts then, and still
+runs faster.
 """
 
 PER_OPERAND = 20
-"""Instructions of branches for each operand, above which branches with loops are kept out.
+"""Instructions of branches with loops for each operand, above which they stay out of kernels.
 
-A branch that is not taken makes the kernel that holds it slower, by up to a quarter, and longer to
-compile. Out of the kernel it costs launches, its operands are stored, and where it is taken it runs
-slower. Chains of links or particles have 15 to 17 instructions for each operand, take their branch
-often, and run faster with it in the kernel; linkages with loops have 23 to 44, and run faster with
-it outside.
+An untaken branch makes the kernel that holds it slower, by up to a quarter, and longer to compile.
+Outside, it costs launches, its operands are stored, and it runs slower where it is taken. Chains of
+links or particles have 15 to 17 instructions for each operand, take their branch often, and run
+faster with it in the kernel. Closed kinematic chains have 23 to 44, and run faster with it outside.
+All branches with loops of a program go together, by their mean.
 """
 
 Step = Operation | list[int]
@@ -339,7 +341,7 @@ def _in_parts(steps: list[Step]) -> list[list[Step]]:
 
 
 def _set_apart(steps: list[Step]) -> None:
-    """Keeps large branches with loops out of kernels where few launches result."""
+    """Keeps large branches with loops out of kernels, unless too many parts result."""
     ops = [x for x in steps if isinstance(x, Operation) and _fits(x) and _has_loop(x)]
     inside = sum(instructions(x.jaxpr) for op in ops for x in op.params["branches"])
     if inside <= PER_OPERAND * sum(len(op.inputs) for op in ops):

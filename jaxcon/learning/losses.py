@@ -197,7 +197,8 @@ def unless_failed(x: PyTree, state: Any) -> PyTree:
 
     def one(y: Any) -> Array:
         own = jnp.shape(y)[: bad.ndim] == bad.shape
-        lost = bad.reshape(*bad.shape, *(1,) * (jnp.ndim(y) - bad.ndim)) if own else jnp.any(bad)
+        axes = (*bad.shape, *(1,) * (jnp.ndim(y) - bad.ndim))
+        lost = jnp.reshape(bad, axes) if own else jnp.any(bad)
         return jnp.where(lost, jnp.nan, y)
 
     return jax.tree.map(one, x)

@@ -37,11 +37,11 @@ class JointCoordinate:
 
     def read(self, snapshot: Any) -> Any:
         """Value, rate, bias and pulls by element, the value over turns where they are counted."""
-        known = snapshot.coordinates.setdefault((self.group, self.joints), {})
-        if self.name not in known:
+        rows = snapshot.joint_rows.setdefault((self.group, self.joints), {})
+        if self.name not in rows:
             group = snapshot.system.constraints[self.group]
-            known |= group.select(self.joints).coordinates_with(snapshot, self.name)
-        row = known[self.name]
+            rows |= group.select(self.joints).coordinate_rows(snapshot, self.name)
+        row = rows[self.name]
         if not self.counters:
             return row
         before = take(snapshot.system.turns, self.counters)

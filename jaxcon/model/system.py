@@ -55,20 +55,20 @@ class MassProperties:
 class Snapshot:
     """A system at one instant: frames of bodies and coordinates of joints, computed once.
 
-    A value that is first read within a branch of a condition or a loop cannot be read outside of
-    it; a snapshot is therefore made and read in the same function.
+    Read a snapshot only in the trace in which it was made: a value that is first read within a
+    branch of a condition or a loop cannot be read outside of it.
 
     Attributes:
         system: the bodies, joints and forces.
         q: positions, (n_q,).
         v: velocities, (n_v,).
         instant: the time [s], with what rounding takes of it.
-        coordinates: rows by name, for each group of joints and the indices that were asked for.
+        joint_rows: rows of coordinates by name, for each group of joints and indices asked for.
     """
 
     def __init__(self, system: Any, q: Array, v: Array, instant: Any) -> None:
         self.system, self.q, self.v, self.instant = system, q, v, instant
-        self.coordinates: dict[Any, dict[str, Any]] = {}
+        self.joint_rows: dict[Any, dict[str, Any]] = {}
 
     @property
     def t(self) -> Any:
