@@ -39,6 +39,14 @@ def arm(lower, **stop):
     return scene.build()
 
 
+def disc(height, **contact):
+    """Of radius 0.1 m, at a height above a floor."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("disc", mass=1.0, inertia=0.005, position=(0.0, height))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "disc", radius=0.1, **contact))
+    return scene.build()
+
+
 def flat():
     """A parallelogram of rods, all along one line: there its three rows have rank 2."""
     scene = jc.Scene(dim=2)
@@ -193,6 +201,9 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
     ),
     "below a limit": (lambda: arm(0.4), with_(), ("range",), "stop (0.4 rad below lower)"),
     "within limits": (lambda: arm(-0.1), with_(), (), ""),
+    "in the floor": (lambda: disc(0.05), with_(), ("overlap",), "floor (0.05 m)"),
+    "on the floor": (lambda: disc(0.1), with_(), (), ""),
+    "in a soft floor": (lambda: disc(0.05, stiffness=1e3), with_(), (), ""),
     "below a soft limit": (lambda: arm(0.4, stiffness=10.0), with_(), (), ""),
 }
 
@@ -208,7 +219,7 @@ def test_a_trap_is_seen_where_it_is(name):
 
 def test_each_trap_of_the_chapter_is_there():
     assert set(TRAPS) == {name for _, _, names, _ in CASES.values() for name in names}
-    assert len(TRAPS) == 11  # eight of the chapter, long steps, impacts, joint limits
+    assert len(TRAPS) == 12  # eight of the chapter, long steps, impacts, joint limits, overlaps
 
 
 def test_a_method_that_remembers_needs_no_state_of_its_own():
@@ -217,6 +228,16 @@ def test_a_method_that_remembers_needs_no_state_of_its_own():
     report = jc.report(system, state, forgets, DT, measure=True)
     assert report.probe.status == jc.Status.OK
     assert "gains" not in str(dataclasses.replace(report, gains=(0.0, 0.0, np.inf), choice=None))
+
+
+def test_a_start_in_a_contact_is_told_without_a_method():
+    """And how fast the bodies really part."""
+    system, state = disc(0.05, recovery=0.3)
+    assert set(jc.report(system, state).warnings) == {"overlap"}
+    text = str(jc.report(system, state))
+    assert "contacts start in overlap: floor (0.05 m). They part at 0.3 m/s at most" in text
+    after, _ = jc.step(system, jc.Method(), state, None, DT)
+    np.testing.assert_allclose(after.v[1], 0.3, rtol=1e-6)
 
 
 def test_a_start_outside_joint_limits_is_told_without_a_method():

@@ -60,8 +60,9 @@ class Report:
         angle: how far the fastest motion turns or swings in a step, where a method and a step were
             given.
         warnings: by trap, "gains", "step", "singular", "order", "over-constrained", "start",
-            "nonlinear", "dense", "iterations", "impacts" and "range", of those in which the scene
-            and the method are. All but "range" need a method, some a step, and "order" to measure.
+            "nonlinear", "dense", "iterations", "impacts", "range" and "overlap", of those in which
+            the scene and the method are. All but the last two need a method, some a step, and
+            "order" to measure.
     """
 
     coordinates: int

@@ -13,6 +13,7 @@ import numpy as np
 from jaxcon.analysis.estimate import contact_operations, solved_rows
 from jaxcon.analysis.known import Known, asked_gains
 from jaxcon.constraints.bounds import BoundRows, kinds_of, linearize_bounds
+from jaxcon.constraints.contact import Rope, Touches
 from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
 from jaxcon.constraints.limits import Limit
 from jaxcon.core import host
@@ -50,7 +51,7 @@ MANY = 12
 """Rows from which on that matters."""
 FEW_NAMES = 3
 """Names of elements that a report lists in one place."""
-OF_SCENE = ("range",)
+OF_SCENE = ("range", "overlap")
 """Traps of a scene and a state alone, whatever the method."""
 
 
@@ -296,12 +297,16 @@ def _swept(known: Known, rounds: int) -> str | None:
 
 def bound_rows(known: Known) -> BoundRows | None:
     """The inequality constraints of a scene by shape; None where there are none."""
-    system, at = known.system, known.state
-    if not system.bounds or not hasattr(system, "layout"):
+    if not known.system.bounds or not hasattr(known.system, "layout"):
         return None
-    h = jnp.ones((), at.q.dtype)
-    control = jnp.zeros(system.layout.n_u, at.q.dtype)
-    return jax.eval_shape(linearize_bounds, system, at.q, at.v, at.time, control, h)
+    return jax.eval_shape(_linearized_bounds, known.system, known.state)
+
+
+def _linearized_bounds(system: Any, state: Any) -> BoundRows:
+    """The inequality constraints at a state, without control and for a step of 1 s."""
+    h = jnp.ones((), state.q.dtype)
+    control = jnp.zeros(system.layout.n_u, state.q.dtype)
+    return linearize_bounds(system, state.q, state.v, state.time, control, h)
 
 
 def colliding(known: Known) -> tuple[str, ...]:
@@ -352,6 +357,38 @@ def outside(known: Known) -> str | None:
     )
 
 
+def overlapping(known: Known) -> str | None:
+    """Trap 11: hard contacts that start in overlap, which they leave slowly."""
+    rows = bound_rows(known)
+    contacts = [g for g in known.system.bounds if isinstance(g, Touches) and g.law is not Rope]
+    if rows is None or not contacts:
+        return None
+    names = {name for group in contacts for name in group.names}
+
+    def gaps(system: Any, state: Any) -> jax.Array:
+        return _linearized_bounds(system, state).gap
+
+    gap = np.asarray(host.evaluate(gaps, known.system, known.state))
+    deepest: dict[str, float] = {}
+    for row in np.flatnonzero(rows.kinds.one_sided & np.array(rows.hard) & (gap < -OFF)):
+        name = rows.layout.names[rows.layout.owners[row]]
+        if name in names:
+            deepest[name] = max(float(-gap[row]), deepest.get(name, 0.0))
+    if not deepest:
+        return None
+    speeds = {
+        f"{float(speed):.2g} m/s"
+        for group in contacts
+        for name, speed in zip(group.names, np.asarray(group.params["recovery"]), strict=True)
+        if name in deepest
+    }
+    return (
+        f"contacts start in overlap: {listed([f'{x} ({d:.2g} m)' for x, d in deepest.items()])}."
+        f" They part at {' or '.join(sorted(speeds))} at most: start clear of each other, or set"
+        " recovery= of the contact."
+    )
+
+
 def _limited(known: Known) -> list[tuple[Any, np.ndarray]]:
     """The groups of joint limits, each with the coordinates (elements,) that they limit."""
     groups = [g for g in known.system.bounds if getattr(g, "law", None) is Limit]
@@ -378,6 +415,7 @@ TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
     "iterations": ("too many iterations", iterations),
     "impacts": ("gradients through impacts", impact),
     "range": ("a start outside joint limits", outside),
+    "overlap": ("contacts that start in overlap", overlapping),
 }
 """By name: the trap in words, and how it is found."""
 

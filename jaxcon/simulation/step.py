@@ -242,6 +242,10 @@ def _channels(layout: Any, control: Any, dtype: Any) -> Array:
         array, got = None, checks.shortened(control)
         if isinstance(control, Mapping):
             got = f"a {type(control).__name__} with {checks.described(control)}"
+    if (array is None or array.size) and not layout.n_u:
+        raise ValueError(
+            f"step: control must be None, since no element of the scene takes one, got {got}."
+        )
     if array is None or array.shape != (layout.n_u,):
         raise ValueError(
             f"step: control must have shape ({layout.n_u},), got {got}; its channels (name, first,"
