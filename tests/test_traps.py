@@ -40,7 +40,7 @@ def arm(lower, **stop):
 
 
 def disc(height, **contact):
-    """Of radius 0.1 m, at a height above a floor."""
+    """Builds a disc of radius 0.1 m at a height above a floor."""
     scene = jc.Scene(dim=2)
     scene.add_body("disc", mass=1.0, inertia=0.005, position=(0.0, height))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "disc", radius=0.1, **contact))

@@ -49,7 +49,7 @@ def test_worlds_get_what_they_want_and_others_what_is_given(batch, share):
 
 
 def test_few_worlds_are_evaluated_for_few():
-    """Of 64 worlds, chunks of 8 are evaluated, and none without a wanted world; on one CPU."""
+    """On one CPU, 64 worlds are evaluated in chunks of 8; chunks that nobody wants are skipped."""
     in_chunks = jax.default_backend() == "cpu" and jax.device_count() == 1
     seen = []
 

@@ -239,7 +239,7 @@ def report(
         conflicts=known.conflicts,
         choice=known.choice,
         rotor_rows=layout.size - len(unit.values),
-        warnings=traps.found(known, OF_SCENE),
+        warnings=traps.found(known, OF_SCENE if method is None else None),
     )
     return found if method is None else _with_method(found, known, measure, timed)
 
@@ -261,5 +261,4 @@ def _with_method(found: Report, known: Known, measure: bool, timed: bool) -> Rep
         gains=gains,
         angle=known.angle,
         probe=known.probe,
-        warnings=traps.found(known),
     )

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxcon.analysis.estimate import contact_operations, solved_rows
 from jaxcon.analysis.known import Known, asked_gains
-from jaxcon.constraints.bounds import BoundRows, kinds_of, linearize_bounds
+from jaxcon.constraints.bounds import BoundRows, kinds_of, linearize_at_rest, linearize_bounds
 from jaxcon.constraints.contact import Rope, Touches
 from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
 from jaxcon.constraints.limits import Limit
@@ -299,14 +299,7 @@ def bound_rows(known: Known) -> BoundRows | None:
     """The inequality constraints of a scene by shape; None where there are none."""
     if not known.system.bounds or not hasattr(known.system, "layout"):
         return None
-    return jax.eval_shape(_linearized_bounds, known.system, known.state)
-
-
-def _linearized_bounds(system: Any, state: Any) -> BoundRows:
-    """The inequality constraints at a state, without control and for a step of 1 s."""
-    h = jnp.ones((), state.q.dtype)
-    control = jnp.zeros(system.layout.n_u, state.q.dtype)
-    return linearize_bounds(system, state.q, state.v, state.time, control, h)
+    return jax.eval_shape(linearize_at_rest, known.system, known.state.q, known.state.v)
 
 
 def colliding(known: Known) -> tuple[str, ...]:
@@ -364,11 +357,7 @@ def overlapping(known: Known) -> str | None:
     if rows is None or not contacts:
         return None
     names = {name for group in contacts for name in group.names}
-
-    def gaps(system: Any, state: Any) -> jax.Array:
-        return _linearized_bounds(system, state).gap
-
-    gap = np.asarray(host.evaluate(gaps, known.system, known.state))
+    gap = np.asarray(host.evaluate(_gaps, known.system, known.state))
     deepest: dict[str, float] = {}
     for row in np.flatnonzero(rows.kinds.one_sided & np.array(rows.hard) & (gap < -OFF)):
         name = rows.layout.names[rows.layout.owners[row]]
@@ -387,6 +376,13 @@ def overlapping(known: Known) -> str | None:
         f" They part at {' or '.join(sorted(speeds))} at most: start clear of each other, or set"
         " recovery= of the contact."
     )
+
+
+def _gaps(system: Any, state: Any) -> jax.Array:
+    """The gaps of the inequality constraints at a state, (n,)."""
+    h = jnp.ones((), state.q.dtype)
+    control = jnp.zeros(system.layout.n_u, state.q.dtype)
+    return linearize_bounds(system, state.q, state.v, state.instant, control, h).gap
 
 
 def _limited(known: Known) -> list[tuple[Any, np.ndarray]]:
