@@ -1,1 +1,1 @@
-"""Studies that take longer than a test; each has a small version among the tests."""
+"""Benchmarks: studies that run longer than a test. The tests run a small version of each."""

@@ -1,9 +1,8 @@
-"""How well a run holds its constraints, and how far it is off after one second.
+"""Measures constraint violation and position error of a run of one second.
 
-Errors are those of the centres of mass [m], against a reduced equation where there is one, else
-against Runge and Kutta of fourth order at a step so small that its own error does not count: by
-MuJoCo where the mechanism is a tree of joints there, by jaxcon's `Schur` in float64
-where it has loops.
+Errors are distances between centers of mass [m]. The reference is a reduced equation where one
+exists. Otherwise it is RK4 at a step so small that its own error is negligible. MuJoCo computes
+RK4 if the mechanism is a tree of joints. If it has loops, jaxcon does, with `Schur` in float64.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mechanisms, targets
@@ -22,18 +22,18 @@ from benchmarks.mechanisms import Mechanism, lift
 from benchmarks.mjcf import DT
 
 FINE = 1e-4
-"""Step of the references [s]."""
+"""Step size of the reference simulations [s]."""
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """Of one run of a second.
+    """Accuracy of one run.
 
     Attributes:
-        violation: the worst |φ| of all rows and steps, in link lengths.
-        error: of the centre of mass that is furthest off after the last step [m].
-        peer: the same of MuJoCo's Euler at the same step, None without MuJoCo [m].
-        healthy: whether no step failed.
+        violation: the largest |φ| over all rows and steps, divided by the link length.
+        error: the largest error of a center of mass after the last step [m].
+        peer: the error of MuJoCo's Euler integrator at the same step size [m], None without MuJoCo.
+        healthy: True if no step failed.
     """
 
     violation: float
@@ -43,13 +43,13 @@ class Accuracy:
 
     @property
     def counts(self) -> bool:
-        """Whether the run is accurate enough for its speed to count."""
+        """True if the run is accurate enough for its rate to count."""
         close = self.peer is None or self.error <= targets.ERROR * self.peer
         return bool(self.healthy and self.violation < targets.VIOLATION and close)
 
 
-def measure(name: str, method: jc.Method, dtype: Any, seconds: float = 1.0) -> Accuracy:
-    """Runs a mechanism for so long at the step of the benchmarks."""
+def measure(name: str, method: jc.Method, dtype: DTypeLike, seconds: float = 1.0) -> Accuracy:
+    """Runs a mechanism at the benchmarks' step size and compares it with its reference."""
     mechanism = mechanisms.find(name)
     exact = reference(name, seconds)
     with jax.enable_x64(np.dtype(dtype) == np.float64):
@@ -61,13 +61,17 @@ def measure(name: str, method: jc.Method, dtype: Any, seconds: float = 1.0) -> A
 
 
 def run(
-    mechanism: Mechanism, method: jc.Method, dtype: Any, dt: float, seconds: float
+    mechanism: Mechanism, method: jc.Method, dtype: DTypeLike, dt: float, seconds: float
 ) -> tuple[np.ndarray, float, bool]:
-    """Where the markers are at the end, the worst violation of all steps, and whether all went."""
+    """Simulates a mechanism.
+
+    Returns:
+        The final marker positions (bodies, 3) [m], the largest |φ|, and True if no step failed.
+    """
     system, state = mechanism.build(dtype)
     steps = round(seconds / dt)
 
-    def record(state: jc.State, info: jc.StepInfo) -> jax.Array:
+    def record(state: jc.State, info: jc.extend.StepInfo) -> jax.Array:
         return jc.violation(system, state).worst
 
     @jax.jit
@@ -80,25 +84,25 @@ def run(
 
 
 def distance(x: np.ndarray, y: np.ndarray) -> float:
-    """Of the two points that are furthest apart [m]."""
+    """Returns the largest distance between corresponding points [m]."""
     return float(np.max(np.linalg.norm(x - y, axis=-1)))
 
 
 @functools.cache
 def reference(name: str, seconds: float) -> np.ndarray:
-    """Where the markers of a mechanism are after so long, as exactly as is known, (bodies, 3)."""
+    """Returns reference positions of the markers after `seconds`, (bodies, 3) [m]."""
     mechanism = mechanisms.find(name)
     if mechanism.exact is not None:
         return lift(mechanism.exact(seconds))
     if has_mujoco() and not mechanism.loops:
         return by_mujoco(mechanism, "RK4", FINE, seconds)
-    method = jc.Method(integrator=jc.RK4(), solver=jc.Schur())
+    method = jc.Method(integrator=jc.RK4(), solver=jc.solvers.Schur())
     with jax.enable_x64(True):
         return run(mechanism, method, np.float64, FINE, seconds)[0]
 
 
 def by_mujoco(mechanism: Mechanism, integrator: str, dt: float, seconds: float) -> np.ndarray:
-    """Where MuJoCo takes the markers, (bodies, 3) [m]."""
+    """Simulates a mechanism in MuJoCo and returns positions of its markers, (bodies, 3) [m]."""
     import mujoco
 
     model, data = model_of(mechanism)
@@ -112,7 +116,7 @@ def by_mujoco(mechanism: Mechanism, integrator: str, dt: float, seconds: float) 
 
 @functools.cache
 def has_mujoco() -> bool:
-    """Whether MuJoCo can be imported."""
+    """Returns True if MuJoCo can be imported."""
     try:
         import mujoco  # noqa: F401
     except ImportError:

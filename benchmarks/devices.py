@@ -1,12 +1,15 @@
-"""Throughput against the number of devices that a CPU is made to be.
+"""Throughput against the number of devices into which a CPU is split.
 
     python -m benchmarks.devices [--scenes four-bar …] [--devices 1,2,4,8] [--batch 1024]
         [--json FILE]
 
-The same batch lies over 1, 2, 4, … devices, each number in a process of its own, since XLA reads it
-when it starts: a rollout, and value and gradient of a mean over all worlds by the gains, which they
-share. Float32, semi-implicit Euler with Baumgarte at 2 ms, compilation apart. Devices beyond the
-cores can bring nothing. The last columns count what both compiled programs exchange.
+The same batch is sharded over 1, 2, 4, … devices. Each number of devices runs in its own process,
+since XLA reads it at startup. Two programs are timed: a rollout, and a gradient. The gradient is
+that of a mean over all worlds with respect to the feedback gains, which all worlds share.
+
+All runs are in float32, by semi-implicit Euler with Baumgarte at 2 ms. Compilation is excluded.
+More devices than cores cannot bring a gain. The last columns count the communication instructions
+of both compiled programs.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mechanisms, timing
@@ -33,19 +37,21 @@ from benchmarks.timing import Rate
 FORCED = "--xla_force_host_platform_device_count"
 EXCHANGES = ("all-reduce", "all-gather", "all-to-all", "collective-permute", "reduce-scatter")
 GAIN = 50.0
-"""α = β of the feedback [1/s]."""
+"""Baumgarte gains α = β [1/s]."""
 LIMIT = 600.0
-"""On one process [s]."""
+"""Time limit of a process [s]."""
 
 
 @dataclass(frozen=True)
 class Scaling:
-    """Of one scene on some devices.
+    """Rates of one scene on a number of devices.
 
     Attributes:
-        scene, devices: which.
-        rollout, gradient: world-steps a second.
-        exchanges: how many of each the compiled rollout and gradient have.
+        scene: name of the scene.
+        devices: number of devices.
+        rollout: world-steps per second of the rollout.
+        gradient: world-steps per second of value and gradient.
+        exchanges: communication instructions by kind, for the rollout and for the gradient.
     """
 
     scene: str
@@ -56,21 +62,21 @@ class Scaling:
 
 
 def exchanges(program: str) -> dict[str, int]:
-    """How many instructions of an HLO text move data between devices, by kind."""
-    found = re.findall(rf" ({'|'.join(EXCHANGES)})(?:-start)?\(", program)
-    return dict(Counter(found))
+    """Counts the instructions in an HLO text that move data between devices, by kind."""
+    kinds = re.findall(rf" ({'|'.join(EXCHANGES)})(?:-start)?\(", program)
+    return dict(Counter(kinds))
 
 
 World = Callable[[jax.Array, jc.State], jc.State]
-"""(gain, start) → the end of one world."""
+"""(gain, start) → final state of one world."""
 
 
-def world(name: str, steps: int, dtype: Any) -> tuple[World, jc.State]:
-    """The rollout of one world by the gain of its feedback, and a start."""
+def world(name: str, steps: int, dtype: DTypeLike) -> tuple[World, jc.State]:
+    """Returns the rollout of one world as a function of its feedback gain, and an initial state."""
     system, state = mechanisms.find(name).build(dtype)
 
     def run(gain: jax.Array, s: jc.State) -> jc.State:
-        method = jc.Method(stabilizer=jc.Baumgarte(gain, gain), solver=jc.Sparse())
+        method = jc.Method(stabilizer=jc.Baumgarte(gain, gain), solver=jc.solvers.Sparse())
         dt = jnp.asarray(DT, dtype)
         return jc.rollout(system, method, s, None, dt, steps, record=lambda s, i: None)[0]
 
@@ -78,8 +84,12 @@ def world(name: str, steps: int, dtype: Any) -> tuple[World, jc.State]:
 
 
 def mean(run: World, mesh: Any = None) -> Callable[..., Any]:
-    """Value and gradient by the gain of the mean of Σ q² at the end over the worlds of a batch."""
-    batch = jc.over_devices(jax.vmap(run, in_axes=(None, 0)), mesh)
+    """Returns a function that computes value and gradient of a loss.
+
+    The loss is the batch mean of Σ q² at the end. The gradient is with respect to the feedback
+    gain.
+    """
+    batch = jc.devices.over_devices(jax.vmap(run, in_axes=(None, 0)), mesh)
 
     def loss(gain: jax.Array, s: jc.State) -> jax.Array:
         return jnp.mean(jnp.sum(batch(gain, s).q ** 2, axis=1))
@@ -88,82 +98,89 @@ def mean(run: World, mesh: Any = None) -> Callable[..., Any]:
 
 
 def measure(name: str, batch: int, work: int, repeats: int = 5) -> Scaling:
-    """One scene on the devices that there are."""
+    """Measures one scene on the devices of this process."""
     steps = max(10, work // batch)
     run, state = world(name, steps, jnp.float32)
-    given = jnp.float32(GAIN), jc.shard(worlds(state, batch))
-    rates, found = [], []
+    inputs = jnp.float32(GAIN), jc.devices.shard(worlds(state, batch))
+    rates, counts = [], []
     for function in (jax.vmap(run, in_axes=(None, 0)), mean(run)):
-        compiled, _ = timing.compile_seconds(function, *given)
-        jax.block_until_ready(compiled(*given))
-        rates.append(timing.rate(lambda run=compiled: run(*given), batch * steps, repeats))
-        found.append(exchanges(compiled.as_text()))
-    return Scaling(name, jax.device_count(), rates[0], rates[1], (found[0], found[1]))
+        compiled, _ = timing.compile_seconds(function, *inputs)
+        jax.block_until_ready(compiled(*inputs))
+        rates.append(timing.rate(lambda run=compiled: run(*inputs), batch * steps, repeats))
+        counts.append(exchanges(compiled.as_text()))
+    return Scaling(name, jax.device_count(), rates[0], rates[1], (counts[0], counts[1]))
 
 
-def elsewhere(name: str, devices: int, given: argparse.Namespace) -> Scaling | str:
-    """The same in a process that has so many devices, or why there is nothing."""
-    options = ["--batch", str(given.batch), "--work", str(given.work)]
-    found = timing.in_process(
-        ["benchmarks.devices", "--here", name, *options],
+def elsewhere(name: str, devices: int, options: argparse.Namespace) -> Scaling | str:
+    """Measures one scene in a process with `devices` devices.
+
+    Returns:
+        The rates, or the reason why there are none.
+    """
+    command = ["--batch", str(options.batch), "--work", str(options.work)]
+    result = timing.in_process(
+        ["benchmarks.devices", "--here", name, *command],
         timing.with_flags(f"{FORCED}={devices}") | {"JAX_PLATFORMS": "cpu"},
         LIMIT,
         "does not compile and run in",
     )
-    if isinstance(found, str):
-        return found
-    rates = {what: Rate(**found.pop(what)) for what in ("rollout", "gradient")}
-    return Scaling(**found, **rates)
+    if isinstance(result, str):
+        return result
+    rates = {program: Rate(**result.pop(program)) for program in ("rollout", "gradient")}
+    return Scaling(**result, **rates)
 
 
 def line(row: Scaling, first: Scaling) -> str:
-    """A row of the table, beside the first of its scene."""
+    """Formats the rates on a number of devices as a table row.
+
+    Speedups are relative to `first`, the first row of the scene.
+    """
     cells: list[Any] = [row.scene, row.devices]
-    for what in ("rollout", "gradient"):
-        own, other = getattr(row, what), getattr(first, what)
-        cells += [own, f"{own.median / other.median:.2f}"]
-    said = [", ".join(f"{n} {what}" for what, n in x.items()) or "none" for x in row.exchanges]
-    return "| " + " | ".join(map(str, [*cells, *said])) + " |"
+    for program in ("rollout", "gradient"):
+        rate, reference = getattr(row, program), getattr(first, program)
+        cells += [rate, f"{rate.median / reference.median:.2f}"]
+    counts = [", ".join(f"{n} {kind}" for kind, n in x.items()) or "none" for x in row.exchanges]
+    return "| " + " | ".join(map(str, [*cells, *counts])) + " |"
 
 
 HEAD = """
-| scene | devices | rollout, steps/s (min to max) | times | and gradient | times | exchanges | |
+| scene | devices | rollout, steps/s (min to max) | ratio | with gradient | ratio | exchanges | |
 |---|---|---|---|---|---|---|---|"""
 
 
 def arguments() -> argparse.Namespace:
-    """The options of the command line."""
+    """Parses the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="*", default=["four-bar", "planar-chain-10"])
     parser.add_argument("--devices", type=numbers, default=[1, 2, 4, 8])
     parser.add_argument("--batch", type=int, default=1024)
-    parser.add_argument("--work", type=int, default=200_000, help="world-steps of a repeat")
-    parser.add_argument("--here", metavar="SCENE", help="one scene, in this process, as JSON")
+    parser.add_argument("--work", type=int, default=200_000, help="world-steps per repeat")
+    parser.add_argument("--here", metavar="SCENE", help="measure in this process, print JSON")
     parser.add_argument("--json", type=Path)
     return parser.parse_args()
 
 
 def main() -> None:
-    """Prints the table and writes the file."""
-    given, rows = arguments(), []
-    if given.here:
-        print(json.dumps(dataclasses.asdict(measure(given.here, given.batch, given.work))))
+    """Prints the table of rates and writes the file of `--json`."""
+    options, rows = arguments(), []
+    if options.here:
+        print(json.dumps(dataclasses.asdict(measure(options.here, options.batch, options.work))))
         return
     print(timing.machine())
     print(HEAD)
-    for name in given.scenes:
+    for name in options.scenes:
         first = None
-        for devices in given.devices:
-            row = elsewhere(name, devices, given)
+        for devices in options.devices:
+            row = elsewhere(name, devices, options)
             rows.append(row)
             if isinstance(row, str):
                 print(f"| {name} | {devices} | {row} |", flush=True)
                 continue
             first = first or row
             print(line(row, first), flush=True)
-    if given.json:
-        result = {"machine": timing.machine(), "batch": given.batch, "rows": timing.plain(rows)}
-        given.json.write_text(json.dumps(result, indent=1) + "\n")
+    if options.json:
+        result = {"machine": timing.machine(), "batch": options.batch, "rows": timing.plain(rows)}
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

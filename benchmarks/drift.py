@@ -1,9 +1,9 @@
-"""Drift of a constraint without feedback, and what feedback makes of it (chapter 3.3.1, 3.3.2).
+"""Constraint drift without and with feedback (chapters 3.3.1, 3.3.2).
 
     python -m benchmarks.drift
 
-Without feedback one perturbation grows linearly, φ = φ₀ + φ̇₀ t, and faster where every step adds
-its own truncation error. With feedback the error stays at the size of what one step adds.
+Without feedback a perturbation grows linearly, φ = φ₀ + φ̇₀ t, and faster if every step adds its
+own truncation error. With feedback the error stays at the truncation error of one step.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import numpy as np
 import jaxcon as jc
 
 STABILIZERS = {
-    "none": jc.Unstabilized(),
+    "none": jc.stabilizers.Unstabilized(),
     "critical, 10 /s": jc.Baumgarte.critical(10.0),
     "default": jc.Baumgarte(),
 }
@@ -22,7 +22,7 @@ INTEGRATORS = {"semi-implicit Euler": jc.SemiImplicitEuler(), "RK4": jc.RK4()}
 
 
 def pendulum(perturbation: float = 0.0) -> tuple:
-    """A pendulum released horizontally, its first velocity off the constraint by so much [m/s]."""
+    """Builds a pendulum released from the horizontal, with a velocity error along the rod [m/s]."""
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0), velocity=(perturbation, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -30,11 +30,11 @@ def pendulum(perturbation: float = 0.0) -> tuple:
 
 
 def violation(method: jc.Method, perturbation: float, dt: float, seconds: float) -> np.ndarray:
-    """|φ| at ten times, evenly spaced [m]."""
+    """Simulates the pendulum and returns |φ| at ten evenly spaced times, (10,) [m]."""
     system, state = pendulum(perturbation)
     steps = round(seconds / dt / 10) * 10
 
-    def record(state: jc.State, info: jc.StepInfo) -> jax.Array:
+    def record(state: jc.State, info: jc.extend.StepInfo) -> jax.Array:
         return jc.violation(system, state).worst
 
     run = jax.jit(
@@ -44,14 +44,18 @@ def violation(method: jc.Method, perturbation: float, dt: float, seconds: float)
 
 
 def growth(errors: np.ndarray) -> float:
-    """The exponent p of |φ| ~ tᵖ over the last half of the times."""
+    """Returns the exponent p of the growth |φ| ~ tᵖ, fitted to the last half of the times."""
     times = np.arange(1, len(errors) + 1)
     half = len(errors) // 2
     return float(np.polyfit(np.log(times[half:]), np.log(np.maximum(errors[half:], 1e-300)), 1)[0])
 
 
 def table(dt: float = 1e-3, seconds: float = 20.0) -> list[tuple[str, str, float, float, float]]:
-    """Integrator, feedback, |φ| at the end from a perturbation and without one, and growth."""
+    """Returns a row for each integrator and stabilizer.
+
+    A row has integrator, stabilizer, final |φ| with and without perturbation [m], and growth
+    exponent.
+    """
     rows = []
     for name, integrator in INTEGRATORS.items():
         for feedback, stabilizer in STABILIZERS.items():
@@ -63,7 +67,7 @@ def table(dt: float = 1e-3, seconds: float = 20.0) -> list[tuple[str, str, float
 
 
 def main() -> None:
-    """Prints the table."""
+    """Prints the table of constraint drift."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--dt", type=float, default=1e-3)
     parser.add_argument("--seconds", type=float, default=20.0)

@@ -1,4 +1,4 @@
-"""All entries of the suite; each is in it once its module has been imported."""
+"""All benchmarks of the suite. Importing a module of entries registers its benchmarks."""
 
 from __future__ import annotations
 

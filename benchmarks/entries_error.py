@@ -1,4 +1,4 @@
-"""The entries of the suite that say how right something is: errors, violations, failures."""
+"""Benchmarks of correctness in the suite: errors, violations and failures."""
 
 from __future__ import annotations
 
@@ -27,43 +27,43 @@ from benchmarks.suite import (
 
 @entry("accuracy")
 def accuracy(quick: bool) -> list[Metric]:
-    """Violation and error after a second at 2 ms in float32, and MuJoCo's error at that step."""
+    """Measures violation and error after one second at 2 ms, relative to MuJoCo's Euler."""
     from benchmarks import accuracy as study
     from benchmarks.throughput import method_of
 
-    found = []
+    metrics = []
     for name in SMALL[:1] if quick else scenes(quick):
         row = study.measure(name, method_of(name, "Sparse"), np.float32)
-        found.append(error(f"{name}, violation over link", row.violation, floor=1e-6))
-        found.append(error(f"{name}, error", row.error, "m"))
+        metrics.append(error(f"{name}, violation over link", row.violation, floor=1e-6))
+        metrics.append(error(f"{name}, error", row.error, "m"))
         if row.peer:
             title = f"{name}, error over that of MuJoCo's Euler"
-            found.append(Metric(title, row.error / row.peer, "", LOWER))
-        found.append(count(f"{name}, failed", float(not row.healthy)))
-    return found
+            metrics.append(Metric(title, row.error / row.peer, "", LOWER))
+        metrics.append(count(f"{name}, failed", float(not row.healthy)))
+    return metrics
 
 
 @entry("residuals")
 def residuals(quick: bool) -> list[Metric]:
-    """How well each solver solves the saddle system: backward errors, worst of all states."""
+    """Measures backward errors of each solver on saddle-point systems of the scenes."""
     from benchmarks import residuals as study
 
-    found, names = [], list(study.SOLVERS)
+    metrics, names = [], list(study.SOLVERS)
     for dtype in ("float64",) if quick else study.LIMIT:
         for name in SMALL[1:] if quick else scenes(quick):
             rows = list(study.measure(name, dtype, names, [0.0] if quick else [0.0, 0.25]))
             eps, title = float(jnp.finfo(dtype).eps), f"{name}, {dtype}"
             for what in ("motion", "constraint"):
                 worst = max(getattr(row, what) for row in rows)
-                found.append(error(f"{title}, {what}", worst, floor=10 * eps))
+                metrics.append(error(f"{title}, {what}", worst, floor=10 * eps))
             failed = sum(row.verdict != "passes" for row in rows)
-            found.append(count(f"{title}, failed", failed))
-    return found
+            metrics.append(count(f"{title}, failed", failed))
+    return metrics
 
 
 @entry("drift")
 def drift(quick: bool) -> list[Metric]:
-    """How far constraints drift with feedback and without it."""
+    """Measures constraint drift with and without feedback."""
     from benchmarks import drift as study
 
     with jax.enable_x64(True):
@@ -73,31 +73,31 @@ def drift(quick: bool) -> list[Metric]:
 
 @entry("stabilisation")
 def stabilisation(quick: bool) -> list[Metric]:
-    """How far φ, φ̇ and the energy get, by stabiliser and integrator."""
+    """Measures the largest φ, φ̇ and energy error, by stabilizer and integrator."""
     from benchmarks import stabilisation as study
 
-    found = []
+    metrics = []
     names = ("Baumgarte", "projection") if quick else tuple(study.STABILIZERS)
     integrators = ("semi-implicit Euler",) if quick else tuple(study.INTEGRATORS)
     with jax.enable_x64(True):
         for scene in ("pendulum",) if quick else ("double_pendulum", "four_bar"):
             for integrator in integrators:
                 for name in names:
-                    given = (np.float64, integrator, name, 2000 if quick else 10_000, 1e-3)
-                    row = study.measure(scene, *given)
+                    settings = (np.float64, integrator, name, 2000 if quick else 10_000, 1e-3)
+                    row = study.measure(scene, *settings)
                     if not row.remark:
                         title = f"{scene}, {integrator}, {name}"
-                        found.append(error(f"{title}, φ", row.position, floor=1e-14))
-                        found.append(error(f"{title}, energy", row.energy, floor=1e-12))
-    return found
+                        metrics.append(error(f"{title}, φ", row.position, floor=1e-14))
+                        metrics.append(error(f"{title}, energy", row.energy, floor=1e-12))
+    return metrics
 
 
 @entry("extremes")
 def extremes(quick: bool) -> list[Metric]:
-    """How many of the absurd values of masses, steps, gains, … each method holds."""
+    """Counts the extreme values (masses, steps, gains, …) that each method withstands."""
     from benchmarks import extremes as study
 
-    found = []
+    metrics = []
     families = ("gains",) if quick else ("tip", "step", "gains", "spring", "penalty", "flat")
     methods = ("semi-implicit Euler",) if quick else tuple(study.METHODS)
     with jax.enable_x64(True):
@@ -106,102 +106,102 @@ def extremes(quick: bool) -> list[Metric]:
                 rows = study.run(study.FAMILIES[family], study.METHODS[label], np.float64)
                 if not isinstance(rows, str):
                     held = sum(row.held for row in rows)
-                    found.append(Metric(f"{family}, {label}, held", held, "", HIGHER, 1.0))
-    return found
+                    metrics.append(Metric(f"{family}, {label}, held", held, "", HIGHER, 1.0))
+    return metrics
 
 
 @entry("heavy_tip", "scipy")
 def heavy_tip(quick: bool) -> list[Metric]:
-    """A chain with a tip a million times heavier: error of the tip and energy."""
+    """Simulates a chain with a tip up to a million times heavier: errors of tip and energy."""
     from benchmarks import heavy_tip as study
 
     chain = study.Chain(links=2, ratio=1e3, seconds=0.6) if quick else study.Chain()
-    reference, found = chain.reference(), []
+    reference, metrics = chain.reference(), []
     with jax.enable_x64(True):
         steps = {"generalized-α": 5e-3} if quick else {"RK4": 1e-4, "generalized-α": 1e-3}
         for name, dt in steps.items():
-            got = study.run(chain, study.METHODS[name][0], dt, reference)
-            found.append(error(f"{name}, tip", got.error, "m"))
-            found.append(error(f"{name}, energy", got.energy))
-    return found
+            result = study.run(chain, study.METHODS[name][0], dt, reference)
+            metrics.append(error(f"{name}, tip", result.error, "m"))
+            metrics.append(error(f"{name}, energy", result.energy))
+    return metrics
 
 
 @entry("equivalence", MUJOCO)
 def equivalence(quick: bool) -> list[Metric]:
-    """Whether jaxcon and MuJoCo have the same mechanisms: places, M and accelerations."""
+    """Compares the mechanisms in jaxcon and MuJoCo: positions, mass matrices and accelerations."""
     from benchmarks import equivalence as study
 
-    found = []
+    metrics = []
     for name in ("planar-chain-3",) if quick else scenes(quick):
         row = study.compare(mechanisms.find(name))
-        found += [
+        metrics += [
             error(f"{name}, {what}", getattr(row, what), floor=1e-12)
             for what in ("place", "mass", "acceleration")
         ]
-    return found
+    return metrics
 
 
 @entry("mjcf_agreement", MUJOCO, GYMNASIUM)
 def mjcf_agreement(quick: bool) -> list[Metric]:
-    """How far models read from MJCF are from MuJoCo: accelerations, trajectories, closed loops."""
+    """Compares MJCF models with MuJoCo: accelerations, trajectories, closed loops."""
     from benchmarks import mjcf_agreement as study
 
-    found = []
+    metrics = []
     with jax.enable_x64(True):
         for name in ("inverted_pendulum",) if quick else study.MODELS:
-            off = study.acceleration_error(study.load(name), 5 if quick else 100)
-            found.append(error(f"{name}, qacc", off, floor=1e-12))
+            deviation = study.acceleration_error(study.load(name), 5 if quick else 100)
+            metrics.append(error(f"{name}, qacc", deviation, floor=1e-12))
             if not quick:
-                path = study.trajectory_error(study.load(name))
-                found.append(error(f"{name}, qpos", path, "", 1e-11))
+                trajectory = study.trajectory_error(study.load(name))
+                metrics.append(error(f"{name}, qpos", trajectory, "", 1e-11))
         for name in () if quick else study.loops.LOOPS:
             row = study.loop_agreement(name)
-            found.append(error(f"{name}, qacc continued", row.limit, floor=1e-7))
-            found.append(error(f"{name}, open", row.closure, "m"))
-    return found
+            metrics.append(error(f"{name}, qacc continued", row.limit, floor=1e-7))
+            metrics.append(error(f"{name}, open", row.closure, "m"))
+    return metrics
 
 
 @entry("bounded")
 def bounded(quick: bool) -> list[Metric]:
-    """What solvers of bounded rows miss, the worst of random states, and what a step costs."""
+    """Measures the largest residual of contact solvers over random states, and cost of a step."""
     from benchmarks import bounded as study
 
-    found = []
+    metrics = []
     labels = ("GaussSeidel(15)",) if quick else ("GaussSeidel(50)", "InteriorPoint(15)")
     with jax.enable_x64(True):
         for scene in ("chain",) if quick else study.SCENES:
             for label in labels:
-                given = (jnp.dtype("float64"), study.SOLVERS[label], 20 if quick else 256)
-                missed, cost, compiling = study.measure(scene, *given)
+                settings = (jnp.dtype("float64"), study.SOLVERS[label], 20 if quick else 256)
+                residuals, cost, compile_time = study.measure(scene, *settings)
                 title = f"{scene}, {label}"
-                found.append(error(f"{title}, missed", float(missed.max()), floor=1e-12))
-                found.append(seconds(f"{title}, step", cost))
-                found.append(seconds(f"{title}, compile", compiling))
-    return found
+                metrics.append(error(f"{title}, missed", float(residuals.max()), floor=1e-12))
+                metrics.append(seconds(f"{title}, step", cost))
+                metrics.append(seconds(f"{title}, compile", compile_time))
+    return metrics
 
 
 @entry("falls", MUJOCO, GYMNASIUM)
 def falls(quick: bool) -> list[Metric]:
-    """What must come to rest, and what must stay up: walkers, and a heavy column."""
+    """Checks that fallen walkers come to rest and that a heavy column stays up."""
     from benchmarks import falls as study
 
     stood = study.stand(
         "GaussSeidel" if quick else "InteriorPoint", "float32", 0.05 if quick else 60
     )
-    found = [error("column, moved", stood.moved, "m", 1e-6)]
+    metrics = [error("column, moved", stood.moved, "m", 1e-6)]
     if not quick:
         fallen = study.drop("GaussSeidel", "float32", 1000, 4.0)
-        found.append(count("walkers, failed", fallen.failed))
-        found.append(error("walkers, speed of nine of ten", fallen.speeds[1], "rad/s", 1e-4))
-    return found
+        metrics.append(count("walkers, failed", fallen.failed))
+        metrics.append(error("walkers, speed of nine of ten", fallen.speeds[1], "rad/s", 1e-4))
+    return metrics
 
 
 @entry("gradient_table")
 def gradient_table(quick: bool) -> list[Metric]:
-    """Derivatives of rollouts against differences, for all that can be combined."""
+    """Compares derivatives of rollouts with finite differences, for combinations of methods."""
     from benchmarks import gradient_table as study
 
-    found = []
+    metrics = []
     with jax.enable_x64(True):
         for scene, build in list(study.SCENES.items())[: 1 if quick else None]:
             subject, choices = study.Subject(*build()), study.choices()
@@ -209,69 +209,69 @@ def gradient_table(quick: bool) -> list[Metric]:
                 row = study.measure(choice, scene, subject)
                 worst, floor = max(row.forward, row.reverse), 1e-9
                 floor = floor if choice.dtype == "float64" else 1e-5
-                found.append(error(f"{scene}, {choice}", worst, floor=floor))
-    return found
+                metrics.append(error(f"{scene}, {choice}", worst, floor=floor))
+    return metrics
 
 
 @entry("training")
 def training(quick: bool) -> Found:
-    """Whether the examples of learning reach their goals."""
+    """Counts the learning examples that reach their goals."""
     from benchmarks import training as study
 
-    known = [(a, task) for a in study.ALGORITHMS for task in a.settings]
+    tasks = [(a, name) for a in study.ALGORITHMS for name in a.settings]
     if quick:
-        algorithm, task = known[0]
+        algorithm, task = tasks[0]
         short = {task: algorithm.settings[task]._replace(updates=5)}
-        known = [(dataclasses.replace(algorithm, settings=short), task)]
+        tasks = [(dataclasses.replace(algorithm, settings=short), task)]
     seeds = [0] if quick else [0, 1, 2, 3, 4]
-    rows = [study.measure(algorithm, task, seeds, 900.0) for algorithm, task in known]
-    found = []
+    rows = [study.measure(algorithm, task, seeds, 900.0) for algorithm, task in tasks]
+    metrics = []
     for row in rows:
         title, last = f"{row.task}, {row.algorithm}", [curve[-1].earned for curve in row.curves]
-        found.append(Metric(f"{title}, last return", float(np.mean(last)), "", HIGHER, 2.0))
+        metrics.append(Metric(f"{title}, last return", float(np.mean(last)), "", HIGHER, 2.0))
         if not quick:
             reached = sum(look is not None for look in row.reached)
-            found.append(Metric(f"{title}, reached the goal", reached, "", HIGHER, 1.0))
-    return Found(tuple(found), lambda path: study.draw(rows, str(path)))
+            metrics.append(Metric(f"{title}, reached the goal", reached, "", HIGHER, 1.0))
+    return Found(tuple(metrics), lambda path: study.draw(rows, str(path)))
 
 
 @entry("curricula")
 def curricula(quick: bool) -> Found:
-    """Policies trained on soft, noisy and relaxed constraints, tried on hard ones."""
+    """Evaluates policies on hard constraints that were trained on soft, noisy and relaxed ones."""
     from benchmarks import curricula as study
 
     arms = {"hard": study.ARMS["hard"]} if quick else study.ARMS
     seeds, updates = ([0], 3) if quick else ([0, 1, 2, 3, 4], 150)
-    algorithm = "ppo" if quick else "apg"  # of which the first compiles sooner
+    algorithm = "ppo" if quick else "apg"  # ppo compiles faster
     rows = study.study(algorithm, arms, seeds, updates)
     hard = study.TITLES.index("hard hinges")
-    found = [
+    metrics = [
         Metric(f"{label}, share of the return", float(np.mean(arm["trials"], 0)[hard]))
         for label, arm in rows.items()
     ]
-    return Found(tuple(found), lambda path: study.draw({algorithm: rows}, str(path)))
+    return Found(tuple(metrics), lambda path: study.draw({algorithm: rows}, str(path)))
 
 
 @entry("exploration")
 def exploration(quick: bool) -> list[Metric]:
-    """Feasible exploration and layered control in learning by trial: returns and crashes."""
+    """Measures returns and crashes of learning with feasible exploration and layered control."""
     from benchmarks import exploration as study
 
-    found = []
+    metrics = []
     for name in ["feasible"] if quick else study.ARMS:
         rows = study.measure(name, [0] if quick else [0, 1, 2, 3, 4], 3 if quick else 100)
         _, last, crashes = np.mean(rows, axis=0)
-        found.append(Metric(f"{name}, return", float(last), "", HIGHER, 2.0))
-        found.append(Metric(f"{name}, crashes", float(crashes), "", LOWER, 2.0, floor=0.05))
-    return found
+        metrics.append(Metric(f"{name}, return", float(last), "", HIGHER, 2.0))
+        metrics.append(Metric(f"{name}, crashes", float(crashes), "", LOWER, 2.0, floor=0.05))
+    return metrics
 
 
 @entry("gradient_states")
 def gradient_states(quick: bool) -> list[Metric]:
-    """Derivatives in very many states, also at singular spots: those not finite or not right."""
+    """Counts non-finite and wrong derivatives over many states, including singular states."""
     from benchmarks import gradient_states as study
 
-    found, n = [], 40 if quick else 250
+    metrics, n = [], 40 if quick else 250
     scenes = list(study.SCENES)[: 1 if quick else None]
     with jax.enable_x64(True):
         for choice in list(study.choices(scenes, False))[: 1 if quick else None]:
@@ -279,15 +279,15 @@ def gradient_states(quick: bool) -> list[Metric]:
             if row is None:
                 continue
             title = f"{row.scene}, {row.dim}, {row.method}, {row.dtype}"
-            found.append(count(f"{title}, not finite", row.broken))
-            found.append(count(f"{title}, modes apart", row.beyond))
-            found.append(count(f"{title}, off", row.off))
-    return found
+            metrics.append(count(f"{title}, not finite", row.broken))
+            metrics.append(count(f"{title}, modes apart", row.beyond))
+            metrics.append(count(f"{title}, off", row.off))
+    return metrics
 
 
 @entry("poisoned")
 def poisoned(quick: bool) -> list[Metric]:
-    """Batches with a number that is NaN or infinite in one world: what goes wrong, of all tried."""
+    """Counts wrong results of batches in which one world has a NaN or infinity."""
     from benchmarks import poisoned as study
 
     total = study.Counts()
@@ -295,18 +295,18 @@ def poisoned(quick: bool) -> list[Metric]:
         for name in ("PID", "recovery") if quick else study.studies(quick=True):
             total += study.measure(name, quick)
     wrong = ("accepted", "neighbors", "gradients")
-    found = [count(f"{what}, wrong", len(getattr(total, what))) for what in wrong]
-    return [Metric("tried", total.tried), *found]
+    metrics = [count(f"{what}, wrong", len(getattr(total, what))) for what in wrong]
+    return [Metric("tried", total.tried), *metrics]
 
 
 @entry("random_scenes")
 def random_scenes(quick: bool) -> list[Metric]:
-    """Random mechanisms under the default method: checks that fail, of all tried."""
+    """Counts failed checks of random mechanisms under the default method."""
     from benchmarks import random_scenes as study
 
     number, total = 1 if quick else 20, dict.fromkeys(study.CHECKS, 0)
     with jax.enable_x64(True):
-        for found in study.study(number):
-            for name in found.wrong:
+        for mechanism in study.study(number):
+            for name in mechanism.wrong:
                 total[name] += 1
     return [Metric("tried", 2 * number), *(count(f"{k}, wrong", x) for k, x in total.items())]

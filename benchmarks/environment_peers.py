@@ -1,13 +1,15 @@
-"""Actions a second of many copies of the same tasks: ours, Gymnasium's on MuJoCo, and Brax's.
+"""Actions per second of many copies of a task: jaxcon, Gymnasium on MuJoCo, and Brax.
 
     python -m benchmarks.environments --peers [--peer-seconds 100] [--copies 4096]
 
-Each in a process of its own, on all cores: jaxcon's copies and Brax's lie over one device a core,
-Gymnasium's asynchronous copies over processes that share memory, its synchronous ones do not
-spread. Actions are random, within the bounds of each; every copy that is done is reset, by Brax to
-the start that it first drew. An action of all lasts the same time but where the table says
-otherwise; how many steps of the simulation that takes is each one's own choice. CartPole is a
-scene of ours, the others' pendulums are files of theirs: a cart and a pole on a rail in each.
+Each setting runs in its own process, on all cores. Copies in jaxcon and Brax are sharded over one
+device per core. Gymnasium's asynchronous copies run in processes that share memory; its synchronous
+copies run on one core. Actions are random within the bounds of each environment. Every finished
+copy is reset. In Brax, a reset returns to the copy's first initial state.
+
+An action lasts equally long in all packages unless the table says otherwise. The number of
+simulation steps per action is the choice of each package. CartPole is a scene of jaxcon. The other
+pendulums come from their packages; each is a cart and a pole on a rail.
 """
 
 from __future__ import annotations
@@ -25,19 +27,19 @@ from benchmarks import timing
 from benchmarks.timing import Rate
 
 ENOUGH = 1.5
-"""How long a repeat takes, about [s]."""
+"""Target duration of a repeat [s]."""
 REPEATS = 3
 
 
 class Case(NamedTuple):
-    """One row.
+    """One row of the table: a task in one package with one setting.
 
     Attributes:
-        task: of all of whom it is.
-        who: "jaxcon", "gymnasium" or "brax".
-        name: by which they know it.
-        how: their setting.
-        copies: how many; 0 for as many as asked for.
+        task: name of the task in the table.
+        who: the package: "jaxcon", "gymnasium" or "brax".
+        name: name of the environment in that package.
+        how: setting of the package.
+        copies: number of copies; 0 for the number on the command line.
     """
 
     task: str
@@ -48,29 +50,29 @@ class Case(NamedTuple):
 
 
 def cases() -> list[Case]:
-    """All rows: each peer with every setting that it recommends."""
+    """Returns all rows of the table: each package with every setting that it recommends."""
     tasks = (
         ("cart and pole", "CartPole", "InvertedPendulum-v5", "inverted_pendulum"),
         ("half-cheetah", "HalfCheetah", "HalfCheetah-v5", "halfcheetah"),
     )
-    found = []
+    rows = []
     for task, ours, gymnasium, brax in tasks:
-        found.append(Case(task, "jaxcon", ours, "VectorEnv"))
-        found.append(Case(task, "gymnasium", gymnasium, "sync", 16))
-        found += [Case(task, "gymnasium", gymnasium, "async", n) for n in (timing.cores(), 16)]
-        found += [Case(task, "brax", brax, how) for how in ("generalized", "positional", "mjx")]
-    return found
+        rows.append(Case(task, "jaxcon", ours, "VectorEnv"))
+        rows.append(Case(task, "gymnasium", gymnasium, "sync", 16))
+        rows += [Case(task, "gymnasium", gymnasium, "async", n) for n in (timing.cores(), 16)]
+        rows += [Case(task, "brax", brax, how) for how in ("generalized", "positional", "mjx")]
+    return rows
 
 
 class Run(NamedTuple):
-    """What one of them did.
+    """The result of one row.
 
     Attributes:
-        copies: how many.
-        action: how long it lasts [s].
-        steps: of the simulation in it.
-        ready: until the second action can be taken, from the first reset on [s].
-        rate: actions a second of all copies together.
+        copies: number of copies.
+        action: duration of an action in simulated time [s].
+        steps: simulation steps per action.
+        ready: time from the creation of the copies until their second action can be taken [s].
+        rate: actions per second of all copies together.
     """
 
     copies: int
@@ -81,7 +83,13 @@ class Run(NamedTuple):
 
 
 class Copies(NamedTuple):
-    """Many copies of a task: how long an action lasts [s], its steps, and what takes one of all."""
+    """Copies of a task in one package.
+
+    Attributes:
+        action: duration of an action in simulated time [s].
+        steps: simulation steps per action.
+        act: takes one random action in every copy.
+    """
 
     action: float
     steps: int
@@ -89,7 +97,7 @@ class Copies(NamedTuple):
 
 
 def ours(name: str, how: str, copies: int) -> Copies:
-    """Those of `GymnasiumVectorEnv` on all devices."""
+    """Creates copies of a task in jaxcon's `GymnasiumVectorEnv` on all devices."""
     import jax
 
     from jaxcon import environments
@@ -103,15 +111,15 @@ def ours(name: str, how: str, copies: int) -> Copies:
     draw = jax.jit(lambda k: jax.random.uniform(k, shape, minval=-1.0, maxval=1.0))
 
     def act() -> Any:
-        key[0], own = jax.random.split(key[0])
-        return envs.step(draw(own))[0]
+        key[0], draw_key = jax.random.split(key[0])
+        return envs.step(draw(draw_key))[0]
 
-    own: Any = envs.environment
-    return Copies(float(own.dt) * own.skip, own.skip, act)
+    environment: Any = envs.environment
+    return Copies(float(environment.dt) * environment.skip, environment.skip, act)
 
 
 def brax(name: str, how: str, copies: int) -> Copies:
-    """Those of Brax under the wrappers that its training has, on all devices."""
+    """Creates copies of a Brax environment under Brax's training wrappers, on all devices."""
     import jax
     from brax import envs  # pyright: ignore[reportMissingImports]
     from brax.envs.wrappers import training  # pyright: ignore[reportMissingImports]
@@ -120,41 +128,41 @@ def brax(name: str, how: str, copies: int) -> Copies:
 
     env: Any = envs.get_environment(name, backend=how)
     wrapped = training.wrap(env, episode_length=1000)
-    keys = jax.random.split(jax.random.PRNGKey(0), copies)  # its wrappers know no others
-    now, key = [jc.shard(jax.jit(wrapped.reset)(keys))], [jax.random.key(1)]
+    keys = jax.random.split(jax.random.PRNGKey(0), copies)  # the wrappers need old-style keys
+    state, key = [jc.devices.shard(jax.jit(wrapped.reset)(keys))], [jax.random.key(1)]
     shape, step = (copies, env.action_size), jax.jit(wrapped.step)
     draw = jax.jit(lambda k: jax.random.uniform(k, shape, minval=-1.0, maxval=1.0))
 
     def act() -> Any:
-        key[0], own = jax.random.split(key[0])
-        now[0] = step(now[0], jc.shard(draw(own)))
-        return now[0].obs
+        key[0], draw_key = jax.random.split(key[0])
+        state[0] = step(state[0], jc.devices.shard(draw(draw_key)))
+        return state[0].obs
 
     return Copies(float(env.dt), round(float(env.dt / env.sys.opt.timestep)), act)
 
 
 def gymnasiums(name: str, how: str, copies: int) -> Copies:
-    """Those of Gymnasium."""
+    """Creates copies of a Gymnasium environment."""
     import gymnasium
 
-    one: Any = gymnasium.make(name).unwrapped
+    single: Any = gymnasium.make(name).unwrapped
     envs = gymnasium.make_vec(name, num_envs=copies, vectorization_mode=how)
     envs.reset(seed=0)
-    space, random = one.action_space, np.random.default_rng(0)
+    space, random = single.action_space, np.random.default_rng(0)
 
     def act() -> Any:
-        # drawn at once: the space would draw number by number
+        # One draw for all copies: sampling the space would loop over its numbers.
         actions = random.uniform(space.low, space.high, envs.action_space.shape)
         return envs.step(actions.astype(space.dtype))[0]
 
-    return Copies(float(one.dt), one.frame_skip, act)
+    return Copies(float(single.dt), single.frame_skip, act)
 
 
 MAKE = {"jaxcon": ours, "brax": brax, "gymnasium": gymnasiums}
 
 
 def measure(case: Case, enough: float = ENOUGH, repeats: int = REPEATS) -> Run:
-    """One row, in this process."""
+    """Measures one row in this process."""
     wait = (lambda x: x) if case.who == "gymnasium" else _ready
     started = time.perf_counter()
     copies = MAKE[case.who](case.name, case.how, case.copies)
@@ -180,39 +188,43 @@ def _ready(x: Any) -> Any:
 
 
 def in_process(case: Case, limit: float) -> Run | str:
-    """One row in a process of its own, or why there is none."""
+    """Measures one row in its own process.
+
+    Returns:
+        The result, or the reason why there is none.
+    """
     arguments = ["benchmarks.environment_peers", *map(str, case)]
-    found = timing.in_process(arguments, dict(os.environ), limit, "is not done after")
-    if isinstance(found, str):
-        return found
-    rate = Rate(**found.pop("rate"))
-    return Run(**found, rate=rate)
+    result = timing.in_process(arguments, dict(os.environ), limit, "is not done after")
+    if isinstance(result, str):
+        return result
+    rate = Rate(**result.pop("rate"))
+    return Run(**result, rate=rate)
 
 
 HEAD = """
-| task | of | setting | copies | an action | steps | ready | actions/s (min to max) | simulated |
+| task | package | setting | copies | action | steps | ready | actions/s (min to max) | simulated |
 |---|---|---|---|---|---|---|---|---|"""
 
 
 def line(case: Case, run: Run | str) -> str:
-    """A row of the table."""
-    own = f"| {case.task} | {case.who} | {case.how} | {case.copies} |"
+    """Formats the result of a case as a table row."""
+    head = f"| {case.task} | {case.who} | {case.how} | {case.copies} |"
     if isinstance(run, str):
-        return f"{own} | | | {run} | |"
-    took = f"{1e3 * run.action:.3g} ms | {run.steps} | {run.ready:.1f} s"
-    return f"{own} {took} | {run.rate} | {run.action * run.rate.median:.3g} s/s |"
+        return f"{head} | | | {run} | |"
+    timings = f"{1e3 * run.action:.3g} ms | {run.steps} | {run.ready:.1f} s"
+    return f"{head} {timings} | {run.rate} | {run.action * run.rate.median:.3g} s/s |"
 
 
 def table(copies: int, limit: float) -> None:
-    """Prints all rows."""
+    """Measures and prints all rows."""
     print(HEAD)
     for case in cases():
-        asked = case if case.copies else case._replace(copies=copies)
-        print(line(asked, in_process(asked, limit)), flush=True)
+        sized = case if case.copies else case._replace(copies=copies)
+        print(line(sized, in_process(sized, limit)), flush=True)
 
 
 def main() -> None:
-    """One row, as JSON."""
+    """Measures the case on the command line and prints it as JSON."""
     parser = argparse.ArgumentParser(description=__doc__)
     for field in Case._fields:
         parser.add_argument(field, type=int if field == "copies" else str)

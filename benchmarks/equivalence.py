@@ -1,10 +1,11 @@
-"""Whether jaxcon and MuJoCo simulate the same mechanism: same M, same accelerations at the start.
+"""Checks that jaxcon and MuJoCo model the same mechanisms.
 
     python -m benchmarks.equivalence
 
-The mass matrix is compared in the velocities of MuJoCo's joints: with B the map from those to the
-velocities of the bodies, Bᵀ M B must be MuJoCo's. The accelerations are those of the bodies'
-centres of mass. MuJoCo's closed loops are soft, so their accelerations agree only as far as that.
+Mass matrices and initial accelerations are compared. Mass matrices are compared in MuJoCo's joint
+velocities: Bᵀ M B must equal MuJoCo's mass matrix. Here M is the mass matrix in jaxcon, and B maps
+joint velocities to body velocities. Accelerations are those of the centers of mass. MuJoCo closes
+loops softly, so accelerations of mechanisms with loops agree only to within this softness.
 """
 
 from __future__ import annotations
@@ -21,19 +22,20 @@ from benchmarks import mechanisms
 from benchmarks.mechanisms import Mechanism, lift
 
 TREE, SOFT = 1e-6, 1e-3
-"""Relative differences of the first accelerations: trees, and loops that MuJoCo closes softly."""
-IDEAL = jc.Method(stabilizer=jc.Unstabilized(), solver=jc.Dense())
+"""Bounds on the relative difference of initial accelerations, for trees and for closed loops."""
+IDEAL = jc.Method(stabilizer=jc.stabilizers.Unstabilized(), solver=jc.solvers.Dense())
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Relative differences between the two models of a mechanism, and violation of the start.
+    """Differences between the two models of a mechanism.
 
     Attributes:
-        place, mass, acceleration: of the markers, M and the markers' accelerations, each by the
-            largest entry.
-        violation: of φ and φ̇ by the start in jaxcon.
-        bound: of the acceleration.
+        place: difference of the marker positions, relative to the largest entry.
+        mass: difference of the mass matrices, relative to the largest entry.
+        acceleration: difference of the marker accelerations, relative to the largest entry.
+        violation: the larger of |φ| and |φ̇| at the start in jaxcon.
+        bound: bound on `acceleration`.
     """
 
     place: float
@@ -44,13 +46,13 @@ class Difference:
 
     @property
     def same(self) -> bool:
-        """Whether all is as it should be."""
+        """True if all differences are within their bounds."""
         exact = max(self.place, self.mass, self.violation) <= TREE
         return exact and self.acceleration <= self.bound
 
 
 def model_of(mechanism: Mechanism) -> tuple[Any, Any]:
-    """MuJoCo's model and data of the mechanism at its start."""
+    """Returns MuJoCo's model and its data in the initial state of the mechanism."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(mechanism.mjcf())
@@ -61,7 +63,7 @@ def model_of(mechanism: Mechanism) -> tuple[Any, Any]:
 
 
 def compare(mechanism: Mechanism) -> Difference:
-    """The two models of a mechanism side by side, in float64."""
+    """Compares the jaxcon and the MuJoCo model of a mechanism in float64."""
     with jax.enable_x64(True):
         system, state = mechanism.build(np.float64)
         places = lift(mechanism.markers(system, state))
@@ -70,7 +72,7 @@ def compare(mechanism: Mechanism) -> Difference:
         )
         violation = jc.violation(system, state)
         mass = np.asarray(system.mass(state.q).dense())
-        off = float(max(violation.worst, violation.worst_rate))
+        worst = float(max(violation.worst, violation.worst_rate))
     model, data = model_of(mechanism)
     ids = [model.body(name).id for name in mechanism.bodies]
     columns = bodies_from_joints(mechanism, system, model, data)
@@ -78,18 +80,18 @@ def compare(mechanism: Mechanism) -> Difference:
         place=relative(data.xpos[ids], places),
         mass=relative(full_mass(model, data), columns.T @ mass @ columns),
         acceleration=relative(mujoco_accelerations(model, data, ids), accelerations),
-        violation=off,
+        violation=worst,
         bound=SOFT if mechanism.loops else TREE,
     )
 
 
 def relative(x: np.ndarray, y: np.ndarray) -> float:
-    """The largest difference over the largest entry."""
+    """Returns the largest difference of two arrays, divided by the largest entry of `y`."""
     return float(np.max(np.abs(x - y)) / np.max(np.abs(y)))
 
 
 def marker_accelerations(mechanism: Mechanism, system: Any, state: jc.State) -> jax.Array:
-    """Of the centres of mass, without feedback, (bodies, dim) [m/s²]."""
+    """Returns accelerations of the centers of mass without feedback, (bodies, dim) [m/s²]."""
     a = jc.forward_dynamics(system, state, None, IDEAL, 1e-3).acceleration
 
     def speeds(q: Any, v: Any) -> jax.Array:
@@ -101,20 +103,23 @@ def marker_accelerations(mechanism: Mechanism, system: Any, state: jc.State) -> 
 
 
 def mujoco_accelerations(model: Any, data: Any, ids: list[int]) -> np.ndarray:
-    """J q̈ + J̇ q̇ of the centres of mass, (bodies, 3) [m/s²]."""
+    """Returns accelerations of the centers of mass in MuJoCo, (bodies, 3) [m/s²].
+
+    They are J q̈ + J̇ q̇, with the Jacobian J of a center of mass.
+    """
     import mujoco
 
-    found = []
+    accelerations = []
     for i in ids:
         jacobian, rate = np.zeros((3, model.nv)), np.zeros((3, model.nv))
         mujoco.mj_jac(model, data, jacobian, None, data.xpos[i], i)
         mujoco.mj_jacDot(model, data, rate, None, data.xpos[i], i)
-        found.append(jacobian @ data.qacc + rate @ data.qvel)
-    return np.array(found)
+        accelerations.append(jacobian @ data.qacc + rate @ data.qvel)
+    return np.array(accelerations)
 
 
 def full_mass(model: Any, data: Any) -> np.ndarray:
-    """MuJoCo's mass matrix, dense."""
+    """Returns MuJoCo's mass matrix as a dense array."""
     import mujoco
 
     mass = np.zeros((model.nv, model.nv))
@@ -124,7 +129,7 @@ def full_mass(model: Any, data: Any) -> np.ndarray:
 
 
 def bodies_from_joints(mechanism: Mechanism, system: Any, model: Any, data: Any) -> np.ndarray:
-    """B: jaxcon's velocities from those of MuJoCo's joints, (n_v, joints)."""
+    """Returns the matrix B that maps MuJoCo's joint velocities to jaxcon's, (n_v, joints)."""
     import mujoco
 
     columns = np.zeros((system.layout.n_v, model.nv))
@@ -142,7 +147,7 @@ def bodies_from_joints(mechanism: Mechanism, system: Any, model: Any, data: Any)
 
 
 def main() -> None:
-    """Prints the differences of the mechanisms of the table."""
+    """Prints the differences of all mechanisms in the benchmark table."""
     from benchmarks.targets import SCENES
 
     parser = argparse.ArgumentParser(description=__doc__)

@@ -1,13 +1,15 @@
-"""Where each method ends (chapter 3.3 to 3.5, 3.11): masses, steps, gains, springs, spins, lengths.
+"""Limits of each method (chapters 3.3 to 3.5, 3.11): masses, steps, gains, springs, spins, lengths.
 
     python -m benchmarks.extremes [--families tip …] [--dtypes float64 float32] [--peer]
 
-Each family is one mechanism that loses no energy, with one number taken from the harmless to the
-absurd. All values run side by side in one batch, as a user's worlds would: one that fails must stop
-with a status, and no other may notice. A value is held where the world ends healthy, φ stayed below
-a hundredth of the mechanism's size and the energy within a tenth of its scale. The table says up to
-where each method holds, and how it ends beyond. `--peer` runs MuJoCo in C on the same mechanisms,
-which sees their trees in reduced coordinates and therefore has no φ.
+Each family is one conservative mechanism with one parameter that varies from harmless to extreme.
+All values run in one batch. A world that fails must stop with a status, and must not affect the
+other worlds.
+
+A method withstands a value if three conditions hold at the end: the world is healthy, |φ| stays
+below a hundredth of the mechanism's size, and the energy error below a tenth of its scale. The
+table shows up to which value each method holds, and how it fails beyond. `--peer` runs the same
+mechanisms in MuJoCo in C. MuJoCo models trees in reduced coordinates and therefore has no φ.
 """
 
 from __future__ import annotations
@@ -22,6 +24,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mjcf
@@ -29,39 +32,39 @@ from benchmarks.stabilisation import cast
 
 G = 9.81
 FRAMES = 100
-"""Times at which φ and the energy are looked at."""
+"""Number of times at which φ and the energy are recorded."""
 OFF = 1e-2
-"""Of the mechanism's size, what φ may be."""
+"""Largest accepted |φ|, relative to the mechanism's size."""
 CHANGE = 0.1
-"""Of the scale of its energy, by how much that may change."""
+"""Largest accepted energy error, relative to the energy scale."""
 
 METHODS = {
     "semi-implicit Euler": jc.Method(),
-    "the same, projected": jc.Method(jc.SemiImplicitEuler(), jc.Projection()),
+    "semi-implicit Euler, projected": jc.Method(jc.SemiImplicitEuler(), jc.Projection()),
     "RK4": jc.Method(jc.RK4()),
     "RK4, projected": jc.Method(jc.RK4(), jc.Projection()),
-    "RATTLE": jc.Method(jc.RATTLE()),
-    "generalized-α": jc.Method(jc.GeneralizedAlpha()),
+    "RATTLE": jc.Method(jc.integrators.RATTLE()),
+    "generalized-α": jc.Method(jc.integrators.GeneralizedAlpha()),
 }
 
 
 @dataclass(frozen=True)
 class World:
-    """One mechanism.
+    """A mechanism with one value of the family's varied parameter.
 
     Attributes:
         system: the mechanism.
-        state: its start.
-        size: a length by which φ is measured [m].
-        energy: the scale of its energy [J].
-        dt: h [s].
-        number: what the family's `adapt` is given.
-        text: the same mechanism for MuJoCo; None where it has none.
-        rates: its joint velocities at the start.
+        state: its initial state.
+        size: length by which φ is divided [m].
+        energy: energy by which energy errors are divided [J].
+        dt: step size h [s].
+        number: argument of the family's `adapt`.
+        text: MJCF of the same mechanism, None if MuJoCo has no such mechanism.
+        rates: initial joint velocities in MuJoCo.
     """
 
     system: Any
-    state: Any
+    state: jc.State
     size: float
     energy: float
     dt: float = 1e-3
@@ -72,15 +75,16 @@ class World:
 
 @dataclass(frozen=True)
 class Family:
-    """A mechanism with a number to be taken far.
+    """A mechanism with one parameter that varies to extremes.
 
     Attributes:
-        what: it is, with its unit.
-        values: of the number.
-        build: the mechanism with a value.
-        steps: how many.
-        adapt: (method, number) → the method of a world; None where it has no part in it.
-        alone: whether each value is a structure of its own, and compiled by itself.
+        what: name of the parameter, with its unit.
+        values: values of the parameter.
+        build: (value) → mechanism.
+        steps: number of steps.
+        adapt: (method, number) → method of a world, None if the parameter does not apply to the
+            method.
+        alone: True if each value changes the structure and is compiled on its own.
     """
 
     what: str
@@ -92,7 +96,7 @@ class Family:
 
 
 def chain(masses: Sequence[float], length: float, dt: float = 1e-3) -> World:
-    """Rods of equal length on hinges in the plane, released level."""
+    """Builds rods of equal length on hinges in the plane, released from the horizontal."""
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     before, inside = jc.WORLD, ""
     for i, mass in enumerate(masses):
@@ -112,47 +116,52 @@ def chain(masses: Sequence[float], length: float, dt: float = 1e-3) -> World:
 
 
 def tip(ratio: float) -> World:
-    """Ten links of a metre, the last so many times heavier."""
+    """Builds ten links of 1 m and 1 kg, except that the last link has the mass `ratio` [kg]."""
     return chain([1.0] * 9 + [ratio], 1.0)
 
 
 def links(n: float) -> World:
-    """So many links, one metre together."""
+    """Builds a chain of `n` links, 1 m long in total."""
     return chain([1.0 / n] * round(n), 1.0 / n)
 
 
 def step(dt: float) -> World:
-    """A double pendulum of two metres."""
+    """Builds a double pendulum of 2 m with step size `dt`."""
     return chain([1.0, 1.0], 1.0, dt)
 
 
 def rods(length: float) -> World:
-    """A double pendulum of so long rods, whose step keeps with its period."""
+    """Builds a double pendulum with rods of a length [m]; the step size scales with its period."""
     return chain([1.0, 1.0], length, 1e-3 * float(np.sqrt(length)))
 
 
 def gains(multiple: float) -> World:
-    """A double pendulum under feedback of so many times the largest stable rate."""
+    """Builds a double pendulum. `multiple` is the feedback rate over the largest stable rate."""
     pendulum = chain([1.0, 1.0], 1.0)
     return World(pendulum.system, pendulum.state, 2.0, pendulum.energy, number=multiple)
 
 
 def feeds_back(method: jc.Method) -> bool:
-    """Whether it is feedback that keeps constraints, and not the integrator or a projection."""
-    own = isinstance(method.integrator, jc.RATTLE | jc.GeneralizedAlpha)
-    return type(method.stabilizer) is jc.Baumgarte and not own
+    """Returns True if feedback enforces the constraints, not the integrator or a projection."""
+    integrator_enforces = isinstance(
+        method.integrator, jc.integrators.RATTLE | jc.integrators.GeneralizedAlpha
+    )
+    return type(method.stabilizer) is jc.Baumgarte and not integrator_enforces
 
 
 def feedback(method: jc.Method, multiple: Any) -> jc.Method | None:
-    """The method with that feedback, where it has any."""
+    """Returns the method with its feedback rate set to `multiple` times the largest stable rate.
+
+    It is None if the method has no feedback.
+    """
     if not feeds_back(method):
         return None
-    rate = multiple * jc.largest_stable_rate(method.integrator, 1e-3)
+    rate = multiple * jc.stabilizers.largest_stable_rate(method.integrator, 1e-3)
     return jc.Method(method.integrator, jc.Baumgarte(rate, rate))
 
 
 def bob(stiffness: float) -> World:
-    """A kilogram on a spring a metre long, beside another on a rod."""
+    """Builds a particle of 1 kg on a spring of 1 m, and a particle of 1 kg on a rod."""
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     scene.add_particle("elastic", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Spring("spring", jc.WORLD, "elastic", stiffness=stiffness, rest_length=1.0))
@@ -165,7 +174,7 @@ def bob(stiffness: float) -> World:
 
 
 def spring(stiffness: float) -> World:
-    """A pendulum whose rod is held by a penalty."""
+    """Builds a pendulum whose rod is enforced by a penalty of the given stiffness."""
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -173,21 +182,26 @@ def spring(stiffness: float) -> World:
 
 
 def penalty(method: jc.Method, stiffness: Any) -> jc.Method | None:
-    """The method with the penalty, where it stands beside one."""
+    """Returns the method with a penalty as its stabilizer.
+
+    It is None if the method has no feedback that the penalty could replace.
+    """
     if not feeds_back(method):
         return None
-    return jc.Method(method.integrator, jc.Penalty(stiffness, 0.0))
+    return jc.Method(method.integrator, jc.stabilizers.Penalty(stiffness, 0.0))
 
 
 def spin(rate: float) -> World:
-    """A top of a kilogram on its point, turning about its axis, which leans by 45°."""
+    """Builds a top of 1 kg on its point, spinning about an axis inclined by 45°."""
     height, inertia = 0.1, (1e-3, 1e-3, 2e-3)
     lean = np.pi / 4
     q = np.array([np.cos(lean / 2), 0.0, np.sin(lean / 2), 0.0])
     axis = np.array([np.sin(lean), 0.0, np.cos(lean)])
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -G))
-    moving = {"angular_velocity": (0.0, 0.0, rate)}
-    scene.add_body("top", mass=1.0, inertia=inertia, position=height * axis, quaternion=q, **moving)
+    spinning = {"angular_velocity": (0.0, 0.0, rate)}
+    scene.add_body(
+        "top", mass=1.0, inertia=inertia, position=height * axis, quaternion=q, **spinning
+    )
     scene.add(jc.Spherical("point", jc.WORLD, "top", point=(0.0, 0.0, 0.0)))
     ball = mjcf.joint("ball", pos=(0.0, 0.0, -height))
     text = mjcf.body("top", height * axis, 1.0, inertia, ball, q)
@@ -198,7 +212,10 @@ def spin(rate: float) -> World:
 
 
 def flat(angle: float) -> World:
-    """A parallelogram of rods so far from lying flat, where its two motions meet, under way."""
+    """Builds a moving parallelogram at an angle [rad] from its flat position.
+
+    In the flat position, two branches of its motion meet.
+    """
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     up, rate = np.array([np.cos(angle), np.sin(angle)]), 2.0
     across = rate * np.array([-up[1], up[0]])
@@ -217,7 +234,7 @@ def flat(angle: float) -> World:
 
 
 def decades(low: int, high: int) -> tuple[float, ...]:
-    """10ˡ to 10ʰ."""
+    """Returns the powers of ten from 10ˡ to 10ʰ, where l is `low` and h is `high`."""
     return tuple(float(f"1e{i}") for i in range(low, high + 1))
 
 
@@ -240,14 +257,14 @@ FAMILIES = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one world.
+    """The result of one world.
 
     Attributes:
-        value: of the family's number.
-        status: its name, or "NaN" where the state itself is not finite, which must never be.
-        time: reached [s].
-        violation: the largest max |φ| seen, over the mechanism's size.
-        energy: the largest change of it seen, over its scale.
+        value: value of the family's varied parameter.
+        status: name of the status, or "NaN" for a non-finite final state, which must never occur.
+        time: time reached [s].
+        violation: largest recorded |φ|, relative to the mechanism's size.
+        energy: largest recorded energy error, relative to its scale.
     """
 
     value: float
@@ -258,19 +275,23 @@ class Outcome:
 
     @property
     def held(self) -> bool:
-        """Whether the world is healthy and close to what it should be."""
+        """True if the world is healthy with a small violation and a small energy error."""
         return self.status == "OK" and self.violation <= OFF and self.energy <= CHANGE
 
     @property
     def end(self) -> str:
-        """How it ended, in a word."""
+        """The kind of failure: a status, "φ" or "energy"."""
         if self.status != "OK":
             return self.status
         return "φ" if self.violation > OFF else "energy"
 
 
-def run(family: Family, method: jc.Method, dtype: Any) -> list[Outcome] | str:
-    """All values side by side, or why the method has no part in it."""
+def run(family: Family, method: jc.Method, dtype: DTypeLike) -> list[Outcome] | str:
+    """Runs all values of a family in batches.
+
+    Returns:
+        The outcome of each value, or the reason why the method does not apply.
+    """
     worlds = [family.build(value) for value in family.values]
     if family.adapt(method, 1.0) is None:
         return "—"
@@ -279,8 +300,8 @@ def run(family: Family, method: jc.Method, dtype: Any) -> list[Outcome] | str:
         outcomes = [_side_by_side(family, group, method, np.dtype(dtype)) for group in groups]
     except ValueError as error:
         return f"refused: {error}"
-    found = [x for group in outcomes for x in group]
-    return [Outcome(value, *x) for value, x in zip(family.values, found, strict=True)]
+    results = [x for group in outcomes for x in group]
+    return [Outcome(value, *x) for value, x in zip(family.values, results, strict=True)]
 
 
 def _side_by_side(
@@ -293,36 +314,36 @@ def _side_by_side(
     numbers = (jnp.asarray([getattr(w, x) for w in worlds], dtype) for x in ("dt", "number"))
     every = max(family.steps // FRAMES, 1)
 
-    def one(system: Any, state: Any, dt: Any, number: Any) -> Any:
-        own = family.adapt(method, number)
-        assert own is not None
-        start = jc.init(system, own, state.q, state.v)
+    def run_world(system: Any, state: jc.State, dt: Any, number: Any) -> Any:
+        adapted = family.adapt(method, number)
+        assert adapted is not None
+        start = jc.init(system, adapted, state.q, state.v)
 
-        def seen(state: jc.State, info: Any) -> tuple[Any, Any]:
+        def record(state: jc.State, info: Any) -> tuple[Any, Any]:
             return jc.violation(system, state).worst, jc.energy(system, state).total
 
-        final, (off, energy) = jc.rollout(
-            system, own, start, None, dt, family.steps, record=seen, every=every
+        final, (violation, energy) = jc.rollout(
+            system, adapted, start, None, dt, family.steps, record=record, every=every
         )
         change = jnp.max(jnp.abs(energy - jc.energy(system, start).total))
         finite = jnp.all(jnp.isfinite(final.q)) & jnp.all(jnp.isfinite(final.v))
-        return jnp.where(finite, final.status, -1), final.time, jnp.max(off), change
+        return jnp.where(finite, final.status, -1), final.time, jnp.max(violation), change
 
-    found = jax.device_get(jax.jit(jax.vmap(one))(systems, states, *numbers))
-    names = ["NaN" if code < 0 else jc.Status(int(code)).name for code in found[0]]
-    sizes = zip(worlds, *found[1:], strict=True)
+    results = jax.device_get(jax.jit(jax.vmap(run_world))(systems, states, *numbers))
+    names = ["NaN" if code < 0 else jc.Status(int(code)).name for code in results[0]]
+    sizes = zip(worlds, *results[1:], strict=True)
     return [
-        (name, float(t), float(off / w.size), float(change / w.energy))
-        for name, (w, t, off, change) in zip(names, sizes, strict=True)
+        (name, float(t), float(violation / w.size), float(change / w.energy))
+        for name, (w, t, violation, change) in zip(names, sizes, strict=True)
     ]
 
 
 def peer(family: Family, integrator: str) -> list[Outcome] | str:
-    """The same in MuJoCo, with one of its integrators."""
+    """Runs all values of a family in MuJoCo with one of its integrators."""
     import mujoco
 
-    mujoco.set_mju_user_warning(lambda _: None)  # or it writes a file
-    found = []
+    mujoco.set_mju_user_warning(lambda _: None)  # the default handler writes a log file
+    results = []
     for value in family.values:
         world = family.build(value)
         if world.text is None:
@@ -336,7 +357,7 @@ def peer(family: Family, integrator: str) -> list[Outcome] | str:
         if world.rates:
             data.qvel[:] = world.rates
         mujoco.mj_forward(model, data)
-        start, most, status = float(np.sum(data.energy)), 0.0, "OK"
+        start, largest, status = float(np.sum(data.energy)), 0.0, "OK"
         for _ in range(FRAMES):
             mujoco.mj_step(model, data, family.steps // FRAMES)
             mujoco.mj_forward(model, data)
@@ -344,17 +365,17 @@ def peer(family: Family, integrator: str) -> list[Outcome] | str:
             if not np.isfinite(change) or any(w.number for w in data.warning):
                 status = "NON_FINITE"
                 break
-            most = max(most, change)
-        found.append(Outcome(value, status, float(data.time), 0.0, most))
-    return found
+            largest = max(largest, change)
+        results.append(Outcome(value, status, float(data.time), 0.0, largest))
+    return results
 
 
-def summary(found: list[Outcome] | str) -> str:
-    """Which values are held, and how the others end."""
-    if isinstance(found, str):
-        return found.split(";")[0][:60]
+def summary(outcomes: list[Outcome] | str) -> str:
+    """Formats which values a method withstands, and how it fails at other values."""
+    if isinstance(outcomes, str):
+        return outcomes.split(";")[0][:60]
     runs: list[tuple[str, list[float]]] = []
-    for x in found:
+    for x in outcomes:
         word = "held" if x.held else x.end
         if runs and runs[-1][0] == word:
             runs[-1][1].append(x.value)
@@ -365,36 +386,36 @@ def summary(found: list[Outcome] | str) -> str:
 
 
 def main() -> None:
-    """Prints the table as it grows."""
+    """Prints the table of each family, with a row per method and precision."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), choices=list(FAMILIES))
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--dtypes", nargs="+", default=["float64", "float32"])
-    parser.add_argument("--peer", action="store_true", help="run MuJoCo in C, too")
+    parser.add_argument("--peer", action="store_true", help="also run MuJoCo in C")
     parser.add_argument("--json")
-    asked = parser.parse_args()
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     rows: list[dict[str, Any]] = []
-    for name in asked.families:
+    for name in options.families:
         family = FAMILIES[name]
         print(f"\n{family.what}, {family.steps} steps\n")
         print("| method | precision | outcome |\n|---|---|---|")
         trials: list[tuple[str, str, Callable[[], Any]]] = [
             (label, dtype, functools.partial(run, family, METHODS[label], dtype))
-            for dtype in asked.dtypes
-            for label in asked.methods
+            for dtype in options.dtypes
+            for label in options.methods
         ]
-        if asked.peer:
+        if options.peer:
             for integrator in ("EULER", "IMPLICITFAST", "RK4"):
                 job = functools.partial(peer, family, integrator)
                 trials.append((f"MuJoCo, {integrator}", "float64", job))
         for label, dtype, job in trials:
-            found = job()
-            print(f"| {label} | {dtype} | {summary(found)} |", flush=True)
-            numbers = found if isinstance(found, str) else [asdict(x) for x in found]
+            result = job()
+            print(f"| {label} | {dtype} | {summary(result)} |", flush=True)
+            numbers = result if isinstance(result, str) else [asdict(x) for x in result]
             rows.append({"family": name, "method": label, "dtype": dtype, "found": numbers})
-    if asked.json:
-        with open(asked.json, "w") as file:
+    if options.json:
+        with open(options.json, "w") as file:
             json.dump(rows, file, indent=1)
 
 

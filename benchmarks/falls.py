@@ -1,12 +1,12 @@
-"""What must come to rest, and what must stay up: a thousand drops, and a heavy column for a minute.
+"""Drops of a thousand walkers that must come to rest, and a heavy column that must stay up.
 
-    python -m benchmarks.falls [--walkers 1000] [--seconds 4] [--minute 60] [--dtype float32]
+    python -m benchmarks.falls [--walkers 1000] [--seconds 4] [--minute 60] [--dtypes float32]
         [--bounded GaussSeidel InteriorPoint]
 
-Gymnasium's walker starts a metre above its reference height, its hinges anywhere in their ranges,
-its trunk turned by up to half a turn either way and all joints moving, and falls without control at
-2 ms. The column is that of `benchmarks.bounded`: ten guided blocks, the topmost a thousand times
-heavier, at 5 ms.
+Gymnasium's walker starts 1 m above its reference height. Its hinge angles are random within their
+ranges, its trunk is rotated by up to half a turn either way and all joints move. It falls without
+control at a step size of 2 ms. The column is that of `benchmarks.bounded` at 5 ms: ten guided
+blocks, with a block of thousandfold mass on top.
 """
 
 from __future__ import annotations
@@ -23,22 +23,23 @@ from benchmarks import bounded, legged
 from benchmarks.mjcf import DT
 
 HEIGHT, BLOCK, SLOW = 1.0, 125, 5e-3
-"""Of the drop [m]; worlds at a time; step of the column [s]."""
+"""Height of the drop [m], walkers per batch, and step size of the column [s]."""
 SPEED = 1.0
-"""Standard deviation of the velocities of joints at the start [m/s, rad/s]."""
+"""Standard deviation of the initial joint velocities [m/s, rad/s]."""
 
 
 QUANTILES = (0.5, 0.9, 0.99, 1)
-"""Of the speeds at the end."""
+"""Quantiles of the final speeds."""
 
 
 class Fallen(NamedTuple):
-    """What became of the walkers.
+    """Result of the walkers.
 
     Attributes:
-        failed, worlds: how many failed, and of how many.
-        speeds: of those that did not, the largest of each, by `QUANTILES` [m/s, rad/s].
-        depth: the worst of them.
+        failed: number of worlds that failed.
+        worlds: number of worlds.
+        speeds: `QUANTILES` over the healthy worlds of the largest final joint speed [m/s, rad/s].
+        depth: the deepest final penetration of the healthy worlds.
     """
 
     failed: int
@@ -47,24 +48,24 @@ class Fallen(NamedTuple):
     depth: legged.Depth
 
     def __str__(self) -> str:
-        """The cells of a row."""
-        shown = ", ".join(f"{speed:.1e}" for speed in self.speeds)
-        return f"{self.failed} of {self.worlds} | {shown} | {legged.deep(self.depth)}"
+        """Formats the cells of a table row."""
+        speeds = ", ".join(f"{speed:.1e}" for speed in self.speeds)
+        return f"{self.failed} of {self.worlds} | {speeds} | {legged.deep(self.depth)}"
 
 
 class Stood(NamedTuple):
-    """By how much a block of the column has moved [m], and the status of the world."""
+    """Result of the column: largest displacement of a block [m], and status of the world."""
 
     moved: float
     status: int
 
     def __str__(self) -> str:
-        """The cell of a row."""
+        """Formats the cell of a table row."""
         return f"{self.moved:.1e} m, status {self.status}"
 
 
 def poses(model: Any, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """qpos and qvel at the start, (count, …)."""
+    """Draws random initial qpos and qvel of walkers, (count, …) each."""
     random, qpos = np.random.default_rng(seed), np.tile(model.qpos0, (count, 1))
     qpos[:, 1] += HEIGHT
     qpos[:, 2] += random.uniform(-np.pi, np.pi, count)
@@ -75,22 +76,25 @@ def poses(model: Any, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray
 
 
 def drop(how: str, dtype: str, count: int, seconds: float) -> Fallen:
-    """How many worlds fail, and how fast and how deep those that do not end."""
+    """Drops walkers and counts failures.
+
+    Final speeds and penetrations are those of the healthy worlds.
+    """
     model = legged.load("walker2d")
-    read = jc.from_mjcf(model, dtype=jnp.dtype(dtype))
-    method = jc.Method(solver=jc.Sparse(), bounded=legged.BOUNDED[how])
+    walker = jc.from_mjcf(model, dtype=jnp.dtype(dtype))
+    method = jc.Method(solver=jc.solvers.Sparse(), contact_solver=legged.BOUNDED[how])
     qpos, qvel = (jnp.asarray(x, dtype) for x in poses(model, count))
 
     def idle(state: jc.State) -> jax.Array:
-        return jnp.zeros(read.system.layout.n_u, state.q.dtype)
+        return jnp.zeros(walker.system.layout.n_u, state.q.dtype)
 
     def fall(place: jax.Array, speed: jax.Array) -> tuple[Any, Any, Any]:
-        state = read.state(place, speed)
-        turns = state.turns if read.system.counted else None
-        state = jc.init(read.system, method, state.q, state.v, turns=turns)
+        state = walker.state(place, speed)
+        turns = state.turns if walker.system.counted else None
+        state = jc.init(walker.system, method, state.q, state.v, turns=turns)
         steps = int(seconds / DT)
-        final, _ = jc.rollout(read.system, method, state, idle, DT, steps, every=steps)
-        return final.status, read.qpos(final), read.qvel(final)
+        final, _ = jc.rollout(walker.system, method, state, idle, DT, steps, every=steps)
+        return final.status, walker.qpos(final), walker.qvel(final)
 
     run, ends = jax.jit(jax.vmap(fall)), []
     for i in range(0, count, BLOCK):
@@ -103,9 +107,9 @@ def drop(how: str, dtype: str, count: int, seconds: float) -> Fallen:
 
 
 def stand(how: str, dtype: str, seconds: float) -> Stood:
-    """How far a block of the column is from its place at the end [m]."""
+    """Simulates the column and measures the largest displacement of its blocks [m]."""
     system, state = bounded.column(jnp.dtype(dtype))
-    method = jc.Method(bounded=legged.BOUNDED[how])
+    method = jc.Method(contact_solver=legged.BOUNDED[how])
     start = jc.init(system, method, state.q, state.v)
     steps = int(seconds / SLOW)
     dt = jnp.asarray(SLOW, dtype)
@@ -116,21 +120,24 @@ def stand(how: str, dtype: str, seconds: float) -> Stood:
 
 
 def main() -> None:
-    """Prints both tables."""
+    """Prints the tables of the column and of the walkers."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--walkers", type=int, default=1000)
-    parser.add_argument("--seconds", type=float, default=4.0, help="of a fall")
-    parser.add_argument("--minute", type=float, default=60.0, help="seconds of the column")
+    parser.add_argument("--seconds", type=float, default=4.0, help="duration of a fall [s]")
+    parser.add_argument("--minute", type=float, default=60.0, help="duration of the column [s]")
     parser.add_argument("--dtypes", nargs="*", default=["float32", "float64"])
     parser.add_argument("--bounded", nargs="*", default=["GaussSeidel", "InteriorPoint"])
-    given = parser.parse_args()
-    jax.config.update("jax_enable_x64", "float64" in given.dtypes)
-    for dtype in given.dtypes:
-        for how in given.bounded if given.minute else ():
-            print(f"| column | {dtype} | {how} | {stand(how, dtype, given.minute)} |", flush=True)
-    for how in given.bounded if given.walkers else ():
-        print(f"| walkers | float32 | {how} |", end=" ", flush=True)
-        print(drop(how, "float32", given.walkers, given.seconds), "|", flush=True)
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", "float64" in options.dtypes)
+    for dtype in options.dtypes:
+        for solver in options.bounded if options.minute else ():
+            print(
+                f"| column | {dtype} | {solver} | {stand(solver, dtype, options.minute)} |",
+                flush=True,
+            )
+    for solver in options.bounded if options.walkers else ():
+        print(f"| walkers | float32 | {solver} |", end=" ", flush=True)
+        print(drop(solver, "float32", options.walkers, options.seconds), "|", flush=True)
 
 
 if __name__ == "__main__":

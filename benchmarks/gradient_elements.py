@@ -1,8 +1,8 @@
-"""Two bodies under each kind of element, placed so that singular spots are met exactly.
+"""Pairs of bodies with each kind of element, placed so that singular configurations occur exactly.
 
-At assembly both bodies are unturned and at rest, one metre apart along x, and every constraint
-holds. Second points are the first moved along with the bodies: where these are put onto each other,
-so are the points, and what has a length has none.
+At assembly both bodies are unrotated and at rest, 1 m apart along x, and every constraint holds.
+An element's point on the second body is its point on the first body, shifted by 1 m. If the bodies
+are moved onto each other, the two points coincide and lengths become zero.
 """
 
 from __future__ import annotations
@@ -20,51 +20,54 @@ PAIR = ("a", "b")
 
 
 def along(dim: int, i: int) -> np.ndarray:
-    """An axis of the world; the last one is the normal of the plane in space."""
+    """Returns the i-th world axis. In space, the last axis is normal to the plane."""
     return np.eye(dim)[i]
 
 
 def hinge(dim: int, name: str = "joint", a: str = "a", b: str = "b", x: float = 0.5) -> Any:
-    """About z, at a place on the x axis."""
+    """Returns a revolute joint about z between two bodies, at a point on the x axis."""
     axis = None if dim == 2 else along(3, 2)
     return jc.Revolute(name, a, b, point=x * along(dim, 0), axis=axis)
 
 
 def slide(dim: int, name: str = "joint", a: str = "a", b: str = "b") -> Any:
-    """Along x."""
+    """Returns a prismatic joint along x between two bodies."""
     return jc.Prismatic(name, a, b, axis=along(dim, 0), point=0.5 * along(dim, 0))
 
 
 def ends(dim: int) -> dict[str, Any]:
-    """A point of a, and that of b onto which it comes where the bodies do."""
+    """Returns attachment points on the bodies a and b that coincide if the bodies do."""
     point = 0.3 * along(dim, 1)
     return {"point_a": point, "point_b": point + along(dim, 0)}
 
 
 def wave(t: Any, p: Any) -> Any:
-    """What a drive follows, from rest."""
+    """Returns the target of a drive, which starts at rest."""
     return p["size"] * (1 - jnp.cos(p["frequency"] * t))
 
 
 def parabola(x: Any, p: Any) -> Any:
-    """A curve through the middle."""
+    """Returns the residuals of a point on a parabola, which passes through the point `start`."""
     y = x - p["start"]
     return jnp.stack([y[1] + p["curvature"] * y[0] ** 2, *y[2:]])
 
 
 def apart(a: Any, b: Any, t: Any, p: Any) -> Any:
-    """The square of a distance, one metre at assembly."""
+    """Returns the deviation of the squared distance from its value at assembly, 1 m²."""
     gap = b.position - a.position
     return jnp.stack([gap @ gap - p["square"]])
 
 
 def skate(a: Any, b: Any, t: Any, p: Any) -> Any:
-    """A point of b does not move across a direction of a."""
+    """Returns the sideways velocity of a point of body b along a direction of body a, (1,) [m/s].
+
+    The constraint requires that it is zero.
+    """
     return jnp.stack([a.direction(p["edge"]) @ (b.point_velocity(p["anchor"]) - a.velocity)])
 
 
 def pull(a: Any, b: Any, t: Any, u: Any, p: Any) -> Any:
-    """Wrenches of one's own, by the square of a distance."""
+    """Returns custom wrenches on both bodies that depend on their squared distance."""
     gap = b.position - a.position
     force = p["stiffness"] * gap * (gap @ gap - 1)
     wrench = jnp.concatenate([force, jnp.zeros(1 if len(gap) == 2 else 3, gap.dtype)])
@@ -72,36 +75,39 @@ def pull(a: Any, b: Any, t: Any, u: Any, p: Any) -> Any:
 
 
 def hills(dim: int) -> np.ndarray:
-    """Heights of a ground that passes below the second body."""
+    """Returns the heights of a terrain that passes below the second body."""
     x = 0.1 * np.cos(np.linspace(-4.0, 4.0, 12))
     return x - 0.3 if dim == 2 else np.add.outer(x, x) - 0.4
 
 
 def spans(dim: int) -> Made:
-    """Two spans, one of them without length where the bodies meet."""
+    """Returns two spans between the bodies. The first has zero length if the bodies coincide."""
     near, far = ends(dim), ends(dim)
     far["point_b"] = far["point_b"] + 0.4 * along(dim, 1)
-    return [jc.Span("first", *PAIR, **near), jc.Span("second", *PAIR, **far)]
+    return [jc.joints.Span("first", *PAIR, **near), jc.joints.Span("second", *PAIR, **far)]
 
 
 def twisted(dim: int) -> Made:
-    """A ball joint whose turns about x are read."""
+    """Returns a ball joint, and a twist angle of it about x."""
     ball = jc.Spherical("joint", *PAIR, point=0.5 * along(dim, 0))
-    return [ball, jc.Twist("twist", *PAIR, axis=along(dim, 0))]
+    return [ball, jc.joints.Twist("twist", *PAIR, axis=along(dim, 0))]
 
 
 def two_hinges(dim: int) -> Made:
-    """One of a on the world, one between the bodies."""
+    """Returns a hinge between the world and body a, and a hinge between the bodies."""
     return [hinge(dim, "first", jc.WORLD, "a", 0.0), hinge(dim, "second")]
 
 
 def slider(dim: int) -> Made:
-    """A hinge of a on the world, and b slides along a."""
+    """Returns a hinge between the world and body a, and a slider of b along a."""
     return [hinge(dim, "first", jc.WORLD, "a", 0.0), slide(dim, "second")]
 
 
 JOINTS: dict[str, tuple[tuple[int, ...], Callable[[int], Made]]] = {
-    "coincident": ((2, 3), lambda n: [jc.Coincident("joint", *PAIR, point=0.5 * along(n, 0))]),
+    "coincident": (
+        (2, 3),
+        lambda n: [jc.joints.Coincident("joint", *PAIR, point=0.5 * along(n, 0))],
+    ),
     "spherical": ((3,), lambda n: [jc.Spherical("joint", *PAIR, point=0.5 * along(n, 0))]),
     "distance": ((2, 3), lambda n: [jc.Distance("joint", *PAIR, **ends(n))]),
     "revolute": ((2, 3), lambda n: [hinge(n)]),
@@ -109,88 +115,110 @@ JOINTS: dict[str, tuple[tuple[int, ...], Callable[[int], Made]]] = {
     "fixed": ((2, 3), lambda n: [jc.Fixed("joint", *PAIR, point=0.5 * along(n, 0))]),
     "universal": (
         (3,),
-        lambda n: [jc.Universal("joint", *PAIR, 0.5 * along(n, 0), along(n, 1), along(n, 2))],
+        lambda n: [
+            jc.joints.Universal("joint", *PAIR, 0.5 * along(n, 0), along(n, 1), along(n, 2))
+        ],
     ),
-    "cylindrical": ((3,), lambda n: [jc.Cylindrical("joint", *PAIR, axis=along(n, 0))]),
-    "screw": ((3,), lambda n: [jc.Screw("joint", *PAIR, axis=along(n, 0), lead=0.7)]),
-    "planar": ((3,), lambda n: [jc.Planar("joint", *PAIR, axis=along(n, 2))]),
-    "parallel": ((3,), lambda n: [jc.Parallel("joint", *PAIR, axis=along(n, 2))]),
+    "cylindrical": ((3,), lambda n: [jc.joints.Cylindrical("joint", *PAIR, axis=along(n, 0))]),
+    "screw": ((3,), lambda n: [jc.joints.Screw("joint", *PAIR, axis=along(n, 0), lead=0.7)]),
+    "planar": ((3,), lambda n: [jc.joints.Planar("joint", *PAIR, axis=along(n, 2))]),
+    "parallel": ((3,), lambda n: [jc.joints.Parallel("joint", *PAIR, axis=along(n, 2))]),
     "constant velocity": (
         (3,),
         lambda n: [
-            jc.ConstantVelocity(
+            jc.joints.ConstantVelocity(
                 "joint", *PAIR, 0.5 * along(n, 0), along(n, 0), along(n, 0) + 0.5 * along(n, 1)
             )
         ],
     ),
-    "point on line": ((2, 3), lambda n: [jc.PointOnLine("joint", *PAIR, axis=along(n, 0))]),
-    "point on plane": ((2, 3), lambda n: [jc.PointOnPlane("joint", *PAIR, axis=along(n, 1))]),
+    "point on line": ((2, 3), lambda n: [jc.joints.PointOnLine("joint", *PAIR, axis=along(n, 0))]),
+    "point on plane": (
+        (2, 3),
+        lambda n: [jc.joints.PointOnPlane("joint", *PAIR, axis=along(n, 1))],
+    ),
     "point on curve": (
         (2, 3),
         lambda n: [
-            jc.PointOnCurve(
+            jc.joints.PointOnCurve(
                 "joint", *PAIR, parabola, params={"start": along(n, 0), "curvature": 0.7}
             )
         ],
     ),
-    "spherical-spherical": ((3,), lambda n: [jc.SphericalSpherical("joint", *PAIR, **ends(n))]),
+    "spherical-spherical": (
+        (3,),
+        lambda n: [jc.joints.SphericalSpherical("joint", *PAIR, **ends(n))],
+    ),
     "revolute-spherical": (
         (3,),
         lambda n: [
-            jc.RevoluteSpherical("joint", *PAIR, np.zeros(3), along(n, 0), axis=along(n, 1))
+            jc.joints.RevoluteSpherical("joint", *PAIR, np.zeros(3), along(n, 0), axis=along(n, 1))
         ],
     ),
     "compound": (
         (3,),
         lambda n: [
-            jc.Compound("joint", *PAIR, slides=(along(n, 0),), hinges=(along(n, 1), along(n, 2)))
+            jc.joints.Compound(
+                "joint", *PAIR, slides=(along(n, 0),), hinges=(along(n, 1), along(n, 2))
+            )
         ],
     ),
-    "gimbal": ((3,), lambda n: [jc.Compound("joint", *PAIR, hinges=tuple(np.eye(3)))]),
+    "gimbal": ((3,), lambda n: [jc.joints.Compound("joint", *PAIR, hinges=tuple(np.eye(3)))]),
     "drive of a hinge": (
         (2, 3),
-        lambda n: [hinge(n), jc.Drive("law", "joint", wave, {"size": 0.4, "frequency": 3.0})],
+        lambda n: [
+            hinge(n),
+            jc.joints.Drive("law", "joint", wave, {"size": 0.4, "frequency": 3.0}),
+        ],
     ),
     "drive of a slide": (
         (2, 3),
-        lambda n: [slide(n), jc.Drive("law", "joint", wave, {"size": 0.4, "frequency": 3.0})],
+        lambda n: [
+            slide(n),
+            jc.joints.Drive("law", "joint", wave, {"size": 0.4, "frequency": 3.0}),
+        ],
     ),
-    "rotor": ((2, 3), lambda n: [hinge(n), jc.Armature("law", "joint", inertia=0.3)]),
-    "gear": ((2, 3), lambda n: [*two_hinges(n), jc.Gear("law", "first", "second", ratio=-2.0)]),
+    "rotor": ((2, 3), lambda n: [hinge(n), jc.joints.Armature("law", "joint", inertia=0.3)]),
+    "gear": (
+        (2, 3),
+        lambda n: [*two_hinges(n), jc.joints.Gear("law", "first", "second", ratio=-2.0)],
+    ),
     "rack": (
         (2, 3),
-        lambda n: [*slider(n), jc.RackAndPinion("law", "first", "second", radius=0.3)],
+        lambda n: [*slider(n), jc.joints.RackAndPinion("law", "first", "second", radius=0.3)],
     ),
     "cam": (
         (2, 3),
         lambda n: [
             *slider(n),
-            jc.PolynomialCoupling("law", "first", "second", (0.0, 0.3, -0.2, 0.1)),
+            jc.joints.PolynomialCoupling("law", "first", "second", (0.0, 0.3, -0.2, 0.1)),
         ],
     ),
-    "pulley": ((2, 3), lambda n: [*spans(n), jc.Pulley("joint", "first", "second", parts=2.0)]),
-    "rolling sphere": ((3,), lambda n: [jc.RollingSphere("joint", *PAIR, radius=0.4)]),
+    "pulley": (
+        (2, 3),
+        lambda n: [*spans(n), jc.joints.Pulley("joint", "first", "second", parts=2.0)],
+    ),
+    "rolling sphere": ((3,), lambda n: [jc.joints.RollingSphere("joint", *PAIR, radius=0.4)]),
     "rolling cylinder": (
         (3,),
-        lambda n: [jc.RollingCylinder("joint", *PAIR, radius=0.4, axis=along(n, 1))],
+        lambda n: [jc.joints.RollingCylinder("joint", *PAIR, radius=0.4, axis=along(n, 1))],
     ),
     "rolling disc": (
         (2, 3),
         lambda n: [
-            jc.RollingDisc("joint", *PAIR, radius=0.4, axis=None if n == 2 else along(n, 1))
+            jc.joints.RollingDisc("joint", *PAIR, radius=0.4, axis=None if n == 2 else along(n, 1))
         ],
     ),
-    "knife edge": ((2, 3), lambda n: [jc.KnifeEdge("joint", *PAIR, edge=along(n, 0))]),
-    "angular momentum": ((2, 3), lambda n: [jc.AngularMomentum("joint", PAIR)]),
-    "linear momentum": ((2, 3), lambda n: [jc.LinearMomentum("joint", PAIR)]),
+    "knife edge": ((2, 3), lambda n: [jc.joints.KnifeEdge("joint", *PAIR, edge=along(n, 0))]),
+    "angular momentum": ((2, 3), lambda n: [jc.joints.AngularMomentum("joint", PAIR)]),
+    "linear momentum": ((2, 3), lambda n: [jc.joints.LinearMomentum("joint", PAIR)]),
     "holonomic": (
         (2, 3),
-        lambda n: [jc.Holonomic(apart, PAIR, name="joint", params={"square": 1.0})],
+        lambda n: [jc.joints.Holonomic(apart, PAIR, name="joint", params={"square": 1.0})],
     ),
     "velocity level": (
         (2, 3),
         lambda n: [
-            jc.VelocityLevel(
+            jc.joints.VelocityLevel(
                 skate, PAIR, name="joint", params={"anchor": along(n, 0), "edge": along(n, 1)}
             )
         ],
@@ -210,25 +238,28 @@ FORCES: dict[str, tuple[tuple[int, ...], Callable[[int], Made]]] = {
         (2, 3),
         lambda n: [
             hinge(n),
-            jc.JointSpring("spring", "joint", 3.0, 0.2),
-            jc.PositionServo("servo", "joint", 5.0, 0.5),
-            jc.VelocityServo("speed", "joint", 0.3),
+            jc.forces.JointSpring("spring", "joint", 3.0, 0.2),
+            jc.forces.PositionServo("servo", "joint", 5.0, 0.5),
+            jc.forces.VelocityServo("speed", "joint", 0.3),
             jc.Motor("motor", "joint", gear=2.0),
         ],
     ),
-    "twist": ((3,), lambda n: [*twisted(n), jc.JointSpring("law", "twist", 3.0, 0.2)]),
+    "twist": ((3,), lambda n: [*twisted(n), jc.forces.JointSpring("law", "twist", 3.0, 0.2)]),
     "bending": (
         (2, 3),
-        lambda n: [jc.Bending("joint", jc.WORLD, *PAIR, 2.0, point_a=-along(n, 0))],
+        lambda n: [jc.forces.Bending("joint", jc.WORLD, *PAIR, 2.0, point_a=-along(n, 0))],
     ),
     "flexure": (
         (2, 3),
-        lambda n: [jc.Flexure("joint", *PAIR, bending=2.0, twisting=0.0 if n == 2 else 1.0)],
+        lambda n: [jc.forces.Flexure("joint", *PAIR, bending=2.0, twisting=0.0 if n == 2 else 1.0)],
     ),
-    "force": ((2, 3), lambda n: [jc.Force("joint", "b", force=along(n, 1), point=np.zeros(n))]),
+    "force": (
+        (2, 3),
+        lambda n: [jc.forces.Force("joint", "b", force=along(n, 1), point=np.zeros(n))],
+    ),
     "force of one's own": (
         (2, 3),
-        lambda n: [jc.CustomForce("joint", PAIR, pull, params={"stiffness": 2.0})],
+        lambda n: [jc.forces.CustomForce("joint", PAIR, pull, params={"stiffness": 2.0})],
     ),
 }
 
@@ -239,10 +270,10 @@ ENDS: dict[str, tuple[tuple[int, ...], Callable[[int], Made]]] = {
         (2, 3),
         lambda n: [slide(n), jc.Limit("law", "joint", -0.1, 0.2, stiffness=100.0, damping=2.0)],
     ),
-    "dry friction": ((2, 3), lambda n: [hinge(n), jc.JointFriction("law", "joint", 0.5)]),
-    "rate motor": ((2, 3), lambda n: [hinge(n), jc.RateMotor("law", "joint", 0.5)]),
-    "rate limit": ((2, 3), lambda n: [hinge(n), jc.RateLimit("law", "joint", 0.5)]),
-    "slack rope": ((2, 3), lambda n: [jc.Rope("joint", *PAIR, **ends(n))]),
+    "dry friction": ((2, 3), lambda n: [hinge(n), jc.contacts.JointFriction("law", "joint", 0.5)]),
+    "rate motor": ((2, 3), lambda n: [hinge(n), jc.contacts.RateMotor("law", "joint", 0.5)]),
+    "rate limit": ((2, 3), lambda n: [hinge(n), jc.contacts.RateLimit("law", "joint", 0.5)]),
+    "slack rope": ((2, 3), lambda n: [jc.contacts.Rope("joint", *PAIR, **ends(n))]),
     "ball on a plane": (
         (2, 3),
         lambda n: [
@@ -260,17 +291,19 @@ ENDS: dict[str, tuple[tuple[int, ...], Callable[[int], Made]]] = {
     "box on a plane": (
         (2, 3),
         lambda n: [
-            jc.BoxContact("law", jc.WORLD, "b", np.full(n, 0.4), point=-0.2 * along(n, -1), **TOUCH)
+            jc.contacts.BoxContact(
+                "law", jc.WORLD, "b", np.full(n, 0.4), point=-0.2 * along(n, -1), **TOUCH
+            )
         ],
     ),
     "two balls": (
         (2, 3),
-        lambda n: [jc.CapsuleContact("law", *PAIR, radius_a=0.5, radius_b=0.5, **TOUCH)],
+        lambda n: [jc.contacts.CapsuleContact("law", *PAIR, radius_a=0.5, radius_b=0.5, **TOUCH)],
     ),
     "two capsules": (
         (2, 3),
         lambda n: [
-            jc.CapsuleContact(
+            jc.contacts.CapsuleContact(
                 "law",
                 *PAIR,
                 radius_a=0.5,
@@ -284,14 +317,14 @@ ENDS: dict[str, tuple[tuple[int, ...], Callable[[int], Made]]] = {
     "ball on hills": (
         (2, 3),
         lambda n: [
-            jc.HeightFieldContact(
+            jc.contacts.HeightFieldContact(
                 "law", jc.WORLD, "b", hills(n), 4.0 if n == 2 else (4.0, 4.0), radius=0.2, **TOUCH
             )
         ],
     ),
     "inequality": (
         (2, 3),
-        lambda n: [jc.Inequality(apart, PAIR, name="law", params={"square": 1.0})],
+        lambda n: [jc.contacts.Inequality(apart, PAIR, name="law", params={"square": 1.0})],
     ),
 }
 

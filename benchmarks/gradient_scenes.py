@@ -1,4 +1,4 @@
-"""Scenes in which derivatives meet singular spots: elements between two bodies, and mechanisms."""
+"""Scenes with singular configurations, for tests of derivatives: pairs of bodies and mechanisms."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from benchmarks.gradient_elements import ELEMENTS, PAIR, Made, along, hinge
 
 
 def pair(dim: int, make: Callable[[int], Made]) -> Any:
-    """Two bodies and the elements between them."""
+    """Builds a scene of two bodies with elements between them."""
     scene = jc.Scene(dim=dim)
     for i, name in enumerate(PAIR):
         add(scene, name, i * along(dim, 0))
@@ -22,13 +22,13 @@ def pair(dim: int, make: Callable[[int], Made]) -> Any:
 
 
 def add(scene: jc.Scene, name: str, position: np.ndarray) -> None:
-    """A body at rest, unturned."""
+    """Adds a body at rest, without rotation."""
     inertia = 0.8 if scene.dim == 2 else (0.8, 1.1, 1.5)
     scene.add_body(name, mass=1.0, inertia=inertia, position=position)
 
 
 def chain(dim: int) -> Any:
-    """Three links in a straight line, the first on the world."""
+    """Builds three links in a straight line, the first hinged to the world."""
     scene = jc.Scene(dim=dim)
     for i, name in enumerate("abc"):
         add(scene, name, (i + 0.5) * along(dim, 0))
@@ -39,7 +39,7 @@ def chain(dim: int) -> Any:
 
 
 def rope(dim: int) -> Any:
-    """Four particles in a straight line."""
+    """Builds a rope of four particles in a straight line, fixed to the world."""
     scene = jc.Scene(dim=dim)
     for i, name in enumerate("abcd"):
         scene.add_particle(name, mass=0.5, position=(i + 1.0) * along(dim, 0))
@@ -49,7 +49,7 @@ def rope(dim: int) -> Any:
 
 
 def folded(dim: int) -> Any:
-    """A parallelogram in the position in which all its bars lie on one line, and may part ways."""
+    """Builds a parallelogram with all bars in one line, where two branches of its motion meet."""
     scene = jc.Scene(dim=dim)
     places = {"a": 0.5, "b": 2.0, "c": 3.5}
     for name, x in places.items():
@@ -61,7 +61,7 @@ def folded(dim: int) -> Any:
 
 
 def door(dim: int) -> Any:
-    """A body on two hinges with one axis, the second of which says nothing new."""
+    """Builds a body on two hinges with one common axis; the second hinge is redundant."""
     scene = jc.Scene(dim=dim)
     add(scene, "a", 0.5 * along(dim, 0))
     for i, name in enumerate(("joint", "joint1")):
@@ -80,11 +80,11 @@ MECHANISMS: dict[str, tuple[tuple[int, ...], Callable[[int], Any]]] = {
 
 
 def build(name: str, dim: int) -> Any:
-    """A scene of this name: (system, state) in float64."""
+    """Builds a scene by name: (system, state) in float64."""
     if name in MECHANISMS:
         return MECHANISMS[name][1](dim)
     return pair(dim, ELEMENTS[name][1])
 
 
 SCENES = tuple((name, dim) for name, (dims, _) in (ELEMENTS | MECHANISMS).items() for dim in dims)
-"""Names and dimensions."""
+"""Scene names with their dimensions."""

@@ -1,18 +1,22 @@
-"""Derivatives in very many states, a part of them exactly at singular spots.
+"""Derivatives over very many states, some of them exactly at singular configurations.
 
     python -m benchmarks.gradient_states [--states 100000] [--scenes distance spring …] [--product]
 
-Each kind of joint, coupling, force, stop and contact between two bodies, in the plane and in space,
-and straight and folded mechanisms, under stabilisers in turn (under all of them with `--product`),
-in both precisions: the derivative of three steps by positions, velocities, masses and the numbers
-of the element, forward and reverse. Counted are derivatives that are not finite; compared are
-forward with reverse mode, and in float64 some states with central differences extrapolated to a
-step of zero.
+Scenes have each kind of joint, coupling, force, joint limit and contact between two bodies, in the
+plane and in space. Other scenes are straight and folded mechanisms. The stabilizers take turns over
+the scenes; with `--product`, each scene runs with all of them. Both precisions are used.
 
-States are random by 1e-6 to 1 m and rad from assembly and 1e-6 to 10 m/s and rad/s; at assembly,
-where bodies are unturned, chains straight and constraints exactly met, at rest or moving; with all
-bodies in one place, where what has a length has none, at rest or moving; and near to that, by
-1e-12 to 1e-2 m, not nearer.
+The result of three steps is differentiated with respect to positions, velocities, masses and the
+parameters of the element, in forward and reverse mode. The study counts non-finite derivatives and
+compares both modes. In float64, some states are compared with central differences extrapolated to
+zero step.
+
+States are of four kinds:
+
+- random, 1e-6 to 1 m and rad from assembly, with 1e-6 to 10 m/s and rad/s,
+- at assembly, at rest or moving: bodies unrotated, chains straight, constraints exact,
+- all bodies at one point, so that lengths are zero, at rest or moving,
+- all bodies 1e-12 to 1e-2 m from one point.
 """
 
 from __future__ import annotations
@@ -44,30 +48,34 @@ KINDS = {
     "in one place, moving": 0.08,
     "almost in one place": 0.08,
 }
-"""Shares of the states."""
+"""Kinds of states with their shares."""
 SMOOTH = ("random", "at rest", "moving")
-"""States at which a length has a derivative."""
+"""Kinds of states at which a length is differentiable."""
 OFF_ENDS = ("random",)
-"""Those of what has an end, at which assembly leaves it: the sides of that have two derivatives."""
+"""Kinds of states at which contacts and joint limits (`ENDS`) are differentiable.
+
+At assembly, their one-sided derivatives differ.
+"""
 APART = {"float64": 1e-8, "float32": 1e-2}
-"""By what the modes may differ, relative to the largest part of the derivative."""
+"""Bound on the difference of both modes, relative to the largest part of the derivative."""
 OFF = 1e-6
-"""By what differences may."""
+"""Bound on the difference from finite differences, relative to that largest part."""
 LEVELS = 8
 METHODS = {name: jc.Method(stabilizer=x) for name, x in STABILIZERS.items()} | {
-    "RATTLE": jc.Method(jc.RATTLE()),
-    "generalized-α": jc.Method(jc.GeneralizedAlpha(), jc.Unstabilized()),
+    "RATTLE": jc.Method(jc.integrators.RATTLE()),
+    "generalized-α": jc.Method(jc.integrators.GeneralizedAlpha(), jc.stabilizers.Unstabilized()),
 }
 IN_ROUNDS = ("multipliers", "hybrid")
-"""Methods that solve several times a step, for which bounded rows have no place."""
+"""Methods that solve several times per step; they do not support inequality constraints."""
 
 
 @dataclass(frozen=True)
 class States:
-    """Starts, a row for each.
+    """Initial states, one per row.
 
     Attributes:
-        q, v: positions and velocities, (n, n_q) and (n, n_v).
+        q: positions, (n, n_q).
+        v: velocities, (n, n_v).
         kinds: indices into `KINDS`, (n,).
     """
 
@@ -77,24 +85,24 @@ class States:
 
 
 def drawn(subject: Subject, n: int, seed: int = 0) -> States:
-    """So many states of all kinds."""
+    """Draws `n` states of all kinds."""
     random, state = np.random.default_rng(seed), subject.state
     kinds = random.choice(len(KINDS), size=n, p=list(KINDS.values()))
     names = np.array(list(KINDS))[kinds]
     place = 10.0 ** random.uniform(-6, 0, (n, 1)) * random.normal(size=(n, len(state.v)))
     speed = 10.0 ** random.uniform(-6, 1, (n, 1)) * random.normal(size=(n, len(state.v)))
     near = 10.0 ** random.uniform(-12, -2, (n, 1)) * random.normal(size=(n, len(state.v)))
-    one = np.char.find(names, "one place") >= 0
+    coincident = np.char.find(names, "one place") >= 0
     move = np.where((names == "random")[:, None], place, 0)
     move = np.where((names == "almost in one place")[:, None], near, move)
-    start = np.where(one[:, None], together(subject), np.asarray(state.q))
+    start = np.where(coincident[:, None], together(subject), np.asarray(state.q))
     q = jax.jit(jax.vmap(subject.system.retract))(jnp.asarray(start), jnp.asarray(move))
     rest = np.char.endswith(names, "at rest")
     return States(np.asarray(q), np.where(rest[:, None], 0, speed), kinds)
 
 
 def together(subject: Subject) -> np.ndarray:
-    """Positions with all bodies in the place of the first, unturned."""
+    """Returns positions with all bodies at the position of the first body, unrotated."""
     layout, q = subject.system.layout, np.array(subject.state.q)
     first = q[layout.q(layout.bodies[0])[: layout.dim]].copy()
     for name in layout.bodies:
@@ -103,7 +111,7 @@ def together(subject: Subject) -> np.ndarray:
 
 
 def subject_of(name: str, dim: int) -> Subject:
-    """A scene, differentiated by the mass of a body and all real numbers of its elements."""
+    """Builds a scene, to be differentiated by one body's mass and all real element parameters."""
     system, state = build(name, dim)
     parameters = [(body, "mass") for body in system.layout.bodies[-1:]]
     for element, fields in system.params.items():
@@ -114,79 +122,91 @@ def subject_of(name: str, dim: int) -> Subject:
 
 
 def searched(x: Any) -> bool:
-    """Whether all of a field are finite real numbers."""
+    """Returns True if all entries of a parameter are finite real numbers."""
     leaves = jax.tree.leaves(x)
     real = all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves)
     return bool(leaves) and real and all(np.all(np.isfinite(leaf)) for leaf in leaves)
 
 
 def direction(subject: Subject, seed: int = 1) -> dict[str, Any]:
-    """A way along which everything moves by about its size; what is zero stays, as friction may."""
+    """Draws a random direction for all variables, scaled with the size of each.
+
+    Zeros, such as no friction, stay zero.
+    """
     random = np.random.default_rng(seed)
 
-    def one(x: jax.Array) -> jax.Array:
+    def random_move(x: jax.Array) -> jax.Array:
         size = jnp.max(jnp.abs(x), initial=0)
         return size * jnp.asarray(random.normal(size=x.shape), x.dtype)
 
     x = subject.numbers()
     moves = {name: jnp.ones_like(subject.state.v) for name in ("position", "velocity")}
-    return jax.tree.map(one, x | moves)
+    return jax.tree.map(random_move, x | moves)
 
 
 def started(subject: Subject, q: jax.Array, v: jax.Array) -> tuple[Subject, dict[str, Any]]:
-    """The subject in another state, and its numbers there."""
+    """Returns the subject with another initial state, and its variables at that state."""
     moved = dataclasses.replace(subject, state=dataclasses.replace(subject.state, q=q, v=v))
     return moved, moved.numbers()
 
 
 def both(subject: Subject, method: jc.Method, q: jax.Array, v: jax.Array, way: Any) -> Any:
-    """Of one state: the derivative along a way by both modes, its size, what is finite, status.
+    """Returns the derivative at one state in forward and in reverse mode.
 
-    The size is the largest part that one leaf has in the derivative.
+    Returns:
+        The directional derivative in forward mode and in reverse mode, its size, True if the
+        gradient is finite, and the status. The size is the largest contribution of one leaf.
     """
-    own, x = started(subject, q, v)
+    subject_at, x = started(subject, q, v)
 
     def value(x: Any) -> tuple[jax.Array, jax.Array]:
-        final = own.final(method, x)
-        return own.weighed(final), final.status
+        final = subject_at.final(method, x)
+        return subject_at.weighed(final), final.status
 
-    found, tangent, status = jax.linearize(value, x, has_aux=True)
+    outcome, tangent, status = jax.linearize(value, x, has_aux=True)
     forward = tangent(way)
-    (gradient,) = jax.linear_transpose(tangent, x)(jnp.ones_like(found))
+    (gradient,) = jax.linear_transpose(tangent, x)(jnp.ones_like(outcome))
     parts = jnp.stack(jax.tree.leaves(jax.tree.map(lambda g, w: jnp.sum(g * w), gradient, way)))
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]
     return forward, jnp.sum(parts), jnp.max(jnp.abs(parts)), jnp.all(jnp.stack(finite)), status
 
 
 def slopes(subject: Subject, method: jc.Method, q: Any, v: Any, way: Any) -> Any:
-    """Central differences of several states, halving steps, (n, levels)."""
+    """Returns central differences at a batch of states, with halved steps, (n, levels)."""
     steps = STEP * 0.5 ** np.arange(LEVELS)
 
-    def one(q: jax.Array, v: jax.Array) -> jax.Array:
-        own, x = started(subject, q, v)
+    def differences(q: jax.Array, v: jax.Array) -> jax.Array:
+        subject_at, x = started(subject, q, v)
 
-        def along(step: jax.Array) -> jax.Array:
+        def value_at(step: jax.Array) -> jax.Array:
             moved = jax.tree.map(lambda a, d: a + step * d, x, way)
-            return own.outcome(method, moved)
+            return subject_at.outcome(method, moved)
 
-        return jax.lax.map(along, jnp.asarray([*steps, *-steps]))
+        return jax.lax.map(value_at, jnp.asarray([*steps, *-steps]))
 
-    ahead, behind = np.split(np.asarray(jax.jit(jax.vmap(one))(q, v)), 2, axis=1)
+    ahead, behind = np.split(np.asarray(jax.jit(jax.vmap(differences))(q, v)), 2, axis=1)
     return (ahead - behind) / (2 * steps)
 
 
 @dataclass(frozen=True)
 class Row:
-    """What was found of one scene under one method.
+    """Result of one scene under one method.
 
     Attributes:
-        states, failed: how many, and in how many the world fails and has no derivative.
-        forward, reverse: by kind, how many derivatives are not finite.
-        beyond: in how many the modes differ by more than `APART`.
-        apart: by how much at most.
-        compared, undecided, off: of the states compared with differences how many, in how many
-            these do not tell, and how many are beyond `OFF`.
-        error: the largest of those compared.
+        scene: name of the scene.
+        dim: its dimension.
+        method: name of the method.
+        dtype: precision.
+        states: number of states.
+        failed: number of worlds that fail; these have no derivative.
+        forward: number of non-finite derivatives in forward mode, by kind of state.
+        reverse: number of non-finite derivatives in reverse mode, by kind of state.
+        beyond: number of states at which the modes differ by more than `APART`.
+        apart: the largest difference of the modes.
+        compared: number of states compared with finite differences.
+        undecided: number of compared states with inaccurate finite differences.
+        off: number of compared states with an error above `OFF`.
+        error: the largest error of the compared states.
     """
 
     scene: str
@@ -206,32 +226,32 @@ class Row:
 
     @property
     def broken(self) -> int:
-        """Derivatives that are not finite."""
+        """The number of non-finite derivatives."""
         return sum(self.forward.values()) + sum(self.reverse.values())
 
     def __str__(self) -> str:
         head = f"| {self.scene} | {self.dim} | {self.method} | {self.dtype} | {self.states} |"
         modes = f" {self.failed} | {self.broken} | {self.apart:.1e} | {self.beyond} |"
-        told = f" {self.compared - self.undecided} of {self.compared} | {self.error:.1e} |"
+        decided = f" {self.compared - self.undecided} of {self.compared} | {self.error:.1e} |"
         where = {k: n for d in (self.forward, self.reverse) for k, n in d.items() if n}
-        return head + modes + told + f" {self.off} |" + (f" {where}" if where else "")
+        return head + modes + decided + f" {self.off} |" + (f" {where}" if where else "")
 
 
 def measure(name: str, dim: int, method: str, dtype: str, n: int, compared: int = 8) -> Row:
-    """One row.
+    """Measures one scene under one method.
 
     Raises:
         ValueError: the method refuses the scene.
     """
     subject, chosen = subject_of(name, dim), METHODS[method]
     chosen.check_system(subject.system)
-    states, way, own, given = drawn(subject, n), direction(subject), subject, chosen
+    states, way, cast_subject, cast_method = drawn(subject, n), direction(subject), subject, chosen
     if dtype == "float32":
-        own, given, way = single(subject), single(chosen), single(way)
+        cast_subject, cast_method, way = single(subject), single(chosen), single(way)
     q, v = (jnp.asarray(x, dtype) for x in (states.q, states.v))
-    run = jax.jit(jax.vmap(lambda q, v: both(own, given, q, v, way)))
+    run = jax.jit(jax.vmap(lambda q, v: both(cast_subject, cast_method, q, v, way)))
     forward, reverse, size, finite, status = map(np.asarray, run(q, v))
-    lost = np.asarray(failed(jnp.asarray(status)))
+    failures = np.asarray(failed(jnp.asarray(status)))
     with np.errstate(invalid="ignore", divide="ignore"):
         apart = np.abs(forward - reverse) / np.where(size > 0, size, 1)
     good = np.isfinite(forward) & finite
@@ -241,7 +261,7 @@ def measure(name: str, dim: int, method: str, dtype: str, n: int, compared: int 
         method,
         dtype,
         n,
-        int(np.sum(lost)),
+        int(np.sum(failures)),
         counted(states.kinds[~np.isfinite(forward)]),
         counted(states.kinds[~finite]),
         int(np.sum(apart[good] > APART[dtype])),
@@ -250,46 +270,48 @@ def measure(name: str, dim: int, method: str, dtype: str, n: int, compared: int 
     if dtype == "float32" or not compared:
         return row
     kinds = OFF_ENDS if name in ENDS else SMOOTH
-    smooth = np.isin(np.array(list(KINDS))[states.kinds], kinds) & ~lost & good
-    some = np.flatnonzero(smooth)[:compared]
-    if not some.size:
+    smooth = np.isin(np.array(list(KINDS))[states.kinds], kinds) & ~failures & good
+    picked = np.flatnonzero(smooth)[:compared]
+    if not picked.size:
         return row
-    exact, doubt = ridders(slopes(subject, chosen, q[some], v[some], way))
-    scale = np.where(size[some] > 0, size[some], 1)
-    told = doubt / scale <= OFF
-    error = np.abs(exact - reverse[some])[told] / scale[told]
+    exact, uncertainty = ridders(slopes(subject, chosen, q[picked], v[picked], way))
+    scale = np.where(size[picked] > 0, size[picked], 1)
+    decided = uncertainty / scale <= OFF
+    error = np.abs(exact - reverse[picked])[decided] / scale[decided]
     return dataclasses.replace(
         row,
-        compared=len(some),
-        undecided=int(np.sum(~told)),
+        compared=len(picked),
+        undecided=int(np.sum(~decided)),
         off=int(np.sum(error > OFF)),
         error=float(np.max(error, initial=0)),
     )
 
 
 def counted(kinds: np.ndarray) -> dict[str, int]:
-    """How many there are of each kind."""
+    """Counts the states of each kind."""
     return {name: int(np.sum(kinds == i)) for i, name in enumerate(KINDS)}
 
 
 def admitted(name: str, dim: int, methods: list[str]) -> list[str]:
-    """Those of the methods that take a scene."""
+    """Returns the names of the methods that accept a scene."""
     system, _ = build(name, dim)
-    found = []
+    accepted = []
     for method in methods:
         try:
             METHODS[method].check_system(system)
         except ValueError:
             continue
         if name not in ENDS or method not in IN_ROUNDS:
-            found.append(method)
-    return found
+            accepted.append(method)
+    return accepted
 
 
 def choices(scenes: Any, product: bool) -> Iterator[tuple[str, int, list[str], str]]:
-    """Scene, dimension, methods of which the first that takes it is meant, and precision.
+    """Yields scene, dimension, methods and precision.
 
-    Methods come in turn, or each by itself. Some refuse a scene only when a step is traced.
+    The caller uses the first of the methods that accepts the scene, because some methods refuse a
+    scene only when a step is traced. The first method of the list changes in turn. With `product`,
+    each method is yielded on its own.
     """
     turn = itertools.count()
     for name, dim in scenes:
@@ -305,7 +327,7 @@ def choices(scenes: Any, product: bool) -> Iterator[tuple[str, int, list[str], s
 def of_first(
     name: str, dim: int, methods: list[str], dtype: str, n: int, compared: int
 ) -> Row | None:
-    """The row of the first method that does not refuse the scene; None where all do."""
+    """Returns the result of the first method that accepts the scene, or None if all refuse it."""
     for method in methods:
         try:
             return measure(name, dim, method, dtype, n, compared)
@@ -315,21 +337,25 @@ def of_first(
 
 
 def main() -> None:
-    """The table, and sums."""
+    """Prints a row of counts per scene and method, and their totals."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--states", type=int, default=100_000)
     parser.add_argument("--scenes", nargs="*")
     parser.add_argument("--compared", type=int, default=8)
     parser.add_argument("--product", action="store_true")
-    given = parser.parse_args()
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    scenes = [x for x in SCENES if given.scenes is None or x[0] in given.scenes]
-    every = list(choices(scenes, given.product))
-    each = -(-given.states // len(every))
+    scenes = [x for x in SCENES if options.scenes is None or x[0] in options.scenes]
+    every = list(choices(scenes, options.product))
+    each = -(-options.states // len(every))
     total = collections.Counter[str]()
-    print("| scene | | method | precision | states | failed | not finite | modes apart | beyond |")
+    print(
+        "| scene | | method | precision | states | failed | not finite | mode difference | beyond",
+        end="",
+    )
+    print(" | compared | error | beyond |")
     for choice in every:
-        row = of_first(*choice, each, given.compared)
+        row = of_first(*choice, each, options.compared)
         if row is None:
             continue
         print(row, flush=True)

@@ -1,11 +1,12 @@
-"""Derivatives of rollouts, over everything that can be combined.
+"""Derivatives of rollouts for all combinations of method parts.
 
     python -m benchmarks.gradient_table [--scenes particle four-bar …] [--worlds 100000]
 
-Every admissible triple of a stabiliser, an integrator and a solver, in both precisions: forward and
-reverse mode by positions, velocities, masses and the numbers of joints, each against central
-differences in float64 that are extrapolated to a step of zero. Then the derivatives in very many
-random states in float32, none of which may be NaN.
+All admissible combinations of stabilizer, integrator and solver are tested in both precisions.
+Rollouts are differentiated with respect to positions, velocities, masses and joint parameters, in
+forward and reverse mode. The derivatives are compared with central differences in float64,
+extrapolated to zero step. Derivatives are then taken in very many random states in float32, none of
+which may be NaN.
 """
 
 from __future__ import annotations
@@ -29,38 +30,40 @@ from jaxcon.scenes import four_bar
 
 DT, STEPS = 1e-2, 3
 LONG = 2e-2
-"""Step of generalized-α [s], whose multipliers are told by positions: it multiplies their rounding
-by 1/h²."""
+"""Step size of generalized-α [s].
+
+Its multipliers follow from positions, which amplifies rounding by 1/h².
+"""
 STABILIZERS = {
-    "none": jc.Unstabilized(),
+    "none": jc.stabilizers.Unstabilized(),
     "Baumgarte": jc.Baumgarte(),
-    "PID": jc.PID(400.0, 40.0, 100.0),
-    "adaptive": jc.AdaptiveBaumgarte(20.0, 20.0),
-    "sliding window": jc.SlidingWindowBaumgarte(20.0),
-    "penalty": jc.Penalty.from_time(0.1),
-    "multipliers": jc.AugmentedLagrangian(),
-    "hybrid": jc.Hybrid(jc.Penalty.from_time(0.1), soft_below=1e-3),
+    "PID": jc.stabilizers.PID(400.0, 40.0, 100.0),
+    "adaptive": jc.stabilizers.AdaptiveBaumgarte(20.0, 20.0),
+    "sliding window": jc.stabilizers.SlidingWindowBaumgarte(20.0),
+    "penalty": jc.stabilizers.Penalty.from_time(0.1),
+    "multipliers": jc.stabilizers.AugmentedLagrangian(),
+    "hybrid": jc.stabilizers.Hybrid(jc.stabilizers.Penalty.from_time(0.1), soft_below=1e-3),
     "projection": jc.Projection(),
 }
 SOLVERS = {
-    "rank-safe": jc.RankSafe(),
-    "sparse": jc.Sparse(),
-    "Schur": jc.Schur(),
-    "dense": jc.Dense(),
-    "conjugate gradients": jc.ConjugateGradients(),
-    "priority": jc.Priority({"*": 1}),
+    "rank-safe": jc.solvers.RankSafe(),
+    "sparse": jc.solvers.Sparse(),
+    "Schur": jc.solvers.Schur(),
+    "dense": jc.solvers.Dense(),
+    "conjugate gradients": jc.solvers.ConjugateGradients(),
+    "priority": jc.solvers.Priority({"*": 1}),
 }
 DTYPES = ("float64", "float32")
 BOUNDS = {"float64": 1e-6, "float32": 1e-3}
-"""Relative to the largest derivative by each of the numbers."""
+"""Bounds on relative errors of derivatives, by precision."""
 LEVELS = 7
 STEP = 1e-3
-"""The largest of the differences, halved so often."""
+"""The largest step of the central differences, halved `LEVELS` − 1 times."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """One row of the table, by names."""
+    """A combination of integrator, stabilizer, solver and precision, by names."""
 
     integrator: str
     stabilizer: str
@@ -68,7 +71,7 @@ class Choice:
     dtype: str
 
     def method(self) -> jc.Method:
-        """The method, its numbers in float64."""
+        """Returns the method, with its parameters in float64."""
         parts = INTEGRATORS[self.integrator], STABILIZERS[self.stabilizer], SOLVERS[self.solver]
         return jc.Method(*parts)
 
@@ -77,39 +80,45 @@ class Choice:
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """All of it."""
+        """The names of integrator, stabilizer, solver and precision."""
         return self.integrator, self.stabilizer, self.solver, self.dtype
 
 
 def choices() -> list[Choice]:
-    """All that the integrators admit."""
+    """Returns all combinations that the integrators accept."""
     every = (Choice(*x) for x in itertools.product(INTEGRATORS, STABILIZERS, SOLVERS, DTYPES))
     return [x for x in every if not x.method().integrator.refuses(None, x.method().stabilizer)]
 
 
 def pairs(choice: Choice) -> set[tuple[str, str]]:
-    """Of parts."""
+    """Returns all pairs of names in a combination."""
     return set(itertools.combinations(choice.parts, 2))
 
 
-def covering(every: Iterable[Choice], wanted: Callable[[Choice], set[Any]] = pairs) -> list[Choice]:
-    """Few of them in which everything wanted occurs that occurs in all of them."""
-    left = list(every)
-    still = {one for x in left for one in wanted(x)}
-    found = []
-    while still:
-        best = max(left, key=lambda x: len(still & wanted(x)))
-        still -= wanted(best)
-        found.append(best)
-    return found
+def covering(
+    candidates: Iterable[Choice], wanted: Callable[[Choice], set[Any]] = pairs
+) -> list[Choice]:
+    """Returns few combinations that together have every feature of all candidates (greedy cover).
+
+    By default, features are pairs of names.
+    """
+    remaining = list(candidates)
+    uncovered = {feature for x in remaining for feature in wanted(x)}
+    cover = []
+    while uncovered:
+        best = max(remaining, key=lambda x: len(uncovered & wanted(x)))
+        uncovered -= wanted(best)
+        cover.append(best)
+    return cover
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A scene, and what it is differentiated by.
+    """A scene, and the variables with respect to which it is differentiated.
 
     Attributes:
-        system, state: in float64.
+        system: the system in float64.
+        state: its initial state in float64.
         parameters: pairs of element and field.
     """
 
@@ -118,36 +127,39 @@ class Subject:
     parameters: tuple[tuple[str, str], ...]
 
     def numbers(self) -> dict[str, Any]:
-        """Moves of the position, the velocity, and the parameters."""
+        """Returns the variables: displacement of the position, velocity, and parameters."""
         params = self.system.params
-        own = {f"{name}.{field}": params[name][field] for name, field in self.parameters}
-        return {"position": jnp.zeros_like(self.state.v), "velocity": self.state.v} | own
+        values = {f"{name}.{field}": params[name][field] for name, field in self.parameters}
+        return {"position": jnp.zeros_like(self.state.v), "velocity": self.state.v} | values
 
     def outcome(self, method: jc.Method, x: dict[str, Any]) -> jax.Array:
-        """A number that every coordinate of the final state enters."""
+        """Returns a scalar that depends on every coordinate of the final state."""
         return self.weighed(self.final(method, x))
 
     def final(self, method: jc.Method, x: dict[str, Any]) -> jc.State:
-        """The state after some steps."""
+        """Returns the state after `STEPS` steps."""
         changes: dict[str, Any] = {}
         for name, field in self.parameters:
             changes.setdefault(name, {})[field] = x[f"{name}.{field}"]
         system = self.system.with_params(changes) if changes else self.system
         q = system.retract(self.state.q, x["position"])
         start = jc.init(system, method, q, x["velocity"], self.state.time)
-        long = isinstance(method.integrator, jc.GeneralizedAlpha)
+        long = isinstance(method.integrator, jc.integrators.GeneralizedAlpha)
         dt = jnp.asarray(LONG if long else DT, q.dtype)
         return jc.rollout(system, method, start, None, dt, STEPS, record=lambda s, i: None)[0]
 
     def weighed(self, final: jc.State) -> jax.Array:
-        """A sum of all coordinates and velocities."""
+        """Returns a weighted sum of all coordinates and velocities."""
         random = np.random.default_rng(0)
         weights = [jnp.asarray(random.normal(size=y.shape), y.dtype) for y in (final.q, final.v)]
         return final.q @ weights[0] + final.v @ weights[1]
 
 
 def directions(x: dict[str, Any]) -> dict[str, Any]:
-    """One for each of the numbers, the others at rest; (n, …) in each leaf."""
+    """Returns one direction per variable, in which all other variables are fixed.
+
+    Each leaf is (n, …) for n variables.
+    """
     random, names = np.random.default_rng(1), list(x)
 
     def row(i: int, leaf: jax.Array) -> jax.Array:
@@ -161,7 +173,15 @@ def directions(x: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Row:
-    """Relative errors of both modes, the worst of all numbers, and which that is."""
+    """Relative errors of one combination on one scene.
+
+    Attributes:
+        choice: the combination.
+        scene: name of the scene.
+        forward: error in forward mode, the largest over the variables.
+        reverse: error in reverse mode, the largest over the variables.
+        worst: the variable with the largest error.
+    """
 
     choice: Choice
     scene: str
@@ -171,19 +191,21 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        """Whether both are within the bound."""
+        """True if the errors in both modes are within the bound."""
         return max(self.forward, self.reverse) <= BOUNDS[self.choice.dtype]
 
 
 def measure(choice: Choice, scene: str, subject: Subject, compiled: Any = jax.jit) -> Row:
-    """One row of the table."""
-    method, own = choice.method(), subject
+    """Measures one combination on one scene."""
+    method, cast_subject = choice.method(), subject
     x, ways = subject.numbers(), directions(subject.numbers())
     exact = slopes(lambda x: subject.outcome(method, x), x, ways, compiled)
     if choice.dtype == "float32":
-        own, method, x, ways = (single(y) for y in (subject, method, x, ways))
-    both = compiled(lambda x, ways: _modes(lambda x: own.outcome(method, x), x, ways))
-    forward, reverse = (np.asarray(y, np.float64) for y in both(x, ways))
+        cast_subject, method, x, ways = (single(y) for y in (subject, method, x, ways))
+    both_modes = compiled(
+        lambda x, ways: _modes(lambda x: cast_subject.outcome(method, x), x, ways)
+    )
+    forward, reverse = (np.asarray(y, np.float64) for y in both_modes(x, ways))
     scale = np.maximum(np.abs(exact), 1e-2 * np.max(np.abs(exact)))
     errors = np.abs(np.stack([forward, reverse]) - exact) / scale
     worst = list(x)[int(np.argmax(np.max(errors, axis=0)))]
@@ -191,15 +213,17 @@ def measure(choice: Choice, scene: str, subject: Subject, compiled: Any = jax.ji
 
 
 def single(tree: Any) -> Any:
-    """The same in float32; of a subject, its scene."""
+    """Casts a pytree to float32. For a `Subject`, casts its system and state."""
     if isinstance(tree, Subject):
-        own = {"system": single(tree.system), "state": single(tree.state)}
-        return dataclasses.replace(tree, **own)
+        return dataclasses.replace(tree, system=single(tree.system), state=single(tree.state))
     return jax.tree.map(lambda x: cast(x, jnp.float32) if hasattr(x, "dtype") else x, tree)
 
 
 def _modes(value: Callable[[Any], jax.Array], x: Any, ways: Any) -> tuple[jax.Array, jax.Array]:
-    """Derivatives along directions, forward and reverse; one after the other compiles sooner."""
+    """Returns directional derivatives in forward and in reverse mode, (directions,) each.
+
+    Directions are mapped in sequence, which compiles faster than a batch.
+    """
     tangent = jax.linearize(value, x)[1]
     forward = jax.lax.map(tangent, ways)
     (gradient,) = jax.linear_transpose(tangent, x)(jnp.ones_like(forward[0]))
@@ -208,18 +232,18 @@ def _modes(value: Callable[[Any], jax.Array], x: Any, ways: Any) -> tuple[jax.Ar
 
 
 def slopes(value: Any, x: Any, ways: Any, compiled: Any) -> np.ndarray:
-    """Differences along directions, extrapolated."""
+    """Returns central differences along directions, extrapolated to zero step."""
     steps = STEP * 0.5 ** np.arange(LEVELS)
     signed = jnp.asarray([*steps, *-steps])
 
-    def at(way: Any) -> jax.Array:
-        def along(step: jax.Array) -> jax.Array:
+    def differences(way: Any) -> jax.Array:
+        def value_at(step: jax.Array) -> jax.Array:
             return value(jax.tree.map(lambda a, d: a + step * d, x, way))
 
-        return jax.lax.map(along, signed)
+        return jax.lax.map(value_at, signed)
 
-    every = compiled(lambda ways: jax.lax.map(at, ways))
-    ahead, behind = np.split(np.asarray(every(ways)), 2, axis=1)
+    run = compiled(lambda ways: jax.lax.map(differences, ways))
+    ahead, behind = np.split(np.asarray(run(ways)), 2, axis=1)
     return ridders((ahead - behind) / (2 * steps))[0]
 
 
@@ -231,17 +255,17 @@ SCENES: dict[str, Callable[[], tuple[Any, jc.State, Any]]] = {
 
 
 def broken(subject: Subject, method: jc.Method, worlds: int, seed: int = 0) -> int:
-    """In how many of so many random states in float32 a derivative of some steps is not finite.
+    """Counts random states in float32 at which a derivative is not finite.
 
-    States are off the constraints by a tenth, and their velocities are of the order of one.
+    States violate the constraints by about 0.1 and have velocities of about 1.
     """
-    random, one = np.random.default_rng(seed), single(subject)
-    n, method, x = len(one.state.v), single(method), single(subject.numbers())
+    random, cast_subject = np.random.default_rng(seed), single(subject)
+    n, method, x = len(cast_subject.state.v), single(method), single(subject.numbers())
 
     def finite(position: jax.Array, velocity: jax.Array) -> jax.Array:
         moved = x | {"position": position, "velocity": velocity}
-        slopes = jax.tree.leaves(jax.grad(lambda x: one.outcome(method, x))(moved))
-        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in slopes]))
+        leaves = jax.tree.leaves(jax.grad(lambda x: cast_subject.outcome(method, x))(moved))
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
 
     run, good, block = jax.jit(jax.vmap(finite)), 0, min(worlds, 1000)
     for _ in range(worlds // block):
@@ -251,13 +275,13 @@ def broken(subject: Subject, method: jc.Method, worlds: int, seed: int = 0) -> i
 
 
 def main() -> None:
-    """The whole product, by scene, and the random states."""
+    """Prints errors of all combinations by scene, then the counts for random states."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--worlds", type=int, default=100_000)
-    given = parser.parse_args()
+    options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    for scene in given.scenes:
+    for scene in options.scenes:
         subject = Subject(*SCENES[scene]())
         held = collections.Counter[bool]()
         for choice in choices():
@@ -266,8 +290,8 @@ def main() -> None:
             errors = f"forward {row.forward:.1e} | reverse {row.reverse:.1e} | {row.worst}"
             print(f"| {scene} | {choice} | {errors} |{'' if row.holds else ' beyond'}", flush=True)
         print(f"{scene}: {held[True]} of {held.total()} within {BOUNDS}", flush=True)
-        lost = broken(subject, jc.Method(), given.worlds)
-        print(f"{scene}: {lost} of {given.worlds} random states in float32 are not finite")
+        nonfinite = broken(subject, jc.Method(), options.worlds)
+        print(f"{scene}: {nonfinite} of {options.worlds} random states in float32 are not finite")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
-"""What a gradient costs: value and gradient of a rollout beside the rollout, and beside MJX.
+"""Cost of value and gradient of a rollout, compared with the rollout and with MJX.
 
     python -m benchmarks.gradients [--scenes chain-10 four-bar] [--steps 1000] [--seconds 240]
 
-A batch under plain `vmap` on one device, float32, the gradient of Σ q² at the end by the velocities
-of the start. Peak memory is what XLA plans. Whether a gradient is right is judged over fewer steps,
-by central differences along the velocities: over a thousand, that of a chain is beyond float32.
-Each row is a process of its own, which compiles the rollout and then its gradient. Each step of MJX
-is a checkpoint, which is its fastest.
+A batch runs under plain `vmap` on one device in float32. The loss is Σ q² at the end,
+differentiated with respect to the initial velocities. Peak memory is the memory that XLA plans.
+
+The error of a gradient is measured over fewer steps, by central differences along the velocities.
+Over a thousand steps, the gradient of a chain exceeds the accuracy of float32. Each row runs in its
+own process, which compiles the rollout and then its gradient. MJX checkpoints each step, which is
+its fastest setting.
 """
 
 from __future__ import annotations
@@ -17,7 +19,6 @@ import functools
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,24 +30,26 @@ from benchmarks.mjcf import DT
 from benchmarks.peers import FLAGS, mjx_start, mjx_step, speeds
 
 SHORT = 100
-"""Steps of MJX, and of the comparison with differences."""
+"""Number of steps for MJX and for the comparison with finite differences."""
 STEP = 3e-2
-"""Of the differences, relative."""
+"""Relative step of the finite differences."""
 LENGTHS = (100, 1000, 10000)
 MJX = "MJX"
-ADJOINTS = {"every step": jc.EveryStep(), "checkpoints": jc.Checkpoints()}
+ADJOINTS = {"every step": jc.adjoints.EveryStep(), "checkpoints": jc.adjoints.Checkpoints()}
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Of the rollout and of its value and gradient.
+    """Cost of a rollout, and of its value and gradient.
 
     Attributes:
-        forward, gradient: world-steps a second.
-        ratio: how many rollouts one value and gradient costs, the median of repeats in turn.
-        forward_compile, gradient_compile: [s].
-        finite: whether every gradient is.
-        error: of the sum of gradients along the velocities, against differences over fewer steps.
+        forward: world-steps per second of the rollout.
+        gradient: world-steps per second of value and gradient.
+        ratio: cost of value and gradient over that of a rollout, median of alternating repeats.
+        forward_compile: compile time of the rollout [s].
+        gradient_compile: compile time of value and gradient [s].
+        finite: True if every gradient is finite.
+        error: relative error of the derivative along the velocities, over fewer steps.
     """
 
     forward: float
@@ -66,15 +69,15 @@ class Cost:
 
 
 Loss = Callable[[jax.Array, int], jax.Array]
-"""(velocity of the start, steps) → Σ q² at the end, of one world."""
+"""(initial velocity, steps) → Σ q² at the end, for one world."""
 
 
 def measure(loss: Loss, worlds: jax.Array, steps: int, short: int) -> Cost:
-    """The cost of the gradient of a loss by velocities, (worlds, n_v)."""
+    """Measures the cost of differentiating a loss by velocities, (worlds, n_v)."""
     batch = jax.vmap(functools.partial(loss, steps=steps))
-    both = jax.vmap(jax.value_and_grad(functools.partial(loss, steps=steps)))
+    loss_and_gradient = jax.vmap(jax.value_and_grad(functools.partial(loss, steps=steps)))
     (forward, forward_compile), (gradient, gradient_compile) = (
-        timing.compile_seconds(f, worlds) for f in (batch, both)
+        timing.compile_seconds(f, worlds) for f in (batch, loss_and_gradient)
     )
     slope = gradient(worlds)[1]
     jax.block_until_ready(forward(worlds))
@@ -91,101 +94,106 @@ def measure(loss: Loss, worlds: jax.Array, steps: int, short: int) -> Cost:
 
 
 def error(loss: Loss, worlds: jax.Array, steps: int) -> float:
-    """Of the derivatives along the velocities, relative to the largest of all worlds."""
-    both = jax.jit(jax.vmap(jax.value_and_grad(functools.partial(loss, steps=steps))))
+    """Returns the largest error of derivatives along the velocities.
 
-    def at(s: float) -> np.ndarray:
-        return np.asarray(both((1 + s * STEP) * worlds)[0], np.float64)
+    It is relative to the largest derivative over all worlds.
+    """
+    loss_and_gradient = jax.jit(jax.vmap(jax.value_and_grad(functools.partial(loss, steps=steps))))
 
-    by_difference = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * STEP)
-    along = np.sum(np.asarray(both(worlds)[1] * worlds, np.float64), axis=1)
-    return float(np.max(np.abs(along - by_difference)) / np.max(np.abs(by_difference)))
+    def loss_at(s: float) -> np.ndarray:
+        return np.asarray(loss_and_gradient((1 + s * STEP) * worlds)[0], np.float64)
+
+    differences = (8 * (loss_at(1) - loss_at(-1)) - (loss_at(2) - loss_at(-2))) / (12 * STEP)
+    derivatives = np.sum(np.asarray(loss_and_gradient(worlds)[1] * worlds, np.float64), axis=1)
+    return float(np.max(np.abs(derivatives - differences)) / np.max(np.abs(differences)))
 
 
-def ours(name: str, adjoint: Any, batch: int) -> tuple[Loss, jax.Array]:
-    """The loss of a mechanism, and the velocities of a batch."""
+def ours(name: str, adjoint: jc.extend.Adjoint, batch: int) -> tuple[Loss, jax.Array]:
+    """Returns the loss of a mechanism in jaxcon, and initial velocities of a batch."""
     system, state = mechanisms.find(name).build(jnp.float32)
-    method = jc.Method(solver=jc.Sparse())
+    method = jc.Method(solver=jc.solvers.Sparse())
 
     def loss(v: jax.Array, steps: int) -> jax.Array:
         start, dt = dataclasses.replace(state, v=v), jnp.asarray(DT, jnp.float32)
         run = functools.partial(jc.rollout, record=lambda s, i: None, adjoint=adjoint)
         return jnp.sum(run(system, method, start, None, dt, steps)[0].q ** 2)
 
-    moving = state.v if jnp.any(state.v) else jnp.ones_like(state.v)
-    return loss, jnp.asarray(speeds(batch), jnp.float32)[:, None] * moving
+    velocity = state.v if jnp.any(state.v) else jnp.ones_like(state.v)
+    return loss, jnp.asarray(speeds(batch), jnp.float32)[:, None] * velocity
 
 
 def mjx(name: str, batch: int) -> tuple[Loss, jax.Array]:
-    """The same of MJX."""
+    """Returns the loss of a mechanism in MJX, and initial velocities of a batch."""
     mechanism = mechanisms.find(name)
     model, data = mjx_start(mechanism, batch)
-    one = jax.tree.map(lambda x: x[0], data)
+    first = jax.tree.map(lambda x: x[0], data)
     step = jax.checkpoint(functools.partial(mjx_step(), model))
 
     def loss(v: jax.Array, steps: int) -> jax.Array:
-        start = one.replace(qvel=v)
+        start = first.replace(qvel=v)
         return jnp.sum(jax.lax.scan(lambda d, _: (step(d), None), start, None, steps)[0].qpos ** 2)
 
-    moving = data.qvel[0] if jnp.any(data.qvel) else jnp.ones_like(data.qvel[0])
-    return loss, jnp.asarray(speeds(batch), moving.dtype)[:, None] * moving
+    velocity = data.qvel[0] if jnp.any(data.qvel) else jnp.ones_like(data.qvel[0])
+    return loss, jnp.asarray(speeds(batch), velocity.dtype)[:, None] * velocity
 
 
-def planned(name: str, adjoint: Any, batch: int, steps: int) -> int:
-    """Temporary memory of the gradient [B]."""
+def planned(name: str, adjoint: jc.extend.Adjoint, batch: int, steps: int) -> int:
+    """Returns the temporary memory that XLA plans for the gradient [B]."""
     loss, worlds = ours(name, adjoint, batch)
-    both = jax.vmap(jax.value_and_grad(functools.partial(loss, steps=steps)))
-    plan = jax.jit(both).lower(worlds).compile().memory_analysis()
+    loss_and_gradient = jax.vmap(jax.value_and_grad(functools.partial(loss, steps=steps)))
+    plan = jax.jit(loss_and_gradient).lower(worlds).compile().memory_analysis()
     return plan.temp_size_in_bytes  # type: ignore[union-attr]
 
 
-def alone(name: str, way: str, batch: int, steps: int) -> Cost:
-    """The cost of a row, here: of ours by an adjoint, or of MJX."""
-    if way == MJX:
+def alone(name: str, variant: str, batch: int, steps: int) -> Cost:
+    """Measures one row in this process: an adjoint of jaxcon, or MJX."""
+    if variant == MJX:
         return measure(*mjx(name, batch), SHORT, SHORT)
-    return measure(*ours(name, ADJOINTS[way], batch), steps, SHORT)
+    return measure(*ours(name, ADJOINTS[variant], batch), steps, SHORT)
 
 
-def row(name: str, way: str, given: argparse.Namespace, flags: str = "") -> str:
-    """A row of the table, from a process of its own, or why there is none."""
-    numbers = ["--batch", str(given.batch), "--steps", str(given.steps)]
-    call = ["benchmarks.gradients", "--alone", name, way, *numbers]
-    late = "does not compile and run in"
-    found = timing.in_process(call, timing.with_flags(flags), given.seconds, late)
-    shown = found if isinstance(found, str) else Cost(**found)
-    return f"| {name} | {way} {flags} | {shown} |"
+def row(name: str, variant: str, options: argparse.Namespace, flags: str = "") -> str:
+    """Measures one row in its own process and formats it, or the reason why there is no result."""
+    numbers = ["--batch", str(options.batch), "--steps", str(options.steps)]
+    command = ["benchmarks.gradients", "--alone", name, variant, *numbers]
+    message = "does not compile and run in"
+    result = timing.in_process(command, timing.with_flags(flags), options.seconds, message)
+    cost = result if isinstance(result, str) else Cost(**result)
+    return f"| {name} | {variant} {flags} | {cost} |"
 
 
 def arguments() -> argparse.Namespace:
-    """The options of the command line."""
+    """Parses the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="*", default=["chain-10", "four-bar"])
     parser.add_argument("--batch", type=int, default=256)
     parser.add_argument("--steps", type=int, default=1000)
-    parser.add_argument("--seconds", type=float, default=240.0, help="at most, of each row")
-    parser.add_argument("--alone", metavar=("SCENE", "WAY"), nargs=2, help="one row, here, as JSON")
+    parser.add_argument("--seconds", type=float, default=240.0, help="time limit of a row [s]")
+    parser.add_argument("--alone", metavar=("SCENE", "WAY"), nargs=2, help="one row as JSON")
     return parser.parse_args()
 
 
 def main() -> None:
-    """Prints the tables."""
-    given = arguments()
-    if given.alone:
-        cost = alone(*given.alone, given.batch, given.steps)
+    """Prints the tables of cost and of memory."""
+    options = arguments()
+    if options.alone:
+        cost = alone(*options.alone, options.batch, options.steps)
         print(json.dumps(dataclasses.asdict(cost)))
         return
     print(timing.machine())
-    head = "forward | value and gradient | times | compile | with gradient | finite | error"
+    head = (
+        "forward | value and gradient | ratio | compile forward | compile gradient | finite | error"
+    )
     print(f"| scene | | {head} |")
-    for name in given.scenes:
-        for way in ADJOINTS:
-            print(row(name, way, given), flush=True)
+    for name in options.scenes:
+        for variant in ADJOINTS:
+            print(row(name, variant, options), flush=True)
         for flags in FLAGS:
-            print(row(name, MJX, given, flags), flush=True)
+            print(row(name, MJX, options, flags), flush=True)
     print("| scene | | steps | memory |")
-    for name in given.scenes:
+    for name in options.scenes:
         for adjoint, steps in ((a, n) for a in ADJOINTS for n in LENGTHS):
-            size = planned(name, ADJOINTS[adjoint], given.batch, steps)
+            size = planned(name, ADJOINTS[adjoint], options.batch, steps)
             print(f"| {name} | {adjoint} | {steps} | {size / 1e6:.4g} MB |", flush=True)
 
 

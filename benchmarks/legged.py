@@ -1,15 +1,16 @@
-"""Gymnasium's legged robots dropped on the floor without control, beside MuJoCo.
+"""Gymnasium's legged robots dropped on the floor without control, compared with MuJoCo.
 
     python -m benchmarks.legged [--models hopper ant …] [--bounded InteriorPoint GaussSeidel]
         [--dtypes float32 float64] [--batches 1 64] [--ignore self_contact …] [--rates]
 
-Two seconds at 2 ms from the reference pose, every hinge turned a little, so that nothing balances,
-and put into its range. MuJoCo's collision detection says how deep geoms are in the floor
-and in each other at any time; MuJoCo's own simulation, with its soft contacts and its integrator,
-ends where it ends. How they fall is chaotic: heights compare, postures need not. With `--rates`
-MuJoCo runs a batch of the same falls on all cores, and MJX in processes of its own, both with
-Newton's method and Euler's, and one fall of MJX tells how deep its contacts are. Joints drift here
-alone: in the coordinates of both peers there is nothing that could.
+Each robot falls for two seconds at 2 ms. It starts from the reference pose with every hinge turned
+by a small random angle, within its range, so that it does not balance. MuJoCo's collision detection
+measures how far geoms penetrate the floor and each other. Falls are chaotic: final heights are
+comparable with MuJoCo's own simulation, final postures are not.
+
+With `--rates`, a batch of falls also runs in MuJoCo on all cores, and in MJX in its own processes.
+Both use Newton's method and the Euler integrator. One fall in MJX measures its penetrations. Joints
+can drift only in jaxcon: MuJoCo and MJX use reduced coordinates.
 """
 
 from __future__ import annotations
@@ -27,30 +28,31 @@ import jaxcon as jc
 from benchmarks import peers, timing
 from benchmarks.mjcf import DT
 from benchmarks.mjcf_agreement import ASSETS
-from jaxcon.constraints.bounds import count_bounds
+from jaxcon.contact.rows import count_bounds
 
 MODELS = ("hopper", "half_cheetah", "walker2d", "ant", "humanoid")
 BOUNDED = {
-    "InteriorPoint": jc.InteriorPoint(),
-    "GaussSeidel": jc.GaussSeidel(30),
-    "Nearest": jc.Nearest(jc.GaussSeidel(30), contacts=8, stops=8),
-    "NearestInteriorPoint": jc.Nearest(jc.InteriorPoint(), contacts=8, stops=8),
+    "InteriorPoint": jc.solvers.InteriorPoint(),
+    "GaussSeidel": jc.solvers.GaussSeidel(30),
+    "ActiveSet": jc.solvers.ActiveSet(jc.solvers.GaussSeidel(30), contacts=8, stops=8),
+    "NearestInteriorPoint": jc.solvers.ActiveSet(jc.solvers.InteriorPoint(), contacts=8, stops=8),
 }
 STEPS, EVERY = 1000, 10
 TURNED = 0.05
-"""By how much joints are turned at the start, at most [rad]."""
+"""Largest random rotation of the joints at the start [rad]."""
 WITHIN = 0.01
-"""How far they then are from their stops, at least [rad]."""
+"""Smallest initial distance from a joint limit [rad]."""
 PLANE, HINGE = 0, 3
-"""Of MuJoCo's enumerations."""
+"""Values of planes and hinges in MuJoCo's enumerations of geom and joint types."""
 
 
 class Depth(NamedTuple):
-    """The worst of a path: into the floor, into each other, and beyond a range, all ≥ 0.
+    """The largest penetrations of geoms, and the largest violation of a joint limit.
 
     Attributes:
-        floor, limbs: [m], beyond the margin at which MuJoCo's contacts begin to push.
-        joints: [rad].
+        floor: penetration of the floor [m], beyond the margin at which MuJoCo's contacts act.
+        limbs: penetration of other geoms [m], beyond the same margin.
+        joints: angle beyond a joint limit [rad].
     """
 
     floor: float
@@ -59,17 +61,17 @@ class Depth(NamedTuple):
 
 
 class Drop(NamedTuple):
-    """What became of a robot.
+    """Result of a falling robot.
 
     Attributes:
-        rows: with bounded multipliers.
-        compile: of the rollout, tracing included, by batch [s].
-        rates: world-steps a second by batch.
-        healthy: whether no step failed.
-        depth: along the path.
-        drift: the largest |φ| of the joints along the path [m, rad].
-        height: of the torso at the end [m].
-        speed: the largest entry of qvel at the end.
+        rows: number of inequality rows.
+        compile: compile time of the rollout, including tracing, by batch size [s].
+        rates: world-steps per second by batch size.
+        healthy: True if no step failed.
+        depth: largest penetrations along the path.
+        drift: largest |φ| of the joints along the path [m, rad].
+        height: final height of the torso [m].
+        speed: largest final entry of qvel.
     """
 
     rows: int
@@ -83,7 +85,7 @@ class Drop(NamedTuple):
 
 
 def load(name: str) -> Any:
-    """Gymnasium's model of this name, at our step."""
+    """Loads Gymnasium's model of this name, with the step size of the benchmarks."""
     import mujoco
 
     model = mujoco.MjModel.from_xml_path(str(ASSETS / f"{name}.xml"))
@@ -92,7 +94,7 @@ def load(name: str) -> Any:
 
 
 def start(model: Any, seed: int = 0) -> np.ndarray:
-    """qpos at the start, (nq,)."""
+    """Draws a random initial qpos, (nq,)."""
     random, qpos = np.random.default_rng(seed), model.qpos0.copy()
     for j, q in enumerate(model.jnt_qposadr):
         if model.jnt_type[j] == HINGE:
@@ -104,7 +106,10 @@ def start(model: Any, seed: int = 0) -> np.ndarray:
 
 
 def depth(model: Any, path: np.ndarray) -> Depth:
-    """What MuJoCo's collision detection finds along a path of qpos (steps, nq)."""
+    """Returns the largest penetrations along a path of qpos, (steps, nq).
+
+    MuJoCo's collision detection measures them.
+    """
     import mujoco
 
     data, floor, limbs, joints = mujoco.MjData(model), 0.0, 0.0, 0.0
@@ -113,15 +118,18 @@ def depth(model: Any, path: np.ndarray) -> Depth:
     for data.qpos[:] in path:
         mujoco.mj_forward(model, data)
         for c in data.contact:
-            deep, flat = c.includemargin - c.dist, model.geom_type[c.geom[0]] == PLANE
-            floor, limbs = max(floor, deep * flat), max(limbs, deep * (not flat))
+            penetration, on_floor = c.includemargin - c.dist, model.geom_type[c.geom[0]] == PLANE
+            floor, limbs = (
+                max(floor, penetration * on_floor),
+                max(limbs, penetration * (not on_floor)),
+            )
         θ = data.qpos[model.jnt_qposadr[limited]]
         joints = max(joints, np.max(lower - θ, initial=0), np.max(θ - upper, initial=0))
     return Depth(float(floor), float(limbs), float(joints))
 
 
 def torso(model: Any, qpos: np.ndarray) -> float:
-    """The height of the first body [m]."""
+    """Returns the height of the first body, the torso [m]."""
     import mujoco
 
     data = mujoco.MjData(model)
@@ -130,9 +138,9 @@ def torso(model: Any, qpos: np.ndarray) -> float:
     return float(data.xpos[1, 2])
 
 
-def dropped(read: jc.MujocoModel, model: Any, bounded: Any, batches: list[int]) -> Drop:
-    """The robot falls, and in a batch several do that are turned differently."""
-    system, method = read.system, jc.Method(solver=jc.Sparse(), bounded=bounded)
+def dropped(robot: jc.io.MujocoModel, model: Any, bounded: Any, batches: list[int]) -> Drop:
+    """Drops one robot, and batches of robots with different initial angles."""
+    system, method = robot.system, jc.Method(solver=jc.solvers.Sparse(), contact_solver=bounded)
 
     def idle(state: jc.State) -> jax.Array:
         return jnp.zeros(system.layout.n_u, state.q.dtype)
@@ -143,41 +151,51 @@ def dropped(read: jc.MujocoModel, model: Any, bounded: Any, batches: list[int]) 
     def last(state: jc.State) -> jc.State:
         return jc.rollout(system, method, state, idle, DT, STEPS, every=STEPS)[0]
 
-    first = begun(read, method, start(model))
-    (final, states), *measured = timed(run, first, STEPS)
-    times, rates = {1: measured[0]}, {1: measured[1]}
+    first = begun(robot, method, start(model))
+    (final, states), seconds, rate = timed(run, first, STEPS)
+    times, rates = {1: seconds}, {1: rate}
     for batch in (b for b in batches if b > 1):
         poses = jnp.asarray([start(model, seed) for seed in range(batch)], first.q.dtype)
-        worlds = jax.vmap(lambda qpos: begun(read, method, qpos))(poses)
+        worlds = jax.vmap(lambda qpos: begun(robot, method, qpos))(poses)
         worlds = timing.over_devices(worlds, batch)
         ends, times[batch], rates[batch] = timed(jax.vmap(last), worlds, STEPS * batch)
         healthy = np.asarray(ends.status) == 0
         assert healthy.all(), f"{(~healthy).sum()} of {batch} worlds fail"
-    path = np.asarray(jax.jit(jax.vmap(read.qpos))(states), np.float64)
-    rows, qvel = count_bounds(system, first.q, first.v), np.asarray(read.qvel(final))
+    path = np.asarray(jax.jit(jax.vmap(robot.qpos))(states), np.float64)
+    rows, qvel = count_bounds(system, first.q, first.v), np.asarray(robot.qvel(final))
     drift = jax.jit(jax.vmap(lambda state: jnp.abs(jc.violation(system, state).position)))(states)
-    lost = float(np.max(drift, initial=0))
-    found = depth(model, path), lost, torso(model, path[-1]), float(np.abs(qvel).max())
-    return Drop(rows, times, rates, int(final.status) == 0, *found)
+    largest_drift = float(np.max(drift, initial=0))
+    result = depth(model, path), largest_drift, torso(model, path[-1]), float(np.abs(qvel).max())
+    return Drop(rows, times, rates, int(final.status) == 0, *result)
 
 
 def timed(run: Any, state: jc.State, work: int) -> tuple[Any, float, float]:
-    """What a run returns, how long it compiles [s], and its steps a second, run once."""
+    """Compiles and runs a function once.
+
+    Returns:
+        Its result, the compile time [s], and steps per second.
+    """
     compiled, seconds = timing.compile_seconds(run, state)
     started = time.perf_counter()
     result = jax.block_until_ready(compiled(state))
     return result, seconds, work / (time.perf_counter() - started)
 
 
-def begun(read: jc.MujocoModel, method: jc.Method, qpos: Any) -> jc.State:
-    """At rest in a pose."""
-    state = read.state(qpos, jnp.zeros(read.tree.size, read.start.q.dtype))
-    turns = state.turns if read.system.counted else None
-    return jc.init(read.system, method, state.q, state.v, turns=turns)
+def begun(robot: jc.io.MujocoModel, method: jc.Method, qpos: Any) -> jc.State:
+    """Returns a state at rest with the given qpos."""
+    state = robot.state(qpos, jnp.zeros(robot.tree.size, robot.start.q.dtype))
+    turns = state.turns if robot.system.counted else None
+    return jc.init(robot.system, method, state.q, state.v, turns=turns)
 
 
 class Peer(NamedTuple):
-    """A peer's end of the same fall: height of the torso [m], the largest of qvel, and depth."""
+    """The result of a fall in MuJoCo or MJX.
+
+    Attributes:
+        height: final height of the torso [m].
+        speed: largest final entry of qvel.
+        depth: largest penetrations along the path.
+    """
 
     height: float
     speed: float
@@ -185,18 +203,18 @@ class Peer(NamedTuple):
 
     @classmethod
     def of(cls, model: Any, path: list[Any], qvel: Any) -> Peer:
-        """That of a path of qpos."""
+        """Evaluates a path of qpos and the final qvel."""
         speed = float(np.abs(qvel).max())
         return cls(torso(model, path[-1]), speed, depth(model, np.array(path, np.float64)))
 
     def line(self, name: str, who: str, dtype: str) -> str:
-        """A row of the table."""
+        """Formats the result as a table row."""
         end = f"{self.height:.3f} m | {self.speed:.1e} |"
         return f"| {name} | {who} | {dtype} | | | | {deep(self.depth)} | | {end}"
 
 
 def simulated(model: Any) -> Peer:
-    """The same fall in MuJoCo."""
+    """Simulates the fall in MuJoCo and returns its result."""
     import mujoco
 
     data, path = mujoco.MjData(model), []
@@ -208,7 +226,7 @@ def simulated(model: Any) -> Peer:
 
 
 def simulated_by_mjx(name: str) -> Peer:
-    """The same fall in MJX, as it is timed."""
+    """Simulates the fall in MJX, with the settings used for the rates."""
     from mujoco import mjx
 
     model, path = falling(name), []
@@ -223,7 +241,7 @@ def simulated_by_mjx(name: str) -> Peer:
 
 
 def falling(name: str) -> Any:
-    """The model as MuJoCo is fast with it."""
+    """Returns the model with MuJoCo's fastest settings."""
     import mujoco
 
     model = load(name)
@@ -233,7 +251,7 @@ def falling(name: str) -> Any:
 
 
 def mujoco_rate(name: str, batch: int) -> timing.Rate:
-    """World-steps a second of MuJoCo in C over the same falls."""
+    """Measures world-steps per second of MuJoCo in C for a batch of falls."""
     import mujoco
 
     model, spec = falling(name), mujoco.mjtState.mjSTATE_FULLPHYSICS
@@ -245,29 +263,29 @@ def mujoco_rate(name: str, batch: int) -> timing.Rate:
 
 
 def mjx_here(name: str, batch: int) -> dict[str, Any]:
-    """That of MJX in this process, and how long a step compiles [s]."""
+    """Measures MJX in this process: world-steps per second, and compile time of a step [s]."""
     from mujoco import mjx
 
     model = falling(name)
-    one, put = mjx.make_data(model), mjx.put_model(model)
-    poses = jnp.asarray([start(model, seed) for seed in range(batch)], one.qpos.dtype)
-    worlds = jax.vmap(lambda qpos: one.replace(qpos=qpos))(poses)
-    return peers.mjx_rate(put, worlds, batch, STEPS, repeats=1)
+    single, device_model = mjx.make_data(model), mjx.put_model(model)
+    poses = jnp.asarray([start(model, seed) for seed in range(batch)], single.qpos.dtype)
+    worlds = jax.vmap(lambda qpos: single.replace(qpos=qpos))(poses)
+    return peers.mjx_rate(device_model, worlds, batch, STEPS, repeats=1)
 
 
 HEAD = """
-| model | bounded | dtype | rows | compile | steps/s | floor, limbs, stops | drift | height | qvel |
+| model | solver | dtype | rows | compile | steps/s | floor, limbs, limits | drift | height | qvel |
 |---|---|---|---|---|---|---|---|---|---|"""
 
 
-def line(name: str, how: str, dtype: str, drop: Drop) -> str:
-    """A row of the table."""
+def line(name: str, solver: str, dtype: str, drop: Drop) -> str:
+    """Formats the result of a drop in jaxcon as a table row."""
     times = ", ".join(f"{x:.0f} s" for x in drop.compile.values())
     rates = ", ".join(f"{rate:.3g} ({batch})" for batch, rate in drop.rates.items())
     height = f"{drop.height:.3f} m" if drop.healthy else "a step failed"
     cells = (
         name,
-        how,
+        solver,
         dtype,
         drop.rows,
         times,
@@ -280,48 +298,48 @@ def line(name: str, how: str, dtype: str, drop: Drop) -> str:
 
 
 def deep(depth: Depth) -> str:
-    """Depths as a table shows them."""
+    """Formats penetrations and limit violations."""
     return f"{1e3 * depth.floor:.2g} mm, {1e3 * depth.limbs:.2g} mm, {depth.joints:.2g} rad"
 
 
 def main() -> None:
-    """Prints the table."""
+    """Prints the table of drops, or with `--mjx` and `--mjx-fall` a result of MJX."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--models", nargs="*", default=list(MODELS))
     parser.add_argument("--bounded", nargs="*", default=list(BOUNDED))
     parser.add_argument("--dtypes", nargs="*", default=["float32", "float64"])
     parser.add_argument("--batches", nargs="*", type=int, default=[1, 64])
     parser.add_argument("--ignore", nargs="*", default=[])
-    parser.add_argument("--rates", action="store_true", help="run batches of MuJoCo and MJX too")
-    parser.add_argument("--mjx-seconds", type=float, default=400.0, help="limit of a batch of MJX")
-    parser.add_argument("--mjx", metavar="MODEL", help="MJX alone, here, as JSON")
-    parser.add_argument("--mjx-fall", metavar="MODEL", help="a fall of MJX, here, as a row")
-    parser.add_argument("--batch", type=int, default=256, help="worlds of MJX alone")
-    asked = parser.parse_args()
-    if asked.mjx:
+    parser.add_argument("--rates", action="store_true", help="also run batches in MuJoCo and MJX")
+    parser.add_argument("--mjx-seconds", type=float, default=400.0, help="time limit of MJX [s]")
+    parser.add_argument("--mjx", metavar="MODEL", help="rate of MJX in this process, as JSON")
+    parser.add_argument("--mjx-fall", metavar="MODEL", help="one fall in MJX, as a table row")
+    parser.add_argument("--batch", type=int, default=256, help="batch size of --mjx")
+    options = parser.parse_args()
+    if options.mjx:
         timing.use_all_cores()
-        print(json.dumps(mjx_here(asked.mjx, asked.batch)))
+        print(json.dumps(mjx_here(options.mjx, options.batch)))
         return
-    if asked.mjx_fall:
-        print(simulated_by_mjx(asked.mjx_fall).line(asked.mjx_fall, "MJX", "float32"))
+    if options.mjx_fall:
+        print(simulated_by_mjx(options.mjx_fall).line(options.mjx_fall, "MJX", "float32"))
         return
     timing.use_all_cores()
     jax.config.update("jax_enable_x64", True)
     print(HEAD)
-    for name in asked.models:
+    for name in options.models:
         model = load(name)
-        for dtype in asked.dtypes:
-            read = jc.from_mjcf(model, tuple(asked.ignore), dtype=jnp.dtype(dtype))
-            for how in asked.bounded:
-                drop = dropped(read, model, BOUNDED[how], asked.batches)
-                print(line(name, how, dtype, drop), flush=True)
+        for dtype in options.dtypes:
+            robot = jc.from_mjcf(model, tuple(options.ignore), dtype=jnp.dtype(dtype))
+            for solver in options.bounded:
+                drop = dropped(robot, model, BOUNDED[solver], options.batches)
+                print(line(name, solver, dtype, drop), flush=True)
         print(simulated(model).line(name, "MuJoCo", "float64"), flush=True)
-        if asked.rates:
-            batches = tuple(b for b in asked.batches if b > 1)
+        if options.rates:
+            batches = tuple(b for b in options.batches if b > 1)
             print(f"MuJoCo in C, all cores: {mujoco_rate(name, max(batches))} steps/s")
-            other = peers.mjx(name, batches, asked.mjx_seconds, "benchmarks.legged")
+            rate = peers.mjx(name, batches, options.mjx_seconds, "benchmarks.legged")
             print(
-                f"MJX: {other} steps/s; {other.notes}; its depths by `--mjx-fall {name}`",
+                f"MJX: {rate} steps/s; {rate.notes}; penetrations by `--mjx-fall {name}`",
                 flush=True,
             )
 

@@ -1,4 +1,4 @@
-"""Closed loops as a user of MuJoCo writes them: trees of joints, closed by connect equalities."""
+"""Mechanisms with closed loops in MJCF: trees of joints, closed by `connect` equalities."""
 
 from __future__ import annotations
 
@@ -7,11 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 TIKHONOV = 1e-10
-"""Regularises what a planar loop in space says twice: that it is planar."""
+"""Regularizes the redundant rows that a planar loop has in space."""
 
 
 def rod(name: str, start: np.ndarray, end: np.ndarray, joints: str, inside: str = "") -> str:
-    """A uniform rod from its body's origin to a point, both given in the frame of its parent."""
+    """Returns the MJCF of a uniform rod between two points, given in the frame of the parent.
+
+    The origin of the body is at the first point.
+    """
     tip = numbers(end - start)
     return (
         f'<body name="{name}" pos="{numbers(start)}">{joints}'
@@ -20,12 +23,12 @@ def rod(name: str, start: np.ndarray, end: np.ndarray, joints: str, inside: str 
 
 
 def numbers(x: np.ndarray) -> str:
-    """With every digit."""
+    """Formats numbers with full precision."""
     return " ".join(repr(float(value)) for value in np.ravel(x))
 
 
 def document(bodies: str, equalities: str, actuators: str = "") -> str:
-    """The whole model."""
+    """Returns the MJCF text of a model."""
     return (
         '<mujoco><compiler angle="radian"/><option><flag contact="disable"/></option>'
         f"<worldbody>{bodies}</worldbody><equality>{equalities}</equality>"
@@ -34,12 +37,15 @@ def document(bodies: str, equalities: str, actuators: str = "") -> str:
 
 
 def connect(first: str, second: str, anchor: np.ndarray) -> str:
-    """Two bodies share a point, given in the frame of the first."""
+    """Returns a `connect` equality that keeps a point of the first body on the second.
+
+    The point is given in the frame of the first body.
+    """
     return f'<connect body1="{first}" body2="{second}" anchor="{numbers(anchor)}"/>'
 
 
 def four_bar() -> str:
-    """Crank, coupler and rocker on hinges about y."""
+    """Returns the MJCF of a four-bar linkage: crank, coupler and rocker on hinges about y."""
     a, b, c, d = np.array([[0, 0, 0], [0, 0, 0.3], [0.8, 0, 0.7], [1, 0, 0]], float)
     hinge = '<joint name="{}" axis="0 1 0" damping="0.01"/>'
     coupler = rod("coupler", b - a, c - a, hinge.format("knee"))
@@ -50,7 +56,10 @@ def four_bar() -> str:
 
 
 def five_bar_leg() -> str:
-    """A hip that slides and pitches, and two thighs with shins that meet in the foot."""
+    """Returns the MJCF of a hip that slides and pitches, with a five-bar leg.
+
+    The leg has two thighs with shins that are joined at the foot.
+    """
     hinge = '<joint name="{}" axis="0 1 0" armature="0.01"/>'
     foot = np.array([0.0, 0, -0.6])
     legs = ""
@@ -66,11 +75,11 @@ def five_bar_leg() -> str:
 
 
 CROSS = '<joint name="{}_x" axis="1 0 0"/><joint name="{}_y" axis="0 1 0"/>'
-"""Two hinges of one body: a universal joint."""
+"""MJCF of two hinges of one body, which form a universal joint."""
 
 
 def stewart() -> str:
-    """A platform on six legs that slide out of each other, on universal joints below."""
+    """Returns the MJCF of a platform on six telescoping legs with universal joints at the base."""
     bodies, closing, motors = "", "", ""
     platform = np.array([0, 0, 0.8])
     for i in range(6):
@@ -90,21 +99,28 @@ def stewart() -> str:
 
 
 def delta() -> str:
-    """Three arms, each with two parallel rods to a platform that cannot turn."""
+    """Returns the MJCF of a delta robot.
+
+    It has three arms, each with two parallel rods to a platform that cannot rotate.
+    """
     bodies, closing, motors = "", "", ""
     platform = np.array([0, 0, -0.7])
     for i, angle in enumerate(2 * np.pi * np.arange(3) / 3):
-        out, across = np.array(
+        radial, tangential = np.array(
             [[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0]]
         )
-        shoulder, elbow, wrist = 0.2 * out, 0.5 * out - np.array([0, 0, 0.1]), platform + 0.08 * out
+        shoulder, elbow, wrist = (
+            0.2 * radial,
+            0.5 * radial - np.array([0, 0, 0.1]),
+            platform + 0.08 * radial,
+        )
         rods = ""
         for side in (-1, 1):
-            name, shift = f"rod{i}{'ab'[side > 0]}", 0.06 * side * across
+            name, shift = f"rod{i}{'ab'[side > 0]}", 0.06 * side * tangential
             start, end = elbow - shoulder + shift, wrist - shoulder + shift
             rods += rod(name, start, end, CROSS.format(name, name))
             closing += connect("platform", name, wrist - platform + shift)
-        axis = f'<joint name="arm{i}" axis="{numbers(across)}" armature="0.02"/>'
+        axis = f'<joint name="arm{i}" axis="{numbers(tangential)}" armature="0.02"/>'
         bodies += rod(f"arm{i}", shoulder, elbow, axis, rods)
         motors += f'<position joint="arm{i}" kp="60" kv="0.3"/>'
     free = '<freejoint/><geom type="cylinder" size="0.1 0.01"/>'
@@ -120,11 +136,11 @@ LOOPS: dict[str, Callable[[], str]] = {
     "delta": delta,
 }
 REDUNDANT = ("four_bar", "five_bar_leg")
-"""Planar loops, which close a row more than they need."""
+"""Planar loops, which have redundant rows."""
 CONTROL = {
     "four_bar": [0.3],
     "five_bar_leg": [0.2, -0.3],
     "stewart": [0.5, 0.2, 0.6, 0.1, 0.4, 0.3],
     "delta": [0.3, -0.2, 0.4],
 }
-"""Of the motors and servos, constant."""
+"""Constant controls of the motors and servos."""

@@ -1,8 +1,8 @@
-"""The mechanisms of the benchmarks: each in jaxcon and in MuJoCo, with one start for both.
+"""The mechanisms of the benchmarks: each has models in jaxcon and MuJoCo with one initial state.
 
-`find("chain-10")` gives a `Mechanism`; a number at the end of a name is a size, so that
-`chain-1000` and `rope-7` exist too. Bodies have the same names in both, their frames lie at the
-centres of mass, and a point (x, y) of a planar scene is (x, 0, y) in MuJoCo.
+`find("chain-10")` returns a `Mechanism`. A number at the end of a name is a size, so that
+`chain-1000` and `rope-7` exist too. Bodies have the same names in both models, and their frames are
+at the centers of mass. A point (x, y) of a planar scene is (x, 0, y) in MuJoCo.
 """
 
 from __future__ import annotations
@@ -34,19 +34,18 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class Mechanism:
-    """One scene of the benchmarks.
+    """A scene of the benchmarks.
 
     Attributes:
-        name: of the scene.
-        bodies: names; their centres of mass are the markers by which runs are compared.
+        name: name of the scene.
+        bodies: names of the markers, bodies whose centers of mass are compared.
         link: characteristic length [m].
-        loops: whether MuJoCo needs soft equality constraints for it; otherwise it is a tree of
-            joints there, and nothing is soft.
-        build: dtype → system and start in jaxcon.
-        mjcf: → text of the same model for MuJoCo.
-        rates: MuJoCo's joint velocities at the start, in its order.
-        exact: seconds → where the markers then are, from a closed form or a reduced equation;
-            None where there is none.
+        loops: True if MuJoCo needs soft equality constraints, False if it models a tree of joints.
+        build: (dtype) → system and initial state in jaxcon.
+        mjcf: () → MJCF of the same model.
+        rates: MuJoCo's initial joint velocities, in its order.
+        exact: (seconds) → marker positions by a closed form or a reduced equation, None if there is
+            no such solution.
     """
 
     name: str
@@ -58,13 +57,13 @@ class Mechanism:
     rates: tuple[float, ...]
     exact: Callable[[float], np.ndarray] | None = None
 
-    def markers(self, system: Any, state: jc.State) -> jax.Array:
-        """Where the centres of mass are, (bodies, dim) [m]."""
+    def markers(self, system: jc.extend.System, state: jc.State) -> jax.Array:
+        """Returns the positions of the centers of mass, (bodies, dim) [m]."""
         return jnp.stack([jc.position(system, state, name) for name in self.bodies])
 
 
 def lift(points: Any) -> np.ndarray:
-    """Points of a plane in the space of MuJoCo: (x, y) → (x, 0, y); others as they are."""
+    """Maps planar points to MuJoCo's space, (x, y) → (x, 0, y). Spatial points are unchanged."""
     points = np.asarray(points, np.float64)
     if points.shape[-1] == 3:
         return points
@@ -75,7 +74,7 @@ def lift(points: Any) -> np.ndarray:
 def of_rods(
     name: str, rods: Linkage, scene: Callable[[Linkage, Any], Any], exact: Any = None
 ) -> Mechanism:
-    """A mechanism of rods, in the plane or in space."""
+    """Returns a mechanism of rods, in the plane or in space."""
     return Mechanism(
         name=name,
         bodies=tuple(rod.name for rod in rods.rods),
@@ -89,32 +88,32 @@ def of_rods(
 
 
 def chain(n: int) -> Mechanism:
-    """Rods of 1 m and 1 kg on parallel hinges, let go from the horizontal; a scene in space."""
+    """Returns n rods of 1 m and 1 kg on parallel hinges in space, released from the horizontal."""
     return of_rods(f"chain-{n}", collinear(n, length=1.0), spatial_scene)
 
 
 def pendulum() -> Mechanism:
-    """The chain of one."""
+    """Returns a chain of one rod in space."""
     return of_rods("pendulum", collinear(1, length=1.0), spatial_scene)
 
 
 def planar_chain(n: int) -> Mechanism:
-    """The same chain as a scene in the plane."""
+    """Returns n rods of 1 m and 1 kg on hinges in the plane, released from the horizontal."""
     return of_rods(f"planar-chain-{n}", collinear(n, length=1.0), planar_scene)
 
 
 def rope(n: int) -> Mechanism:
-    """Particles of 0.1 kg at distances of 0.1 m, let go from the horizontal, in the plane.
+    """Returns n particles of 0.1 kg, 0.1 m apart in the plane, released from the horizontal.
 
-    In MuJoCo, which has no particles, a chain of hinges with the masses at the ends of the links:
-    the same mechanism in the smallest coordinates there are.
+    MuJoCo has no particles. Its model is a chain of hinges with point masses at the ends of the
+    links. This is the same mechanism in minimal coordinates.
     """
     rods = collinear(n, length=0.1, mass=0.1, at_end=True)
     return of_rods(f"rope-{n}", rods, particles_scene)
 
 
 def four_bar() -> Mechanism:
-    """The crank-rocker of `jaxcon.scenes.four_bar`, its crank turning at 10 rad/s."""
+    """Returns the crank-rocker of `jaxcon.scenes.four_bar`, with its crank at 10 rad/s."""
     base, *lengths = CRANK_ROCKER
     masses = (0.3, 0.9, 0.7)
     angles = linkage.close(lengths, base, 0.5)
@@ -131,10 +130,12 @@ def four_bar() -> Mechanism:
 
 
 def n_four_bar(n: int) -> Mechanism:
-    """Cranks of 1 m side by side, joined at their tops by couplers; horizontal, it is singular.
+    """Returns cranks of 1 m side by side, joined at their tops by couplers.
+
+    The mechanism is singular when it is horizontal.
 
     References:
-        IFToMM benchmark A02, N-four-bar mechanism: vertical at the start, the tops at 1 m/s.
+        IFToMM benchmark A02, N-four-bar mechanism: initially vertical, the tops at 1 m/s.
     """
     rods, loops = [], []
     for i in range(n + 1):
@@ -151,7 +152,7 @@ def n_four_bar(n: int) -> Mechanism:
 
 
 def parallelogram(name: str, angle: float) -> np.ndarray:
-    """The centre of a crank or coupler of the N-four-bar whose cranks are at an angle, (2,)."""
+    """Returns the center of a crank or coupler of the N-four-bar at a crank angle, (2,) [m]."""
     arm = np.array([np.cos(angle), np.sin(angle)])
     if name.startswith("crank"):
         return np.array([float(name[5:]), 0.0]) + arm / 2
@@ -159,7 +160,10 @@ def parallelogram(name: str, angle: float) -> np.ndarray:
 
 
 def crank_angle(n: int, seconds: float, steps: int = 4000) -> float:
-    """θ̈ = −g [(n+1)/2 + n] / [(n+1)/3 + n] cos θ from θ = π/2, θ̇ = −1, by RK4 [rad]."""
+    """Returns the angle θ of the cranks after `seconds`, integrated by RK4 [rad].
+
+    θ̈ = −g [(n+1)/2 + n] / [(n+1)/3 + n] cos θ, from θ = π/2 and θ̇ = −1.
+    """
     pull = GRAVITY * ((n + 1) / 2 + n) / ((n + 1) / 3 + n)
 
     def rate(y: np.ndarray) -> np.ndarray:
@@ -175,7 +179,7 @@ def crank_angle(n: int, seconds: float, steps: int = 4000) -> float:
 
 
 def stewart_platform() -> Mechanism:
-    """Six legs on universal joints, each a spring-loaded slider, carry a platform in space."""
+    """Returns a platform in space on six legs with universal joints and spring-loaded sliders."""
     return Mechanism(
         name="stewart",
         bodies=stewart.BODIES,
@@ -201,15 +205,15 @@ FAMILIES: dict[str, Callable[[int], Mechanism]] = {
 
 
 def find(name: str) -> Mechanism:
-    """The mechanism of a name such as `four-bar` or `chain-10`.
+    """Returns the mechanism of a name such as `four-bar` or `chain-10`.
 
     Raises:
-        ValueError: there is none.
+        ValueError: the name is unknown.
     """
     if name in SINGLE:
         return SINGLE[name]()
     family, _, size = name.rpartition("-")
     if family in FAMILIES and size.isdigit():
         return FAMILIES[family](int(size))
-    known = [*SINGLE, *(f"{family}-<n>" for family in FAMILIES)]
-    raise ValueError(f"mechanism '{name}' is unknown; known are {known}.")
+    names = [*SINGLE, *(f"{family}-<n>" for family in FAMILIES)]
+    raise ValueError(f"mechanism '{name}' is unknown; known are {names}.")

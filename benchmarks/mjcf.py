@@ -1,4 +1,4 @@
-"""The text of MuJoCo models: bodies with explicit inertia, joints, equality constraints."""
+"""MJCF text of MuJoCo models: bodies with explicit inertia, joints, equality constraints."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from typing import Any
 import numpy as np
 
 OUT_OF_PLANE = (0.0, -1.0, 0.0)
-"""The axis about which (x, y) of the plane turns positively when it is drawn as (x, 0, z)."""
+"""Axis of positive rotation for a plane (x, y) drawn as (x, 0, z)."""
 SOFTNESS = 'solref="0.004 1" solimp="0.9999 0.9999 0.001 0.5 2"'
 """The stiffest equality that MuJoCo allows at 2 ms: a time constant of two steps."""
 DT = 2e-3
+"""Step size of the benchmarks [s]."""
 
 
 def in_space(point: Any) -> np.ndarray:
-    """(x, y) → (x, 0, y)."""
+    """Maps a planar point (x, y) to (x, 0, y)."""
     return np.array([point[0], 0.0, point[1]])
 
 
 def numbers(values: Any) -> str:
-    """With every digit."""
+    """Formats numbers with full precision."""
     return " ".join(repr(float(x)) for x in np.ravel(values))
 
 
@@ -32,7 +33,7 @@ def body(
     inside: str = "",
     quaternion: Any = (1.0, 0.0, 0.0, 0.0),
 ) -> str:
-    """A body whose frame lies at its centre of mass along its principal axes."""
+    """Returns the MJCF of a body with its frame at the center of mass along the principal axes."""
     return (
         f'<body name="{name}" pos="{numbers(position)}" quat="{numbers(quaternion)}">'
         f'<inertial pos="0 0 0" mass="{mass!r}" diaginertia="{numbers(moments)}"/>'
@@ -41,20 +42,24 @@ def body(
 
 
 def joint(kind: str, **attributes: Any) -> str:
-    """A joint; its attributes are numbers."""
-    given = " ".join(f'{key}="{numbers(value)}"' for key, value in attributes.items())
-    return f'<joint type="{kind}" {given}/>'
+    """Returns the MJCF of a joint with numeric attributes."""
+    text = " ".join(f'{key}="{numbers(value)}"' for key, value in attributes.items())
+    return f'<joint type="{kind}" {text}/>'
 
 
 def connect(first: str, second: str, anchor: Any) -> str:
-    """Two bodies share a point, given in the frame of the first."""
+    """Returns a `connect` equality that keeps a point of the first body on the second.
+
+    The point is given in the frame of the first body.
+    """
     return f'<connect body1="{first}" body2="{second}" anchor="{numbers(anchor)}" {SOFTNESS}/>\n'
 
 
 def model(bodies: str, equalities: Sequence[str] = ()) -> str:
-    """A model with what makes MuJoCo fast: Euler, no contacts or islands, no constraints in a tree.
+    """Returns the MJCF of a model with MuJoCo's fast options.
 
-    Damping is explicit, as in the scenes it is compared with, which also saves a factorization.
+    These are the Euler integrator, no contacts, no islands, and no constraints in trees. Damping is
+    explicit, as in the scenes of jaxcon. This also saves a factorization.
     """
     flags = 'contact="disable" eulerdamp="disable"'
     flags += ' island="disable"' if equalities else ' constraint="disable"'

@@ -1,7 +1,7 @@
-"""Motions whose end is known, each in jaxcon and in MuJoCo, for comparisons at equal error.
+"""Motions with known final states, in jaxcon and in MuJoCo, for comparisons at equal error.
 
-Errors are the distance of the centre of mass that is furthest off, in metres, and of Andrews'
-mechanism the largest of its seven angles, in radians.
+Errors are the largest distance of a center of mass [m]. For Andrews' mechanism, the error is the
+largest of its seven angles [rad].
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mjcf, rods
@@ -21,19 +22,19 @@ DRAKE = ("crank", "coupler", "rocker")
 ANGLES = ("crank", "rod", "triangle", "upper", "upper_arm", "lower", "lower_arm")
 """Bodies whose hinges have the angles (β, Θ, γ, δ, Φ, ε, Ω), in the order of MuJoCo's joints."""
 ORDER = (0, 1, 2, 4, 3, 6, 5)
-"""Of those in q = (β, Θ, γ, Φ, δ, Ω, ε)."""
+"""Indices into `ANGLES` of the components of q = (β, Θ, γ, Φ, δ, Ω, ε)."""
 
 
 @dataclass(frozen=True)
 class Form:
-    """A motion as a system of jaxcon.
+    """A model of a motion in jaxcon.
 
     Attributes:
-        name: of the form; empty where there is only one.
-        build: dtype → system and start.
-        places: (system, q) → what is compared.
-        solver: that suits it.
-        control: of every step, in any precision; None without.
+        name: name of the form, empty if the motion has only one.
+        build: (dtype) → system and initial state.
+        places: (system, q) → compared quantities.
+        solver: a suitable solver.
+        control: constant control, None without control.
     """
 
     name: str
@@ -45,20 +46,20 @@ class Form:
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion whose end is known.
+    """A motion with a known final state.
 
     Attributes:
-        name: of it.
-        seconds: until its end [s].
-        unit: of errors.
-        first: how many steps the coarsest run has.
-        forms: in jaxcon.
-        mjcf: → text of the model for MuJoCo.
-        rates: of MuJoCo's joints at the start, in its order.
-        seen: MuJoCo's (model, data) after its kinematics → what is compared.
-        end: what that should be.
-        gravity: whether there is any.
-        loops: whether MuJoCo needs soft equality constraints for it.
+        name: name of the motion.
+        seconds: duration [s].
+        unit: unit of errors.
+        first: number of steps of the coarsest run.
+        forms: models in jaxcon.
+        mjcf: () → MJCF of the model.
+        rates: MuJoCo's initial joint velocities, in its order.
+        seen: MuJoCo's (model, data) after kinematics → compared quantities.
+        end: reference value of the compared quantities.
+        gravity: False if there is no gravity.
+        loops: True if MuJoCo needs soft equality constraints.
     """
 
     name: str
@@ -74,27 +75,27 @@ class Motion:
     loops: bool = False
 
     def error(self, places: np.ndarray) -> float:
-        """Of what a run ends with; infinite where it is not finite."""
+        """Returns the error of the final quantities, infinite if one of them is not finite."""
         if not np.all(np.isfinite(places)):
             return float("inf")
-        apart = places - self.end
-        far = np.abs(apart) if self.unit == "rad" else np.linalg.norm(apart, axis=-1)
-        return float(np.max(far))
+        difference = places - self.end
+        errors = np.abs(difference) if self.unit == "rad" else np.linalg.norm(difference, axis=-1)
+        return float(np.max(errors))
 
 
 def bobs(names: tuple[str, ...]) -> Form:
-    """Particles on rods, of 1 kg and 1 m, released level."""
-    level = rods.collinear(len(names), length=1.0, at_end=True)
-    still = Linkage(tuple(replace(rod, rate=0.0) for rod in level.rods))
+    """Returns a pendulum of particles of 1 kg on rods of 1 m, released from the horizontal."""
+    moving = rods.collinear(len(names), length=1.0, at_end=True)
+    still = Linkage(tuple(replace(rod, rate=0.0) for rod in moving.rods))
 
     def places(system: Any, q: np.ndarray) -> np.ndarray:
         return np.stack([q[system.layout.q(name)] for name in names])
 
-    return Form("", lambda dtype: rods.particles_scene(still, dtype), places, jc.Sparse())
+    return Form("", lambda dtype: rods.particles_scene(still, dtype), places, jc.solvers.Sparse())
 
 
 def swinging(name: str, seconds: float, first: int, end: Any) -> Motion:
-    """A pendulum of as many bobs as have an end, (bobs, 2) [m]."""
+    """Returns the motion of a multiple pendulum with the final positions `end`, (bobs, 2) [m]."""
     end = np.array(end)
     names = tuple(f"link{i}" for i in range(len(end)))
     text = rods.to_mjcf(rods.collinear(len(end), length=1.0, at_end=True))
@@ -103,7 +104,7 @@ def swinging(name: str, seconds: float, first: int, end: Any) -> Motion:
 
 
 def xz(names: tuple[str, ...]) -> Callable[[Any, Any], np.ndarray]:
-    """MuJoCo's centres of mass in the plane, (bodies, 2) [m]."""
+    """Returns a function that reads MuJoCo's centers of mass in the plane, (bodies, 2) [m]."""
 
     def seen(model: Any, data: Any) -> np.ndarray:
         return data.xpos[[model.body(name).id for name in names]][:, [0, 2]].copy()
@@ -112,21 +113,24 @@ def xz(names: tuple[str, ...]) -> Callable[[Any, Any], np.ndarray]:
 
 
 def pendulum() -> Motion:
-    """IFToMM's A01 after 10 s, by elliptic functions."""
+    """Returns IFToMM's problem A01, whose state after 10 s follows from elliptic functions."""
     rows = references.load("iftomm_A01_pendulum")["reference"]
     row = next(row for row in rows if row["t"] == 10)
     return swinging("pendulum", 10.0, 40, [[row["x"], row["y"]]])
 
 
 def double_pendulum() -> Motion:
-    """Two point masses after 3 s, by extrapolation in 80-bit arithmetic."""
+    """Returns a pendulum of two point masses, with reference after 3 s by 80-bit extrapolation."""
     rows = references.load("an_double_pendulum")["rows"]
     row = next(row for row in rows if row["t"] == 3)
     return swinging("double pendulum", 3.0, 15, [row["p1"], row["p2"]])
 
 
 def four_bar() -> Motion:
-    """Drake's four-bar after 2 s; its reference is off by about 3e-10."""
+    """Returns Drake's four-bar linkage with its state after 2 s.
+
+    The error of the reference is about 3e-10.
+    """
     rows = references.load("drake_four_bar")["reference"]
     row = next(row for row in rows if row["t"] == 2)
     bar = linkage.hanging_trapezoid(-rows[0]["qA_rate"])
@@ -146,16 +150,16 @@ def four_bar() -> Motion:
         )
         for i, name in enumerate(DRAKE)
     )
-    joined = Linkage(bodies, (("coupler", "rocker", ends[1]),))
-    turned = [-row[key] for key in ("qA", "coupler_abs", "qC")]
-    halves = 2.0 * np.stack([np.cos(turned), np.sin(turned)], -1)
+    loop = Linkage(bodies, (("coupler", "rocker", ends[1]),))
+    angles = [-row[key] for key in ("qA", "coupler_abs", "qC")]
+    halves = 2.0 * np.stack([np.cos(angles), np.sin(angles)], -1)
     end = halves + np.array([[0.0, 0.0], 2 * halves[0], [bar.base, 0.0]])
 
     def places(system: Any, q: np.ndarray) -> np.ndarray:
         return np.stack([q[system.layout.q(name)][:2] for name in DRAKE])
 
-    form = Form("", lambda dtype: rods.planar_scene(joined, dtype), places, jc.Sparse())
-    text = rods.to_mjcf(joined)
+    form = Form("", lambda dtype: rods.planar_scene(loop, dtype), places, jc.solvers.Sparse())
+    text = rods.to_mjcf(loop)
     return Motion(
         "four-bar", 2.0, "m", 10, (form,), lambda: text, tuple(rates), xz(DRAKE), end, loops=True
     )
@@ -163,11 +167,11 @@ def four_bar() -> Motion:
 
 @dataclass(frozen=True)
 class Squeezer:
-    """Andrews' mechanism in the plane as it is assembled; angles as in `verification.andrews`.
+    """Andrews' mechanism in the plane at assembly. Its angles are those of `verification.andrews`.
 
     Attributes:
-        p: its parameters [SI].
-        q: its angles at the start (7,) [rad].
+        p: parameters of the test set in SI units.
+        q: initial angles (β, Θ, γ, Φ, δ, Ω, ε), (7,) [rad].
     """
 
     p: dict[str, float]
@@ -175,16 +179,17 @@ class Squeezer:
 
     @classmethod
     def published(cls) -> Squeezer:
-        """As the test set has it."""
+        """Returns the mechanism with the parameters of the published test set."""
         data = references.load("ivp_andrews")
         return cls(data["parameters"], np.array(data["initial"]["q"]))
 
     @property
     def linkage(self) -> Linkage:
-        """Seven bodies on seven hinges, and three hinges where four of them meet.
+        """Seven bodies on seven hinges, and three hinges where four bodies meet.
 
-        Where the centre of mass of a body on a fixed pivot lies around it does not matter without
-        gravity: only its distance does, as part of the moment about the pivot.
+        The last three hinges close the loops. There is no gravity. The direction from a fixed pivot
+        to the center of mass of its body therefore does not matter. Only the distance does, as part
+        of the moment of inertia about the pivot.
         """
         p, (beta, theta, gamma, phi, delta, omega, epsilon) = self.p, self.q
         a, b = np.array([p["xa"], p["ya"]]), np.array([p["xb"], p["yb"]])
@@ -214,13 +219,13 @@ class Squeezer:
 
     @property
     def spring(self) -> tuple[np.ndarray, np.ndarray]:
-        """Its ends on the ground and on the triangle, (2,) each [m]."""
+        """The ends of the spring on the ground and on the triangle, (2,) each [m]."""
         p, gamma = self.p, self.q[2]
         on = np.array([p["xb"], p["yb"]]) + p["sd"] * along(gamma) - p["sc"] * turned(gamma)
         return np.array([p["xc"], p["yc"]]), on
 
-    def scene(self, dtype: Any) -> tuple[Any, jc.State]:
-        """Seven bodies of the plane: 21 velocities, 20 rows."""
+    def scene(self, dtype: DTypeLike) -> tuple[Any, jc.State]:
+        """Builds seven bodies in the plane, with 21 velocities and 20 constraint rows."""
         scene = rods.hinged(jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=dtype), self.linkage)
         ground, on = self.spring
         stiff = {"stiffness": self.p["c0"], "rest_length": self.p["l0"]}
@@ -229,14 +234,18 @@ class Squeezer:
         return scene.build()
 
     def angles(self, system: Any, q: np.ndarray) -> np.ndarray:
-        """(β, Θ, γ, Φ, δ, Ω, ε) of the bodies, (7,) [rad]."""
-        turn = {name: q[system.layout.q(name)][2] for name in ANGLES} | {jc.WORLD: 0.0}
+        """Returns the angles (β, Θ, γ, Φ, δ, Ω, ε) from the poses of the bodies, (7,) [rad]."""
+        turns = {name: q[system.layout.q(name)][2] for name in ANGLES} | {jc.WORLD: 0.0}
         parents = {rod.name: rod.parent for rod in self.linkage.rods}
-        own = np.array([turn[name] - turn[parents[name]] for name in ANGLES])
-        return self.q + own[list(ORDER)]
+        relative = np.array([turns[name] - turns[parents[name]] for name in ANGLES])
+        return self.q + relative[list(ORDER)]
 
     def mjcf(self) -> str:
-        """Four trees of hinges, three `connect`, a spring as a tendon, a constant torque."""
+        """Returns the MJCF of the mechanism.
+
+        It has four trees of hinges, three `connect` equalities, a spring tendon and a constant
+        torque.
+        """
         ground, on = (mjcf.in_space(x) for x in self.spring)
         triangle = next(rod for rod in self.linkage.rods if rod.name == "triangle")
         site = '<site name="{}" pos="{}"/>'
@@ -256,30 +265,35 @@ class Squeezer:
         )
 
     def seen(self, model: Any, data: Any) -> np.ndarray:
-        """The angles in MuJoCo, (7,) [rad]."""
+        """Returns the angles (β, Θ, γ, Φ, δ, Ω, ε) in MuJoCo, (7,) [rad]."""
         joints = [model.jnt_qposadr[model.body(name).jntadr[0]] for name in ANGLES]
         return self.q + data.qpos[joints][list(ORDER)]
 
 
 def along(angle: Any) -> np.ndarray:
-    """The unit vector at an angle, (2,)."""
+    """Returns the unit vector at an angle, (2,)."""
     return np.array([np.cos(angle), np.sin(angle)])
 
 
 def turned(angle: Any) -> np.ndarray:
-    """The same a right angle further, (2,)."""
+    """Returns the unit vector at an angle plus π/2, (2,)."""
     return rods.across(along(angle))
 
 
 def squeezer() -> Motion:
-    """Andrews' mechanism after 30 ms, by extrapolation in 80-bit arithmetic."""
+    """Returns the motion of Andrews' mechanism for 30 ms.
+
+    The reference is by extrapolation in 80-bit arithmetic.
+    """
     rows = references.load("ivp_andrews")["corrected_reference"]["rows"]
-    own = Squeezer.published()
-    angles = Form("angles", lambda dtype: andrews.andrews(), lambda system, q: q, jc.Schur())
-    bodies = Form("bodies", own.scene, own.angles, jc.Sparse(), control=1.0)
+    mechanism = Squeezer.published()
+    angles = Form(
+        "angles", lambda dtype: andrews.andrews(), lambda system, q: q, jc.solvers.Schur()
+    )
+    bodies = Form("bodies", mechanism.scene, mechanism.angles, jc.solvers.Sparse(), control=1.0)
     return Motion(
-        "Andrews", rows[-1]["t"], "rad", 50, (bodies, angles), own.mjcf, (0.0,) * 7, own.seen,
-        np.array(rows[-1]["q"]), gravity=False, loops=True,
+        "Andrews", rows[-1]["t"], "rad", 50, (bodies, angles), mechanism.mjcf, (0.0,) * 7,
+        mechanism.seen, np.array(rows[-1]["q"]), gravity=False, loops=True,
     )  # fmt: skip
 
 

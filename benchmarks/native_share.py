@@ -1,11 +1,11 @@
-"""What of the native speed plain `jit(vmap(rollout))` reaches: at least four fifths.
+"""Speed of plain `jit(vmap(rollout))` relative to batch-last steps; it must be at least 0.8.
 
     python -m benchmarks.native_share [--scenes chain-10 …] [--batch 512] [--dtype float32]
         [--json FILE]
 
-The other runs the same steps by hand: worlds on the last axis from the beginning, a scan that calls
-the step on the whole batch, and no vmap anywhere. Both lie over one device a core and do the same
-numbers of steps; their repeats alternate, so that a machine that slows down slows both.
+The comparison program runs the same steps without vmap: the batch axis is last throughout, and a
+scan calls the step on the whole batch. Both programs run on one device per core and take the same
+number of steps. Repeats alternate, so that a change in the machine's speed affects both.
 """
 
 from __future__ import annotations
@@ -21,29 +21,31 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mechanisms, targets, timing
 from benchmarks.mjcf import DT
 from benchmarks.throughput import WORK, method_of, worlds
 from benchmarks.timing import Rate
-from jaxcon.core import native
-from jaxcon.simulation.step import contained_step
+from jaxcon.execution.shell import masked_step
+from jaxcon.staging import batch_last
 
 SHARE = 0.8
-"""Of the native rate that plain vmap is to reach."""
+"""Required rate of plain vmap over that of batch-last steps."""
 
 Run = Callable[[jc.State], jc.State]
 
 
 @dataclass(frozen=True)
 class Share:
-    """Of one scene.
+    """Rates of one scene.
 
     Attributes:
-        scene: which.
-        plain, native: world-steps a second.
-        ratios: the rate of vmap over the native one, least, median and most of the repeats.
+        scene: name of the scene.
+        plain: world-steps per second by vmap.
+        native: world-steps per second of batch-last steps.
+        ratios: minimum, median and maximum over the repeats of plain / native.
     """
 
     scene: str
@@ -53,12 +55,12 @@ class Share:
 
     @property
     def verdict(self) -> str:
-        """Whether vmap costs little."""
+        """Returns "passes" if plain vmap reaches `SHARE`, otherwise "below"."""
         return "passes" if self.ratios[1] >= SHARE else "below"
 
 
-def plain(system: Any, method: jc.Method, steps: int) -> Run:
-    """Steps of a batch on the first axis, by vmap."""
+def plain(system: jc.extend.System, method: jc.Method, steps: int) -> Run:
+    """Returns a rollout of a batch along the first axis, by vmap."""
 
     def run(state: jc.State) -> jc.State:
         return jc.rollout(system, method, state, None, DT, steps, record=lambda s, i: None)[0]
@@ -66,29 +68,32 @@ def plain(system: Any, method: jc.Method, steps: int) -> Run:
     return jax.vmap(run)
 
 
-def by_hand(system: Any, method: jc.Method, steps: int) -> Run:
-    """Steps of a batch on the last axis, without vmap; what worlds share has a last axis of 1."""
+def by_hand(system: jc.extend.System, method: jc.Method, steps: int) -> Run:
+    """Returns a rollout of a batch along the last axis, without vmap.
 
-    def one(state: jc.State, shared: Any) -> tuple[jc.State, None]:
+    Arrays that all worlds share get a last axis of length 1.
+    """
+
+    def step_batch(state: jc.State, shared: Any) -> tuple[jc.State, None]:
         system, method, dt = shared
-        return native.call(contained_step, system, method, state, None, dt)[0], None
+        return batch_last.call(masked_step, system, method, state, None, dt)[0], None
 
     def run(state: jc.State) -> jc.State:
         dt = jnp.asarray(DT, state.q.dtype)
         shared = jax.tree.map(lambda x: jnp.asarray(x)[..., None], (system, method, dt))
-        return jax.lax.scan(lambda s, _: one(s, shared), state, None, steps)[0]
+        return jax.lax.scan(lambda s, _: step_batch(s, shared), state, None, steps)[0]
 
     return run
 
 
 def turned(states: jc.State, last: bool = True) -> jc.State:
-    """The batch from the first axis to the last, or back."""
+    """Moves the batch axis of states from first to last, or back."""
     source, target = (0, -1) if last else (-1, 0)
     return jax.jit(lambda s: jax.tree.map(lambda x: jnp.moveaxis(x, source, target), s))(states)
 
 
-def measure(name: str, batch: int, dtype: Any, work: int = WORK, repeats: int = 9) -> Share:
-    """Both rates of one scene."""
+def measure(name: str, batch: int, dtype: DTypeLike, work: int = WORK, repeats: int = 9) -> Share:
+    """Measures the rates of both programs on one scene."""
     with jax.enable_x64(np.dtype(dtype) == np.float64):
         system, state = mechanisms.find(name).build(dtype)
         method = method_of(name, "Sparse")
@@ -100,24 +105,24 @@ def measure(name: str, batch: int, dtype: Any, work: int = WORK, repeats: int = 
             for make, start in zip((plain, by_hand), starts, strict=True)
         ]
         calls = [functools.partial(*pair) for pair in zip(runs, starts, strict=True)]
-        rates = timing.in_turn(calls, batch * steps, repeats + 1)[1:]  # the first warms up
+        rates = timing.in_turn(calls, batch * steps, repeats + 1)[1:]  # the first repeat warms up
     ratios = rates[:, 0] / rates[:, 1]
     plain_rate, by_hand_rate, share = map(spread, (*rates.T, ratios))
     return Share(name, Rate(*plain_rate), Rate(*by_hand_rate), (share[1], share[0], share[2]))
 
 
 def spread(x: np.ndarray) -> tuple[float, float, float]:
-    """Median, least and most."""
+    """Returns median, minimum and maximum."""
     return float(np.median(x)), float(np.min(x)), float(np.max(x))
 
 
 def main() -> None:
-    """Prints the table and writes the file."""
+    """Prints the table of rates and ratios, and writes the file of `--json`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="*", default=list(targets.SCENES))
     parser.add_argument("--batch", type=int, default=512)
     parser.add_argument("--dtype", default="float32")
-    parser.add_argument("--work", type=int, default=WORK, help="world-steps of a call")
+    parser.add_argument("--work", type=int, default=WORK, help="world-steps per call")
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -129,8 +134,8 @@ def main() -> None:
     for name in options.scenes:
         row = measure(name, options.batch, options.dtype, options.work, options.repeats)
         rows.append(timing.plain(row) | {"verdict": row.verdict})
-        least, median, most = row.ratios
-        ratio = f"{median:.2f} ({least:.2f} to {most:.2f})"
+        low, median, high = row.ratios
+        ratio = f"{median:.2f} ({low:.2f} to {high:.2f})"
         print(f"| {name} | {row.plain} | {row.native} | {ratio} | {row.verdict} |", flush=True)
     if options.json:
         result = {"machine": timing.machine(), "batch": options.batch, "dtype": options.dtype}

@@ -1,12 +1,14 @@
-"""Only what a scene requires: coordinates, rows and operations from a particle to a humanoid.
+"""Coordinates, rows and operations that a scene needs, from a particle to a humanoid.
 
     python -m benchmarks.needed [--scenes particle rod …] [--batch 256] [--counts] [--json FILE]
 
-Each scene has what the one before it lacks. Operations are those of one world's step as
-`jaxcon.core.operations` counts them: of alternatives the cheapest, loops of unknown length as one
-round, so that of bounded rows one iteration is counted. Instructions are those of the program
-before it is compiled. Time is that of a step of one world in a batch, float32, semi-implicit Euler
-with Baumgarte and the solver of `jc.Method.auto`, on one device; `--counts` leaves it out.
+Each scene adds a feature to the previous scene. Operations are those of one world's step, counted
+by `jaxcon.staging.operations`. Of a conditional, the cheapest branch counts. Of a loop of unknown
+length, such as that of a contact solver, one iteration counts. Instructions are those of the
+program before compilation.
+
+Time is that of a step of one world in a batch on one device, in float32, with semi-implicit Euler,
+Baumgarte and the solver of `jc.Method.auto`. `--counts` skips the timing.
 """
 
 from __future__ import annotations
@@ -20,26 +22,29 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mechanisms, timing
 from jaxcon.analysis.work import seconds, work
-from jaxcon.constraints.bounds import count_bounds
-from jaxcon.simulation.choice import words
+from jaxcon.contact.rows import count_bounds
+from jaxcon.methods.choice import words
 
 
 @dataclass(frozen=True)
 class Need:
-    """What one scene takes.
+    """Size and cost of one scene.
 
     Attributes:
-        scene: its name.
-        positions, velocities: numbers of its state.
-        rows, bounded: with free and with bounded multipliers.
-        operations: arithmetic of one world's step.
-        instructions: of the program.
-        solver: that was taken.
-        step: time of a step of one world [s]; None where it was not asked.
+        scene: name of the scene.
+        positions: number of position coordinates.
+        velocities: number of velocities.
+        rows: number of equality rows.
+        bounded: number of inequality rows.
+        operations: arithmetic operations of one world's step.
+        instructions: instructions of the program.
+        solver: the chosen solver.
+        step: time of a step per world [s], None if not measured.
     """
 
     scene: str
@@ -53,23 +58,23 @@ class Need:
     step: float | None = None
 
 
-def particle(dtype: Any) -> tuple[Any, jc.State]:
-    """A particle in the plane that falls."""
+def particle(dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds a particle in the plane in free fall."""
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("bob", mass=1.0)
     return scene.build()
 
 
-def rod(dtype: Any) -> tuple[Any, jc.State]:
-    """The same on a rod."""
+def rod(dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds a particle in the plane on a rod."""
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     return scene.build()
 
 
-def ball(dtype: Any) -> tuple[Any, jc.State]:
-    """A ball in space that falls on a floor with friction."""
+def ball(dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds a ball in space that falls on a floor with friction."""
     scene = jc.Scene(dtype=dtype)
     scene.add_body("ball", inertia=jc.inertia.sphere(0.5, 0.1), position=(0, 0, 1))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, friction=0.4))
@@ -77,14 +82,14 @@ def ball(dtype: Any) -> tuple[Any, jc.State]:
 
 
 def mechanism(name: str) -> Callable[[Any], tuple[Any, jc.State]]:
-    """One of the benchmarks."""
+    """Returns the builder of one of the benchmarks' mechanisms."""
     return lambda dtype: mechanisms.find(name).build(dtype)
 
 
 def robot(name: str, ignore: tuple[str, ...] = ()) -> Callable[[Any], tuple[Any, jc.State]]:
-    """One of Gymnasium's models."""
+    """Returns the builder of one of Gymnasium's models."""
 
-    def build(dtype: Any) -> tuple[Any, jc.State]:
+    def build(dtype: DTypeLike) -> tuple[Any, jc.State]:
         from benchmarks.mjcf_agreement import ASSETS
 
         system, state = jc.from_mjcf(str(ASSETS / f"{name}.xml"), ignore, dtype=np.dtype(dtype))
@@ -107,13 +112,16 @@ SCENES: dict[str, Callable[[Any], tuple[Any, jc.State]]] = {
 }
 
 
-def measure(name: str, batch: int | None, dtype: Any = np.float32) -> Need:
-    """One scene, timed in a batch where one is given."""
+def measure(name: str, batch: int | None, dtype: DTypeLike = np.float32) -> Need:
+    """Counts coordinates, rows and operations of one scene.
+
+    If a batch size is given, it also times a step.
+    """
     system, state = SCENES[name](dtype)
     method = jc.Method.auto(system, state, batch or 1)
-    layout = getattr(system, "layout", None)
+    layout = system.layout
     control = np.zeros(layout.n_u, dtype) if layout is not None and layout.n_u else None
-    found = work(system, method, state, control)
+    count = work(system, method, state, control)
     rows = jax.eval_shape(lambda s: jc.violation(system, s), state).position.shape[0]
     return Need(
         name,
@@ -121,20 +129,20 @@ def measure(name: str, batch: int | None, dtype: Any = np.float32) -> Need:
         len(state.v),
         rows,
         count_bounds(system, state.q, state.v),
-        found.usual,
-        found.instructions,
+        count.usual,
+        count.instructions,
         words(method.solver),
         None if batch is None else seconds(system, method, state, control, batch),
     )
 
 
 HEAD = """
-| scene | positions | velocities | rows | bounded | operations | instructions | a step | solver |
+| scene | positions | velocities | rows | inequalities | operations | instructions | step | solver |
 |---|---|---|---|---|---|---|---|---|"""
 
 
 def line(need: Need) -> str:
-    """A row of the table."""
+    """Formats the needs of one scene as a table row."""
     step = "-" if need.step is None else f"{1e6 * need.step:.3g} µs"
     numbers = (need.positions, need.velocities, need.rows, need.bounded)
     cells = [need.scene, *numbers, f"{need.operations:.0f}", need.instructions, step]
@@ -142,21 +150,21 @@ def line(need: Need) -> str:
 
 
 def main() -> None:
-    """Prints the table and writes the file."""
+    """Prints the table of scenes and writes the file of `--json`."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--batch", type=int, default=256)
-    parser.add_argument("--counts", action="store_true", help="do not measure time")
+    parser.add_argument("--counts", action="store_true", help="skip the timing")
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     print(timing.machine())
     print(HEAD)
-    found = []
+    rows = []
     for name in options.scenes:
-        found.append(measure(name, None if options.counts else options.batch))
-        print(line(found[-1]), flush=True)
+        rows.append(measure(name, None if options.counts else options.batch))
+        print(line(rows[-1]), flush=True)
     if options.json:
-        result = {"machine": timing.machine(), "batch": options.batch, "rows": found}
+        result = {"machine": timing.machine(), "batch": options.batch, "rows": rows}
         options.json.write_text(json.dumps(timing.plain(result), indent=1) + "\n")
 
 

@@ -1,11 +1,11 @@
-"""MuJoCo in C on all cores, and MJX at its best batch, on the mechanisms of the benchmarks.
+"""Rates of MuJoCo in C on all cores, and of MJX at its best batch, on the benchmarks' mechanisms.
 
     python -m benchmarks.peers [--scenes chain-10 …] [--mjx-seconds 240]
 
-MuJoCo runs `mujoco.rollout` with one thread a core and records nothing. MJX runs jit(vmap(step)) in
-a scan, in a process of its own, so that a compilation that takes too long can be stopped; of
-several batches and settings of XLA the best counts. MJX is told to solve closed loops by one
-iteration; MuJoCo in C stops after one by itself. Worlds differ by the speed of their start.
+MuJoCo runs `mujoco.rollout` with one thread per core and records nothing. MJX runs jit(vmap(step))
+in a scan, in its own process, so that a long compilation can be stopped. The best of several batch
+sizes and XLA settings counts. MJX solves closed loops by one solver iteration; MuJoCo in C stops
+after one iteration by itself. Worlds differ by their initial speed.
 """
 
 from __future__ import annotations
@@ -28,27 +28,27 @@ from benchmarks.timing import Rate
 
 BATCHES = (64, 256, 1024)
 FLAGS = ("--xla_cpu_use_fusion_emitters=false", "")
-"""Settings of XLA that MJX is tried with: on long chains the first is many times faster."""
+"""XLA settings for MJX. On long chains the first is many times faster."""
 SPREAD = 0.1
-"""Worlds start at between 1 − this and 1 + this times the speed of the mechanism."""
+"""Half width of the range of initial speeds, relative to the mechanism's speed."""
 
 
 def speeds(batch: int) -> np.ndarray:
-    """By which each world multiplies the velocities of the start, (batch,)."""
+    """Returns factors on the initial velocities of the worlds, (batch,)."""
     return np.linspace(1 - SPREAD, 1 + SPREAD, batch) if batch > 1 else np.ones(1)
 
 
 def mujoco_rate(
     name: str, batch: int = 1024, seconds: float = 0.5, repeats: int = 5, threads: int = 0
 ) -> Rate:
-    """World-steps a second of MuJoCo in C.
+    """Measures world-steps per second of MuJoCo in C on a mechanism.
 
     Args:
-        name: of the mechanism.
-        batch: worlds.
-        seconds: about how long a repeat takes.
-        repeats: how many.
-        threads: one a core unless given.
+        name: name of the mechanism.
+        batch: number of worlds.
+        seconds: approximate duration of a repeat [s].
+        repeats: number of repeats.
+        threads: number of threads; 0 for one thread per core.
     """
     model, start = model_of(mechanisms.find(name))
     states = world_states(model, start, batch)
@@ -59,7 +59,7 @@ def mujoco_rate(
 
 
 def rate_of(model: Any, states: np.ndarray, steps: int, repeats: int = 5, threads: int = 0) -> Rate:
-    """The same of any model over some steps from states (batch, full physics state)."""
+    """Measures world-steps per second of a MuJoCo model, from a batch of full physics states."""
     import mujoco
     from mujoco import rollout
 
@@ -69,33 +69,33 @@ def rate_of(model: Any, states: np.ndarray, steps: int, repeats: int = 5, thread
     with rollout.Rollout(nthread=threads) as pool:
 
         def run() -> None:
-            # unchecked, so that no trajectory is allocated or written
+            # skip_checks avoids allocating and writing a trajectory
             pool.rollout(models, data, states, nstep=steps, skip_checks=True)
 
         return timing.rate(run, batch * steps, repeats)
 
 
 def world_states(model: Any, data: Any, batch: int) -> np.ndarray:
-    """The start of each world, (batch, full physics state)."""
+    """Returns initial states of all worlds, (batch, full physics state)."""
     import mujoco
 
     spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
-    states, moving = np.zeros((batch, mujoco.mj_stateSize(model, spec))), data.qvel.copy()
+    states, velocity = np.zeros((batch, mujoco.mj_stateSize(model, spec))), data.qvel.copy()
     for state, speed in zip(states, speeds(batch), strict=True):
-        data.qvel[:] = speed * moving
+        data.qvel[:] = speed * velocity
         mujoco.mj_getState(model, data, state, spec)
     return states
 
 
 @dataclass(frozen=True)
 class MjxRun:
-    """MJX at one batch under one setting of XLA.
+    """Rate of MJX at one batch size with one XLA setting.
 
     Attributes:
-        batch: worlds.
-        flags: for XLA.
-        rate: world-steps a second.
-        compile: of one step, tracing included [s].
+        batch: number of worlds.
+        flags: XLA flags.
+        rate: world-steps per second.
+        compile: compile time of one step, including tracing [s].
     """
 
     batch: int
@@ -106,18 +106,23 @@ class MjxRun:
 
 @dataclass(frozen=True)
 class Mjx:
-    """What MJX did with a mechanism: its runs, and why others are missing."""
+    """All runs of a mechanism in MJX.
+
+    Attributes:
+        runs: the runs that finished.
+        notes: reasons why runs are missing.
+    """
 
     runs: tuple[MjxRun, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property
     def best(self) -> MjxRun | None:
-        """The fastest run."""
+        """The fastest run, None if there is no run."""
         return max(self.runs, key=lambda run: run.rate.median, default=None)
 
     def __str__(self) -> str:
-        """As a table shows it: the best rate, or why there is none."""
+        """Formats the best rate, or the reasons why there is none."""
         best = self.best
         return f"{best.rate}, batch {best.batch}" if best else "; ".join(self.notes)
 
@@ -128,39 +133,45 @@ def mjx(
     limit: float = 240.0,
     module: str = "benchmarks.peers",
 ) -> Mjx:
-    """World-steps a second of MJX, one process a run, until one takes longer than the limit.
+    """Measures world-steps per second of MJX in one process per run.
+
+    Batch sizes grow until a run exceeds the limit.
 
     Args:
-        name: of the mechanism.
-        batches: worlds.
-        limit: for compiling and running one batch [s].
-        module: that knows the name.
+        name: name of the mechanism.
+        batches: numbers of worlds.
+        limit: time limit for compiling and running one batch [s].
+        module: module whose command line accepts the name.
     """
     runs, notes = [], []
     for flags in FLAGS:
         for batch in batches:
-            found = mjx_process(name, batch, flags, limit, module)
-            if isinstance(found, str):
-                notes.append(found)
+            result = mjx_process(name, batch, flags, limit, module)
+            if isinstance(result, str):
+                notes.append(result)
                 break
-            runs.append(found)
+            runs.append(result)
     return Mjx(tuple(runs), tuple(notes))
 
 
 def mjx_process(
     name: str, batch: int, flags: str, limit: float, module: str = "benchmarks.peers"
 ) -> MjxRun | str:
-    """One run in a process of its own, or why there is none."""
+    """Measures MJX at one batch size in its own process.
+
+    Returns:
+        The result, or the reason why there is none.
+    """
     arguments = [module, "--mjx", name, "--batch", str(batch)]
-    late = "does not compile and run in"
-    found = timing.in_process(arguments, timing.with_flags(flags), limit, late)
-    if isinstance(found, str):
-        return f"batch {batch}" + (f" with {flags}" if flags else "") + f" {found}"
-    return MjxRun(batch, flags, Rate(**found["rate"]), found["compile"])
+    message = "does not compile and run in"
+    result = timing.in_process(arguments, timing.with_flags(flags), limit, message)
+    if isinstance(result, str):
+        return f"batch {batch}" + (f" with {flags}" if flags else "") + f" {result}"
+    return MjxRun(batch, flags, Rate(**result["rate"]), result["compile"])
 
 
 def mjx_here(name: str, batch: int, repeats: int = 5) -> dict[str, Any]:
-    """The same in this process, at one batch: rate, and compile time of one step [s]."""
+    """Measures MJX in this process at one batch size: rate, and compile time of one step [s]."""
     model, data = mjx_start(mechanisms.find(name), batch)
     return mjx_rate(model, data, batch, None, repeats)
 
@@ -168,22 +179,22 @@ def mjx_here(name: str, batch: int, repeats: int = 5) -> dict[str, Any]:
 def mjx_rate(
     model: Any, data: Any, batch: int, steps: int | None, repeats: int = 5
 ) -> dict[str, Any]:
-    """The same of any model of MJX and a batch of its data.
+    """Measures a model of MJX on a batch: rate, and compile time of one step [s].
 
     Args:
-        model: of MJX.
-        data: its worlds.
-        batch: how many.
-        steps: of one call; if None, as many as take about a repeat, at most a thousand.
-        repeats: how many.
+        model: model of MJX.
+        data: batch of MJX data.
+        batch: number of worlds.
+        steps: steps per call. None takes as many steps as last about a repeat, at most a thousand.
+        repeats: number of repeats.
     """
     data = timing.over_devices(data, batch)
     step = jax.vmap(functools.partial(mjx_step(), model))
     compiled, seconds = timing.compile_seconds(step, data)
     if steps is None:
         jax.block_until_ready(compiled(data))
-        alone = timing.rate(lambda: compiled(data), 1.0, 1, 0.0).median
-        steps = int(np.clip(timing.SECONDS * alone, 10, 1000))
+        step_rate = timing.rate(lambda: compiled(data), 1.0, 1, 0.0).median
+        steps = int(np.clip(timing.SECONDS * step_rate, 10, 1000))
 
     @jax.jit
     def run(data: Any) -> Any:
@@ -195,43 +206,45 @@ def mjx_rate(
 
 
 def mjx_start(mechanism: Mechanism, batch: int) -> tuple[Any, Any]:
-    """MJX's model, and a batch of its data at the start."""
+    """Returns MJX's model of a mechanism, and a batch of its initial data."""
     from mujoco import mjx
 
     model, data = model_of(mechanism)
-    if mechanism.loops:  # the trajectory is that of more iterations, several times faster
+    if mechanism.loops:  # one iteration gives the same trajectory several times faster
         model.opt.iterations, model.opt.ls_iterations = 1, 4
-    moving = np.asarray(data.qvel)[None] * speeds(batch)[:, None]
-    one = mjx.put_data(model, data)
-    worlds = jax.vmap(lambda v: one.replace(qvel=v))(jax.numpy.asarray(moving, one.qvel.dtype))
+    velocities = np.asarray(data.qvel)[None] * speeds(batch)[:, None]
+    single = mjx.put_data(model, data)
+    worlds = jax.vmap(lambda v: single.replace(qvel=v))(
+        jax.numpy.asarray(velocities, single.qvel.dtype)
+    )
     return mjx.put_model(model), worlds
 
 
 def mjx_step() -> Any:
-    """(model, data) → data."""
+    """Returns MJX's step function, (model, data) → data."""
     from mujoco import mjx
 
     return mjx.step
 
 
 def main() -> None:
-    """Prints a table, or for one process of MJX its result."""
+    """Prints the table, or with `--mjx` the result of one run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES))
     parser.add_argument("--mjx-seconds", type=float, default=240.0)
-    parser.add_argument("--mjx", metavar="SCENE", help="MJX alone, here, as JSON")
+    parser.add_argument("--mjx", metavar="SCENE", help="rate of MJX in this process, as JSON")
     parser.add_argument("--batch", type=int, default=256)
     options = parser.parse_args()
     if options.mjx:
         timing.use_all_cores()
         print(json.dumps(mjx_here(options.mjx, options.batch)))
         return
-    print(f"world-steps a second, {timing.cores()} cores, {timing.versions()}")
+    print(f"world-steps per second, {timing.cores()} cores, {timing.versions()}")
     print("| scene | MuJoCo C | MJX, best batch | MJX compiles |\n|---|---|---|---|")
     for name in options.scenes:
-        ours, other = mujoco_rate(name), mjx(name, limit=options.mjx_seconds)
-        compiling = ", ".join(f"{run.compile:.1f} s" for run in other.runs)
-        print(f"| {name} | {ours} | {other} | {compiling} |", flush=True)
+        ours, theirs = mujoco_rate(name), mjx(name, limit=options.mjx_seconds)
+        compile_times = ", ".join(f"{run.compile:.1f} s" for run in theirs.runs)
+        print(f"| {name} | {ours} | {theirs} | {compile_times} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Pictures that are small enough to be kept beside the text."""
+"""Writes pictures that are small enough for the repository."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from typing import Any
 from jaxcon import view
 
 COLORS = 48
-"""Of a picture; lines and their edges need no more."""
+"""Number of colors of a picture; enough for lines and their antialiased edges."""
 
 
 def save(figure: Any, path: Path, dpi: float = 100.0) -> None:
-    """Writes a figure of lines as a PNG of few colours, and closes it.
+    """Writes a figure of lines as a PNG with few colors, and closes it.
 
     Args:
-        figure: of matplotlib.
-        path: of the picture.
+        figure: figure of matplotlib.
+        path: path of the picture.
         dpi: dots per inch.
     """
     from PIL import Image

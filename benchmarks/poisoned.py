@@ -1,18 +1,20 @@
-"""Batches in which a number of one world is NaN or infinite: who is told, and who else notices.
+"""Tests of batches in which one world has a value of NaN or infinity.
 
     python -m benchmarks.poisoned [NAMES …] [--quick] [--list]
 
-Each element of `gradient_elements` joins a scene of its dimension on two bodies of its own. Every
-number is poisoned in turn: those of `system.params`, control, start, step size and the method. All
-cases run as worlds of a batch beside healthy worlds, so that a scene is compiled once. Checked:
+Each element of `gradient_elements` is added to a scene, on two bodies of its own. Every value is
+replaced in turn: those of `system.params`, control, start, step size and the method. A case is one
+replaced value. All cases run as worlds of a batch beside healthy worlds, so that a scene is
+compiled once. Three properties are checked:
 
-    status     the poisoned world fails after the first step, unless infinity means "no limit"
-    neighbors  healthy worlds are those of a healthy batch, bit for bit
-    gradient   the gradient by shared numbers is that of the healthy worlds alone, in both modes
+    status     the poisoned world fails in the first step, unless infinity means "no limit"
+    neighbors  healthy worlds are equal to those of a healthy batch, bit for bit
+    gradient   the gradient with respect to shared values is that of the healthy worlds alone
 
-Prints counts by scene and method, and the cases that go wrong; ends with 1 where there are any.
-`--quick` takes the small scenes of the tests, and the first entry of each array. The long version
-takes every element in the plane and in space under several methods, some hours on one core.
+The study prints counts by scene and method, and the cases that fail a check. The exit status is 1
+if there are any. `--quick` runs the small scenes of the tests, and poisons the first entry of each
+array. The full version runs every element in the plane and in space under several methods. It takes
+some hours on one core.
 """
 
 from __future__ import annotations
@@ -37,19 +39,19 @@ from benchmarks.gradient_scenes import add, along
 
 POISONS = (np.nan, np.inf, -np.inf)
 LIMITS = (0.0, -1.0)
-"""Numbers by which a world may fail or go on; others must not notice either."""
+"""Replacements by which a world may fail or go on. Other worlds must not change either way."""
 HEALTHY = 2
-"""Healthy worlds at the front of each batch."""
+"""Number of healthy worlds at the front of each batch."""
 BATCH = 256
-"""Worlds of a batch; what is left over is healthy, too."""
+"""Number of worlds in a batch. Worlds without a case are healthy, too."""
 STEPS, DT = 3, 0.01
 
 NO_LIMIT = {("lower", -np.inf), ("upper", np.inf)}
-"""Fields that may be infinite, and on which side: a joint without a stop there."""
+"""Fields that may be infinite, with the sign: the joint then has no limit on this side."""
 
 
 def stage(dim: int, tables: dict[str, Any]) -> Any:
-    """A scene with all elements of the tables, each on two bodies of its own.
+    """Builds a scene with all elements of the tables, each on two bodies of its own.
 
     Args:
         dim: 2 or 3.
@@ -69,7 +71,10 @@ def stage(dim: int, tables: dict[str, Any]) -> Any:
 
 
 def _renamed(element: Any, known: set[str], suffix: str) -> Any:
-    """The element with a suffix to its name, and to those of the bodies and joints it names."""
+    """Returns the element with a suffix on its name and on the names that it refers to.
+
+    These are the names of its bodies and joints.
+    """
 
     def renamed(x: Any) -> Any:
         if isinstance(x, tuple):
@@ -82,13 +87,13 @@ def _renamed(element: Any, known: set[str], suffix: str) -> Any:
 
 @dataclass(frozen=True)
 class Case:
-    """One number and what it is replaced by.
+    """One value of a world and its replacement.
 
     Attributes:
-        path: of the leaf, such as "params/law1/friction".
-        leaf: its place among the leaves.
-        index: of the number in the leaf.
-        poison: NaN, inf or −inf.
+        path: path of the leaf, such as "params/law1/friction".
+        leaf: index of the leaf among all leaves.
+        index: index of the value in the leaf.
+        poison: the replacement: NaN, inf, −inf, or a value of `LIMITS`.
     """
 
     path: str
@@ -98,7 +103,7 @@ class Case:
 
     @property
     def allowed(self) -> bool:
-        """Returns True where the world may go on: its number means "no limit", or is no poison."""
+        """True if the world may go on: the replacement is finite, or infinity means "no limit"."""
         finite = bool(np.isfinite(self.poison))
         return finite or (self.path.rsplit("/", 1)[-1], self.poison) in NO_LIMIT
 
@@ -111,12 +116,13 @@ class Counts:
     """The counts of a study.
 
     Attributes:
-        tried: cases.
-        told: worlds that failed in the first step, or after the retries of a `Recovery`.
-        free: worlds that went on and may, see `Case.allowed`.
-        idle: worlds that went on as without the poison, whose number takes no part in the motion,
-            as the time where nothing depends on it. Numbers of inequalities are never idle.
-        accepted: cases in which the world went on otherwise.
+        tried: number of cases.
+        told: number of worlds that failed in the first step, or after the retries of a `Recovery`.
+        free: number of worlds that went on and may go on, see `Case.allowed`.
+        idle: number of worlds that moved as without the replacement, because the value has no
+            influence. An example is the time, if nothing depends on it. Of the values of
+            inequalities, only terrain heights away from a ball may be idle.
+        accepted: cases in which the world wrongly went on.
         neighbors: cases in which a healthy world changed.
         gradients: cases in which the gradient of the healthy worlds changed, in either mode.
     """
@@ -130,13 +136,13 @@ class Counts:
     gradients: tuple[Case, ...] = ()
 
     def __add__(self, other: Counts) -> Counts:
-        """Both together."""
+        """Adds the counts of two studies."""
         names = [field.name for field in dataclasses.fields(self)]
         return Counts(*(getattr(self, name) + getattr(other, name) for name in names))
 
     @property
     def clean(self) -> bool:
-        """True where no case went wrong."""
+        """True if no case went wrong."""
         return not (self.accepted or self.neighbors or self.gradients)
 
 
@@ -145,10 +151,10 @@ class Seen:
     """The results of a batch.
 
     Attributes:
-        failed: by case and step, whether its world had failed.
-        healthy: final states of the healthy worlds, and tangents of their losses.
-        cases: the same of the others.
-        gradient: of the sum of the losses that count.
+        failed: True if the world of a case has failed, by case and step.
+        healthy: final q and v of the healthy worlds, and tangents of their losses.
+        cases: final q and v of the worlds of the cases, and tangents of their losses.
+        gradient: gradient of the sum of the losses that count.
     """
 
     failed: np.ndarray
@@ -158,12 +164,12 @@ class Seen:
 
 
 class Study:
-    """One scene under one method.
+    """Runs the cases of one scene under one method.
 
     Args:
-        system, state: as built.
-        method: its floating leaves are poisoned as well.
-        thorough: whether every entry of an array is poisoned, or the first alone.
+        system, state: the scene as built.
+        method: its floating-point leaves are poisoned as well.
+        thorough: True to poison every entry of an array, False for the first entry only.
     """
 
     def __init__(self, system: Any, state: Any, method: Any, thorough: bool = False) -> None:
@@ -187,7 +193,7 @@ class Study:
         self.numbers = [np.asarray(x, dtype) for _, x in known]
 
     def cases(self) -> Iterator[Case]:
-        """Every number with every poison."""
+        """Yields every value with every replacement."""
         for leaf, (path, x) in enumerate(zip(self.paths, self.numbers, strict=True)):
             indices = list(itertools.product(*map(range, x.shape)))
             for index in indices if self.thorough else indices[:1]:
@@ -195,7 +201,7 @@ class Study:
                     yield Case(path, leaf, index, poison)
 
     def batch(self, cases: Sequence[Case | None]) -> list[np.ndarray]:
-        """The numbers of all worlds: healthy ones, and one for each case."""
+        """Returns the values of all worlds: healthy worlds first, then one world for each case."""
         numbers = [np.repeat(x[None], BATCH, axis=0) for x in self.numbers]
         velocity = numbers[self.paths.index("v")]
         velocity[:HEALTHY] += 0.01 * np.arange(HEALTHY)[:, None]
@@ -205,7 +211,7 @@ class Study:
         return numbers
 
     def rollout(self, shared: Any, numbers: list[Any]) -> Any:
-        """The final state of one world and its status after each step."""
+        """Returns the final state of one world and its status after each step."""
         x = jax.tree.unflatten(self.tree, numbers)
         own = iter(x["method"])
         leaves = [next(own) if g else y for g, y in zip(self.gains, self.others, strict=True)]
@@ -227,21 +233,27 @@ class Study:
         return final, codes
 
     def loss(self, shared: Any, numbers: list[Any]) -> Any:
-        """A number of one world that reads all of its final state."""
+        """Returns a scalar that depends on all of one world's final state, and the run.
+
+        The run is the final state and the status after each step.
+        """
         final, codes = self.rollout(shared, numbers)
         weights = jnp.cos(jnp.arange(final.q.size + final.v.size, dtype=final.q.dtype))
         return jnp.sum(weights * jnp.concatenate([final.q, final.v])), (final, codes)
 
     @cached_property
     def shared(self) -> dict[str, Any]:
-        """Numbers that all worlds share: offsets of gravity, a mass and h."""
+        """Values that all worlds share: offsets of gravity, of a mass and of the step size."""
         dtype = self.state.q.dtype
         none = jnp.zeros(self.system.layout.dim, dtype)
         return {"gravity": none, "mass": jnp.zeros((), dtype), "h": jnp.zeros((), dtype)}
 
     @cached_property
     def compiled(self) -> Any:
-        """(numbers, which losses count) → statuses, and what healthy worlds must not notice."""
+        """The compiled program (values, losses that count) → results.
+
+        The results are statuses, final q, v and tangents of all worlds, and the gradient.
+        """
 
         def each(shared: Any, numbers: list[Any]) -> Any:
             return jax.vmap(self.loss, (None, 0))(shared, numbers)
@@ -256,22 +268,30 @@ class Study:
             (gradient,) = pull(counts.astype(tangents.dtype))
             return codes, (final.q, final.v, tangents), gradient
 
-        # compiled once and run a few times: what the program computes matters, not its speed
+        # compiled once and run a few times, so fast compilation matters more than fast code
         return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})
 
     def of_inequality(self, case: Case) -> bool:
-        """True for a number of a stop, contact, friction or motor."""
+        """Returns True for a value of a joint limit, contact, friction or motor.
+
+        Heights of a terrain are an exception: a step reads only the heights near the ball.
+        """
         names = {name for group in self.system.bounds for name in group.names}
-        return case.path.split("/")[1:2] != [] and case.path.split("/")[1] in names
+        _, *element = case.path.split("/")
+        return bool(element) and element[0] in names and element[-1] != "heights"
 
     def seen(self, cases: Sequence[Case | None], failures_count: bool = False) -> Seen:
-        """Runs the cases as a batch."""
+        """Runs the cases as a batch.
+
+        With `failures_count`, the losses of failed worlds are part of the gradient; they must not
+        change it.
+        """
         numbers = self.batch(cases)
         counts = np.arange(BATCH) < HEALTHY
         codes, worlds, gradient = self.compiled(numbers, counts)
         codes = np.asarray(codes)[HEALTHY : HEALTHY + len(cases)]
         failed = (codes > 0) & (codes < int(jc.Status.CONFLICT))
-        if failures_count:  # their losses must not add to the gradient
+        if failures_count:  # the losses of failed worlds must not add to the gradient
             counts[HEALTHY : HEALTHY + len(cases)] = failed[:, self.patience]
             gradient = self.compiled(numbers, counts)[2]
         worlds = tuple(np.asarray(x) for x in worlds)
@@ -283,7 +303,7 @@ class Study:
         )
 
     def run(self, cases: list[Case] | None = None) -> Counts:
-        """Counts how the cases end."""
+        """Runs all cases in batches and counts how they end."""
         cases = list(self.cases()) if cases is None else cases
         total = Counts()
         for start in range(0, len(cases), BATCH - HEALTHY):
@@ -321,7 +341,10 @@ class Study:
 
 
 def culprits(bad: Any, cases: list[Case]) -> tuple[Case, ...]:
-    """The cases that alone make a batch bad, by halves; all where only several together do."""
+    """Returns the cases that make a batch bad on their own, by bisection.
+
+    If cases make the batch bad only together, all of them are returned.
+    """
     if not cases or not bad(cases):
         return ()
     if len(cases) == 1:
@@ -332,47 +355,63 @@ def culprits(bad: Any, cases: list[Case]) -> tuple[Case, ...]:
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Returns True where arrays agree bit for bit."""
+    """Returns True if arrays agree bit for bit."""
     return all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def _near(a: Any, b: Any) -> bool:
-    """Returns True where gradients agree to rounding, relative to the largest."""
+    """Returns True if gradients agree to rounding, relative to the largest entry."""
     pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
     return all(np.allclose(x, y, rtol=1e-9, atol=1e-9 * np.max(np.abs(y))) for x, y in pairs)
 
 
 QUICK: dict[str, tuple[tuple[str, ...], int, Any]] = {
     "contact": (("ball that rolls with resistance",), 2, jc.Method()),
-    "sweeps": (("soft stops", "dry friction"), 2, jc.Method(bounded=jc.GaussSeidel(sweeps=4))),
-    "generalized-α": (("force",), 2, jc.Method(jc.GeneralizedAlpha())),
-    "PID": (("distance",), 2, jc.Method(stabilizer=jc.PID(100.0, 20.0, 10.0, limit=5.0))),
-    "adaptive": (("distance",), 2, jc.Method(stabilizer=jc.AdaptiveBaumgarte(10.0, 10.0))),
-    "window": (("distance",), 2, jc.Method(stabilizer=jc.SlidingWindowBaumgarte())),
-    "springs": (("distance",), 2, jc.Method(stabilizer=jc.Penalty(100.0, 1.0))),
-    "rounds": (("distance",), 2, jc.Method(stabilizer=jc.AugmentedLagrangian())),
-    "recovery": (("distance",), 2, jc.Method(recovery=jc.Recovery(limit=0.5, retries=1))),
+    "sweeps": (
+        ("soft stops", "dry friction"),
+        2,
+        jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=4)),
+    ),
+    "generalized-α": (("force",), 2, jc.Method(jc.integrators.GeneralizedAlpha())),
+    "PID": (
+        ("distance",),
+        2,
+        jc.Method(stabilizer=jc.stabilizers.PID(100.0, 20.0, 10.0, limit=5.0)),
+    ),
+    "adaptive": (
+        ("distance",),
+        2,
+        jc.Method(stabilizer=jc.stabilizers.AdaptiveBaumgarte(10.0, 10.0)),
+    ),
+    "window": (("distance",), 2, jc.Method(stabilizer=jc.stabilizers.SlidingWindowBaumgarte())),
+    "springs": (("distance",), 2, jc.Method(stabilizer=jc.stabilizers.Penalty(100.0, 1.0))),
+    "rounds": (("distance",), 2, jc.Method(stabilizer=jc.stabilizers.AugmentedLagrangian())),
+    "recovery": (
+        ("distance",),
+        2,
+        jc.Method(recovery=jc.stabilizers.Recovery(limit=0.5, retries=1)),
+    ),
 }
 """Elements, dimension and method of the small studies, by name."""
 
 SETS = {
     "plain": ({**JOINTS, **FORCES, **ENDS}, jc.Method()),
     "RK4": ({**JOINTS, **FORCES, **ENDS}, jc.Method(jc.RK4())),
-    "RATTLE": ({**JOINTS, **FORCES}, jc.Method(jc.RATTLE())),
-    "generalized-α": ({**JOINTS, **FORCES}, jc.Method(jc.GeneralizedAlpha())),
-    "sweeps": (ENDS, jc.Method(bounded=jc.GaussSeidel(sweeps=8))),
-    "nearest": (ENDS, jc.Method(bounded=jc.Nearest(stops=1))),
-    "events": (ENDS, jc.Method(events=jc.Events())),
-    "recovery": (ENDS, jc.Method(recovery=jc.Recovery(retries=1))),
+    "RATTLE": ({**JOINTS, **FORCES}, jc.Method(jc.integrators.RATTLE())),
+    "generalized-α": ({**JOINTS, **FORCES}, jc.Method(jc.integrators.GeneralizedAlpha())),
+    "sweeps": (ENDS, jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=8))),
+    "nearest": (ENDS, jc.Method(contact_solver=jc.solvers.ActiveSet(stops=1))),
+    "events": (ENDS, jc.Method(events=jc.integrators.Events())),
+    "recovery": (ENDS, jc.Method(recovery=jc.stabilizers.Recovery(retries=1))),
 }
 """Elements and methods of the long studies."""
 
 TOGETHER = 3
-"""Elements of a scene of the long studies: compiling takes ten seconds each."""
+"""Number of elements in a scene of the long studies. Compiling takes ten seconds each."""
 
 
 def studies(quick: bool) -> dict[str, tuple[tuple[str, ...], int, Any]]:
-    """Elements, dimension and method of every study, by name."""
+    """Returns elements, dimension and method of every study, by name."""
     if quick:
         return QUICK
     found = dict(QUICK)
@@ -386,7 +425,7 @@ def studies(quick: bool) -> dict[str, tuple[tuple[str, ...], int, Any]]:
 
 
 def measure(name: str, quick: bool) -> Counts:
-    """The counts of one study."""
+    """Runs one study and returns its counts."""
     elements, dim, method = studies(quick=False)[name]
     every = {**JOINTS, **FORCES, **ENDS}
     system, state = stage(dim, {element: every[element] for element in elements})
@@ -394,7 +433,7 @@ def measure(name: str, quick: bool) -> Counts:
 
 
 def words(name: str, counts: Counts) -> str:
-    """A line of the table, and what went wrong below it."""
+    """Formats a row of counts, with the cases that went wrong below it."""
     wrong = {
         "accepted wrongly": counts.accepted,
         "neighbors changed": counts.neighbors,
@@ -408,7 +447,7 @@ def words(name: str, counts: Counts) -> str:
 
 
 def main(given: list[str] | None = None) -> int:
-    """Prints the table."""
+    """Prints the counts of the studies. The exit status is 1 if a case went wrong."""
     text = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("benchmarks.poisoned", None, __doc__, formatter_class=text)
     parser.add_argument("names", nargs="*", help="parts of the names of studies")
@@ -435,5 +474,5 @@ def main(given: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    warnings.simplefilter("ignore")  # gains are poisoned, and some steps have none
+    warnings.simplefilter("ignore")  # replaced gains and step sizes cause warnings
     sys.exit(main())

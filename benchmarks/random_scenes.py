@@ -1,21 +1,21 @@
-"""Random mechanisms under the default method: none may fail, gain energy or drift off its joints.
+"""Checks random mechanisms under the default method for failure, energy gain and drift.
 
     python -m benchmarks.random_scenes [--scenes N] [--seed K]
 
-Each scene has two to five bodies, joined as a random tree by random joints, with springs, dampers,
-joint limits or a closing rod now and then. Some are free to float, without gravity. Each runs from
-random starts at several step sizes, side by side in one batch. Checked, by world:
+Each scene has two to five bodies in a random tree of random joints. Some have springs, dampers,
+joint limits or a closing rod. Some float freely without gravity. Each runs from random velocities
+at several step sizes in one batch. Each world is checked for:
 
     status      OK to the end
-    energy      never above that at the start by more than a tenth of the largest kinetic energy
-    joints      φ below a hundredth of the size of the mechanism
-    momentum    of what floats: linear to rounding, angular within (h ω)² of its scale
-    batch       the first world alone moves as it does in the batch
-    derivative  forward and reverse mode agree, and are finite
+    energy      gain below a tenth of the largest kinetic energy
+    joints      |φ| below a hundredth of the size of the mechanism
+    momentum    constant linear momentum of floating mechanisms, to rounding
+    batch       the first world moves alone as in the batch
+    derivative  forward and reverse mode agree and are finite
 
-Prints a count of each and the scenes that go wrong; ends with 1 where there are any. A scene that
-goes wrong is counted apart where a body whips around, by more than half a radian in the longest
-step: RATTLE, generalized-α and RK4 with projection then end NOT_CONVERGED.
+The study prints the number of failures of each check and the failing scenes. The exit status is 1
+if a check failed. A failing scene counts separately if a body turns by more than half a radian in
+the longest step. RATTLE, generalized-α and RK4 with projection then end with NOT_CONVERGED.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ import numpy as np
 
 import jaxcon as jc
 from jaxcon.constraints.rows import RowLayout, Rows, linearize
-from jaxcon.solvers.jacobian import Jacobian
+from jaxcon.linear.jacobian import Jacobian
 
 STEPS = 600
-"""The number of steps of a motion."""
+"""Number of steps of a motion."""
 SIZES = (1e-3, 5e-3, 1 / 60)
 """Step sizes [s]."""
 FAST = 0.5
-"""Turn of a body in a step [rad] from which no method resolves the motion."""
+"""Rotation of a body per step above which no method resolves the motion [rad]."""
 CHECKS = ("status", "energy", "joints", "momentum", "batch", "derivative")
 
 
@@ -50,9 +50,9 @@ class Found:
     """The failed checks of a scene.
 
     Attributes:
-        name: by which it is made again.
-        wrong: the checks that it failed, with the worst number of each.
-        fast: whether, where it failed some, bodies turn too fast for the longest step.
+        name: dimension and seed, which reproduce the scene.
+        wrong: the worst value of each failed check.
+        fast: True if a check failed and bodies turn too fast for the longest step.
     """
 
     name: str
@@ -61,7 +61,11 @@ class Found:
 
 
 def build(dim: int, seed: int) -> tuple[Any, jc.State, bool]:
-    """A random mechanism, and whether it floats."""
+    """Builds a random mechanism.
+
+    Returns:
+        The system, its state, and True if the mechanism floats freely.
+    """
     random = np.random.default_rng((dim, seed))
     floats = random.random() < 0.25
     gravity = (0.0,) * dim if floats else (*(0.0,) * (dim - 1), -9.81)
@@ -108,21 +112,21 @@ def _add_body(scene: jc.Scene, name: str, place: np.ndarray, random: np.random.G
 def _add_joint(
     scene: jc.Scene, name: str, before: str, body: str, places: dict[str, Any], random: Any
 ) -> None:
-    """A random joint halfway between two bodies, or at a place in the world near the body."""
+    """Adds a random joint halfway between two bodies, or between a body and a world point."""
     dim = scene.dim
-    other = places[before] if before != jc.WORLD else places[body] + _direction(random, dim)
-    point = (other + places[body]) / 2
+    anchor = places[before] if before != jc.WORLD else places[body] + _direction(random, dim)
+    point = (anchor + places[body]) / 2
     kind = random.choice(["hinge", "hinge", "slide", "rod"] + ["ball"] * (dim == 3))
     axis = {} if dim == 2 else {"axis": _direction(random, 3)}
     if kind == "hinge":
         scene.add(jc.Revolute(name, before, body, point=point, **axis))
         if random.random() < 0.3:
-            scene.add(jc.JointDamper(f"{name} damper", name, random.uniform(0.01, 0.2)))
+            scene.add(jc.forces.JointDamper(f"{name} damper", name, random.uniform(0.01, 0.2)))
         if random.random() < 0.2:
             scene.add(jc.Limit(f"{name} stop", name, -0.5, 0.7))
     elif kind == "slide":
         scene.add(jc.Prismatic(name, before, body, point=point, axis=_direction(random, dim)))
-        scene.add(jc.JointSpring(f"{name} spring", name, random.uniform(5, 50)))
+        scene.add(jc.forces.JointSpring(f"{name} spring", name, random.uniform(5, 50)))
     elif kind == "ball":
         scene.add(jc.Spherical(name, before, body, point=point))
     elif before == jc.WORLD:
@@ -132,7 +136,7 @@ def _add_joint(
 
 
 def starts(system: Any, state: jc.State, count: int, seed: int) -> jax.Array:
-    """Random velocities, projected in the metric M onto those that joints allow, (count, n_v)."""
+    """Draws random velocities (count, n_v), projected in the metric M onto the joint rows."""
     random = np.random.default_rng((seed, 1))
     rows = linearize(system, state.q, state.v, state.time)
     j, mass = np.asarray(rows.jacobian.dense()), np.asarray(system.mass(state.q).dense())
@@ -142,7 +146,14 @@ def starts(system: Any, state: jc.State, count: int, seed: int) -> jax.Array:
 
 
 def check(dim: int, seed: int, derivatives: bool = True, method: jc.Method | None = None) -> Found:
-    """Runs a scene, by the default method where none is given, and says what of it is wrong."""
+    """Runs a scene and returns its failed checks.
+
+    Args:
+        dim: dimension of the scene.
+        seed: seed of the scene.
+        derivatives: True to check derivatives too.
+        method: method of the run, by default `jc.Method()`.
+    """
     system, state, floats = build(dim, seed)
     method = jc.Method() if method is None else method
     speeds = starts(system, state, 2, seed)
@@ -152,37 +163,40 @@ def check(dim: int, seed: int, derivatives: bool = True, method: jc.Method | Non
     def run(v: jax.Array, h: jax.Array) -> Any:
         start = dataclasses.replace(state, v=v)
 
-        def seen(state: jc.State, _: Any) -> Any:
+        def record(state: jc.State, _: Any) -> Any:
             energy = jc.energy(system, _at_its_place(system, method, state, h))
-            moving = jc.momentum(system, state), jc.angular_momentum(system, state)
-            return energy.total, energy.kinetic, jc.violation(system, state).worst, moving
+            momentum = jc.momentum(system, state), jc.angular_momentum(system, state)
+            return energy.total, energy.kinetic, jc.violation(system, state).worst, momentum
 
-        final, path = jc.rollout(system, method, start, None, h, STEPS, record=seen, every=20)
-        return final, path, jc.energy(system, start).total, seen(start, None)[3]
+        final, path = jc.rollout(system, method, start, None, h, STEPS, record=record, every=20)
+        return final, path, jc.energy(system, start).total, record(start, None)[3]
 
-    found = jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(v, h))
-    final, (total, kinetic, off, moving), first, moved = found
+    results = jax.tree.map(np.asarray, jax.jit(jax.vmap(run))(v, h))
+    final, (total, kinetic, violation, momentum), first, initial_momentum = results
     scale = np.max(kinetic, axis=1)
     gain = (np.max(total, axis=1) - first) / scale
     size = 1.0 + float(system.extent(state.q))
     numbers = {
         "status": (float(np.max(final.status)), 0.5),
         "energy": (float(np.max(gain)), 0.1),
-        "joints": (float(np.max(off)) / size, 1e-2),
+        "joints": (float(np.max(violation)) / size, 1e-2),
     }
     if floats:
-        numbers["momentum"] = (_drift(system, moving[0], moved[0], scale), 1e-9)
-    alone = jax.jit(run)(v[0], h[0])[0]
-    numbers["batch"] = (float(np.max(np.abs(alone.q - final.q[0]))), 1e-6)
+        numbers["momentum"] = (_drift(system, momentum[0], initial_momentum[0], scale), 1e-9)
+    single = jax.jit(run)(v[0], h[0])[0]
+    numbers["batch"] = (float(np.max(np.abs(single.q - final.q[0]))), 1e-6)
     if derivatives:
         numbers["derivative"] = (_modes_differ(system, method, state, v[0]), 1e-8)
-    wrong = {name: x for name, (x, most) in numbers.items() if not x <= most}
+    wrong = {name: x for name, (x, bound) in numbers.items() if not x <= bound}
     fast = bool(wrong) and any(_turn(system, state, v) > FAST for v in speeds)
     return Found(f"{dim}D, seed {seed}", wrong, fast)
 
 
 def _at_its_place(system: Any, method: jc.Method, state: jc.State, h: jax.Array) -> jc.State:
-    """The state with the v of its q: that of semi-implicit Euler is half a step behind."""
+    """Returns the state with v at the time of q.
+
+    Semi-implicit Euler stores v half a step earlier.
+    """
     if not isinstance(method.integrator, jc.SemiImplicitEuler):
         return state
     a = jc.forward_dynamics(system, state, None, method, h).acceleration
@@ -190,65 +204,74 @@ def _at_its_place(system: Any, method: jc.Method, state: jc.State, h: jax.Array)
 
 
 def _turn(system: Any, state: jc.State, v: jax.Array) -> float:
-    """The largest turn of a body in the longest step [rad], of an accurate motion."""
+    """Returns the largest rotation of a body in the longest step [rad].
+
+    It is measured in an accurate simulation.
+    """
     method, h = jc.Method(jc.RK4(), jc.Projection()), 1e-3
     start = dataclasses.replace(state, v=jnp.asarray(v, state.v.dtype))
     steps = round(STEPS * SIZES[-1] / h)
 
-    def seen(state: jc.State, _: Any) -> jax.Array:
-        zero, none = jnp.zeros(0), Jacobian((), (0, state.v.size))
-        rows = Rows(zero, zero, none, zero, RowLayout(()))
+    def record(state: jc.State, _: Any) -> jax.Array:
+        empty, no_jacobian = jnp.zeros(0), Jacobian((), (0, state.v.size))
+        rows = Rows(empty, empty, no_jacobian, empty, RowLayout(()))
         return system.squared_turn(state.q, state.v, state.v, rows, jnp.full(1, SIZES[-1]))
 
-    squares = jax.jit(lambda s: jc.rollout(system, method, s, None, h, steps, record=seen)[1])
+    squares = jax.jit(lambda s: jc.rollout(system, method, s, None, h, steps, record=record)[1])
     return float(np.sqrt(np.max(squares(start))))
 
 
 def _drift(system: Any, momentum: np.ndarray, start: np.ndarray, kinetic: np.ndarray) -> float:
-    """The change of linear momentum, over √(2 m T)."""
+    """Returns the largest change of linear momentum, divided by √(2 m T).
+
+    m is the total mass and T the largest kinetic energy.
+    """
     mass = float(np.sum(np.asarray([p.mass.sum() for p in system.inertia])))
     change = np.linalg.norm(momentum - start[:, None], axis=-1).max(axis=1)
     return float(np.max(change / np.sqrt(2 * mass * kinetic)))
 
 
 def _modes_differ(system: Any, method: jc.Method, state: jc.State, v: jax.Array) -> float:
-    """The relative difference of forward and reverse mode on a rollout; inf if not finite."""
+    """Returns the relative difference of forward and reverse mode on a rollout.
+
+    It is infinite if a derivative is not finite.
+    """
 
     def loss(v: jax.Array) -> jax.Array:
         start = dataclasses.replace(state, v=v)
         return jnp.sum(jc.rollout(system, method, start, None, 5e-3, 20)[0].q ** 2)
 
-    along = jnp.ones_like(v)
-    forward = jax.jit(lambda v: jax.jvp(loss, (v,), (along,))[1])(v)
+    direction = jnp.ones_like(v)
+    forward = jax.jit(lambda v: jax.jvp(loss, (v,), (direction,))[1])(v)
     reverse = jax.jit(jax.grad(loss))(v)
     if not np.all(np.isfinite(reverse)):
         return np.inf
-    return float(abs(forward - reverse @ along) / (1e-12 + np.abs(reverse).sum()))
+    return float(abs(forward - reverse @ direction) / (1e-12 + np.abs(reverse).sum()))
 
 
 def study(scenes: int, seed: int = 0) -> Iterator[Found]:
-    """Checks a number of scenes in each dimension; derivatives of every fourth."""
+    """Checks scenes in both dimensions. Derivatives are checked in every fourth scene."""
     for i in range(scenes):
         for dim in (2, 3):
             yield check(dim, seed + i, i % 4 == 0)
 
 
 def main() -> int:
-    """Prints the counts and what went wrong."""
+    """Prints the counts of failed checks, and the failing scenes."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=40, help="in the plane and in space each")
+    parser.add_argument("--scenes", type=int, default=40, help="number of scenes per dimension")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     counts: Counter[str] = Counter()
-    for found in study(options.scenes, options.seed):
-        counts.update(["too fast"] if found.fast else found.wrong)
-        if found.wrong:
-            print(found.name, found.wrong, "too fast" * found.fast, flush=True)
+    for result in study(options.scenes, options.seed):
+        counts.update(["too fast"] if result.fast else result.wrong)
+        if result.wrong:
+            print(result.name, result.wrong, "too fast" * result.fast, flush=True)
     motions = 4 * options.scenes * len(SIZES)
-    tried = f"tried: {2 * options.scenes} scenes, {motions} motions; wrong: "
-    print(tried + ", ".join(f"{name} {counts[name]}" for name in CHECKS))
-    print(f"scenes with bodies that turn by more than {FAST} rad in a step: {counts['too fast']}")
+    head = f"tried: {2 * options.scenes} scenes, {motions} motions; wrong: "
+    print(head + ", ".join(f"{name} {counts[name]}" for name in CHECKS))
+    print(f"scenes with a rotation of more than {FAST} rad in a step: {counts['too fast']}")
     return 1 if any(counts[name] for name in CHECKS) else 0
 
 

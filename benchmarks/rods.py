@@ -1,4 +1,4 @@
-"""Linkages of rods: one description, built in jaxcon in the plane or in space, and in MuJoCo."""
+"""Linkages of rods: one description gives scenes in jaxcon, in plane or space, and in MuJoCo."""
 
 from __future__ import annotations
 
@@ -7,26 +7,29 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mjcf
 
 SLENDER = 0.02
-"""Moment of a rod about its own axis over that about a transverse one, in space."""
+"""Ratio of a rod's axial to its transverse moment of inertia, in space."""
 POINT = 1e-12
-"""Moment that stands for none in MuJoCo, which wants one [kg m²]."""
+"""Moment of inertia of a point mass in MuJoCo, which requires a positive value [kg m²]."""
 
 
 @dataclass(frozen=True)
 class Rod:
-    """A rod of the plane, hinged at its start to its parent.
+    """A planar rod, hinged at its start to its parent.
 
     Attributes:
-        name, parent: unique; the parent is an earlier rod or `WORLD`.
-        start, end: at assembly, (2,) [m].
-        mass: [kg].
-        rate: of its hinge at the start, seen from its parent [rad/s].
-        at_end: whether the mass is a point at the end, not spread uniformly.
+        name: unique name.
+        parent: name of an earlier rod, or `WORLD`.
+        start: start point at assembly, (2,) [m].
+        end: end point at assembly, (2,) [m].
+        mass: mass [kg].
+        rate: initial angular velocity relative to the parent [rad/s].
+        at_end: True for a point mass at the end, False for a uniform rod.
     """
 
     name: str
@@ -39,27 +42,27 @@ class Rod:
 
     @property
     def length(self) -> float:
-        """[m]."""
+        """The length of the rod [m]."""
         return float(np.linalg.norm(np.subtract(self.end, self.start)))
 
     @property
     def center(self) -> np.ndarray:
-        """Of mass, (2,) [m]."""
+        """The center of mass at assembly, (2,) [m]."""
         return np.array(self.end) if self.at_end else np.add(self.start, self.end) / 2
 
     @property
     def moment(self) -> float:
-        """Of inertia about the centre of mass, across the rod [kg m²]."""
+        """The moment of inertia about the center of mass, normal to the plane [kg m²]."""
         return POINT if self.at_end else self.mass * self.length**2 / 12
 
 
 @dataclass(frozen=True)
 class Solid(Rod):
-    """A rod with a centre of mass and a moment of its own.
+    """A rod with a given center of mass and moment of inertia.
 
     Attributes:
-        heavy_at: (2,) [m].
-        turns_with: about the centre of mass, across the plane [kg m²].
+        heavy_at: center of mass at assembly, (2,) [m].
+        turns_with: moment of inertia about the center of mass, normal to the plane [kg m²].
     """
 
     heavy_at: Any = (0.0, 0.0)
@@ -67,43 +70,54 @@ class Solid(Rod):
 
     @property
     def center(self) -> np.ndarray:
-        """Of mass, (2,) [m]."""
+        """The center of mass at assembly, (2,) [m]."""
         return np.array(self.heavy_at)
 
     @property
     def moment(self) -> float:
-        """Of inertia about the centre of mass [kg m²]."""
+        """The moment of inertia about the center of mass, normal to the plane [kg m²]."""
         return self.turns_with
 
 
 @dataclass(frozen=True)
 class Linkage:
-    """Rods, each after its parent, and the hinges that close loops: (rod, rod, point (2,))."""
+    """Rods that form trees, and hinges that close loops between them.
+
+    Attributes:
+        rods: the rods, each after its parent.
+        loops: the closing hinges: (name of a rod, name of a rod, point at assembly (2,) [m]).
+    """
 
     rods: tuple[Rod, ...]
     loops: tuple[tuple[str, str, Any], ...] = ()
 
     def motion(self) -> dict[str, tuple[np.ndarray, float]]:
-        """Velocity of the centre of mass (2,) [m/s] and rate [rad/s] of each rod."""
+        """Returns initial velocities of each rod by name.
+
+        They are the velocity of the center of mass (2,) [m/s] and the angular velocity [rad/s].
+        """
         by_name = {rod.name: rod for rod in self.rods}
-        found: dict[str, tuple[np.ndarray, float]] = {}
+        motions: dict[str, tuple[np.ndarray, float]] = {}
         for rod in self.rods:
-            pivot, turning = np.zeros(2), rod.rate
+            pivot, spin = np.zeros(2), rod.rate
             if rod.parent != jc.WORLD:
-                speed, rate = found[rod.parent]
-                pivot = speed + rate * across(rod.start - by_name[rod.parent].center)
-                turning += rate
-            found[rod.name] = pivot + turning * across(rod.center - rod.start), turning
-        return found
+                velocity, rate = motions[rod.parent]
+                pivot = velocity + rate * across(rod.start - by_name[rod.parent].center)
+                spin += rate
+            motions[rod.name] = pivot + spin * across(rod.center - rod.start), spin
+        return motions
 
 
 def across(arm: np.ndarray) -> np.ndarray:
-    """A vector of the plane turned by a right angle."""
+    """Returns a planar vector rotated by 90° counterclockwise."""
     return np.array([-arm[1], arm[0]])
 
 
 def collinear(n: int, length: float, mass: float = 1.0, at_end: bool = False) -> Linkage:
-    """A horizontal chain from the origin, every other hinge turning against the one before."""
+    """Returns a horizontal chain of n rods from the origin.
+
+    The initial rates of the hinges alternate in sign.
+    """
     parents = [jc.WORLD, *(f"link{i}" for i in range(n - 1))]
     return Linkage(
         tuple(
@@ -121,23 +135,23 @@ def collinear(n: int, length: float, mass: float = 1.0, at_end: bool = False) ->
     )
 
 
-def planar_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
-    """Rigid bodies in the plane and a hinge for each rod and loop."""
+def planar_scene(linkage: Linkage, dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds rigid bodies in the plane, with a hinge for each rod and loop."""
     return hinged(jc.Scene(dim=2, dtype=dtype), linkage).build()
 
 
 def hinged(scene: jc.Scene, linkage: Linkage) -> jc.Scene:
-    """A scene of the plane with the bodies and hinges in it: `{rod}_hinge`, `{rod}_{rod}`."""
+    """Adds bodies, and hinges named `{rod}_hinge` and `{rod}_{rod}`, to a planar scene."""
     motion = linkage.motion()
     for rod in linkage.rods:
-        speed, turning = motion[rod.name]
+        velocity, rate = motion[rod.name]
         scene.add_body(
             rod.name,
             mass=rod.mass,
             inertia=rod.moment,
             position=rod.center,
-            velocity=speed,
-            angular_velocity=turning,
+            velocity=velocity,
+            angular_velocity=rate,
         )
     for rod in linkage.rods:
         scene.add(jc.Revolute(f"{rod.name}_hinge", rod.parent, rod.name, point=rod.start))
@@ -146,18 +160,21 @@ def hinged(scene: jc.Scene, linkage: Linkage) -> jc.Scene:
     return scene
 
 
-def spatial_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
-    """Rigid bodies in space and hinges about −y; for rods along x, whose frames are principal."""
+def spatial_scene(linkage: Linkage, dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds rigid bodies in space with hinges about −y.
+
+    Rods must be along x, so that the frames of the bodies are principal.
+    """
     scene, motion = jc.Scene(dim=3, dtype=dtype), linkage.motion()
     for rod in linkage.rods:
-        speed, turning = motion[rod.name]
+        velocity, rate = motion[rod.name]
         scene.add_body(
             rod.name,
             mass=rod.mass,
             inertia=np.array([SLENDER, 1.0, 1.0]) * rod.moment,
             position=mjcf.in_space(rod.center),
-            velocity=mjcf.in_space(speed),
-            angular_velocity=(0.0, -turning, 0.0),
+            velocity=mjcf.in_space(velocity),
+            angular_velocity=(0.0, -rate, 0.0),
         )
     for rod in linkage.rods:
         point = mjcf.in_space(rod.start)
@@ -166,12 +183,12 @@ def spatial_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
     return scene.build()
 
 
-def particles_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
-    """Particles in the plane at distances of each other."""
+def particles_scene(linkage: Linkage, dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds particles in the plane joined by distance constraints."""
     scene, motion = jc.Scene(dim=2, dtype=dtype), linkage.motion()
     for rod in linkage.rods:
-        speed, _ = motion[rod.name]
-        scene.add_particle(rod.name, mass=rod.mass, position=rod.center, velocity=speed)
+        velocity, _ = motion[rod.name]
+        scene.add_particle(rod.name, mass=rod.mass, position=rod.center, velocity=velocity)
     for rod in linkage.rods:
         start = rod.start if rod.parent == jc.WORLD else None
         name = f"{rod.name}_distance"
@@ -180,13 +197,13 @@ def particles_scene(linkage: Linkage, dtype: Any) -> tuple[Any, jc.State]:
 
 
 def to_mjcf(linkage: Linkage, inside: Mapping[str, str] | None = None) -> str:
-    """The rods as trees of hinges in MuJoCo, loops closed by `connect`.
+    """Returns the MJCF of the rods as trees of hinges, with loops closed by `connect`.
 
     Args:
         linkage: the rods.
-        inside: more text for the inside of a rod, or of `WORLD`, by name.
+        inside: additional MJCF inside a rod or `WORLD`, by name.
     """
-    more = inside or {}
+    extra = inside or {}
     by_name = {rod.name: rod for rod in linkage.rods}
     children: dict[str, str] = {}
     for rod in reversed(linkage.rods):
@@ -199,11 +216,11 @@ def to_mjcf(linkage: Linkage, inside: Mapping[str, str] | None = None) -> str:
             mjcf.in_space(rod.center - origin),
             rod.mass,
             np.array([1.0 if rod.at_end else SLENDER, 1.0, 1.0]) * rod.moment,
-            hinge + more.get(rod.name, "") + children.get(rod.name, ""),
+            hinge + extra.get(rod.name, "") + children.get(rod.name, ""),
         )
         children[rod.parent] = text + children.get(rod.parent, "")
     equalities = [
         mjcf.connect(first, second, mjcf.in_space(np.subtract(point, by_name[first].center)))
         for first, second, point in linkage.loops
     ]
-    return mjcf.model(more.get(jc.WORLD, "") + children[jc.WORLD], equalities)
+    return mjcf.model(extra.get(jc.WORLD, "") + children[jc.WORLD], equalities)

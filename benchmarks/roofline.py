@@ -1,10 +1,10 @@
-"""Operations of one step counted from its jaxpr, and the elementwise peak of the machine.
+"""Operations of one step, counted from its jaxpr, and the elementwise peak of the machine.
 
     python -m benchmarks.roofline [--scenes chain-10 …]
 
-What counts as an operation is said in `jaxcon.core.operations`. The peak is what XLA reaches on
-fused multiply-adds of an array that lies in the cache, two operations each, spread over all devices
-as the worlds are whose rates it is compared with.
+`jaxcon.staging.operations` defines what counts as an operation. The peak is the rate of XLA on
+fused multiply-adds of an array in the cache, two operations each. The array is sharded over all
+devices, as the worlds of the throughput benchmarks are.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mechanisms, timing
@@ -26,10 +27,10 @@ from jaxcon.analysis import work as analysis
 
 @dataclass(frozen=True)
 class Work:
-    """What one step of one world takes.
+    """Work and memory of one step of one world.
 
     Attributes:
-        operations: arithmetic, of floating-point numbers.
+        operations: floating-point operations.
         state: size of the state [B].
     """
 
@@ -37,8 +38,8 @@ class Work:
     state: int
 
 
-def work(name: str, method: jc.Method, dtype: Any) -> Work:
-    """Of a step of a mechanism."""
+def work(name: str, method: jc.Method, dtype: DTypeLike) -> Work:
+    """Counts the operations of a step of a mechanism, and the size of its state."""
     with jax.enable_x64(np.dtype(dtype) == np.float64):
         system, state = mechanisms.find(name).build(dtype)
         operations = analysis.work(system, method, state).operations
@@ -47,19 +48,22 @@ def work(name: str, method: jc.Method, dtype: Any) -> Work:
 
 @functools.cache
 def peak(dtype: str = "float32") -> float:
-    """Operations a second of fused multiply-adds in the cache, the best of several shapes."""
+    """Measures operations per second of fused multiply-adds in the cache.
+
+    The result is the best of several array shapes.
+    """
     with jax.enable_x64(dtype == "float64"):
         sizes = [(1 << bits, depth) for bits in (10, 12, 14, 18) for depth in (8, 32)]
         return max(multiply_adds(size, depth, dtype) for size, depth in sizes)
 
 
 def multiply_adds(size: int, depth: int, dtype: str) -> float:
-    """Operations a second of x ← a x + b, `depth` of them to each pass over an array.
+    """Measures operations per second of x ← a x + b, applied `depth` times per pass over an array.
 
     Args:
-        size: of the part of the array on each device.
-        depth: multiply-adds of each number in a pass.
-        dtype: of the array.
+        size: array size per device.
+        depth: multiply-adds of each entry per pass.
+        dtype: dtype of the array.
     """
     passes = max(1, (1 << 27) // (size * depth))
     start, run = over_all(size, dtype), sweeps(depth, passes)
@@ -68,7 +72,7 @@ def multiply_adds(size: int, depth: int, dtype: str) -> float:
 
 
 def sweeps(depth: int, passes: int) -> Any:
-    """The compiled function that does so many to each number in each of its passes."""
+    """Returns a compiled function that makes `passes` passes of `depth` multiply-adds."""
 
     def sweep(x: jax.Array, _: Any) -> tuple[jax.Array, None]:
         for _ in range(depth):
@@ -79,7 +83,7 @@ def sweeps(depth: int, passes: int) -> Any:
 
 
 def over_all(size: int, dtype: str) -> jax.Array:
-    """Numbers, so many on each device."""
+    """Returns an array with `size` entries on each device."""
     whole = size * jax.device_count()
     return timing.over_devices(jnp.linspace(0.5, 1.5, whole, dtype=dtype), whole)
 
@@ -88,13 +92,13 @@ def main() -> None:
     """Prints the operations and bytes of each scene, and the peak."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scenes", nargs="*", default=list(SCENES))
-    scenes, method = parser.parse_args().scenes, jc.Method(solver=jc.Sparse())
+    scenes, method = parser.parse_args().scenes, jc.Method(solver=jc.solvers.Sparse())
     timing.use_all_cores()
     devices = f"{jax.device_count()} devices, {timing.cores()} cores"
-    print(f"peak {peak() / 1e9:.1f} G float32 operations a second, {devices}")
+    print(f"peak {peak() / 1e9:.1f} G float32 operations per second, {devices}")
     for name in scenes:
-        found = work(name, method, np.float32)
-        print(f"{name:18s} {found.operations:9.0f} operations a step, {found.state:6d} B of state")
+        cost = work(name, method, np.float32)
+        print(f"{name:18s} {cost.operations:9.0f} operations a step, {cost.state:6d} B of state")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""Scenes that differ by how their constraints hang together, in any size.
+"""Scenes with different constraint graphs, in any size.
 
-`FAMILIES[name].build(n)` has n bodies or, of "rows", n constraints on bodies whose number stays.
+`FAMILIES[name].build(n, dtype)` builds a scene of n bodies. In the family "rows", n is the number
+of constraints, on a fixed number of bodies.
 """
 
 from __future__ import annotations
@@ -11,24 +12,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jax.typing import DTypeLike
 
 import jaxcon as jc
 from benchmarks import mechanisms
 
 LINK = 0.1
-"""Between neighbours [m]."""
+"""Distance between neighbors [m]."""
 BODIES = 100
-"""Of the scene whose constraints are varied."""
+"""Number of bodies in the scenes of `rows`."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """Scenes of one structure.
+    """Scenes whose constraint graphs have one structure.
 
     Attributes:
-        says: what it is, in words.
-        sizes: that are measured.
-        build: size, dtype → system and state.
+        says: description of the structure.
+        sizes: sizes to measure.
+        build: (size, dtype) → system and state.
     """
 
     says: str
@@ -37,28 +39,28 @@ class Family:
 
 
 def of(name: str) -> Callable[[int, Any], tuple[Any, jc.State]]:
-    """A mechanism of the benchmarks by its size."""
+    """Returns the builder of a benchmark mechanism as a function of its size."""
     return lambda n, dtype: mechanisms.find(f"{name}-{n}").build(dtype)
 
 
-def particles(points: Any, dtype: Any) -> jc.Scene:
-    """A scene of particles of 0.1 kg at points (n, dim)."""
+def particles(points: Any, dtype: DTypeLike) -> jc.Scene:
+    """Returns a scene of particles of 0.1 kg at points (n, dim)."""
     scene = jc.Scene(dim=len(points[0]), dtype=dtype)
     for i, point in enumerate(points):
         scene.add_particle(f"p{i}", mass=0.1, position=point)
     return scene
 
 
-def posts(n: int, dtype: Any) -> tuple[Any, jc.State]:
-    """Pendulums beside each other, none of which touches another."""
+def posts(n: int, dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds independent pendulums side by side."""
     scene = particles([(i * LINK + LINK, 0.0) for i in range(n)], dtype)
     for i in range(n):
         scene.add(jc.Distance(f"rod{i}", jc.WORLD, f"p{i}", point_a=(i * LINK, 0.0)))
     return scene.build()
 
 
-def hub(n: int, dtype: Any) -> tuple[Any, jc.State]:
-    """Particles on rods around one heavy body: every constraint meets every other on it."""
+def hub(n: int, dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds particles on rods around one heavy body, on which all constraints act."""
     angles = 2 * np.pi * np.arange(n) / n
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
     scene = particles(2 * rays, dtype)
@@ -68,8 +70,8 @@ def hub(n: int, dtype: Any) -> tuple[Any, jc.State]:
     return scene.build()
 
 
-def net(n: int, dtype: Any) -> tuple[Any, jc.State]:
-    """A square net of about n particles in space, hung along one side: loops everywhere."""
+def net(n: int, dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds a square net of about n particles in space, fixed along one side, with many loops."""
     side = max(2, math.isqrt(n))
     places = [(i, j) for i in range(side) for j in range(side)]
     scene = particles([(i * LINK, -j * LINK, 0.0) for i, j in places], dtype)
@@ -84,8 +86,11 @@ def net(n: int, dtype: Any) -> tuple[Any, jc.State]:
     return scene.build()
 
 
-def rows(m: int, dtype: Any) -> tuple[Any, jc.State]:
-    """A hundred particles in a row, of which the first m hang together."""
+def rows(m: int, dtype: DTypeLike) -> tuple[Any, jc.State]:
+    """Builds a hundred particles in a row with m constraints.
+
+    The constraints connect the first m particles in a chain that starts at the world.
+    """
     scene = particles([(i * LINK + LINK, 0.0) for i in range(BODIES)], dtype)
     for i in range(m):
         first = (jc.WORLD, (0.0, 0.0)) if i == 0 else (f"p{i - 1}", None)

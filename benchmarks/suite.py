@@ -1,6 +1,6 @@
-"""The contract of the benchmarks, and the comparison with numbers that were stored.
+"""Benchmarks and metrics of the benchmark suite, and the comparison with a baseline.
 
-Every number has a name and a unit, and says which way is better and by how much it may get worse.
+Every metric has a name, a unit, a better direction and a factor by which it may get worse.
 """
 
 from __future__ import annotations
@@ -20,17 +20,18 @@ FILE = Path(__file__).with_name("baseline.json")
 
 @dataclass(frozen=True)
 class Metric:
-    """One number that a benchmark found.
+    """A measured value of a benchmark.
 
     Attributes:
-        name: unique in its entry.
-        value: not finite where there is none, which is worse than any number.
-        unit: of it; empty for ratios and counts.
+        name: unique name within its benchmark.
+        value: the value. A value that is not finite means that the measurement failed. It is worse
+            than any finite value.
+        unit: unit, empty for ratios and counts.
         better: `HIGHER` or `LOWER`.
-        tolerance: the factor by which it may get worse, at least 1.
-        floor: what is below counts as this much, such as rounding.
-        transfers: whether it means the same on another machine, as ratios and errors do and times
-            do not; a baseline holds only such numbers.
+        tolerance: factor by which the value may get worse, at least 1.
+        floor: lower bound for comparisons; smaller values, such as rounding, count as the floor.
+        transfers: True if the value is comparable between machines, as ratios and errors are. A
+            baseline stores only such values.
     """
 
     name: str
@@ -42,43 +43,49 @@ class Metric:
     transfers: bool = True
 
     def worse_than(self, before: float) -> bool:
-        """Whether it is worse than another value by more than the tolerance."""
-        now, old = (max(x, self.floor) if math.isfinite(x) else x for x in (self.value, before))
+        """Returns True if the value is worse than `before` by more than the tolerance."""
+        new, old = (max(x, self.floor) if math.isfinite(x) else x for x in (self.value, before))
         if not math.isfinite(old):
             return False
-        if not math.isfinite(now):
+        if not math.isfinite(new):
             return True
         limit = old * self.tolerance if self.better == LOWER else old / self.tolerance
-        return now > limit if self.better == LOWER else now < limit
+        return new > limit if self.better == LOWER else new < limit
 
 
 def seconds(name: str, value: float) -> Metric:
-    """A time, which does not transfer."""
+    """Returns the metric of a time in seconds, which is not comparable between machines."""
     return Metric(name, value, "s", LOWER, transfers=False)
 
 
 def rate(name: str, value: float) -> Metric:
-    """Work a second, which does not transfer."""
+    """Returns the metric of a rate, which is not comparable between machines."""
     return Metric(name, value, "1/s", HIGHER, transfers=False)
 
 
 def error(name: str, value: float, unit: str = "", floor: float = 0.0) -> Metric:
-    """An error or violation: of other compilers and processors up to three times as large."""
+    """Returns the metric of an error or violation.
+
+    The tolerance is 3, since compilers and processors change rounding.
+    """
     return Metric(name, value, unit, LOWER, 3.0, floor)
 
 
 def count(name: str, value: float, unit: str = "", tolerance: float = 1.0) -> Metric:
-    """A number of operations, bytes or failures, which no machine changes."""
+    """Returns the metric of a number of operations, bytes or failures.
+
+    It is equal on all machines.
+    """
     return Metric(name, value, unit, LOWER, tolerance)
 
 
 @dataclass(frozen=True)
 class Found:
-    """What an entry found.
+    """The result of a benchmark.
 
     Attributes:
-        metrics: its numbers.
-        draw: makes a picture at a path; None where there is none.
+        metrics: the measured values.
+        draw: draws a picture at a path, None if there is no picture.
     """
 
     metrics: tuple[Metric, ...]
@@ -87,13 +94,13 @@ class Found:
 
 @dataclass(frozen=True)
 class Entry:
-    """One benchmark of the suite.
+    """A benchmark of the suite.
 
     Attributes:
-        name: by which it is run.
-        about: what it measures.
-        run: quick → what it found.
-        needs: packages without which it is left out.
+        name: name on the command line.
+        about: description in one sentence.
+        run: (quick) → result.
+        needs: packages that it requires.
     """
 
     name: str
@@ -103,42 +110,45 @@ class Entry:
 
 
 ENTRIES: dict[str, Entry] = {}
-"""By name; `benchmarks.entries` has them all."""
+"""All entries by name, registered by importing `benchmarks.entries`."""
 GYMNASIUM, MUJOCO = "gymnasium", "mujoco"
 SMALL = ("pendulum", "four-bar")
-"""The scenes of a quick run."""
+"""Scenes of a quick run."""
 
 
 def entry(name: str, *needs: str) -> Callable[[Callable[[bool], Any]], Callable[[bool], Any]]:
-    """Enters a function from quick to metrics, or to `Found`; its docstring says what it does."""
+    """Registers a function (quick) → metrics or `Found` as a benchmark.
 
-    def enters(run: Callable[[bool], Any]) -> Callable[[bool], Any]:
-        def found(quick: bool) -> Found:
+    The first line of its docstring becomes the description.
+    """
+
+    def register(run: Callable[[bool], Any]) -> Callable[[bool], Any]:
+        def run_entry(quick: bool) -> Found:
             result = run(quick)
             return result if isinstance(result, Found) else Found(tuple(result))
 
         about = (run.__doc__ or "").strip().splitlines()[0]
-        ENTRIES[name] = Entry(name, about, found, needs)
+        ENTRIES[name] = Entry(name, about, run_entry, needs)
         return run
 
-    return enters
+    return register
 
 
 def scenes(quick: bool) -> list[str]:
-    """Of the comparison with other simulators."""
+    """Returns the names of the scenes in the comparison with other simulators."""
     return list(SMALL if quick else targets.SCENES)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of an entry.
+    """The outcome of running a benchmark.
 
     Attributes:
-        metrics: its numbers.
-        seconds: that it took.
-        failed: why it has none although it was run; empty where it has.
-        left_out: why it was not run; empty where it was.
-        picture: where one was drawn.
+        metrics: the measured values.
+        seconds: duration of the benchmark [s].
+        failed: the reason of a failure, empty otherwise.
+        left_out: the reason why the benchmark was not run, empty otherwise.
+        picture: file name of the picture, empty if there is none.
     """
 
     metrics: tuple[Metric, ...] = ()
@@ -150,11 +160,11 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Baseline:
-    """Numbers as they were, by size ("quick" or "full"), entry and name.
+    """Stored values by size ("quick" or "full"), benchmark and metric name.
 
     Attributes:
-        values: of the metrics that transfer.
-        machines: on which those of a size and entry were measured.
+        values: values of the metrics that are comparable between machines.
+        machines: the machine that produced the values, by size and benchmark.
     """
 
     values: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
@@ -162,10 +172,10 @@ class Baseline:
 
     @classmethod
     def read(cls, file: Path) -> Baseline:
-        """From a file; empty where there is none.
+        """Reads a baseline from a file. A missing file gives an empty baseline.
 
         Raises:
-            ValueError: the file is no baseline.
+            ValueError: the file is not a baseline.
         """
         try:
             return cls(**json.loads(file.read_text())) if file.exists() else cls()
@@ -173,42 +183,47 @@ class Baseline:
             raise ValueError(f"{file} is no baseline, as --update --compare FILE writes") from None
 
     def write(self, file: Path) -> None:
-        """To a file."""
+        """Writes the baseline to a JSON file."""
         file.write_text(json.dumps(asdict(self), indent=1, sort_keys=True) + "\n")
 
     def of(self, size: str, entry: str) -> dict[str, float]:
-        """The values of an entry by name."""
+        """Returns the stored values of a benchmark by metric name."""
         return self.values.get(size, {}).get(entry, {})
 
-    def updated(self, size: str, found: Mapping[str, Outcome], machine: Any) -> Baseline:
-        """With the numbers of the entries that were run in the place of theirs."""
+    def updated(self, size: str, outcomes: Mapping[str, Outcome], machine: Any) -> Baseline:
+        """Returns a baseline in which the values of these outcomes are replaced."""
         new = {
             name: {m.name: m.value for m in outcome.metrics if m.transfers and _finite(m)}
-            for name, outcome in found.items()
+            for name, outcome in outcomes.items()
             if outcome.metrics
         }
         values = self.values | {size: self.values.get(size, {}) | new}
-        own = dict.fromkeys(new, machine)
-        machines = self.machines | {size: self.machines.get(size, {}) | own}
+        new_machines = dict.fromkeys(new, machine)
+        machines = self.machines | {size: self.machines.get(size, {}) | new_machines}
         return Baseline(values, machines)
 
-    def worse(self, size: str, found: Mapping[str, Outcome]) -> list[str]:
-        """What got worse by more than its tolerance or is no longer there, in words."""
-        said = []
-        for name, outcome in found.items():
-            before, now = self.of(size, name), {m.name: m for m in outcome.metrics}
+    def worse(self, size: str, outcomes: Mapping[str, Outcome]) -> list[str]:
+        """Returns messages about metrics that failed, are missing, or got worse.
+
+        Only a change beyond the tolerance of a metric counts as worse.
+        """
+        messages = []
+        for name, outcome in outcomes.items():
+            before, metrics = self.of(size, name), {m.name: m for m in outcome.metrics}
             if outcome.left_out:
                 continue
             if outcome.failed:
-                said.append(f"{name}: {outcome.failed}")
+                messages.append(f"{name}: {outcome.failed}")
                 continue
-            said += [f"{name}: {gone} is missing" for gone in before if gone not in now]
-            said += [
+            messages += [
+                f"{name}: {missing} is missing" for missing in before if missing not in metrics
+            ]
+            messages += [
                 f"{name}: {m.name} was {before[m.name]:.3g} and is {m.value:.3g} {m.unit}".rstrip()
                 for m in outcome.metrics
                 if m.name in before and m.worse_than(before[m.name])
             ]
-        return said
+        return messages
 
 
 def _finite(metric: Metric) -> bool:
@@ -216,17 +231,17 @@ def _finite(metric: Metric) -> bool:
 
 
 HEAD = """
-| benchmark | | value | better | before | may become |
+| benchmark | metric | value | better | baseline | may become |
 |---|---|---|---|---|---|"""
 
 
-def lines(name: str, outcome: Outcome, before: Mapping[str, float]) -> list[str]:
-    """The rows of an entry."""
+def lines(name: str, outcome: Outcome, baseline: Mapping[str, float]) -> list[str]:
+    """Formats the table rows of a benchmark."""
     if not outcome.metrics:
         return [f"| {name} | | {outcome.failed or outcome.left_out} | | | |"]
     rows = []
     for m in outcome.metrics:
-        old = f"{before[m.name]:.3g}" if m.name in before else ""
+        old = f"{baseline[m.name]:.3g}" if m.name in baseline else ""
         bound = f"{m.tolerance:g} times {'more' if m.better == LOWER else 'less'}"
         cells = [name, m.name, f"{m.value:.3g} {m.unit}".rstrip(), m.better, old]
         rows.append("| " + " | ".join([*cells, bound if m.transfers else "anything"]) + " |")
@@ -234,5 +249,5 @@ def lines(name: str, outcome: Outcome, before: Mapping[str, float]) -> list[str]
 
 
 def unknown(names: Iterable[str], entries: Mapping[str, Entry]) -> list[str]:
-    """Those names that no entry has."""
+    """Returns the names that belong to no benchmark."""
     return [name for name in names if name not in entries]

@@ -1,4 +1,4 @@
-"""The rows that `benchmarks.throughput` measures, their verdicts, and the tables it prints."""
+"""The results of `benchmarks.throughput`, their verdicts, and the tables that it prints."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ from benchmarks.timing import Rate
 
 @dataclass(frozen=True)
 class Row:
-    """One scene at one precision.
+    """Results of one scene in one precision.
 
     Attributes:
-        scene, dtype: which.
-        rates: world-steps a second by batch.
-        compile: of the rollout, tracing included, by batch [s].
-        accuracy: of one second.
-        work: of one step.
-        mujoco, mjx: what the peers do, None where they did not run.
-        alone: MuJoCo in C with one world on one core.
+        scene: name of the scene.
+        dtype: precision.
+        rates: world-steps per second by batch size.
+        compile: compile time of the rollout, including tracing, by batch size [s].
+        accuracy: accuracy of a run of one second.
+        work: operations and state size of one step.
+        mujoco: rate of MuJoCo in C, None if not measured.
+        mjx: runs of MJX, None if not measured.
+        alone: rate of MuJoCo in C with one world on one core.
     """
 
     scene: str
@@ -36,49 +38,52 @@ class Row:
 
     @property
     def best(self) -> float:
-        """The median at the batch that suits it best."""
+        """The median rate at the best batch size."""
         return max(rate.median for rate in self.rates.values())
 
     @property
     def over_c(self) -> float | None:
-        """How many times faster than MuJoCo in C."""
+        """The best rate divided by that of MuJoCo in C, None if that is not measured."""
         return self.best / self.mujoco.median if self.mujoco else None
 
     @property
     def over_mjx(self) -> float | None:
-        """How many times faster than MJX."""
+        """The best rate divided by the best rate of MJX, None if that is not measured."""
         best = self.mjx.best if self.mjx else None
         return self.best / best.rate.median if best else None
 
     @property
     def behind_alone(self) -> float | None:
-        """How many times slower than MuJoCo in C on one core with one world, if that was run."""
+        """The rate of MuJoCo in C over that of jaxcon, for one world.
+
+        MuJoCo uses one core. None if a rate is not measured.
+        """
         ours = self.rates.get(1)
         return self.alone.median / ours.median if self.alone and ours else None
 
     @property
     def share(self) -> float:
-        """Of the machine's elementwise peak."""
+        """The share of the machine's elementwise peak that the best rate reaches."""
         return self.best * self.work.operations / roofline.peak(self.dtype)
 
 
 def verdict(row: Row) -> str:
-    """Whether a row of the table of targets passes."""
+    """Returns the verdict on a row: the target that it reaches, "below", or "does not count"."""
     if not row.accuracy.counts:
         return "does not count"
     target, factor = targets.SCENES.get(row.scene), row.over_c
     if target is None or factor is None:
         return "-"
-    said = "aim" if factor >= target.aim else "at least" if factor >= target.least else "below"
+    result = "aim" if factor >= target.aim else "at least" if factor >= target.least else "below"
     slow = row.over_mjx is not None and row.over_mjx < targets.MJX
-    return f"{said}; below {targets.MJX:g} x MJX" if slow else said
+    return f"{result}; below {targets.MJX:g} x MJX" if slow else result
 
 
 HEAD = """
 | scene | dtype | batch | steps/s (min to max) | compile | violation / link | error [m] | MuJoCo's |
 |---|---|---|---|---|---|---|---|"""
 AGAINST = """
-| scene | dtype | best | MuJoCo C | times | MJX | times | at least | aim | verdict | one world |
+| scene | dtype | best | MuJoCo C | ratio | MJX | ratio | at least | aim | verdict | one world |
 |---|---|---|---|---|---|---|---|---|---|---|"""
 ROOFLINE = """
 | scene | dtype | operations a step | state | rate | of the peak |
@@ -86,19 +91,19 @@ ROOFLINE = """
 
 
 def lines(row: Row) -> list[str]:
-    """A row of the first table for each batch."""
-    a = row.accuracy
-    off = f"{a.violation:.1e}" if a.healthy else "a step failed"
-    peer = "-" if a.peer is None else f"{a.peer:.1e}"
+    """Formats the rows of the first table, one for each batch size."""
+    accuracy = row.accuracy
+    violation = f"{accuracy.violation:.1e}" if accuracy.healthy else "a step failed"
+    peer = "-" if accuracy.peer is None else f"{accuracy.peer:.1e}"
     return [
         f"| {row.scene} | {row.dtype} | {batch} | {rate} | {row.compile[batch]:.1f} s"
-        f" | {off} | {a.error:.1e} | {peer} |"
+        f" | {violation} | {accuracy.error:.1e} | {peer} |"
         for batch, rate in row.rates.items()
     ]
 
 
 def against(row: Row) -> str:
-    """A row of the comparison."""
+    """Formats a row of the comparison with MuJoCo and MJX."""
     target = targets.SCENES.get(row.scene)
     wanted = (target.least, target.aim) if target else ("-", "-")
     cells = [row.scene, row.dtype, f"{row.best / 1e6:.3g} M", row.mujoco or "-"]
@@ -109,12 +114,12 @@ def against(row: Row) -> str:
 
 
 def times(factor: float | None) -> str:
-    """A ratio in words."""
+    """Formats a ratio."""
     return "-" if factor is None else f"{factor:.3g} x"
 
 
 def roof(row: Row) -> str:
-    """A row of the table of operations."""
+    """Formats operations and share of the peak as a table row."""
     return (
         f"| {row.scene} | {row.dtype} | {row.work.operations:.0f} | {row.work.state} B"
         f" | {row.best * row.work.operations / 1e9:.2f} G/s | {100 * row.share:.1f} % |"

@@ -1,4 +1,4 @@
-"""The scenes of the comparison with MuJoCo and MJX, and by what factor each is to be faster."""
+"""The scenes of the comparison with MuJoCo and MJX, and the speedup targets."""
 
 from __future__ import annotations
 
@@ -6,7 +6,12 @@ from typing import NamedTuple
 
 
 class Target(NamedTuple):
-    """Throughput relative to MuJoCo in C on all cores: at least this, at best that."""
+    """Throughput relative to MuJoCo in C on all cores.
+
+    Attributes:
+        least: the required ratio.
+        aim: the desired ratio.
+    """
 
     least: float
     aim: float
@@ -24,10 +29,10 @@ SCENES = {
     "rope-100": Target(5, 10),
 }
 TIKHONOV = {"n-four-bar-10": 1e-5, "chain-50": 1e-6}
-"""Regularisation of the scenes whose rows become dependent on the way, or nearly so in float32."""
+"""Tikhonov regularization of scenes whose rows become dependent, or nearly so in float32."""
 MJX = 6.0
-"""And relative to MJX at its best batch, on every scene."""
+"""Required throughput relative to MJX at its best batch, on every scene."""
 VIOLATION = 1e-3
-"""A rate counts only if constraints hold to this, in link lengths, over one second …"""
+"""Bound on the violation over one second, in link lengths, for a rate to count."""
 ERROR = 2.0
-"""… and if the error after one second is at most so many times that of MuJoCo's Euler."""
+"""Bound on the error after one second, relative to MuJoCo's Euler, for a rate to count."""

@@ -1,4 +1,4 @@
-"""Rates with their spread, compile times, and the machine on which they were measured."""
+"""Measures rates and compile times, and describes the machine."""
 
 from __future__ import annotations
 
@@ -24,53 +24,56 @@ ROOT = Path(__file__).parents[1]
 
 @dataclass(frozen=True)
 class Rate:
-    """Work per second: the median of several repeats and their extremes."""
+    """Work per second: median, minimum and maximum over several repeats."""
 
     median: float
     least: float
     most: float
 
     def __str__(self) -> str:
-        """As a table shows it, in millions."""
+        """Formats the rate in millions, with its range."""
         spread = f"{self.least / 1e6:.3g} to {self.most / 1e6:.3g}"
         return f"{self.median / 1e6:.3g} M ({spread})"
 
 
 SECONDS = 0.2
-"""How long a repeat lasts at least, so that neither the clock nor the scheduler decides."""
+"""Minimum duration of a repeat, so that clock and scheduler have little influence [s]."""
 
 
 def rate(run: Callable[[], Any], work: float, repeats: int = 5, seconds: float = SECONDS) -> Rate:
-    """How much work a second a function does that returns arrays or None; it has run before.
+    """Measures the rate of a function that returns arrays or None and has run before.
 
     Args:
         run: the function.
-        work: of one call.
-        repeats: how many.
-        seconds: for which a repeat calls it again and again, once at least.
+        work: amount of work in one call.
+        repeats: number of repeats.
+        seconds: minimum duration of a repeat, which calls the function at least once [s].
     """
     rates = []
     for _ in range(repeats):
-        calls, spent, start = 0, 0.0, time.perf_counter()
-        while not calls or spent < seconds:
+        calls, elapsed, start = 0, 0.0, time.perf_counter()
+        while not calls or elapsed < seconds:
             jax.block_until_ready(run())
-            calls, spent = calls + 1, time.perf_counter() - start
-        rates.append(work * calls / spent)
+            calls, elapsed = calls + 1, time.perf_counter() - start
+        rates.append(work * calls / elapsed)
     return Rate(float(np.median(rates)), min(rates), max(rates))
 
 
 def in_turn(runs: Sequence[Callable[[], Any]], work: float, repeats: int = 5) -> np.ndarray:
-    """Rates of functions that have run before, (repeats, functions).
+    """Measures the rates of functions that have run before, (repeats, functions).
 
-    One after the other in each repeat, so that a machine that becomes slower slows them all.
+    Functions alternate in each repeat, so that a change in the machine's speed affects all.
     """
     return np.array([[rate(run, work, 1).median for run in runs] for _ in range(repeats)])
 
 
 def compile_seconds(function: Callable[..., Any], *args: Any) -> tuple[Any, float]:
-    """The compiled function, and how long tracing and compiling it took [s].
+    """Compiles a function.
 
-    JAX's cache on the disk, where it is turned on, makes this the time of reading it.
+    If JAX's disk cache is on, the time is that of reading the cache.
+
+    Returns:
+        The compiled function, and the time of tracing and compiling [s].
     """
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*args).compile()
@@ -78,7 +81,7 @@ def compile_seconds(function: Callable[..., Any], *args: Any) -> tuple[Any, floa
 
 
 def yardstick(repeats: int = 3) -> float:
-    """How long a fixed program of plain JAX takes to compile here, the median of several [s]."""
+    """Returns the compile time of a fixed program in plain JAX, the median of several [s]."""
 
     def program(x: jax.Array) -> jax.Array:
         for i in range(50):
@@ -86,23 +89,26 @@ def yardstick(repeats: int = 3) -> float:
         return x
 
     start = jax.numpy.eye(8)
-    spent = [compile_seconds(lambda x: program(x), start)[1] for _ in range(repeats)]
-    return float(np.median(spent))
+    times = [compile_seconds(lambda x: program(x), start)[1] for _ in range(repeats)]
+    return float(np.median(times))
 
 
 def in_process(
     arguments: list[str], environment: dict[str, str], limit: float, late: str
 ) -> dict[str, Any] | str:
-    """What a module prints as JSON when run in a process of its own, or why there is nothing.
+    """Runs a module in its own process.
 
     Args:
-        arguments: of `python -m`.
-        environment: of the process.
-        limit: on its time [s].
-        late: what to say where it takes longer.
+        arguments: arguments of `python -m`.
+        environment: environment of the process.
+        limit: time limit [s].
+        late: beginning of the message for a timeout; the limit follows.
+
+    Returns:
+        The JSON output of the process, or the reason of a failure.
     """
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", *arguments],
             capture_output=True,
             text=True,
@@ -115,33 +121,33 @@ def in_process(
         return f"{late} {limit:g} s"
     except subprocess.CalledProcessError as error:
         return f"fails: {(error.stderr.strip().splitlines() or ['?'])[-1]}"
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(process.stdout.splitlines()[-1])
 
 
 def with_flags(flags: str) -> dict[str, str]:
-    """The environment of this process with more flags for XLA."""
+    """Returns the environment of this process with additional XLA flags."""
     return os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
 
 
 def cores() -> int:
-    """How many this process may use."""
+    """Returns the number of cores available to this process."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def use_all_cores() -> None:
-    """Makes JAX see one device a core; to be called before JAX is used."""
+    """Gives JAX one device per core. Must be called before JAX is used."""
     jax.config.update("jax_num_cpu_devices", cores())
 
 
 def over_devices(worlds: Any, batch: int) -> Any:
-    """A batch spread over all devices, where it can be divided among them."""
-    return worlds if batch % jax.device_count() else jc.shard(worlds)
+    """Shards a batch over all devices if its size is divisible by their number."""
+    return worlds if batch % jax.device_count() else jc.devices.shard(worlds)
 
 
 def machine() -> dict[str, Any]:
-    """What a file of results says about where they were measured."""
+    """Describes the machine and package versions, for files of results."""
     return {
         "cores": cores(),
         "processor": platform.processor() or platform.machine(),
@@ -152,20 +158,20 @@ def machine() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Of the peers that are installed."""
+    """Returns the versions of the installed packages MuJoCo and MJX."""
     from importlib import metadata
 
-    found = {}
+    installed = {}
     for package in ("mujoco", "mujoco-mjx"):
         try:
-            found[package] = metadata.version(package)
+            installed[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return installed
 
 
 def plain(value: Any) -> Any:
-    """A result as JSON can hold it; numbers that are not finite are null."""
+    """Converts a result to JSON data. Non-finite numbers become None."""
     if hasattr(value, "__dataclass_fields__"):
         return plain(asdict(value))
     if isinstance(value, dict):

@@ -1,12 +1,13 @@
-"""Whether the examples of learning reach their stated returns, over five seeds.
+"""Checks that the learning examples reach their stated returns, over five seeds.
 
     python -m benchmarks.training [--tasks CartPole …] [--seeds 0 1 2 3 4] [--seconds 900]
         [--json training.json] [--picture training.png]
 
-Each task is trained by `examples/learn_ppo.py` or `examples/learn_apg.py` as they stand, one seed
-after the other in one process, so that only the first compiles; its seconds contain that. A seed
-reaches the goal when the mean return of 64 episodes without noise, on fresh starts, is at least
-that at one of the looks; the last return is that after all updates.
+Each task is trained by `examples/learn_ppo.py` or `examples/learn_apg.py` without changes. Seeds
+run in sequence in one process, so that only the first seed compiles; its time includes compilation.
+An evaluation is the mean return of 64 episodes without noise from fresh initial states. A seed
+reaches the goal at its first evaluation with at least the goal's return. The last return is the
+evaluation after all updates.
 """
 
 from __future__ import annotations
@@ -30,7 +31,14 @@ ALGORITHMS = (learn_ppo.PPO, learn_apg.APG)
 
 
 class Row(NamedTuple):
-    """One task under one algorithm: the looks of each seed, and the goal."""
+    """Results of one task under one algorithm.
+
+    Attributes:
+        task: name of the task.
+        algorithm: name of the algorithm.
+        goal: the return to reach.
+        curves: the evaluations of each seed.
+    """
 
     task: str
     algorithm: str
@@ -39,28 +47,28 @@ class Row(NamedTuple):
 
     @property
     def reached(self) -> list[Look | None]:
-        """Of each seed, the first look at which it had reached the goal."""
+        """The first evaluation of each seed that reaches the goal, None if none does."""
         return [next((x for x in c if x.earned >= self.goal), None) for c in self.curves]
 
     def __str__(self) -> str:
-        """A row of the table."""
-        found = [x for x in self.reached if x is not None]
+        """Formats the results of the task as a table row."""
+        reached = [x for x in self.reached if x is not None]
         last = [curve[-1].earned for curve in self.curves]
         ends = f"{min(last):.0f} to {max(last):.0f}"
         name = f"| {self.task} | {self.algorithm} | {self.goal:.0f}"
-        if not found:
+        if not reached:
             return f"{name} | 0 of {len(last)} | - | - | - | {ends} |"
-        spans = [span([x[i] for x in found]) for i in range(3)]
-        return f"{name} | {len(found)} of {len(last)} | {' | '.join(spans)} | {ends} |"
+        spans = [span([x[i] for x in reached]) for i in range(3)]
+        return f"{name} | {len(reached)} of {len(last)} | {' | '.join(spans)} | {ends} |"
 
 
 def span(numbers: list[float]) -> str:
-    """The least and the most."""
+    """Formats the minimum and the maximum of values."""
     return f"{min(numbers):.3g} to {max(numbers):.3g}"
 
 
 def measure(algorithm: Algorithm, task: str, seeds: list[int], seconds: float) -> Row:
-    """Trains every seed, for so many seconds at most."""
+    """Trains a task with every seed, for at most `seconds` each."""
     setting, environment, curves = algorithm.settings[task], environments.make(task), []
     for seed in seeds:
         curve: list[Look] = []
@@ -74,7 +82,7 @@ def measure(algorithm: Algorithm, task: str, seeds: list[int], seconds: float) -
 
 
 def draw(rows: list[Row], picture: str) -> None:
-    """A panel for each row with the curves of all seeds."""
+    """Plots the learning curves of all seeds, one panel per row."""
     from jaxcon import view
 
     pyplot = view.pyplot()
@@ -92,33 +100,33 @@ def draw(rows: list[Row], picture: str) -> None:
 
 
 def save(rows: list[Row], path: str) -> None:
-    """All looks as JSON."""
-    kept: list[dict[str, Any]] = [
+    """Writes all evaluations as JSON."""
+    rows_json: list[dict[str, Any]] = [
         row._asdict() | {"curves": [[x._asdict() for x in c] for c in row.curves]} for row in rows
     ]
-    Path(path).write_text(json.dumps({"machine": timing.machine(), "rows": kept}, indent=1))
+    Path(path).write_text(json.dumps({"machine": timing.machine(), "rows": rows_json}, indent=1))
 
 
 def main() -> None:
-    """Prints the table, writes numbers and picture."""
-    known = [(a, task) for a in ALGORITHMS for task in a.settings]
+    """Prints the table and writes results and picture."""
+    tasks = [(a, task) for a in ALGORITHMS for task in a.settings]
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="*", default=[task for _, task in known])
+    parser.add_argument("--tasks", nargs="*", default=[task for _, task in tasks])
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2, 3, 4])
-    parser.add_argument("--seconds", type=float, default=900.0, help="of each seed, at most")
+    parser.add_argument("--seconds", type=float, default=900.0, help="time limit of a seed [s]")
     parser.add_argument("--json", default="training.json")
     parser.add_argument("--picture", default="training.png")
-    given = parser.parse_args()
+    options = parser.parse_args()
     print(timing.machine())
     print("| task | algorithm | goal | reached by | updates | actions | seconds | last return |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
     rows = []
-    for algorithm, task in known:
-        if task in given.tasks:
-            rows.append(measure(algorithm, task, given.seeds, given.seconds))
+    for algorithm, task in tasks:
+        if task in options.tasks:
+            rows.append(measure(algorithm, task, options.seeds, options.seconds))
             print(rows[-1], flush=True)
-    save(rows, given.json)
-    draw(rows, given.picture)
+    save(rows, options.json)
+    draw(rows, options.picture)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,17 @@
-"""Does it run on every Python and JAX that it says it runs on?
+"""Tests the package on every supported pair of Python and JAX.
 
     python benchmarks/versions.py [--pairs 3.11:0.8.3 3.13:0.12.0 …] [--pythons 3.11 3.13 3.14]
         [--stages import README guide tests] [--minutes 15] [--folder DIR] [--json FILE] [--list]
 
-Tries each Python that is found with each minor version of JAX that pip has for it, from the lower
-bound in pyproject.toml to the newest. A pair gets a virtual environment with the dependencies of
-the package: the first pair with their lower bounds, the others with the newest. The stages are the
-import, the programs of the README, those of every page of the guide, and the tests of `TESTS`. A
-DeprecationWarning is an error throughout.
+Each installed Python is tested with each minor version of JAX that pip offers for it, from the
+lower bound in pyproject.toml to the newest. A pair gets a virtual environment with the dependencies
+of the package. The first pair has their lower bounds, all other pairs the newest versions. There
+are four stages: the import, the programs of the README, the programs of every page of the guide,
+and the tests in `TESTS`. A DeprecationWarning is an error throughout.
 
-Pairs run one after the other, each at most so many minutes; what it did not reach is said. The
-table is printed as it grows. The script needs nothing but Python, and ends with 1 where something
-failed. Environments stay in the folder, if one is given, and are used again.
+Pairs run in sequence with a time limit each. The table is printed row by row, and marks stages for
+which no time was left. The script needs only Python, and its exit status is 1 if a stage failed.
+Environments are kept and reused if a folder is given.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ TESTS = (
     *("native", "fusion", "worlds", "composition"),
     *("needed", "numerics", "lanes", "quaternion", "layout"),
 )
-"""Modules of tests that lean on JAX's inner workings, or hold them at arm's length."""
+"""Tests of modules that depend on JAX's internals or isolate the package from them."""
 TOOLS = ("pytest>=8", "pytest-xdist>=3.5", "flatbuffers")
 STAGES = ("import", "README", "guide", "tests")
 LEFT_OUT = ("models-you-already-have", "train-policies")
-"""Pages of the guide that need MuJoCo or Gymnasium, which have versions of their own."""
+"""Pages of the guide that need MuJoCo or Gymnasium, which restrict versions themselves."""
 
 IMPORT = "import jaxcon; jaxcon.environments; jaxcon.learning"
 READER = """
@@ -53,29 +53,29 @@ for page in sys.argv[1:]:
         names = {}
         for block in re.findall(r"```python\\n(.*?)```", open(page, encoding="utf-8").read(), re.S):
             exec(block, names)
-        said = "ok"
+        result = "ok"
     except BaseException as error:
         failed += 1
         traceback.print_exc()
-        said = f"{type(error).__name__}: {error}"
-    print(f"PAGE {page} {time.perf_counter() - start:.0f} s {said}", flush=True)
+        result = f"{type(error).__name__}: {error}"
+    print(f"PAGE {page} {time.perf_counter() - start:.0f} s {result}", flush=True)
 sys.exit(bool(failed))
 """
-"""Runs the programs of each page from its top, and after nothing else."""
+"""A script that runs the programs of each page in order, in a fresh namespace per page."""
 
 
 def project() -> dict[str, Any]:
-    """Reads the package's table of pyproject.toml."""
+    """Reads the `project` table of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
 def number(version: str) -> tuple[int, ...]:
-    """A version to be compared."""
+    """Returns a version as a tuple of integers, for comparisons."""
     return tuple(int(x) for x in version.split("."))
 
 
 def chosen(versions: Iterable[str], bound: str) -> list[str]:
-    """The lower bound, and the last patch of every minor version after it."""
+    """Returns the lower bound and the last patch of every later minor version."""
     last: dict[tuple[int, ...], str] = {}
     for version in sorted((v for v in versions if re.fullmatch(r"[\d.]+", v)), key=number):
         if number(version) >= number(bound):
@@ -84,38 +84,39 @@ def chosen(versions: Iterable[str], bound: str) -> list[str]:
 
 
 def lower_bounds(dependencies: Sequence[str]) -> dict[str, str]:
-    """The least version of each dependency."""
+    """Returns the lower bound of each dependency."""
     return dict(re.fullmatch(r"([\w-]+)>=([\d.]+)", x).groups() for x in dependencies)  # type: ignore[union-attr]
 
 
 def interpreter(version: str) -> str | None:
-    """A Python of this minor version: one on the path, or of pyenv."""
-    found = shutil.which(f"python{version}")
-    beside = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
-    for candidate in [*([found] if found else []), *map(str, beside)]:
-        asked = [candidate, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
-        said = subprocess.run(asked, capture_output=True, text=True, check=False)
-        if said.stdout.strip() == version:
+    """Returns the path of a Python of this minor version, on the path or in pyenv, or None."""
+    on_path = shutil.which(f"python{version}")
+    of_pyenv = sorted(Path.home().glob(f".pyenv/versions/{version}.*/bin/python"))
+    for candidate in [*([on_path] if on_path else []), *map(str, of_pyenv)]:
+        command = [candidate, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        if result.stdout.strip() == version:
             return candidate
     return None
 
 
 def offered(python: str) -> list[str]:
-    """The versions of JAX that pip has for a Python."""
+    """Returns the versions of JAX that pip offers for a Python."""
     command = [python, "-m", "pip", "index", "versions", "jax", "--disable-pip-version-check"]
-    said = subprocess.run(command, capture_output=True, text=True, check=False)
-    found = re.search(r"Available versions: (.*)", said.stdout)
-    return found[1].split(", ") if found else []
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    match = re.search(r"Available versions: (.*)", result.stdout)
+    return match[1].split(", ") if match else []
 
 
 class Pair:
-    """One Python with one JAX.
+    """A version of Python with a version of JAX, and its test results.
 
     Attributes:
-        python, jax: their versions.
-        lowest: whether all dependencies have their lower bounds.
-        found: what became of each stage.
-        said: the end of what a stage that failed printed.
+        python: version of Python.
+        jax: version of JAX.
+        lowest: True if all dependencies have their lower bounds.
+        found: result of each stage.
+        said: end of the output of each failed stage.
     """
 
     def __init__(self, python: str, jax: str, lowest: bool = False) -> None:
@@ -124,7 +125,7 @@ class Pair:
         self.said: dict[str, str] = {}
 
     def run(self, folder: Path, minutes: float, wanted: Sequence[str] = STAGES) -> None:
-        """Makes the environment where there is none, and goes through the wanted stages."""
+        """Creates the environment if needed, and runs the wanted stages."""
         start = time.monotonic()
         end = start + 60 * minutes
         place = folder / f"python{self.python}-jax{self.jax}{'-lowest' * self.lowest}"
@@ -145,12 +146,12 @@ class Pair:
         self.found["time"] = f"{(time.monotonic() - start) / 60:.0f} min"
 
     def _installed(self, place: Path, end: float) -> bool:
-        """Makes the environment unless it exists; returns True where it does at the end."""
-        done = place / "versions.txt"
-        if not done.exists():
+        """Creates the environment unless it exists. Returns True if it exists afterwards."""
+        record = place / "versions.txt"
+        if not record.exists():
             needed = project()["dependencies"]
-            least = lower_bounds(needed)
-            others = [f"{k}=={v}" for k, v in least.items()] if self.lowest else needed
+            bounds = lower_bounds(needed)
+            others = [f"{k}=={v}" for k, v in bounds.items()] if self.lowest else needed
             exact = {f"jax=={self.jax}", f"jaxlib=={self.jax}"}
             wanted = [*exact, *(x for x in others if not x.startswith("jax"))]
             python, venv = interpreter(self.python), place / "venv"
@@ -163,32 +164,45 @@ class Pair:
                 text = self._stage("install", command, place, end)
                 if text is None:
                     return False
-            done.write_text(text)
-        packages = dict(x.split("==") for x in done.read_text().splitlines() if "==" in x)
+            record.write_text(text)
+        packages = dict(x.split("==") for x in record.read_text().splitlines() if "==" in x)
         self.found["install"] = ", ".join(f"{x} {packages[x]}" for x in ("numpy", "optax"))
         return True
 
     def _stage(self, name: str, command: list[str], place: Path, end: float) -> str | None:
-        """Returns the output of a command; None, with a note, where it fails or is out of time."""
+        """Runs a command and returns its output.
+
+        After a failure or timeout, it records the result and returns None.
+        """
         place.mkdir(parents=True, exist_ok=True)
-        left = end - time.monotonic()
-        own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "PYTHON"))}
-        own |= {"PYTHONPATH": str(ROOT), "JAX_COMPILATION_CACHE_DIR": str(place / "programs")}
-        own |= {"JAX_PLATFORMS": "cpu", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        remaining = end - time.monotonic()
+        environment = {
+            k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "PYTHON"))
+        }
+        environment |= {
+            "PYTHONPATH": str(ROOT),
+            "JAX_COMPILATION_CACHE_DIR": str(place / "programs"),
+        }
+        environment |= {"JAX_PLATFORMS": "cpu", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
         try:
-            done = subprocess.run(
-                command, cwd=place, env=own, capture_output=True, text=True, timeout=max(1.0, left)
+            process = subprocess.run(
+                command,
+                cwd=place,
+                env=environment,
+                capture_output=True,
+                text=True,
+                timeout=max(1.0, remaining),
             )
         except subprocess.TimeoutExpired as error:
             text = (error.stdout or b"").decode(errors="replace")
             self.found[name], self.said[name] = "no time left", text[-2000:]
             return None
-        seen = outcome(done.stdout)
-        self.found[name] = f"FAILED {seen}".strip() if done.returncode else seen or "ok"
-        if done.returncode:
-            self.said[name] = (done.stdout + done.stderr)[-4000:]
+        summary = outcome(process.stdout)
+        self.found[name] = f"FAILED {summary}".strip() if process.returncode else summary or "ok"
+        if process.returncode:
+            self.said[name] = (process.stdout + process.stderr)[-4000:]
             return None
-        return done.stdout
+        return process.stdout
 
 
 def outcome(text: str) -> str:
@@ -201,7 +215,7 @@ def outcome(text: str) -> str:
 
 
 def table(pairs: Sequence[Pair]) -> str:
-    """The results of all pairs as a Markdown table."""
+    """Formats the results of all pairs as a Markdown table."""
     columns = ("install", *STAGES, "time")
     rows = [("Python", "JAX", "with", *STAGES, "time"), ("---",) * 8]
     rows += [(p.python, p.jax, *(p.found.get(c, "—") for c in columns)) for p in pairs]
@@ -209,20 +223,20 @@ def table(pairs: Sequence[Pair]) -> str:
 
 
 def all_pairs(pythons: Sequence[str]) -> tuple[list[Pair], list[str]]:
-    """The pairs to be tried, oldest Python first, and the Pythons that are not here."""
+    """Returns the pairs to test, oldest Python first, and the Pythons that are not installed."""
     bound = lower_bounds(project()["dependencies"])["jax"]
-    found = {version: interpreter(version) for version in pythons}
+    interpreters = {version: interpreter(version) for version in pythons}
     pairs: list[Pair] = []
-    for version, python in found.items():
+    for version, python in interpreters.items():
         if python:
             pairs += [Pair(version, jax) for jax in chosen(offered(python), bound)]
     if pairs:
         pairs[0].lowest = True
-    return pairs, [version for version, python in found.items() if not python]
+    return pairs, [version for version, python in interpreters.items() if not python]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Tries all pairs, or those that are named."""
+    """Tests all supported pairs, or the pairs of `--pairs`, and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pairs", nargs="+", default=(), metavar="PYTHON:JAX")
     parser.add_argument("--pythons", nargs="+", default=PYTHONS)
@@ -230,28 +244,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--minutes", type=float, default=15.0)
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--list", action="store_true", help="say which pairs, and try none")
-    given = parser.parse_args(arguments)
-    pairs, absent = all_pairs(given.pythons)
-    if given.pairs:
-        pairs, absent = [Pair(*x.split(":")) for x in given.pairs], []
+    parser.add_argument("--list", action="store_true", help="print the pairs and exit")
+    options = parser.parse_args(arguments)
+    pairs, absent = all_pairs(options.pythons)
+    if options.pairs:
+        pairs, absent = [Pair(*x.split(":")) for x in options.pairs], []
     for version in absent:
-        print(f"Python {version} is not on this machine: not tried.")
-    if given.list:
+        print(f"Python {version} is not on this machine: not tested.")
+    if options.list:
         print(*(f"{p.python}:{p.jax}" for p in pairs))
         return 0
-    with tempfile.TemporaryDirectory() as own:
-        folder = (given.folder or Path(own)).resolve()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = (options.folder or Path(temporary)).resolve()
         for i, pair in enumerate(pairs):
-            pair.run(folder, given.minutes, given.stages)
+            pair.run(folder, options.minutes, options.stages)
             rows = table(pairs[: i + 1]).splitlines()
             print("\n".join(rows[-1:] if i else rows), flush=True)
     for pair in pairs:
         for name, text in pair.said.items():
             print(f"\n{name} of Python {pair.python}, JAX {pair.jax}:\n{text}")
-    if given.json:
-        found = [{"python": p.python, "jax": p.jax, **p.found} for p in pairs]
-        given.json.write_text(json.dumps(found, indent=1) + "\n")
+    if options.json:
+        results = [{"python": p.python, "jax": p.jax, **p.found} for p in pairs]
+        options.json.write_text(json.dumps(results, indent=1) + "\n")
     return 1 if any(p.said for p in pairs) else 0
 
 

@@ -1,7 +1,8 @@
-"""What a motion costs and how far off it ends, by step, in jaxcon.
+"""Cost and error of motions against step size in jaxcon.
 
-Every run has half the step of the one before. Its error is that of one world; its cost is that of a
-batch over all cores, without compilation, by world and simulated second, from a median of repeats.
+Every run halves the step size of the previous run. The error is that of one world. The cost is the
+time of all cores per world and simulated second in a batch, without compilation, the median of
+repeats.
 """
 
 from __future__ import annotations
@@ -22,31 +23,32 @@ from benchmarks.motions import Form, Motion
 from jaxcon.analysis.reference import butcher
 
 ENOUGH = 1e-9
-"""Error at which steps are halved no more."""
+"""Error below which step sizes are not halved further."""
 ALIKE = 1.5
-"""By which an error must fall with half the step, or something else than the step makes it."""
+"""Smallest factor by which a halved step must reduce the error. Otherwise the error stalls."""
 STARTS = 8
-"""Worlds of a batch start at so many places along the motion."""
+"""Number of points along the motion at which worlds of a batch start."""
 SPAN = 0.05
-"""How long a repeat takes, about [s]; of as many steps, within these:"""
+"""Approximate duration of a repeat [s]."""
 FEW, MANY = 4, 2000
+"""Bounds on the number of steps in a repeat."""
 CLOSE = 1e-2
-"""Error of the run along which worlds start, and whose steps are timed."""
+"""Error bound of the run that provides start points and the timed step size."""
 BATCH, OTHERS = 256, (64, 1024)
-"""Worlds that everything is tried with, and those that the best are tried with, too."""
+"""Batch size for all methods, and additional batch sizes for the best methods."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One run.
+    """Cost and error of one run.
 
     Attributes:
         code: "jaxcon", "MuJoCo C" or "MJX".
-        setting: the method, its precision, and what else there was to choose.
-        dt: h [s].
-        error: at the end of the motion [m] or [rad].
-        cost: of all cores for a simulated second of one world in a batch [s].
-        note: of the batch, and of XLA where it was chosen.
+        setting: method, precision and other choices.
+        dt: step size h [s].
+        error: error at the end of the motion [m] or [rad].
+        cost: time of all cores per simulated second and world, in a batch [s].
+        note: batch size, and XLA flags if chosen.
     """
 
     code: str
@@ -59,64 +61,69 @@ class Point:
 
 METHODS: dict[str, tuple[Any, Any]] = {
     "semi-implicit Euler": (jc.SemiImplicitEuler(), jc.Baumgarte()),
-    "Heun": (jc.Heun(), jc.Baumgarte()),
+    "Heun": (jc.integrators.Heun(), jc.Baumgarte()),
     "RK4": (jc.RK4(), jc.Baumgarte()),
     "order 6": (butcher(), jc.Baumgarte()),
-    "RATTLE": (jc.RATTLE(), jc.Baumgarte()),
-    "generalized-α": (jc.GeneralizedAlpha(), jc.Baumgarte()),
+    "RATTLE": (jc.integrators.RATTLE(), jc.Baumgarte()),
+    "generalized-α": (jc.integrators.GeneralizedAlpha(), jc.Baumgarte()),
 }
-"""Integrators and what keeps constraints beside them; the last two do so themselves."""
+"""Integrators and stabilizers. The last two integrators enforce constraints themselves."""
 SINGLE = ("semi-implicit Euler", "RK4")
-"""Those that are tried in float32, too."""
+"""Methods that also run in float32."""
 FIXED = {"generalized-α": 16}
-"""Worlds of those that are tried with no others: its dense matrices, factored for 256 worlds over
-two devices of a CPU, did not come back."""
+"""Fixed batch sizes.
+
+Generalized-α runs only with this batch size. With 256 worlds on two CPU devices, the factorization
+of its dense matrices did not return.
+"""
 ITERATES = ("RATTLE", "generalized-α")
-"""Those whose steps may cost more where they are long."""
+"""Methods that need more iterations at larger step sizes."""
 
 
 def halved(
     motion: Motion, error_of: Callable[[int], float], limit: float
 ) -> Iterator[tuple[int, float]]:
-    """Numbers of steps, doubled, and errors, until steps no longer matter or a run takes too long.
+    """Yields numbers of steps, each double the previous number, with their errors.
+
+    It stops when errors no longer fall, or when a run takes too long.
 
     Args:
-        motion: with its coarsest run.
-        error_of: runs it with so many steps.
-        limit: of a run, in time of the processor, which other work does not change [s].
+        motion: the motion, with the number of steps of its coarsest run.
+        error_of: (steps) → error.
+        limit: CPU time limit of a run [s]. Other processes do not affect CPU time.
     """
-    steps, before, idle = motion.first, float("inf"), 0
+    steps, previous, stalled = motion.first, float("inf"), 0
     while True:
         begin = time.process_time()
         error = error_of(steps)
-        spent = time.process_time() - begin
+        elapsed = time.process_time() - begin
         yield steps, error
-        idle = idle + 1 if np.isfinite(before) and error > before / ALIKE else 0
-        if error <= ENOUGH or idle == 2 or 2 * spent > limit:
+        stalled = stalled + 1 if np.isfinite(previous) and error > previous / ALIKE else 0
+        if error <= ENOUGH or stalled == 2 or 2 * elapsed > limit:
             return
-        steps, before = 2 * steps, error
+        steps, previous = 2 * steps, error
 
 
 def step_seconds(run: Callable[[int], Any], repeats: int = 5) -> float:
-    """How long a step takes, the median of several runs of many steps [s].
+    """Returns the time of a step, the median of several runs of many steps [s].
 
     Args:
-        run: does so many steps.
-        repeats: how many.
+        run: runs a given number of steps.
+        repeats: number of repeats.
     """
 
-    def lasts(count: int) -> float:
+    def seconds_per_step(count: int) -> float:
         begin = time.perf_counter()
         run(count)
         return (time.perf_counter() - begin) / count
 
-    run(FEW)  # the first touches memory that the later ones have
-    count = int(np.clip(SPAN / lasts(FEW), FEW, MANY))
-    return float(np.median([lasts(count) for _ in range(repeats)]))
+    run(FEW)  # the first run allocates memory
+    count = int(np.clip(SPAN / seconds_per_step(FEW), FEW, MANY))
+    return float(np.median([seconds_per_step(count) for _ in range(repeats)]))
 
 
 class Ours:
-    """A method on a form of a motion, compiled once for every step."""
+    """A jaxcon method on a form of a motion, compiled once for all step sizes."""
 
     def __init__(self, motion: Motion, form: Form, name: str, dtype: str) -> None:
         self.motion, self.form, self.name, self.dtype = motion, form, name, dtype
@@ -128,24 +135,24 @@ class Ours:
             self.one = jax.jit(self.travel).lower(self.start, *self.numbers(1.0, 1)).compile()
 
     def precision(self) -> Any:
-        """In which its arrays are made."""
+        """Returns a context manager for the precision of the method's arrays."""
         return jax.enable_x64(self.dtype == "float64")
 
     def numbers(self, dt: float, steps: int) -> tuple[jax.Array, jax.Array]:
-        """h and a number of steps as arguments."""
+        """Returns step size and number of steps as array arguments."""
         return jnp.asarray(dt, self.dtype), jnp.asarray(steps, jnp.int32)
 
     def travel(self, state: jc.State, dt: jax.Array, steps: jax.Array) -> jc.State:
-        """So many steps of one world."""
+        """Steps one world `steps` times and returns its state."""
         control = None if self.form.control is None else jnp.full(1, self.form.control, self.dtype)
 
-        def one(_: Any, state: jc.State) -> jc.State:
+        def step(_: Any, state: jc.State) -> jc.State:
             return jc.step(self.system, self.method, state, control, dt)[0]
 
-        return jax.lax.fori_loop(0, steps, one, state)
+        return jax.lax.fori_loop(0, steps, step, state)
 
     def error(self, steps: int) -> float:
-        """Of a run; infinite where it failed."""
+        """Returns the error of a run, infinite if it failed."""
         with self.precision():
             final = self.one(self.start, *self.numbers(self.motion.seconds / steps, steps))
             q, status = np.asarray(final.q, np.float64), int(final.status)
@@ -154,55 +161,65 @@ class Ours:
         return self.motion.error(self.form.places(self.system, q))
 
     def cost(self, batch: int, steps: int) -> Callable[[float], float]:
-        """Compiles a batch spread along a run of so many steps; h → cost of a simulated second."""
+        """Compiles a batch of worlds that start along a run.
+
+        Returns:
+            A function from the step size h to the cost of a simulated second.
+        """
         with self.precision():
             numbers = functools.partial(self.numbers, self.motion.seconds / steps)
-            along = [self.one(self.start, *numbers(i * steps // STARTS)) for i in range(STARTS)]
+            starts = [self.one(self.start, *numbers(i * steps // STARTS)) for i in range(STARTS)]
             index = np.arange(batch) * STARTS // batch
-            worlds = jax.tree.map(lambda *x: jnp.stack(x)[index], *along)
+            worlds = jax.tree.map(lambda *x: jnp.stack(x)[index], *starts)
             worlds = timing.over_devices(worlds, batch)
-            # methods that iterate would have devices wait for each other in every step
-            each = jax.vmap(self.travel, (0, None, None))
-            travel = jc.over_devices(lambda given, own: each(own, *given))
-            many, _ = timing.compile_seconds(travel, self.numbers(1.0, 1), worlds)
+            # One program per device: in a common program, devices would wait for each other
+            # in every step of a method that iterates.
+            batch_travel = jax.vmap(self.travel, (0, None, None))
+            travel = jc.devices.over_devices(
+                lambda arguments, batch_worlds: batch_travel(batch_worlds, *arguments)
+            )
+            compiled, _ = timing.compile_seconds(travel, self.numbers(1.0, 1), worlds)
 
-        def measured(dt: float) -> float:
+        def seconds_of(dt: float) -> float:
             def run(count: int) -> Any:
                 with self.precision():
-                    given = self.numbers(dt, count)
-                return jax.block_until_ready(many(given, worlds))
+                    arguments = self.numbers(dt, count)
+                return jax.block_until_ready(compiled(arguments, worlds))
 
             return step_seconds(run) / batch / dt
 
-        return measured
+        return seconds_of
 
     def points(self, limit: float) -> list[Point]:
-        """Runs of one batch by steps."""
+        """Runs the method at all step sizes, and times it at one batch size."""
         runs = list(halved(self.motion, self.error, limit))
         return self.priced(runs, FIXED.get(self.name, BATCH))
 
     def priced(self, runs: Sequence[tuple[int, float]], batch: int) -> list[Point]:
-        """Steps and errors with their cost: of one step where it is the same in all, else each."""
-        able = [(steps, error) for steps, error in runs if np.isfinite(error)]
-        if not able:
+        """Adds costs to runs.
+
+        Methods in `ITERATES` are timed at each step size, other methods once.
+        """
+        finite = [(steps, error) for steps, error in runs if np.isfinite(error)]
+        if not finite:
             return []
-        near = next((steps for steps, error in able if error < CLOSE), able[-1][0])
-        cost, seconds = self.cost(batch, near), self.motion.seconds
-        step = None if self.name in ITERATES else cost(seconds / near) / near
+        timed = next((steps for steps, error in finite if error < CLOSE), finite[-1][0])
+        cost, seconds = self.cost(batch, timed), self.motion.seconds
+        step = None if self.name in ITERATES else cost(seconds / timed) / timed
         return [
             Point("jaxcon", self.label, seconds / n, error, price, f"batch {batch}")
-            for n, error in able
+            for n, error in finite
             for price in [n * step if step else cost(seconds / n)]
         ]
 
 
 def label_of(form: Form, name: str, dtype: str) -> str:
-    """What a table calls a method."""
+    """Returns the name of a method in tables."""
     return ", ".join(part for part in (name, dtype, form.name) if part)
 
 
 class Runs:
-    """The methods of jaxcon on a motion, each compiled once and when it is first needed."""
+    """All jaxcon methods on a motion, each compiled on first use."""
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
@@ -216,17 +233,19 @@ class Runs:
         }
 
     def of(self, label: str) -> Ours:
-        """One of them."""
+        """Returns the compiled method with a label."""
         if label not in self.made:
             self.made[label] = Ours(self.motion, *self.known[label])
         return self.made[label]
 
     def all(self, limit: float, labels: Sequence[str] | None = None) -> Iterator[list[Point]]:
-        """The runs of each method, all of one batch; why there are none is in `refused`.
+        """Yields the runs of each method at one batch size.
+
+        `refused` receives the reasons why methods refuse the motion.
 
         Args:
-            limit: of a run of one world [s].
-            labels: of the methods, all unless given.
+            limit: CPU time limit of a run of one world [s].
+            labels: labels of the methods, by default all.
         """
         for label in labels or self.known:
             try:
@@ -239,9 +258,9 @@ class Runs:
     def again(
         self, points: Sequence[Point], batches: Sequence[int] = OTHERS
     ) -> Iterator[list[Point]]:
-        """Runs of some of them again in other batches."""
+        """Repeats selected runs at other batch sizes."""
         for label in dict.fromkeys(point.setting for point in points):
-            own = [point for point in points if point.setting == label]
-            runs = [(round(self.motion.seconds / point.dt), point.error) for point in own]
+            selected = [point for point in points if point.setting == label]
+            runs = [(round(self.motion.seconds / point.dt), point.error) for point in selected]
             for batch in batches if self.of(label).name not in FIXED else ():
                 yield self.of(label).priced(runs, batch)

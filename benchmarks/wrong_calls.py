@@ -1,12 +1,17 @@
-"""Wrong calls: every public door is given values that it must refuse, by an error that says why.
+"""Calls with wrong arguments: each must raise an error that names the argument.
 
     python -m benchmarks.wrong_calls [--sample N] [--seed K] [--limit SECONDS] [--only TEXT]
 
-A door is one argument of one call, with all others right. It says what it takes (`Takes`), from
-which the wrong values follow: other types, shapes, dtypes, ranges. Of each call one of four is
-counted. Refused: ValueError or TypeError whose message names the argument. Raw: another error, of
-Python, NumPy or JAX, or one that does not say which argument is meant. Accepted: no error. Hung: no
-answer within the limit. The last three must be zero; each of those calls is listed.
+A door is one argument of a public call, with valid values for all other arguments. `Takes`
+describes the valid values of the argument. Wrong values follow from it: other types, shapes, dtypes
+and ranges. Each call has one of four outcomes:
+
+- refused: a ValueError or TypeError whose message names the argument,
+- raw: another error of Python, NumPy or JAX, or an error that does not name the argument,
+- accepted: no error,
+- hung: no answer within the limit.
+
+The last three outcomes must not occur. Such calls are listed.
 """
 
 from __future__ import annotations
@@ -31,20 +36,29 @@ from benchmarks import wrong_doors
 from benchmarks.wrong_doors import Door, Takes
 
 EXPECTED = (ValueError, TypeError, FileNotFoundError, jc.SimulationError)
-"""Errors that the documentation speaks of."""
+"""Documented error types."""
 
 OUTCOMES = ("refused", "accepted", "raw", "hung")
 LIMIT = 20.0
-"""Seconds after which a call has hung."""
+"""Time limit of a call [s]."""
 
 
 class HungError(BaseException):
-    """The limit has passed; no `except Exception` on the way holds it up."""
+    """An exception at the time limit of a call.
+
+    It is a BaseException, so that `except Exception` does not catch it.
+    """
 
 
 @dataclass(frozen=True)
 class Call:
-    """One door and one value that it must refuse."""
+    """A call with one wrong value of an argument.
+
+    Attributes:
+        door: the call and its open argument.
+        label: description of the wrong value.
+        value: the wrong value.
+    """
 
     door: Door
     label: str
@@ -54,12 +68,12 @@ class Call:
         return f"{self.door.name} = {self.label}"
 
     def outcome(self, limit: float = LIMIT) -> tuple[str, str]:
-        """Returns the outcome, one of `OUTCOMES`, and the message or value."""
+        """Makes the call. Returns one of `OUTCOMES`, and the error message."""
 
         def stop(*_: Any) -> None:
             raise HungError
 
-        before = signal.signal(signal.SIGALRM, stop)
+        handler = signal.signal(signal.SIGALRM, stop)
         signal.setitimer(signal.ITIMER_REAL, limit)
         try:
             with warnings.catch_warnings():
@@ -72,18 +86,18 @@ class Call:
             return kind, f"{type(error).__name__}: {str(error)[:300]}"
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)
+            signal.signal(signal.SIGALRM, handler)
         return "accepted", ""
 
     def _named(self, error: Exception) -> bool:
-        """Returns True where the error is the library's own and names the wrong argument."""
+        """Returns True if the error is documented and its message names the argument."""
         if not isinstance(error, EXPECTED):
             return False
-        return any(re.search(word, str(error)) for word in self.door.words)
+        return any(re.search(pattern, str(error)) for pattern in self.door.words)
 
 
 def calls() -> Iterator[Call]:
-    """Every door with every value that is wrong there."""
+    """Yields every door with all its wrong values, then the calls of `SPECIAL`."""
     for door in wrong_doors.doors():
         for label, value in wrong_values(door.takes):
             yield Call(door, label, value)
@@ -92,7 +106,7 @@ def calls() -> Iterator[Call]:
 
 
 def wrong_values(takes: Takes) -> Iterator[tuple[str, Any]]:
-    """What an argument must not be, by what it takes."""
+    """Yields values that an argument must refuse, with their names."""
     if takes.kind == "one":
         yield "as it says", None
         return
@@ -105,7 +119,7 @@ def wrong_values(takes: Takes) -> Iterator[tuple[str, Any]]:
     if takes.kind == "count":
         for label, value in COUNTS.items():
             yield label, value
-        yield "one below the least", takes.least - 1
+        yield "below the smallest count", takes.least - 1
 
 
 VALUES: list[tuple[str, Any, frozenset[str]]] = [
@@ -132,7 +146,7 @@ VALUES: list[tuple[str, Any, frozenset[str]]] = [
         ("a ragged list", [[1.0], [1.0, 2.0]], ""),
         ("a list of strings", ["a", "b", "c"], "strings"),
         ("a key of random numbers", jax.random.key(0), "key"),
-        ("an integer beyond all range", 10**400, ""),
+        ("an integer beyond every dtype", 10**400, ""),
     ]
 ]
 
@@ -147,7 +161,7 @@ COUNTS = {
 
 
 def _wrong_numbers(takes: Takes) -> Iterator[tuple[str, Any]]:
-    """Numbers of the wrong kind, shape or range."""
+    """Yields numbers of the wrong kind, shape or range, with their names."""
     good = np.asarray(takes.good, float)
     first = np.zeros(good.shape)
     first[(0,) * good.ndim] = 1
@@ -178,16 +192,16 @@ def _wrong_numbers(takes: Takes) -> Iterator[tuple[str, Any]]:
         yield "another dtype", jnp.asarray(good, jnp.float16)
         yield "beyond the range", put(1e300)
     if takes.shaped:
-        yield "an axis before", good[None]
-        yield "an axis before, of JAX", jnp.asarray(good[None], takes.dtype)
+        yield "a leading axis", good[None]
+        yield "a leading axis, of JAX", jnp.asarray(good[None], takes.dtype)
         if "batch" not in takes.allows:
-            yield "an axis behind", good[..., None]
-        yield "none of it", np.zeros((*good.shape[:-1], 0))
-        yield "one more" if good.ndim else "two", np.append(good, 1.0)
+            yield "a trailing axis", good[..., None]
+        yield "no components", np.zeros((*good.shape[:-1], 0))
+        yield "one component too many" if good.ndim else "two numbers", np.append(good, 1.0)
     if takes.sign != "any":
-        yield "a negative one", put(-1.0)
+        yield "a negative number", put(-1.0)
         if not takes.unread:
-            yield "a negative one of JAX", jnp.asarray(put(-1.0), takes.dtype)
+            yield "a negative number of JAX", jnp.asarray(put(-1.0), takes.dtype)
     if takes.sign == "positive":
         yield "zero", put(0.0)
     if takes.most is not None:
@@ -195,7 +209,7 @@ def _wrong_numbers(takes: Takes) -> Iterator[tuple[str, Any]]:
 
 
 def run(chosen: list[Call], limit: float = LIMIT, show: bool = True) -> Counter[str]:
-    """How many calls had which outcome; those that should not have are printed."""
+    """Makes the calls, prints unexpected outcomes and returns the number of calls by outcome."""
     counts: Counter[str] = Counter()
     for call in chosen:
         kind, message = call.outcome(limit)
@@ -206,25 +220,28 @@ def run(chosen: list[Call], limit: float = LIMIT, show: bool = True) -> Counter[
 
 
 def sample(number: int | None, seed: int) -> list[Call]:
-    """Some of all calls; the hand-written ones always."""
+    """Returns a random sample of the generated calls, and all hand-written calls."""
     everything = list(calls())
     if number is None:
         return everything
     special = [call for call in everything if call.label == "as it says"]
-    others = [call for call in everything if call.label != "as it says"]
-    return [*random.Random(seed).sample(others, min(number, len(others))), *special]
+    generated = [call for call in everything if call.label != "as it says"]
+    return [*random.Random(seed).sample(generated, min(number, len(generated))), *special]
 
 
 def main() -> int:
-    """Prints the counts; 1 where a wrong call was not refused."""
-    parser = argparse.ArgumentParser(description="Wrong calls of every public door.")
-    parser.add_argument("--sample", type=int, default=None, help="calls; all unless given")
+    """Makes the calls and prints how many had each outcome.
+
+    The exit status is 1 if a wrong call was not refused.
+    """
+    parser = argparse.ArgumentParser(description="Makes wrong calls of the public interface.")
+    parser.add_argument("--sample", type=int, default=None, help="number of calls (default: all)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--limit", type=float, default=LIMIT)
-    parser.add_argument("--only", default="", help="doors with this in their name")
-    given = parser.parse_args()
-    chosen = [c for c in sample(given.sample, given.seed) if given.only in c.door.name]
-    counts = run(chosen, given.limit)
+    parser.add_argument("--only", default="", help="text that the name of a door must contain")
+    options = parser.parse_args()
+    chosen = [c for c in sample(options.sample, options.seed) if options.only in c.door.name]
+    counts = run(chosen, options.limit)
     print(f"tried {sum(counts.values())}, " + ", ".join(f"{k} {counts[k]}" for k in OUTCOMES))
     return int(counts["refused"] != sum(counts.values()))
 

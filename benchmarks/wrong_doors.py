@@ -1,4 +1,8 @@
-"""The doors that `wrong_calls` knocks at: calls of the public interface, one argument left open."""
+"""The doors of `wrong_calls`: public calls with one open argument each.
+
+All other arguments of a call have valid values. `wrong_calls` passes wrong values to the open
+argument.
+"""
 
 from __future__ import annotations
 
@@ -23,19 +27,21 @@ F32 = jnp.float32
 
 @dataclass(frozen=True)
 class Takes:
-    """What an argument takes.
+    """The valid values of an argument.
 
     Attributes:
-        kind: "real" numbers, a "count", a "flag", or "other" things.
-        good: numbers that it takes, of its shape.
+        kind: "real" numbers, a "count", a "flag", a field of a "state", "one" fixed call, or
+            "other".
+        good: valid numbers, in the argument's shape.
         sign: "any", "not negative" or "positive".
-        most: the largest number.
-        least: the smallest count.
-        allows: tags of other values that it takes, as "none"; "NaN" and "infinity", which a formula
-            hands on; "batch", further axes behind.
-        dtype: of the scene; None where the door does not know it.
-        shaped: whether only the shape of `good` will do.
-        unread: whether values of JAX's arrays are judged by the status, not read.
+        most: largest valid number.
+        least: smallest valid count.
+        allows: tags of other valid values, such as "none". "NaN" and "infinity" are for formulas
+            that propagate them, "batch" for trailing axes.
+        dtype: dtype of the scene, None if the call does not know it.
+        shaped: True if only the shape of `good` is valid.
+        unread: True if the call does not read values of JAX arrays; wrong values then end in a
+            status.
     """
 
     kind: str = "none"
@@ -54,10 +60,10 @@ class Door:
     """One argument of one call.
 
     Attributes:
-        name: of the call and the argument.
-        call: with the argument, all others right.
-        takes: what is right.
-        words: patterns, one of which a message must have.
+        name: name of the call and the argument.
+        call: the call as a function of the argument, with valid values for all other arguments.
+        takes: valid values.
+        words: patterns, one of which the error message must match.
     """
 
     name: str
@@ -66,30 +72,33 @@ class Door:
     words: tuple[str, ...]
 
 
-def real(good: Any = 1.0, sign: str = "any", *allows: str, **more: Any) -> Takes:
-    """Real numbers in the dtype of the scene."""
+def real(good: Any = 1.0, sign: str = "any", *allows: str, **overrides: Any) -> Takes:
+    """Describes real numbers in the dtype of the scene."""
     allowed = frozenset(allows)
     return Takes(
-        **({"kind": "real", "good": good, "sign": sign, "allows": allowed, "dtype": F32} | more)
+        **(
+            {"kind": "real", "good": good, "sign": sign, "allows": allowed, "dtype": F32}
+            | overrides
+        )
     )
 
 
-def free(good: Any = 1.0, sign: str = "any", *allows: str, **more: Any) -> Takes:
-    """Real numbers where the dtype of the scene is not known."""
-    return real(good, sign, *allows, **({"dtype": None} | more))
+def free(good: Any = 1.0, sign: str = "any", *allows: str, **overrides: Any) -> Takes:
+    """Describes real numbers of a call that does not know the dtype of the scene."""
+    return real(good, sign, *allows, **({"dtype": None} | overrides))
 
 
 def count(least: int = 1, *allows: str) -> Takes:
-    """A whole number."""
+    """Describes an integer of at least `least`."""
     return Takes("count", 1, least=least, allows=frozenset(allows))
 
 
 FUNCTION = Takes("other", allows=frozenset({"function"}))
-"""A function of the user's."""
+"""The valid values of an argument that is a function of the user."""
 
 
 def flag() -> Takes:
-    """True or False."""
+    """Describes an argument that is True or False."""
     return Takes("flag", allows=frozenset({"flag"}))
 
 
@@ -107,7 +116,7 @@ ROUND = {"rolling": SOME, "spinning": SOME}
 RANGE = real((-1.0, 1.0), "any", "none")
 
 ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
-    (jc.Force, {"body": "arm", "force": Z}, {"force": AXIS, "point": POINT}),
+    (jc.forces.Force, {"body": "arm", "force": Z}, {"force": AXIS, "point": POINT}),
     (
         jc.Spring,
         {"body_a": "arm", "body_b": "leg", "stiffness": 1.0},
@@ -119,13 +128,13 @@ ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
             "point_b": POINT,
         },
     ),
-    (jc.ExternalWrench, {"body": "arm"}, {"point": POINT}),
+    (jc.forces.ExternalWrench, {"body": "arm"}, {"point": POINT}),
     (
         jc.Distance,
         {"body_a": "arm", "body_b": "leg"},
         {"length": LENGTH, "point_a": POINT, "point_b": POINT},
     ),
-    (jc.Coincident, {"body_a": "arm", "body_b": "leg", "point": ORIGIN}, {"point": POINT}),
+    (jc.joints.Coincident, {"body_a": "arm", "body_b": "leg", "point": ORIGIN}, {"point": POINT}),
     (jc.Fixed, {"body_a": "arm", "body_b": "leg"}, {"point": POINT}),
     (
         jc.Revolute,
@@ -134,61 +143,77 @@ ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (jc.Prismatic, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
     (jc.Spherical, {"body_a": "arm", "body_b": "leg", "point": ORIGIN}, {"point": POINT}),
-    (jc.Cylindrical, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
     (
-        jc.Universal,
+        jc.joints.Cylindrical,
+        {"body_a": "arm", "body_b": "leg", "axis": Z},
+        {"axis": AXIS, "point": POINT},
+    ),
+    (
+        jc.joints.Universal,
         {"body_a": "arm", "body_b": "leg", "point": ORIGIN, "axis_a": X, "axis_b": Y},
         {"point": POINT, "axis_a": AXIS, "axis_b": AXIS},
     ),
-    (jc.Planar, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
     (
-        jc.Screw,
+        jc.joints.Planar,
+        {"body_a": "arm", "body_b": "leg", "axis": Z},
+        {"axis": AXIS, "point": POINT},
+    ),
+    (
+        jc.joints.Screw,
         {"body_a": "arm", "body_b": "leg", "axis": Z, "lead": 0.1},
         {"axis": AXIS, "point": POINT, "lead": ANY},
     ),
     (
-        jc.ConstantVelocity,
+        jc.joints.ConstantVelocity,
         {"body_a": "arm", "body_b": "leg", "point": ORIGIN, "axis": Z},
         {"point": POINT, "axis": AXIS, "axis_b": real(Z, "any", "none")},
     ),
     (
-        jc.RevoluteSpherical,
+        jc.joints.RevoluteSpherical,
         {"body_a": "arm", "body_b": "leg", "hinge": ORIGIN, "ball": X, "axis": Z},
         {"hinge": POINT, "ball": POINT, "axis": AXIS},
     ),
     (
-        jc.SphericalSpherical,
+        jc.joints.SphericalSpherical,
         {"body_a": "arm", "body_b": "leg"},
         {"length": LENGTH, "point_a": POINT, "point_b": POINT},
     ),
-    (jc.Span, {"body_a": "arm", "body_b": "leg"}, {"point_a": POINT, "point_b": POINT}),
-    (jc.Twist, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
-    (jc.Parallel, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS}),
-    (jc.PointOnLine, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS, "point": POINT}),
+    (jc.joints.Span, {"body_a": "arm", "body_b": "leg"}, {"point_a": POINT, "point_b": POINT}),
     (
-        jc.PointOnPlane,
+        jc.joints.Twist,
+        {"body_a": "arm", "body_b": "leg", "axis": Z},
+        {"axis": AXIS, "point": POINT},
+    ),
+    (jc.joints.Parallel, {"body_a": "arm", "body_b": "leg", "axis": Z}, {"axis": AXIS}),
+    (
+        jc.joints.PointOnLine,
+        {"body_a": "arm", "body_b": "leg", "axis": Z},
+        {"axis": AXIS, "point": POINT},
+    ),
+    (
+        jc.joints.PointOnPlane,
         {"body_a": "arm", "body_b": "leg", "axis": Z},
         {"axis": AXIS, "point": POINT},
     ),
     *[
         (
             joint,
-            {"body_a": jc.WORLD, "body_b": "leg", "radius": 1.0, **more},
+            {"body_a": jc.WORLD, "body_b": "leg", "radius": 1.0, **extra},
             {"radius": POSITIVE, "normal": real(Z, "any", "none"), "center": POINT, "point": POINT},
         )
-        for joint, more in (
-            (jc.RollingSphere, {}),
-            (jc.RollingDisc, {"axis": Y}),
-            (jc.RollingCylinder, {"axis": Y}),
+        for joint, extra in (
+            (jc.joints.RollingSphere, {}),
+            (jc.joints.RollingDisc, {"axis": Y}),
+            (jc.joints.RollingCylinder, {"axis": Y}),
         )
     ],
     (
-        jc.KnifeEdge,
+        jc.joints.KnifeEdge,
         {"body_a": jc.WORLD, "body_b": "leg", "edge": X},
         {"edge": real(X), "normal": real(Z, "any", "none"), "center": POINT},
     ),
-    (jc.LinearMomentum, {}, {"value": real(ORIGIN, "any", "none")}),
-    (jc.AngularMomentum, {}, {"value": real(ORIGIN, "any", "none")}),
+    (jc.joints.LinearMomentum, {}, {"value": real(ORIGIN, "any", "none")}),
+    (jc.joints.AngularMomentum, {}, {"value": real(ORIGIN, "any", "none")}),
     (
         jc.PlaneContact,
         {"body_a": jc.WORLD, "body_b": "leg"},
@@ -202,7 +227,7 @@ ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        jc.CapsuleContact,
+        jc.contacts.CapsuleContact,
         {"body_a": "arm", "body_b": "leg", "radius_a": 0.1, "radius_b": 0.1},
         {
             "radius_a": SOME,
@@ -214,7 +239,7 @@ ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        jc.BoxContact,
+        jc.contacts.BoxContact,
         {"body_a": jc.WORLD, "body_b": "leg", "size": (1.0, 1.0, 1.0)},
         {
             "size": real((1.0, 1.0, 1.0), "positive"),
@@ -226,7 +251,7 @@ ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        jc.HeightFieldContact,
+        jc.contacts.HeightFieldContact,
         {
             "body_a": jc.WORLD,
             "body_b": "leg",
@@ -246,12 +271,12 @@ ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        jc.Rope,
+        jc.contacts.Rope,
         {"body_a": "arm", "body_b": "leg"},
         {"length": LENGTH, "point_a": POINT, "point_b": POINT, **STOP},
     ),
     (
-        jc.Compound,
+        jc.joints.Compound,
         {"body_a": "arm", "body_b": "leg", "slides": (X,), "hinges": (Y,)},
         {
             "point": POINT,
@@ -261,29 +286,29 @@ ELEMENTS: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        jc.Bending,
+        jc.forces.Bending,
         {"body_a": "arm", "body_b": "leg", "body_c": "bob", "stiffness": 1.0},
         {"stiffness": SOME, "point_a": POINT, "point_b": POINT, "point_c": POINT},
     ),
     (
-        jc.Flexure,
+        jc.forces.Flexure,
         {"body_a": "arm", "body_b": "leg", "bending": 1.0},
         {"bending": SOME, "twisting": real(0.5, "not negative"), "straight": flag()},
     ),
 ]
-"""Elements on bodies: the class, arguments that are right, and numbers to be got wrong."""
+"""Elements on bodies: class, valid arguments, and the open arguments with their valid values."""
 
 ALONG: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
-    (jc.Armature, {"joint": "one", "inertia": 1.0}, {"inertia": POSITIVE}),
+    (jc.joints.Armature, {"joint": "one", "inertia": 1.0}, {"inertia": POSITIVE}),
     (
-        jc.JointSpring,
+        jc.forces.JointSpring,
         {"joint": "one", "stiffness": 1.0},
         {"stiffness": SOME, "damping": SOME, "rest": ANY},
     ),
-    (jc.JointDamper, {"joint": "one", "damping": 1.0}, {"damping": SOME}),
+    (jc.forces.JointDamper, {"joint": "one", "damping": 1.0}, {"damping": SOME}),
     (jc.Motor, {"joint": "one"}, {"gear": ANY, "control_range": RANGE}),
     (
-        jc.PositionServo,
+        jc.forces.PositionServo,
         {"joint": "one", "stiffness": 1.0},
         {
             "stiffness": SOME,
@@ -294,12 +319,12 @@ ALONG: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        jc.VelocityServo,
+        jc.forces.VelocityServo,
         {"joint": "one", "damping": 1.0},
         {"damping": SOME, "gear": ANY, "control_range": RANGE, "force_range": RANGE},
     ),
     (
-        jc.AffineActuator,
+        jc.forces.AffineActuator,
         {"joint": "one"},
         {"gain": real(X), "bias": real(X), "gear": ANY, "control_range": RANGE},
     ),
@@ -312,32 +337,32 @@ ALONG: list[tuple[Any, dict[str, Any], dict[str, Takes]]] = [
             **STOP,
         },
     ),
-    (jc.JointFriction, {"joint": "one", "most": 1.0}, {"most": SOME}),
-    (jc.RateLimit, {"joint": "one", "rate": 1.0}, {"rate": SOME}),
-    (jc.RateMotor, {"joint": "one", "most": 1.0}, {"most": SOME}),
-    (jc.Gear, {"joint_a": "one", "joint_b": "two", "ratio": 2.0}, {"ratio": ANY}),
+    (jc.contacts.JointFriction, {"joint": "one", "max_force": 1.0}, {"max_force": SOME}),
+    (jc.contacts.RateLimit, {"joint": "one", "rate": 1.0}, {"rate": SOME}),
+    (jc.contacts.RateMotor, {"joint": "one", "max_force": 1.0}, {"max_force": SOME}),
+    (jc.joints.Gear, {"joint_a": "one", "joint_b": "two", "ratio": 2.0}, {"ratio": ANY}),
     (
-        jc.Belt,
+        jc.joints.Belt,
         {"joint_a": "one", "joint_b": "two", "radius_a": 1.0, "radius_b": 1.0},
         {"radius_a": ANY, "radius_b": ANY},
     ),
     (
-        jc.RackAndPinion,
+        jc.joints.RackAndPinion,
         {"pinion": "one", "rack": "slide", "radius": 1.0},
         {"radius": ANY},
     ),
     (
-        jc.PolynomialCoupling,
+        jc.joints.PolynomialCoupling,
         {"joint_a": "one", "joint_b": "two", "coefficients": (0.0, 1.0, 0.5)},
         {"coefficients": real((0.0, 1.0, 0.5), shaped=False)},
     ),
-    (jc.Pulley, {"span_a": "span", "span_b": "span2"}, {"parts": ANY}),
+    (jc.joints.Pulley, {"span_a": "span", "span_b": "span2"}, {"parts": ANY}),
 ]
-"""Elements on joints."""
+"""Elements on joints: class, valid arguments, and the open arguments with their valid values."""
 
 
 def bodies(dtype: Any = F32) -> jc.Scene:
-    """Two bodies and a particle."""
+    """Returns a scene of two bodies and a particle."""
     scene = jc.Scene(dtype=dtype)
     for i, name in enumerate(("arm", "leg")):
         scene.add_body(name, mass=1.0, inertia=(1.0, 1.0, 1.0), position=(float(i), 0.0, 0.0))
@@ -346,99 +371,102 @@ def bodies(dtype: Any = F32) -> jc.Scene:
 
 
 def jointed(dtype: Any = F32) -> jc.Scene:
-    """Two arms on hinges, one of which carries a slide, and two spans."""
+    """Returns a scene of two hinged arms, a slider and two spans."""
     scene = bodies(dtype)
     scene.add(jc.Revolute("one", jc.WORLD, "arm", point=ORIGIN, axis=Z))
     scene.add(jc.Revolute("two", "arm", "leg", point=X, axis=Z))
     scene.add_body("block", mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 2.0, 0.0))
     scene.add(jc.Prismatic("slide", jc.WORLD, "block", axis=X))
-    scene.add(jc.Span("span", jc.WORLD, "bob"))
-    scene.add(jc.Span("span2", "leg", "bob"))
+    scene.add(jc.joints.Span("span", jc.WORLD, "bob"))
+    scene.add(jc.joints.Span("span2", "leg", "bob"))
     return scene
 
 
-def with_element(make: Callable[[], jc.Scene], kind: Any, given: Mapping[str, Any]) -> Any:
-    """A built scene with one more element."""
+def with_element(make: Callable[[], jc.Scene], kind: Any, arguments: Mapping[str, Any]) -> Any:
+    """Builds a scene of `make` with one added element."""
     scene = make()
-    scene.add(kind("it", **given))
+    scene.add(kind("it", **arguments))
     return scene.build()
 
 
 @functools.cache
 def motor() -> tuple[Any, Any]:
-    """An arm on a hinge with a motor and a stop, that is at rest."""
+    """Builds an arm at rest on a hinge with a motor and a joint limit."""
     scene = bodies()
     scene.add(jc.Revolute("one", jc.WORLD, "arm", point=ORIGIN, axis=Z))
     scene.add(jc.Motor("drive", "one"))
     scene.add(jc.Limit("stop", "one", lower=-1.0, upper=1.0))
     scene.add(jc.Spring("coil", "arm", "leg", 1.0))
-    scene.add(jc.TurnCounter("turns", "one"))
+    scene.add(jc.joints.TurnCounter("turns", "one"))
     return scene.build()
 
 
 @functools.cache
 def plain() -> tuple[Any, Any]:
-    """A pendulum, at rest."""
+    """Builds a pendulum at rest."""
     scene = jc.Scene(dim=2, dtype=F32)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     return scene.build()
 
 
-def body(dim: int, **given: Any) -> Any:
-    """A scene of one body."""
+def body(dim: int, **arguments: Any) -> Any:
+    """Builds a scene of one body with the given arguments."""
     scene = jc.Scene(dim=dim, dtype=F32)
     inertia = 1.0 if dim == 2 else (1.0, 1.0, 1.0)
-    scene.add_body("arm", **({"mass": 1.0, "inertia": inertia} | given))
+    scene.add_body("arm", **({"mass": 1.0, "inertia": inertia} | arguments))
     return scene.build()
 
 
-def particle(**given: Any) -> Any:
-    """A scene of one particle."""
+def particle(**arguments: Any) -> Any:
+    """Builds a scene of one particle with the given arguments."""
     scene = jc.Scene(dtype=F32)
-    scene.add_particle("bob", **({"mass": 1.0} | given))
+    scene.add_particle("bob", **({"mass": 1.0} | arguments))
     return scene.build()
 
 
 def begun(**parts: Any) -> Any:
-    """The first state under a method: where its numbers are read."""
+    """Returns the initial state of the pendulum under a method.
+
+    The parameters of the method are read in the process.
+    """
     system, state = plain()
     return jc.init(system, jc.Method(**parts), state.q, state.v)
 
 
-def step(**given: Any) -> Any:
-    """A step with a motor."""
+def step(**overrides: Any) -> Any:
+    """Takes a step of the arm with a motor, with some arguments replaced."""
     system, state = motor()
-    arguments = {"control": np.zeros(1), "dt": 1e-3, "state": state} | given
+    arguments = {"control": np.zeros(1), "dt": 1e-3, "state": state} | overrides
     return jc.step(system, jc.Method(), arguments["state"], arguments["control"], arguments["dt"])
 
 
-def rollout(**given: Any) -> Any:
-    """Two steps."""
+def rollout(**overrides: Any) -> Any:
+    """Takes two steps of the pendulum, with some arguments replaced."""
     system, state = plain()
-    named = {"controls": None, "dt": 1e-3, "steps": 2} | given
+    arguments = {"controls": None, "dt": 1e-3, "steps": 2} | overrides
     return jc.rollout(
         system,
         jc.Method(),
         state,
-        named.pop("controls"),
-        named.pop("dt"),
-        named.pop("steps"),
-        **named,
+        arguments.pop("controls"),
+        arguments.pop("dt"),
+        arguments.pop("steps"),
+        **arguments,
     )
 
 
 PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     (
         "solver",
-        jc.Sparse,
+        jc.solvers.Sparse,
         {},
         {"tikhonov": free(1e-6, "not negative", "none"), "run": count()},
     ),
-    ("solver", jc.Schur, {}, {"tikhonov": free(1e-6, "not negative", "none")}),
+    ("solver", jc.solvers.Schur, {}, {"tikhonov": free(1e-6, "not negative", "none")}),
     (
         "solver",
-        jc.ConjugateGradients,
+        jc.solvers.ConjugateGradients,
         {},
         {
             "tikhonov": free(1e-6, "not negative", "none"),
@@ -448,7 +476,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "solver",
-        jc.RankSafe,
+        jc.solvers.RankSafe,
         {},
         {
             "share": free(1e-6, "not negative", "none"),
@@ -461,7 +489,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "solver",
-        jc.Priority,
+        jc.solvers.Priority,
         {"levels": {"rod": 0}},
         {
             "cutoff": free(1e-6, "not negative", "none"),
@@ -471,8 +499,8 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        "bounded",
-        jc.InteriorPoint,
+        "contact_solver",
+        jc.solvers.InteriorPoint,
         {},
         {
             "iterations": count(),
@@ -481,14 +509,14 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
         },
     ),
     (
-        "bounded",
-        jc.GaussSeidel,
+        "contact_solver",
+        jc.solvers.GaussSeidel,
         {},
         {"sweeps": count(), "warm": flag(), "smoothing": free(1e-3, "not negative", "none")},
     ),
     (
-        "bounded",
-        jc.Nearest,
+        "contact_solver",
+        jc.solvers.ActiveSet,
         {},
         {"contacts": count(1, "none"), "stops": count(1, "none"), "solver": Takes("other")},
     ),
@@ -503,7 +531,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "stabilizer",
-        jc.AdaptiveBaumgarte,
+        jc.stabilizers.AdaptiveBaumgarte,
         {},
         {
             "size": free(1e-3, "positive", shaped=False),
@@ -512,7 +540,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "stabilizer",
-        jc.SlidingWindowBaumgarte,
+        jc.stabilizers.SlidingWindowBaumgarte,
         {},
         {
             "rate": free(1.0, "not negative", "none", shaped=False),
@@ -528,7 +556,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "stabilizer",
-        jc.PID,
+        jc.stabilizers.PID,
         {},
         {
             "proportional": free(1.0, "not negative", "none", shaped=False),
@@ -539,7 +567,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "stabilizer",
-        jc.Penalty,
+        jc.stabilizers.Penalty,
         {"stiffness": 1.0},
         {
             "stiffness": free(1.0, "not negative", shaped=False),
@@ -551,7 +579,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "stabilizer",
-        jc.AugmentedLagrangian,
+        jc.stabilizers.AugmentedLagrangian,
         {},
         {
             "stiffness": free(1.0, "positive", shaped=False),
@@ -576,7 +604,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "stabilizer",
-        jc.Hybrid,
+        jc.stabilizers.Hybrid,
         {"small": jc.Baumgarte(1.0, 1.0)},
         {
             "soft_below": free(1e-6, "positive"),
@@ -588,7 +616,7 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
     ),
     (
         "integrator",
-        jc.GeneralizedAlpha,
+        jc.integrators.GeneralizedAlpha,
         {},
         {
             "rho": free(0.9, "not negative", most=1),
@@ -598,11 +626,11 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
             "projects": flag(),
         },
     ),
-    ("integrator", jc.RATTLE, {}, {"iterations": count(), "rounds": count()}),
+    ("integrator", jc.integrators.RATTLE, {}, {"iterations": count(), "rounds": count()}),
     ("integrator", jc.SemiImplicitEuler, {}, {"gyroscopic": Takes("other")}),
     (
         "recovery",
-        jc.Recovery,
+        jc.stabilizers.Recovery,
         {},
         {
             "limit": free(1.0, "positive", "none"),
@@ -613,43 +641,52 @@ PARTS: list[tuple[str, Any, dict[str, Any], dict[str, Takes]]] = [
             "projector": Takes("other"),
         },
     ),
-    ("events", jc.Events, {}, {"splits": count(), "iterations": count(), "slips": flag()}),
+    (
+        "events",
+        jc.integrators.Events,
+        {},
+        {"splits": count(), "iterations": count(), "slips": flag()},
+    ),
 ]
-"""Parts of a method: the field, the class, arguments that are right, and those to be got wrong."""
+"""Parts of a method: field, class, valid arguments, and the open arguments with valid values."""
 
 
 def doors() -> Iterator[Door]:
-    """All of them."""
+    """Yields the doors of all public calls."""
     for make, table in ((bodies, ELEMENTS), (jointed, ALONG)):
-        for kind, given, fields in table:
+        for kind, arguments, fields in table:
             for field, takes in fields.items():
-                yield _element(make, kind, given, field, takes)
+                yield _element(make, kind, arguments, field, takes)
     yield from _of_bodies()
     yield from _of_params()
-    for part, kind, given, fields in PARTS:
+    for part, kind, arguments, fields in PARTS:
         for field, takes in fields.items():
 
             def call(
-                x: Any, part: str = part, kind: Any = kind, given: Any = given, f: str = field
+                x: Any,
+                part: str = part,
+                kind: Any = kind,
+                arguments: Any = arguments,
+                f: str = field,
             ) -> Any:
-                return begun(**{part: kind(**(given | {f: x}))})
+                return begun(**{part: kind(**(arguments | {f: x}))})
 
             yield Door(f"{kind.__name__}.{field}", call, takes, (rf"\b{field.rstrip('s')}",))
-            yield _constructor(kind, given, field, takes)
+            yield _constructor(kind, arguments, field, takes)
     for name, call, takes, *words in (*_simulation(), *_analysis(), *_search(), *_others()):
         yield Door(name, call, takes, tuple(words) or (rf"\b{re.split('[.(]', name)[-1]}\b",))
 
 
-def _constructor(kind: Any, given: dict[str, Any], field: str, takes: Takes) -> Door:
-    """The door of a constructor, which takes arrays for a batch of worlds."""
-    call = functools.partial(_with, kind, given, field)
+def _constructor(kind: Any, arguments: dict[str, Any], field: str, takes: Takes) -> Door:
+    """Returns the door of a constructor, which also accepts arrays for a batch of worlds."""
+    call = functools.partial(_with, kind, arguments, field)
     takes = dataclasses.replace(takes, shaped=False)
     return Door(f"{kind.__name__}({field}=)", call, takes, (rf"\b{field.rstrip('s')}",))
 
 
-def _element(make: Any, kind: Any, given: Any, field: str, takes: Takes) -> Door:
+def _element(make: Any, kind: Any, arguments: Any, field: str, takes: Takes) -> Door:
     def call(x: Any) -> Any:
-        return with_element(make, kind, given | {field: x})
+        return with_element(make, kind, arguments | {field: x})
 
     return Door(f"{kind.__name__}.{field}", call, takes, (rf"\b{field}\b",))
 
@@ -737,9 +774,9 @@ def _simulation() -> Iterator[Row]:
 
         takes = Takes("state", np.asarray(good))
         yield f"State.{field}", call, takes, rf"state.{field}\b"
-        for what, x in wrong_arrays().items():
+        for label, x in wrong_arrays().items():
             yield (
-                f"State.{field} {what}",
+                f"State.{field} {label}",
                 functools.partial(_given, call, x),
                 Takes("one"),
                 rf"state.{field}\b",
@@ -767,40 +804,40 @@ def _simulation() -> Iterator[Row]:
     yield "rollout.controls", lambda x: rollout(controls=x), controls
     yield (
         "Checkpoints.levels",
-        lambda x: rollout(adjoint=jc.Checkpoints(levels=x)),
+        lambda x: rollout(adjoint=jc.adjoints.Checkpoints(levels=x)),
         count(1, "none"),
     )
     yield (
         "Checkpoints.segments",
-        lambda x: rollout(adjoint=jc.Checkpoints(segments=x)),
+        lambda x: rollout(adjoint=jc.adjoints.Checkpoints(segments=x)),
         count(1, "none"),
     )
     yield (
         "Checkpoints.budget",
-        lambda x: rollout(adjoint=jc.Checkpoints(budget=x)),
+        lambda x: rollout(adjoint=jc.adjoints.Checkpoints(budget=x)),
         free(1e9, "positive", "none"),
     )
-    yield "Truncated.steps", lambda x: rollout(adjoint=jc.Truncated(x)), count()
+    yield "Truncated.steps", lambda x: rollout(adjoint=jc.adjoints.Truncated(x)), count()
     yield (
         "Truncated.within",
-        lambda x: rollout(adjoint=jc.Truncated(1, x)),
+        lambda x: rollout(adjoint=jc.adjoints.Truncated(1, x)),
         Takes("other"),
         "adjoint|within",
     )
     yield (
         "Discounted.factor",
-        lambda x: rollout(adjoint=jc.Discounted(x)),
+        lambda x: rollout(adjoint=jc.adjoints.Discounted(x)),
         free(0.5, "not negative", most=1),
     )
     yield (
         "Reversible.segments",
-        lambda x: rollout(adjoint=jc.Reversible(x)),
+        lambda x: rollout(adjoint=jc.adjoints.Reversible(x)),
         count(1, "none"),
     )
 
 
 def wrong_arrays() -> dict[str, Any]:
-    """What a field of a float32 state must not be."""
+    """Returns invalid values for a field of a float32 state, by description."""
     return {
         "of booleans": np.ones(1, bool),
         "of complex numbers": np.ones(1, complex),
@@ -816,10 +853,10 @@ def _given(call: Callable[[Any], Any], x: Any, _: Any) -> Any:
     return call(x)
 
 
-def _swapped(**given: Any) -> tuple[Any, ...]:
+def _swapped(**overrides: Any) -> tuple[Any, ...]:
     system, state = motor()
-    named = {"system": system, "method": jc.Method()} | given
-    return named["system"], named["method"], state, np.zeros(1), 1e-3
+    arguments = {"system": system, "method": jc.Method()} | overrides
+    return arguments["system"], arguments["method"], state, np.zeros(1), 1e-3
 
 
 def _analysis() -> Iterator[Row]:
@@ -839,21 +876,37 @@ def _analysis() -> Iterator[Row]:
         for reader in readers:
             read = functools.partial(reader, system, state)
             yield f"{reader.__name__}.{argument}", read, names, f"{argument}|unknown"
+    info = jc.forward_dynamics(system, state, np.zeros(1), jc.Method(), 1e-3)
+    optional = Takes("other", allows=frozenset({"none"}))
     for reader in (jc.multipliers, jc.wrench):
+        yield f"{reader.__name__}.info", lambda x, reader=reader: reader(x, "one"), names
         yield (
-            f"{reader.__name__}.info",
-            lambda x, reader=reader: reader(system, state, x, "one"),
+            f"{reader.__name__}.name",
+            functools.partial(reader, info),
             names,
+            "constraint|element|unknown",
         )
+    yield "wrench.body", lambda x: jc.wrench(info, "one", x), optional
+    for reader in (jc.acceleration, jc.angular_acceleration):
+        name = reader.__name__
+        yield f"{name}.info", lambda x, reader=reader: reader(x, "arm"), names
+        yield f"{name}.body", functools.partial(reader, info), names, "body|unknown"
+    at = functools.partial(jc.acceleration, info, "arm")
+    yield "acceleration.point", at, real(ORIGIN, "any", "none")
+    react = functools.partial(jc.reaction, system, state, control=np.zeros(1))
+    yield "reaction.name", react, names, "element|unknown"
+    yield "reaction.body", lambda x: react("one", x), optional
+    yield "reaction.dt", lambda x: react("one", dt=x), free(1e-3, "not negative", shaped=False)
+    yield "reaction.solver", lambda x: react("one", solver=x), optional
     ratio = free(1.0, "not negative")
-    rate = jc.largest_stable_rate
+    rate = jc.stabilizers.largest_stable_rate
     yield "largest_stable_rate.dt", lambda x: rate(jc.RK4(), x), free(1e-3, "positive")
     yield "largest_stable_rate.damping_ratio", lambda x: rate(jc.RK4(), 1e-3, x), ratio
     yield "largest_stable_rate.integrator", lambda x: rate(x, 1e-3), names
     response = {"frequency": 1.0, "alpha": 1.0, "beta": 1.0, "integral": 0.0}
-    for what, good in response.items():
+    for field, good in response.items():
         takes = free(good, shaped=False)
-        yield f"frequency_response.{what}", functools.partial(_response, what), takes
+        yield f"frequency_response.{field}", functools.partial(_response, field), takes
     yield (
         "frequency_response.dt",
         functools.partial(_response, "dt"),
@@ -870,18 +923,34 @@ def _analysis() -> Iterator[Row]:
         Takes("other", allows=frozenset({"none"})),
     )
     yield "Method.auto.batch", lambda x: jc.Method.auto(system, state, x), count()
-    three = (system, jc.Method(), state, None)
-    yield "diagnose.dt", lambda x: jc.diagnose(*three, x, 5), free(1e-3, "positive")
-    yield "diagnose.steps", lambda x: jc.diagnose(*three, 1e-3, x), count()
+    problem = (system, jc.Method(), state, None)
+    yield "diagnose.dt", lambda x: jc.analysis.diagnose(*problem, x, 5), free(1e-3, "positive")
+    yield "diagnose.steps", lambda x: jc.analysis.diagnose(*problem, 1e-3, x), count()
     yield (
         "find_first_failure.dt",
-        lambda x: jc.find_first_failure(*three, x, 5),
+        lambda x: jc.analysis.find_first_failure(*problem, x, 5),
         free(1e-3, "not negative", unread=True),
     )
-    yield "find_first_failure.steps", lambda x: jc.find_first_failure(*three, 1e-3, x), count(0)
-    yield "gradient_growth.dt", lambda x: jc.gradient_growth(*three, x, 5), free(1e-3, "positive")
-    yield "gradient_growth.steps", lambda x: jc.gradient_growth(*three, 1e-3, x), count(4)
-    yield "gradient_growth.seed", lambda x: jc.gradient_growth(*three, 1e-3, 5, x), count(0)
+    yield (
+        "find_first_failure.steps",
+        lambda x: jc.analysis.find_first_failure(*problem, 1e-3, x),
+        count(0),
+    )
+    yield (
+        "gradient_growth.dt",
+        lambda x: jc.analysis.gradient_growth(*problem, x, 5),
+        free(1e-3, "positive"),
+    )
+    yield (
+        "gradient_growth.steps",
+        lambda x: jc.analysis.gradient_growth(*problem, 1e-3, x),
+        count(4),
+    )
+    yield (
+        "gradient_growth.seed",
+        lambda x: jc.analysis.gradient_growth(*problem, 1e-3, 5, x),
+        count(0),
+    )
     check = functools.partial(jc.check_gradients, jnp.sum, jnp.ones(2))
     yield "check_gradients.tolerance", lambda x: check(tolerance=x), free(1e-3, "positive", "none")
     yield "check_gradients.directions", lambda x: check(directions=x), count()
@@ -903,18 +972,18 @@ def _analysis() -> Iterator[Row]:
     yield "raise_for_status.result", jc.raise_for_status, Takes("other")
     yield (
         "vakonomic.multipliers",
-        lambda x: jc.vakonomic(*_sledge(), x),
+        lambda x: jc.systems.vakonomic(*_sledge(), x),
         Takes("other", allows=frozenset({"none"})),
         "multipliers|constraint",
     )
     yield (
         "vakonomic.multipliers of a row",
-        lambda x: jc.vakonomic(*_sledge(), {"edge": x}),
+        lambda x: jc.systems.vakonomic(*_sledge(), {"edge": x}),
         real(np.zeros(1)),
         "μ|multipliers",
     )
-    for what in ("horizon", "budget"):
-        yield f"tradeoff.{what}", functools.partial(_tradeoff, what), free(1.0, "positive")
+    for field in ("horizon", "budget"):
+        yield f"tradeoff.{field}", functools.partial(_tradeoff, field), free(1.0, "positive")
     yield "tradeoff.gradients", functools.partial(_tradeoff, "gradients"), flag()
     yield "tradeoff.batch", functools.partial(_tradeoff, "batch"), count()
     yield (
@@ -932,26 +1001,26 @@ def _analysis() -> Iterator[Row]:
     yield "tradeoff.dtypes", functools.partial(_tradeoff, "dtypes"), Takes("other")
 
 
-def _tradeoff(what: str, x: Any) -> Any:
+def _tradeoff(name: str, x: Any) -> Any:
     system, state = plain()
-    given = {"horizon": 0.01, "budget": 1.0, "dts": [1e-2], "methods": {"a": jc.Method()}} | {
-        what: x
+    arguments = {"horizon": 0.01, "budget": 1.0, "dts": [1e-2], "methods": {"a": jc.Method()}} | {
+        name: x
     }
-    return jc.tradeoff(system, state, given.pop("horizon"), **given)
+    return jc.tradeoff(system, state, arguments.pop("horizon"), **arguments)
 
 
-def _response(what: str, x: Any) -> Any:
-    given = {"frequency": 1.0, "alpha": 1.0, "beta": 1.0}
-    if what in ("dt", "integrator"):
-        given |= {"dt": 1e-3, "integrator": jc.RK4()}
-    return jc.frequency_response(**(given | {what: x}))
+def _response(name: str, x: Any) -> Any:
+    arguments = {"frequency": 1.0, "alpha": 1.0, "beta": 1.0}
+    if name in ("dt", "integrator"):
+        arguments |= {"dt": 1e-3, "integrator": jc.RK4()}
+    return jc.stabilizers.frequency_response(**(arguments | {name: x}))
 
 
 @functools.cache
 def _sledge() -> tuple[Any, Any]:
     scene = jc.Scene(dim=2, dtype=F32)
     scene.add_body("sledge", mass=1.0, inertia=1.0)
-    scene.add(jc.KnifeEdge("edge", jc.WORLD, "sledge", edge=(1.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("edge", jc.WORLD, "sledge", edge=(1.0, 0.0)))
     return scene.build()
 
 
@@ -1006,29 +1075,35 @@ def _others() -> Iterator[Row]:
         "capsule": ({"mass": 1.0, "radius": 1.0, "length": 1.0}, ()),
         "rod": ({"mass": 1.0, "radius": 0.1, "length": 1.0}, ()),
     }
-    for solid, (given, _) in solids.items():
-        for what, good in given.items():
+    for solid, (arguments, _) in solids.items():
+        for field, good in arguments.items():
 
-            def call(x: Any, solid: str = solid, given: Any = given, what: str = what) -> Any:
-                return getattr(jc.inertia, solid)(**(given | {what: x}))
+            def call(
+                x: Any, solid: str = solid, arguments: Any = arguments, field: str = field
+            ) -> Any:
+                return getattr(jc.inertia, solid)(**(arguments | {field: x}))
 
-            yield f"inertia.{solid}.{what}", call, free(good, "positive")
+            yield f"inertia.{solid}.{field}", call, free(good, "positive")
     tensor = functools.partial(jc.inertia.from_tensor, 1.0)
     yield "inertia.from_tensor.tensor", tensor, free(np.eye(3))
     yield "inertia.from_log_cholesky.theta", jc.inertia.from_log_cholesky, free(np.zeros(10))
-    yield "box_corners.size", jc.box_corners, free((1.0, 1.0, 1.0), "positive", shaped=False)
+    yield (
+        "box_corners.size",
+        jc.contacts.box_corners,
+        free((1.0, 1.0, 1.0), "positive", shaped=False),
+    )
     yield (
         "box_corners.position",
-        lambda x: jc.box_corners((1.0, 1.0, 1.0), x),
+        lambda x: jc.contacts.box_corners((1.0, 1.0, 1.0), x),
         free(ORIGIN, "any", "none"),
     )
     hung = {"start": (0.0, 0.0), "end": (1.0, 0.0), "length": 2.0}
-    for what, good in hung.items():
-        sign = "positive" if what == "length" else "any"
-        yield f"hanging.{what}", functools.partial(_hanging, what), free(good, sign)
+    for field, good in hung.items():
+        sign = "positive" if field == "length" else "any"
+        yield f"hanging.{field}", functools.partial(_hanging, field), free(good, sign)
     yield "hanging.links", functools.partial(_hanging, "links"), count()
     line = np.linspace(ORIGIN, X, 4)
-    for what, good in {
+    for field, good in {
         "points": line,
         "mass": 1.0,
         "radius": 0.1,
@@ -1037,67 +1112,69 @@ def _others() -> Iterator[Row]:
     }.items():
         takes = real(
             good,
-            "not negative" if what in ("bending", "twisting") else "any",
-            shaped=what == "mass",
+            "not negative" if field in ("bending", "twisting") else "any",
+            shaped=field == "mass",
         )
-        if what == "mass":
+        if field == "mass":
             takes = POSITIVE
-        if what in ("radius", "bending"):
+        if field in ("radius", "bending"):
             takes = dataclasses.replace(takes, allows=frozenset({"none"}))
-        yield f"rod.{what}", functools.partial(_rod, jc.rod, what), takes
-        if what in ("points", "mass", "bending"):
-            yield f"rope.{what}", functools.partial(_rod, jc.rope, what), takes
+        yield f"rod.{field}", functools.partial(_rod, jc.chains.rod, field), takes
+        if field in ("points", "mass", "bending"):
+            yield f"rope.{field}", functools.partial(_rod, jc.chains.rope, field), takes
     yield (
         "curricula.decay.time",
         lambda x: curricula.decay(1.0, 1.0, x),
         free(1.0, "positive", shaped=False),
     )
-    for what, good in {"t": 1.0, "initial": 1.0}.items():
-        late = functools.partial(_with, curricula.decay, {"t": 1.0, "initial": 1.0, "time": 1.0})
-        yield f"curricula.decay.{what}", functools.partial(late, what), free(good, shaped=False)
+    for field, good in {"t": 1.0, "initial": 1.0}.items():
+        decay = functools.partial(_with, curricula.decay, {"t": 1.0, "initial": 1.0, "time": 1.0})
+        yield f"curricula.decay.{field}", functools.partial(decay, field), free(good, shaped=False)
     ramp = functools.partial(
         _with, curricula.warm_up, {"episode": 1.0, "begin": 0.0, "end": 2.0, "least": 0.1}
     )
-    for what in ("episode", "begin", "end", "least"):
-        takes = free(3.0 if what == "end" else 0.0, shaped=False)
-        yield f"curricula.warm_up.{what}", functools.partial(ramp, what), takes
+    for field in ("episode", "begin", "end", "least"):
+        takes = free(3.0 if field == "end" else 0.0, shaped=False)
+        yield f"curricula.warm_up.{field}", functools.partial(ramp, field), takes
     by_mean = functools.partial(
         _with, curricula.by_performance, {"performance": 1.0, "least": 0.0, "most": 1.0}
     )
-    for what in ("performance", "least", "most", "middle"):
+    for field in ("performance", "least", "most", "middle"):
         yield (
-            f"curricula.by_performance.{what}",
-            functools.partial(by_mean, what),
+            f"curricula.by_performance.{field}",
+            functools.partial(by_mean, field),
             free(1.0, shaped=False),
         )
     for task, build in environments.TASKS.items():
-        for what, option in inspect.signature(build).parameters.items():
-            make = functools.partial(_made, task, what)
+        for field, option in inspect.signature(build).parameters.items():
+            make = functools.partial(_made, task, field)
             if isinstance(option.default, float | tuple):
-                sign = "positive" if what == "dt" else "not negative"
-                yield f"{task}.{what}", make, free(option.default, sign, shaped=False)
+                sign = "positive" if field == "dt" else "not negative"
+                yield f"{task}.{field}", make, free(option.default, sign, shaped=False)
             elif type(option.default) is int:
-                yield f"{task}.{what}", make, count(1, *(["none"] if what == "horizon" else []))
+                yield f"{task}.{field}", make, count(1, *(["none"] if field == "horizon" else []))
     yield from _quaternions()
-    for what in ("base", "speed", "force"):
+    for field in ("base", "speed", "force"):
 
-        def tolerance(x: Any, what: str = what) -> Any:
+        def tolerance(x: Any, field: str = field) -> Any:
             return begun(
-                stabilizer=jc.Projection(tolerance=jc.Tolerance(**({"base": 1e-6} | {what: x})))
+                stabilizer=jc.Projection(
+                    tolerance=jc.stabilizers.Tolerance(**({"base": 1e-6} | {field: x}))
+                )
             )
 
-        allows = ("none",) if what != "base" else ()
-        yield f"Tolerance.{what}", tolerance, free(1e-6, "not negative", *allows)
+        allows = ("none",) if field != "base" else ()
+        yield f"Tolerance.{field}", tolerance, free(1e-6, "not negative", *allows)
     yield "make.task", environments.make, Takes("other")
     none = frozenset({"none"})
-    for what in ("qpos", "qvel", "time"):
-        good = 0.0 if what == "time" else np.zeros(1)
-        optional = ("none",) if what == "qvel" else ()
+    for field in ("qpos", "qvel", "time"):
+        good = 0.0 if field == "time" else np.zeros(1)
+        optional = ("none",) if field == "qvel" else ()
         takes = real(good, "any", *optional)
-        yield f"MujocoModel.state.{what}", functools.partial(_model_state, what), takes
-    for what, takes in {"ignore": Takes("other"), "count_turns": flag()}.items():
+        yield f"MujocoModel.state.{field}", functools.partial(_model_state, field), takes
+    for field, takes in {"ignore": Takes("other"), "count_turns": flag()}.items():
         read = functools.partial(_with, jc.from_mjcf, {"source": _text()})
-        yield f"from_mjcf.{what}", functools.partial(read, what), takes
+        yield f"from_mjcf.{field}", functools.partial(read, field), takes
     yield "from_mjcf.dtype", lambda x: jc.from_mjcf(_text(), dtype=x), Takes("other", allows=none)
     yield "from_mjcf.source", jc.from_mjcf, Takes("other"), "source|from_mjcf|file|XML"
 
@@ -1112,85 +1189,87 @@ QUATERNIONS = {
     "log": {"q": 4},
     "normalize": {"q": 4},
 }
-"""The functions of arrays of components, and how many of these each argument has."""
+"""Functions of quaternions and vectors, with the number of components of each argument."""
 
 
 def _quaternions() -> Iterator[Row]:
     for name, sizes in QUATERNIONS.items():
-        given = {what: np.eye(size)[0] for what, size in sizes.items()}
-        for what, good in given.items():
-            call = functools.partial(_with, getattr(jc.quaternion, name), given, what)
+        arguments = {field: np.eye(size)[0] for field, size in sizes.items()}
+        for field, good in arguments.items():
+            call = functools.partial(_with, getattr(jc.quaternion, name), arguments, field)
             takes = free(good, "any", "NaN", "infinity", "batch")
-            yield f"quaternion.{name}.{what}", call, takes, rf"\b{what}\b"
+            yield f"quaternion.{name}.{field}", call, takes, rf"\b{field}\b"
     turn = {"axis": Z, "angle": 1.0}
-    for what, good in turn.items():
-        call = functools.partial(_with, jc.quaternion.from_axis_angle, turn, what)
-        yield f"quaternion.from_axis_angle.{what}", call, free(good, unread=True)
+    for field, good in turn.items():
+        call = functools.partial(_with, jc.quaternion.from_axis_angle, turn, field)
+        yield f"quaternion.from_axis_angle.{field}", call, free(good, unread=True)
     yield "quaternion.from_matrix.r", jc.quaternion.from_matrix, free(np.eye(3), unread=True)
 
 
-def _with(function: Any, given: dict[str, Any], what: str, x: Any) -> Any:
-    return function(**(given | {what: x}))
+def _with(function: Any, arguments: dict[str, Any], name: str, x: Any) -> Any:
+    return function(**(arguments | {name: x}))
 
 
-def _made(task: str, what: str, x: Any) -> Any:
-    return environments.make(task, **{what: x})
+def _made(task: str, name: str, x: Any) -> Any:
+    return environments.make(task, **{name: x})
 
 
-def _hanging(what: str, x: Any) -> Any:
-    given = {"start": (0.0, 0.0), "end": (1.0, 0.0), "length": 2.0, "links": 4}
-    return jc.hanging(**(given | {what: x}))
+def _hanging(name: str, x: Any) -> Any:
+    arguments = {"start": (0.0, 0.0), "end": (1.0, 0.0), "length": 2.0, "links": 4}
+    return jc.chains.hanging(**(arguments | {name: x}))
 
 
-def _rod(make: Any, what: str, x: Any) -> Any:
+def _rod(make: Any, name: str, x: Any) -> Any:
     scene = jc.Scene(dtype=F32)
-    given = {"points": np.linspace(ORIGIN, X, 4), "mass": 1.0} | {what: x}
-    if make is jc.rod:
-        given = {"radius": 0.05} | given
-    points, mass = given.pop("points"), given.pop("mass")
-    make(scene, "it", points, mass, **given)
+    arguments = {"points": np.linspace(ORIGIN, X, 4), "mass": 1.0} | {name: x}
+    if make is jc.chains.rod:
+        arguments = {"radius": 0.05} | arguments
+    points, mass = arguments.pop("points"), arguments.pop("mass")
+    make(scene, "it", points, mass, **arguments)
     return scene.build()
 
 
 def hesitant(state: Any) -> Any:
-    """A policy that asks for a value."""
+    """Returns an action, but branches on a traced value: an invalid policy."""
     return jnp.zeros(1) if state.q[0] > 0 else jnp.ones(1)
 
 
 def nothing(*_: Any) -> None:
-    """Returns nothing."""
+    """Returns nothing, where a function must return a value."""
 
 
 def words(*_: Any) -> str:
-    """Returns a string."""
+    """Returns a string, where a function must return an array."""
     return "force"
 
 
 def branching(x: Any, *_: Any) -> Any:
-    """Asks for a value."""
+    """Returns an array, but branches on a traced value."""
     leaf = jax.tree.leaves(x)[0]
     return leaf if jnp.sum(leaf) > 0 else -leaf
 
 
 def _levels(level: Any) -> Any:
-    return jc.Priority({"rod": level})
+    return jc.solvers.Priority({"rod": level})
 
 
-def _motor_rollout(**given: Any) -> Any:
+def _motor_rollout(**arguments: Any) -> Any:
     system, state = motor()
-    return jc.rollout(system, jc.Method(), state, given.pop("controls"), 1e-3, 2, **given)
+    return jc.rollout(system, jc.Method(), state, arguments.pop("controls"), 1e-3, 2, **arguments)
 
 
 def _custom(function: Any) -> Any:
-    system, state = with_element(bodies, jc.CustomForce, {"bodies": ("bob",), "function": function})
+    system, state = with_element(
+        bodies, jc.forces.CustomForce, {"bodies": ("bob",), "function": function}
+    )
     return jc.step(system, jc.Method(), state, None, 1e-3)
 
 
-def _generalized(mass: Any = None, force: Any = None, **more: Any) -> Any:
+def _generalized(mass: Any = None, force: Any = None, **arguments: Any) -> Any:
     system = jc.GeneralizedSystem(
         mass=mass or (lambda q, p: jnp.ones_like(q)),
         force=force or (lambda q, v, t, u, p: -q),
-        **more,
+        **arguments,
     )
     state = jc.init(system, jc.Method(), np.ones(2), np.zeros(2))
     return jc.step(system, jc.Method(), state, None, 1e-3)
@@ -1201,12 +1280,12 @@ MJCF = """<mujoco><worldbody><body pos="0 0 1">
 <geom type="sphere" size="{size}" mass="{mass}"/></body></worldbody></mujoco>"""
 
 
-def _text(**given: str) -> str:
-    return MJCF.format(**({"damping": "0.1", "size": "0.1", "mass": "1"} | given))
+def _text(**attributes: str) -> str:
+    return MJCF.format(**({"damping": "0.1", "size": "0.1", "mass": "1"} | attributes))
 
 
-def _mjcf(**given: str) -> Any:
-    return jc.from_mjcf(_text(**given))
+def _mjcf(**attributes: str) -> Any:
+    return jc.from_mjcf(_text(**attributes))
 
 
 @functools.cache
@@ -1214,8 +1293,8 @@ def _model() -> Any:
     return jc.from_mjcf(_text(), dtype=F32)
 
 
-def _model_state(what: str, x: Any) -> Any:
-    return _model().state(**({"qpos": np.zeros(1), "qvel": np.zeros(1)} | {what: x}))
+def _model_state(name: str, x: Any) -> Any:
+    return _model().state(**({"qpos": np.zeros(1), "qvel": np.zeros(1)} | {name: x}))
 
 
 Special = tuple[Callable[[Any], Any], tuple[str, ...]]
@@ -1255,7 +1334,7 @@ SPECIAL: dict[str, Special] = {
             lambda _, kind=kind, function=function: with_element_of(kind, function),
             (f"{kind.__name__} 'it'",),
         )
-        for kind in (jc.Holonomic, jc.VelocityLevel, jc.Inequality)
+        for kind in (jc.joints.Holonomic, jc.joints.VelocityLevel, jc.contacts.Inequality)
         for does, function in (
             ("returns nothing", nothing),
             ("returns a string", words),
@@ -1265,7 +1344,7 @@ SPECIAL: dict[str, Special] = {
     **{
         f"a drive that {does}": (
             lambda _, function=function: with_element(
-                jointed, jc.Drive, {"joint": "one", "motion": function}
+                jointed, jc.joints.Drive, {"joint": "one", "motion": function}
             ),
             ("Drive 'it'",),
         )
@@ -1298,17 +1377,20 @@ SPECIAL: dict[str, Special] = {
         )
     },
     "RankSafe in RankSafe": (
-        lambda _: begun(solver=jc.RankSafe(jc.RankSafe())),
+        lambda _: begun(solver=jc.solvers.RankSafe(jc.solvers.RankSafe())),
         ("RankSafe: solver",),
     ),
     "Priority in RankSafe": (
-        lambda _: begun(solver=jc.RankSafe(jc.Priority({"rod": 1}))),
+        lambda _: begun(solver=jc.solvers.RankSafe(jc.solvers.Priority({"rod": 1}))),
         ("RankSafe: solver",),
     ),
     "a level that is half": (lambda _: begun(solver=_levels(0.5)), ("level",)),
     "a level that is True": (lambda _: begun(solver=_levels(True)), ("level",)),
-    "no elimination in runs of none": (lambda _: begun(solver=jc.Sparse(run=0)), ("run",)),
-    "a billion levels": (lambda _: rollout(adjoint=jc.Checkpoints(levels=10**9)), ("levels",)),
+    "a run of zero rows": (lambda _: begun(solver=jc.solvers.Sparse(run=0)), ("run",)),
+    "a billion levels": (
+        lambda _: rollout(adjoint=jc.adjoints.Checkpoints(levels=10**9)),
+        ("levels",),
+    ),
     "a status of 99": (
         lambda _: step(state=dataclasses.replace(motor()[1], status=99)),
         ("status",),
@@ -1331,7 +1413,7 @@ SPECIAL: dict[str, Special] = {
             lambda _, part=part, value=value: jc.Method(**{part: value}),
             (rf"Method: {part}\b",),
         )
-        for part in ("integrator", "stabilizer", "solver", "recovery", "bounded", "events")
+        for part in ("integrator", "stabilizer", "solver", "recovery", "contact_solver", "events")
         for what, value in (("a class", float), ("a name", "RK4"), ("a number", 1.0))
     },
     "gains by numbers": (lambda _: begun(stabilizer=jc.Baumgarte({1: 1.0}, 1.0)), ("alpha",)),
@@ -1343,11 +1425,11 @@ SPECIAL: dict[str, Special] = {
     "MJCF with a size of NaN": (lambda _: _mjcf(size="nan"), ("size",)),
     "MJCF with a damping of NaN": (lambda _: _mjcf(damping="nan"), ("damping",)),
 }
-"""Calls that no table makes: each with patterns, one of which its message must have."""
+"""Hand-written wrong calls with patterns, one of which the error message must match."""
 
 
 def with_element_of(kind: Any, function: Any) -> Any:
-    """A scene with a user's constraint on a body."""
+    """Takes a step of a scene in which a body has a constraint with a user's function."""
     scene = bodies()
     scene.add(kind(function, ("bob",), name="it"))
     system, state = scene.build()

@@ -1,5 +1,7 @@
 """How Sphinx builds these pages: `python -m sphinx -W -b html docs docs/_build`, offline."""
 
+import functools
+import importlib
 import os
 import re
 import sys
@@ -46,6 +48,9 @@ LINKS = (
 )
 """Files that the README and the guide point to, and where they are among these pages."""
 
+ALIKE = ("inertia", "quaternion", "view")
+"""Namespaces whose names, such as `box`, are linked within them only."""
+
 os.environ.setdefault(  # the notebooks compile much and run little, as the tests do
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
@@ -73,6 +78,31 @@ def prepare_page(app, name, source):
         source[0] = linked(source[0])
 
 
+def link_name(app, env, node, content):
+    """Links `Dense` or `Penalty.from_time` to its namespace, from any page.
+
+    Called for each reference whose target is not on its own page.
+    """
+    if node.get("refdomain") != "py":
+        return None
+    head, dot, member = node["reftarget"].partition(".")
+    target = public_names().get(head, head) + dot + member
+    python = env.get_domain("py")
+    if target not in python.objects:
+        return None
+    return python.resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, content)
+
+
+@functools.cache
+def public_names():
+    """Returns dotted names of what the namespaces have, by the last part."""
+    package, found = importlib.import_module("jaxcon"), {}
+    for space in package.__all__:
+        if hasattr(getattr(package, space), "__all__") and space not in ALIKE:
+            found |= {n: f"jaxcon.{space}.{n}" for n in getattr(package, space).__all__}
+    return {n: f"jaxcon.{n}" for n in package.__all__ if n not in found} | found
+
+
 def bring_notebooks():
     """Copies of the notebooks, among these pages, with their links to examples."""
     place = ROOT / "docs" / "notebooks"
@@ -89,3 +119,4 @@ def setup(app):
     bring_notebooks()
     app.connect("include-read", prepare_readme)
     app.connect("source-read", prepare_page)
+    app.connect("missing-reference", link_name)

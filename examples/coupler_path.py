@@ -51,7 +51,7 @@ def turn(p: dict) -> tuple:
         q = q.at[own.layout.q("crank")[:2]].set(crank)
         closed = jc.assemble(own, q, hold="crank").state
         point = jc.position(own, closed, "coupler", p["point"])
-        return jc.losses.unless_failed(point, closed), closed.q
+        return jc.learning.losses.unless_failed(point, closed), closed.q
 
     return jax.vmap(place)(jnp.asarray(ANGLES, p["lengths"].dtype))
 
@@ -61,7 +61,7 @@ def draw(p: dict) -> jax.Array:
     return turn(p)[0]
 
 
-def find() -> jc.Identified:
+def find() -> jc.learning.Identified:
     """The lengths and the point whose path is nearest to the wanted one."""
     wanted = np.asarray(draw(TRUTH))
     return jc.identify(draw, GUESS, wanted, positive="lengths")

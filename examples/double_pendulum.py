@@ -37,7 +37,7 @@ def main(picture: str = "double_pendulum.png", worlds: int = 1000) -> None:
         start = jc.State(state.q, state.v.at[system.layout.v("lower")[2]].set(turn), *rest)
         rod = (0.5, 0.0)
 
-        def record(s: jc.State, _: jc.StepInfo) -> tuple[jax.Array, jax.Array]:
+        def record(s: jc.State, _: jc.extend.StepInfo) -> tuple[jax.Array, jax.Array]:
             return jc.position(system, s, "lower", rod), jc.energy(system, s).total
 
         method = jc.Method(jc.RK4())

@@ -42,7 +42,7 @@ def smooth(x: jax.Array) -> jax.Array:
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
-def spine(front: jc.Pose, rear: jc.Pose, t: jax.Array, bend: jax.Array) -> jax.Array:
+def spine(front: jc.extend.Pose, rear: jc.extend.Pose, t: jax.Array, bend: jax.Array) -> jax.Array:
     """The rear half is turned against the front one by β about an axis that goes round once."""
     t = t / TIME
     β = bend * smooth(t / 0.2) * smooth((1 - t) / 0.2)
@@ -66,8 +66,8 @@ def build() -> tuple:
         )
     scene.add(jc.Spherical("waist", "front", "rear", point=(0.0, 0.0, HEIGHT)))
     bodies = ("front", "rear")
-    scene.add(jc.Holonomic(spine, bodies, name="spine", params=bend_for_half_a_turn()))
-    scene.add(jc.AngularMomentum("no_help", bodies))
+    scene.add(jc.joints.Holonomic(spine, bodies, name="spine", params=bend_for_half_a_turn()))
+    scene.add(jc.joints.AngularMomentum("no_help", bodies))
     return scene.build()
 
 

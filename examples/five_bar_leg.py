@@ -36,7 +36,9 @@ def build() -> tuple:
             )
         scene.add(jc.Revolute(f"{side}_hip", jc.WORLD, f"{side}_thigh", hip))
         scene.add(jc.Revolute(f"{side}_knee", f"{side}_thigh", f"{side}_shank", knee))
-        scene.add(jc.PositionServo(f"{side}_servo", f"{side}_hip", stiffness=200.0, damping=4.0))
+        scene.add(
+            jc.forces.PositionServo(f"{side}_servo", f"{side}_hip", stiffness=200.0, damping=4.0)
+        )
     scene.add(jc.Revolute("ankle", "left_shank", "right_shank", foot))
     return *scene.build(), np.array(foot)
 
@@ -64,7 +66,7 @@ def main(picture: str = "five_bar_leg.png") -> None:
 
     def loss(angles: jax.Array) -> jax.Array:
         """The mean square of the distance from the goals, log₁₀ [m]."""
-        return jnp.log10(jc.losses.tracking(jax.vmap(reach)(angles), goals)) / 2
+        return jnp.log10(jc.learning.losses.tracking(jax.vmap(reach)(angles), goals)) / 2
 
     found = jc.tune(loss, jnp.zeros((len(phase), 2)), steps=150)
     angles = found.params
@@ -75,7 +77,7 @@ def main(picture: str = "five_bar_leg.png") -> None:
         lambda a: jnp.interp(clock, phase, a, period=2 * jnp.pi), in_axes=1, out_axes=1
     )(angles)
 
-    def record(s: jc.State, _: jc.StepInfo) -> jax.Array:
+    def record(s: jc.State, _: jc.extend.StepInfo) -> jax.Array:
         return jc.position(system, s, "left_shank", tip)
 
     final, way = jax.jit(

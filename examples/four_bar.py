@@ -37,7 +37,7 @@ def build() -> tuple:
     scene.add(jc.Revolute("c", "coupler", "rocker", point=C))
     scene.add(jc.Revolute("d", "rocker", jc.WORLD, point=D))
     scene.add(jc.Spring("spring", jc.WORLD, "crank", stiffness=40.0, point_a=(-0.5, 0), point_b=B))
-    scene.add(jc.JointDamper("friction", "d", damping=0.05))
+    scene.add(jc.forces.JointDamper("friction", "d", damping=0.05))
     return scene.build()
 
 
@@ -52,9 +52,9 @@ def main(picture: str = "four_bar.png") -> None:
     print(f"\nafter 2 s: violation {jc.violation(system, final).worst:.1e} m")
 
     # What the last hinge holds: force (2,) and torque on the ground, from the multipliers.
-    no_feedback = jc.Method(stabilizer=jc.Unstabilized())
+    no_feedback = jc.Method(stabilizer=jc.stabilizers.Unstabilized())
     solution = jc.forward_dynamics(system, final, None, no_feedback, 1e-3)
-    print("force of the rocker on the ground [N]:", jc.wrench(system, final, solution, "d")[:2])
+    print("force of the rocker on the ground [N]:", jc.wrench(solution, "d")[:2])
     path = jax.vmap(lambda s: jc.position(system, s, "coupler"))(trajectory)
     print("the middle of the coupler, first and last [m]:", np.asarray(path[0]), path[-1])
 

@@ -35,7 +35,7 @@ def build(p: dict) -> tuple:
         holder = jc.WORLD if name == "upper" else "upper"
         scene.add(jc.Revolute(f"{name}_hinge", holder, name, point=end))
         end = end + way
-    scene.add(jc.ExternalWrench("torque", "upper"))
+    scene.add(jc.forces.ExternalWrench("torque", "upper"))
     return scene.build()
 
 
@@ -43,15 +43,15 @@ def swing(p: dict, torque: jax.Array) -> jax.Array:
     """Both angles over time, (STEPS / EVERY, 2) [rad]."""
     system, state = build(p)
 
-    def record(s: jc.State, _: jc.StepInfo) -> jax.Array:
+    def record(s: jc.State, _: jc.extend.StepInfo) -> jax.Array:
         return jnp.stack([jc.orientation(system, s, name) for name in ("upper", "lower")])
 
     control = jnp.zeros((STEPS, 3)).at[:, 2].set(torque)
-    method = jc.Method(solver=jc.Schur())
+    method = jc.Method(solver=jc.solvers.Schur())
     final, angles = jc.rollout(
         system, method, state, control, DT, STEPS, record=record, every=EVERY
     )
-    return jc.losses.unless_failed(angles, final)
+    return jc.learning.losses.unless_failed(angles, final)
 
 
 def free(p: dict) -> jax.Array:
@@ -64,7 +64,7 @@ def driven(p: dict) -> jax.Array:
     return swing(p, TORQUE)
 
 
-def identify(simulate, seed: int = 0) -> jc.Identified:
+def identify(simulate, seed: int = 0) -> jc.learning.Identified:
     """What a noisy recording of the true pendulum tells."""
     angles = np.asarray(jax.jit(simulate)(TRUTH))
     data = angles + NOISE * np.random.default_rng(seed).normal(size=angles.shape)

@@ -25,7 +25,7 @@ from jaxcon import scenes
 DT, STEPS = 2e-3, 250
 START, GOAL = 0.5, 1.0  # angles of the crank [rad]
 GUESS = {"stiffness": 10.0, "damping": 0.3}  # [N m/rad], [N m s/rad]
-METHOD = jc.Method(solver=jc.Schur())
+METHOD = jc.Method(solver=jc.solvers.Schur())
 
 
 def scattered(worlds: int) -> np.ndarray:
@@ -37,7 +37,7 @@ def scattered(worlds: int) -> np.ndarray:
 def settle(p: dict, lengths: jax.Array) -> tuple[jc.State, jax.Array]:
     """One linkage after half a second, and how far its crank is off: (angle, rate / 10), (2,)."""
     k, c = p["stiffness"], p["damping"]
-    spring = jc.JointSpring("spring", "ground_crank", k, c, rest=GOAL - START)
+    spring = jc.forces.JointSpring("spring", "ground_crank", k, c, rest=GOAL - START)
     system, state = scenes.four_bar(lengths, angle=START, rate=0.0, elements=[spring])
     dt = jnp.asarray(DT, state.q.dtype)
     final, _ = jc.rollout(system, METHOD, state, None, dt, STEPS, record=lambda s, i: None)
@@ -47,11 +47,11 @@ def settle(p: dict, lengths: jax.Array) -> tuple[jc.State, jax.Array]:
 
 def loss(p: dict, lengths: jax.Array) -> jax.Array:
     """The mean over linkages of the square of what they are off; each device has its own."""
-    final, off = jc.over_devices(jax.vmap(settle, in_axes=(None, 0)))(p, lengths)
-    return jc.losses.unless_failed(jnp.mean(jnp.sum(off**2, axis=1)), final)
+    final, off = jc.devices.over_devices(jax.vmap(settle, in_axes=(None, 0)))(p, lengths)
+    return jc.learning.losses.unless_failed(jnp.mean(jnp.sum(off**2, axis=1)), final)
 
 
-def tune(lengths: np.ndarray, steps: int) -> jc.Tuned:
+def tune(lengths: np.ndarray, steps: int) -> jc.learning.Tuned:
     """Adam on the logarithms; the first process shows how far it is."""
     shown = None if jax.process_index() == 0 else False
     own = {"positive": True, "steps": steps, "progress": shown}
@@ -78,7 +78,7 @@ def main() -> None:
     if given.coordinator:
         jax.distributed.initialize(given.coordinator, given.processes, given.process)
     lengths = scattered(given.worlds)
-    batch = jc.shard(jnp.asarray(lengths))
+    batch = jc.devices.shard(jnp.asarray(lengths))
     final, _ = jax.jit(jax.vmap(settle, in_axes=(None, 0)))(GUESS, batch)
     value, slope = jax.jit(jax.value_and_grad(loss))(GUESS, batch)
     found = tune(lengths, given.steps)

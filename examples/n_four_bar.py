@@ -44,7 +44,7 @@ def main(picture: str = "n_four_bar.png") -> None:
     print(jc.report(system, state))
     method = jc.Method(jc.RK4())
 
-    def record(s: jc.State, _: jc.StepInfo) -> tuple:
+    def record(s: jc.State, _: jc.extend.StepInfo) -> tuple:
         return s.q, jc.energy(system, s).total, jc.violation(system, s).worst
 
     run = jax.jit(lambda s: jc.rollout(system, method, s, None, DT, STEPS, record=record, every=20))

@@ -26,7 +26,7 @@ def steer(t: jax.Array, p: dict) -> jax.Array:
     return p["angle"] * jnp.sin(2 * OMEGA * t)
 
 
-def engine(car: jc.Motion, t: jax.Array, p: dict) -> jax.Array:
+def engine(car: jc.extend.Motion, t: jax.Array, p: dict) -> jax.Array:
     """The middle of the rear axle moves forward as fast as the driver wants."""
     forward = car.direction(jnp.array([1.0, 0.0]))
     speed = car.point_velocity(jnp.array([-WHEELBASE / 2, 0.0]))
@@ -41,10 +41,10 @@ def build(angle: jax.Array) -> tuple:
     turning = 2 * OMEGA * angle
     scene.add_body("wheel", mass=40.0, inertia=2.0, position=front, angular_velocity=turning)
     scene.add(jc.Revolute("steering", "car", "wheel", point=front))
-    scene.add(jc.KnifeEdge("rear", jc.WORLD, "car", edge=(1.0, 0.0), center=(0.0, 0.0)))
-    scene.add(jc.KnifeEdge("front", jc.WORLD, "wheel", edge=(1.0, 0.0)))
-    scene.add(jc.Drive("column", "steering", steer, params={"angle": angle}))
-    scene.add(jc.VelocityLevel(engine, ("car",), name="engine", params={"speed": SPEED}))
+    scene.add(jc.joints.KnifeEdge("rear", jc.WORLD, "car", edge=(1.0, 0.0), center=(0.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("front", jc.WORLD, "wheel", edge=(1.0, 0.0)))
+    scene.add(jc.joints.Drive("column", "steering", steer, params={"angle": angle}))
+    scene.add(jc.joints.VelocityLevel(engine, ("car",), name="engine", params={"speed": SPEED}))
     return scene.build()
 
 
@@ -59,7 +59,7 @@ def park(angle: jax.Array) -> tuple:
 def main(picture: str = "parallel_parking.png") -> None:
     """Says what the rows allow, finds the steering, and draws the way."""
     system, state = build(jnp.asarray(0.3))
-    print(jc.integrability(system, state, ["steering", "rear", "front"]))
+    print(jc.analysis.integrability(system, state, ["steering", "rear", "front"]))
 
     slope = jax.jit(jax.value_and_grad(park, has_aux=True))
     angle = jnp.asarray(0.3)

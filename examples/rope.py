@@ -20,16 +20,18 @@ START, END = (0.0, 0.0), (1.2, 0.0)
 def build(end: str | None) -> tuple:
     """The rope, its last point held by a body or free."""
     scene = jc.Scene(dim=2)
-    points = jc.hanging(START, END, LENGTH, LINKS)
-    chain = jc.rope(scene, "rope", points, MASS, end=end, bending=1e-4)
+    points = jc.chains.hanging(START, END, LENGTH, LINKS)
+    chain = jc.chains.rope(scene, "rope", points, MASS, end=end, bending=1e-4)
     return *scene.build(), chain
 
 
 def main(picture: str = "rope.png") -> None:
     """Reads the tension at rest, lets the rope go, and draws it."""
     system, state, chain = build(end=jc.WORLD)
-    info = jc.forward_dynamics(system, state, None, jc.Method(stabilizer=jc.Unstabilized()), 1e-3)
-    tension = -np.array([jc.multipliers(system, state, info, x)[0] for x in chain.joints])
+    info = jc.forward_dynamics(
+        system, state, None, jc.Method(stabilizer=jc.stabilizers.Unstabilized()), 1e-3
+    )
+    tension = -np.array([jc.multipliers(info, x)[0] for x in chain.joints])
     print(f"tension: {tension.max():.3f} N at the ends, {tension.min():.3f} N at the bottom")
 
     system, state, chain = build(end=None)

@@ -37,7 +37,7 @@ def build() -> tuple:
     scene.add(jc.Revolute("crank_pin", "crank", "rod", point=pin))
     scene.add(jc.Revolute("wrist_pin", "rod", "piston", point=piston))
     scene.add(jc.Prismatic("guide", jc.WORLD, "piston", axis=(1.0, 0.0)))
-    scene.add(jc.Drive("motor", "bearing", turning, params={"speed": SPEED}))
+    scene.add(jc.joints.Drive("motor", "bearing", turning, params={"speed": SPEED}))
     system, state = scene.build()
     return system, jc.assemble(system, state).check()  # gives every body the speed of the drive
 
@@ -49,10 +49,10 @@ def main(picture: str = "slider_crank.png") -> None:
     turn = 2 * math.pi / SPEED
     method, dt = jc.Method(jc.RK4()), turn / 500
 
-    def record(s: jc.State, _: jc.StepInfo) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def record(s: jc.State, _: jc.extend.StepInfo) -> tuple[jax.Array, jax.Array, jax.Array]:
         solution = jc.forward_dynamics(system, s, None, method, dt)
-        torque = jc.wrench(system, s, solution, "motor")[2]
-        side = jc.wrench(system, s, solution, "guide")[1]
+        torque = jc.wrench(solution, "motor")[2]
+        side = jc.wrench(solution, "guide")[1]
         return SPEED * s.time, torque, side
 
     final, (angle, torque, side) = jax.jit(

@@ -46,10 +46,10 @@ def build() -> tuple:
         scene.add_body(f"cylinder{i}", inertia=part, position=foot + 0.3 * along, quaternion=turn)
         scene.add_body(f"piston{i}", inertia=part, position=head - 0.3 * along, quaternion=turn)
         crossed = {"axis_a": first, "axis_b": np.cross(along, first)}
-        scene.add(jc.Universal(f"foot{i}", jc.WORLD, f"cylinder{i}", foot, **crossed))
+        scene.add(jc.joints.Universal(f"foot{i}", jc.WORLD, f"cylinder{i}", foot, **crossed))
         scene.add(jc.Prismatic(f"leg{i}", f"cylinder{i}", f"piston{i}", axis=along))
         scene.add(jc.Spherical(f"head{i}", f"piston{i}", "platform", head))
-        scene.add(jc.PositionServo(f"servo{i}", f"leg{i}", stiffness=2e5, damping=4e3))
+        scene.add(jc.forces.PositionServo(f"servo{i}", f"leg{i}", stiffness=2e5, damping=4e3))
     return scene.build()
 
 
@@ -77,7 +77,7 @@ def main(picture: str = "stewart_platform.png") -> None:
     times = DT * jnp.arange(STEPS)
     controls = jax.vmap(lengths)(times)
 
-    def record(s: jc.State, _: jc.StepInfo) -> tuple[jax.Array, jax.Array]:
+    def record(s: jc.State, _: jc.extend.StepInfo) -> tuple[jax.Array, jax.Array]:
         return jc.position(system, s, "platform"), jc.violation(system, s).worst
 
     final, (path, violation) = jax.jit(

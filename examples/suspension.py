@@ -35,10 +35,10 @@ def build(p: dict) -> tuple:
     scene.add_body("arm", mass=ARM, inertia=ARM * LENGTH**2 / 12, position=middle, angle=-angle)
     scene.add(jc.Prismatic("rail", jc.WORLD, "chassis", axis=(0.0, 1.0)))
     scene.add(jc.Revolute("hinge", "chassis", "arm", point=hinge))
-    scene.add(jc.PointOnLine("ground", jc.WORLD, "arm", axis=(1.0, 0.0), point=wheel))
+    scene.add(jc.joints.PointOnLine("ground", jc.WORLD, "arm", axis=(1.0, 0.0), point=wheel))
     load = (CAR + ARM / 2) * 9.81 * LENGTH * np.cos(level)  # [N m]
     rest = angle - level - load / p["stiffness"]
-    scene.add(jc.JointSpring("spring", "hinge", p["stiffness"], p["damping"], rest=rest))
+    scene.add(jc.forces.JointSpring("spring", "hinge", p["stiffness"], p["damping"], rest=rest))
     return scene.build()
 
 
@@ -46,20 +46,20 @@ def settle(p: dict) -> jax.Array:
     """The height of the chassis over time, (STEPS / EVERY,) [m]."""
     system, state = build(p)
 
-    def record(s: jc.State, _: jc.StepInfo) -> jax.Array:
+    def record(s: jc.State, _: jc.extend.StepInfo) -> jax.Array:
         return jc.position(system, s, "chassis")[1]
 
-    method = jc.Method(solver=jc.Schur())
+    method = jc.Method(solver=jc.solvers.Schur())
     final, height = jc.rollout(system, method, state, None, DT, STEPS, record=record, every=EVERY)
-    return jc.losses.unless_failed(height, final)
+    return jc.learning.losses.unless_failed(height, final)
 
 
 def loss(p: dict) -> jax.Array:
     """log₁₀ of the root mean square of the error of the height [m]."""
-    return jnp.log10(jc.losses.tracking(settle(p), WANTED)) / 2
+    return jnp.log10(jc.learning.losses.tracking(settle(p), WANTED)) / 2
 
 
-def fit(steps: int = 80) -> jc.Tuned:
+def fit(steps: int = 80) -> jc.learning.Tuned:
     """Adam on the logarithms of stiffness and damping."""
     optimizer = optax.adam(optax.cosine_decay_schedule(0.2, steps))
     return jc.tune(loss, GUESS, positive=True, steps=steps, optimizer=optimizer)

@@ -27,7 +27,7 @@ def build() -> tuple:
     scene.add_body("pole", mass=POLE, inertia=POLE * LENGTH**2 / 12, position=middle)
     scene.add(jc.Prismatic("rail", jc.WORLD, "cart", axis=(1.0, 0.0)))
     scene.add(jc.Revolute("pivot", "cart", "pole", point=(0.0, 0.0)))
-    scene.add(jc.ExternalWrench("push", "cart"))
+    scene.add(jc.forces.ExternalWrench("push", "cart"))
     return scene.build()
 
 
@@ -37,7 +37,7 @@ system, start = build()
 def swing(forces: jax.Array) -> tuple:
     """The final state and the way there, for the forces of the knots (KNOTS,) [N]."""
     control = jnp.zeros((STEPS, 3)).at[:, 0].set(jnp.repeat(forces, STEPS // KNOTS))
-    return jc.rollout(system, jc.Method(solver=jc.Schur()), start, control, DT, STEPS)
+    return jc.rollout(system, jc.Method(solver=jc.solvers.Schur()), start, control, DT, STEPS)
 
 
 def miss(final: jc.State) -> dict:
@@ -56,11 +56,11 @@ def loss(forces: jax.Array) -> tuple:
     terms = {name: x**2 for name, x in miss(final).items()}
     terms["effort"] = jnp.mean((forces / LIMIT) ** 2)
     weights = {"angle": 1.0, "spin": 0.1, "place": 1.0, "speed": 0.1, "effort": 1e-3}
-    total, _ = jc.losses.weighted(terms, weights)
-    return jc.losses.unless_failed(total, final), path
+    total, _ = jc.learning.losses.weighted(terms, weights)
+    return jc.learning.losses.unless_failed(total, final), path
 
 
-def find(steps: int = 300) -> jc.Tuned:
+def find(steps: int = 300) -> jc.learning.Tuned:
     """From a gentle push to and fro."""
     first = 2.0 * jnp.sin(jnp.linspace(0.0, 4 * jnp.pi, KNOTS))
     optimizer = optax.adam(optax.cosine_decay_schedule(1.0, steps))

@@ -18,21 +18,21 @@ import jaxcon as jc
 from jaxcon import scenes
 
 DT, STEPS, ITERATIONS = 5e-3, 100, 80
-INTEGRATOR = jc.Heun()
+INTEGRATOR = jc.integrators.Heun()
 STARTS = {"the default": 1.0, "a hundredth of it": 0.01}
 
 
 def loss(gains: dict) -> jax.Array:
     """log₁₀ of the root mean square of (φ, h φ̇) over the motion [m]."""
     system, state = scenes.four_bar()
-    method = jc.Method(INTEGRATOR, jc.Baumgarte(gains["alpha"], gains["beta"]), jc.Schur())
+    method = jc.Method(INTEGRATOR, jc.Baumgarte(gains["alpha"], gains["beta"]), jc.solvers.Schur())
     final, off = jc.rollout(
         system, method, state, None, DT, STEPS, record=lambda s, info: info.violation
     )
-    return jc.losses.unless_failed(jc.losses.violation(off, DT), final)
+    return jc.learning.losses.unless_failed(jc.learning.losses.violation(off, DT), final)
 
 
-def tune(share: float) -> jc.Tuned:
+def tune(share: float) -> jc.learning.Tuned:
     """From a share of the default gains."""
     alpha, beta = INTEGRATOR.default_gains(DT)
     optimizer = optax.adam(optax.cosine_decay_schedule(0.3, ITERATIONS))

@@ -15,11 +15,15 @@ from pathlib import Path
 from typing import Any
 
 SCENES = ("four_bar", "bicycle")
-"""The scenes of `jaxcon.scenes` that the command line knows, by name."""
+"""The scenes of `jaxcon.scenes` that the command line accepts by name."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs a command and returns its exit status."""
+    """Runs the command line and returns its exit status.
+
+    Args:
+        arguments: command-line arguments; by default `sys.argv[1:]`.
+    """
     parser = argparse.ArgumentParser(prog="python -m jaxcon", description=__doc__)
     commands = parser.add_subparsers(dest="command")
     demo = commands.add_parser("demo", help="simulate linkages and tune gains (the default)")
@@ -30,9 +34,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     verify = commands.add_parser("verify", help="compare with reference cases")
     verify.add_argument("cases", nargs="*", help="names of cases; all unless given")
     verify.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
-    _add_tradeoff(commands)
+    compare = commands.add_parser("tradeoff", help="which method to take on a scene")
+    compare.add_argument(
+        "scene",
+        help="a name from jaxcon.scenes, a model of MuJoCo (.xml, .urdf), or file.py:function,"
+        " which returns (system, state)",
+    )
+    compare.add_argument("--seconds", type=positive, default=1.0, help="simulated seconds")
+    compare.add_argument("--error", type=positive, help="recommend for at most this error [m]")
+    compare.add_argument("--cost", type=positive, help="recommend for at most this cost [s/s]")
+    compare.add_argument("--budget", type=positive, default=300.0, help="seconds that it may take")
+    compare.add_argument("--batch", type=whole, default=256, help="worlds that share the device")
+    compare.add_argument("--file", metavar="FILE", help="goes on from there if interrupted")
+    compare.add_argument("--picture", help="where to write the work-precision diagram")
+    compare.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
+    compare.add_argument("--all", action="store_true", help="print every run")
     options = parser.parse_args(arguments)
-    for path in (getattr(options, name, None) for name in ("picture", "json", "file")):
+    for path in (vars(options).get(name) for name in ("picture", "json", "file")):
         if path and not Path(path).absolute().parent.is_dir():
             parser.error(f"there is no folder for {path}")
         if path and Path(path).is_dir():
@@ -45,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def positive(text: str) -> float:
-    """A number that is positive and finite, of an option."""
+    """Parses a command-line option as a positive, finite number."""
     number = float(text)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"must be positive and finite, got {text}")
@@ -53,7 +71,7 @@ def positive(text: str) -> float:
 
 
 def whole(text: str) -> int:
-    """A whole number from 1, of an option."""
+    """Parses a command-line option as a positive integer."""
     number = int(text)
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number from 1, got {text}")
@@ -61,7 +79,7 @@ def whole(text: str) -> int:
 
 
 def run_demo(copies: int, seconds: float, picture: str) -> int:
-    """Simulates many linkages, tunes their gains and draws a picture."""
+    """Runs the demo: simulates linkages, tunes their gains and draws a picture. Returns 0."""
     os.environ.setdefault("MPLBACKEND", "Agg")
     from jaxcon import demo
 
@@ -69,27 +87,13 @@ def run_demo(copies: int, seconds: float, picture: str) -> int:
     return 0
 
 
-def _add_tradeoff(commands: Any) -> None:
-    """The options of `tradeoff`."""
-    command = commands.add_parser("tradeoff", help="which method to take on a scene")
-    command.add_argument(
-        "scene",
-        help="a name from jaxcon.scenes, a model of MuJoCo (.xml, .urdf), or file.py:function,"
-        " which returns (system, state)",
-    )
-    command.add_argument("--seconds", type=positive, default=1.0, help="simulated seconds")
-    command.add_argument("--error", type=positive, help="recommend for at most this error [m]")
-    command.add_argument("--cost", type=positive, help="recommend for at most this cost [s/s]")
-    command.add_argument("--budget", type=positive, default=300.0, help="seconds that it may take")
-    command.add_argument("--batch", type=whole, default=256, help="worlds that share the device")
-    command.add_argument("--file", metavar="FILE", help="goes on from there if interrupted")
-    command.add_argument("--picture", help="where to write the work-precision diagram")
-    command.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
-    command.add_argument("--all", action="store_true", help="print every run")
-
-
 def run_tradeoff(options: argparse.Namespace) -> int:
-    """Compares methods on a scene; 1 where none is as accurate or as cheap as asked."""
+    """Compares methods on a scene and prints the result.
+
+    Returns:
+        The exit status: 0 for success, 1 if no method meets the limit on error or cost, 2 if the
+        comparison failed.
+    """
     begin = time.perf_counter()
     import jax
 
@@ -97,13 +101,13 @@ def run_tradeoff(options: argparse.Namespace) -> int:
     from jaxcon.analysis.tradeoff import tradeoff
     from jaxcon.core.status import SimulationError
 
-    known = {"batch": options.batch, "file": options.file}
     try:
         system, state = find_scene(options.scene)
-        # importing and building count, too, but leave something of the budget to compare with
-        spent = time.perf_counter() - begin
-        known["budget"] = max(options.budget - spent, options.budget / 2)
-        result = tradeoff(system, state, options.seconds, **known)
+        # imports and building count too, but leave at least half of the budget to compare with
+        budget = max(options.budget - (time.perf_counter() - begin), options.budget / 2)
+        result = tradeoff(
+            system, state, options.seconds, batch=options.batch, file=options.file, budget=budget
+        )
     except (ValueError, OSError, SimulationError) as error:
         print(error)
         return 2
@@ -115,13 +119,12 @@ def run_tradeoff(options: argparse.Namespace) -> int:
     if options.picture:
         os.environ.setdefault("MPLBACKEND", "Agg")
         result.plot(options.picture)
-    for what in ("error", "cost"):
-        most = getattr(options, what)
-        if most is not None:
+    for what, limit in (("error", options.error), ("cost", options.cost)):
+        if limit is not None:
             try:
-                chosen = result.recommend(**{what: most})
+                chosen = result.recommend(**{what: limit})
                 unit = chosen.unit if what == "error" else "s/s"
-                print(f"\n{what} of at most {most:g} {unit}: {chosen}")
+                print(f"\n{what} of at most {limit:g} {unit}: {chosen}")
             except ValueError as error:
                 print(error)
                 return 1
@@ -129,10 +132,18 @@ def run_tradeoff(options: argparse.Namespace) -> int:
 
 
 def find_scene(name: str) -> Any:
-    """The system and state of a name, of a model, or of a function in a file.
+    """Builds a scene from its name, from a model file, or by calling a function in a Python file.
+
+    Args:
+        name: one of `SCENES`, the path of an MJCF or URDF file, or "file.py:function".
+
+    Returns:
+        The system and its initial state. For a model file it is a `jc.io.MujocoModel`, which
+        unpacks to them.
 
     Raises:
-        ValueError: there is none.
+        ValueError: the name is unknown, the file or function does not exist, or the function does
+            not return (system, state).
     """
     from jaxcon import scenes
     from jaxcon.io.mjcf import from_mjcf
@@ -166,7 +177,15 @@ def find_scene(name: str) -> Any:
 
 
 def run_verify(names: Sequence[str], file: Path | None) -> int:
-    """Compares with the reference cases in float64; 1 where one fails."""
+    """Runs verification cases in float64 and prints pass or fail for each check.
+
+    Args:
+        names: names of the cases; all if empty.
+        file: path of a JSON file for the results; None writes no file.
+
+    Returns:
+        The exit status: 0 if all checks pass, 1 if a check fails, 2 if a name is unknown.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -189,7 +208,7 @@ def run_verify(names: Sequence[str], file: Path | None) -> int:
     print(f"{len(checks) - failed} passed, {failed} failed")
     if file:
         rows = [dataclasses.asdict(check) | {"passed": check.passed} for check in checks]
-        for row in rows:  # JSON has no infinity: null is "no bound", or a figure that is none
+        for row in rows:  # JSON has no infinity and no NaN: null stands for both
             row.update((k, None) for k in ("value", "bound") if not math.isfinite(row[k]))
         file.write_text(json.dumps(rows, indent=1) + "\n")
     return 1 if failed else 0

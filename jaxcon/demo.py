@@ -1,4 +1,4 @@
-"""The main job of the command line: a thousand linkages, and gains tuned by gradient."""
+"""The command-line demo: simulates a thousand linkages, and tunes feedback gains by gradients."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -14,33 +14,43 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxcon import scenes
-from jaxcon.analysis.quantities import energy
 from jaxcon.core.status import raise_for_status
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array, DType
+from jaxcon.execution.initialize import init
+from jaxcon.execution.rollout import rollout
 from jaxcon.learning import losses, tuning
-from jaxcon.model.state import State
-from jaxcon.simulation.initialize import init
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
-from jaxcon.solvers.sparse import Sparse
-from jaxcon.stabilization.pid import PID
+from jaxcon.linear.sparse import Sparse
+from jaxcon.methods.method import Method
+from jaxcon.methods.pid import PID
+from jaxcon.protocols import System
+from jaxcon.readout.quantities import energy
+from jaxcon.step import StepInfo
+from jaxcon.system.body_system import BodySystem
+from jaxcon.system.state import State
+
+Gains: TypeAlias = dict[str, Array]
+"""The PID gains `proportional` [1/s²], `derivative` [1/s] and `integral` [1/s³], () each."""
 
 STEP = 2e-3
-"""h [s]"""
+"""The step size h [s]."""
 METHOD = Method(solver=Sparse())
-"""Semi-implicit Euler, default feedback, sparse elimination."""
+"""The method of the demo: semi-implicit Euler, default feedback and sparse elimination."""
+
+Worlds: TypeAlias = tuple[BodySystem, State]
+"""A batch of four-bars: systems and initial states, with the worlds along the first axis."""
 
 
 @dataclass(frozen=True)
 class Simulation:
-    """What the batch did.
+    """The results of simulating a batch of linkages in chunks of steps.
 
     Attributes:
-        throughput: environment-steps per second, compilation excluded.
-        compile_time: [s].
-        times: at the ends of the chunks [s].
-        violation: max |φ| over worlds and steps of each chunk [m].
-        drift: |E − E₀| / max kinetic energy at the start, median and worst.
+        throughput: environment steps (steps of single worlds) per second, without compilation.
+        compile_time: the time to compile [s].
+        times: the simulated times at the ends of the chunks, (chunks,) [s].
+        violation: for each chunk, the largest joint error |φ| over worlds and steps, (chunks,) [m].
+        drift: the median and the maximum over worlds of the relative energy drift
+            |E − E₀| / (initial kinetic energy).
     """
 
     throughput: float
@@ -51,14 +61,14 @@ class Simulation:
 
 
 _four_bars = jax.jit(jax.vmap(lambda lengths, masses: scenes.four_bar(lengths, masses)))
-"""Builds a batch; compiled once for all of a size."""
+"""Builds a batch of four-bars; compiled once for each batch size."""
 
 
-def linkages(copies: int, seed: int = 0) -> PyTree:
-    """Crank-rockers with lengths spread by 5 % and masses by 30 %, all able to turn over.
+def linkages(copies: int, seed: int = 0) -> Worlds:
+    """Returns a batch of random crank-rockers; lengths vary by ±5 % and masses by ±30 %.
 
-    With those spreads crank + ground stays below coupler + rocker and the crank the shortest rod
-    (Grashof's condition); cranks start at 10 rad/s.
+    All cranks can make full turns by Grashof's condition: the crank is the shortest rod, and
+    crank + ground is shorter than coupler + rocker. Cranks start at 10 rad/s.
     """
     keys = jax.random.split(jax.random.key(seed))
     lengths = jnp.asarray(scenes.CRANK_ROCKER)
@@ -68,15 +78,23 @@ def linkages(copies: int, seed: int = 0) -> PyTree:
     return _four_bars(lengths, masses)
 
 
-def simulate(worlds: PyTree, seconds: float, chunks: int = 50) -> Simulation:
-    """Runs every world for some simulated seconds under jit(vmap(rollout))."""
+def simulate(worlds: Worlds, seconds: float, chunks: int = 50) -> Simulation:
+    """Simulates a batch with jit(vmap(rollout)), in chunks of steps.
+
+    Args:
+        worlds: the batch of linkages.
+        seconds: the simulated time [s].
+        chunks: the number of chunks.
+    """
     systems, states = worlds
     steps = round(seconds / STEP / chunks)
 
-    def record(state: Any, info: Any) -> Array:
+    def record(state: State, info: StepInfo) -> Array:
+        """Returns the largest joint error |φ| of a step."""
         return info.violation.worst
 
-    def run(system: Any, state: Any) -> Any:
+    def run(system: System, state: State) -> tuple[State, Array]:
+        """Simulates one chunk; returns its final state and its largest joint error |φ|."""
         dt = jnp.asarray(STEP, state.q.dtype)
         final, worst = rollout(system, METHOD, state, None, dt, steps, record=record)
         return final, jnp.max(worst)
@@ -88,9 +106,9 @@ def simulate(worlds: PyTree, seconds: float, chunks: int = 50) -> Simulation:
     worst, spent = [], 0.0
     for _ in tqdm(range(chunks), desc="simulating", unit="chunk", disable=None):
         begin = time.perf_counter()
-        states, off = jax.block_until_ready(compiled(systems, states))
+        states, violation = jax.block_until_ready(compiled(systems, states))
         spent += time.perf_counter() - begin
-        worst.append(float(off.max()))
+        worst.append(float(violation.max()))
     raise_for_status(states)
     end = jax.vmap(energy)(systems, states)
     drift = jnp.abs(end.total - start.total) / start.kinetic
@@ -100,22 +118,31 @@ def simulate(worlds: PyTree, seconds: float, chunks: int = 50) -> Simulation:
     return Simulation(throughput, compile_time, times, np.array(worst), spread)
 
 
-def feedback(gains: PyTree) -> Method:
-    """The method with PID feedback of these gains, `proportional`, `derivative` and `integral`."""
+def feedback(gains: Gains) -> Method:
+    """Returns the method of the demo with PID feedback instead of the default feedback."""
     return dataclasses.replace(METHOD, stabilizer=PID(**gains))
 
 
-def default_gains(dtype: Any) -> PyTree:
-    """K_p = β² [1/s²] and K_d = 2α [1/s] of the default feedback, and K_i = 0 [1/s³]."""
+def default_gains(dtype: DType) -> Gains:
+    """Returns the PID gains that equal the default feedback.
+
+    They are K_p = β² [1/s²], K_d = 2α [1/s] and K_i = 0 [1/s³], with the default feedback
+    parameters α and β.
+    """
     alpha, beta = METHOD.integrator.default_gains(jnp.asarray(STEP, dtype))
     return {"proportional": beta**2, "derivative": 2 * alpha, "integral": 0 * alpha}
 
 
-def errors(gains: PyTree, worlds: PyTree, steps: int) -> tuple[State, Array]:
-    """The final states and φ [m] of every step, (copies, steps, rows), from consistent starts."""
+def errors(gains: Gains, worlds: Worlds, steps: int) -> tuple[State, Array]:
+    """Simulates a batch from initial states that are first made consistent with the constraints.
+
+    Returns:
+        The final states, and the joint errors φ of every step, (copies, steps, rows) [m].
+    """
     method = feedback(gains)
 
-    def run(system: Any, state: Any) -> Any:
+    def run(system: System, state: State) -> tuple[State, Array]:
+        """Simulates one world; returns its final state and the joint errors φ of every step."""
         start = init(system, method, state.q, state.v)
         dt = jnp.asarray(STEP, state.q.dtype)
         return rollout(
@@ -125,22 +152,25 @@ def errors(gains: PyTree, worlds: PyTree, steps: int) -> tuple[State, Array]:
     return jax.vmap(run)(*worlds)
 
 
-def loss(gains: PyTree, worlds: PyTree, steps: int) -> Array:
-    """log₁₀ of the root mean square of φ over rows, time and copies, () [m]."""
-    final, off = errors(gains, worlds, steps)
-    return losses.unless_failed(jnp.log10(jnp.mean(off**2)) / 2, final)
+def loss(gains: Gains, worlds: Worlds, steps: int) -> Array:
+    """Returns the tuning loss: log₁₀ of the rms joint error φ [m] over rows, steps and linkages.
+
+    The loss is NaN if any world failed.
+    """
+    final, error = errors(gains, worlds, steps)
+    return losses.unless_failed(jnp.log10(jnp.mean(error**2)) / 2, final)
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Gains before and after, by name [1/s², 1/s, 1/s³], and the way between them.
+    """The result of tuning PID gains; see `Gains` for their names and units.
 
     Attributes:
-        default: of the default feedback.
-        tuned: found from there, with an integral.
-        history: rms of φ by iteration [m].
-        before: the same by default [m].
-        copies: how many linkages the loss is a mean over.
+        default: the gains of the default feedback, by name.
+        tuned: the tuned gains, by name.
+        history: the rms joint error φ at each iteration, (iterations,) [m].
+        before: the rms joint error φ with the default gains [m].
+        copies: the number of linkages over which the loss is averaged.
     """
 
     default: dict[str, float]
@@ -150,35 +180,41 @@ class Tuning:
     copies: int
 
 
-def tune(worlds: PyTree, steps: int = 250, iterations: int = 30) -> Tuning:
-    """Tunes PID gains by gradients through the rollout, from the default and a small integral.
+def tune(worlds: Worlds, steps: int = 250, iterations: int = 30) -> Tuning:
+    """Tunes PID gains by gradients through the rollout.
 
-    The error after a step is what the step itself adds, and changes little from one to the next.
-    Proportional and derivative gains leave it as it is; an integral takes most of it away.
+    The search starts from the default gains and a small integral gain. The integrator adds nearly
+    the same joint error in every step. Proportional and derivative gains cannot remove such a
+    constant error, but an integral gain removes most of it.
+
+    Args:
+        worlds: the batch of linkages over which the loss is averaged.
+        steps: the number of steps of each rollout.
+        iterations: the number of optimizer iterations.
     """
     default = default_gains(worlds[1].q.dtype)
     start = default | {"integral": default["derivative"] ** 3 / 10}
-    own = functools.partial(loss, worlds=worlds, steps=steps)
-    found = tuning.tune(own, start, positive=True, steps=iterations)
-    before = 10 ** float(jax.jit(own)(default))
-    before_after = [{name: float(x) for name, x in g.items()} for g in (default, found.params)]
+    objective = functools.partial(loss, worlds=worlds, steps=steps)
+    result = tuning.tune(objective, start, positive=True, steps=iterations)
     return Tuning(
-        default=before_after[0],
-        tuned=before_after[1],
-        history=10.0**found.history,
-        before=before,
+        default={name: float(x) for name, x in default.items()},
+        tuned={name: float(x) for name, x in result.params.items()},
+        history=10.0**result.history,
+        before=10 ** float(jax.jit(objective)(default)),
         copies=worlds[1].status.size,
     )
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Errors with default and tuned gains on copies that were not used in tuning, (2, …) [m].
+    """The joint errors φ of linkages that were not used for tuning.
+
+    The first axis of `rms` and `worst` enumerates default gains and tuned gains.
 
     Attributes:
-        times: middles of windows [s], (windows,).
-        rms: of φ by window and copy, (2, windows, copies).
-        worst: |φ| of all, (2,).
+        times: the middles of the time windows, (windows,) [s].
+        rms: the rms of φ in each window for each linkage, (2, windows, copies) [m].
+        worst: the largest |φ| over all linkages and steps, (2,) [m].
     """
 
     times: np.ndarray
@@ -187,41 +223,57 @@ class Validation:
 
     @property
     def mean(self) -> np.ndarray:
-        """rms of φ over all copies and time, (2,)."""
+        """The rms of φ over all linkages and times, with default and tuned gains, (2,) [m]."""
         return np.sqrt(np.mean(self.rms**2, axis=(1, 2)))
 
 
-def validate(found: Tuning, worlds: PyTree, seconds: float, windows: int = 100) -> Validation:
-    """Runs fresh copies with default and tuned gains, by one compiled program."""
+def validate(gains: Tuning, worlds: Worlds, seconds: float, windows: int = 100) -> Validation:
+    """Simulates linkages with default gains and with tuned gains, by one compiled program.
+
+    Args:
+        gains: the default and the tuned gains.
+        worlds: a batch of linkages that were not used for tuning.
+        seconds: the simulated time [s].
+        windows: the number of time windows for which errors are reported.
+    """
     length = max(round(seconds / STEP / windows), 1)
     dtype = worlds[1].q.dtype
 
-    def run(gains: Any, system: Any, state: Any) -> Any:
+    def run(gains: Gains, system: System, state: State) -> tuple[State, tuple[Array, Array]]:
+        """Simulates one world; returns its final state, and the `record` of each step."""
         method = feedback(gains)
         start = init(system, method, state.q, state.v)
         dt = jnp.asarray(STEP, dtype)
 
-        def record(state: Any, info: Any) -> Any:
-            off = info.violation.position
-            return jnp.mean(off**2), jnp.max(jnp.abs(off))
+        def record(state: State, info: StepInfo) -> tuple[Array, Array]:
+            """Returns the mean φ² and the largest |φ| over the joint errors of a step."""
+            error = info.violation.position
+            return jnp.mean(error**2), jnp.max(jnp.abs(error))
 
         return rollout(system, method, start, None, dt, length * windows, record=record)
 
     compiled = jax.jit(jax.vmap(run, (None, 0, 0)))
     rms, worst = [], []
-    for gains in (found.default, found.tuned):
-        given = {name: jnp.asarray(x, dtype) for name, x in gains.items()}
-        final, (square, most) = compiled(given, *worlds)
+    for chosen in (gains.default, gains.tuned):
+        final, (square, largest) = compiled(
+            {name: jnp.asarray(x, dtype) for name, x in chosen.items()}, *worlds
+        )
         raise_for_status(final)
         square = np.asarray(square).reshape(-1, windows, length)
         rms.append(np.sqrt(square.mean(axis=2)).T)
-        worst.append(np.max(most))
+        worst.append(np.max(largest))
     times = STEP * length * (np.arange(windows) + 0.5)
     return Validation(times, np.array(rms), np.array(worst))
 
 
 def main(copies: int = 1024, seconds: float = 5.0, picture: str = "jaxcon.png") -> None:
-    """Simulates, tunes, prints and draws."""
+    """Runs the demo: simulates linkages, tunes gains, prints the results and draws a picture.
+
+    Args:
+        copies: the number of linkages.
+        seconds: the simulated time [s].
+        picture: the file name of the picture.
+    """
     worlds = linkages(copies)
     print(f"{copies} crank-rocker four-bars, closed loops, h = {STEP * 1e3:g} ms, {seconds:g} s")
     result = simulate(worlds, seconds)
@@ -229,17 +281,17 @@ def main(copies: int = 1024, seconds: float = 5.0, picture: str = "jaxcon.png") 
     print(f"  {result.throughput:,.0f} environment-steps per second")
     print(f"  worst violation {result.violation.max():.2e} m")
     print(f"  energy drift: median {result.drift[0]:.2e}, worst {result.drift[1]:.2e} (relative)")
-    found = tune(jax.tree.map(lambda x: x[:64], worlds))
-    print(f"feedback gains by gradient through 250 steps of {found.copies} linkages")
-    for label, gains in (("default", found.default), ("tuned", found.tuned)):
+    tuned = tune(jax.tree.map(lambda x: x[:64], worlds))
+    print(f"feedback gains by gradient through 250 steps of {tuned.copies} linkages")
+    for label, gains in (("default", tuned.default), ("tuned", tuned.tuned)):
         p, d, i = (gains[name] for name in ("proportional", "derivative", "integral"))
         print(f"  {label:8s} K_p {p:8.3g} 1/s²   K_d {d:6.3g} 1/s   K_i {i:8.3g} 1/s³")
-    fresh = validate(found, linkages(copies, seed=1), seconds)
+    fresh = validate(tuned, linkages(copies, seed=1), seconds)
     print(f"{copies} other linkages for {seconds:g} s")
     for label, mean, worst in zip(("default", "tuned"), fresh.mean, fresh.worst, strict=True):
         print(f"  {label:8s} joint errors {mean:.2e} m rms, {worst:.2e} m at worst")
     print(f"  the tuned gains leave {fresh.mean[0] / fresh.mean[1]:.1f} times less (rms)")
     from jaxcon import view
 
-    view.main_job(found, fresh, jax.tree.map(lambda x: x[0], worlds), STEP, picture)
+    view.main_job(tuned, fresh, jax.tree.map(lambda x: x[0], worlds), STEP, picture)
     print(f"wrote {picture}")

@@ -1,29 +1,56 @@
-"""Floor 7: pictures. matplotlib is imported inside, so that simulating needs none."""
+"""Pictures and animations of mechanisms. matplotlib is imported only when they are drawn."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.pictures import MISSING, pyplot
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
+from jaxcon.core.typing import Array
+from jaxcon.execution.rollout import rollout
+from jaxcon.methods.method import Method
+from jaxcon.system.elements import Elements
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.animation import FuncAnimation
+    from matplotlib.axes import Axes
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    from jaxcon.demo import Tuning, Validation
+    from jaxcon.protocols import Constraint
+    from jaxcon.system.body_system import BodySystem
+    from jaxcon.system.state import State
+
+__all__ = [
+    "draw",
+    "animate",
+    "links",
+    "canvas",
+]
 
 
-def canvas(width: float, height: float, dpi: float) -> Any:
-    """A canvas with a figure of its own, which needs no window and no pyplot.
+def __dir__() -> list[str]:
+    """Returns the public names."""
+    return [*__all__]
+
+
+def canvas(width: float, height: float, dpi: float) -> FigureCanvasAgg:
+    """Returns a canvas with a new figure, independent of windows and pyplot.
 
     Args:
-        width: [inch].
-        height: [inch].
+        width: width of the figure [inch].
+        height: height of the figure [inch].
         dpi: dots per inch.
 
     Raises:
-        ImportError: matplotlib is not installed; names the extra that brings it.
+        ImportError: matplotlib is not installed.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -33,22 +60,25 @@ def canvas(width: float, height: float, dpi: float) -> Any:
     return FigureCanvasAgg(Figure(figsize=(width, height), dpi=dpi))
 
 
-def links(system: Any, q: Any) -> dict[str, np.ndarray]:
-    """For each moving body the world points (n, dim) where joints and springs hold it [m].
+def links(system: BodySystem, q: Array | np.ndarray) -> dict[str, np.ndarray]:
+    """Returns the anchors of joints and springs on each moving body, by the name of the body.
 
-    Bodies held at one point only are drawn from their centre of mass.
+    If a body has fewer than two anchors, its center of mass is added as the first point.
 
     Args:
-        system: a `BodySystem`.
+        system: the system.
         q: positions, (n_q,).
+
+    Returns:
+        For each body, n points in the world frame, (n, dim) [m].
     """
-    found = _links(system, q)
-    return {name: np.asarray(found[name]) for name in system.layout.bodies}
+    points = _links(system, q)
+    return {name: np.asarray(points[name]) for name in system.layout.bodies}
 
 
 @jax.jit
-def _links(system: Any, q: Array) -> dict[str, Array]:
-    """Compiled once for all pictures of a mechanism."""
+def _links(system: BodySystem, q: Array) -> dict[str, Array]:
+    """Computes the points that `links` returns, as JAX arrays; compiled."""
     v = jnp.zeros(system.n_v, q.dtype)
     layout = system.layout
     result = {}
@@ -63,101 +93,126 @@ def _links(system: Any, q: Array) -> dict[str, Array]:
     return result
 
 
-def _anchors(group: Any, located: tuple[int, int]) -> list[Any]:
-    """Where the elements of a group hold a body, in its frame."""
-    found = []
-    for side, place in zip(("anchor_a", "anchor_b"), getattr(group, "places", ()), strict=False):
-        if place.group == located[0] and isinstance(group.params, dict) and side in group.params:
-            hits = [i for i, index in enumerate(place.indices) if index == located[1]]
-            found += [group.get(i)[side] for i in hits]
-    return found
-
-
-def draw(system: Any, q: Any, axes: Any = None, **style: Any) -> Any:
-    """Draws each body as a line through the points where it is held.
+def _anchors(group: Constraint | Elements, located: tuple[int, int]) -> list[Array]:
+    """Returns the anchors of a group of elements on one body, in the body frame, (dim,) each [m].
 
     Args:
-        system: a `BodySystem`.
+        group: a group of constraints or forces.
+        located: the index of the body's group, and the index of the body within its group.
+    """
+    if not isinstance(group, Elements) or not isinstance(group.params, dict):
+        return []
+    anchors = []
+    for side, place in zip(("anchor_a", "anchor_b"), group.places, strict=False):
+        if place.group == located[0] and side in group.params:
+            hits = [i for i, index in enumerate(place.indices) if index == located[1]]
+            anchors += [group.get(i)[side] for i in hits]
+    return anchors
+
+
+def draw(
+    system: BodySystem,
+    q: Array | np.ndarray,
+    axes: Axes | None = None,
+    **style: float | str | bool | None,
+) -> Axes:
+    """Draws each body as a line through its anchors.
+
+    A planar system is drawn in its x-y plane. A spatial system is projected onto the x-z plane.
+
+    Args:
+        system: the system.
         q: positions, (n_q,).
-        axes: matplotlib axes; new ones unless given. Scenes in space are drawn seen along y.
-        style: for the lines.
+        axes: matplotlib axes to draw in; by default, new axes.
+        style: options of `matplotlib.axes.Axes.plot`.
 
     Returns:
         The axes.
     """
-    axes = pyplot().subplots()[1] if axes is None else axes
+    if axes is None:
+        axes = cast("Axes", pyplot().subplots()[1])
     first, second = (0, 1) if system.layout.dim == 2 else (0, 2)
     for i, (name, points) in enumerate(links(system, q).items()):
-        options = {"color": f"C{i}", "marker": "o", "markersize": 3, "lw": 2, "label": name}
-        axes.plot(points[:, first], points[:, second], **(options | style))
+        options: dict[str, Any] = {"color": f"C{i}", "marker": "o", "markersize": 3, "lw": 2}
+        options |= {"label": name} | style
+        axes.plot(points[:, first], points[:, second], **options)
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]" if second == 1 else "z [m]")
     return axes
 
 
-def animate(system: Any, path: Any, interval: float, axes: Any = None, **style: Any) -> Any:
-    """Draws a motion, a frame for each row of a path, in axes that hold all of it.
+def animate(
+    system: BodySystem,
+    path: Array | np.ndarray,
+    interval: float,
+    axes: Axes | None = None,
+    **style: float | str | bool | None,
+) -> FuncAnimation:
+    """Animates a motion, with one frame for each row of a path.
 
     Args:
-        system: a `BodySystem`.
+        system: the system.
         path: positions, (frames, n_q), such as `trajectory.q` of a rollout.
         interval: time between frames [s].
-        axes: matplotlib axes, which keep their limits; new ones unless given, outside of pyplot.
-        style: for the lines.
+        axes: matplotlib axes to draw in, whose limits are not changed. By default, a new figure
+            that is independent of pyplot, with limits around the whole motion.
+        style: options of `matplotlib.axes.Axes.plot`.
 
     Returns:
-        matplotlib's `FuncAnimation`: `save("motion.gif", writer="pillow")` writes it, `to_jshtml()`
-        shows it in a notebook. Keep it until then.
+        The animation. Write it with `save("motion.gif", writer="pillow")`, or show it in a notebook
+        with `to_jshtml()`. Keep a reference to the animation until it is written or shown.
     """
     from matplotlib.animation import FuncAnimation
 
     frames = [list(links(system, q).values()) for q in path]
-    own = axes is None
-    if own:
+    shown = [0, 1 if system.layout.dim == 2 else 2]
+    if axes is None:
         figure = canvas(4.0, 3.2, 80).figure
         figure.set_layout_engine("constrained")
         axes = figure.add_subplot()
-    first = len(axes.lines)
-    draw(system, path[0], axes, **style)
-    lines, shown = axes.lines[first:], (0, 1 if system.layout.dim == 2 else 2)
-    if own:
-        _hold(axes, np.concatenate([points for frame in frames for points in frame])[:, shown])
+        draw(system, path[0], axes, **style)
+        points = np.concatenate([points for frame in frames for points in frame])[:, shown]
+        low, high = points.min(0), points.max(0)
+        edge = 0.05 * float(np.max(high - low)) + 1e-3
+        axes.set(xlim=(low[0] - edge, high[0] + edge), ylim=(low[1] - edge, high[1] + edge))
+        lines = list(axes.lines)
+    else:
+        first = len(axes.lines)
+        draw(system, path[0], axes, **style)
+        lines = axes.lines[first:]
 
-    def show(i: int) -> list[Any]:
+    def show(i: int) -> Sequence[Line2D]:
+        """Moves the lines to frame i."""
         for line, points in zip(lines, frames[i], strict=True):
             line.set_data(*points[:, shown].T)
         return lines
 
-    return FuncAnimation(axes.figure, show, len(frames), interval=1000 * interval)
-
-
-def _hold(axes: Any, points: np.ndarray) -> None:
-    """Limits around points (n, 2), a twentieth of the larger side beyond them."""
-    low, high = points.min(0), points.max(0)
-    edge = 0.05 * float(np.max(high - low)) + 1e-3
-    axes.set(xlim=(low[0] - edge, high[0] + edge), ylim=(low[1] - edge, high[1] + edge))
+    figure = cast("Figure", axes.figure)
+    return FuncAnimation(figure, show, len(frames), interval=1000 * interval)
 
 
 INK = "#22303c"
-"""Color of outlines."""
+"""The color of outlines."""
 BEFORE, AFTER = "#8a949e", "#c8501e"
-"""Colors of default and tuned gains."""
+"""The colors of results with default gains and with tuned gains."""
 NM = 1e9
-"""Nanometers in a meter."""
+"""The number of nanometers in a meter."""
 PARTS = {"crank": "#c8501e", "coupler": "#2f6f9f", "rocker": "#3f8f5f"}
-"""Colors of the links of a four-bar."""
+"""The colors of the links of a four-bar."""
 
 
-def main_job(tuning: Any, fresh: Any, world: PyTree, step: float, path: str) -> None:
-    """One picture: the mechanism through a turn, the loss, and errors of copies not tuned on.
+def main_job(
+    tuning: Tuning, fresh: Validation, world: tuple[BodySystem, State], step: float, path: str
+) -> None:
+    """Draws the picture of the demo: the mechanism, the loss, and the errors of other linkages.
 
     Args:
-        tuning: a `Tuning` of the demo.
-        fresh: a `Validation` of the demo.
-        world: a four-bar, (system, state).
-        step: h [s].
-        path: where the picture is written.
+        tuning: the result of tuning the gains.
+        fresh: the errors of linkages that were not used for tuning.
+        world: the system and initial state of one four-bar.
+        step: the step size h [s].
+        path: the file name of the picture.
     """
     plt = pyplot()
     style = {
@@ -182,8 +237,8 @@ def main_job(tuning: Any, fresh: Any, world: PyTree, step: float, path: str) -> 
         plt.close(figure)
 
 
-def _draw_turn(axes: Any, world: PyTree, step: float) -> None:
-    """A four-bar through one turn of its crank: links, pins, ground, and traces of its points."""
+def _draw_turn(axes: Axes, world: tuple[BodySystem, State], step: float) -> None:
+    """Draws a four-bar through one turn of its crank, with traces of its hinges and coupler."""
     system, state = world
     now, frames = links(system, state.q), _turn(system, state, step)
     center = frames["coupler"].mean(axis=1)
@@ -205,28 +260,32 @@ def _draw_turn(axes: Any, world: PyTree, step: float) -> None:
     axes.legend(loc="upper left")
 
 
-def _turn(system: Any, state: Any, step: float) -> dict[str, np.ndarray]:
-    """The hinges of each link from the start until its crank has turned once, (n, 2, 2) [m]."""
+def _turn(system: BodySystem, state: State, step: float) -> dict[str, np.ndarray]:
+    """Simulates one turn of the crank; returns the paths of both hinges of each link.
+
+    Returns:
+        For each link, by name, hinge positions (instant, hinge, coordinate), (n, 2, 2) [m].
+    """
     dt = jnp.asarray(step, state.q.dtype)
     run = jax.jit(lambda s: rollout(system, Method(), s, None, dt, 800, every=4)[1].q)
     q = jnp.concatenate([state.q[None], run(state)])
     frames = {k: np.asarray(x) for k, x in jax.vmap(_links, (None, 0))(system, q).items()}
-    along = frames["crank"][:, 1] - frames["crank"][:, 0]
-    angle = np.unwrap(np.arctan2(along[:, 1], along[:, 0]))
+    crank = frames["crank"][:, 1] - frames["crank"][:, 0]
+    angle = np.unwrap(np.arctan2(crank[:, 1], crank[:, 0]))
     after = np.nonzero(np.abs(angle - angle[0]) >= 2 * np.pi)[0]
     return {k: x[: after[0] + 1] if after.size else x for k, x in frames.items()}
 
 
-def _label_link(axes: Any, name: str, start: np.ndarray, end: np.ndarray) -> None:
-    """The name of a link, along it on its lower or right-hand side."""
-    along = (end - start) / np.hypot(*(end - start))
-    across = np.array([along[1], -along[0]])
+def _label_link(axes: Axes, name: str, start: np.ndarray, end: np.ndarray) -> None:
+    """Writes the name of a link beside the link, below it or to its right."""
+    direction = (end - start) / np.hypot(*(end - start))
+    across = np.array([direction[1], -direction[0]])
     across = across if across[0] > across[1] else -across
-    angle = np.degrees(np.arctan2(along[1], along[0]))
+    angle = np.degrees(np.arctan2(direction[1], direction[0]))
     axes.annotate(
         name,
-        (start + end) / 2,
-        14 * across,
+        tuple((start + end) / 2),
+        tuple(14 * across),
         textcoords="offset points",
         ha="center",
         va="center",
@@ -237,8 +296,8 @@ def _label_link(axes: Any, name: str, start: np.ndarray, end: np.ndarray) -> Non
     )
 
 
-def _draw_links(axes: Any, points: dict[str, np.ndarray], width: float, alpha: float = 1) -> None:
-    """Rods between their hinges, and the pins; thick ones with an outline."""
+def _draw_links(axes: Axes, points: dict[str, np.ndarray], width: float, alpha: float = 1) -> None:
+    """Draws each link as a rod between its hinges; opaque rods get outlines and pins."""
     solid = alpha == 1
     for name, (start, end) in points.items():
         x, y = zip(start, end, strict=True)
@@ -251,8 +310,8 @@ def _draw_links(axes: Any, points: dict[str, np.ndarray], width: float, alpha: f
         axes.plot(*pins.T, "o", ms=width - 1, mfc="white", mec=INK, mew=1.3, zorder=6)
 
 
-def _draw_ground(axes: Any, pivot: np.ndarray, size: float = 0.075) -> None:
-    """A fixed bearing: a triangle on hatched ground, its height `size` [m]."""
+def _draw_ground(axes: Axes, pivot: np.ndarray, size: float = 0.075) -> None:
+    """Draws a fixed bearing at a pivot: a triangle of height `size` [m] on hatched ground."""
     from matplotlib.patches import Polygon, Rectangle
 
     x, y = pivot
@@ -265,26 +324,26 @@ def _draw_ground(axes: Any, pivot: np.ndarray, size: float = 0.075) -> None:
     axes.plot([x - 1.2 * size, x + 1.2 * size], [y - size] * 2, color=INK, lw=1.3, zorder=3)
 
 
-def _draw_loss(axes: Any, tuning: Any) -> None:
-    """The loss of each iteration, the best so far, and that of the default gains."""
-    seen = NM * np.where(np.isfinite(tuning.history), tuning.history, np.nan)
-    best, default = np.fmin.accumulate(seen), NM * tuning.before
+def _draw_loss(axes: Axes, tuning: Tuning) -> None:
+    """Plots the loss of each iteration, the best loss so far, and the loss of the default gains."""
+    history = NM * np.where(np.isfinite(tuning.history), tuning.history, np.nan)
+    best, default = np.fmin.accumulate(history), NM * tuning.before
     label = f"default gains on these {tuning.copies}: {default:.3g} nm"
     axes.axhline(default, color=BEFORE, ls="--", lw=1.8, label=label)
-    tried = f"tried, from default + integral: {seen[0]:.3g} nm"
-    axes.plot(seen, "o", ms=4, color=AFTER, alpha=0.4, mew=0, label=tried)
+    tried = f"tried, from default + integral: {history[0]:.3g} nm"
+    axes.plot(history, "o", ms=4, color=AFTER, alpha=0.4, mew=0, label=tried)
     label = f"best so far, at last {best[-1]:.3g} nm"
     axes.step(np.arange(len(best)), best, where="post", color=AFTER, lw=2, label=label)
     title = f"Tuning: error of the {tuning.copies} linkages tuned on"
     axes.set(xlabel="iteration of tuning", title=title)
     _error_axis(axes)
-    low, high = np.nanmin(seen), max(default, np.nanmax(seen))
+    low, high = np.nanmin(history), max(default, np.nanmax(history))
     axes.set_ylim(0.9 * low, high * (high / low) ** 0.3)  # room for the legend
     axes.legend(loc="upper right")
 
 
-def _draw_errors(axes: Any, fresh: Any) -> None:
-    """The median and the middle 90 % of the copies, by time."""
+def _draw_errors(axes: Axes, fresh: Validation) -> None:
+    """Plots the joint errors over time: the median over the linkages, and the middle 90 %."""
     for rms, mean, color, label in zip(
         fresh.rms, fresh.mean, (BEFORE, AFTER), ("default", "tuned"), strict=True
     ):
@@ -301,8 +360,8 @@ def _draw_errors(axes: Any, fresh: Any) -> None:
     axes.legend(loc="upper right", title="line: median; band: 90 % of the linkages")
 
 
-def _error_axis(axes: Any) -> None:
-    """A logarithmic axis of errors [nm] with plain numbers."""
+def _error_axis(axes: Axes) -> None:
+    """Makes the y axis a logarithmic axis of errors [nm] with plain decimal tick labels."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set(yscale="log", ylabel="rms joint error φ [nm]")

@@ -1,4 +1,4 @@
-"""A function of named numbers against differences and, by world, against a loop."""
+"""Checks of the gradients of a function of named numbers, and of its batches."""
 
 import jax
 import jax.numpy as jnp
@@ -7,13 +7,13 @@ from tolerances import DIFFERENCE
 
 
 def assert_smooth_and_batched(value, numbers, step, close):
-    """Gradients are differences of fourth order, relative to the largest; worlds are a loop.
+    """Compares gradients with fourth-order differences, and a batch with a loop over its worlds.
 
     Args:
-        value: from a dict of numbers to a number.
-        numbers: where.
-        step: of the differences, relative to each number.
-        close: what a batch may be off by, relative.
+        value: function from a dict of numbers to a number.
+        numbers: the point at which derivatives are taken.
+        step: step of the differences, relative to each number.
+        close: relative tolerance of the batch.
     """
     x = {key: jnp.asarray(number) for key, number in numbers.items()}
     run, gradient = jax.jit(value), jax.jit(jax.grad(value))(x)
@@ -29,13 +29,15 @@ def assert_smooth_and_batched(value, numbers, step, close):
 
 
 def assert_batched_either_way(value, shared, own, close):
-    """Gradients by what worlds share, inside of their batch and outside; returns those of a loop.
+    """Checks gradients by shared numbers, taken inside and outside a batch.
+
+    Returns those of a loop.
 
     Args:
-        value: from (shared, of one world) to a number.
-        shared: what worlds share.
-        own: of each world, by first axis.
-        close: what they may be off by, relative.
+        value: function (shared, own of one world) → number.
+        shared: the numbers that all worlds share.
+        own: the numbers of each world, along the first axis.
+        close: relative tolerance.
     """
     alone = np.array([jax.jit(jax.grad(value))(shared, x) for x in own])
     together = jax.jit(jax.vmap(jax.grad(value), (None, 0)))(shared, own)

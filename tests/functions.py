@@ -1,7 +1,7 @@
-"""Functions of arrays (4, n) as users write them in forces and constraints, for the compiler.
+"""Functions of arrays (4, n), as users write them in forces and constraints, to test compilation.
 
-Each is there because a kernel that XLA forms of it could leave an argument unread, hold an
-operation that it must not hold, or lose or confuse a value.
+Each function tests one error that a fused kernel could make: an argument left unread, an operation
+that must not be in a kernel, or a value lost or confused with another.
 """
 
 import jax
@@ -12,7 +12,7 @@ NEAR = (np.asarray(0.123456789), np.asarray(0.1234567891))
 
 
 def chain_of_shared_values(x, y):
-    """Each value is needed twice by the next: 2⁴⁰ operations if none is stored."""
+    """Each value is used twice by the next: without sharing, that makes 2⁴⁰ operations."""
     a, b = x, y
     for _ in range(40):
         a, b = 0.5 * (a * b + a), 0.5 * (a * b - b)
@@ -64,7 +64,7 @@ def loops_with_branches(x, y):
 
 
 def loops_in_branches(x, y):
-    """The first branch for the x and y of the tests, the second one for −x."""
+    """The inputs x and y of the tests take the first branch, and −x takes the second."""
 
     def turned(z):
         return jax.lax.fori_loop(0, 5, lambda i, a: jnp.sin(a) * 1.1 - jnp.cos(a * 0.3), z)
@@ -179,4 +179,4 @@ WIDE = [
     joined_and_cut_again,
     padded_and_cropped,
 ]
-"""The functions to be tried on arrays that are large enough for XLA to split among threads."""
+"""Functions tested on arrays so large that XLA splits them among threads."""

@@ -1,6 +1,6 @@
-"""Runs in a process of its own, with two devices: worlds inside `shard_map` and on explicit meshes.
+"""Runs on two devices in a separate process: worlds inside `shard_map` and on explicit meshes.
 
-What is found there must be what one device finds, with JAX's default checks of types.
+The results must equal those of one device, with JAX's default type checks.
 """
 
 import sys
@@ -15,8 +15,11 @@ import jaxcon as jc
 from benchmarks import devices
 
 SCENES = {
-    "turns": (lambda: scenes.arm(jc.JointSpring("spring", "hinge", 2.0), dim=3), jc.Sparse()),
-    "stop": (lambda: scenes.arm(jc.Limit("stop", "hinge", -0.1, 0.02)), jc.RankSafe()),
+    "turns": (
+        lambda: scenes.arm(jc.forces.JointSpring("spring", "hinge", 2.0), dim=3),
+        jc.solvers.Sparse(),
+    ),
+    "stop": (lambda: scenes.arm(jc.Limit("stop", "hinge", -0.1, 0.02)), jc.solvers.RankSafe()),
 }
 
 
@@ -56,7 +59,7 @@ def check(name):
     inside = jax.shard_map(jax.grad(summed, has_aux=True), out_specs=(whole, laid), **parts)
     compiled = jax.jit(inside).lower(1.0, worlds).compile()
     same(compiled(1.0, worlds), (slope, expected))
-    if name == "turns":  # devices add up once, at the end, and never wait for each other before
+    if name == "turns":  # the only communication is one sum at the end
         assert devices.exchanges(compiled.as_text()) == {"all-reduce": 1}
         mapped = jax.shard_map(run, out_specs=laid, **parts)
         same(jax.jit(jax.grad(lambda x: jnp.sum(mapped(x, worlds).q)))(1.0), slope)

@@ -1,8 +1,8 @@
-"""The scenes of the product tests: one table of joints, three places in which each is put.
+"""The scenes of the tests: one table of joints, each joint built in three topologies.
 
-A row says how a joint is made between two bodies; every test that runs over `NAMES` then covers it
-in the plane and in space, on a tree, between moving bodies and closing a loop. The joints of one
-place share a scene, each with bodies of its own, so that one compilation serves all of them;
+An entry of the table says how to make a joint between two bodies. Every test over `NAMES` then
+covers it in the plane and in space, on a tree, between moving bodies and closing a loop. The
+joints of one topology share a scene, each with bodies of its own, so that they compile together.
 `build("revolute-3d-loop")` is the scene of one joint alone.
 """
 
@@ -24,12 +24,12 @@ from jaxcon.constraints.curves import Curves
 from jaxcon.constraints.rows import linearize
 
 linearized = jax.jit(linearize)
-"""The rows of a scene at a state, by the program that was compiled when the scene was made."""
+"""Linearizes the rows of a scene at a state; compiled once for each scene."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """Where a joint is to be made: between which bodies, at which point, along which axis."""
+    """The place of a joint: its two bodies, a point and an axis."""
 
     a: str
     b: str
@@ -39,24 +39,24 @@ class Site:
     other: np.ndarray
     """A second point, for joints that have two."""
     suffix: str = ""
-    """The suffix of the names of the elements."""
+    """The suffix of the element names."""
 
     @property
     def joint(self) -> tuple[str, str, str]:
-        """The name of the joint and of its bodies."""
+        """The names of the joint and of its two bodies."""
         return ("joint" + self.suffix, self.a, self.b)
 
 
 @dataclass(frozen=True)
 class Joint:
-    """One row of the table.
+    """One entry of the table of joints.
 
     Attributes:
-        make: elements that make the joint, the joint itself called "joint", a drive "drive".
-        parameter: element and field of a number to differentiate by.
-        dims: dimensions in which it exists.
-        held: how many of the rows of "joint" have a φ, in the plane and in space; these come first.
-            All have where it is None.
+        make: returns the elements of the joint; the joint is called "joint", a drive "drive".
+        parameter: the element and the field that tests differentiate by.
+        dims: the dimensions in which the joint exists.
+        held: the number of rows of "joint" that have a φ, in the plane and in space; these come
+            first. None if all rows have one.
     """
 
     make: Callable[[Site], list[Any]]
@@ -66,7 +66,7 @@ class Joint:
 
 
 def coincident(s: Site) -> list[Any]:
-    return [jc.Coincident(*s.joint, point=s.point)]
+    return [jc.joints.Coincident(*s.joint, point=s.point)]
 
 
 def spherical(s: Site) -> list[Any]:
@@ -88,39 +88,41 @@ def prismatic(s: Site) -> list[Any]:
 
 def universal(s: Site) -> list[Any]:
     across = np.cross(s.axis, s.other)
-    return [jc.Universal(*s.joint, point=s.point, axis_a=s.axis, axis_b=across)]
+    return [jc.joints.Universal(*s.joint, point=s.point, axis_a=s.axis, axis_b=across)]
 
 
 def cylindrical(s: Site) -> list[Any]:
-    return [jc.Cylindrical(*s.joint, axis=s.axis, point=s.point)]
+    return [jc.joints.Cylindrical(*s.joint, axis=s.axis, point=s.point)]
 
 
 def screw(s: Site) -> list[Any]:
-    return [jc.Screw(*s.joint, axis=s.axis, point=s.point, lead=0.7)]
+    return [jc.joints.Screw(*s.joint, axis=s.axis, point=s.point, lead=0.7)]
 
 
 def planar(s: Site) -> list[Any]:
-    return [jc.Planar(*s.joint, axis=s.axis, point=s.point)]
+    return [jc.joints.Planar(*s.joint, axis=s.axis, point=s.point)]
 
 
 def parallel(s: Site) -> list[Any]:
-    return [jc.Parallel(*s.joint, axis=s.axis)]
+    return [jc.joints.Parallel(*s.joint, axis=s.axis)]
 
 
 def constant_velocity(s: Site) -> list[Any]:
-    return [jc.ConstantVelocity(*s.joint, point=s.point, axis=s.axis, axis_b=s.axis + s.other)]
+    return [
+        jc.joints.ConstantVelocity(*s.joint, point=s.point, axis=s.axis, axis_b=s.axis + s.other)
+    ]
 
 
 def point_on_line(s: Site) -> list[Any]:
-    return [jc.PointOnLine(*s.joint, axis=s.axis, point=s.point)]
+    return [jc.joints.PointOnLine(*s.joint, axis=s.axis, point=s.point)]
 
 
 def point_on_plane(s: Site) -> list[Any]:
-    return [jc.PointOnPlane(*s.joint, axis=s.axis, point=s.point)]
+    return [jc.joints.PointOnPlane(*s.joint, axis=s.axis, point=s.point)]
 
 
 def bend(x: Any, p: Any) -> Any:
-    """A parabola through a point of a, twisted out of its plane in space."""
+    """Returns φ of a parabola through a point of body a, twisted out of its plane in space."""
     y = x - p["start"]
     rows = [y[1] + p["curvature"] * y[0] ** 2 + 0.3 * y[0] * y[1]]
     if len(x) == 3:
@@ -129,17 +131,17 @@ def bend(x: Any, p: Any) -> Any:
 
 
 def point_on_curve(s: Site) -> list[Any]:
-    params = {"start": np.zeros(s.dim), "curvature": 0.7}  # the start: see start_curves
-    return [jc.PointOnCurve(*s.joint, bend, point=s.point, params=params)]
+    params = {"start": np.zeros(s.dim), "curvature": 0.7}  # start_curves replaces the start
+    return [jc.joints.PointOnCurve(*s.joint, bend, point=s.point, params=params)]
 
 
 def spherical_spherical(s: Site) -> list[Any]:
-    return [jc.SphericalSpherical(*s.joint, point_a=s.point, point_b=s.other)]
+    return [jc.joints.SphericalSpherical(*s.joint, point_a=s.point, point_b=s.other)]
 
 
 def revolute_spherical(s: Site) -> list[Any]:
     across = np.cross(s.axis, s.other - s.point)
-    return [jc.RevoluteSpherical(*s.joint, hinge=s.point, ball=s.other, axis=across)]
+    return [jc.joints.RevoluteSpherical(*s.joint, hinge=s.point, ball=s.other, axis=across)]
 
 
 def fixed(s: Site) -> list[Any]:
@@ -154,13 +156,13 @@ WAVE = {"size": 0.4, "frequency": 3.0}
 
 
 def drive(s: Site) -> Any:
-    return jc.Drive("drive" + s.suffix, s.joint[0], wave, params=WAVE)
+    return jc.joints.Drive("drive" + s.suffix, s.joint[0], wave, params=WAVE)
 
 
 def driven(
     make: Callable[[Site], list[Any]], coordinate: str | None = None
 ) -> Callable[[Site], list[Any]]:
-    """A joint with one of its coordinates driven."""
+    """Returns a function that makes a joint and drives one of its coordinates."""
 
     def elements(s: Site) -> list[Any]:
         one = dataclasses.replace(drive(s), coordinate=coordinate)
@@ -170,96 +172,98 @@ def driven(
 
 
 def pulley(s: Site) -> list[Any]:
-    """A rope from a point of a through one of b and back."""
+    """A rope from a point of body a to a point of body b and back."""
     spans = [
-        jc.Span(name + s.suffix, s.a, s.b, start, end)
+        jc.joints.Span(name + s.suffix, s.a, s.b, start, end)
         for name, start, end in (("there", s.point, s.other), ("back", s.other, s.other + s.axis))
     ]
     names = [span.name for span in spans]
-    return [*spans, jc.Pulley(s.joint[0], *names, parts=2.0)]
+    return [*spans, jc.joints.Pulley(s.joint[0], *names, parts=2.0)]
 
 
 def cam(s: Site) -> list[Any]:
-    """The distance of two points as a polynomial of the angle of a hinge."""
+    """A coupling: the distance of two points is a polynomial of a hinge angle."""
     axis = None if s.dim == 2 else s.axis
     hinge = jc.Revolute("hinge" + s.suffix, s.a, s.b, point=s.point, axis=axis)
-    reach = jc.Span("reach" + s.suffix, s.a, s.b, s.other, s.point + s.other)
+    reach = jc.joints.Span("reach" + s.suffix, s.a, s.b, s.other, s.point + s.other)
     shape = (0.0, 0.3, -0.2, 0.1)
-    return [hinge, reach, jc.PolynomialCoupling(s.joint[0], hinge.name, reach.name, shape)]
+    return [hinge, reach, jc.joints.PolynomialCoupling(s.joint[0], hinge.name, reach.name, shape)]
 
 
 def telescope(s: Site) -> list[Any]:
-    """Two slides and two hinges, none perpendicular to another, with three of them prescribed."""
+    """Two oblique slides and two oblique hinges; two couplings relate them in pairs."""
     axes = np.array([s.axis, s.other + s.axis, np.cross(s.axis, s.other) + 0.3 * s.axis])
     name, a, b = s.joint
-    arm = jc.Compound(name, a, b, s.point, slides=(*axes[:2],), hinges=(*axes[1:],))
+    arm = jc.joints.Compound(name, a, b, s.point, slides=(*axes[:2],), hinges=(*axes[1:],))
     shape = (0.0, 0.3, -0.2, 0.1)
     cams = [
-        jc.PolynomialCoupling(cam + s.suffix, name, name, shape, *coordinates)
+        jc.joints.PolynomialCoupling(cam + s.suffix, name, name, shape, *coordinates)
         for cam, *coordinates in (("cam", "angle_1", "travel_2"), ("rise", "travel_1", "angle_2"))
     ]
     return [arm, *cams]
 
 
 def gimbal(s: Site) -> list[Any]:
-    """A slide and three oblique hinges, each turned by the next."""
+    """A slide and three oblique hinges; two couplings relate the hinge angles."""
     axes = np.array([s.axis, np.cross(s.axis, s.other) + 0.2 * s.axis, s.other])
     name, a, b = s.joint
-    arm = jc.Compound(name, a, b, s.point, slides=(s.other,), hinges=(*axes,))
+    arm = jc.joints.Compound(name, a, b, s.point, slides=(s.other,), hinges=(*axes,))
     shape = (0.0, 0.3, -0.2, 0.1)
     turns = ("angle_1", "angle_2"), ("angle_2", "angle_3")
     cams = [
-        jc.PolynomialCoupling(cam + s.suffix, name, name, shape, *pair)
+        jc.joints.PolynomialCoupling(cam + s.suffix, name, name, shape, *pair)
         for cam, pair in zip(("outer", "inner"), turns, strict=True)
     ]
     return [arm, *cams]
 
 
 def breathing(a: Any, b: Any, t: Any, p: Any) -> Any:
-    """A point of b stays at a distance from the centre of a that varies in time."""
+    """Returns φ of a time-dependent distance between a point of b and the center of a."""
     gap = b.point(p["anchor"]) - a.position
     return (gap @ gap - p["square"] * (1 + 0.2 * jnp.sin(2 * t)))[None]
 
 
 def holonomic(s: Site) -> list[Any]:
-    params = {"anchor": np.full(s.dim, 0.3), "square": 1.0}  # the square: see start_breathing
-    return [jc.Holonomic(breathing, bodies=(s.a, s.b), name=s.joint[0], params=params)]
+    params = {"anchor": np.full(s.dim, 0.3), "square": 1.0}  # start_breathing replaces the square
+    return [jc.joints.Holonomic(breathing, bodies=(s.a, s.b), name=s.joint[0], params=params)]
 
 
 def skate(a: Any, b: Any, t: Any, p: Any) -> Any:
-    """A point of b moves across a direction of a as a wave in time says."""
+    """Returns φ̇ of a constraint that gives a point of b a speed along a direction of a."""
     speed = b.point_velocity(p["anchor"]) - a.velocity
     return (a.direction(p["edge"]) @ speed - 0.2 * jnp.sin(3 * t))[None]
 
 
 def velocity_level(s: Site) -> list[Any]:
     params = {"anchor": np.full(s.dim, 0.3), "edge": np.arange(1.0, s.dim + 1)}
-    return [jc.VelocityLevel(skate, bodies=(s.a, s.b), name=s.joint[0], params=params)]
+    return [jc.joints.VelocityLevel(skate, bodies=(s.a, s.b), name=s.joint[0], params=params)]
 
 
 def rolling_sphere(s: Site) -> list[Any]:
-    return [jc.RollingSphere(*s.joint, radius=0.4, normal=s.axis, center=s.point)]
+    return [jc.joints.RollingSphere(*s.joint, radius=0.4, normal=s.axis, center=s.point)]
 
 
 def rolling_cylinder(s: Site) -> list[Any]:
     along = np.cross(s.axis, s.other)
-    return [jc.RollingCylinder(*s.joint, radius=0.4, axis=along, normal=s.axis, center=s.point)]
+    return [
+        jc.joints.RollingCylinder(*s.joint, radius=0.4, axis=along, normal=s.axis, center=s.point)
+    ]
 
 
 def rolling_disc(s: Site) -> list[Any]:
     axis = None if s.dim == 2 else s.other
-    return [jc.RollingDisc(*s.joint, radius=0.4, axis=axis, normal=s.axis, center=s.point)]
+    return [jc.joints.RollingDisc(*s.joint, radius=0.4, axis=axis, normal=s.axis, center=s.point)]
 
 
 def knife_edge(s: Site) -> list[Any]:
     ice = None if s.dim == 2 else s.axis
-    return [jc.KnifeEdge(*s.joint, edge=s.other, normal=ice, center=s.point)]
+    return [jc.joints.KnifeEdge(*s.joint, edge=s.other, normal=ice, center=s.point)]
 
 
 def momentum(s: Site) -> list[Any]:
     bodies = tuple(name for name in (s.a, s.b) if name != jc.WORLD)
     value = 0.3 if s.dim == 2 else 0.1 * s.axis
-    return [jc.AngularMomentum(s.joint[0], bodies, value)]
+    return [jc.joints.AngularMomentum(s.joint[0], bodies, value)]
 
 
 JOINTS = {
@@ -303,11 +307,14 @@ CORE = (
     *("coincident", "distance", "revolute", "prismatic", "universal", "fixed"),
     *("driven_revolute", "pulley", "rolling_disc", "gimbal", "holonomic", "velocity_level"),
 )
-"""Joints of every kind of row, for tests in which compiling all of them would take minutes."""
+"""Joints that cover every kind of row, for tests where compiling all would take minutes."""
 PARTS = {2: 2, 3: 5}
-"""Scenes among which the joints of one place are shared out: compiling grows faster than they."""
+"""The number of scenes that share the joints of a topology, by dimension.
+
+Compile time grows faster than the number of joints in a scene.
+"""
 CORE_PARTS = {2: 1, 3: 3}
-"""Scenes among which those of the core are shared out."""
+"""The number of scenes that share the core joints of a topology, by dimension."""
 TOPOLOGIES = ("tree", "between", "loop")
 
 
@@ -316,11 +323,11 @@ class Built:
     """A scene, ready to run.
 
     Attributes:
-        system: what `build` gave.
-        state: on the constraints, moving, at time 0.
-        off: off the constraints in position and velocity, at another time.
-        parameters: elements and fields to differentiate by.
-        velocity_level: constraints with rows that have no φ, and how many rows before them do.
+        system: the system that `build` returned.
+        state: a moving state at time 0 that satisfies the constraints.
+        off: a state at another time that violates the constraints in position and velocity.
+        parameters: elements and fields that tests differentiate by.
+        velocity_level: constraints with rows that have no φ, each with its number of rows with φ.
     """
 
     system: Any
@@ -331,7 +338,7 @@ class Built:
 
 
 def joints_scene(kinds: tuple[str, ...], dim: int, topology: str, dtype: Any) -> Built:
-    """Joints of the table, each to the world, between two bodies, or closing a loop of them."""
+    """Builds a scene of joints of the table, all in one topology."""
     random = seeded(kinds, dim, topology)
     scene = jc.Scene(dim=dim, dtype=dtype)
     parameters: list[tuple[str, str]] = []
@@ -351,7 +358,7 @@ def joints_scene(kinds: tuple[str, ...], dim: int, topology: str, dtype: Any) ->
 
 
 def add_joint(scene: jc.Scene, kind: str, topology: str, suffix: str, random: Any) -> None:
-    """Bodies at random places and the joint between them."""
+    """Adds bodies at random places and the joint between them."""
     first, second = "first" + suffix, "second" + suffix
     for name in (first,) if topology == "tree" else (first, second):
         add_random_body(scene, name, random)
@@ -368,12 +375,12 @@ def add_joint(scene: jc.Scene, kind: str, topology: str, suffix: str, random: An
 
 
 def near(place: tuple[float, float], random: Any, dim: int) -> np.ndarray:
-    """A random point near a place of the plane."""
+    """Returns a random point near a point of the plane."""
     return np.pad(place, (0, dim - 2)) + 0.2 * random.normal(size=dim)
 
 
 def start_breathing(system: Any, state: jc.State) -> Any:
-    """Returns the system with the squares of the user's distances as they are at assembly."""
+    """Returns the system with each squared `breathing` distance as it is at assembly."""
     changes = {}
     for group in system.constraints:
         if getattr(getattr(group, "law", None), "function", None) is breathing:
@@ -385,7 +392,7 @@ def start_breathing(system: Any, state: jc.State) -> Any:
 
 
 def start_curves(system: Any, state: jc.State) -> Any:
-    """Returns the system with curves that run through their points at assembly."""
+    """Returns the system with curves that pass through their points at assembly."""
     snapshot = system.snapshot(state.q, state.v, state.time)
     changes = {}
     for group in system.constraints:
@@ -396,7 +403,10 @@ def start_curves(system: Any, state: jc.State) -> Any:
 
 
 def add_random_body(scene: jc.Scene, name: str, random: Any) -> None:
-    """A body somewhere; a "second" has its centre of mass and principal axes off its frame."""
+    """Adds a randomly placed body.
+
+    A "second" body has its center of mass and its principal axes off its frame.
+    """
     dim = scene.dim
     place = (1.5, 0.5) if name.startswith("second") else (0.1, -0.1)
     motion: dict[str, Any] = {"position": near(place, random, dim)}
@@ -418,7 +428,7 @@ def add_random_body(scene: jc.Scene, name: str, random: Any) -> None:
 
 
 def mixed_scene(dim: int, dtype: Any) -> Built:
-    """Particles and rigid bodies together, every kind of constraint that a particle may have."""
+    """Builds particles and rigid bodies with every constraint that a particle may have."""
     random = seeded("mixed", dim)
     scene = jc.Scene(dim=dim, dtype=dtype)
     add_random_body(scene, "first", random)
@@ -428,21 +438,21 @@ def mixed_scene(dim: int, dtype: Any) -> Built:
         scene.add_particle(name, mass=random.uniform(0.5, 2.0), position=place)
     axis = None if dim == 2 else (0.0, 1.0, 1.0)
     scene.add(jc.Revolute("hinge", jc.WORLD, "first", point=random.normal(size=dim), axis=axis))
-    scene.add(jc.Coincident("pin", "first", "bead", point=places[0]))
+    scene.add(jc.joints.Coincident("pin", "first", "bead", point=places[0]))
     scene.add(jc.Distance("rod", "bead", "bob"))
     scene.add(jc.Distance("bar", "second", "bob", point_a=random.normal(size=dim)))
     scene.add(jc.Distance("string", jc.WORLD, "mate", point_a=random.normal(size=dim)))
     edge = {"anchor": np.zeros(dim), "edge": np.arange(1.0, dim + 1)}
-    scene.add(jc.VelocityLevel(skate, bodies=("mate", "second"), name="skate", params=edge))
+    scene.add(jc.joints.VelocityLevel(skate, bodies=("mate", "second"), name="skate", params=edge))
     scene.add(jc.Spring("spring", "free", "bob", stiffness=3.0, damping=0.2, rest_length=0.5))
-    scene.add(jc.ExternalWrench("push", "second"))
+    scene.add(jc.forces.ExternalWrench("push", "second"))
     system, state = scene.build()
     parameters = (("rod", "length"), ("bob", "mass"), ("spring", "stiffness"))
     return finish(system, state, random, parameters, (("skate", 0),))
 
 
 def arm(*elements: Any, dim: int = 2) -> tuple[Any, jc.State]:
-    """A body on a hinge, and more elements."""
+    """Builds a body on a hinge, with more elements if given."""
     scene = jc.Scene(dim=dim)
     place = np.eye(dim)[0]
     inertia = 0.1 if dim == 2 else (0.1, 0.2, 0.3)
@@ -455,7 +465,10 @@ def arm(*elements: Any, dim: int = 2) -> tuple[Any, jc.State]:
 
 
 def hanging(dtype: Any = None, steps: int = 60) -> Any:
-    """A bob on a rod and a spring: its height by stiffness and damping, every 10 ms for 0.6 s."""
+    """Returns a function: (stiffness, damping) → height of a bob on a rod and a spring.
+
+    The heights are recorded every 10 ms for 0.6 s.
+    """
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -466,7 +479,7 @@ def hanging(dtype: Any = None, steps: int = 60) -> Any:
     def height(p: Any) -> jax.Array:
         own, record = system.with_params({"spring": p}), lambda s, i: s.q[1]
         last, y = jc.rollout(own, jc.Method(), state, None, 1e-2, steps, record=record)
-        return jc.losses.unless_failed(y, last)
+        return jc.learning.losses.unless_failed(y, last)
 
     return height
 
@@ -496,7 +509,7 @@ def polar_scene(dtype: Any) -> Built:
         mass=polar_mass,
         force=polar_force,
         potential=polar_potential,
-        constraints=(jc.Holonomic(polar_rod, name="rod"),),
+        constraints=(jc.joints.Holonomic(polar_rod, name="rod"),),
         params={name: jnp.asarray(x, dtype) for name, x in params.items()},
     )
     state = jc.init(system, jc.Method(), jnp.asarray([1.2, 0.7], dtype), np.zeros(2))
@@ -518,11 +531,11 @@ def arm_speed(q: Any, v: Any, t: Any, p: Any) -> Any:
 
 
 def arm_scene(dtype: Any) -> Built:
-    """Two links by their angles: a full mass matrix, and a constraint on the velocity."""
+    """Two links described by their angles: a full mass matrix and a velocity constraint."""
     system = jc.GeneralizedSystem(
         mass=arm_mass,
         force=arm_force,
-        constraints=(jc.VelocityLevel(arm_speed, name="speed"),),
+        constraints=(jc.joints.VelocityLevel(arm_speed, name="speed"),),
         params={"moment": jnp.asarray(1.3, dtype), "coupling": jnp.asarray(0.7, dtype)},
     )
     state = jc.init(system, jc.Method(), jnp.asarray([0.4, -0.9], dtype), np.zeros(2))
@@ -538,24 +551,24 @@ OTHERS = {
 
 
 def parts(dim: int, topology: str) -> tuple[str, ...]:
-    """The scenes that together hold every joint in this place."""
+    """The names of the scenes that together contain every joint in this topology."""
     return tuple(f"part{i}-{dim}d-{topology}" for i in range(PARTS[dim]))
 
 
 def core(dim: int, topology: str) -> tuple[str, ...]:
-    """The scenes that together hold the joints of the core in this place."""
+    """The names of the scenes that together contain the core joints in this topology."""
     return tuple(f"core{i}-{dim}d-{topology}" for i in range(CORE_PARTS[dim]))
 
 
 ALL = tuple(name for dim in PARTS for topology in TOPOLOGIES for name in parts(dim, topology))
-"""Scenes that together hold every joint in every place."""
+"""The scenes that together contain every joint in every topology."""
 NAMES = (*ALL, *OTHERS)
 SELECTED = (*parts(2, "loop"), *core(3, "loop"), *OTHERS)
-"""Scenes that together hold every kind of row, in the plane and in space."""
+"""The scenes that together contain every kind of row, in the plane and in space."""
 
 
 def names(*topologies: str) -> tuple[str, ...]:
-    """The scene of each joint alone, in these places."""
+    """The names of the scenes of single joints in these topologies."""
     return tuple(
         f"{kind}-{dim}d-{topology}"
         for kind, joint in JOINTS.items()
@@ -566,7 +579,7 @@ def names(*topologies: str) -> tuple[str, ...]:
 
 @functools.cache
 def build(name: str, dtype: str = "float64") -> Built:
-    """The scene of this name."""
+    """Builds the scene of this name."""
     if name in OTHERS:
         return OTHERS[name](jnp.dtype(dtype))
     kind, place, topology = name.split("-")
@@ -575,7 +588,7 @@ def build(name: str, dtype: str = "float64") -> Built:
 
 
 def kinds_of(kind: str, dim: int) -> tuple[str, ...]:
-    """The joints of a scene: one, a part of the core, or a part of all."""
+    """Returns the joints of a scene: one joint, a share of the core, or a share of all joints."""
     if kind in JOINTS:
         return (kind,)
     table, count = (CORE, CORE_PARTS) if kind.startswith("core") else (JOINTS, PARTS)
@@ -586,7 +599,7 @@ def kinds_of(kind: str, dim: int) -> tuple[str, ...]:
 def finish(
     system: Any, state: jc.State, random: Any, parameters: Any = (), velocity_level: Any = ()
 ) -> Built:
-    """Adds velocities that the constraints allow, and a state off the constraints."""
+    """Adds velocities that satisfy the constraints, and a second state that violates them."""
     dtype = state.q.dtype
     v = jnp.asarray(random.normal(size=state.v.shape), dtype)
     step = jnp.asarray(0.1 * random.normal(size=state.v.shape), dtype)
@@ -598,7 +611,7 @@ def finish(
 
 
 def allowed(system: Any, state: jc.State, v: jax.Array) -> jax.Array:
-    """The velocities nearest to v, in the metric of M, that the constraints allow."""
+    """Returns the velocities nearest to v, in the metric of M, that satisfy the constraints."""
     rows = linearized(system, state.q, v, state.time)
     j = np.asarray(rows.jacobian.dense(), np.float64)
     lift = np.linalg.solve(np.asarray(system.mass(state.q).dense(), np.float64), j.T)
@@ -607,5 +620,5 @@ def allowed(system: Any, state: jc.State, v: jax.Array) -> jax.Array:
 
 
 def seeded(*key: Any) -> np.random.Generator:
-    """Random numbers that depend on the key alone."""
+    """Returns a random generator whose seed depends on the key alone."""
     return np.random.default_rng(zlib.crc32(repr(key).encode()))

@@ -1,4 +1,4 @@
-"""Assembly against closed forms, its derivative against differences, and what cannot be closed."""
+"""Assembly: closed forms, derivatives, and mechanisms that cannot be closed."""
 
 import dataclasses
 
@@ -71,14 +71,17 @@ def generalized(length=1.2):
     return jc.GeneralizedSystem(
         mass=polar_mass,
         force=no_force,
-        constraints=(jc.Holonomic(polar, name="rod"),),
+        constraints=(jc.joints.Holonomic(polar, name="rod"),),
         params={"length": jnp.asarray(length)},
     )
 
 
 @pytest.mark.parametrize("place", [(3.0, 4.0), (0.03, 0.04)])
 def test_nearest_point_of_a_circle(place):
-    """It lies on the same radius, however far the start is; v loses what is along the rod."""
+    """The result lies on the same radius, however far the start.
+
+    The velocity v loses its component along the rod.
+    """
     system, state = bead(place)
     found = jc.assemble(system, state)
     np.testing.assert_allclose(found.q, (0.6, 0.8), atol=IDENTITY)
@@ -116,7 +119,7 @@ def test_what_is_held_does_not_move(hold):
 
 
 def test_four_bar_from_rough_angles():
-    """The crank is held, the rest follows, at the velocities of the closed form."""
+    """The crank is held; the other bodies take the positions and velocities of the closed form."""
     system, _ = four_bar()
     at = lambda x: four_bar_poses(jnp.asarray(CRANK_ROCKER), x).T.ravel()  # noqa: E731
     for angle in (0.4, 2.0):
@@ -131,7 +134,7 @@ def test_four_bar_from_rough_angles():
 
 
 def test_a_linkage_drawn_as_nothing_at_all():
-    """All at one place: stationary by symmetry, and still a way out is found."""
+    """Assembly converges even from all bodies at one place, a stationary point by symmetry."""
     system, _ = four_bar()
     found = jc.assemble(system, np.zeros(9))
     assert found.converged
@@ -139,7 +142,7 @@ def test_a_linkage_drawn_as_nothing_at_all():
 
 
 def test_it_is_the_nearest():
-    """d is normal to the constraints in the metric of M, and no neighbour on them is nearer."""
+    """The displacement d is M-orthogonal to the constraints; no neighbor on them is nearer."""
     system, state = four_bar()
     rough = state.q + 0.3 * np.random.default_rng(3).normal(size=9)
     mass = system.mass(state.q).values
@@ -175,7 +178,7 @@ def test_a_consistent_state_stays():
 
 
 def test_generalized_coordinates():
-    """The nearest point of a line under a full mass matrix, by its own closed form."""
+    """The nearest point of a line under a full mass matrix, compared with its closed form."""
     system = generalized()
     q = jnp.asarray([1.0, 0.3])
     found = jc.assemble(system, q, np.array([1.0, 2.0]))
@@ -189,7 +192,7 @@ def test_generalized_coordinates():
 
 
 def test_time_and_velocity_level_rows():
-    """A driven joint is where its motion is at t, at its rate, and ψ vanishes."""
+    """A driven joint takes its prescribed position and rate at t, and ψ vanishes."""
     built = scenes.build("driven_revolute-2d-tree")
     wave, time = scenes.WAVE, 0.3
     found = jc.assemble(built.system, built.state, time=time)
@@ -243,7 +246,7 @@ def test_the_derivative_beside_redundant_rows():
 
 
 def test_second_derivatives():
-    """The nearest point of a circle of radius r: q = r n, so ∂q/∂q₀ = r (1 − n nᵀ)/‖q₀‖."""
+    """The nearest point of a circle of radius r is q = r n, hence ∂q/∂q₀ = r (1 − n nᵀ)/‖q₀‖."""
     system, state = bead((3.0, 4.0))
     hessian = jax.jit(jax.jacfwd(jax.jacrev(lambda q: jc.assemble(system, q).q)))(state.q)
     expected = jax.jacfwd(jax.jacrev(lambda q: q / jnp.sqrt(q @ q)))(state.q)
@@ -262,7 +265,7 @@ def test_a_world_that_cannot_be_assembled_leaves_the_others_alone():
         return jnp.sum(found.q**2), found
 
     run = jax.jit(jax.vmap(jax.grad(total, has_aux=True)))
-    slopes, batch = run(jnp.asarray([3.0, 7.0, 2.5]))  # 7 > 4 + 1 + 1: it cannot reach
+    slopes, batch = run(jnp.asarray([3.0, 7.0, 2.5]))  # 7 > 4 + 1 + 1: impossible
     healthy, _ = run(jnp.asarray([3.0, 2.0, 2.5]))
     np.testing.assert_allclose(slopes, jnp.where(batch.converged, healthy, 0), rtol=1e-12)
     assert np.all(healthy != 0)
@@ -298,7 +301,7 @@ def test_contradictory_joints_are_named():
 
 
 def test_a_start_without_direction_takes_one():
-    """From the middle of a circle all ways are equal; the derivative along them is none."""
+    """From the center of a circle all directions are equal; assembly chooses one."""
     system, state = bead((0.0, 0.0))
     found = jc.assemble(system, state).check()
     np.testing.assert_allclose(np.hypot(*found.q), 1.0, rtol=IDENTITY)

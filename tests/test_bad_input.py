@@ -1,4 +1,4 @@
-"""What a hurried user gives: each mistake is refused with the culprit, what was got, what to give.
+"""Mistakes of users: each error names the culprit, the value given, and a remedy.
 
 The words of each case must appear in the message in this order.
 """
@@ -16,7 +16,7 @@ from jaxcon.core import checks
 
 
 def scene(dim=3, **options):
-    """Two bodies and a particle."""
+    """A scene of two bodies and a particle."""
     s = jc.Scene(dim=dim, **options)
     inertia = 1.0 if dim == 2 else (1.0, 1.0, 1.0)
     for i, name in enumerate(("arm", "leg")):
@@ -110,19 +110,19 @@ MISTAKES = {
         ["Distance 'd'", "'lag' is unknown", "'leg'"],
     ),
     "unknown body of a force": (
-        lambda: build(jc.Force("f", "lag", Z)),
+        lambda: build(jc.forces.Force("f", "lag", Z)),
         ["Force 'f'", "'lag' is unknown", "'leg'"],
     ),
     "unknown joint of a drive": (
-        lambda: build(jc.Drive("d", "hinge", scenes.wave)),
+        lambda: build(jc.joints.Drive("d", "hinge", scenes.wave)),
         ["Drive 'd'", "joint 'hinge' is unknown"],
     ),
     "unknown joint of a spring": (
-        lambda: build(jc.Fixed("bolt", "arm", "leg"), jc.JointSpring("s", "hinge", 1.0)),
+        lambda: build(jc.Fixed("bolt", "arm", "leg"), jc.forces.JointSpring("s", "hinge", 1.0)),
         ["JointSpring 's'", "joint 'hinge' is unknown", "'bolt'"],
     ),
     "unknown body of a constraint": (
-        lambda: build(jc.Holonomic(flat, bodies=("lag",), name="h")),
+        lambda: build(jc.joints.Holonomic(flat, bodies=("lag",), name="h")),
         ["Holonomic 'h'", "'lag' is unknown", "'leg'"],
     ),
     "body twice": (lambda: scene().add_body("arm", mass=1, inertia=Z), ["'arm' is taken"]),
@@ -136,7 +136,7 @@ MISTAKES = {
         ["'arm' is taken"],
     ),
     "two nameless user constraints": (
-        lambda: twice(jc.Holonomic(flat, ("arm",)), jc.Holonomic(flat, ("leg",))),
+        lambda: twice(jc.joints.Holonomic(flat, ("arm",)), jc.joints.Holonomic(flat, ("leg",))),
         ["'holonomic' is taken"],
     ),
     "reserved name": (
@@ -145,7 +145,7 @@ MISTAKES = {
     ),
     "empty name": (lambda: scene().add_particle("", mass=1), ["name", "''"]),
     "name that is a number": (lambda: scene().add_particle(3, mass=1), ["name", "3"]),
-    # who is joined
+    # bodies of joints
     "joint to itself": (
         lambda: build(jc.Distance("d", "arm", "arm")),
         ["Distance 'd'", "'arm' to itself"],
@@ -167,7 +167,7 @@ MISTAKES = {
         ["Prismatic 'j'", "orientation", "'bob' is a particle"],
     ),
     "point away from a particle": (
-        lambda: build(jc.Coincident("j", "arm", "bob", point=ORIGIN)),
+        lambda: build(jc.joints.Coincident("j", "arm", "bob", point=ORIGIN)),
         ["Coincident 'j'", "particle", "2.0"],
     ),
     "point of a distance away from a particle": (
@@ -183,43 +183,43 @@ MISTAKES = {
         ["Spherical 'j'", "3 dimensions only"],
     ),
     "universal joint in the plane": (
-        lambda: build(jc.Universal("j", "arm", "leg", (0, 0), (1, 0), (0, 1)), dim=2),
+        lambda: build(jc.joints.Universal("j", "arm", "leg", (0, 0), (1, 0), (0, 1)), dim=2),
         ["Universal 'j'", "3 dimensions only"],
     ),
     "universal joint on a particle": (
-        lambda: build(jc.Universal("j", jc.WORLD, "bob", ORIGIN, (1, 0, 0), Z)),
+        lambda: build(jc.joints.Universal("j", jc.WORLD, "bob", ORIGIN, (1, 0, 0), Z)),
         ["Universal 'j'", "orientation", "'bob' is a particle"],
     ),
     "screw joint in the plane": (
-        lambda: build(jc.Screw("j", "arm", "leg", axis=(1, 0), lead=0.1), dim=2),
+        lambda: build(jc.joints.Screw("j", "arm", "leg", axis=(1, 0), lead=0.1), dim=2),
         ["Screw 'j'", "3 dimensions only"],
     ),
     "sleeve on a particle": (
-        lambda: build(jc.Cylindrical("j", jc.WORLD, "bob", axis=Z)),
+        lambda: build(jc.joints.Cylindrical("j", jc.WORLD, "bob", axis=Z)),
         ["Cylindrical 'j'", "orientation", "'bob' is a particle"],
     ),
     "line of a particle": (
-        lambda: build(jc.PointOnLine("j", "bob", "arm", axis=Z)),
+        lambda: build(jc.joints.PointOnLine("j", "bob", "arm", axis=Z)),
         ["PointOnLine 'j'", "orientation", "'bob' is a particle", "body_b"],
     ),
     "rod hinged to a particle": (
         lambda: build(
-            jc.RevoluteSpherical("j", "bob", "arm", hinge=(2, 0, 0), ball=ORIGIN, axis=Z)
+            jc.joints.RevoluteSpherical("j", "bob", "arm", hinge=(2, 0, 0), ball=ORIGIN, axis=Z)
         ),
         ["RevoluteSpherical 'j'", "orientation", "'bob' is a particle", "body_b"],
     ),
     "drive of a joint without a coordinate": (
-        lambda: build(jc.Fixed("bolt", "arm", "leg"), jc.Drive("d", "bolt", scenes.wave)),
+        lambda: build(jc.Fixed("bolt", "arm", "leg"), jc.joints.Drive("d", "bolt", scenes.wave)),
         ["Drive 'd'", "'bolt' has no coordinate"],
     ),
     "bodies as a string": (
-        lambda: build(jc.Holonomic(flat, bodies="arm", name="h")),
+        lambda: build(jc.joints.Holonomic(flat, bodies="arm", name="h")),
         ["Holonomic 'h'", "tuple", "'arm'"],
     ),
     "not an element": (lambda: scene().add("hinge"), ["joint, constraint or force", "hinge"]),
     "a class": (lambda: scene().add(jc.Revolute), ["joint, constraint or force", "Revolute"]),
     "a class of constraints": (
-        lambda: scene().add(jc.Holonomic),
+        lambda: scene().add(jc.joints.Holonomic),
         ["joint, constraint or force", "Holonomic"],
     ),
     # numbers out of range
@@ -275,11 +275,11 @@ MISTAKES = {
         ["Prismatic 'j'", "axis", "length", "0.0"],
     ),
     "cross axis of length zero": (
-        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=Z, axis_b=ORIGIN)),
+        lambda: build(jc.joints.Universal("j", "arm", "leg", ORIGIN, axis_a=Z, axis_b=ORIGIN)),
         ["Universal 'j'", "axis_b", "length", "0.0"],
     ),
     "cross axes that are not perpendicular": (
-        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=Z, axis_b=(0, 3, 4))),
+        lambda: build(jc.joints.Universal("j", "arm", "leg", ORIGIN, axis_a=Z, axis_b=(0, 3, 4))),
         ["Universal 'j'", "axis_a and axis_b", "perpendicular", "0.8"],
     ),
     "distance of zero": (
@@ -295,65 +295,67 @@ MISTAKES = {
         ["Distance 'd'", "length", "positive", "-2.0"],
     ),
     "screw without a lead": (
-        lambda: build(jc.Screw("j", "arm", "leg", axis=Z)),
+        lambda: build(jc.joints.Screw("j", "arm", "leg", axis=Z)),
         ["Screw 'j'", "lead", "one turn"],
     ),
     "screw with a lead of zero": (
-        lambda: build(jc.Screw("j", "arm", "leg", axis=Z, lead=0.0)),
+        lambda: build(jc.joints.Screw("j", "arm", "leg", axis=Z, lead=0.0)),
         ["Screw 'j'", "lead", "0.0"],
     ),
     "shafts that point at each other": (
-        lambda: build(jc.ConstantVelocity("j", "arm", "leg", ORIGIN, axis=Z, axis_b=(0, 0, -1))),
+        lambda: build(
+            jc.joints.ConstantVelocity("j", "arm", "leg", ORIGIN, axis=Z, axis_b=(0, 0, -1))
+        ),
         ["ConstantVelocity 'j'", "axis and axis_b", "opposite", "from a to b"],
     ),
     "rod of length zero": (
-        lambda: build(jc.RevoluteSpherical("j", "arm", "leg", hinge=Z, ball=Z, axis=Z)),
+        lambda: build(jc.joints.RevoluteSpherical("j", "arm", "leg", hinge=Z, ball=Z, axis=Z)),
         ["RevoluteSpherical 'j'", "hinge to ball", "positive", "0.0"],
     ),
     "rod oblique to its hinge": (
         lambda: build(
-            jc.RevoluteSpherical("j", "arm", "leg", hinge=ORIGIN, ball=(0, 3, 4), axis=Z)
+            jc.joints.RevoluteSpherical("j", "arm", "leg", hinge=ORIGIN, ball=(0, 3, 4), axis=Z)
         ),
         ["RevoluteSpherical 'j'", "normal to the axis", "0.8"],
     ),
     "ball of radius zero": (
-        lambda: build(jc.RollingSphere("r", jc.WORLD, "arm", radius=0.0)),
+        lambda: build(jc.joints.RollingSphere("r", jc.WORLD, "arm", radius=0.0)),
         ["RollingSphere 'r'", "radius", "positive", "0.0"],
     ),
     "ball that rolls in the plane": (
-        lambda: build(jc.RollingSphere("r", jc.WORLD, "arm", radius=1.0), dim=2),
+        lambda: build(jc.joints.RollingSphere("r", jc.WORLD, "arm", radius=1.0), dim=2),
         ["RollingSphere 'r'", "3 dimensions only"],
     ),
     "cylinder that stands on its plane": (
-        lambda: build(jc.RollingCylinder("r", jc.WORLD, "arm", radius=1.0, axis=(0, 3, 4))),
+        lambda: build(jc.joints.RollingCylinder("r", jc.WORLD, "arm", radius=1.0, axis=(0, 3, 4))),
         ["RollingCylinder 'r'", "axis", "parallel", "0.8"],
     ),
     "disc that lies flat": (
-        lambda: build(jc.RollingDisc("r", jc.WORLD, "arm", radius=1.0, axis=Z)),
+        lambda: build(jc.joints.RollingDisc("r", jc.WORLD, "arm", radius=1.0, axis=Z)),
         ["RollingDisc 'r'", "flat", "axis", "normal"],
     ),
     "disc without an axis": (
-        lambda: build(jc.RollingDisc("r", jc.WORLD, "arm", radius=1.0)),
+        lambda: build(jc.joints.RollingDisc("r", jc.WORLD, "arm", radius=1.0)),
         ["RollingDisc 'r'", "axis", "none"],
     ),
     "axis of a disc in the plane": (
-        lambda: build(jc.RollingDisc("r", jc.WORLD, "arm", radius=1.0, axis=Z), dim=2),
+        lambda: build(jc.joints.RollingDisc("r", jc.WORLD, "arm", radius=1.0, axis=Z), dim=2),
         ["RollingDisc 'r'", "in the plane", "axis"],
     ),
     "particle that rolls": (
-        lambda: build(jc.RollingDisc("r", jc.WORLD, "bob", radius=1.0, axis=Z)),
+        lambda: build(jc.joints.RollingDisc("r", jc.WORLD, "bob", radius=1.0, axis=Z)),
         ["RollingDisc 'r'", "orientation", "'bob' is a particle"],
     ),
     "normal of length zero": (
-        lambda: build(jc.RollingSphere("r", jc.WORLD, "arm", radius=1.0, normal=ORIGIN)),
+        lambda: build(jc.joints.RollingSphere("r", jc.WORLD, "arm", radius=1.0, normal=ORIGIN)),
         ["RollingSphere 'r'", "normal", "length", "0.0"],
     ),
     "ice in the plane": (
-        lambda: build(jc.KnifeEdge("k", jc.WORLD, "arm", edge=(1, 0), normal=(0, 1)), dim=2),
+        lambda: build(jc.joints.KnifeEdge("k", jc.WORLD, "arm", edge=(1, 0), normal=(0, 1)), dim=2),
         ["KnifeEdge 'k'", "in the plane", "normal"],
     ),
     "edge of another dimension": (
-        lambda: build(jc.KnifeEdge("k", jc.WORLD, "arm", edge=(1, 0))),
+        lambda: build(jc.joints.KnifeEdge("k", jc.WORLD, "arm", edge=(1, 0))),
         ["KnifeEdge 'k'", "edge", r"\(3,\)", r"\(2,\)"],
     ),
     "negative stiffness": (
@@ -363,15 +365,15 @@ MISTAKES = {
     "negative damping of a joint": (
         lambda: build(
             jc.Revolute("j", "arm", "leg", point=ORIGIN, axis=Z),
-            jc.JointSpring("s", "j", 1.0, damping=-1.0),
+            jc.forces.JointSpring("s", "j", 1.0, damping=-1.0),
         ),
         ["JointSpring 's'", "damping", "zero or more", "-1.0"],
     ),
     "force that is not a number": (
-        lambda: build(jc.Force("f", "arm", (0, np.inf, 0))),
+        lambda: build(jc.forces.Force("f", "arm", (0, np.inf, 0))),
         ["force 'f'", "force", "finite", "inf"],
     ),
-    # shapes and kinds of numbers
+    # shapes and dtypes
     "position of another dimension": (
         lambda: body(position=(0, 0)),
         ["body 'arm'", "position", r"\(3,\)", r"\(2,\)"],
@@ -396,7 +398,7 @@ MISTAKES = {
     "ragged position": (lambda: body(position=[1, [2], 3]), ["body 'arm'", "position", "numbers"]),
     "complex mass": (lambda: particle(mass=1j), ["particle 'bob'", "mass", "1j"]),
     "point of another dimension": (
-        lambda: build(jc.Coincident("j", "arm", "leg", point=(0, 0))),
+        lambda: build(jc.joints.Coincident("j", "arm", "leg", point=(0, 0))),
         ["Coincident 'j'", "point", r"\(3,\)", r"\(2,\)"],
     ),
     "gravity as a number": (
@@ -411,7 +413,7 @@ MISTAKES = {
         ["body 'arm'", "position is float32", "scene is float64"],
     ),
     "float32 in a joint": (
-        lambda: build(jc.Coincident("j", "arm", "leg", point=jnp.zeros(3, F32))),
+        lambda: build(jc.joints.Coincident("j", "arm", "leg", point=jnp.zeros(3, F32))),
         ["Coincident 'j'", "point is float32", "scene is float64"],
     ),
     "quaternion in the plane": (
@@ -439,53 +441,53 @@ MISTAKES = {
         ["Prismatic 'j'", "axis", "none"],
     ),
     "no cross axis": (
-        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=None, axis_b=Z)),
+        lambda: build(jc.joints.Universal("j", "arm", "leg", ORIGIN, axis_a=None, axis_b=Z)),
         ["Universal 'j'", r"axis_a \(3,\)", "none"],
     ),
     "cross axis of the plane": (
-        lambda: build(jc.Universal("j", "arm", "leg", ORIGIN, axis_a=(1, 0), axis_b=Z)),
+        lambda: build(jc.joints.Universal("j", "arm", "leg", ORIGIN, axis_a=(1, 0), axis_b=Z)),
         ["Universal 'j'", "axis_a", r"\(3,\)", r"\(2,\)"],
     ),
     "nothing moves": (lambda: jc.Scene().build(), ["no body that moves"]),
     # users' functions
     "curve of other arguments": (
-        lambda: build(jc.PointOnCurve("c", "arm", "bob", three_arguments)),
+        lambda: build(jc.joints.PointOnCurve("c", "arm", "bob", three_arguments)),
         ["PointOnCurve 'c'", r"curve\(x, params\) cannot be called"],
     ),
     "curve in space of one function": (
-        lambda: build(jc.PointOnCurve("c", "arm", "bob", sheet)),
+        lambda: build(jc.joints.PointOnCurve("c", "arm", "bob", sheet)),
         ["PointOnCurve 'c'", r"\(2,\) of float64 in 3 dimensions", r"\[1\]"],
     ),
     "curve whose function does not cross zero": (
-        lambda: build(jc.PointOnCurve("c", jc.WORLD, "bob", touching, params=2.0), dim=2),
+        lambda: build(jc.joints.PointOnCurve("c", jc.WORLD, "bob", touching, params=2.0), dim=2),
         ["PointOnCurve 'c'", "rank 0, but 1", "crossed", "touched"],
     ),
     "curve of a particle": (
-        lambda: build(jc.PointOnCurve("c", "bob", "arm", sheet), dim=2),
+        lambda: build(jc.joints.PointOnCurve("c", "bob", "arm", sheet), dim=2),
         ["PointOnCurve 'c'", "orientation", "'bob' is a particle", "body_b"],
     ),
     "constraint that returns a matrix": (
-        lambda: build(jc.Holonomic(matrix, ("arm",), name="h")),
+        lambda: build(jc.joints.Holonomic(matrix, ("arm",), name="h")),
         ["Holonomic 'h'", r"\(m,\)", r"\[3, 3\]"],
     ),
     "constraint that returns a tuple": (
-        lambda: build(jc.Holonomic(tuples, ("arm",), name="h")),
+        lambda: build(jc.joints.Holonomic(tuples, ("arm",), name="h")),
         ["Holonomic 'h'", r"\(m,\)", "tuple"],
     ),
     "constraint that returns a number": (
-        lambda: build(jc.Holonomic(number, ("arm",), name="h")),
+        lambda: build(jc.joints.Holonomic(number, ("arm",), name="h")),
         ["Holonomic 'h'", r"\(m,\)", r"\[\]"],
     ),
     "constraint that returns integers": (
-        lambda: build(jc.Holonomic(whole, ("arm",), name="h")),
+        lambda: build(jc.joints.Holonomic(whole, ("arm",), name="h")),
         ["Holonomic 'h'", "float64", "int"],
     ),
     "constraint of other arguments": (
-        lambda: build(jc.Holonomic(two_arguments, ("arm",), name="h")),
+        lambda: build(jc.joints.Holonomic(two_arguments, ("arm",), name="h")),
         ["Holonomic 'h'", "cannot be called", "argument"],
     ),
     "velocity constraint that is not affine": (
-        lambda: build(jc.VelocityLevel(quadratic, ("arm",), name="w")),
+        lambda: build(jc.joints.VelocityLevel(quadratic, ("arm",), name="w")),
         ["VelocityLevel 'w'", "affine in the velocities"],
     ),
 }
@@ -517,19 +519,19 @@ GENERALIZED = {
         ["Holonomic, VelocityLevel and Inequality", "Fixed"],
     ),
     "a constraint on bodies": (
-        lambda: generalized(jc.Holonomic(ring, bodies=("a",), name="h")),
+        lambda: generalized(jc.joints.Holonomic(ring, bodies=("a",), name="h")),
         ["'h'", "no bodies"],
     ),
     "two constraints of one name": (
-        lambda: generalized((jc.Holonomic(ring), jc.Holonomic(ring))),
+        lambda: generalized((jc.joints.Holonomic(ring), jc.joints.Holonomic(ring))),
         ["'holonomic'", "name="],
     ),
     "not affine": (
-        lambda: generalized(jc.VelocityLevel(bent, name="w")),
+        lambda: generalized(jc.joints.VelocityLevel(bent, name="w")),
         ["VelocityLevel 'w'", "affine in the velocities"],
     ),
     "wrong shape": (
-        lambda: generalized(jc.Holonomic(lambda q, t, p: q @ q, name="h")),
+        lambda: generalized(jc.joints.Holonomic(lambda q, t, p: q @ q, name="h")),
         ["Holonomic 'h'", r"\(m,\)", r"\[\]"],
     ),
 }
@@ -543,7 +545,7 @@ def test_a_mistake_on_generalized_coordinates_is_named(mistake):
 
 
 def stepping(**options):
-    """A step of the mixed scene with one thing wrong."""
+    """Steps the mixed scene with one wrong argument."""
     built = scenes.build("mixed-2d")
     given = {"method": jc.Method(), "state": built.state, "control": None} | options
     return jc.step(built.system, given["method"], given["state"], given["control"], 1e-3)
@@ -639,7 +641,7 @@ def test_controls_may_be_numpy_arrays_and_lists():
 
 
 def test_numpy_float64_in_a_float32_scene():
-    """Numpy's numbers are converted, as Python's are; an array of JAX is a choice of dtype."""
+    """NumPy and Python scalars take the scene's dtype; a JAX array must already have it."""
     built = scenes.build("mixed-2d", "float32")
     new, _ = jc.step(built.system, jc.Method(), built.state, None, np.float64(1e-3))
     assert new.q.dtype == new.v.dtype == new.time.dtype == jnp.float32
@@ -679,7 +681,7 @@ def test_the_same_scene_may_be_built_twice():
 def test_an_unknown_order_of_elimination():
     system, state = build(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)), dim=2)
     with pytest.raises(ValueError, match="order must be one of .*'levels'.* got 'random'"):
-        jc.step(system, jc.Method(solver=jc.Sparse(order="random")), state, None, 1e-3)
+        jc.step(system, jc.Method(solver=jc.solvers.Sparse(order="random")), state, None, 1e-3)
 
 
 @pytest.mark.parametrize("method", [jc.RK4(), jc.Method])

@@ -30,14 +30,14 @@ from benchmarks import (  # noqa: E402
     throughput,
     timing,
 )
-from jaxcon.core import operations  # noqa: E402
+from jaxcon.staging import operations  # noqa: E402
 
 SMALL = ("chain-3", "planar-chain-3", "four-bar", "n-four-bar-2", "rope-5", "stewart")
 
 
 @pytest.mark.parametrize("name", list(stabilisation.STABILIZERS))
 def test_every_stabilizer_holds_a_double_pendulum(name):
-    """Projection to rounding, feedback and springs to what a step of RK4 adds."""
+    """The bound is rounding for projections, and else the error of RK4 steps."""
     row = stabilisation.measure("double_pendulum", np.float64, "RK4", name, 2000, 1e-3)
     assert row.remark == ""
     bound = {"projection": 1e-12, "linearized projection": 1e-12}.get(name, 1e-4)
@@ -53,7 +53,11 @@ def test_an_implicit_method_says_what_it_refuses():
 
 
 def test_more_sweeps_and_iterations_miss_less():
-    solvers = (jc.GaussSeidel(sweeps=3), jc.GaussSeidel(sweeps=300), jc.InteriorPoint())
+    solvers = (
+        jc.solvers.GaussSeidel(sweeps=3),
+        jc.solvers.GaussSeidel(sweeps=300),
+        jc.solvers.InteriorPoint(),
+    )
     chain, column = (
         [bounded.measure(scene, jnp.dtype("float64"), s, 20)[0].max() for s in solvers]
         for scene in ("chain", "column")
@@ -65,15 +69,15 @@ def test_more_sweeps_and_iterations_miss_less():
 
 @pytest.mark.parametrize(("scene", "slides"), [("box", 0.3), ("chain", 0.7)])
 def test_no_law_of_bounded_rows_is_missed_at_random_states(scene, slides):
-    """Signorini's and Coulomb's, each by itself; none makes energy but recovery, none fails."""
+    """Signorini's and Coulomb's laws hold one by one. Only recovery may add energy."""
     found = laws.measure(scene, jnp.dtype("float64"), laws.OneProblem(), 600)
     assert laws.beyond(found, "float64") == laws.Laws(0, 0, 0, 0, 0)
-    assert np.mean(found.direction > 0) > slides  # what rests has none to miss
+    assert np.mean(found.direction > 0) > slides  # a contact that sticks has no direction law
 
 
 def test_sweeps_that_end_early_are_told_by_their_laws():
-    """What is pressed together still, or not yet held; but friction never leaves its cone."""
-    few = laws.measure("box", jnp.dtype("float32"), jc.GaussSeidel(sweeps=3), 300)
+    """After few sweeps, contacts still press or penetrate, but friction never leaves its cone."""
+    few = laws.measure("box", jnp.dtype("float32"), jc.solvers.GaussSeidel(sweeps=3), 300)
     over = laws.beyond(few, "float32")
     assert min(over.complementarity, over.separation, over.direction) > 5
     assert over.cone == over.energy == 0
@@ -119,7 +123,7 @@ def test_mujoco_simulates_the_same_mechanism(name):
 
 @pytest.mark.parametrize("name", ["four-bar", "n-four-bar-10", "stewart"])
 def test_mujoco_solves_loops_by_one_iteration(name):
-    """So that it needs no such setting to be as fast as it can."""
+    """MuJoCo already stops after one solver iteration, so a limit would not make it faster."""
     mujoco = pytest.importorskip("mujoco")
     model, data = equivalence.model_of(mechanisms.find(name))
     limited, one = equivalence.model_of(mechanisms.find(name))
@@ -141,7 +145,7 @@ def test_the_four_bar_is_the_ready_made_one():
 
 
 def test_the_motion_of_the_n_four_bar_is_the_published_one():
-    """IFToMM A02, N = 2, the top of the first crank after a second."""
+    """IFToMM A02, N = 2: the position of the top of the first crank after one second."""
     angle = mechanisms.crank_angle(2, 1.0)
     top = np.cos(angle), np.sin(angle)
     np.testing.assert_allclose(top, (-0.19502030194944, -0.98079920566217), atol=1e-9)
@@ -167,7 +171,7 @@ def test_operations_are_counted():
 
 def test_operations_are_counted_once():
     def repeated(x, y):
-        """Sine and product each once, two sums, and a cosine for nobody."""
+        """The product and the sine count once, the two sums each, and the unused cosine never."""
         jnp.cos(x)
         return x * y + jax.jit(lambda a, b: b * a)(x, y) + jnp.sin(x), jnp.sin(x)
 
@@ -214,7 +218,7 @@ def test_a_rate_is_measured():
 
 
 def test_a_repeat_calls_until_it_has_lasted_long_enough(monkeypatch):
-    """With a clock by which a call takes 1/16 s."""
+    """The clock is replaced by one on which a call takes 1/16 s."""
     calls = []
     monkeypatch.setattr(timing, "time", SimpleNamespace(perf_counter=lambda: len(calls) / 16))
     for seconds, expected in ((0.25, 4), (0.2, 4), (0.0, 1)):
@@ -235,11 +239,11 @@ def test_every_solver_leaves_only_rounding(name, dtype, monkeypatch):
 
 
 def test_a_solution_of_another_system_is_seen():
-    """Sees the regularized solution in place of the plain one, and one whose λ is off."""
+    """Rejects the solution of the regularized system, and a solution with wrong λ."""
     (plain,) = residuals.systems("four-bar", "float64", [0.0])
-    exact = residuals.on_arrays(jc.Dense().solve, plain)
+    exact = residuals.on_arrays(jc.solvers.Dense().solve, plain)
     numbers, which = residuals.Numbers(plain), ("four-bar", "float64", "-", 0.0)
-    softened = residuals.solve(jc.Dense, plain, residuals.regularized(plain, 1e-6), 1e-6)
+    softened = residuals.solve(jc.solvers.Dense, plain, residuals.regularized(plain, 1e-6), 1e-6)
     found = residuals.judged(numbers, softened, exact, numbers.condition(), which)
     assert found.verdict == "fails: constraint, distance"
     off = exact._replace(multipliers=exact.multipliers * (1 + 1e-9))

@@ -1,4 +1,4 @@
-"""Conjugate gradients against dense solutions, and against what theory says of them."""
+"""Conjugate gradients compared with dense solutions and with the theory."""
 
 import dataclasses
 
@@ -11,15 +11,14 @@ from test_sparse import GRAPHS, hinge_twice, links, problem
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
-from jaxcon.dynamics.forward import saddle
-from jaxcon.solvers.saddle import Diagonal
+from jaxcon.constraints.rows import linearize, saddle
+from jaxcon.linear.saddle import Diagonal
 
-CG = jc.ConjugateGradients
+CG = jc.solvers.ConjugateGradients
 
 
 def assembled(system, state, seed=3):
-    """The saddle system of a scene with a random right side that is consistent: b = J x."""
+    """Returns the saddle system of a scene with a random consistent right-hand side b = J x."""
     rows = linearize(system, state.q, state.v, state.time)
     random = np.random.default_rng(seed)
     force, x = (jnp.asarray(random.normal(size=state.v.shape), state.v.dtype) for _ in range(2))
@@ -27,7 +26,7 @@ def assembled(system, state, seed=3):
 
 
 def joints_in_space(n, closed, dtype=np.float64):
-    """A planar chain of links in space; closed, its joints hold it in the plane several times."""
+    """A planar chain of links in space; if closed, its joint rows are redundant."""
     scene, points = jc.Scene(dim=3, dtype=dtype), np.random.default_rng(1).normal(size=(n + 1, 2))
     points = np.column_stack([np.arange(n + 1), points[:, 0], np.zeros(n + 1)])
     for i in range(n):
@@ -41,7 +40,7 @@ def joints_in_space(n, closed, dtype=np.float64):
 
 
 def matrices(system):
-    """A, its diagonal blocks P, and the right side b − J M⁻¹ f, in float64."""
+    """Returns A, its diagonal blocks P, and the right-hand side b − J M⁻¹ f, in float64."""
     j = np.asarray(system.jacobian.dense(), float)
     lift = j.T / np.asarray(system.mass.values, float)[:, None]
     a, right = j @ lift, np.asarray(system.target, float) - lift.T @ np.asarray(system.force, float)
@@ -55,7 +54,7 @@ def matrices(system):
 
 
 def iterates(a, p, b, count):
-    """Conjugate residuals as in the books, with P⁻¹ as a matrix."""
+    """Yields the iterates of the textbook conjugate residual method, with P⁻¹ as a matrix."""
     inverse = np.linalg.inv(p)
     x, r = np.zeros_like(b), b
     z = d = inverse @ r
@@ -69,7 +68,7 @@ def iterates(a, p, b, count):
 
 
 def least(a, p, b, count):
-    """The x with the least residual, in the norm of P⁻¹, in the Krylov space of so many vectors."""
+    """Returns the x of least residual, in the norm of P⁻¹, in a Krylov space of `count` vectors."""
     inverse, half = np.linalg.inv(p), np.linalg.cholesky(np.linalg.inv(p)).T
     basis, new = np.zeros((len(b), 0)), inverse @ b
     for _ in range(count):
@@ -81,14 +80,14 @@ def least(a, p, b, count):
 
 
 def multipliers(system, iterations):
-    """λ after some iterations, as an array of the host."""
+    """Returns λ after some iterations, as a NumPy array."""
     return np.asarray(jax.jit(CG(iterations=iterations).solve)(system).multipliers)
 
 
 @pytest.mark.parametrize("name", GRAPHS)
 def test_the_solution_is_that_of_the_dense_solver(name):
     system = problem(name)
-    expected = jc.Dense().solve(system)
+    expected = jc.solvers.Dense().solve(system)
     got = jax.jit(CG(tolerance=1e-14).solve)(system)
     assert got.status == jc.Status.OK
     np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=1e-9, atol=1e-9)
@@ -100,20 +99,23 @@ def test_with_compliance():
     compliance = jnp.asarray(np.random.default_rng(4).uniform(0, 1, size=system.target.shape))
     system = dataclasses.replace(system, compliance=compliance)
     got = jax.jit(CG(tolerance=1e-14).solve)(system)
-    expected = jc.Dense().solve(system)
+    expected = jc.solvers.Dense().solve(system)
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-9, atol=1e-9)
 
 
 def test_a_full_mass_matrix_is_left_to_schur():
     system = small(J, FULL, FORCE, TARGET)
     for share in (None, 0.1):
-        ours, theirs = CG(tikhonov=share).solve(system), jc.Schur(tikhonov=share).solve(system)
+        ours, theirs = (
+            CG(tikhonov=share).solve(system),
+            jc.solvers.Schur(tikhonov=share).solve(system),
+        )
         np.testing.assert_array_equal(ours.multipliers, theirs.multipliers)
 
 
 @pytest.mark.parametrize("count", [1, 3, 7])
 def test_the_iterates_leave_the_least_residual(count):
-    """With one block of the preconditioner for each joint, of two rows and of five."""
+    """The preconditioner has one block for each joint, of two rows and of five."""
     for built in (links(10, True), joints_in_space(6, False)):
         system = assembled(*built)
         expected = least(*matrices(system), count)
@@ -122,7 +124,7 @@ def test_the_iterates_leave_the_least_residual(count):
 
 
 def test_every_iteration_brings_a_chain_nearer_to_the_solution():
-    """In the norm of A, although it is the residual that is made least."""
+    """The error decreases in the norm of A, although the method minimizes the residual."""
     system = assembled(*links(10, False))
     a, _, b = matrices(system)
     exact = np.linalg.solve(a, b)
@@ -180,7 +182,7 @@ def test_redundant_rows_have_a_gradient():
         changed = system.with_params({"link": {"mass": mass}})
         return jc.forward_dynamics(changed, state, None, jc.Method(solver=CG()), 1e-3)
 
-    # −m g l / (I + m l²) by m
+    # derivative of −m g l / (I + m l²) by m
     exact = -9.81 * 0.5 * 0.1 / (0.1 + 0.25) ** 2
     slope = jax.grad(lambda mass: turn(mass).acceleration[2])
     np.testing.assert_allclose(slope(1.0), exact, rtol=1e-9)
@@ -194,7 +196,7 @@ EMPTY = np.concatenate([J, np.zeros((1, 4))])
 
 @pytest.mark.parametrize("rows", [TWICE, EMPTY], ids=["twice", "empty"])
 def test_rows_without_a_solution_are_told_from_redundant_ones(rows):
-    """Uses rows of one constraint, so that a block of the preconditioner is singular."""
+    """The rows belong to one constraint, so that a block of the preconditioner is singular."""
     last = {id(TWICE): TARGET[0], id(EMPTY): 0.0}[id(rows)]
     for wrong, status in ((0.0, jc.Status.OK), (1.0, jc.Status.CONFLICT)):
         system = small(rows, MASS, FORCE, np.append(TARGET, last + wrong))
@@ -206,7 +208,7 @@ def test_rows_without_a_solution_are_told_from_redundant_ones(rows):
 @pytest.mark.parametrize("off", [1e-9, 1e-6, 1e-3])
 @pytest.mark.parametrize("iterations", [50, 500])
 def test_rows_that_disagree_are_met_by_least_squares(off, iterations):
-    """With λ bounded by what is asked: none of what rows cannot meet is left in it."""
+    """λ stays as small as for consistent rows: the inconsistent part of b does not enter it."""
     system = assembled(*joints_in_space(8, True))
     a, p, b = matrices(system)
     values, vectors = np.linalg.eigh(a)
@@ -229,7 +231,10 @@ def test_rows_that_disagree_are_met_by_least_squares(off, iterations):
 
 def test_tikhonov_solves_rows_that_contradict_each_other():
     system = small(TWICE, MASS, FORCE, np.append(TARGET, TARGET[0] + 0.1))
-    ours, theirs = CG(tikhonov=1e-3, tolerance=1e-13).solve(system), jc.Schur(1e-3).solve(system)
+    ours, theirs = (
+        CG(tikhonov=1e-3, tolerance=1e-13).solve(system),
+        jc.solvers.Schur(1e-3).solve(system),
+    )
     assert ours.status == jc.Status.OK
     np.testing.assert_allclose(ours.multipliers, theirs.multipliers, rtol=1e-9)
 
@@ -257,7 +262,7 @@ def test_the_default_tolerance_leaves_two_thirds_of_the_digits(dtype, bound):
 
 
 def test_a_batch_is_a_loop():
-    """Steps worlds that need none, few and all iterations, and one that fails."""
+    """Solves worlds that need no, few and all iterations, and one that fails."""
     system = assembled(*links(6, True))
     zero, random = jnp.zeros_like(system.force), np.random.default_rng(6)
     force = jnp.asarray(random.normal(size=system.force.shape))
@@ -282,7 +287,10 @@ def numbers(system):
 
 
 def value(solver, system, mass, force, target, scale):
-    """A number that every result enters, by those of the system and a factor of each block."""
+    """Returns a number that depends on all results.
+
+    The arguments replace numbers of the system; `scale` multiplies each block of the Jacobian.
+    """
     blocks = [
         dataclasses.replace(block, value=jax.tree.map(lambda x, s=s: x * s, block.value))
         for block, s in zip(system.jacobian.blocks, scale, strict=True)
@@ -301,7 +309,7 @@ def test_derivatives_are_those_of_the_dense_solver_and_differences(name):
     direction = tuple(jnp.asarray(random.normal(size=leaf.shape)) for leaf in x)
     ours, dense = (
         jax.jit(jax.grad(lambda x, s=solver: value(s, system, *x)))(x)
-        for solver in (CG(tolerance=1e-14), jc.Dense())
+        for solver in (CG(tolerance=1e-14), jc.solvers.Dense())
     )
     for got, expected in zip(ours, dense, strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-8, atol=1e-8)
@@ -318,7 +326,7 @@ def test_derivatives_are_those_of_the_dense_solver_and_differences(name):
 
 
 def test_gradients_of_a_batched_rollout():
-    """Inside vmap and outside of it, as of the default solver."""
+    """Gradients inside and outside of vmap equal those of `Sparse`."""
     system, state = links(4, True)
     states = jnp.stack([state.v, 2 * state.v, -state.v])
 
@@ -332,13 +340,13 @@ def test_gradients_of_a_batched_rollout():
     def outside(solver):
         return jax.jit(jax.grad(lambda v: jnp.sum(jax.vmap(lambda x: final(solver, x))(v))))(states)
 
-    expected = inside(jc.Sparse())
+    expected = inside(jc.solvers.Sparse())
     for found in (inside(CG(tolerance=1e-14)), outside(CG(tolerance=1e-14))):
         np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
 
 
 def equations(jaxpr):
-    """Returns the equations of a jaxpr and of all within it."""
+    """Yields the equations of a jaxpr and of all jaxprs within it."""
     for equation in jaxpr.eqns:
         yield equation
         for inner in jax.tree.leaves(list(equation.params.values())):
@@ -346,7 +354,7 @@ def equations(jaxpr):
 
 
 def program_of(solver, n, dtype=np.float64):
-    """How many rows a chain of n links in space has, and all equations from its rows to λ."""
+    """Returns the number of rows of a chain of n links, and all equations from its rows to λ."""
     system, state = joints_in_space(n, False, dtype)
     trace = jax.make_jaxpr(lambda state: solver.solve(assembled(system, state)))
     closed, solution = trace(state), jax.eval_shape(lambda: assembled(system, state).target)
@@ -367,7 +375,7 @@ def test_arrays_grow_no_faster_than_the_scene():
     (few, small), (many, large) = (largest(CG(), n) for n in (10, 100))
     assert many == 10 * few
     assert large == 10 * small < 2 * many
-    assert largest(jc.Schur(), 10)[1] >= few**2
+    assert largest(jc.solvers.Schur(), 10)[1] >= few**2
 
 
 def test_nothing_in_float32_is_float64():
@@ -379,7 +387,7 @@ def test_nothing_in_float32_is_float64():
 
 @pytest.mark.parametrize("load", [1e4, 1e5])
 def test_a_chain_holds_a_heavy_load_in_float32(load):
-    """Its small eigenvalue is that of the load, and not of a row too many."""
+    """The small eigenvalue of A belongs to the load and must not be taken for a redundant row."""
     scene = jc.Scene(dim=2, dtype=np.float32)
     for i in range(5):
         mass = load if i == 4 else 1.0
@@ -387,7 +395,7 @@ def test_a_chain_holds_a_heavy_load_in_float32(load):
         before = f"link{i - 1}" if i else jc.WORLD
         scene.add(jc.Revolute(f"hinge{i}", before, f"link{i}", point=(0.0, -float(i))))
     system, state = scene.build()
-    method = jc.Method(solver=jc.ConjugateGradients(iterations=1000))
+    method = jc.Method(solver=jc.solvers.ConjugateGradients(iterations=1000))
     state = jc.init(system, method, state.q, state.v)
     found = jc.forward_dynamics(system, state, None, method, 1e-2)
     assert found.status == jc.Status.OK

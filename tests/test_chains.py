@@ -1,4 +1,4 @@
-"""Ropes and rods: their shape, the energy of bending, what holds them, and how they scale."""
+"""Ropes and rods: shape, bending energy, equilibrium under loads, and scaling with length."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,11 @@ import pytest
 from tolerances import IDENTITY
 
 import jaxcon as jc
-from jaxcon.solvers import graphs
+from jaxcon.linear import graphs
 
 
 def circle(links, radius, dim=2):
-    """Points on half a circle."""
+    """Returns points on half a circle."""
     angles = np.linspace(0, np.pi, links + 1)
     points = radius * np.column_stack([np.cos(angles), np.sin(angles)])
     return np.pad(points, ((0, 0), (0, dim - 2)))
@@ -25,7 +25,7 @@ def helix(links):
 def test_a_rope_keeps_its_mass_and_its_lengths():
     scene = jc.Scene(dim=3)
     points = helix(12)
-    chain = jc.rope(scene, "rope", points, 2.4, start=None)
+    chain = jc.chains.rope(scene, "rope", points, 2.4, start=None)
     system, state = scene.build()
     assert chain.bodies == tuple(f"rope.{i}" for i in range(13))
     assert len(chain.joints) == 12
@@ -39,12 +39,15 @@ def test_a_rope_keeps_its_mass_and_its_lengths():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_bending_energy_of_an_arc(dim):
-    """E = ½ (B/s) (2 sin δ/2)² at each joint, for ropes and, with stiffness B/s, for rods."""
+    """Each joint has the energy ½ (B/s) (2 sin δ/2)², in ropes and in rods of stiffness B/s."""
     n, radius, stiffness = 20, 1.5, 0.7
     points, δ = circle(n, radius, dim), np.pi / n
     s = 2 * radius * np.sin(δ / 2)
     expected = (n - 1) * stiffness / s * 2 * np.sin(δ / 2) ** 2
-    for build, options in ((jc.rope, {}), (jc.rod, {"radius": 0.02, "twisting": 0.5})):
+    for build, options in (
+        (jc.chains.rope, {}),
+        (jc.chains.rod, {"radius": 0.02, "twisting": 0.5}),
+    ):
         scene = jc.Scene(dim=dim, gravity=np.zeros(dim))
         options = {} if dim == 2 else options
         build(scene, "c", points, 1.0, end=jc.WORLD, bending=stiffness, **options)
@@ -59,8 +62,8 @@ def test_forces_are_those_of_the_energy(dim, straight):
     scene = jc.Scene(dim=dim, gravity=np.zeros(dim))
     points = helix(4)[:, :dim]
     twist = {} if dim == 2 else {"radius": 0.05, "twisting": 0.8}
-    jc.rod(scene, "rod", points, 1.0, bending=1.3, straight=straight, **twist)
-    jc.rope(scene, "rope", points + 1.0, 1.0, bending=0.9)
+    jc.chains.rod(scene, "rod", points, 1.0, bending=1.3, straight=straight, **twist)
+    jc.chains.rope(scene, "rope", points + 1.0, 1.0, bending=0.9)
     system, state = scene.build()
     if not straight:
         slack = system.with_params({f"rope.bend{i}": {"stiffness": 0.0} for i in (1, 2, 3)})
@@ -76,11 +79,11 @@ def test_forces_are_those_of_the_energy(dim, straight):
 
 
 def test_small_turns_meet_the_stiffnesses():
-    """½ k_t θ² about the axis of the rod and ½ k_b θ² across it."""
+    """The energy is ½ k_t θ² for a turn about the axis of the rod and ½ k_b θ² across it."""
     scene = jc.Scene(dim=3, gravity=np.zeros(3))
     for name in ("a", "b"):
         scene.add_body(name, mass=1.0, inertia=(1.0, 1.0, 1.0))
-    scene.add(jc.Flexure("f", "a", "b", bending=2.0, twisting=3.0))
+    scene.add(jc.forces.Flexure("f", "a", "b", bending=2.0, twisting=3.0))
     system, state = scene.build()
     turns = system.layout.v("b")[3:]
 
@@ -96,7 +99,9 @@ def test_small_turns_meet_the_stiffnesses():
 def test_a_hanging_chain_in_space_and_at_unequal_heights_rests():
     start, end, gravity = (0.0, 0.0, 1.0), (1.0, 0.5, 0.7), (0.0, 0.0, -9.81)
     scene = jc.Scene(dim=3, gravity=gravity)
-    jc.rope(scene, "rope", jc.hanging(start, end, 2.0, 30, gravity), 1.5, end=jc.WORLD)
+    jc.chains.rope(
+        scene, "rope", jc.chains.hanging(start, end, 2.0, 30, gravity), 1.5, end=jc.WORLD
+    )
     system, state = scene.build()
     info = jc.forward_dynamics(system, state, None, jc.Method(), 1e-3)
     np.testing.assert_allclose(info.acceleration, 0, atol=1e-8)
@@ -104,11 +109,11 @@ def test_a_hanging_chain_in_space_and_at_unequal_heights_rests():
 
 
 def test_the_derivative_by_the_points():
-    """A rope of traced points: each length follows."""
+    """The length of each link follows the traced points of the rope."""
 
     def lengths(points):
         scene = jc.Scene(dim=2)
-        jc.rope(scene, "rope", points, 1.0)
+        jc.chains.rope(scene, "rope", points, 1.0)
         system, _ = scene.build()
         return jnp.stack([system.params[f"rope.link{i}"]["length"] for i in range(3)])
 
@@ -117,11 +122,13 @@ def test_the_derivative_by_the_points():
 
 
 def test_the_plan_of_a_long_chain_is_one_run():
-    """The program does not grow with the chain, and neither planning nor names are quadratic."""
+    """The traced program does not grow with the chain; planning and naming are not quadratic."""
     sizes = {}
     for n in (50, 2000):
         scene = jc.Scene(dim=2)
-        jc.rope(scene, "rope", np.column_stack([np.linspace(0, 1, n + 1)] * 2), 1.0, end=jc.WORLD)
+        jc.chains.rope(
+            scene, "rope", np.column_stack([np.linspace(0, 1, n + 1)] * 2), 1.0, end=jc.WORLD
+        )
         system, state = scene.build()
         step = jax.make_jaxpr(lambda s, system=system: jc.step(system, jc.Method(), s, None, 1e-3))
         sizes[n] = str(step(state)).count("\n")
@@ -141,7 +148,7 @@ def test_the_heap_finds_what_a_search_finds():
 
 
 def searched(neighbours, distance):
-    """The order by a search among all at every step."""
+    """Returns the elimination order found by a search of all nodes at each step."""
     graph, order, near = {k: set(v) for k, v in neighbours.items()}, [], set()
     while graph:
         node = min(graph, key=lambda x: (len(graph[x]), x not in near, distance[x], x))
@@ -154,15 +161,24 @@ def searched(neighbours, distance):
 
 SPAN = np.linspace((0.0, 0.0), (1.0, 0.0), 4)
 MISTAKES = {
-    "shape": (lambda s: jc.rope(s, "r", np.ones((4, 3)), 1.0), r"\(links \+ 1, 2\).*\(4, 3\)"),
-    "one link": (lambda s: jc.rope(s, "r", SPAN[:2], 1.0), "2 links or more"),
-    "twice": (lambda s: jc.rod(s, "r", SPAN[[0, 1, 1, 2]], 1.0), "points 1 and 2 must be apart"),
-    "nan": (lambda s: jc.rope(s, "r", SPAN * np.nan, 1.0), "points must be finite"),
-    "mass": (lambda s: jc.rope(s, "r", SPAN, -1.0), "mass must be positive"),
-    "unknown end": (lambda s: jc.rope(s, "r", SPAN, 1.0, end="hook"), "'hook' is unknown"),
-    "stiffness": (lambda s: jc.rope(s, "r", SPAN, 1.0, bending=-1.0), "bending must be zero or"),
+    "shape": (
+        lambda s: jc.chains.rope(s, "r", np.ones((4, 3)), 1.0),
+        r"\(links \+ 1, 2\).*\(4, 3\)",
+    ),
+    "one link": (lambda s: jc.chains.rope(s, "r", SPAN[:2], 1.0), "2 links or more"),
+    "twice": (
+        lambda s: jc.chains.rod(s, "r", SPAN[[0, 1, 1, 2]], 1.0),
+        "points 1 and 2 must be apart",
+    ),
+    "nan": (lambda s: jc.chains.rope(s, "r", SPAN * np.nan, 1.0), "points must be finite"),
+    "mass": (lambda s: jc.chains.rope(s, "r", SPAN, -1.0), "mass must be positive"),
+    "unknown end": (lambda s: jc.chains.rope(s, "r", SPAN, 1.0, end="hook"), "'hook' is unknown"),
+    "stiffness": (
+        lambda s: jc.chains.rope(s, "r", SPAN, 1.0, bending=-1.0),
+        "bending must be zero or",
+    ),
     "twist": (
-        lambda s: s.add(jc.Flexure("f", "p", jc.WORLD, 1.0)),
+        lambda s: s.add(jc.forces.Flexure("f", "p", jc.WORLD, 1.0)),
         "'p' is a particle: it has no orientation",
     ),
 }
@@ -185,8 +201,8 @@ def test_a_mistake_is_named(mistake):
 def test_a_rod_in_space_needs_a_radius_and_a_bounded_twist():
     scene = jc.Scene(dim=3)
     with pytest.raises(ValueError, match="a radius is needed"):
-        jc.rod(scene, "r", helix(3), 1.0)
-    jc.rod(scene, "r", helix(3), 1.0, radius=0.1, bending=1.0, twisting=3.0)
+        jc.chains.rod(scene, "r", helix(3), 1.0)
+    jc.chains.rod(scene, "r", helix(3), 1.0, radius=0.1, bending=1.0, twisting=3.0)
     with pytest.raises(ValueError, match="twisting must be at most twice bending"):
         scene.build()
 
@@ -202,10 +218,10 @@ def test_a_rod_in_space_needs_a_radius_and_a_bounded_twist():
 )
 def test_a_chain_that_cannot_hang_is_refused(arguments, words):
     with pytest.raises(ValueError, match=words):
-        jc.hanging(*arguments)
+        jc.chains.hanging(*arguments)
 
 
 @pytest.mark.parametrize(("end", "links"), [((0.3, 0.5), 2), ((0.2, 0.0), 3)])
 def test_links_too_long_for_their_gap_cannot_hang(end, links):
     with pytest.raises(ValueError, match="without a link under pressure.*shorter"):
-        jc.hanging((0.0, 0.0), end, 1.2, links)
+        jc.chains.hanging((0.0, 0.0), end, 1.2, links)

@@ -1,4 +1,4 @@
-"""The half-cheetah sees, earns and starts as Gymnasium's own, whose file it reads."""
+"""The half-cheetah: observations, rewards, starts and motions equal Gymnasium's."""
 
 import dataclasses
 import functools
@@ -14,13 +14,13 @@ from jaxcon import environments
 from jaxcon.environments.tasks import cheetah
 
 pytest.importorskip("mujoco")
-CHEAP = jc.Method(solver=jc.Schur(), bounded=jc.GaussSeidel(4))
+CHEAP = jc.Method(solver=jc.solvers.Schur(), contact_solver=jc.solvers.GaussSeidel(4))
 EXACT = 1e-9
 
 
 @functools.cache
 def built():
-    """The environment, a start of it, and what puts it somewhere."""
+    """Returns the environment, 256 starts, and the function that places it at (qpos, qvel)."""
     environment = environments.make("HalfCheetah", method=CHEAP)
     starts = jax.jit(jax.vmap(environment.reset))(jax.random.split(jax.random.key(3), 256))
     return environment, starts, jax.jit(jax.vmap(environment.place))
@@ -32,7 +32,7 @@ def peer():
 
 
 def test_what_is_seen_and_earned_is_what_gymnasium_says():
-    """At its start, near it, and far from it, where angles have whole turns."""
+    """States at the start, near it, and far from it with angles beyond whole turns."""
     (environment, starts, place), other, random = built(), peer(), np.random.default_rng(0)
     size = np.repeat([0.02, 0.15, 3.0], 8)[:, None]
     qpos, qvel = (scale * size * random.normal(size=(24, 9)) for scale in (1, 40))
@@ -63,7 +63,7 @@ def test_actions_and_their_time_are_gymnasiums():
 
 
 def test_episodes_start_as_scattered_as_gymnasiums():
-    """Widths of all entries together, 2,304 numbers, and of each."""
+    """Compares the standard deviation of all 2,304 entries together and of each entry."""
     (environment, starts, _), other = built(), peer()
     read = jax.jit(jax.vmap(lambda episode: environment.coordinates(episode)))
     theirs = []
@@ -78,9 +78,9 @@ def test_episodes_start_as_scattered_as_gymnasiums():
 
 
 def test_copies_move_as_gymnasiums_and_stand_on_the_ground():
-    """Three things of one program: motors and NaN high above the ground, then a fall.
+    """Checks one program thrice: driven high above the ground, with a NaN action, and in a fall.
 
-    Steps of half a millisecond of both integrators hardly differ.
+    With steps of half a millisecond the two integrators hardly differ.
     """
     h, other = 5e-4, gymnasium.make("HalfCheetah-v5").unwrapped
     other.model.opt.timestep, other.frame_skip = h, 16
@@ -104,7 +104,7 @@ def test_copies_move_as_gymnasiums_and_stand_on_the_ground():
     assert not truncated.any()
     assert not info["diverged"].any()
     assert np.all(seen[:6, 0] > 4)
-    assert abs(seen[6, 0]) < 0.1  # begun anew
+    assert abs(seen[6, 0]) < 0.1  # was reset
 
     envs.reset(seed=1)
     envs.environment = dataclasses.replace(environment, dt=jnp.asarray(0.01))

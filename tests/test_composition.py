@@ -1,4 +1,4 @@
-"""What JAX does with functions and pytrees, it does with ours: meshes, export, donation, keys."""
+"""JAX features applied to steps and systems: meshes, export, donation, hashing, equality."""
 
 import os
 import subprocess
@@ -33,23 +33,25 @@ def stop():
 SCENES = {
     "plane": scenes.arm,
     "stop": lambda: scenes.arm(stop()),
-    "turns": lambda: scenes.arm(jc.JointSpring("spring", "hinge", 2.0), dim=3),
+    "turns": lambda: scenes.arm(jc.forces.JointSpring("spring", "hinge", 2.0), dim=3),
     "motor": lambda: scenes.arm(
-        jc.Motor("motor", "hinge"), jc.PositionServo("servo", "hinge", 2.0)
+        jc.Motor("motor", "hinge"), jc.forces.PositionServo("servo", "hinge", 2.0)
     ),
 }
 METHODS = {
     "default": jc.Method(),
-    "stages": jc.Method(jc.RK4(), stabilizer=jc.PID(100.0, 20.0, 1.0), solver=jc.Sparse()),
-    "window": jc.Method(stabilizer=jc.SlidingWindowBaumgarte()),
-    "implicit": jc.Method(jc.GeneralizedAlpha()),
-    "recovery": jc.Method(recovery=jc.Recovery(), events=jc.Events()),
-    "multipliers": jc.Method(stabilizer=jc.AugmentedLagrangian()),
+    "stages": jc.Method(
+        jc.RK4(), stabilizer=jc.stabilizers.PID(100.0, 20.0, 1.0), solver=jc.solvers.Sparse()
+    ),
+    "window": jc.Method(stabilizer=jc.stabilizers.SlidingWindowBaumgarte()),
+    "implicit": jc.Method(jc.integrators.GeneralizedAlpha()),
+    "recovery": jc.Method(recovery=jc.stabilizers.Recovery(), events=jc.integrators.Events()),
+    "multipliers": jc.Method(stabilizer=jc.stabilizers.AugmentedLagrangian()),
 }
 
 
 def stepped(system, method):
-    """(state) → what `step` returns."""
+    """Returns the function from a state to the result of `step`."""
     u = jnp.zeros(system.layout.n_u) if system.layout.n_u else None
     return lambda state: jc.step(system, method, state, u, 1e-2)
 
@@ -60,8 +62,9 @@ def same(found, expected):
         np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
 
 
-def test_worlds_on_meshes_with_all_checks_of_types():
-    """`shard_map` with `check_vma`, and explicit axes, in a process with two devices."""
+@pytest.mark.parametrize("name", ["turns", "stop"])
+def test_worlds_on_meshes_with_all_checks_of_types(name):
+    """Runs `shard_map` with `check_vma`, and explicit axes, in a process with two devices."""
     own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
     kept = {k: v for k, v in os.environ.items() if k.startswith("JAX_COMPILATION_CACHE")}
     own |= kept | {
@@ -71,7 +74,7 @@ def test_worlds_on_meshes_with_all_checks_of_types():
         "XLA_FLAGS": os.environ["XLA_FLAGS"],
     }
     own["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), own.get("PYTHONPATH")]))
-    command = [sys.executable, str(ROOT / "tests" / "mesh_program.py")]
+    command = [sys.executable, str(ROOT / "tests" / "mesh_program.py"), name]
     done = subprocess.run(command, env=own, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
@@ -109,7 +112,7 @@ def test_gradients_of_a_batch_of_any_size_are_exported():
 def test_system_state_and_info_are_written_to_a_file_and_read():
     pytest.importorskip("flatbuffers")
     method = METHODS["recovery"]
-    system, state = scenes.arm(stop(), jc.JointSpring("spring", "hinge", 2.0))
+    system, state = scenes.arm(stop(), jc.forces.JointSpring("spring", "hinge", 2.0))
     state = jc.init(system, method, state.q, state.v)
 
     def step(system, state):
@@ -119,12 +122,12 @@ def test_system_state_and_info_are_written_to_a_file_and_read():
     text = export.export(run)(system, state).serialize()
     read = export.deserialize(text)
     same(read.call(system, state), run(system, state))
-    with pytest.raises(ValueError, match="args"):  # a system of another structure is refused
+    with pytest.raises(ValueError, match="args"):  # refuses a system of another structure
         read.call(*scenes.arm())
 
 
 def nodes(structure):
-    """Class and static data of each node of a tree."""
+    """Yields the class and the static data of each node of a tree."""
     if structure.node_data() is not None:
         yield structure.node_data()
     for child in structure.children():
@@ -132,7 +135,10 @@ def nodes(structure):
 
 
 def writable(tree):
-    """The classes of a tree's nodes that JAX can write, after their static data are read back."""
+    """Returns the classes of a tree's nodes.
+
+    Checks that their static data survive being written and read.
+    """
     known = (tuple, list, dict, type(None))
     found = set()
     for cls, data in nodes(jax.tree.structure(tree)):
@@ -146,7 +152,7 @@ def writable(tree):
 
 
 def registered(cls):
-    """Returns True where JAX has a name for a class: it refuses to be told a second one."""
+    """Checks that JAX knows a class: registering it a second time must fail."""
     named = issubclass(cls, tuple)
     how = {} if named else {"serialize_auxdata": encoded, "deserialize_auxdata": decoded}
     register = getattr(export, f"register_{'namedtuple' if named else 'pytree_node'}_serialization")
@@ -202,7 +208,7 @@ def test_a_file_runs_no_code():
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_fresh_state_can_be_donated(name, method):
-    """None of its arrays is there twice, in the state or in the system."""
+    """No array occurs twice in a state, or in both the state and the system."""
     method = METHODS[method]
     system, built = SCENES[name]()
     given = jnp.zeros_like(built.v)
@@ -243,12 +249,12 @@ def test_equal_methods_are_equal_and_hash_alike():
     assert len({*gains, jc.Method()}) == 3
     assert jc.Method(jc.RK4()) != jc.Method()
     assert jc.Method() != jc.Method
-    assert jc.RankSafe() == jc.RankSafe()
-    assert jc.RankSafe() != jc.RankSafe(always=True)
+    assert jc.solvers.RankSafe() == jc.solvers.RankSafe()
+    assert jc.solvers.RankSafe() != jc.solvers.RankSafe(always=True)
 
 
 def gains(alpha):
-    """A method with any leaf in the place of α, as JAX rebuilds it."""
+    """Returns a method with any leaf in place of α, built by `tree.unflatten` as JAX does."""
     leaves, structure = jax.tree.flatten(alpha)
     known = jax.tree.unflatten(structure, [1.0] * len(leaves))
     method = jc.Method(stabilizer=jc.Baumgarte(known, 25.0))
@@ -259,7 +265,7 @@ def gains(alpha):
     ("x", "y", "equal"),
     [
         (5.0, 5.0, True),
-        (5.0, 5, False),  # other dtypes, and so other programs
+        (5.0, 5, False),  # another dtype compiles another program
         (1, True, False),
         (0.0, -0.0, False),
         (float("nan"), float("nan"), True),
@@ -295,7 +301,7 @@ def test_traced_numbers_are_themselves_alone():
 
 
 def test_a_hash_waits_for_no_array():
-    """Not even for one that will never be there."""
+    """Hashing a method must not read its arrays: here one of them is deleted."""
     gone = jnp.ones(3)
     method = gains(gone)
     gone.delete()
@@ -311,10 +317,10 @@ def test_a_method_is_a_static_argument_that_is_traced_once():
         return jc.step(system, method, state, None, 1e-3)[0]
 
     run = jax.jit(step, static_argnums=0)
-    found = [run(jc.Method(solver=jc.Sparse()), state) for _ in range(3)]
+    found = [run(jc.Method(solver=jc.solvers.Sparse()), state) for _ in range(3)]
     assert len(traces) == 1
     same(found[0], found[2])
-    run(jc.Method(solver=jc.Schur()), state)
+    run(jc.Method(solver=jc.solvers.Schur()), state)
     assert len(traces) == 2
 
 

@@ -1,4 +1,4 @@
-"""Compound joints and twists: angles of hinges in series, against turns composed one by one."""
+"""Compound joints and twists: angles of hinges in series, compared with composed rotations."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from tolerances import IDENTITY
 
 import jaxcon as jc
 
-FREE = jc.Method(stabilizer=jc.Unstabilized())
+FREE = jc.Method(stabilizer=jc.stabilizers.Unstabilized())
 POINT = np.array([0.3, -0.2, 0.5])
 AXES = np.array([[1.0, 0.2, 0.1], [-0.3, 1.0, 0.4], [0.2, -0.1, 1.0]])
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
@@ -20,10 +20,10 @@ MOMENTS = (0.4, 0.5, 0.7)
 
 
 def arm(slides, hinges, *elements, ball=False, dtype=None, **body):
-    """A body on a compound joint of so many slides and hinges."""
+    """A body on a compound joint with the given numbers of slides and hinges."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0), dtype=dtype)
     scene.add_body("arm", mass=2.0, inertia=MOMENTS, position=(0.1, 0.4, 0.2), **body)
-    joint = jc.Compound(
+    joint = jc.joints.Compound(
         "joint",
         jc.WORLD,
         "arm",
@@ -39,7 +39,7 @@ def arm(slides, hinges, *elements, ball=False, dtype=None, **body):
 
 
 def placed(system, state, travels, angles):
-    """The state at these coordinates, by composing the motions of the slides and hinges."""
+    """Returns q at these coordinates, by composing the motions of the slides and hinges."""
     turn = jnp.asarray([1.0, 0.0, 0.0, 0.0])
     for axis, angle in zip(AXES, angles, strict=False):
         turn = jc.quaternion.multiply(turn, jc.quaternion.exp(jnp.asarray(axis) * angle))
@@ -51,7 +51,7 @@ def placed(system, state, travels, angles):
 @pytest.mark.parametrize("slides", [0, 1, 2, 3])
 @pytest.mark.parametrize("hinges", [0, 1, 2, 3])
 def test_coordinates_are_those_that_were_composed(slides, hinges):
-    """Values; and rates, which are derivatives along the motion of the composed pose."""
+    """Compares coordinates, and their rates as derivatives of the composed pose."""
     system, state = arm(slides, hinges)
     travels = jnp.asarray([0.3, -0.7, 0.4])[:slides]
     angles = jnp.asarray([2.1, -1.1, -2.9])[:hinges]
@@ -78,9 +78,10 @@ def test_coordinates_are_those_that_were_composed(slides, hinges):
 
 
 def test_springs_on_three_hinges_add_up():
-    """Angles that are computed together are those that each spring alone sees."""
+    """Three springs evaluated together give the sum of the forces of each spring alone."""
     springs = [
-        jc.JointSpring(f"spring{i}", "joint", float(i), coordinate=f"angle_{i}") for i in (1, 2, 3)
+        jc.forces.JointSpring(f"spring{i}", "joint", float(i), coordinate=f"angle_{i}")
+        for i in (1, 2, 3)
     ]
 
     def force(*elements):
@@ -93,11 +94,13 @@ def test_springs_on_three_hinges_add_up():
 
 
 def test_perpendicular_hinges_up_to_gimbal_lock():
-    """Euler angles of the middle hinge up to ±90°, where everything stays finite."""
+    """The middle angle takes values up to ±90°, where accelerations and derivatives stay finite."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_body("arm", mass=2.0, inertia=MOMENTS)
-    scene.add(jc.Compound("joint", jc.WORLD, "arm", hinges=((1, 0, 0), (0, 1, 0), (0, 0, 1))))
-    scene.add(jc.JointSpring("spring", "joint", 1.0, coordinate="angle_2"))
+    scene.add(
+        jc.joints.Compound("joint", jc.WORLD, "arm", hinges=((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    )
+    scene.add(jc.forces.JointSpring("spring", "joint", 1.0, coordinate="angle_2"))
     system, state = scene.build()
 
     def middle(angle):
@@ -119,7 +122,7 @@ def test_perpendicular_hinges_up_to_gimbal_lock():
 
 
 def test_motors_on_two_hinges_do_the_work_of_their_angles():
-    """Jᵀτ is the generalized force of the two torques: M v̇ projected on the hinges is τ at rest."""
+    """At rest, M v̇ projected on the hinges equals the two torques τ."""
     motors = [jc.Motor(f"m{i}", "joint", coordinate=f"angle_{i}") for i in (1, 2)]
     system, state = arm(0, 2, *motors)
     lever = np.array([0.1, 0.4, 0.2]) - POINT
@@ -132,12 +135,12 @@ def test_motors_on_two_hinges_do_the_work_of_their_angles():
 
 
 def ball(*elements, **body):
-    """A body on a ball joint at its centre of mass, turned at assembly."""
+    """A body on a ball joint at its center of mass, rotated at assembly."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_body("ball", mass=1.0, inertia=MOMENTS, quaternion=(0.5, 0.5, 0.5, 0.5), **body)
     scene.add(jc.Spherical("socket", jc.WORLD, "ball", point=(0, 0, 0)))
-    for i, axis in enumerate(np.eye(3)):  # x of the body lies along y of the world, and so on
-        scene.add(jc.Twist(f"twist{i}", jc.WORLD, "ball", axis=np.roll(axis, 1)))
+    for i, axis in enumerate(np.eye(3)):  # x of the body is y of the world, y is z, z is x
+        scene.add(jc.joints.Twist(f"twist{i}", jc.WORLD, "ball", axis=np.roll(axis, 1)))
     for element in elements:
         scene.add(element)
     return scene.build()
@@ -152,9 +155,9 @@ def test_a_motor_on_a_twist_is_a_torque_in_the_body():
 
 
 def test_rotors_on_three_twists_add_to_the_moments():
-    """(I + I_r) ω̇ = −ω × Iω: the rotors' own momentum is that along the axes of the body only."""
+    """(I + I_r) ω̇ = −ω × Iω: rotors have momentum along their own axes in the body only."""
     spin = np.array([0.4, -0.8, 1.1])
-    rotors = [jc.Armature(f"r{i}", f"twist{i}", 0.2) for i in range(3)]
+    rotors = [jc.joints.Armature(f"r{i}", f"twist{i}", 0.2) for i in range(3)]
     system, state = ball(*rotors, angular_velocity=spin)
     solution = jc.forward_dynamics(system, state, None, FREE, 1e-3)
     moments = np.array(MOMENTS)
@@ -163,7 +166,7 @@ def test_rotors_on_three_twists_add_to_the_moments():
 
 
 def test_equal_springs_on_three_twists_pull_along_the_rotation_vector():
-    system, state = ball(*(jc.JointSpring(f"s{i}", f"twist{i}", 2.0, 0.1) for i in range(3)))
+    system, state = ball(*(jc.forces.JointSpring(f"s{i}", f"twist{i}", 2.0, 0.1) for i in range(3)))
     turn, spin = jnp.asarray([0.7, -1.3, 0.4]), jnp.asarray([0.2, 0.1, -0.3])
     turned = jc.quaternion.multiply(state.q[3:], jc.quaternion.exp(turn))
     q = jnp.concatenate([jnp.zeros(3), turned])
@@ -194,12 +197,15 @@ def test_a_free_compound_has_no_rows():
 def test_bad_axes_are_named(slides, hinges, ball, match):
     scene = jc.Scene()
     scene.add_body("arm", mass=1.0, inertia=(1, 1, 1))
-    scene.add(jc.Compound("j", jc.WORLD, "arm", slides=slides, hinges=hinges, ball=ball))
+    scene.add(jc.joints.Compound("j", jc.WORLD, "arm", slides=slides, hinges=hinges, ball=ball))
     with pytest.raises(ValueError, match=match):
         scene.build()
 
 
 def test_a_twist_is_neither_driven_nor_coupled():
-    for element in (jc.Gear("g", "twist0", "twist1", 2.0), jc.Drive("g", "twist0", jnp.sin)):
+    for element in (
+        jc.joints.Gear("g", "twist0", "twist1", 2.0),
+        jc.joints.Drive("g", "twist0", jnp.sin),
+    ):
         with pytest.raises(ValueError, match="'g': the twist of 'twist0' is not the integral"):
             ball(element)

@@ -1,4 +1,4 @@
-"""Contact and ropes: closed forms, energy, Coulomb's law, gradients through impacts."""
+"""Contacts and ropes: closed forms, energy, Coulomb's law, gradients through impacts."""
 
 import dataclasses
 import functools
@@ -19,7 +19,7 @@ dtypes = pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 
 
 def run(system, state, h, steps, method=None, every=1):
-    """The states and what the bounded rows did."""
+    """Rolls out and returns the recorded states and reactions."""
     method = jc.Method() if method is None else method
     state = jc.init(system, method, state.q, state.v)
     return recorded(system, method, state, jnp.asarray(h, state.q.dtype), steps, every)
@@ -27,7 +27,7 @@ def run(system, state, h, steps, method=None, every=1):
 
 @functools.partial(jax.jit, static_argnames=("steps", "every"))
 def recorded(system, method, state, h, steps, every):
-    """One program for all scenes that differ by numbers only."""
+    """Rolls out; scenes that differ only in numbers share one compiled program."""
 
     def record(s, i):
         return s, i.reactions
@@ -36,7 +36,7 @@ def recorded(system, method, state, h, steps, every):
 
 
 def ball(velocity, spin=(0.0, 0.0, 0.0), height=1e-9, gravity=0.0, **contact):
-    """A ball of 1 kg and 0.1 m over a floor."""
+    """A ball of 1 kg and radius 0.1 m over a floor."""
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -gravity))
     inertia = jc.inertia.sphere(1.0, 0.1)
     scene.add_body(
@@ -48,7 +48,7 @@ def ball(velocity, spin=(0.0, 0.0, 0.0), height=1e-9, gravity=0.0, **contact):
 
 
 def box(slope, friction, dtype=None, size=(0.4, 0.3, 0.1)):
-    """A box on four corners; gravity is turned, not the floor."""
+    """A box on four corners; the slope tilts gravity, not the floor."""
     turned = (9.81 * np.sin(slope), 0.0, -9.81 * np.cos(slope))
     scene = jc.Scene(dim=3, gravity=turned, dtype=dtype)
     a, b, c = size
@@ -74,7 +74,7 @@ def test_a_ball_bounces_as_high_as_it_should():
 
 @pytest.mark.parametrize("name", ["sphere_floor_stick", "sphere_floor_slip"])
 def test_an_impact_with_friction(name):
-    """The reference is in the plane, its spin about z; here that is −y of the body."""
+    """The reference is planar with its spin about z; that axis is −y of this scene."""
     after = FORMS[name]["after"]
     start, spin = ((1.0, 0.0, -2.0), 0.0) if "stick" in name else ((4.0, 0.0, -2.0), 5.0)
     system, state = ball(start, (0.0, -spin, 0.0), friction=0.3, restitution=0.7)
@@ -85,12 +85,14 @@ def test_an_impact_with_friction(name):
 
 
 def test_balls_that_meet():
-    """A central collision, and a cradle by the simultaneous rule of Newton."""
+    """A central collision, and a cradle by Newton's simultaneous impact law."""
     case = FORMS["central_collision"]
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
     scene.add_particle("a", mass=2.0, position=(0, 0, 0), velocity=(3.0, 0, 0))
     scene.add_particle("b", mass=5.0, position=(0.2, 0, 0), velocity=(-1.0, 0, 0))
-    scene.add(jc.CapsuleContact("touch", "a", "b", radius_a=0.1, radius_b=0.1, restitution=0.6))
+    scene.add(
+        jc.contacts.CapsuleContact("touch", "a", "b", radius_a=0.1, radius_b=0.1, restitution=0.6)
+    )
     states, _ = run(*scene.build(), H, 1)
     np.testing.assert_allclose(states.v[-1, :2], [case["v1_after"], case["v2_after"]], rtol=1e-9)
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
@@ -98,7 +100,7 @@ def test_balls_that_meet():
         scene.add_particle(f"{i}", mass=1.0, position=(0.2 * i, 0), velocity=(float(i == 0), 0))
     for i in range(2):
         touch = {"radius_a": 0.1, "radius_b": 0.1, "restitution": 1.0}
-        scene.add(jc.CapsuleContact(f"touch {i}", f"{i}", f"{i + 1}", **touch))
+        scene.add(jc.contacts.CapsuleContact(f"touch {i}", f"{i}", f"{i + 1}", **touch))
     states, reactions = run(*scene.build(), H, 1)
     np.testing.assert_allclose(states.v[-1, :3], [-1 / 3, 2 / 3, 2 / 3], rtol=1e-9)
     np.testing.assert_allclose(reactions.kept, 1.0)
@@ -118,7 +120,7 @@ def test_a_rod_that_falls_on_its_tip():
 
 
 def test_a_bowling_ball_slides_then_rolls():
-    """The reference has y up and rolls along z; here x is along the lane and y its negative x."""
+    """The reference has y up and rolls along z; here z is up and x is along the lane."""
     want = FORMS["bowling_ball"]["states"][-1]
     errors = []
     for h in (2e-3, 1e-3):
@@ -140,7 +142,7 @@ def test_a_bowling_ball_slides_then_rolls():
 @dtypes
 @pytest.mark.parametrize("friction", [0.3, 0.7])
 def test_a_box_on_a_slope(friction, dtype):
-    """It slides with g (sin α − μ cos α), or stays; its corners bear what they must."""
+    """The box slides with g (sin α − μ cos α) or stays; its corners together bear m g cos α."""
     case = FORMS["block_incline"]
     system, state = box(np.pi / 6, friction, dtype)
     states, reactions = run(system, state, H, 400)
@@ -156,7 +158,7 @@ def test_a_box_on_a_slope(friction, dtype):
 
 @pytest.mark.parametrize("slope", [0.95, 1.05])
 def test_a_box_topples_beyond_its_corner(slope):
-    """A tall box with much friction stays while tan α < width/height."""
+    """A tall box with high friction stays while tan α < width/height."""
     system, state = box(np.arctan(slope * 0.5), 2.0, size=(0.1, 0.1, 0.2))
     states, _ = run(system, state, 2e-3, 400)
     tilt = np.abs(np.asarray(states.q[-1, 5]))
@@ -164,7 +166,7 @@ def test_a_box_topples_beyond_its_corner(slope):
 
 
 def test_what_is_missed_over_random_states_of_a_box():
-    """Laws, cone and the direction of friction: 2,000 boxes thrown into the floor."""
+    """Contact laws and the friction cone hold for 2,000 boxes thrown into the floor."""
     system, state = box(0.4, 0.5)
     method = jc.Method()
 
@@ -186,9 +188,10 @@ def test_what_is_missed_over_random_states_of_a_box():
 
 
 def test_no_impact_adds_energy():
-    """Rods that fall on a rough floor: without a cap, one in eight of them would gain.
+    """Rods fall on a rough floor. Without the energy cap, one in eight impacts would add energy.
 
-    Every other tip starts where it arrives just at the end of the step: there only a bounce acts.
+    Every other tip starts such that it reaches the floor at the end of the step: only its
+    restitution acts in that step.
     """
     turn = np.pi / 6
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
@@ -225,7 +228,9 @@ def test_a_column_with_a_heavy_block_stays_up(dtype):
         below = jc.PlaneContact("floor", jc.WORLD, "0", center=(0.0, 0.0))
         touch = {"radius_a": 0.05, "radius_b": 0.05, "friction": 0.5}
         scene.add(
-            below if i == 0 else jc.CapsuleContact(f"{i - 1}:{i}", f"{i - 1}", f"{i}", **touch)
+            below
+            if i == 0
+            else jc.contacts.CapsuleContact(f"{i - 1}:{i}", f"{i - 1}", f"{i}", **touch)
         )
     system, state = scene.build()
     states, _ = run(system, state, 5e-3, 400, every=400)
@@ -237,7 +242,7 @@ def test_a_column_with_a_heavy_block_stays_up(dtype):
 def test_a_rope_catches_a_weight(integrator):
     scene = jc.Scene(dim=3)
     scene.add_particle("weight", mass=1.0, position=(0.3, 0.0, -0.5))
-    scene.add(jc.Rope("rope", jc.WORLD, "weight", length=1.0, point_a=(0.0, 0.0, 0.0)))
+    scene.add(jc.contacts.Rope("rope", jc.WORLD, "weight", length=1.0, point_a=(0.0, 0.0, 0.0)))
     system, state = scene.build()
     states, reactions = run(system, state, H, 1500, jc.Method(integrator=integrator))
     length = np.linalg.norm(np.asarray(states.q), axis=1)
@@ -250,7 +255,7 @@ def test_a_rope_catches_a_weight(integrator):
 
 
 def test_gradients_through_a_bounce_contain_its_time():
-    """y(T) = r + e (−v T − (y₀ − r)): without the time of impact ∂y/∂y₀ has the wrong sign."""
+    """y(T) = r + e (−v T − (y₀ − r)). Ignoring the time of impact gives ∂y/∂y₀ the wrong sign."""
     case = references.load("grad_contact_zhong")["task1"]
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("ball", mass=1.0, position=(0.0, 1.0))
@@ -267,7 +272,7 @@ def test_gradients_through_a_bounce_contain_its_time():
 
 
 def falling(dtype=None, restitution=0.7, ceiling=False):
-    """A ball of 0.1 m in the plane."""
+    """A ball of radius 0.1 m in the plane, above a floor or below a ceiling."""
     scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=dtype)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
     side = {"point": (0.0, 1.1), "normal": (0.0, -1.0)} if ceiling else {}
@@ -277,7 +282,10 @@ def falling(dtype=None, restitution=0.7, ceiling=False):
 
 
 def height(world, z, e, g, v, h, steps, last=-1):
-    """The height of the ball of `falling` after steps of h, or the last of them, from v₀ = v."""
+    """Returns the height of the ball of `falling` after steps of h, started at height z with v.
+
+    `last` is the index of the step after which the height is read.
+    """
     system, state = world
     own = {"end": {"restitution": e}, "gravity": jnp.stack([0 * g, -g])}
     start = dataclasses.replace(state, q=state.q.at[1].set(z), v=state.v.at[1].set(v))
@@ -287,11 +295,11 @@ def height(world, z, e, g, v, h, steps, last=-1):
 
 
 slopes = jax.jit(jax.grad(height, (1, 2, 3, 4)), static_argnames="steps")
-"""The derivatives by place, restitution, gravity and velocity."""
+"""Derivatives of `height` by place, restitution, gravity and velocity."""
 
 
 def bounced(z, e, g, v, end, duration):
-    """y after a bounce at y = `end`, where it arrives with √(v² + 2 g (z − end))."""
+    """Returns y after one bounce at y = `end`, reached with speed √(v² + 2 g (z − end))."""
     there = jnp.sqrt(v * v + 2 * g * (z - end))
     up = jnp.where(end > z, 1, -1)
     left = duration - (v - up * there) / g
@@ -303,7 +311,7 @@ STEP, STEPS = 4e-3, 120
 
 @jax.jit
 def values_and_slopes(world, speed, z, e, g):
-    """The heights from many places, and their derivatives by place, restitution and gravity."""
+    """Returns heights from many starts z, with derivatives by z, restitution and gravity."""
 
     def found(z, e, g):
         return height(world, z, e, g, speed + STEP * g / 2, STEP, STEPS)
@@ -314,7 +322,7 @@ def values_and_slopes(world, speed, z, e, g):
 @dtypes
 @pytest.mark.parametrize(("ceiling", "speed"), [(False, 0.0), (True, 5.0)])
 def test_what_falls_and_bounces_does_so_exactly(dtype, ceiling, speed):
-    """And by place, restitution and gravity, where v₀ is that of half a step before z."""
+    """Heights and derivatives are exact if v₀ is the velocity half a step before z."""
     world = falling(dtype, ceiling=ceiling)
     end = 1.0 if ceiling else 0.1
 
@@ -333,7 +341,7 @@ def test_what_falls_and_bounces_does_so_exactly(dtype, ceiling, speed):
 @dtypes
 @pytest.mark.parametrize("ceiling", [False, True])
 def test_what_hardly_arrives_has_finite_derivatives(dtype, ceiling):
-    """Where gravity turns it round, or it moves by less than has a square."""
+    """Gravity turns the ball before it arrives, or the speed is so small that v² underflows."""
     h = 2.0**-10
     world = falling(dtype, ceiling=ceiling)
     toward, end = (1.0, 1.0) if ceiling else (-1.0, 0.1)
@@ -345,7 +353,10 @@ def test_what_hardly_arrives_has_finite_derivatives(dtype, ceiling):
 
 
 def test_the_gradient_by_place_through_a_bounce_halves_its_error_with_the_step():
-    """∂y/∂z = −e + (1 + e) g d/v for a start at rest, which a step takes for half a step before."""
+    """The derivative is ∂y/∂z = −e + (1 + e) g d/v from rest, d the time after the bounce.
+
+    A step reads the initial v as that of half a step before z, hence the error of first order.
+    """
     world = falling()
     z = np.linspace(0.49, 0.51, 41)
     numbers, axes = (0.7, 9.81), {"in_axes": (0, None, None)}
@@ -363,9 +374,15 @@ def test_the_gradient_by_place_through_a_bounce_halves_its_error_with_the_step()
 
 
 def test_events_have_the_gradient_by_place_through_a_bounce():
-    """And all of it, from a start at rest."""
+    """With events the derivative is exact, also for a start at rest."""
     system, state = falling()
-    method, h, z, g, e = jc.Method(integrator=jc.RK4(), events=jc.Events()), 2e-2, 0.503, 9.81, 0.7
+    method, h, z, g, e = (
+        jc.Method(integrator=jc.RK4(), events=jc.integrators.Events()),
+        2e-2,
+        0.503,
+        9.81,
+        0.7,
+    )
 
     def height(z):
         start = jc.init(system, method, state.q.at[1].set(z), state.v)
@@ -393,7 +410,7 @@ def test_what_has_ceased_to_bounce_stays(dtype, restitution):
 
 
 def test_a_ball_without_loss_goes_on_bouncing():
-    """v is that of half a step before y."""
+    """The velocity v belongs half a step before y."""
     h, g = 1e-3, 9.81
     system, state = falling(restitution=1.0)
     states, _ = run(system, state, h, 10000)
@@ -404,7 +421,7 @@ def test_a_ball_without_loss_goes_on_bouncing():
 
 
 def test_a_ball_on_a_spring_between_walls_gains_no_energy():
-    """What the spring does changes on the way to a wall and back."""
+    """The spring force changes the velocity on the way to a wall and back."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("ball", mass=1.0, position=(0.03, 0.0))
     for name, side in (("left", 1.0), ("right", -1.0)):
@@ -420,12 +437,12 @@ def test_a_ball_on_a_spring_between_walls_gains_no_energy():
 
 @pytest.mark.parametrize("force", ["push", "spring"])
 def test_a_ball_that_is_pressed_down_comes_to_rest(force):
-    """No bounce is in time with the steps, so as to gain from one what it loses in the next."""
+    """No bounce locks to the phase of the steps, where it would regain the energy that it loses."""
     scene = jc.Scene(dim=2)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, restitution=0.9))
     spring = jc.Spring("spring", jc.WORLD, "ball", 50.0, rest_length=0.0, point_a=(0.0, 0.1))
-    scene.add(jc.Force("push", "ball", (0.0, -50.0)) if force == "push" else spring)
+    scene.add(jc.forces.Force("push", "ball", (0.0, -50.0)) if force == "push" else spring)
     system, state = scene.build()
 
     def last(z):
@@ -440,18 +457,18 @@ def test_a_ball_that_is_pressed_down_comes_to_rest(force):
 @pytest.mark.parametrize("push", [1000.0, -1000.0])
 @pytest.mark.parametrize("speed", [0.5, 2.0])
 def test_a_ball_bounces_off_a_plate_that_is_pressed_to_a_floor_or_a_ceiling(push, speed):
-    """The force on the plate is borne, and no part of the bounce.
+    """The force on the plate is balanced by its support and does not change the bounce.
 
-    A floor takes the impulse, and a ceiling none: then the plate gives way, as masses 1 and 0.1 do.
+    A floor takes the impulse. A ceiling does not: there the plate recoils, as masses 1 and 0.1 do.
     """
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("plate", mass=1.0, inertia=1.0, position=(0.0, 0.0))
     scene.add_particle("ball", mass=0.1, position=(0.0, 0.2))
     scene.add(jc.Prismatic("guide", jc.WORLD, "plate", axis=(0.0, 1.0)))
     scene.add(jc.PlaneContact("end", jc.WORLD, "plate", normal=(0.0, np.sign(push))))
-    scene.add(jc.Force("push", "plate", (0.0, -push)))
+    scene.add(jc.forces.Force("push", "plate", (0.0, -push)))
     touch = {"radius_a": 0.05, "radius_b": 0.05, "restitution": 1.0}
-    scene.add(jc.CapsuleContact("touch", "plate", "ball", **touch))
+    scene.add(jc.contacts.CapsuleContact("touch", "plate", "ball", **touch))
     system, state = scene.build()
     state = dataclasses.replace(state, v=jnp.asarray([0.0, 0.0, 0.0, 0.0, -speed]))
     states, _ = run(system, state, 1e-3, 400)
@@ -461,9 +478,9 @@ def test_a_ball_bounces_off_a_plate_that_is_pressed_to_a_floor_or_a_ceiling(push
 
 @pytest.mark.parametrize("restitution", [0.0, 0.9])
 def test_what_a_floor_bears_does_not_fall_when_it_bounces_off_a_wall(restitution):
-    """A ball slides into a wall that leans over the floor by half a right angle.
+    """A ball slides into a wall that leans over the floor by 45°.
 
-    It leaves upright, and falls from then on; v is that of half a step before the step's end.
+    The ball leaves straight up and falls from then on. The velocity v belongs half a step before q.
     """
     scene = jc.Scene(dim=2)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.0))
@@ -480,14 +497,14 @@ def test_what_a_floor_bears_does_not_fall_when_it_bounces_off_a_wall(restitution
 
 
 def test_what_friction_bears_does_not_fall_when_it_bounces():
-    """A block slides down a rail at constant speed, as friction is as large as its weight.
+    """A block slides down a rail at constant speed, because friction is as large as its weight.
 
-    On its way up both slow it down; v is that of half a step before the step's end.
+    On its way up, gravity and friction both slow it. The velocity v belongs half a step before q.
     """
     scene = jc.Scene(dim=2, gravity=(0.0, -9.81))
     scene.add_body("block", mass=1.0, inertia=1.0, position=(0.0, 0.1003))
     scene.add(jc.Prismatic("rail", jc.WORLD, "block", axis=(0.0, 1.0)))
-    scene.add(jc.JointFriction("friction", "rail", 9.81))
+    scene.add(jc.contacts.JointFriction("friction", "rail", 9.81))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "block", restitution=1.0))
     system, state = scene.build()
     state = dataclasses.replace(state, v=jnp.asarray([0.0, -1.0, 0.0]))
@@ -502,7 +519,7 @@ def test_gradients_through_a_collision():
     scene.add_particle("a", mass=1.0, position=(0.0, 0.0))
     scene.add_particle("b", mass=1.0, position=(0.52, 0.0))
     touch = {"radius_a": 0.1, "radius_b": 0.1, "restitution": 1.0}
-    scene.add(jc.CapsuleContact("touch", "a", "b", **touch))
+    scene.add(jc.contacts.CapsuleContact("touch", "a", "b", **touch))
     system, state = scene.build()
 
     def place(x):
@@ -517,7 +534,7 @@ def test_gradients_through_a_collision():
 
 
 def test_gradients_of_where_a_block_stops():
-    """d = v²/(2 μ g), at first order in h."""
+    """The stopping distance is d = v²/(2 μ g), to first order in h."""
     case = FORMS["sliding_stop_gradient"]
     scene = jc.Scene(dim=2)
     scene.add_particle("block", mass=1.0, position=(0.0, 0.0))
@@ -540,7 +557,7 @@ def test_gradients_of_where_a_block_stops():
 
 @dtypes
 def test_gradients_at_rest_are_finite(dtype):
-    """A box that lies still, on a floor with as much friction as it needs and with none."""
+    """A box lies still on a floor without friction, and on one with friction."""
     system, state = box(0.0, jnp.asarray(0.5, dtype), dtype)
 
     @jax.jit
@@ -557,7 +574,7 @@ def test_gradients_at_rest_are_finite(dtype):
 
 @dtypes
 def test_what_has_left_the_floor_does_not_stick_in_a_derivative(dtype):
-    """A rough ball in the air and one that leaves, both without slip: ∂v⁺/∂v is the identity."""
+    """A rough ball without slip, in the air or leaving: ∂v⁺/∂v is the identity."""
     scene = jc.Scene(dim=3, dtype=dtype)
     scene.add_body("ball", inertia=jc.inertia.sphere(1.0, 0.1), position=(0, 0, 0.1))
     resists = {"friction": 0.5, "rolling": 0.01, "spinning": 0.01}
@@ -576,20 +593,22 @@ def test_what_has_left_the_floor_does_not_stick_in_a_derivative(dtype):
     np.testing.assert_allclose(slopes[2], 0 * np.eye(6), atol=1e-3)
 
 
-@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel()], ids=["point", "sweeps"])
+@pytest.mark.parametrize(
+    "solver", [jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel()], ids=["point", "sweeps"]
+)
 def test_there_is_no_friction_without_a_normal_force(solver):
-    """A slider on a rail beside a floor: the rail bears it, and the floor does not rub."""
+    """A slider on a rail beside a floor: the rail carries it, so the floor exerts no friction."""
     scene = jc.Scene(dim=2)
     scene.add_body("slide", mass=2.0, inertia=1.0, velocity=(1.0, 0.0))
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "slide", friction=0.5))
-    states, reactions = run(*scene.build(), H, 20, jc.Method(bounded=solver))
+    states, reactions = run(*scene.build(), H, 20, jc.Method(contact_solver=solver))
     np.testing.assert_allclose(reactions["floor"], 0.0, atol=1e-9)
     np.testing.assert_allclose(states.v[-1, 0], 1.0, rtol=1e-9)
 
 
 def test_two_discs_that_touch_keep_their_momenta():
-    """Equal and opposite forces at one place, friction too, before and after they overlap."""
+    """Forces act at one point, equal and opposite, before and after the discs overlap."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     for name, x, v, spin in (("a", 0.0, 1.0, 3.0), ("b", 0.235, -1.0, 2.0)):
         scene.add_body(
@@ -597,7 +616,7 @@ def test_two_discs_that_touch_keep_their_momenta():
             angular_velocity=spin,
         )  # fmt: skip
     touch = {"radius_a": 0.1, "radius_b": 0.1, "friction": 0.8}
-    scene.add(jc.CapsuleContact("touch", "a", "b", **touch))
+    scene.add(jc.contacts.CapsuleContact("touch", "a", "b", **touch))
     system, state = scene.build()
     states, _ = run(system, state, 1e-2, 6)
     linear = jax.vmap(lambda s: jc.momentum(system, s))(states)
@@ -608,7 +627,7 @@ def test_two_discs_that_touch_keep_their_momenta():
 
 
 def test_deep_overlap_ends_slowly():
-    """A ball started inside the floor comes out at the rate of recovery."""
+    """A ball that starts inside the floor comes out at the recovery speed."""
     system, state = ball((0.0, 0.0, 0.0), height=-0.08, recovery=0.05)
     states, _ = run(system, state, H, 2000)
     assert np.all(states.status == 0)
@@ -618,7 +637,7 @@ def test_deep_overlap_ends_slowly():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_capsules_touch_where_they_are_nearest(dim):
-    """Against the smallest distance of many pairs of points."""
+    """The gap equals the smallest distance over a grid of point pairs."""
     rng = np.random.default_rng(0)
     for _ in range(4):
         ends = rng.normal(size=(2, 2, dim))
@@ -628,7 +647,7 @@ def test_capsules_touch_where_they_are_nearest(dim):
             inertia = 1.0 if dim == 2 else (1.0, 1.0, 1.0)
             scene.add_body(name, mass=1.0, inertia=inertia, position=own.mean(axis=0))
         scene.add(
-            jc.CapsuleContact(
+            jc.contacts.CapsuleContact(
                 "touch", "a", "b", radius_a=0.1, radius_b=0.2, segment_a=ends[0],
                 segment_b=ends[1],
             )
@@ -649,9 +668,9 @@ def test_capsules_touch_where_they_are_nearest(dim):
         (jc.PlaneContact("c", jc.WORLD, "ball", restitution=2.0), "restitution must lie in 0 to 1"),
         (jc.PlaneContact("c", jc.WORLD, "ball", normal=(0, 0, 0)), "normal"),
         (jc.PlaneContact("c", jc.WORLD, "bal"), "body 'bal' is unknown"),
-        (jc.CapsuleContact("c", "ball", "ball"), "to itself"),
-        (jc.CapsuleContact("c", jc.WORLD, "ball"), "give radius_a, radius_b or both"),
-        (jc.Rope("r", jc.WORLD, "ball", length=-1.0), "Rope 'r': length must be positive"),
+        (jc.contacts.CapsuleContact("c", "ball", "ball"), "to itself"),
+        (jc.contacts.CapsuleContact("c", jc.WORLD, "ball"), "give radius_a, radius_b or both"),
+        (jc.contacts.Rope("r", jc.WORLD, "ball", length=-1.0), "Rope 'r': length must be positive"),
     ],
 )
 def test_bad_numbers_are_refused(element, match):

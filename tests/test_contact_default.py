@@ -1,4 +1,4 @@
-"""The solver of inequality constraints that a method takes unless one is chosen."""
+"""The default solver of inequality constraints."""
 
 import dataclasses
 
@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.constraints.bounds import count_bounds
-from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
-from jaxcon.model.state import MethodMemory
+from jaxcon.contact.contact_default import EXACT_UP_TO, default_contact_solver
+from jaxcon.contact.rows import count_bounds
+from jaxcon.system.state import MethodMemory
 
 DT = 2e-3
 
 
 def grains(count, dtype=None):
-    """Particles on a rough floor: two rows each, and no load passes from one to another."""
+    """Particles on a rough floor: two rows each, and no load passes between particles."""
     scene = jc.Scene(dim=2, dtype=dtype)
     for i in range(count):
         scene.add_particle(f"p{i}", mass=1.0 + i, position=(i, 1e-3 * i), velocity=(0.5, 0.0))
@@ -25,29 +25,33 @@ def grains(count, dtype=None):
 
 
 def tower(top):
-    """Four boxes in the plane on each other, 32 rows."""
+    """Four stacked boxes in the plane, 32 rows."""
     scene = jc.Scene(dim=2)
     for i in range(4):
         mass, below = (top if i == 3 else 1.0), f"box{i - 1}" if i else jc.WORLD
         middle, edge = (0.0, 0.1 + 0.2 * i), (0.0, 0.2 * i)
         scene.add_body(f"box{i}", mass=mass, inertia=mass * 0.04 / 6, position=middle)
         scene.add(
-            jc.BoxContact(f"on{i}", below, f"box{i}", size=(0.2, 0.2), point=edge, friction=0.5)
+            jc.contacts.BoxContact(
+                f"on{i}", below, f"box{i}", size=(0.2, 0.2), point=edge, friction=0.5
+            )
         )
     return scene.build()
 
 
 def walker(joined):
-    """Fourteen feet on the floor, and a pair of stops between two bodies joined by a hinge, or not.
+    """Fourteen feet on the floor, and a contact between two bodies, with or without a hinge.
 
-    A contact between two parts of one mechanism is no stack: its joints pass the load.
+    A contact within one mechanism is not a stack, because its joints carry the load.
     """
     scene = jc.Scene(dim=2)
     scene.add_body("body", mass=1.0, inertia=0.1, position=(0.0, 1.0))
     scene.add_body("leg", mass=1.0, inertia=0.1, position=(0.0, 0.5))
     if joined:
         scene.add(jc.Revolute("hip", "body", "leg", point=(0.0, 0.75)))
-    scene.add(jc.CapsuleContact("limbs", "body", "leg", radius_a=0.1, radius_b=0.1, friction=0.3))
+    scene.add(
+        jc.contacts.CapsuleContact("limbs", "body", "leg", radius_a=0.1, radius_b=0.1, friction=0.3)
+    )
     for i in range(14):
         foot = (0.1 * i, 0.1)
         scene.add(jc.PlaneContact(f"foot{i}", jc.WORLD, "leg", radius=0.1, center=foot, friction=1))
@@ -55,11 +59,11 @@ def walker(joined):
 
 
 SCENES = {
-    "few": (lambda: grains(EXACT_UP_TO // 2), jc.InteriorPoint),
-    "many": (lambda: grains(EXACT_UP_TO // 2 + 1), jc.GaussSeidel),
-    "tower": (lambda: tower(1.0), jc.InteriorPoint),
-    "walker": (lambda: walker(True), jc.GaussSeidel),
-    "apart": (lambda: walker(False), jc.InteriorPoint),
+    "few": (lambda: grains(EXACT_UP_TO // 2), jc.solvers.InteriorPoint),
+    "many": (lambda: grains(EXACT_UP_TO // 2 + 1), jc.solvers.GaussSeidel),
+    "tower": (lambda: tower(1.0), jc.solvers.InteriorPoint),
+    "walker": (lambda: walker(True), jc.solvers.GaussSeidel),
+    "apart": (lambda: walker(False), jc.solvers.InteriorPoint),
 }
 
 
@@ -68,12 +72,12 @@ def test_the_default_is_chosen_by_structure(name):
     build, kind = SCENES[name]
     system, state = build()
     assert type(default_contact_solver(system, state.q, state.v)) is kind
-    assert type(jc.Method().resolve(system, state).bounded) is kind
-    assert jc.Method().resolve(system, state).bounded.smoothing is None
+    assert type(jc.Method().resolve(system, state).contact_solver) is kind
+    assert jc.Method().resolve(system, state).contact_solver.smoothing is None
     warm = jax.tree.leaves(state.memory)
     assert [x.shape for x in warm] == ([(count_bounds(system, state.q, state.v),)] * len(warm))
-    assert bool(warm) == (kind is jc.GaussSeidel)
-    chosen = jc.Method(bounded=jc.GaussSeidel(7))
+    assert bool(warm) == (kind is jc.solvers.GaussSeidel)
+    chosen = jc.Method(contact_solver=jc.solvers.GaussSeidel(7))
     assert chosen.resolve(system, state) is chosen
 
 
@@ -82,33 +86,33 @@ def test_the_choice_is_made_while_tracing():
     kinds = []
 
     def traced(system, state):
-        kinds.append(type(jc.Method().resolve(system, state).bounded))
+        kinds.append(type(jc.Method().resolve(system, state).contact_solver))
         return jc.step(system, jc.Method(), state, None, DT)[0].q
 
     jax.jit(traced)(system, state)
-    assert set(kinds) == {jc.GaussSeidel}
+    assert set(kinds) == {jc.solvers.GaussSeidel}
 
 
 def program(method, system, state):
-    """The traced step in text."""
+    """Returns the text of the traced step."""
     return str(jax.make_jaxpr(lambda s: jc.step(system, method, s, None, DT))(state))
 
 
 def test_few_rows_and_none_leave_the_step_what_it_was():
     for system, state in (grains(3), tower(1.0)):
-        exact = jc.Method(bounded=jc.InteriorPoint())
+        exact = jc.Method(contact_solver=jc.solvers.InteriorPoint())
         assert program(jc.Method(), system, state) == program(exact, system, state)
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     system, state = scene.build()
-    swept = jc.Method(bounded=jc.GaussSeidel())
+    swept = jc.Method(contact_solver=jc.solvers.GaussSeidel())
     assert state.memory == ()
     assert program(jc.Method(), system, state) == program(swept, system, state)
 
 
 def slid(system, method, state, steps=40):
-    """The end of a slide, in a scan of one's own."""
+    """Returns the final state of a `lax.scan` over `step`."""
 
     def one(state, _):
         return jc.step(system, method, state, None, DT)[0], None
@@ -117,19 +121,20 @@ def slid(system, method, state, steps=40):
 
 
 def test_states_go_from_one_solver_to_another():
-    """From `build`, from `init` of any solver, and from before there was a default."""
+    """States come from `build`, from `init`, and from versions without a default solver."""
     system, state = grains(14)
     auto, exact, swept = (
-        jc.Method(bounded=x) for x in (None, jc.InteriorPoint(), jc.GaussSeidel())
+        jc.Method(contact_solver=x)
+        for x in (None, jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel())
     )
     ends = [slid(system, method, state) for method in (auto, exact, swept)]
     for end in ends:
         assert int(end.status) == 0
         assert jax.tree.structure(end) == jax.tree.structure(state)
         np.testing.assert_allclose(end.q, ends[0].q, atol=1e-9)
-        # grains alone: λ_n = m g h / h
+        # no load passes between grains: λ_n = m g
         weight = 9.81 * (1.0 + np.arange(14))
-        np.testing.assert_allclose(end.memory.bounded[:14], weight, rtol=1e-6)
+        np.testing.assert_allclose(end.memory.contact_multipliers[:14], weight, rtol=1e-6)
     old = dataclasses.replace(state, memory=())
     for method in (auto, exact):
         end = slid(system, method, old)
@@ -145,24 +150,26 @@ def test_states_go_from_one_solver_to_another():
 
 def test_other_memory_is_still_asked_for():
     system, state = grains(14)
-    pid = jc.Method(stabilizer=jc.PID(), recovery=jc.Recovery())
+    pid = jc.Method(stabilizer=jc.stabilizers.PID(), recovery=jc.stabilizers.Recovery())
     with pytest.raises(ValueError, match="does not have the memory"):
         jc.step(system, pid, state, None, DT)
     begun = jc.init(system, pid, state.q, state.v)
-    assert begun.memory.bounded.shape == (28,)
+    assert begun.memory.contact_multipliers.shape == (28,)
     assert int(slid(system, pid, begun, 3).status) == 0
 
 
 def test_a_warm_start_is_used_where_there_is_one():
     system, state = walker(True)
-    warm = dataclasses.replace(state, memory=MethodMemory(bounded=state.memory.bounded + 1.0))
-    method = jc.Method(bounded=jc.GaussSeidel(1))
+    warm = dataclasses.replace(
+        state, memory=MethodMemory(contact_multipliers=state.memory.contact_multipliers + 1.0)
+    )
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel(1))
     rates = [jc.step(system, method, s, None, DT)[0].v for s in (state, warm)]
     assert np.max(np.abs(rates[0] - rates[1])) > 1e-6
 
 
 def test_a_heavy_top_stands_by_default():
-    """Sweeps let it sink into the boxes below."""
+    """With sweeps the heavy box would sink into the boxes below."""
     system, state = tower(100.0)
     end = slid(system, jc.Method(), state, 200)
     assert int(end.status) == 0
@@ -189,19 +196,23 @@ def test_the_default_is_batched_and_differentiated(dtype):
 def test_what_looks_into_a_step_takes_the_default_too():
     system, state = grains(14)
     found = jc.forward_dynamics(system, state, None, jc.Method(), DT)
-    exact = jc.forward_dynamics(system, state, None, jc.Method(bounded=jc.InteriorPoint()), DT)
+    exact = jc.forward_dynamics(
+        system, state, None, jc.Method(contact_solver=jc.solvers.InteriorPoint()), DT
+    )
     np.testing.assert_allclose(found.acceleration, exact.acceleration, atol=1e-8)
-    assert jc.find_first_failure(system, jc.Method(), state, None, DT, 3) is None
+    assert jc.analysis.find_first_failure(system, jc.Method(), state, None, DT, 3) is None
     broken = dataclasses.replace(state, v=state.v.at[0].set(jnp.inf))
-    assert jc.find_first_failure(system, jc.Method(), broken, None, DT, 3).step == 0
+    assert jc.analysis.find_first_failure(system, jc.Method(), broken, None, DT, 3).step == 0
 
 
 def test_multipliers_stay_where_a_body_is_restated():
     system, state = walker(True)
     moved = system.with_params({"leg": {"center": (0.0, 0.01)}})
-    state = dataclasses.replace(state, memory=MethodMemory(bounded=state.memory.bounded + 2.0))
-    after = jc.restate(state, system, moved)
-    np.testing.assert_array_equal(after.memory.bounded, 2.0)
+    state = dataclasses.replace(
+        state, memory=MethodMemory(contact_multipliers=state.memory.contact_multipliers + 2.0)
+    )
+    after = jc.systems.restate(state, system, moved)
+    np.testing.assert_array_equal(after.memory.contact_multipliers, 2.0)
     assert int(jc.step(moved, jc.Method(), after, None, DT)[0].status) == 0
 
 

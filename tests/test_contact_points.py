@@ -1,4 +1,4 @@
-"""Contacts without friction, and bodies that touch at several points."""
+"""Contacts without friction, and contact elements with several points."""
 
 import dataclasses
 
@@ -9,20 +9,20 @@ import pytest
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
-from jaxcon.constraints.bounds import linearize_bounds
-from jaxcon.constraints.contact import nearest
+from jaxcon.contact.contact import nearest
+from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
 
 H = 1e-3
 
 
 def bounded(system, state):
-    """The bounded rows at a state."""
+    """Returns the inequality rows at a state."""
     return linearize_bounds(system, state.q, state.v, state.time, None, jnp.asarray(H))
 
 
 def particles(dim, **frictions):
-    """Particles that slide over one floor at 1 m/s, each with a friction of its own."""
+    """Particles that slide over one floor at 1 m/s, each with its own friction coefficient."""
     scene = jc.Scene(dim=dim)
     rest = (0.0,) * (dim - 1)
     for i, (name, friction) in enumerate(frictions.items()):
@@ -33,13 +33,15 @@ def particles(dim, **frictions):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel()], ids=["point", "sweeps"])
+@pytest.mark.parametrize(
+    "solver", [jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel()], ids=["point", "sweeps"]
+)
 def test_contacts_with_and_without_friction_share_a_scene(dim, solver):
-    """One slides on, one is braked by μ g, and the first has no rows but its normal."""
+    """Without friction particles slide on and have one row; with it they are braked by μ g."""
     system, state = particles(dim, ice=0.0, road=0.4, glass=0)
     kinds = bounded(system, state).kinds
     assert (kinds.single, kinds.contacts, kinds.tangents) == (2, 1, dim - 1)
-    method = jc.Method(bounded=solver)
+    method = jc.Method(contact_solver=solver)
     state = jc.init(system, method, state.q, state.v)
     final, forces = jax.jit(
         lambda s: jc.rollout(system, method, s, None, H, 50, record=lambda _, i: i.reactions)
@@ -76,7 +78,7 @@ TILT = (0.9, 0.1, -0.2, 0.3)
 
 
 def crate(contacts, velocity=(0.3, -0.1, 0.0)):
-    """A crate of 2 kg that slides; gravity is turned, not the floor."""
+    """A crate of 2 kg that slides; the slope tilts gravity, not the floor."""
     scene = jc.Scene(gravity=(9.81 * np.sin(SLOPE), 0.0, -9.81 * np.cos(SLOPE)))
     inertia = jc.inertia.box(2.0, SIZE)
     scene.add_body("crate", inertia=inertia, position=(0, 0, 0.05), velocity=velocity)
@@ -90,8 +92,8 @@ def on_floor(name, **given):
 
 
 def slid(system, state, steps=30):
-    """The end, and what the bounded rows did in each step."""
-    method = jc.Method(bounded=jc.GaussSeidel(sweeps=60))
+    """Returns the final state and the reactions of each step."""
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=60))
     state = jc.init(system, method, state.q, state.v)
     final, forces = jax.jit(
         lambda s: jc.rollout(system, method, s, None, H, steps, record=lambda _, i: i.reactions)
@@ -100,7 +102,7 @@ def slid(system, state, steps=30):
 
 
 def test_points_in_one_element_are_those_in_many():
-    """Each has the reactions of the contact that it stands for."""
+    """Each point of one element has the reactions of its separate contact."""
     corners = [(x * SIZE[0] / 2, y * SIZE[1] / 2, 0.0) for x, y in CORNERS]
     apart, forces_apart = slid(*crate(on_floor(f"{k}", center=x) for k, x in enumerate(corners)))
     final, forces = slid(*crate([on_floor("floor", center=corners)]))
@@ -111,8 +113,8 @@ def test_points_in_one_element_are_those_in_many():
 
 
 def test_a_box_slides_on_its_corners():
-    """It has the acceleration of a block, and its corners bear its weight between them."""
-    box = jc.BoxContact("floor", jc.WORLD, "crate", size=SIZE, friction=0.3)
+    """The box accelerates like a block, and its corners share its weight."""
+    box = jc.contacts.BoxContact("floor", jc.WORLD, "crate", size=SIZE, friction=0.3)
     final, forces = slid(*crate([box], velocity=(0.3, 0.0, 0.0)))
     assert forces["floor"].shape == (30, 8, 3)
     total = jnp.sum(forces["floor"][-1], axis=0)
@@ -123,7 +125,7 @@ def test_a_box_slides_on_its_corners():
 
 
 def gaps(element, dim=3, **body):
-    """φ of the points of a contact of a body with a floor."""
+    """Returns φ of the contact points of a body on a floor."""
     scene = jc.Scene(dim=dim)
     scene.add_body("crate", **body)
     scene.add(element)
@@ -133,34 +135,36 @@ def gaps(element, dim=3, **body):
 
 
 def test_the_corners_of_a_box_lie_where_the_body_was_given():
-    """With principal axes elsewhere than along its edges, in space and in the plane."""
+    """The corners follow the body's frame, not its principal axes, in space and in the plane."""
     turn, place = np.array(TILT) / np.linalg.norm(TILT), (0.1, 0.2, 1.0)
     tensor = jnp.asarray([[2.0, 0.3, 0.1], [0.3, 3.0, -0.2], [0.1, -0.2, 2.5]])
     off = jc.inertia.from_tensor(2.0, tensor, center=jnp.asarray([0.1, -0.2, 0.3]))
     body = {"inertia": off, "position": place, "quaternion": turn}
-    box = jc.BoxContact("box", jc.WORLD, "crate", size=SIZE)
-    want = jc.box_corners(SIZE, place, turn)
+    box = jc.contacts.BoxContact("box", jc.WORLD, "crate", size=SIZE)
+    want = jc.contacts.box_corners(SIZE, place, turn)
     np.testing.assert_allclose(gaps(box, **body), want[:, 2], atol=1e-12)
     given = {"position": (0.4, 0.3, 0.7), "orientation": TILT}
-    box = jc.BoxContact("box", jc.WORLD, "crate", size=SIZE, **given)
+    box = jc.contacts.BoxContact("box", jc.WORLD, "crate", size=SIZE, **given)
     body = {"inertia": jc.inertia.box(2.0, SIZE), "position": place}
-    want = jc.box_corners(SIZE, given["position"], turn)
+    want = jc.contacts.box_corners(SIZE, given["position"], turn)
     np.testing.assert_allclose(gaps(box, **body), want[:, 2], atol=1e-12)
     assert np.ptp(want[:, 2]) > 0.1
     body = {"mass": 1.0, "inertia": 1.0, "position": (0.3, 1.0), "angle": 0.4}
-    box = jc.BoxContact("box", jc.WORLD, "crate", size=SIZE[:2])
+    box = jc.contacts.BoxContact("box", jc.WORLD, "crate", size=SIZE[:2])
     found = gaps(box, 2, **body)
-    np.testing.assert_allclose(found, jc.box_corners(SIZE[:2], (0.3, 1.0), 0.4)[:, 1], atol=1e-12)
+    np.testing.assert_allclose(
+        found, jc.contacts.box_corners(SIZE[:2], (0.3, 1.0), 0.4)[:, 1], atol=1e-12
+    )
     np.testing.assert_allclose(found.min(), 1 - 0.2 * np.sin(0.4) - 0.15 * np.cos(0.4), rtol=1e-9)
 
 
 def test_gradients_by_the_size_of_a_box():
-    """A box in the plane that lands on a corner; a batch of worlds has the differences."""
+    """A planar box lands on a corner; a batch of worlds gives the central differences."""
     scene = jc.Scene(dim=2)
     scene.add_body("crate", mass=2.0, inertia=0.03, position=(0, 0.18), angle=0.1)
-    scene.add(jc.BoxContact("box", jc.WORLD, "crate", size=SIZE[:2], friction=0.3))
+    scene.add(jc.contacts.BoxContact("box", jc.WORLD, "crate", size=SIZE[:2], friction=0.3))
     system, state = scene.build()
-    method = jc.Method(bounded=jc.GaussSeidel(sweeps=200))
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=200))
     state = jc.init(system, method, state.q, state.v)
 
     def end(x):
@@ -177,12 +181,24 @@ def test_gradients_by_the_size_of_a_box():
 @pytest.mark.parametrize(
     ("element", "match"),
     [
-        (jc.BoxContact("b", jc.WORLD, "crate", size=(1.0, 1.0)), r"'b': size must have shape \(3,"),
-        (jc.BoxContact("b", jc.WORLD, "crate", size=(1.0, 1.0, 0.0)), "size must be positive"),
-        (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, friction=-1.0), "friction"),
-        (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, restitution=1.5), "lie in 0 to 1"),
-        (jc.BoxContact("b", jc.WORLD, "crate", size=SIZE, orientation=(1, 0)), "orientation must"),
-        (jc.BoxContact("b", jc.WORLD, "dot", size=SIZE), "'dot' is a particle"),
+        (
+            jc.contacts.BoxContact("b", jc.WORLD, "crate", size=(1.0, 1.0)),
+            r"'b': size must have shape \(3,",
+        ),
+        (
+            jc.contacts.BoxContact("b", jc.WORLD, "crate", size=(1.0, 1.0, 0.0)),
+            "size must be positive",
+        ),
+        (jc.contacts.BoxContact("b", jc.WORLD, "crate", size=SIZE, friction=-1.0), "friction"),
+        (
+            jc.contacts.BoxContact("b", jc.WORLD, "crate", size=SIZE, restitution=1.5),
+            "lie in 0 to 1",
+        ),
+        (
+            jc.contacts.BoxContact("b", jc.WORLD, "crate", size=SIZE, orientation=(1, 0)),
+            "orientation must",
+        ),
+        (jc.contacts.BoxContact("b", jc.WORLD, "dot", size=SIZE), "'dot' is a particle"),
         (jc.PlaneContact("b", jc.WORLD, "crate", damping=1.0), "'b': damping is of a soft stop"),
         (jc.PlaneContact("b", jc.WORLD, "dot", center=np.zeros((2, 3))), "a particle is one"),
         (jc.PlaneContact("b", "dot", "crate"), "'b': it needs an orientation, but 'dot'"),
@@ -213,23 +229,23 @@ def test_bad_numbers_are_refused(element, match):
 )
 def test_bad_corners_are_refused(given, match):
     with pytest.raises(ValueError, match=match):
-        jc.box_corners(**({"size": SIZE} | given))
+        jc.contacts.box_corners(**({"size": SIZE} | given))
 
 
 def test_corners_take_a_quaternion_of_any_length():
-    """As the frame of an element does: it would be a box of another size."""
-    once, twice = (jc.box_corners(SIZE, None, k * np.array(TILT)) for k in (1.0, 2.0))
+    """The quaternion is normalized, as in elements; else the box would change its size."""
+    once, twice = (jc.contacts.box_corners(SIZE, None, k * np.array(TILT)) for k in (1.0, 2.0))
     np.testing.assert_allclose(twice, once, atol=1e-15)
     lengths = np.linalg.norm(once - np.mean(once, axis=0)[None], axis=1)
     np.testing.assert_allclose(lengths, np.linalg.norm(SIZE) / 2, rtol=1e-14)
 
 
 def test_a_capsule_lies_on_both_ends():
-    """What each bears, by the moments about a centre of mass that is not in the middle.
+    """The normal forces of both ends follow from the moments about an off-center center of mass.
 
-    From a gap of φ both ends leave with u* = −φ/h, or come out by a fifth of it and at 0.1 m/s at
-    most: N₁ + N₂ = N = m (g + u*/h). With a lever of r + φ/2 the friction of what slides loads the
-    end in front, 2 l N₂ = N (l + d) + μ N (r + φ/2).
+    From a gap φ both ends leave with u* = −φ/h. From a penetration, u* is a fifth of that and at
+    most 0.1 m/s. Then N₁ + N₂ = N = m (g + u*/h). With a lever of r + φ/2, sliding friction loads
+    the front end: 2 l N₂ = N (l + d) + μ N (r + φ/2).
     """
     mass, half, radius, off, μ = 2.0, 0.5, 0.1, 0.2, 0.3
     scene = jc.Scene(dim=2)
@@ -260,10 +276,11 @@ def test_a_capsule_lies_on_both_ends():
 
 @pytest.mark.parametrize("order", [1, -1], ids=["capsule first", "ball first"])
 def test_a_ball_hits_a_capsule_in_the_plane(order):
-    """Beside it, and beyond either end: the gap, where it is hit, and impulse and friction.
+    """A ball hits the side or either end of a capsule: gap, contact point, impulse and friction.
 
-    With x halfway in the gap and K the mobility of the two bodies there, F = λ (n − μ t) for a slip
-    along t, and n·K F h = −φ/h − n·u: the part of the impact that sweeps do in the step before it.
+    The contact point x is in the middle of the gap; K is the mobility of the two bodies there. The
+    force is F = λ (n − μ t) for a slip along t. Sweeps close the gap within the step before the
+    impact: n·K F h = −φ/h − n·u.
     """
     m, μ, radii = np.array([3.0, 0.5]), 0.2, np.array([0.1, 0.15])
     inertia, apart = np.array([0.4, 0.006]), 1e-4
@@ -281,7 +298,7 @@ def test_a_ball_hits_a_capsule_in_the_plane(order):
     shapes = [("capsule", radii[0], ends), ("ball", radii[1], None)][::order]
     named = zip("ab", shapes, strict=True)
     given = {f"{k}_{s}": x for s, own in named for k, x in zip(FIELDS, own, strict=True)}
-    scene.add(jc.CapsuleContact("touch", **given, friction=μ))
+    scene.add(jc.contacts.CapsuleContact("touch", **given, friction=μ))
     system, state = scene.build()
     places = {name: np.array(range(6))[system.layout.q(name)] for name in ("capsule", "ball")}
     before = {"capsule": np.array([0.1, -0.2, 0.5]), "ball": np.array([0.0, 0.0, 9.0])}
@@ -292,7 +309,11 @@ def test_a_ball_hits_a_capsule_in_the_plane(order):
         v = v.at[places["ball"]].set(speed)
         start = dataclasses.replace(state, q=q, v=v)
         new, info = jc.step(
-            system, jc.Method(bounded=jc.GaussSeidel(100, warm=False)), start, None, H
+            system,
+            jc.Method(contact_solver=jc.solvers.GaussSeidel(100, warm=False)),
+            start,
+            None,
+            H,
         )
         return new.v, info.reactions["touch"], info.reactions.gap[0]
 
@@ -311,7 +332,7 @@ def test_a_ball_hits_a_capsule_in_the_plane(order):
         pull = n - μ * t / np.linalg.norm(t)
         moved = sum(pull / m[k] + turns[k] * (turns[k] @ pull) / inertia[k] for k in (0, 1))
         impulse = (-apart / H - n @ slip) / (n @ moved)
-        assert abs(t @ slip) > impulse * abs(t @ moved)  # it slides to the end
+        assert abs(t @ slip) > impulse * abs(t @ moved)  # it slides until the impact ends
         np.testing.assert_allclose(H * forces[i, 0], impulse, rtol=1e-9)
         np.testing.assert_allclose(H * abs(forces[i, 1]), μ * impulse, rtol=1e-9)
         for k, (name, sign) in enumerate((("capsule", -1), ("ball", 1))):
@@ -323,7 +344,10 @@ FIELDS = ("body", "radius", "segment")
 
 
 def test_parallel_capsules_touch_in_the_middle_of_what_faces():
-    """At an end of it, one that lies on the other would rock; else at the two nearest ends."""
+    """Contact at an end of the overlap would let a capsule rock on the other one.
+
+    Without overlap the two nearest ends touch.
+    """
     starts, ends = np.array([8.0, -1.0, 3.0, 11.0]), np.array([9.0, 1.0, 2.0, 12.0])
     lanes = (0.0 * starts, 10.0 + 0.0 * starts, starts, ends)
     corners = [Vector(jnp.asarray(x), jnp.full(4, float(i > 1))) for i, x in enumerate(lanes)]
@@ -332,17 +356,19 @@ def test_parallel_capsules_touch_in_the_middle_of_what_faces():
     np.testing.assert_allclose(y[0], [8.5, 0.5, 2.5, 11.0], atol=1e-15)
 
 
-@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel(60)], ids=str)
+@pytest.mark.parametrize(
+    "solver", [jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel(60)], ids=str
+)
 def test_a_box_rests_on_a_slope_in_single_precision(solver):
-    """Corners 0.1 m above the floor, far from acting, do not blur what holds those that rest."""
+    """Inactive corners 0.1 m above the floor do not disturb the forces of resting corners."""
     down = 9.81 * np.array([np.sin(0.3), 0.0, -np.cos(0.3)])
     scene = jc.Scene(dim=3, gravity=tuple(down), dtype=jnp.float32)
     scene.add_body("box", inertia=jc.inertia.box(1.0, (0.2, 0.2, 0.1)), position=(0.0, 0.0, 0.05))
     holding = 1.001 * np.tan(0.3)
-    floor = jc.BoxContact("floor", jc.WORLD, "box", size=(0.2, 0.2, 0.1), friction=holding)
+    floor = jc.contacts.BoxContact("floor", jc.WORLD, "box", size=(0.2, 0.2, 0.1), friction=holding)
     scene.add(floor)
     system, state = scene.build()
-    method = jc.Method(bounded=solver)
+    method = jc.Method(contact_solver=solver)
     state = jc.init(system, method, state.q, state.v)
     go = jax.jit(lambda s: jc.rollout(system, method, s, None, 2e-3, 500)[0])
     crept = np.abs(np.asarray(go(state).q - state.q)).max()

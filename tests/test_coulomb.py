@@ -1,4 +1,4 @@
-"""Coulomb's law where it is at its limits: a block that is pulled, and Painlevé's rod."""
+"""Limit cases of Coulomb's law: a block that is pulled, and Painlevé's rod."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ def test_a_block_stays_until_it_is_pulled_hard_enough(dtype):
     case = FORMS["block_pulled"]
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("block", mass=2.0, position=(0.0, 0.0))
-    scene.add(jc.Force("pull", "block", (1.0, 0.0)))
+    scene.add(jc.forces.Force("pull", "block", (1.0, 0.0)))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "block", friction=0.5))
     system, state = scene.build()
 
@@ -34,18 +34,18 @@ def test_a_block_stays_until_it_is_pulled_hard_enough(dtype):
     np.testing.assert_allclose(jax.jit(jax.vmap(speed))(pulls), want, atol=tight)
 
 
-@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel(sweeps=300)])
+@pytest.mark.parametrize("solver", [jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel(sweeps=300)])
 def test_a_rod_that_cannot_slide_jams(solver):
-    """Painlevé's: where p < 0 no force lets the tip slide on; an impulse stops it, without gain.
+    """Painlevé's paradox: for p < 0 no force lets the tip slide, and an impulse stops it.
 
-    To the left as to the right: each angle follows its mirror image.
+    The energy must not increase. Each angle is followed by its mirror image.
     """
     case = FORMS["painleve_rod"]
     scene = jc.Scene(dim=2)
     scene.add_body("rod", mass=1.0, inertia=1 / 3, position=(-1.0, 0.0), velocity=(2.0, 0.0))
     scene.add(jc.PlaneContact("tip", jc.WORLD, "rod", center=(0.0, 0.0), friction=1.0))
     system, state = scene.build()
-    method = jc.Method(bounded=solver)
+    method = jc.Method(contact_solver=solver)
     state = jc.init(system, method, state.q, state.v)
 
     def once(angle, friction, side):

@@ -1,4 +1,4 @@
-"""Schedules, worlds that differ, actions that are allowed, and layers of control."""
+"""Curricula of environments: schedules, random worlds, feasible actions, layers of control."""
 
 import dataclasses
 import functools
@@ -45,7 +45,7 @@ def test_schedules_refuse_what_has_no_meaning():
 
 
 def test_stiffness_goes_into_leaves_and_constraints_give_way_as_hookes_law_says(cart):
-    """The weight m g of cart and pole on a rail of springs, once for the whole curriculum."""
+    """Springs under the rail sag by m g/k; one trace serves all stiffnesses of a curriculum."""
     episode = cart.reset(jax.random.key(0))
     traces = []
 
@@ -101,7 +101,7 @@ def test_noise_moves_what_constraints_ask_for(cart):
 
 
 def test_projection_is_the_nearest_point():
-    """A corner, an edge, inside, beside a dependent row; and rows that contradict each other."""
+    """Nearest points at a corner, on an edge, inside, and with dependent or contradictory rows."""
     rows = jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0], [2.0, 2.0]])
     bounds = jnp.array([1.0, 1.0, 1.5, 3.0])
     cases = {(3.0, 0.2): (1.0, 0.2), (2.0, 2.0): (0.75, 0.75), (-1.0, 0.3): (-1.0, 0.3)}
@@ -142,12 +142,12 @@ def test_projection_has_the_derivative_of_the_nearest_point():
 
 
 def slow(episode, most):
-    """The cart goes no faster than this; its velocity comes first in v."""
+    """Returns the limit of the cart's speed (≤ 0 if satisfied); v[0] is the cart's velocity."""
     return jnp.stack([episode.state.v[0] - most, -episode.state.v[0] - most])
 
 
 def test_actions_and_noise_are_taken_as_far_as_limits_allow(cart):
-    """A push of 20 N on 1.3 kg makes 0.15 m/s in a step of 10 ms, in which all is linear."""
+    """A push of 20 N on 1.3 kg adds 0.15 m/s in a step of 10 ms, which is a linear problem."""
     assert cart.system.layout.v("cart")[0] == 0
     world = dataclasses.replace(cart, skip=1)
     episode = world.reset(jax.random.key(0))
@@ -159,7 +159,7 @@ def test_actions_and_noise_are_taken_as_far_as_limits_allow(cart):
     def along(*x):
         return jax.jvp(held, x, tuple(map(jnp.ones_like, x)))
 
-    both = jax.jit(along)  # and its slope along (1, 1, 1)
+    both = jax.jit(along)  # also the derivative along (1, 1, 1)
     speed = jax.jit(lambda a: world.transition(episode, a[None]).state.v[0])
     wanted, noise, most = jnp.asarray(0.3), jnp.asarray(0.05), jnp.asarray(0.1)
     action, slope = both(wanted, noise, most)  # within the limits
@@ -168,16 +168,16 @@ def test_actions_and_noise_are_taken_as_far_as_limits_allow(cart):
     action, slope = both(wanted, noise + 5.0, most)
     assert action < 0.9
     np.testing.assert_allclose(speed(action), 0.1, atol=1e-6)
-    farther, _ = both(wanted, noise + 5.0, most + 0.01)  # the action itself has no say there
+    farther, _ = both(wanted, noise + 5.0, most + 0.01)  # the derivative by the limit alone
     np.testing.assert_allclose(slope, (farther - action) / 0.01, rtol=DIFFERENCE)
     action, _ = both(wanted - 5.0, noise, most)
     np.testing.assert_allclose(speed(action), -0.1, atol=1e-6)
     action, _ = both(wanted, noise + 5.0, most + 10.0)
-    np.testing.assert_allclose(action, 1.0, atol=1e-6)  # as far as actions go
+    np.testing.assert_allclose(action, 1.0, atol=1e-6)  # the bound of actions
 
 
 def test_limits_are_kept_in_whichever_unit_they_are(cart):
-    """A push moves the cart by 1.5 mm at most, also in single precision."""
+    """The push could move the cart by 1.5 mm. The limit holds in any unit, also in float32."""
     world = environments.make("CartPole", skip=1, dtype="float32")
     episode = world.reset(jax.random.key(0))
     start = episode.state.q[:1]
@@ -197,7 +197,7 @@ def test_limits_are_kept_in_whichever_unit_they_are(cart):
 
 
 def cruise(environment, episode, target):
-    """A cart at up to 1 m/s either way."""
+    """A controller that drives the cart at a target speed of up to 1 m/s."""
     speed = jc.velocity(environment.system, episode.state, "cart")[0]
     return 2.0 * (target - speed[None])
 
@@ -219,7 +219,7 @@ def test_a_slow_policy_sets_what_a_fast_controller_follows(cart):
 
 @pytree
 class Passing(CartPole):
-    """Over for one action alone, the third."""
+    """A task that is over only at the end of the third action."""
 
     def terminal(self, episode):
         return jnp.round(episode.state.time / (self.skip * self.dt)) == 3
@@ -235,7 +235,7 @@ def test_a_target_ends_where_the_task_is_over_on_the_way(cart):
 
 @pytree
 class Racing(CartPole):
-    """Its reward is the mean speed over an action, as that of the half-cheetah."""
+    """A task whose reward is the mean speed during an action, as in the half-cheetah."""
 
     def reward(self, before, action, after):
         came, went = (episode.state.q[0] for episode in (before, after))

@@ -1,4 +1,4 @@
-"""A user's constraints against rows worked out by hand."""
+"""User-defined constraints, compared with rows derived by hand."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -26,11 +26,11 @@ def no_force(q, v, t, u, p):
 
 
 def test_holonomic_on_coordinates_by_hand():
-    """φ = x² + y² − r²(1 + t)²: φ̇ = 2 q·v − 2 r²(1 + t), γ = 2 v·v − 2 r²."""
+    """φ = x² + y² − r²(1 + t)², hence φ̇ = 2 q·v − 2 r²(1 + t) and γ = 2 v·v − 2 r²."""
     system = jc.GeneralizedSystem(
         mass=unit_mass,
         force=no_force,
-        constraints=(jc.Holonomic(circle),),
+        constraints=(jc.joints.Holonomic(circle),),
         params={"radius": jnp.asarray(1.5)},
     )
     q, v, t = np.array([1.0, 2.0]), np.array([0.3, -0.7]), 0.5
@@ -49,7 +49,7 @@ def test_velocity_level_on_coordinates_by_hand():
     system = jc.GeneralizedSystem(
         mass=unit_mass,
         force=no_force,
-        constraints=(jc.VelocityLevel(knife),),
+        constraints=(jc.joints.VelocityLevel(knife),),
         params={"spin": jnp.asarray(0.8)},
     )
     q, v, t = np.array([1.0, 2.0, 0.6]), np.array([0.3, -0.7, 1.1]), 0.5
@@ -69,7 +69,7 @@ def meeting(a, b, t, p):
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("partner", [jc.WORLD, "wall", "first"])
 def test_holonomic_on_bodies_is_the_joint_that_it_describes(dim, partner):
-    """J, γ and the multipliers of a user's coincidence are those of `Coincident`."""
+    """A user-defined coincidence of points has the φ, φ̇, γ and J of `Coincident`."""
     point = np.arange(1.0, dim + 1)
     turn = {"angle": 0.7} if dim == 2 else {"quaternion": (0.5, 0.5, -0.5, 0.5)}
 
@@ -83,13 +83,13 @@ def test_holonomic_on_bodies_is_the_joint_that_it_describes(dim, partner):
         add(scene)
         return scene.build()
 
-    joint = jc.Coincident("pin", partner, "second", point=point)
+    joint = jc.joints.Coincident("pin", partner, "second", point=point)
     system, state = build(lambda scene: scene.add(joint))
     local = {}
     for side, name in (("a", partner), ("b", "second")):
         pose = system.motion(name, state.q, state.v).pose
         local[side] = pose.local_point(jnp.asarray(point))
-    user = jc.Holonomic(meeting, bodies=(partner, "second"), name="pin", params=local)
+    user = jc.joints.Holonomic(meeting, bodies=(partner, "second"), name="pin", params=local)
     mine, _ = build(lambda scene: scene.add(user))
     ours, theirs = rows_of(system, state), rows_of(mine, state)
     for field in ("residual", "rate", "bias"):
@@ -105,12 +105,12 @@ def rolling(wheel, t, p):
 
 
 def test_a_wheel_that_rolls_without_slipping():
-    """A hoop on a slope-like pull F accelerates with F / 2m, and friction is F / 2."""
+    """A pull F accelerates a rolling hoop with F/2m, and friction is F/2."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("wheel", mass=2.0, inertia=2.0 * 0.3**2)
-    scene.add(jc.Force("pull", "wheel", force=(5.0, 0.0)))
+    scene.add(jc.forces.Force("pull", "wheel", force=(5.0, 0.0)))
     params = {"radius": 0.3}
-    scene.add(jc.VelocityLevel(rolling, bodies=("wheel",), name="roll", params=params))
+    scene.add(jc.joints.VelocityLevel(rolling, bodies=("wheel",), name="roll", params=params))
     system, state = scene.build()
     a, multipliers, _ = jc.forward_dynamics(system, state, None, jc.Method(), 1e-3)
     np.testing.assert_allclose(a, [5 / 4, 0, -5 / 4 / 0.3], rtol=IDENTITY)
@@ -118,10 +118,12 @@ def test_a_wheel_that_rolls_without_slipping():
 
 
 def test_velocity_level_rows_decay_under_feedback():
-    """ψ̇ = −2α ψ."""
+    """Feedback gives ψ̇ = −2α ψ."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("wheel", mass=2.0, inertia=0.2, velocity=(1.0, 0.0))
-    scene.add(jc.VelocityLevel(rolling, bodies=("wheel",), name="roll", params={"radius": 0.3}))
+    scene.add(
+        jc.joints.VelocityLevel(rolling, bodies=("wheel",), name="roll", params={"radius": 0.3})
+    )
     system, state = scene.build()
     method = jc.Method(stabilizer=jc.Baumgarte.critical(rate=4.0), integrator=jc.RK4())
     for _ in range(5):
@@ -133,7 +135,9 @@ def test_velocity_level_rows_decay_under_feedback():
 def test_parameters_of_a_user_are_leaves():
     scene = jc.Scene(dim=2)
     scene.add_body("wheel", mass=2.0, inertia=0.2, angular_velocity=1.0)
-    scene.add(jc.VelocityLevel(rolling, bodies=("wheel",), name="roll", params={"radius": 0.3}))
+    scene.add(
+        jc.joints.VelocityLevel(rolling, bodies=("wheel",), name="roll", params={"radius": 0.3})
+    )
     system, state = scene.build()
     assert system.params["roll"]["params"]["radius"] == 0.3
     other = system.with_params({"roll": {"params": {"radius": jnp.asarray(0.5)}}})

@@ -1,4 +1,4 @@
-"""A batch over several devices, and over two processes, gives the numbers of one."""
+"""A batch on several devices, or in two processes, gives the same numbers as on one."""
 
 import os
 import socket
@@ -13,11 +13,11 @@ ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "examples" / "many_devices.py"
 CHEAP = os.environ["XLA_FLAGS"]
 LIMIT = 400
-"""On a process [s], for a machine that does much else."""
+"""Time limit of a process [s], generous for a busy machine."""
 
 
 def started(*options):
-    """A process of its own with an environment of its own, as far as JAX goes."""
+    """Starts a process without JAX and XLA variables of this one."""
     own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
     own |= {"JAX_ENABLE_X64": "1", "JAX_PLATFORMS": "cpu", "XLA_FLAGS": CHEAP}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -25,7 +25,7 @@ def started(*options):
 
 
 def finished(*processes):
-    """What they print; fails with what they complained of."""
+    """Returns the outputs of processes; fails with their error messages."""
     try:
         outputs = [process.communicate(timeout=LIMIT) for process in processes]
     except subprocess.TimeoutExpired:
@@ -39,14 +39,14 @@ def finished(*processes):
 
 
 def free_port():
-    """One that nobody listens at."""
+    """Returns a port on which nobody listens."""
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         return probe.getsockname()[1]
 
 
 def test_two_processes_get_the_numbers_of_one(tmp_path):
-    """Final states, loss, gradient, and each step of a search, of the example."""
+    """Compares final states, loss, gradient, and each step of a search, in the example."""
     files = tmp_path / "two.npz", tmp_path / "one.npz"
     small = [EXAMPLE, "--worlds", 8, "--steps", 5, "--devices", 1, "--save"]
     joined = ["--coordinator", f"localhost:{free_port()}", "--processes", 2, "--process"]
@@ -81,7 +81,7 @@ def met(compiled):
 one, all = (jax.make_mesh((n,), ("x",)) for n in (1, 4))  # Explicit, as JAX makes them
 run, state = devices.world("four-bar", 5, jnp.float64)
 gain, batch = jnp.asarray(50.0), worlds(state, 8)
-apart = jc.shard(batch)
+apart = jc.devices.shard(batch)
 plain = jax.jit(jax.vmap(run, in_axes=(None, 0)))
 compiled = plain.lower(gain, apart).compile()
 assert met(compiled) == {}
@@ -114,13 +114,13 @@ scene = jc.Scene(dim=2)
 scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
 scene.add(jc.Distance("rod", jc.WORLD, "bob"))
 system, start = scene.build()
-method = jc.Method(stabilizer=jc.Projection(), solver=jc.Sparse())  # rounds until all are done
+method = jc.Method(stabilizer=jc.Projection(), solver=jc.solvers.Sparse())  # until all are done
 start = jc.init(system, method, start.q, start.v)
 swing = jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0])
-apart = jc.shard(worlds(start, 4))
+apart = jc.devices.shard(worlds(start, 4))
 together = jax.jit(swing).lower(apart).compile()
 assert met(together) == {}
-alone = jax.jit(jc.over_devices(lambda _, batch: swing(batch))).lower(0.0, apart).compile()
+alone = jax.jit(jc.devices.over_devices(lambda _, batch: swing(batch))).lower(0.0, apart).compile()
 assert met(alone) == {}
 same(alone(0.0, apart), together(apart))
 
@@ -129,9 +129,9 @@ for name in ("chain-5", "four-bar"):
     built, start = mechanisms.find(name).build(jnp.float64)
     turning = dataclasses.replace(worlds(start, 8), v=9.0 * worlds(start, 8).v)
     go = jax.jit(jax.vmap(lambda s: jc.rollout(built, jc.Method(), s, None, 2e-3, 3)[0]))
-    compiled = go.lower(jc.shard(turning)).compile()
+    compiled = go.lower(jc.devices.shard(turning)).compile()
     assert met(compiled) == {}
-    same(compiled(jc.shard(turning)), go(turning))
+    same(compiled(jc.devices.shard(turning)), go(turning))
 
 def refused(words, function, *args, **own):
     try:
@@ -141,11 +141,12 @@ def refused(words, function, *args, **own):
     else:
         raise AssertionError(f"not refused: {words}")
 
-refused("10 worlds does not divide over 4 devices; take 12", jc.shard, jnp.ones(10))
-refused("must be one of JAX, such as", jc.shard, jnp.ones(4), jax.devices())
-refused("over_devices: a batch of 6", jc.over_devices(lambda p, x: x, all), 0.0, jnp.ones(6))
-refused("['t'] of the batch has no first axis", jc.shard, {"t": 1.0, "x": jnp.ones(4)})
-refused("must have as many worlds, got", jc.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})
+refused("10 worlds does not divide over 4 devices; take 12", jc.devices.shard, jnp.ones(10))
+refused("must be one of JAX, such as", jc.devices.shard, jnp.ones(4), jax.devices())
+whole = jc.devices.over_devices(lambda p, x: x, all)
+refused("over_devices: a batch of 6", whole, 0.0, jnp.ones(6))
+refused("['t'] of the batch has no first axis", jc.devices.shard, {"t": 1.0, "x": jnp.ones(4)})
+refused("must have as many worlds, got", jc.devices.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})
 refused("samples=7 does not", jc.tune, loss, 0.0, samples=7, key=key, mesh=all)
 """
 

@@ -1,4 +1,4 @@
-"""Every public name is on one page of the reference, and says what its numbers are."""
+"""Every public name is on one page of the reference, and its docstring describes its parameters."""
 
 import dataclasses
 import enum
@@ -15,36 +15,29 @@ import jaxcon.scenes
 
 ROOT = Path(__file__).parents[1]
 PAGES = {p.stem: p.read_text() for p in (ROOT / "docs" / "reference").glob("*.rst")}
-MODULES = {
-    "inertia": jc.inertia,
-    "quaternion": jc.quaternion,
-    "losses": jc.losses,
-    "scenes": jaxcon.scenes,
-}
+SPACES = {n: getattr(jc, n) for n in jc.__all__ if isinstance(getattr(jc, n), ModuleType)}
+PLACES = {"jaxcon.learning.losses": jc.learning.losses, "jaxcon.scenes": jaxcon.scenes}
+"""Documented modules besides the namespaces."""
 BESIDE = {
-    "jaxcon.model.system.BodySystem",
-    "jaxcon.model.layout.Layout",
+    "jaxcon.system.body_system.BodySystem",
+    "jaxcon.system.layout.Layout",
     "jaxcon.constraints.rows.Violation",
     "jaxcon.analysis.front.Run",
     "jaxcon.analysis.gradients.LeafGradient",
-    "jaxcon.analysis.front.Limit",
+    "jaxcon.analysis.front.StabilityLimit",
     "jaxcon.analysis.front.LeftOut",
-    "jaxcon.view.animate",
-    "jaxcon.view.draw",
-    "jaxcon.view.links",
-    "jaxcon.view.canvas",
     "jaxcon.scenes.CRANK_ROCKER",
     "jaxcon.scenes.BICYCLE",
 }
-"""What public functions return, and other names that users meet."""
+"""Types that public functions return, and other names that users meet."""
 UNREAD = "jaxcon.environments.brax.BraxEnv"
-"""It derives from a class of Brax, which tests do without."""
+"""A subclass of a Brax class; the tests run without Brax."""
 SECTION = re.compile(r"(Args|Attributes):")
 FIELD = re.compile(r" {4}([\w*]+(?:, [\w*]+)*):")
 
 
 def entries(page):
-    """Full names of what a page documents, with the members of each."""
+    """Returns the full names that a page documents, each with its listed members."""
     found, module = [], ""
     for line in page.splitlines():
         if match := re.fullmatch(r"\.\. currentmodule:: (.*)", line):
@@ -63,7 +56,7 @@ GUIDE = {p.stem: p.read_text() for p in (ROOT / "docs" / "guide").glob("*.md")}
 
 
 def look_up(name):
-    """What a full name stands for; modules may have it under another name."""
+    """Imports the object of a full name, which its module may define under another name."""
     parts = name.split(".")
     here = importlib.import_module("jaxcon")
     for i, part in enumerate(parts[1:], 2):
@@ -72,7 +65,7 @@ def look_up(name):
 
 
 def defined(module):
-    """Public functions and classes of a module's own."""
+    """Returns the names of public functions and classes that a module defines."""
     return {
         name
         for name, thing in vars(module).items()
@@ -81,14 +74,27 @@ def defined(module):
 
 
 def public():
-    """Every full name that the reference has."""
-    environments = {*jc.environments.__all__, *jc.environments.OF_OTHERS} - {"BraxEnv"}
+    """Returns every full name that belongs in the reference."""
+    environments = {*jc.environments.__all__, *jc.environments.ADAPTERS} - {"BraxEnv"}
+    spaces = {
+        f"jaxcon.{space}.{n}"
+        for space, module in SPACES.items()
+        for n in module.__all__
+        if not isinstance(getattr(module, n), ModuleType)
+    }
+    elsewhere = {name.rpartition(".")[2] for name in spaces if look_up(name) in at_top()}
     return (
-        {f"jaxcon.{n}" for n in jc.__all__ if not isinstance(getattr(jc, n), ModuleType)}
-        | {f"jaxcon.{place}.{n}" for place, module in MODULES.items() for n in defined(module)}
+        {f"jaxcon.{n}" for n in jc.__all__ if n not in {*SPACES, *elsewhere}}
+        | spaces
+        | {f"{place}.{n}" for place, module in PLACES.items() for n in defined(module)}
         | {f"jaxcon.environments.{n}" for n in environments}
         | {*BESIDE, UNREAD}
     )
+
+
+def at_top():
+    """Returns the functions and classes at the top of the package."""
+    return [getattr(jc, n) for n in jc.__all__ if n not in SPACES]
 
 
 def test_every_public_name_is_on_one_page_and_nothing_else_is():
@@ -99,19 +105,15 @@ def test_every_public_name_is_on_one_page_and_nothing_else_is():
     assert sorted(listed) == sorted(PAGES.keys() - {"index"})
 
 
-def test_pages_are_the_groups_of_the_tour():
-    tour = inspect.getdoc(jc).split("A tour of the names")[1]
-    groups = dict(re.findall(r"^(\w[^:\n]*): (.*(?:\n    .*)*)", tour, re.MULTILINE))
-    pages = {text.splitlines()[0]: page for page, text in PAGES.items()}
-    assert len(groups) == 12
-    for title, words in groups.items():
-        names = [n for n in re.findall(r"\w+", words) if hasattr(jc, n)]
-        wanted = {f"jaxcon.{n}" for n in names if n not in MODULES}
-        assert {name for name, _ in ENTRIES[pages[title]]} - BESIDE == wanted, title
+def test_each_namespace_has_a_page_in_its_order():
+    for space, module in SPACES.items():
+        names = [name for name, _ in ENTRIES[space] if name not in BESIDE]
+        wanted = [n for n in module.__all__ if not isinstance(getattr(module, n), ModuleType)]
+        assert names == [f"jaxcon.{space}.{n}" for n in wanted]
 
 
 def described(doc):
-    """Names in the sections Args and Attributes of a docstring."""
+    """Returns the names described in the sections Args and Attributes of a docstring."""
     found, inside = set(), False
     for line in inspect.cleandoc(doc or "").splitlines():
         if line and not line.startswith(" "):
@@ -122,18 +124,20 @@ def described(doc):
 
 
 def numbers(thing):
-    """Names that a docstring owes its reader: parameters, fields, or members."""
+    """Returns the names that a docstring must describe: parameters, fields, or enum members."""
     if dataclasses.is_dataclass(thing):
         return {f.name for f in dataclasses.fields(thing) if not f.name.startswith("_")}
     if inspect.isclass(thing) and issubclass(thing, enum.Enum):
         return set(thing.__members__)
-    if inspect.isclass(thing) and issubclass(thing, Exception):
+    if inspect.isclass(thing) and (
+        issubclass(thing, Exception) or thing.__dict__.get("_is_protocol")
+    ):
         return set()
     return set(inspect.signature(thing).parameters) - {"self", "cls"}
 
 
 def lacking(thing):
-    """Numbers that nothing describes, for a class neither in its docstring nor in its bases'."""
+    """Returns the names that neither the object's docstring nor those of its bases describe."""
     places = inspect.getmro(thing)[:-1] if inspect.isclass(thing) else [thing]
     return numbers(thing) - set().union(*(described(p.__doc__) for p in places))
 
@@ -219,7 +223,7 @@ def test_the_gallery_shows_small_pictures_that_its_script_makes():
 
 
 def commands():
-    """(file, module, its options) of every `python -m benchmarks…` that a reader is told to run."""
+    """Yields (file, module, options) of every `python -m benchmarks…` in the documentation."""
     files = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "benchmarks" / "RESULTS.md"]
     files += sorted((ROOT / "docs" / "guide").glob("*.md"))
     for path in [*files, *sorted((ROOT / "examples" / "notebooks").glob("*.ipynb"))]:
@@ -250,7 +254,7 @@ def test_links_to_what_is_not_there_are_seen():
 
 
 def test_pages_have_no_programs_of_their_own_that_nothing_runs():
-    """But for those of the guide, which `test_examples.py` runs."""
+    """The guide is excepted, as `test_examples.py` runs its programs."""
     pages = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs").rglob("*.rst")]
     assert len(pages) > 30
     for page in pages:

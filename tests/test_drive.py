@@ -1,4 +1,4 @@
-"""Prescribed motion: the coordinate, its explicit time terms, and the torque of the drive."""
+"""Prescribed motion: the coordinate, its explicit time terms, and the drive torque."""
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,12 @@ def turning(t, p):
 
 
 def wheel(dim, motion, params, **body):
-    """A wheel on an axis through its centre, driven."""
+    """A driven wheel on an axis through its center."""
     scene = jc.Scene(dim=dim, gravity=(0.0,) * dim)
     scene.add_body("wheel", mass=1.0, inertia=0.7 if dim == 2 else (0.4, 0.5, 0.7), **body)
     axis = None if dim == 2 else (0, 0, 2)
     scene.add(jc.Revolute("hub", jc.WORLD, "wheel", point=(0,) * dim, axis=axis))
-    scene.add(jc.Drive("drive", "hub", motion, params=params))
+    scene.add(jc.joints.Drive("drive", "hub", motion, params=params))
     return scene.build()
 
 
@@ -40,7 +40,7 @@ WAVE = {"size": 0.4, "rate": 3.0}
 
 @both
 def test_explicit_time_terms(dim):
-    """φ = θ − θ*, φ̇ = θ̇ − θ̇*, and γ = −θ̈* about a fixed axis."""
+    """About a fixed axis, φ = θ − θ*, φ̇ = θ̇ − θ̇*, and γ = −θ̈*."""
     spin = 1.1 if dim == 2 else (0.0, 0.0, 1.1)
     system, state = wheel(dim, wave, WAVE, angular_velocity=spin)
     t = 0.3
@@ -64,19 +64,19 @@ def test_the_coordinate_is_the_angle_since_assembly(dim, angle):
 
 @both
 def test_torque_is_the_inertia_times_the_acceleration(dim):
-    """λ = I θ̈*."""
+    """The multiplier is λ = I θ̈*."""
     system, state = wheel(dim, wave, WAVE)
     state = jax.tree.map(lambda x: x, state)
-    method = jc.Method(stabilizer=jc.Unstabilized())
+    method = jc.Method(stabilizer=jc.stabilizers.Unstabilized())
     at = jc.init(system, method, state.q, state.v, time=0.3)
     solution = jc.forward_dynamics(system, at, None, method, 1e-3)
-    torque = jc.wrench(system, at, solution, "drive")[-1]
+    torque = jc.wrench(solution, "drive")[-1]
     np.testing.assert_allclose(torque, 0.7 * -3.6 * np.sin(0.9), rtol=1e-9)
 
 
 @both
 def test_a_crank_is_driven_round_and_round(dim):
-    """Two turns and a half, to the angle prescribed."""
+    """The wheel makes two and a half turns and reaches the prescribed angle."""
     spin = 10.0 if dim == 2 else (0.0, 0.0, 10.0)
     system, state = wheel(dim, turning, {"speed": 10.0}, angular_velocity=spin)
     final, _ = jax.jit(
@@ -95,7 +95,7 @@ def test_a_slider_is_driven_along_its_axis(dim):
     scene.add_body("slide", mass=2.0, inertia=0.7 if dim == 2 else (0.4, 0.5, 0.7))
     axis = (3.0, 4.0, 0.0)[:dim]
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=axis))
-    scene.add(jc.Drive("drive", "rail", wave, params=WAVE))
+    scene.add(jc.joints.Drive("drive", "rail", wave, params=WAVE))
     system, state = scene.build()
     moved = system.retract(state.q, jnp.zeros_like(state.v).at[:2].set(jnp.asarray([0.6, 0.8])))
     rows = linearize(system, moved, state.v, jnp.asarray(0.3))

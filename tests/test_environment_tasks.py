@@ -1,4 +1,4 @@
-"""Each task can be done: a hand-made controller earns nearly everything, doing nothing does not."""
+"""Every task can be solved: a hand-made controller earns nearly all, zero actions little."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from jaxcon.environments.tasks.stewart import FEET, HEADS, HEIGHT
 
 
 def play(environment, policy, actions=None, copies=2):
-    """Rewards (copies, actions) under a policy of the observation; 0 once the task is over."""
+    """Returns the rewards (copies, actions) of a policy; 0 after the end of the task."""
 
     def one(key):
         def act(now, _):
@@ -32,7 +32,7 @@ def idle(environment, actions=None):
 
 
 def swing_up(seen):
-    """Energy into the pole, then feedback of its lean; numbers of the stock cart-pole."""
+    """Pumps energy into the pole, then balances it; with the numbers of the default cart-pole."""
     x, speed, cosine, sine, rate = seen
     mass, length, cart, force = 0.3, 0.6, 1.0, 20.0
     energy = mass * length**2 / 6 * rate**2 + mass * 9.81 * length / 2 * (cosine - 1)
@@ -83,7 +83,7 @@ def test_a_reference_of_the_crank_is_an_integral_of_its_rate():
 
 
 def polar(seen):
-    """Drives on a curve to the place, forwards or backwards, and arrives in its direction.
+    """Drives on a curve to the parking place, forwards or backwards, and arrives in its direction.
 
     References:
         Aicardi, Casalino, Bicchi, Balestrino, Closed loop steering of unicycle-like vehicles via
@@ -107,7 +107,7 @@ def test_a_sleigh_is_parked():
 
 
 def legs(turn):
-    """What the legs are longer than at home with the platform turned in place, (6,) [m]."""
+    """Returns the changes of leg lengths when the platform rotates in place, (6,) [m]."""
     home = np.array([0.0, 0.0, HEIGHT])
     arms = jnp.asarray(HEADS - home)
     heads = home[None] + jax.vmap(lambda x: jc.quaternion.rotate(jc.quaternion.exp(turn), x))(arms)
@@ -115,14 +115,14 @@ def legs(turn):
 
 
 def tilt(seen):
-    """Leans the plate against where the ball is and goes."""
+    """Tilts the plate against the position and the velocity of the ball."""
     x, y, u, w = seen[:4]
     turn = jnp.stack([0.8 * y + 0.6 * w, -0.8 * x - 0.6 * u, 0.0 * x])
     return legs(turn) / 0.1
 
 
 def test_a_ball_is_kept_on_the_plate():
-    method = jc.Method(solver=jc.Schur())
+    method = jc.Method(solver=jc.solvers.Schur())
     environment = environments.make("StewartBalancing", method=method)
     earned = play(environment, tilt, 150)
     assert earned[:, -20:].min() > 0.95
@@ -130,15 +130,15 @@ def test_a_ball_is_kept_on_the_plate():
 
 
 KINDS = {"by hand": (1.0, 0.0), "idle": (0.0, 0.0), "random": (0.0, 1.0), "lost": (np.nan, 0.0)}
-"""How much of an action is a policy's, and how much is noise within −1 to 1."""
+"""Weights of the policy and of noise within −1 to 1 in an action, by kind."""
 
 
 def compare(environment, policy, look, actions, copies=2):
-    """What `look` sees and is earned by a policy, by nothing, by noise and by NaN, in one program.
+    """Runs a policy, zero actions, noise and NaN actions in one program.
 
     Returns:
-        By kind, of each copy and action: reward, 0 once the task is over; whether it was not over;
-        outcome; and what `look` says of the episode.
+        By kind, for each copy and action: reward (0 after the end of the task), whether the task
+        was still running, outcome, and the result of `look` for the episode.
     """
 
     def one(weights, key):
@@ -158,13 +158,13 @@ def compare(environment, policy, look, actions, copies=2):
     weights = jnp.repeat(jnp.asarray(list(KINDS.values())), copies, axis=0)
     run = jax.jit(jax.vmap(one))
     first, again = (jax.tree.map(np.asarray, run(weights, keys)) for _ in range(2))
-    jax.tree.map(np.testing.assert_array_equal, first, again)  # bit for bit
+    jax.tree.map(np.testing.assert_array_equal, first, again)  # bitwise reproducible
     parts = [slice(i * copies, (i + 1) * copies) for i in range(len(KINDS))]
     return {k: jax.tree.map(lambda x, p=p: x[p], first) for k, p in zip(KINDS, parts, strict=True)}
 
 
 def assert_sound(found, violation):
-    """Rewards within bounds, no divergence but by NaN, and constraints that are kept."""
+    """Checks reward bounds, the absence of divergence except by NaN, and constraint violations."""
     for kind, (reward, _, outcome, _) in found.items():
         lost = kind == "lost"
         assert reward.min() >= 0
@@ -175,20 +175,22 @@ def assert_sound(found, violation):
 
 
 def returns(found):
-    """The mean over copies of what an episode earned, by kind."""
+    """Returns the mean return of the copies, by kind."""
     return {kind: rewards.sum(axis=-1).mean() for kind, (rewards, *_) in found.items()}
 
 
 def smooth(x):
-    """From 0 to 1 in x from 0 to 1, level outside."""
+    """Returns a smooth step from 0 at x = 0 to 1 at x = 1, constant outside."""
     x = jnp.clip(x, 0.0, 1.0)
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
 def turn_over(seen):
-    """Bends, lets the bend run once round the spine, and stretches; numbers of the stock cat.
+    """Bends the cat, moves the bend once around the spine, and stretches.
 
-    The bend β is that after which a body of two equal halves without twist has made half a turn,
+    Numbers of the default cat.
+
+    A body of two equal halves without twist turns by half a turn for a bend β with
     A cos² β/2 + B sin² β/2 = 2 A cos β/2, with moments A along the spine and B across it.
     """
     along, across = 0.07**2 / 2, (3 * 0.07**2 + 0.25**2) / 12
@@ -208,7 +210,7 @@ def turn_over(seen):
 
 
 def test_a_cat_lands_on_its_feet_without_angular_momentum():
-    method = jc.Method(jc.RATTLE(), solver=jc.Schur())
+    method = jc.Method(jc.integrators.RATTLE(), solver=jc.solvers.Schur())
     environment = environments.make("CatRighting", method=method)
 
     def look(episode):
@@ -243,7 +245,7 @@ def test_a_cat_lands_on_its_feet_without_angular_momentum():
 
 
 def test_no_muscles_fold_the_cat_double():
-    """The most that torques bring in is in time with the bend: where it grows, and with all."""
+    """Torques in phase with the bending velocity, at full strength, add the most energy."""
     cat = environments.make("CatRighting", dtype="float32")
 
     def act(episode, _):
@@ -259,10 +261,10 @@ def test_no_muscles_fold_the_cat_double():
 
 
 def pump(seen):
-    """Up where the body passes below the point, down where it turns, until it swings high enough.
+    """Raises the body below the suspension and lowers it at the ends, up to the target height.
 
-    √(height) and speed are the cosine and the sine of the phase of a swing, whose double leads the
-    climbing by what the servo lags behind.
+    √(height) and speed are cosine and sine of the phase of a swing. Twice that phase, advanced by
+    the lag of the servo, controls the climbing.
     """
     cosine, sine, rate, distance = seen[:4]
     x = jnp.sign(sine) * jnp.sqrt(distance * (1 - cosine))
@@ -273,10 +275,11 @@ def pump(seen):
 
 
 def period(lengths, masses, moments, last):
-    """The period of the slowest small swing of hanging links, the last body fixed to a link.
+    """Returns the period of the slowest small oscillation of a hanging chain.
 
-    M φ̈ + K φ = 0 of the links' angles, with the horizontal arms a of the bodies per angle:
-    M = Σ m a aᵀ + moments, K = g Σ m a on the diagonal.
+    The last body is fixed to the last link. The link angles obey M φ̈ + K φ = 0. With the
+    horizontal lever arms a of the bodies by angle, M = Σ m a aᵀ + moments, and K = g Σ m a on the
+    diagonal.
     """
     n = len(lengths)
     arms = np.array([[*lengths[:k], lengths[k] / 2, *np.zeros(n - k - 1)] for k in range(n)])
@@ -314,12 +317,14 @@ def test_a_swing_on_a_rope_is_pumped_up_to_its_height():
 
 
 def hop(seen):
-    """A spring between trunk and foot, stiffer on the way up; the foot is set where it will stop.
+    """A spring between trunk and foot, stiffer on the way up.
 
-    Forces on the foot become torques by the transpose of its Jacobian.
+    In flight the foot is placed ahead in proportion to the speed and its error.
+
+    The transposed Jacobian of the foot converts forces into torques.
 
     References:
-        Raibert, Legged Robots That Balance (1986), section 2, for where the foot is set.
+        Raibert, Legged Robots That Balance (1986), section 2, for the placement of the foot.
     """
     height, speed, rise = seen[:3]
     foot, velocity, goal = seen[7:9], seen[9:11], seen[11]
@@ -336,10 +341,10 @@ def hop(seen):
 
 
 def test_sweeps_over_stops_and_contact_hop_as_far():
-    """What the task has by default, where the test below solves its rows to rounding."""
+    """Sweeps are the default of the task; the next test solves its rows to rounding."""
     environment = environments.make("FiveBarHopper")
-    assert isinstance(environment.method.bounded, jc.GaussSeidel)
-    cheap = dataclasses.replace(environment.method, solver=jc.Schur())
+    assert isinstance(environment.method.contact_solver, jc.solvers.GaussSeidel)
+    cheap = dataclasses.replace(environment.method, solver=jc.solvers.Schur())
     earned = play(dataclasses.replace(environment, method=cheap), hop)
     assert earned.sum(axis=1).min() > 190
 
@@ -347,12 +352,12 @@ def test_sweeps_over_stops_and_contact_hop_as_far():
 ENDS = [
     (part, side * x / 2) for part, x in (("thigh", THIGH), ("shank", SHANK)) for side in (-1, 1)
 ]
-"""The ends of the bars of a leg from the hip down to the foot."""
+"""The ends of the bars of a leg, from the hip down to the foot."""
 
 
 def test_a_five_bar_leg_hops_forward():
-    """In flight the momenta are those of a throw; on the ground pushes obey Coulomb's law."""
-    environment = environments.make("FiveBarHopper", method=jc.Method(solver=jc.Schur()))
+    """In flight the momenta follow ballistic motion; on the ground forces obey Coulomb's law."""
+    environment = environments.make("FiveBarHopper", method=jc.Method(solver=jc.solvers.Schur()))
     masses = {"trunk": 4.0, "thigh": 0.3, "shank": 0.2, "carriage": 0.2}
     weights = {name: masses[name.split("_")[-1]] for name in environment.system.layout.bodies}
 
@@ -375,7 +380,7 @@ def test_a_five_bar_leg_hops_forward():
     assert earned["idle"] < 10
     assert earned["random"] < 20
     *_, low, speed, goal = found["by hand"][3]
-    assert found["by hand"][1].all()  # it never falls
+    assert found["by hand"][1].all()  # the robot never falls
     np.testing.assert_allclose(speed[:, -100:].mean(axis=1), goal[:, -1], atol=0.15)
     assert low[:, -100:].max() > 0.15
     hops = np.sum((low[:, 1:] > 0.02) & (low[:, :-1] <= 0.02), axis=1)
@@ -388,8 +393,8 @@ def test_a_five_bar_leg_hops_forward():
         for a, b in ((knee, hinge), (other, hung), (foot, met)):
             assert np.abs(a - b)[:, 1:][alive].max() < 1e-3
         normal = np.diff(up) + 9.81 * (sum(weights.values()) - 0.2) * 0.01
-        # a step leaves φ = O(h³) on either side of the ground; without J̇ v it leaves O(h²), always
-        # above it for a foot that swings: 91 µm where a leg pushes, and millimetres under noise
+        # a step leaves φ = O(h³) on either side of the ground; without J̇ v it leaves O(h²),
+        # for a swinging foot always above it: 91 µm where a leg pushes, millimeters under noise
         pushes = alive & (normal > 0.02)
         assert pushes.sum() > 40
         if kind == "by hand":

@@ -1,4 +1,4 @@
-"""What every environment keeps, by itself and behind Gymnasium's interfaces."""
+"""Properties of all environments, in pure JAX and behind Gymnasium's interfaces."""
 
 import dataclasses
 import functools
@@ -28,12 +28,16 @@ from benchmarks import environments as benchmark  # noqa: E402
 
 TASKS = list(environments.TASKS)
 CHEAP = {
-    "CatRighting": {"method": jc.Method(jc.RATTLE(), solver=jc.Schur())},
-    "FiveBarHopper": {"method": jc.Method(solver=jc.Schur(), bounded=jc.GaussSeidel(2))},
-    "HalfCheetah": {"method": jc.Method(solver=jc.Schur(), bounded=jc.GaussSeidel(2))},
-    "StewartBalancing": {"method": jc.Method(solver=jc.Schur())},
+    "CatRighting": {"method": jc.Method(jc.integrators.RATTLE(), solver=jc.solvers.Schur())},
+    "FiveBarHopper": {
+        "method": jc.Method(solver=jc.solvers.Schur(), contact_solver=jc.solvers.GaussSeidel(2))
+    },
+    "HalfCheetah": {
+        "method": jc.Method(solver=jc.solvers.Schur(), contact_solver=jc.solvers.GaussSeidel(2))
+    },
+    "StewartBalancing": {"method": jc.Method(solver=jc.solvers.Schur())},
 }
-"""Options that make a task quicker to compile."""
+"""Options that make a task compile faster."""
 
 
 def single(task="CartPole", **options):
@@ -50,18 +54,18 @@ def pushes(steps, n=4, seed=0):
 
 
 def play(envs, actions):
-    """Everything that the actions led to, as arrays of numpy."""
+    """Returns the results of all actions as NumPy arrays."""
     return [jax.tree.map(np.asarray, envs.step(a)) for a in actions]
 
 
 def same(x, y):
-    """Bit for bit."""
+    """Checks bitwise equality."""
     jax.tree.map(np.testing.assert_array_equal, x, y)
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_gymnasium_finds_nothing_to_warn_of(task):
-    """Warnings are errors here; the checker also draws a picture."""
+    """Warnings are errors here; the checker of Gymnasium also renders an image."""
     env = single(task)
     check_env(env.unwrapped)
     built = environments.make(task, **CHEAP.get(task, {}))
@@ -71,13 +75,13 @@ def test_gymnasium_finds_nothing_to_warn_of(task):
 
 
 def test_a_time_limit_is_gymnasiums():
-    """Its own would go before a task's: 500 actions where 50 were asked for."""
+    """`horizon` is refused: Gymnasium's limit overrides it, giving 500 actions instead of 50."""
     assert gymnasium.make("jaxcon/CartPole-v0", max_episode_steps=50).spec.max_episode_steps == 50
     with pytest.raises(ValueError, match="max_episode_steps"):
         gymnasium.make("jaxcon/CartPole-v0", horizon=50)
     with pytest.raises(ValueError, match="max_episode_steps"):
         gymnasium.make_vec("jaxcon/CartPole-v0", num_envs=2, horizon=50)
-    assert many(max_episode_steps=-1).environment.horizon is None  # of which Gymnasium makes none
+    assert many(max_episode_steps=-1).environment.horizon is None  # −1 means no limit
     with pytest.raises(ValueError, match="max_episode_steps must be a whole number from 1, got 0"):
         many(max_episode_steps=0)
     with pytest.raises(ValueError, match="num_envs must be a whole number from 1, got 2.5"):
@@ -107,7 +111,7 @@ def test_episodes_start_on_the_constraints_and_earn_from_0_to_1(task):
     position, rate, reward = jax.jit(jax.vmap(off))(keys)
     assert jnp.max(position) < 1e-12
     assert jnp.max(rate) < 1e-12
-    if task != "HalfCheetah":  # whose reward is Gymnasium's
+    if task != "HalfCheetah":  # the reward of the half-cheetah is Gymnasium's
         assert jnp.all((reward >= 0) & (reward <= 1))
         assert len(jnp.unique(reward)) == len(keys)
 
@@ -128,7 +132,7 @@ def test_a_seed_gives_the_same_rollout_bit_for_bit():
     actions = pushes(12)
     runs = []
     for seed in (3, 3, 4):
-        envs = many(max_episode_steps=5)  # each copy begins three episodes
+        envs = many(max_episode_steps=5)  # every copy has three episodes
         runs.append([envs.reset(seed=seed), play(envs, actions)])
     same(runs[0], runs[1])
     assert np.all(runs[0][0][0] != runs[2][0][0])
@@ -140,7 +144,7 @@ def test_a_copy_starts_as_it_does_among_fewer():
 
 
 def test_what_was_saved_goes_on_bit_for_bit():
-    """Beyond the next reset, through a file, and in another object."""
+    """Saved states continue beyond the next reset, through a file, and in another object."""
     actions = pushes(12)
     envs = many(max_episode_steps=5)
     envs.reset(seed=0)
@@ -183,11 +187,11 @@ def test_a_copy_that_diverges_is_truncated_and_reset_and_the_others_do_not_notic
     assert reward[2] == 0
     assert not terminated.any()
     assert np.isfinite(observation).all()
-    same(observation[2], found[0][0][2])  # where it last was finite
+    same(observation[2], found[0][0][2])  # the last finite observation
     observation, reward, terminated, truncated, info = found[2]
     assert not truncated.any()
     assert not info["diverged"].any()
-    assert reward[2] == 0  # of the step in which it was reset
+    assert reward[2] == 0  # the action that resets has no reward
     assert abs(observation[2, 0]) < 0.1  # near the start again
     assert not np.array_equal(observation[2], expected[0][0][2])
 
@@ -201,7 +205,7 @@ def test_one_copy_refuses_what_is_no_action():
     start = env.save()
     far, _, *_ = env.step([5.0])
     env.restore(start)
-    same(far, env.step([1.0])[0])  # clipped, as Gymnasium's pendulum does
+    same(far, env.step([1.0])[0])  # clipped, as in Gymnasium's pendulum
 
 
 def test_many_copies_refuse_what_are_no_actions():
@@ -224,7 +228,7 @@ def test_what_was_saved_elsewhere_is_refused():
 
 
 def test_gymnasiums_wrappers_see_arrays_of_numpy():
-    """Episodes of three actions, and a fourth by which they begin anew."""
+    """Episodes have three actions; the fourth action resets."""
     envs = RecordEpisodeStatistics(JaxToNumpy(many(max_episode_steps=3)))
     envs.reset(seed=0)
     seen = [envs.step(action) for action in pushes(8)]
@@ -251,7 +255,7 @@ def test_unknown_names_and_options_are_told():
             environments.make("CartPole", **wrong)
     with pytest.raises(ValueError, match=r"lengths must have shape \(4,\), got \(3,\)"):
         environments.make("FourBarTracking", lengths=(1.0, 0.3, 0.9))
-    whole = environments.make("FourBarTracking", lengths=(4, 1, 3, 3))  # not what dt is to be
+    whole = environments.make("FourBarTracking", lengths=(4, 1, 3, 3))  # dt must stay a float
     assert whole.dt == 5e-3
     with pytest.raises(ValueError, match="built already"):
         environments.make(environments.make("CartPole"), cart=2.0)
@@ -280,13 +284,13 @@ def test_time_is_up_for_one_copy_and_for_many():
     seen = play(envs, np.zeros((8, 4, 1)))
     assert [bool(x[3].all()) for x in seen] == [i in (2, 6) for i in range(8)]
     assert [bool(x[3].any()) for x in seen] == [i in (2, 6) for i in range(8)]
-    assert np.all(seen[3][1] == 0)  # the step that resets
+    assert np.all(seen[3][1] == 0)  # the action that resets
     assert np.all(seen[2][1] > 0)
-    assert np.all(seen[3][0] != start)  # with fresh keys
+    assert np.all(seen[3][0] != start)  # with new keys
 
 
 def test_when_copies_are_reset_is_a_choice():
-    """One motion, told at different times."""
+    """Each reset mode reports the same motion, with the first observation at its own call."""
     actions = pushes(4)
     seen = {}
     for mode in ("NextStep", "SameStep", "Disabled"):
@@ -298,7 +302,7 @@ def test_when_copies_are_reset_is_a_choice():
     close(seen["SameStep"][2][4]["final_obs"], seen["NextStep"][2][0])
     close(seen["SameStep"][2][0], seen["NextStep"][3][0])
     jax.tree.map(close, seen["Disabled"][2][:4], seen["NextStep"][2][:4])
-    assert seen["Disabled"][3][3].all()  # it is still over
+    assert seen["Disabled"][3][3].all()  # stays over
     before = np.asarray(envs.copies.episode.steps)
     mask = np.array([True, False, False, True])
     observation, _ = envs.reset(options={"reset_mask": mask})
@@ -307,7 +311,7 @@ def test_when_copies_are_reset_is_a_choice():
 
 
 def test_a_mode_that_is_unknown_is_told():
-    """The enumeration of Gymnasium's is none of the names, and would never have reset a copy."""
+    """Gymnasium's enumeration is refused: it equals no mode name and would never reset a copy."""
     environment = environments.make("CartPole")
     start, _ = copies.begin(environment, jax.random.key(0), 2)
     for mode in ("next_step", gymnasium.vector.AutoresetMode.NEXT_STEP):
@@ -352,7 +356,7 @@ def test_numbers_of_an_environment_can_be_changed_without_a_new_trace():
     changed = environment.system.with_params({"cart": {"mass": 5.0}})
     heavy = step(dataclasses.replace(environment, system=changed), episode)
     assert len(traces) == 1
-    assert 3 < light[1] / heavy[1] < 5  # the speed after one push of a cart with and without load
+    assert 3 < light[1] / heavy[1] < 5  # speeds after one push without and with a load
 
 
 def test_gymnasium_drives_the_functional_interface():
@@ -435,7 +439,7 @@ else:
 
 
 def test_whoever_is_chosen_starts_as_its_key_says():
-    """None, and up to each of the numbers of starts that are computed, of which there are three."""
+    """Resets chosen copies: none, all, and numbers around the three sizes that are compiled."""
     environment, count = environments.make("CartPole"), 400
     start, _ = jax.jit(copies.begin, static_argnums=(2,))(environment, jax.random.key(0), count)
     expected = jax.jit(jax.vmap(environment.reset))(start.episode.key).state.q
@@ -464,12 +468,12 @@ def test_copies_that_are_simulated_by_lots_move_as_all_at_once(monkeypatch):
     np.testing.assert_allclose(lots, whole, rtol=1e-6, atol=1e-6)
     slopes = (jax.grad(lambda x, n=n: jnp.sum(places(n, x)[:, 0]))(actions) for n in (6, 3))
     np.testing.assert_allclose(*slopes, rtol=1e-5)
-    sizes = [copies.size_of_lot(count, 128) for count in (100, 128, 1000, 4096, 4099)]
+    sizes = [copies.chunk_size(count, 128) for count in (100, 128, 1000, 4096, 4099)]
     assert sizes == [None, None, 125, 128, None]
 
 
 def test_restarts_are_differentiated():
-    """A copy that starts anew does not depend on where it was; the others do."""
+    """A reset copy does not depend on its previous state; the others do."""
     environment = environments.make("CartPole")
     start, _ = copies.begin(environment, jax.random.key(0), 3)
     chosen = jnp.array([False, True, False])

@@ -12,12 +12,12 @@ from jaxcon.verification import references
 
 FORMS = {case["id"]: case for case in references.load("contact_closed_forms")["cases"]}
 EXACT = 1e-6
-"""What event-located stepping is held to against closed forms."""
+"""Tolerance of event-located stepping against closed forms."""
 R = 0.1
 
 
 def falling(dtype=None):
-    """A particle over a floor at its radius, in the plane."""
+    """A ball in the plane over a floor, as a particle with a contact radius."""
     scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=dtype)
     scene.add_particle("ball", mass=1.0, position=(0.0, 1.0 + R))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=R, restitution=0.8))
@@ -25,11 +25,13 @@ def falling(dtype=None):
 
 
 def located(integrator=None, **choices):
-    return jc.Method(jc.RK4() if integrator is None else integrator, events=jc.Events(**choices))
+    return jc.Method(
+        jc.RK4() if integrator is None else integrator, events=jc.integrators.Events(**choices)
+    )
 
 
 def march(system, method):
-    """(state, h, n) → the state n steps on; one program for all h and n."""
+    """Returns the function (state, h, n) → state after n steps; compiled once for all h and n."""
 
     def run(state, h, n):
         start = jc.init(system, method, state.q, state.v)
@@ -39,7 +41,7 @@ def march(system, method):
 
 
 def bounced(y, v, e, g, end):
-    """Height of the centre after bounces on a floor at R, and what it is by y, v and e."""
+    """Returns the height after bounces on a floor at R, and its derivatives by y, v and e."""
 
     def height(y, v, e):
         y, t = y - R, 0.0
@@ -56,7 +58,7 @@ def bounced(y, v, e, g, end):
 
 
 def test_bounces_and_their_derivatives_are_those_of_closed_forms():
-    """In one batch, at 480 steps each: bounces, one without gravity, none, rest, and a graze.
+    """Bounces, a bounce without gravity, no impact, rest, and a graze, with 480 steps each.
 
     Without the time of impact the derivatives of the first four have the wrong sign.
     """
@@ -103,13 +105,13 @@ def test_bounces_and_their_derivatives_are_those_of_closed_forms():
 
 
 def test_derivatives_through_a_collision():
-    """In forward mode, along one direction that has all four."""
+    """Uses forward mode along one direction that changes all four numbers."""
     case = references.load("grad_two_balls_nimble")
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("a", mass=1.0, position=(0.0, 0.0))
     scene.add_particle("b", mass=1.0, position=(0.52, 0.0))
     touch = {"radius_a": 0.1, "radius_b": 0.1, "restitution": 1.0}
-    scene.add(jc.CapsuleContact("touch", "a", "b", **touch))
+    scene.add(jc.contacts.CapsuleContact("touch", "a", "b", **touch))
     system, state = scene.build()
     method = located(jc.SemiImplicitEuler())
 
@@ -127,18 +129,18 @@ def test_derivatives_through_a_collision():
 
 
 def oscillator():
-    """A mass on a rail, x = cos 2t were there no stop at −0.6."""
+    """A mass on a rail; without its stop at −0.6 it moves as x = cos 2t."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("slide", mass=1.0, inertia=1.0)
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
-    scene.add(jc.JointSpring("spring", "rail", stiffness=4.0))
+    scene.add(jc.forces.JointSpring("spring", "rail", stiffness=4.0))
     scene.add(jc.Limit("stop", "rail", lower=-0.6, restitution=0.5))
     system, state = scene.build()
     return system, dataclasses.replace(state, q=state.q.at[0].set(1.0))
 
 
 def struck(time):
-    """Where the oscillator is after its first impact, and before the second."""
+    """Returns the exact position of the oscillator between its first and second impact."""
     first = np.arccos(-0.6) / 2
     rate = 0.5 * 2 * np.sin(2 * first)
     angle = 2 * (time - first)
@@ -146,7 +148,7 @@ def struck(time):
 
 
 def test_an_impact_keeps_the_order_of_the_integrator():
-    """Four with RK4 where steps are split, and about two in plain steps, which find the impact."""
+    """RK4 has order four with events, and about two in plain steps, which also locate impacts."""
     system, state = oscillator()
     end, orders = 1.7, []
     for method in (located(), jc.Method(jc.RK4())):
@@ -159,7 +161,7 @@ def test_an_impact_keeps_the_order_of_the_integrator():
 
 
 def test_what_a_step_tells_of_its_impacts():
-    """When, which element, and the mean force of the impulse; time ends at t + h."""
+    """The info has the time, the element and the mean force of the impulse; time ends at t + h."""
     system, state = falling()
     method = located()
     start = jc.init(system, method, state.q.at[1].set(R + 0.01), state.v.at[1].set(-2.0))
@@ -175,7 +177,7 @@ def test_what_a_step_tells_of_its_impacts():
 
 
 def test_several_impacts_in_one_step():
-    """A slider between two stops, at 40 ms a step and 10 ms from stop to stop."""
+    """A slider needs 10 ms from stop to stop; a step has 38 ms."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("slide", mass=1.0, inertia=1.0, velocity=(1.0, 0.0))
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
@@ -190,13 +192,13 @@ def test_several_impacts_in_one_step():
 
 
 def test_balls_that_touch_are_struck_together():
-    """The simultaneous rule of Newton, from a gap that closes within the step."""
+    """Newton's simultaneous impact law, for a gap that closes within the step."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     for i, x in enumerate((-0.21, 0.0, 0.2)):
         scene.add_particle(f"{i}", mass=1.0, position=(x, 0.0), velocity=(float(i == 0), 0.0))
     for i in range(2):
         touch = {"radius_a": 0.1, "radius_b": 0.1, "restitution": 1.0}
-        scene.add(jc.CapsuleContact(f"touch {i}", f"{i}", f"{i + 1}", **touch))
+        scene.add(jc.contacts.CapsuleContact(f"touch {i}", f"{i}", f"{i + 1}", **touch))
     system, state = scene.build()
     new = march(system, located(jc.SemiImplicitEuler()))(state, 0.1, 1)
     np.testing.assert_allclose(new.v[:3], [-1 / 3, 2 / 3, 2 / 3], atol=EXACT)
@@ -204,7 +206,7 @@ def test_balls_that_touch_are_struck_together():
 
 
 def test_impacts_with_friction():
-    """The references are in the plane, their spin about z; here that is −y of the body."""
+    """The references are planar with the spin about z; that axis is −y of this scene."""
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
     scene.add_body("ball", inertia=jc.inertia.sphere(1.0, 0.1), position=(0, 0, 0.11))
     floor = jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, friction=0.3, restitution=0.7)
@@ -221,11 +223,11 @@ def test_impacts_with_friction():
 
 
 def test_a_rope_jerks():
-    """A weight falls until the rope is taut, and comes back with half the speed."""
+    """A weight falls until the rope is taut, and rebounds with half the speed."""
     scene = jc.Scene(dim=3)
     scene.add_particle("weight", mass=2.0, position=(0.0, 0.0, -0.5))
     ends = {"length": 1.0, "point_a": (0.0, 0.0, 0.0)}
-    scene.add(jc.Rope("rope", jc.WORLD, "weight", restitution=0.5, **ends))
+    scene.add(jc.contacts.Rope("rope", jc.WORLD, "weight", restitution=0.5, **ends))
     system, state = scene.build()
     new = march(system, located())(state, 0.02, 22)
     fall = np.sqrt(1 / 9.81)
@@ -240,10 +242,10 @@ def test_a_rope_jerks():
     ids=["SIE", "RK4"],
 )
 def test_a_ball_comes_to_lie(integrator, dtype):
-    """Beyond the time of infinitely many bounces it rests, and gains no energy on the way.
+    """After the time of infinitely many bounces the ball rests, and it never gains energy.
 
-    But for what semi-implicit Euler makes of a fall, ½ m (g h)² a step, and for what comes back
-    of the ¼ g h² by which a row at rest is passed beside Runge–Kutta methods.
+    Two errors are tolerated: semi-implicit Euler adds ½ m (g h)² a step to a fall, and a resting
+    contact with Runge–Kutta methods penetrates by ¼ g h².
     """
     system, state = falling(dtype)
     changed = system.with_params({"floor": {"restitution": 0.5}})
@@ -268,11 +270,11 @@ def test_a_ball_comes_to_lie(integrator, dtype):
 
 
 def test_what_has_no_end_has_no_trace_of_events():
-    """Friction alone makes no impact: the program is that without events, and nothing is told."""
+    """Friction alone makes no impact: the program equals that without events, without a warning."""
     scene = jc.Scene(dim=2)
     scene.add_body("slide", mass=1.0, inertia=1.0)
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
-    scene.add(jc.JointFriction("rub", "rail", most=1.0))
+    scene.add(jc.contacts.JointFriction("rub", "rail", max_force=1.0))
     scene.add(jc.Limit("soft", "rail", upper=1.0, stiffness=10.0))
     system, state = scene.build()
 
@@ -293,11 +295,23 @@ def test_what_has_no_end_has_no_trace_of_events():
 @pytest.mark.parametrize(
     ("method", "match"),
     [
-        (lambda: jc.Method(events=jc.Events(splits=0)), "Events: splits must be a whole number"),
-        (lambda: jc.Method(events=jc.Events(iterations=0)), "Events: iterations must be a whole"),
-        (lambda: jc.Method(events=jc.Events), r"events must be a value such as Events\(\)"),
+        (
+            lambda: jc.Method(events=jc.integrators.Events(splits=0)),
+            "Events: splits must be a whole number",
+        ),
+        (
+            lambda: jc.Method(events=jc.integrators.Events(iterations=0)),
+            "Events: iterations must be a whole",
+        ),
+        (
+            lambda: jc.Method(events=jc.integrators.Events),
+            r"events must be a value such as Events\(\)",
+        ),
         (lambda: jc.Method(events=True), r"events must be a value such as Events\(\)"),
-        (lambda: jc.Method(jc.RATTLE(), events=jc.Events()), "bounded rows of \\['floor'\\]"),
+        (
+            lambda: jc.Method(jc.integrators.RATTLE(), events=jc.integrators.Events()),
+            "inequality rows of \\['floor'\\]",
+        ),
     ],
 )
 def test_bad_choices_are_refused(method, match):
@@ -307,7 +321,10 @@ def test_bad_choices_are_refused(method, match):
 
 
 def test_points_of_one_element_strike_as_one():
-    """A bar falls flat on both ends: each leaves with e times its speed, and the floor is named."""
+    """A bar falls flat on both ends: each leaves with e times its speed.
+
+    The info names the floor.
+    """
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("bar", mass=1.0, inertia=0.1, position=(0.0, 0.1), velocity=(0.0, -1.0))
     scene.add_particle("bead", mass=1.0, position=(5.0, 9.0))
@@ -316,7 +333,7 @@ def test_points_of_one_element_strike_as_one():
     touch = {"center": ends, "friction": 0.5, "restitution": 0.6}
     scene.add(jc.PlaneContact("floor", jc.WORLD, "bar", **touch))
     system, state = scene.build()
-    method = jc.Method(jc.RK4(), events=jc.Events())
+    method = jc.Method(jc.RK4(), events=jc.integrators.Events())
     start = jc.init(system, method, state.q, state.v)
     new, info = jax.jit(lambda s: jc.step(system, method, s, None, 0.2))(start)
     np.testing.assert_allclose(info.impacts.times, [0.1], atol=1e-12)
@@ -326,7 +343,7 @@ def test_points_of_one_element_strike_as_one():
 
 
 def test_what_nearest_rows_leave_out_of_an_impact_shows_in_the_residual():
-    """Two beads hit the floor at once and one row is solved: the other goes on closing."""
+    """Two beads hit the floor at once and one row is solved: the other bead keeps closing."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     for i in range(2):
         scene.add_particle(f"{i}", mass=1.0, position=(float(i), 0.01), velocity=(0.0, -1.0))
@@ -334,8 +351,8 @@ def test_what_nearest_rows_leave_out_of_an_impact_shows_in_the_residual():
     system, state = scene.build()
     missed = []
     for stops in (1, 2):
-        some = jc.Nearest(jc.GaussSeidel(sweeps=5, warm=False), stops=stops)
-        method = jc.Method(bounded=some, events=jc.Events())
+        some = jc.solvers.ActiveSet(jc.solvers.GaussSeidel(sweeps=5, warm=False), stops=stops)
+        method = jc.Method(contact_solver=some, events=jc.integrators.Events())
         info = jax.jit(lambda s, m=method: jc.step(system, m, s, None, 0.02))(state)[1]
         missed.append(float(info.reactions.residual))
     np.testing.assert_allclose(missed, [1.0, 0.0], atol=1e-9)

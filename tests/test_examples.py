@@ -1,4 +1,4 @@
-"""The README, the guide and the examples run as they stand."""
+"""The programs of the README, the guide and the examples run as printed."""
 
 import os
 import re
@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 
 
 QUICK = {name: ["--updates", "1"] for name in ("learn_apg", "learn_ppo")}
-"""Arguments of examples that take minutes without them."""
+"""Arguments that shorten examples which would take minutes."""
 
 
 def blocks(path: Path) -> list[str]:
@@ -25,7 +25,7 @@ def blocks(path: Path) -> list[str]:
 
 
 def ran(path: Path) -> dict:
-    """The names of a page after its programs, one after the other and after nothing else."""
+    """Runs the programs of a page in order, in one namespace, and returns its names."""
     names: dict = {}
     for block in blocks(path):
         exec(block, names)  # noqa: S102
@@ -38,19 +38,19 @@ TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 @pytest.mark.parametrize("page", [p for p in TEXTS if blocks(p)], ids=lambda p: p.stem)
 def test_programs_of_the_readme_and_the_guide_run_page_by_page(page, capsys):
     names = ran(page)
-    if page.stem == "README":  # the first that it prints is what its comment says
+    if page.stem == "README":  # its comment states the first printed line
         said = re.search(r"print\(.*# (\[.*?\])", page.read_text())
         assert said
         found, known = capsys.readouterr().out.splitlines()[0], said[1]
         both = [np.fromstring(text.strip("[]"), sep=" ") for text in (found, known)]
         np.testing.assert_allclose(*both, atol=1e-3)
-    if page.stem == "control":  # its policy balances its pole
+    if page.stem == "control":  # the policy balances the pole
         upright = jc.orientation(names["system"], names["final"], "pole")
         assert abs(float(upright)) < 0.02
-    if page.stem == "tune":  # the default search finds both numbers, and Adam hardly does
+    if page.stem == "tune":  # the default search finds both numbers; Adam hardly does
 
         def loss(p):
-            return jc.losses.tracking(names["height"](p), names["seen"])
+            return jc.learning.losses.tracking(names["height"](p), names["seen"])
 
         adam = optax.adam(optax.cosine_decay_schedule(0.2, 500))
         slow = jc.tune(loss, names["guess"], positive=True, steps=500, optimizer=adam)
@@ -101,7 +101,7 @@ def test_main_job_small(tmp_path):
     assert "environment-steps per second" in done.stdout
     said = re.search(r"the tuned gains leave ([\d.]+) times less", done.stdout)
     assert said
-    assert float(said[1]) > 3  # on linkages that were not tuned on
+    assert float(said[1]) > 3  # on linkages outside the training set
     assert picture.stat().st_size > 10_000
 
 

@@ -1,4 +1,4 @@
-"""One world fails: it says so and stops, the others do not notice, nor do their gradients."""
+"""One world of a batch fails: it stops with a status, and no other world or gradient changes."""
 
 import dataclasses
 import functools
@@ -17,7 +17,7 @@ HEALTHY = [i for i in range(WORLDS) if i != SICK]
 
 
 def fading(cart, t, p):
-    """A row that vanishes at a time: from then on it constrains nothing."""
+    """Returns ψ of a row that vanishes after the time `until`."""
     return jnp.maximum(p["until"] - t, 0.0) * cart.velocity[1:]
 
 
@@ -29,14 +29,14 @@ def scene():
     s.add_particle("cart", mass=0.7, position=(0.0, 2.0), velocity=(1.0, 0.0))
     s.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
     s.add(jc.Distance("rod", "arm", "bob", point_a=(1.0, 0.0)))
-    s.add(jc.VelocityLevel(fading, ("cart",), name="rail", params={"until": 100.0}))
+    s.add(jc.joints.VelocityLevel(fading, ("cart",), name="rail", params={"until": 100.0}))
     s.add(jc.Spring("spring", "cart", "bob", stiffness=5.0, rest_length=1.0))
-    s.add(jc.ExternalWrench("push", "bob"))
+    s.add(jc.forces.ExternalWrench("push", "bob"))
     return s.build()
 
 
 def healthy_numbers(state):
-    """What differs from world to world."""
+    """Returns the numbers that differ between the worlds."""
     random = np.random.default_rng(0)
     return {
         "q": np.tile(state.q, (WORLDS, 1)),
@@ -68,7 +68,7 @@ def sicken(numbers, what):
 
 
 NON_FINITE, SINGULAR = jc.Status.NON_FINITE, jc.Status.SINGULAR
-# what fails: its status and how many steps the world lives, where theory says
+# by failure: the status, and the number of steps before it where theory gives one
 SICKNESSES = {
     "state": (NON_FINITE, 0),
     "velocity": (NON_FINITE, 0),
@@ -79,7 +79,7 @@ SICKNESSES = {
     "blow-up": (None, None),
 }
 every_sickness = pytest.mark.parametrize("what", SICKNESSES)
-SOLVERS = {"schur": jc.Schur(), "dense": jc.Dense()}
+SOLVERS = {"schur": jc.solvers.Schur(), "dense": jc.solvers.Dense()}
 
 
 def start(system, state, x):
@@ -93,7 +93,7 @@ def start(system, state, x):
 
 @pytest.fixture(scope="module", params=SOLVERS)
 def simulate(scene, request):
-    """All worlds at once: final states, trajectories and what the last step saw."""
+    """Returns the function that simulates all worlds: final states, trajectories and infos."""
     method = jc.Method(solver=SOLVERS[request.param])
 
     def one(x):
@@ -149,7 +149,7 @@ SHARED = {"gravity": np.array([0.3, -9.81]), "arm": 1.3, "gain": 15.0, "stiffnes
 
 
 def loss(scene, shared, x):
-    """Returns the loss of one world, by numbers that all worlds share."""
+    """Returns the loss of one world by the numbers that all worlds share."""
     system, state = start(*scene, x | {"stiffness": x["stiffness"] * shared["stiffness"]})
     system = system.with_params({"gravity": shared["gravity"], "arm": {"mass": shared["arm"]}})
     method = jc.Method(stabilizer=jc.Baumgarte.critical(rate=shared["gain"]))
@@ -159,7 +159,7 @@ def loss(scene, shared, x):
 
 @pytest.fixture(scope="module")
 def gradients(scene):
-    """The gradient by the shared numbers, by both orders of grad and vmap, and of each world."""
+    """Returns the gradient by the shared numbers outside of vmap, and that of each world inside."""
 
     def each(shared, x):
         return jax.vmap(lambda x: loss(scene, shared, x))(x)
@@ -238,7 +238,7 @@ def test_raise_for_status_names_world_and_cause(scene, simulate):
 
 
 def test_a_healthy_world_keeps_its_gradient_through_the_guard(scene):
-    """Against differences, so that the guard does not stop what it should let pass."""
+    """Central differences show that the guard of failed worlds does not block other gradients."""
     x = jax.tree.map(lambda x: x[0], healthy_numbers(scene[1]))
     shared = jax.tree.map(jnp.asarray, SHARED)
     value = jax.jit(lambda s: loss(scene, s, x))
@@ -253,12 +253,14 @@ def test_a_healthy_world_keeps_its_gradient_through_the_guard(scene):
         np.testing.assert_allclose(jnp.sum(gradient[name]), slope, rtol=1e-6, err_msg=name)
 
 
-@pytest.mark.parametrize("solver", [jc.Schur(), jc.Sparse(), jc.ConjugateGradients()])
+@pytest.mark.parametrize(
+    "solver", [jc.solvers.Schur(), jc.solvers.Sparse(), jc.solvers.ConjugateGradients()]
+)
 def test_a_mass_that_is_not_positive_is_singular(solver):
     system = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.stack([1.0 + 0 * q[0], p]),
         force=lambda q, v, t, u, p: -q,
-        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q[0] - q[1]])),),
+        constraints=(jc.joints.Holonomic(lambda q, t, p: jnp.stack([q[0] - q[1]])),),
         params=jnp.zeros(()),
     )
     state = jc.init(system, jc.Method(), jnp.ones(2), jnp.zeros(2))
@@ -269,7 +271,7 @@ def test_a_mass_that_is_not_positive_is_singular(solver):
 def test_a_policy_that_fails_in_one_world_does_not_spoil_the_others():
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("b", mass=1.0, inertia=1.0, position=(1.0, 0.0), angle=0.3)
-    scene.add(jc.ExternalWrench("w", "b"))
+    scene.add(jc.forces.ExternalWrench("w", "b"))
     system, state = scene.build()
 
     def final(theta, c):
@@ -286,7 +288,7 @@ def test_a_policy_that_fails_in_one_world_does_not_spoil_the_others():
 
 
 def test_second_derivatives_are_those_of_the_worlds_that_do_not_fail():
-    """Through every order of both modes, by numbers that all worlds share."""
+    """Combines forward and reverse mode in every order, by numbers that all worlds share."""
     s = jc.Scene(dim=2)
     s.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     s.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -322,11 +324,11 @@ def test_second_derivatives_are_those_of_the_worlds_that_do_not_fail():
 
 @pytest.fixture(scope="module")
 def swing():
-    """What becomes of one world, by numbers that worlds share and one of its own."""
+    """Returns the function (policy, shared numbers, own number of a world) → final value."""
     s = jc.Scene(dim=2)
     s.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     s.add(jc.Distance("rod", jc.WORLD, "bob"))
-    s.add(jc.ExternalWrench("push", "bob"))
+    s.add(jc.forces.ExternalWrench("push", "bob"))
     system, state = s.build()
 
     def value(policy, shared, own):
@@ -343,7 +345,7 @@ def swing():
 def test_second_derivatives_through_a_policy_are_those_of_the_worlds_that_do_not_fail(
     swing, inside
 ):
-    """Through every order of both modes, outside the batch and inside."""
+    """Combines forward and reverse mode in every order, outside of the batch and inside."""
 
     def policy(shared, own, s):
         return shared[0] * jnp.stack([jnp.sin(s.v[1]), jnp.sqrt(own * shared[0]) * s.q[0]])
@@ -366,7 +368,7 @@ def test_second_derivatives_through_a_policy_are_those_of_the_worlds_that_do_not
 
 
 def test_a_policy_may_return_what_worlds_share(swing):
-    """Controls that are the same in all worlds have a derivative by what worlds share."""
+    """Controls that are the same in all worlds have derivatives by the shared numbers."""
 
     def value(shared, own):
         return swing(lambda shared, own, s: shared[:1] * jnp.array([1.0, 2.0]), shared, own)
@@ -377,7 +379,7 @@ def test_a_policy_may_return_what_worlds_share(swing):
 
 
 def test_a_policy_may_branch(swing):
-    """In all orders of `grad` and `vmap`, where the other branch has no derivative."""
+    """All orders of `grad` and `vmap` work, although the other branch has no derivative."""
 
     def value(shared, own):
         def policy(shared, own, s):
@@ -393,7 +395,7 @@ def test_a_policy_may_branch(swing):
 
 
 def test_a_policy_may_have_a_derivative_of_its_own(swing):
-    """By `custom_vjp`, which JAX batches only before it is differentiated."""
+    """A rule of `custom_vjp` works, although JAX can batch it only before it is differentiated."""
 
     @jax.custom_vjp
     def clipped(x):

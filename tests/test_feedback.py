@@ -1,4 +1,4 @@
-"""Feedback by proportion, integral, size and history, and what it lets through."""
+"""Stabilizing feedback: PID, adaptive and windowed gains, their stability and their response."""
 
 import dataclasses
 from typing import Any
@@ -13,11 +13,11 @@ from tolerances import DIFFERENCE, IDENTITY
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.pytree import pytree
-from jaxcon.simulation.stability import growth
-from jaxcon.stabilization.adaptive import judge
+from jaxcon.methods.adaptive import judge
+from jaxcon.methods.stability import growth
 
 H = 0.01
-INTEGRATORS = {"euler": jc.SemiImplicitEuler(), "heun": jc.Heun(), "rk4": jc.RK4()}
+INTEGRATORS = {"euler": jc.SemiImplicitEuler(), "heun": jc.integrators.Heun(), "rk4": jc.RK4()}
 every_integrator = pytest.mark.parametrize("integrator", INTEGRATORS.values(), ids=INTEGRATORS)
 
 
@@ -26,11 +26,11 @@ def coordinate(p, t, axis):
 
 
 def gap_scene(dtype="float64"):
-    """A particle off two lines that hold it: φ = x and φ = y."""
+    """A particle that violates two constraints, φ = x and φ = y."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=dtype)
     scene.add_particle("a", mass=2.0, position=(0.1, -0.2))
     for name, axis in (("leg_x", (1.0, 0.0)), ("leg_y", (0.0, 1.0))):
-        scene.add(jc.Holonomic(coordinate, ("a",), name, jnp.asarray(axis, dtype)))
+        scene.add(jc.joints.Holonomic(coordinate, ("a",), name, jnp.asarray(axis, dtype)))
     return scene.build()
 
 
@@ -54,8 +54,8 @@ def bob(dtype="float64"):
 
 
 @pytree
-class Disturbed(jc.PID):
-    """A PID whose rows are pushed by w cos ωt, sampled at the start of each step."""
+class Disturbed(jc.stabilizers.PID):
+    """A PID with a disturbance w cos ωt of the rows, sampled at the start of each step."""
 
     push: Any = 0.0
     frequency: Any = 0.0
@@ -63,16 +63,17 @@ class Disturbed(jc.PID):
     def init(self, system, q, v):
         return super().init(system, q, v), jnp.zeros((), q.dtype)
 
-    def target(self, rows, memory, dt):
+    def constraint_equations(self, rows, memory, dt):
         push = self.push * jnp.cos(self.frequency * memory[1])
-        return super().target(rows, memory[0], dt) + push[None]
+        equations = super().constraint_equations(rows, memory[0], dt)
+        return equations.with_target(equations.target + push[None])
 
     def advance(self, rows, memory, dt):
         return super().advance(rows, memory[0], dt), memory[1] + dt
 
 
 def rolled(built, method, steps, dt=H):
-    """The last state, and the x of every state."""
+    """Returns the last state, and x in every state."""
     system, state = built
     start = jc.init(system, method, state.q, state.v)
     final, path = jc.rollout(system, method, start, None, dt, steps, record=lambda s, _: s.q[0])
@@ -102,16 +103,16 @@ def test_the_integral_asks_for_no_more_than_its_limit():
 
 
 def test_the_integral_leaves_its_bound_at_once(rows):
-    pid = jc.PID(400.0, 40.0, 2000.0, limit=1.0)
+    pid = jc.stabilizers.PID(400.0, 40.0, 2000.0, limit=1.0)
     full, h = jnp.full(2, 1.0 / 2000.0), jnp.asarray(1e-3)
     np.testing.assert_allclose(pid.advance(rows, full, h), [5e-4, 5e-4 - 2e-4])
 
 
 @every_integrator
 def test_growth_with_an_integral_is_the_factor_of_one_step(gap, integrator):
-    """The spectral radius on (φ, φ̇, ∫φ), taken from steps."""
+    """Compares `growth` with the spectral radius of a step on (φ, φ̇, ∫φ)."""
     system, _ = gap
-    method = jc.Method(integrator, jc.PID(900.0, 50.0, 7000.0))
+    method = jc.Method(integrator, jc.stabilizers.PID(900.0, 50.0, 7000.0))
     columns = []
     for x in np.eye(3):
         state = jc.init(system, method, jnp.asarray([x[0], 0.0]), jnp.asarray([x[1], 0.0]))
@@ -133,7 +134,7 @@ def test_growth_with_an_integral_is_the_factor_of_one_step(gap, integrator):
 )
 def test_unstable_gains_warn(gap, gains, words):
     system, state = gap
-    method = jc.Method(stabilizer=jc.PID(*gains))
+    method = jc.Method(stabilizer=jc.stabilizers.PID(*gains))
     state = jc.init(system, method, state.q, state.v)
     with pytest.warns(UserWarning, match=words):
         jax.eval_shape(lambda s: jc.step(system, method, s, None, H), state)
@@ -142,34 +143,43 @@ def test_unstable_gains_warn(gap, gains, words):
 @every_integrator
 @pytest.mark.parametrize("integral", [0.0, 2000.0])
 def test_the_response_to_a_sine_is_the_predicted_one(integrator, integral):
-    """To the last digits, and in the limit of small steps that of continuous time."""
+    """The discrete response matches to rounding.
+
+    For small steps it tends to that of continuous time.
+    """
     ω, push = 2 * np.pi / (40 * H), 3.0
     gains = Disturbed(400.0, 30.0, integral, push=push, frequency=ω)
     _, path = jax.jit(lambda: rolled(gap_scene(), jc.Method(integrator, gains), 3000))()
-    response = jc.frequency_response(ω, 15.0, 20.0, integral, integrator=integrator, dt=H)
+    response = jc.stabilizers.frequency_response(
+        ω, 15.0, 20.0, integral, integrator=integrator, dt=H
+    )
     phase = np.exp(1j * ω * H * np.arange(1, 3001))
     expected = push * (np.asarray(response) * phase).real
     size = push * abs(response)
     np.testing.assert_allclose(path[-40:], expected[-40:], atol=1e-9 * float(size))
-    fine = jc.frequency_response(ω, 15.0, 20.0, integral, integrator=integrator, dt=1e-6)
-    np.testing.assert_allclose(fine, jc.frequency_response(ω, 15.0, 20.0, integral), rtol=1e-4)
+    fine = jc.stabilizers.frequency_response(
+        ω, 15.0, 20.0, integral, integrator=integrator, dt=1e-6
+    )
+    np.testing.assert_allclose(
+        fine, jc.stabilizers.frequency_response(ω, 15.0, 20.0, integral), rtol=1e-4
+    )
 
 
 def test_the_continuous_response_by_hand():
     ω = np.asarray([0.0, 1.0, 5.0])
     plain = 1 / ((1j * ω) ** 2 + 2 * 2.0 * 1j * ω + 9.0)
-    np.testing.assert_allclose(jc.frequency_response(ω, 2.0, 3.0), plain, rtol=IDENTITY)
-    with_integral = jc.frequency_response(ω, 2.0, 3.0, 4.0)
+    np.testing.assert_allclose(jc.stabilizers.frequency_response(ω, 2.0, 3.0), plain, rtol=IDENTITY)
+    with_integral = jc.stabilizers.frequency_response(ω, 2.0, 3.0, 4.0)
     assert with_integral[0] == 0
     s = 1j * ω[1:]
     expected = s / (s**3 + 4 * s**2 + 9 * s + 4)
     np.testing.assert_allclose(with_integral[1:], expected, rtol=IDENTITY)
     with pytest.raises(ValueError, match="integrator and dt go together"):
-        jc.frequency_response(ω, 2.0, 3.0, dt=H)
+        jc.stabilizers.frequency_response(ω, 2.0, 3.0, dt=H)
 
 
 def test_gains_grow_with_the_size_of_the_violation(rows):
-    law = jc.AdaptiveBaumgarte(20.0, 30.0, size=1e-2, floor=0.25)
+    law = jc.stabilizers.AdaptiveBaumgarte(20.0, 30.0, size=1e-2, floor=0.25)
 
     def scale(x):
         return law.scale(dataclasses.replace(rows, residual=jnp.stack([x, 0.0 * x])))
@@ -191,19 +201,23 @@ def test_a_constraint_has_one_size_and_keeps_its_damping_ratio():
     system, state = scene.build()
     off = state.q + jnp.asarray(np.random.default_rng(0).normal(size=state.q.shape))
     rows = linearize(system, off, state.v + 1.0, state.time)
-    law = jc.AdaptiveBaumgarte(20.0, 40.0, (1.0, 1.0), size=0.5, floor=0.1)
+    law = jc.stabilizers.AdaptiveBaumgarte(20.0, 40.0, (1.0, 1.0), size=0.5, floor=0.1)
     scale = np.asarray(law.scale(rows))
     for name in rows.layout.names:
         own = rows.layout.rows(name)
         x = float(jnp.sum(rows.residual[own] ** 2)) / 0.25
         np.testing.assert_allclose(scale[own], 0.1 + 0.9 * x / (1 + x), rtol=IDENTITY)
     expected = -rows.bias - 40 * scale * rows.rate - (40 * scale) ** 2 * rows.residual
-    np.testing.assert_allclose(law.target(rows, (), jnp.asarray(H)), expected, rtol=IDENTITY)
+    np.testing.assert_allclose(
+        law.constraint_equations(rows, (), jnp.asarray(H)).target, expected, rtol=IDENTITY
+    )
 
 
 def followed(rows, integrator, residuals):
-    """α, β and the starting rate after a window that saw these φ of the first row."""
-    law = jc.Method(integrator, jc.SlidingWindowBaumgarte(rate=20.0)).feedback(jnp.asarray(H))
+    """Returns α, β and the initial rate after a window of these φ of the first row."""
+    law = jc.Method(integrator, jc.stabilizers.SlidingWindowBaumgarte(rate=20.0)).stabilizer_for(
+        jnp.asarray(H)
+    )
     memory = law.init(*(gap_scene()[0], jnp.zeros(2), jnp.zeros(2)))
     for x in residuals:
         seen = dataclasses.replace(rows, residual=jnp.asarray([x, 0.0]))
@@ -216,7 +230,7 @@ def test_a_window_raises_gains_on_growth_and_lowers_them_on_oscillation(rows):
     growing = 1e-4 * 1.3**k
     α, raised = followed(rows, euler, growing)
     assert raised[0] > 25
-    assert raised[1] == 20  # the other row saw nothing
+    assert raised[1] == 20  # the other row had φ = 0
     np.testing.assert_allclose(α / raised, 0.7, rtol=1e-6)
     α, lowered = followed(rows, euler, 1e-4 * (-1.0) ** k)
     assert lowered[0] < 15
@@ -235,8 +249,8 @@ def test_a_window_stays_below_the_limit_at_the_step(rows, integrator):
     assert np.all(α <= β)
     assert β[0] > 40
     assert integrator.growth(α[0], β[0], H) < 1
-    wide = jc.SlidingWindowBaumgarte(rate=1e6)  # also where it starts
-    law = jc.Method(integrator, wide).feedback(jnp.asarray(H))
+    wide = jc.stabilizers.SlidingWindowBaumgarte(rate=1e6)  # the initial rate is bounded, too
+    law = jc.Method(integrator, wide).stabilizer_for(jnp.asarray(H))
     α, β = law.gains(rows, law.init(gap_scene()[0], jnp.zeros(2), jnp.zeros(2)))
     for damping in (0.0, 0.5, 1.0):
         ratio = 0.7 + 0.3 * damping
@@ -257,9 +271,18 @@ def test_a_window_of_nothing_judges_nothing():
 
 
 STABILIZERS = {
-    "pid": (jc.PID, {"proportional": 90.0, "derivative": 19.0, "integral": 60.0, "limit": 50.0}),
-    "adaptive": (jc.AdaptiveBaumgarte, {"alpha": 9.0, "beta": 11.0, "size": 0.01, "floor": 0.3}),
-    "window": (jc.SlidingWindowBaumgarte, {"rate": 11.0, "damping_ratio": 0.8, "speed": 0.05}),
+    "pid": (
+        jc.stabilizers.PID,
+        {"proportional": 90.0, "derivative": 19.0, "integral": 60.0, "limit": 50.0},
+    ),
+    "adaptive": (
+        jc.stabilizers.AdaptiveBaumgarte,
+        {"alpha": 9.0, "beta": 11.0, "size": 0.01, "floor": 0.3},
+    ),
+    "window": (
+        jc.stabilizers.SlidingWindowBaumgarte,
+        {"rate": 11.0, "damping_ratio": 0.8, "speed": 0.05},
+    ),
 }
 
 
@@ -276,10 +299,12 @@ def test_gradients_are_differences_and_worlds_are_a_loop(name):
 
 
 def test_groups_of_constraints_are_batched_and_differentiated():
-    """With a limit for one constraint only."""
+    """Only one constraint has a limit of its integral."""
 
     def value(x):
-        law = jc.PID(90.0, {"leg_*": 19.0}, {"leg_*": x}, {"leg_x": 0.5}, fallback=(1.0, 1.0))
+        law = jc.stabilizers.PID(
+            90.0, {"leg_*": 19.0}, {"leg_*": x}, {"leg_x": 0.5}, fallback=(1.0, 1.0)
+        )
         final, _ = rolled(gap_scene(), jc.Method(stabilizer=law), 30)
         return jnp.sum(final.q * jnp.asarray([1.0, 2.0]))
 
@@ -298,7 +323,7 @@ def test_a_float32_world_stays_float32(name):
     method = jc.Method(
         jc.SemiImplicitEuler(),
         kind(**{key: jnp.asarray(x, jnp.float32) for key, x in numbers.items()}),
-        jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), jc.RankSafe()),
+        jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), jc.solvers.RankSafe()),
     )
     if name == "window":
         extra = {key: jnp.asarray(getattr(method.stabilizer, key), jnp.float32) for key in EXTRA}
@@ -322,32 +347,39 @@ EXTRA = ("recovery", "reach", "noise", "margin")
 
 def test_a_group_of_constraints_shares_a_gain(rows):
     h = jnp.asarray(H)
-    law = jc.PID({"leg_*": 5.0}, {"leg_*": 3.0, "leg_y": 4.0}, 0.0, fallback=(0.0, 0.0))
-    target = law.target(dataclasses.replace(rows, rate=jnp.ones(2)), jnp.zeros(2), h)
+    law = jc.stabilizers.PID({"leg_*": 5.0}, {"leg_*": 3.0, "leg_y": 4.0}, 0.0, fallback=(0.0, 0.0))
+    moving = dataclasses.replace(rows, rate=jnp.ones(2))
+    target = law.constraint_equations(moving, jnp.zeros(2), h).target
     np.testing.assert_allclose(target, [-3.0 - 0.5, -4.0 + 1.0])
     one = jc.Baumgarte({"*_x": 2.0}, {"*_x": 3.0}, fallback=(0.0, 7.0))
-    np.testing.assert_allclose(one.target(rows, (), h), [-0.9, 0.2 * 49])
+    np.testing.assert_allclose(one.constraint_equations(rows, (), h).target, [-0.9, 0.2 * 49])
 
 
 @pytest.mark.parametrize(
     ("stabilizer", "words"),
     [
-        (lambda: jc.PID({"arm*": 5.0}, 1.0), ["PID", r"\['arm\*'\]", "leg_x"]),
+        (lambda: jc.stabilizers.PID({"arm*": 5.0}, 1.0), ["PID", r"\['arm\*'\]", "leg_x"]),
         (lambda: jc.Baumgarte({"leg*": 5.0, "*_x": 4.0}, 1.0), ["leg_x", r"\['\*_x', 'leg\*'\]"]),
-        (lambda: jc.PID(-1.0, 1.0), ["PID", "proportional", "zero or more", "-1"]),
-        (lambda: jc.PID(1.0, 1.0, {"leg_x": -2.0}), ["integral of 'leg_x'", "-2"]),
-        (lambda: jc.PID(1.0, 1.0, limit="big"), ["PID", "limit must be real numbers", "big"]),
+        (lambda: jc.stabilizers.PID(-1.0, 1.0), ["PID", "proportional", "zero or more", "-1"]),
+        (lambda: jc.stabilizers.PID(1.0, 1.0, {"leg_x": -2.0}), ["integral of 'leg_x'", "-2"]),
         (
-            lambda: jc.AdaptiveBaumgarte(1.0, 1.0, size=0.0),
+            lambda: jc.stabilizers.PID(1.0, 1.0, limit="big"),
+            ["PID", "limit must be real numbers", "big"],
+        ),
+        (
+            lambda: jc.stabilizers.AdaptiveBaumgarte(1.0, 1.0, size=0.0),
             ["AdaptiveBaumgarte", "size", "positive"],
         ),
-        (lambda: jc.AdaptiveBaumgarte(1.0, 1.0, floor=2.0), ["floor must lie between 0 and 1"]),
         (
-            lambda: jc.SlidingWindowBaumgarte(damping_ratio=0.1),
+            lambda: jc.stabilizers.AdaptiveBaumgarte(1.0, 1.0, floor=2.0),
+            ["floor must lie between 0 and 1"],
+        ),
+        (
+            lambda: jc.stabilizers.SlidingWindowBaumgarte(damping_ratio=0.1),
             ["damping_ratio must lie between 0.5"],
         ),
         (
-            lambda: jc.SlidingWindowBaumgarte(window=2),
+            lambda: jc.stabilizers.SlidingWindowBaumgarte(window=2),
             ["window must be a whole number from 4", "got 2"],
         ),
     ],
@@ -365,7 +397,7 @@ def test_bad_gains_are_refused(gap, stabilizer, words):
 
 
 def rotor(speed, arm=0.1):
-    """A body on a hinge off its centre, turning at a speed [rad/s], in float32."""
+    """A body on an off-center hinge at an angular velocity [rad/s], in float32."""
     scene = jc.Scene(dim=3, dtype="float32", gravity=(0.0, 0.0, 0.0))
     motion = {"velocity": (0.0, arm * speed, 0.0), "angular_velocity": (0.0, 0.0, speed)}
     scene.add_body("disc", mass=1.0, inertia=(0.01, 0.01, 0.02), position=(arm, 0.0, 0.0), **motion)
@@ -374,7 +406,7 @@ def rotor(speed, arm=0.1):
 
 
 def whirled(speed):
-    """A particle on a rod of 0.1 m, at 0.1 m times a speed [rad/s], in float32."""
+    """A particle on a rod of 0.1 m at an angular velocity [rad/s], in float32."""
     scene = jc.Scene(dim=2, dtype="float32", gravity=(0.0, 0.0))
     scene.add_particle("bob", mass=1.0, position=(0.1, 0.0), velocity=(0.0, 0.1 * speed))
     scene.add(jc.Distance("rod", jc.WORLD, "bob", length=0.1))
@@ -384,7 +416,7 @@ def whirled(speed):
 @pytest.mark.parametrize("scene", [rotor, whirled])
 @pytest.mark.parametrize(("dt", "speed"), [(1e-4, 500.0), (1e-5, 2000.0)])
 def test_default_gains_in_float32_hold_fast_bodies(scene, dt, speed):
-    """The force is m ω² r, and energy stays; gains held at 917/s end 0.2 % to 23 % off."""
+    """The force is m ω² r and the energy is constant; gains fixed at 917/s err by 0.2 % to 23 %."""
     system, state = scene(speed)
 
     def seen(state, info):
@@ -409,7 +441,7 @@ def test_default_gains_in_float32_are_low_where_bodies_are_slow(dt):
 
 
 def test_a_derivative_through_gains_that_rise():
-    """Energy is a square of the speed; at h = 0 the derivative by h exists."""
+    """The energy is quadratic in the speed; at h = 0 the derivative by h exists."""
 
     def energy(speed, dt):
         system, state = whirled(1.0)
@@ -425,10 +457,10 @@ def test_a_derivative_through_gains_that_rise():
 
 
 def test_default_gains_of_a_known_step_are_numbers_where_they_cannot_rise():
-    """At 2 ms 1/h is below 917/s; what is not known, or chosen by the user, stays as it is."""
+    """At 2 ms the rate 1/h is below 917/s; traced steps and the user's gains stay as they are."""
     method, own = jc.Method(), jc.Method(stabilizer=jc.Baumgarte(5.0, 10.0))
     known = method.known_at(2e-3, np.float32)
-    assert type(known.feedback(jnp.float32(2e-3))) is jc.Baumgarte
+    assert type(known.stabilizer_for(jnp.float32(2e-3))) is jc.Baumgarte
     np.testing.assert_allclose(known.stabilizer.fallback, (250.0, 500.0), rtol=1e-6)
     for same, dt, dtype in (
         (method, 1e-4, np.float32),

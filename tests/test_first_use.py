@@ -1,4 +1,4 @@
-"""Messages for a first-time user have units, names and short numbers."""
+"""Messages for first-time users have units, names and short numbers."""
 
 import jax
 import numpy as np
@@ -80,7 +80,7 @@ def test_redundant_rows_are_named_once():
 
 
 def test_each_error_in_the_picture_says_on_which_linkages():
-    """Legends name the linkages, as errors on both sets may round to one number."""
+    """Legends name the linkages, because the errors on both sets may round to the same number."""
     plt = pytest.importorskip("matplotlib.pyplot")
     figure, axes = plt.subplots(1, 2)
     history = np.array([3e-7, 2e-7, 1e-7])
@@ -97,7 +97,7 @@ def test_each_error_in_the_picture_says_on_which_linkages():
 @pytest.mark.parametrize("angle", [0.0, 0.5 * np.pi, np.pi])
 @pytest.mark.parametrize("kind", ["particle", "body"])
 def test_a_report_says_how_far_a_pendulum_swings_in_a_step(kind, angle):
-    """h √(g/l) = 3.13, whether it hangs, is released level or stands."""
+    """The report gives h √(g/l) = 3.13, whether the pendulum hangs, is released level or stands."""
     scene = jc.Scene(dim=2)
     place = (np.sin(angle), -np.cos(angle))
     if kind == "particle":
@@ -117,21 +117,21 @@ def test_a_report_says_how_far_a_pendulum_swings_in_a_step(kind, angle):
 
 
 def test_a_rotor_slows_what_it_turns_with():
-    """ω² = m g l / (m l² + I)."""
+    """The frequency follows ω² = m g l / (m l² + I)."""
     scene = jc.Scene(dim=2)
     scene.add_body("bob", mass=1.0, inertia=1e-9, position=(0.0, -1.0))
     scene.add(jc.Revolute("pin", jc.WORLD, "bob", point=(0.0, 0.0)))
-    scene.add(jc.Armature("rotor", "pin", inertia=3.0))
+    scene.add(jc.joints.Armature("rotor", "pin", inertia=3.0))
     report = jc.report(*scene.build(), jc.Method(), 0.1)
     assert report.angle.swing == pytest.approx(0.1 * np.sqrt(9.81 / 4.0), rel=1e-3)
 
 
 def test_a_report_knows_the_frequencies_of_springs():
-    """Two masses between springs, k/m and 3 k/m for equal ones."""
+    """Two masses between springs have ω² = k/m and 3 k/m if all are equal."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     for name, x in (("a", 1.0), ("b", 2.0)):
         scene.add_particle(name, mass=2.0, position=(x, 0.0))
-        scene.add(jc.PointOnLine(f"{name} line", jc.WORLD, name, axis=(1.0, 0.0)))
+        scene.add(jc.joints.PointOnLine(f"{name} line", jc.WORLD, name, axis=(1.0, 0.0)))
     scene.add(jc.Spring("left", jc.WORLD, "a", stiffness=8.0, point_a=(0.0, 0.0)))
     scene.add(jc.Spring("middle", "a", "b", stiffness=8.0))
     scene.add(jc.Spring("right", "b", jc.WORLD, stiffness=8.0, point_b=(3.0, 0.0)))
@@ -143,12 +143,12 @@ def test_a_report_knows_the_frequencies_of_springs():
 
 
 def test_a_drive_near_its_turning_point_is_no_turn():
-    """A cart on a rail accelerates from rest: it cannot turn, however slow it is."""
+    """A cart on a rail accelerates slowly from rest, which must not be read as a rotation."""
     scene = jc.Scene(dim=2)
     scene.add_body("c", mass=1.0, inertia=0.1, position=(0.0, 0.0), velocity=(1e-6, 0.0))
     rail = jc.Prismatic("rail", jc.WORLD, "c", point=(0.0, 0.0), axis=(1.0, 0.0))
     scene.add(rail)
-    scene.add(jc.Drive("drive", "rail", lambda t, _: 0.5 * t**2 + 1e-6 * t))
+    scene.add(jc.joints.Drive("drive", "rail", lambda t, _: 0.5 * t**2 + 1e-6 * t))
     system, state = scene.build()
     angle = jc.report(system, state, jc.Method(), 1e-3).angle
     assert angle.turning.value < 1e-6

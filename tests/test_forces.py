@@ -1,4 +1,4 @@
-"""Forces against the slope of their potential, and against hand calculations."""
+"""Forces, compared with the gradient of their potential and with hand calculations."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ both = pytest.mark.parametrize("dim", [2, 3])
 
 
 def two_bodies(dim, *elements, gravity=None, damp=()):
-    """Two moving bodies, a particle and a wall at random places, with forces among them."""
+    """Two moving bodies, a particle and a wall at random places, with the given forces."""
     random = np.random.default_rng(dim)
     scene = jc.Scene(dim=dim, gravity=gravity)
     for name in ("first", "second"):
@@ -39,14 +39,14 @@ def elements(dim):
         "spring to the world": [jc.Spring("s", jc.WORLD, "bob", 30.0, rest_length=0.3)],
         "spring to a wall": [jc.Spring("s", "wall", "first", 30.0, rest_length=0.3, point_a=point)],
         "spring on a particle": [jc.Spring("s", "bob", "second", 20.0, 0.0, 0.1)],
-        "force": [jc.Force("f", "second", force=point, point=other)],
+        "force": [jc.forces.Force("f", "second", force=point, point=other)],
         "joint spring": [
             jc.Revolute("joint", "first", "second", point=point, axis=axis),
-            jc.JointSpring("s", "joint", stiffness=3.0, rest=0.4),
+            jc.forces.JointSpring("s", "joint", stiffness=3.0, rest=0.4),
         ],
         "slider spring": [
             jc.Prismatic("joint", "first", "second", axis=point),
-            jc.JointSpring("s", "joint", stiffness=3.0, rest=0.4),
+            jc.forces.JointSpring("s", "joint", stiffness=3.0, rest=0.4),
         ],
     }
 
@@ -130,7 +130,7 @@ def test_damping_takes_energy_and_springs_alone_do_not(dim, name):
 @both
 @pytest.mark.parametrize("name", ["spring", "force", "joint spring"])
 def test_internal_forces_balance(dim, name):
-    """Springs between bodies add no momentum; an outer force adds itself."""
+    """Springs between bodies do not change the total momentum; an external force does."""
     system, state = two_bodies(dim, *elements(dim)[name], gravity=(0.0,) * dim)
     force = system.force(state.q, state.v, state.time)
     total = sum(np.asarray(force[system.layout.v(b)[:dim]]) for b in ("first", "second", "bob"))
@@ -157,7 +157,7 @@ def test_gyroscopic_force_is_that_of_euler():
 
 
 def power(system, state, control):
-    """v · f of the control alone."""
+    """Returns the power v · f of the control alone."""
     with_control = system.force(state.q, state.v, state.time, control)
     without = system.force(state.q, state.v, state.time, None)
     return state.v @ (with_control - without)
@@ -166,9 +166,9 @@ def power(system, state, control):
 @both
 @pytest.mark.parametrize("body", ["first", "second", "bob"])
 def test_a_wrench_does_the_work_of_its_force_and_torque(dim, body):
-    """F · ṗ + τ · ω, at the point where the force acts."""
+    """The power is F · ṗ + τ · ω at the point where the force acts."""
     point = None if body == "bob" else np.arange(1.0, dim + 1)
-    system, state = two_bodies(dim, jc.ExternalWrench("push", body, point=point))
+    system, state = two_bodies(dim, jc.forces.ExternalWrench("push", body, point=point))
     control = jnp.asarray(np.random.default_rng(3).normal(size=system.layout.n_u))
     motion = system.motion(body, state.q, state.v)
     speed, turning = motion.velocity, 0.0
@@ -181,13 +181,13 @@ def test_a_wrench_does_the_work_of_its_force_and_torque(dim, body):
 
 
 def test_without_control_a_wrench_is_zero():
-    system, state = two_bodies(2, jc.ExternalWrench("push", "first"))
+    system, state = two_bodies(2, jc.forces.ExternalWrench("push", "first"))
     zero = system.force(state.q, state.v, state.time, jnp.zeros(3))
     np.testing.assert_array_equal(system.force(state.q, state.v, state.time, None), zero)
 
 
 def pulling(a, b, t, u, p):
-    """A force between two bodies in proportion to control, time and a parameter."""
+    """Returns a force between two bodies, proportional to control, time and a parameter."""
     force = p["gain"] * t * u[0] * (b.position - a.position)
     if a.position.shape == (2,):
         return jnp.append(force, u[1]), -force
@@ -196,9 +196,11 @@ def pulling(a, b, t, u, p):
 
 @both
 def test_custom_force_with_control(dim):
-    """The user's wrench is about the position of the frame that the user gave."""
-    user = jc.CustomForce("pull", ("second", "bob"), pulling, params={"gain": 2.0}, controls=2)
-    system, state = two_bodies(dim, jc.ExternalWrench("push", "bob"), user)
+    """The user's wrench refers to the origin of the body frame that the user gave."""
+    user = jc.forces.CustomForce(
+        "pull", ("second", "bob"), pulling, params={"gain": 2.0}, controls=2
+    )
+    system, state = two_bodies(dim, jc.forces.ExternalWrench("push", "bob"), user)
     at = dataclasses.replace(state, time=jnp.asarray(0.5))
     control = jnp.zeros(dim + 2).at[system.layout.control("pull")].set(jnp.asarray([3.0, 0.7]))
     a, b = (system.motion(name, state.q, state.v) for name in ("second", "bob"))
@@ -216,13 +218,13 @@ def test_custom_force_of_the_wrong_shape():
     def wrong(a, t, u, p):
         return jnp.zeros(2)
 
-    system, state = two_bodies(2, jc.CustomForce("bad", ("first",), wrong))
+    system, state = two_bodies(2, jc.forces.CustomForce("bad", ("first",), wrong))
     with pytest.raises(ValueError, match="force 'bad'.*'first'.*\\(3,\\).*\\(2,\\)"):
         system.force(state.q, state.v, state.time)
 
 
 def test_a_spring_at_zero_length_keeps_its_stiffness():
-    """With l = 0 force and energy are smooth at d = 0: dF/dq = −k, ∂V/∂l = −k ‖d‖."""
+    """For l = 0 force and energy are smooth at d = 0: dF/dq = −k, ∂V/∂l = −k ‖d‖."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("bob", mass=1.0)
     scene.add(jc.Spring("s", jc.WORLD, "bob", stiffness=10.0))

@@ -15,20 +15,20 @@ from functions import (
 )
 
 import jaxcon as jc
-from jaxcon.core import fusion, native
-from jaxcon.core.native import Native
-from jaxcon.core.operations import count
-from jaxcon.core.program import Program
 from jaxcon.scenes import four_bar
+from jaxcon.staging import batch_last, fusion
+from jaxcon.staging.batch_last import Native
+from jaxcon.staging.operations import count
+from jaxcon.staging.program import Program
 
 X = np.linspace(0.3, 1.7, 24).reshape(4, 6)
 Y = np.linspace(-1.0, 2.0, 24).reshape(4, 6)
 
 
 def staged(function):
-    """The function, cut into stages."""
+    """Returns the function, run in stages (kernels)."""
     native = Native(function)
-    return lambda *args: fusion.settled(native, args)
+    return lambda *args: fusion.run_staged(native, args)
 
 
 @pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.__name__)
@@ -74,7 +74,7 @@ def test_two_arguments_may_be_the_same_array():
 
     def run(x):
         z = jnp.sin(x) * 1.5
-        return native.call(turned, z, z)
+        return batch_last.call(turned, z, z)
 
     z = np.sin(X) * 1.5
     compare(jax.jit(run)(X), [z + z[::-1], z + z.sum(axis=0), z - z[::-1, ::-1]])
@@ -84,12 +84,12 @@ def test_cotangents_may_be_equal():
     def function(x):
         return [x, jnp.broadcast_to(jnp.sum(x, axis=0), x.shape)]
 
-    found = jax.jit(jax.grad(lambda x: sum(map(jnp.sum, native.call(function, x)))))(X)
+    found = jax.jit(jax.grad(lambda x: sum(map(jnp.sum, batch_last.call(function, x)))))(X)
     np.testing.assert_allclose(found, np.full(X.shape, 5.0))
 
 
 def a_user_force(q, v, t, u, p):
-    """A delay line and a loop."""
+    """Returns a force with concatenations, slices and a loop."""
     joined = jnp.concatenate([q, v])
     twice = jnp.concatenate([joined[:4], joined[:4]])
     return jax.lax.fori_loop(0, 3, lambda i, f: f + p["k"] @ f, -jnp.sin(twice[2:6]))
@@ -99,7 +99,9 @@ def test_a_step_with_such_functions_is_that_of_the_compiler_alone(monkeypatch):
     system = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.ones(4),
         force=a_user_force,
-        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q[:2] @ q[:2] - 1.0]), name="rod"),),
+        constraints=(
+            jc.joints.Holonomic(lambda q, t, p: jnp.stack([q[:2] @ q[:2] - 1.0]), name="rod"),
+        ),
         params={"k": jnp.asarray(np.random.default_rng(0).normal(size=(4, 4)))},
     )
     state = jc.init(system, jc.Method(), jnp.array([0.0, 1.0, 0.2, 0.3]), jnp.ones(4) * 0.1)
@@ -135,7 +137,7 @@ def test_shared_values_are_computed_once():
 
 
 def unread(text):
-    """Arguments of kernels that nothing in them reads."""
+    """Returns the arguments that a kernel does not read."""
     found = []
     for part in text.split("\n\n"):
         if re.match(r"\s*%kernel", part):
@@ -159,7 +161,7 @@ def test_kernels_read_all_their_arguments(function):
 
 @pytest.mark.parametrize(
     "solver",
-    [jc.Sparse(), jc.Schur(), jc.ConjugateGradients()],
+    [jc.solvers.Sparse(), jc.solvers.Schur(), jc.solvers.ConjugateGradients()],
     ids=["sparse", "schur", "cg"],
 )
 def test_kernels_of_a_step_and_its_gradient_read_all_their_arguments(solver):
@@ -209,7 +211,7 @@ own_cotangent.defvjp(lambda x: (own_cotangent(x), x), lambda x, dy: (dy * jnp.co
 
 
 def root(x):
-    """y of y + y = sin x, with the derivative of what is implicit."""
+    """Returns the root y of y + y = sin x, with implicit differentiation."""
 
     def solve(function, start):
         return start - function(start) / 2
@@ -232,13 +234,13 @@ CALLING = {
 
 @pytest.mark.parametrize("name", CALLING)
 def test_functions_that_are_only_called_are_inlined(name):
-    """However the version of JAX writes them down; else each would break a kernel in two."""
+    """Calls are inlined, whatever primitive of JAX they use; each would split a kernel."""
     function = Native(lambda x: [CALLING[name](x) * 2])
     program = Program(function.traced(((4, 6), np.dtype("float64"))), fusion._settled_body)
     known = fusion.ARITHMETIC | fusion.COSTLY | fusion.MOVES
     assert {op.name for op in program.operations} <= known
     assert program.operations
-    (found,) = fusion.settled(function, [jnp.asarray(X)])
+    (found,) = fusion.run_staged(function, [jnp.asarray(X)])
     np.testing.assert_allclose(found, CALLING[name](jnp.asarray(X)) * 2, rtol=1e-14)
     counted = count(jax.make_jaxpr(CALLING[name])(jnp.asarray(X)).jaxpr)
     assert counted >= X.size
@@ -248,7 +250,7 @@ TWO_OPERANDS = fusion._names("add sub mul max min eq ne lt le gt ge nextafter di
 
 
 def functions_of(name):
-    """Functions of a number that are one operation of this name."""
+    """Returns functions that consist of the named operation alone."""
     if name == "integer_pow":
         return [partial(jax.lax.integer_pow, y=y) for y in (-3, 2, 15, 1023)]
     if name == "round":
@@ -279,7 +281,7 @@ def test_no_operation_costs_more_than_is_said(name):
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("name", ["asinh", "mul"])
 def test_a_single_result_is_alone_up_to_what_the_compiler_divides_among_threads(name, dtype):
-    """The longest chain that is light compiles alone, and one twice as long with a second."""
+    """The longest light chain compiles with one result; one twice as long needs a second."""
     x = jnp.linspace(0.1, 0.9, 128, dtype=dtype)
     operation = {"asinh": jnp.arcsinh, "mul": lambda x: x * x + 0.1}[name]
 
@@ -305,7 +307,7 @@ def test_a_single_result_is_alone_up_to_what_the_compiler_divides_among_threads(
 
 
 def test_a_light_stage_of_one_result_has_no_other():
-    """Each buffer of a kernel costs a look-up in every call."""
+    """A second result would need a buffer, and each buffer costs a look-up in every call."""
 
     def chain(x):
         for _ in range(5):

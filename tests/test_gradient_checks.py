@@ -1,4 +1,4 @@
-"""What tells users whether their gradients are right, and how far they reach."""
+"""Tools that check gradients against differences, and that measure how far they reach in time."""
 
 import dataclasses
 import operator
@@ -63,7 +63,7 @@ def test_where_nothing_is_finite_there_is_nothing_to_check(f, x, message):
 
 
 def test_empty_leaves_and_results_are_left_out():
-    """Such as the controls of a scene that has none."""
+    """An empty leaf is, for example, the control of a scene without controls."""
     check = jc.check_gradients(
         lambda x: (x["a"] ** 2, x["none"] * 2.0), {"a": 2.0, "none": jnp.zeros((5, 0))}
     )
@@ -99,7 +99,7 @@ def test_a_missing_derivative_does_not_hide_behind_a_large_one_of_its_leaf():
 
 @pytest.mark.parametrize("coarse", ["leaf", "result"])
 def test_the_coarsest_of_mixed_numbers_says_what_differences_can_tell(coarse):
-    """A right gradient is not accused of rounding."""
+    """The lowest precision sets the tolerance, so that rounding fails no right gradient."""
 
     def f(x):
         size = jnp.exp(x["b"].astype(jnp.float64)) * jnp.sin(x["a"])
@@ -119,7 +119,7 @@ def test_leaves_that_are_no_floating_numbers_are_left_as_they_are():
 
 
 def half_differentiable(x):
-    """x below zero, where the derivative of the root is NaN in the branch that is not taken."""
+    """Returns x for x < 0, where the square root of the other branch has a NaN derivative."""
     return jnp.where(x > 0, jnp.sqrt(x), x)
 
 
@@ -129,7 +129,7 @@ def test_nan_is_no_agreement():
 
 
 def test_what_differences_cannot_see_is_undecided():
-    """A function with noise a million times that of rounding."""
+    """The function has noise a million times larger than rounding."""
 
     def noisy(x):
         return jnp.sin(x) + 1e-6 * jnp.sin(1e9 * jax.lax.stop_gradient(x))
@@ -196,7 +196,7 @@ def test_ridders_takes_away_every_even_power():
 
 
 def test_differences_know_what_rounding_makes_of_them():
-    """The noise is what no spacing of f foretells, as that of many steps of a rollout."""
+    """Their noise cannot be derived from the spacing of f, as for a rollout of many steps."""
     steps, random = 0.1 * 0.5 ** np.arange(10), np.random.default_rng(0)
     noise = 1e-5 * random.normal(size=(2000, 10)) / steps
     best, uncertainty = ridders(2.0 + 3 * steps**2 - steps**4 + noise)
@@ -214,15 +214,15 @@ def swing(height, dtype=None):
 
 
 def test_an_inverted_pendulum_falls_as_its_exponent_says():
-    """e^√(g/l) t: cosh in closed form, from moves of φ and of the speed across."""
+    """The growth is e^(√(g/l) t), in closed form by cosh and sinh, for moves along φ and across."""
     system, state = swing(1.0)
-    growth = jc.gradient_growth(system, jc.Method(jc.RK4()), state, None, 1e-2, 400)
+    growth = jc.analysis.gradient_growth(system, jc.Method(jc.RK4()), state, None, 1e-2, 400)
     rate, t = np.sqrt(9.81), growth.time
     c, s = np.cosh(rate * t), np.sinh(rate * t)
     expected = np.sqrt((2 * c**2 + (s / rate) ** 2 + (s * rate) ** 2) / 2)
     np.testing.assert_allclose(growth.growth, expected, rtol=1e-5)
     np.testing.assert_allclose(growth.exponent, rate, rtol=1e-3)
-    # where ε · growth is 1
+    # the time at which ε · growth = 1
     reach = np.log(2 / (np.finfo(float).eps * np.sqrt((2 + 9.81 + 1 / 9.81) / 2))) / rate
     np.testing.assert_allclose(growth.horizon(), reach, rtol=1e-3)
     assert growth.horizon(1e-3) < growth.time[-1] < growth.horizon()
@@ -230,9 +230,9 @@ def test_an_inverted_pendulum_falls_as_its_exponent_says():
 
 
 def test_growth_is_told_as_far_as_the_precision_reaches():
-    """Its square is beyond float32 from 2e19 on."""
+    """The square of the growth overflows in float32 beyond 2e19; the growth itself must not."""
     system, state = swing(1.0, jnp.float32)
-    growth = jc.gradient_growth(system, jc.Method(), state, None, jnp.float32(2e-2), 2000)
+    growth = jc.analysis.gradient_growth(system, jc.Method(), state, None, jnp.float32(2e-2), 2000)
     np.testing.assert_allclose(growth.exponent, np.sqrt(9.81), rtol=1e-3)
     assert np.max(growth.growth[np.isfinite(growth.growth)]) > 1e36
     assert not np.isfinite(growth.growth[-1])
@@ -241,7 +241,7 @@ def test_growth_is_told_as_far_as_the_precision_reaches():
 
 def test_a_hanging_pendulum_has_no_horizon():
     system, state = swing(-1.0)
-    growth = jc.gradient_growth(system, jc.Method(jc.RK4()), state, None, 1e-2, 400)
+    growth = jc.analysis.gradient_growth(system, jc.Method(jc.RK4()), state, None, 1e-2, 400)
     assert growth.horizon() == np.inf
     assert growth.growth.max() < 4.0
     assert "no more than a power of time" in str(growth)
@@ -250,19 +250,19 @@ def test_a_hanging_pendulum_has_no_horizon():
 def test_a_rollout_that_fails_is_refused():
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(0.0, -1.0))
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     system, state = scene.build()
     push = jnp.zeros((8, 2)).at[5].set(jnp.nan)
     with pytest.raises(ValueError, match="rollout fails, NON_FINITE.*find_first_failure"):
-        jc.gradient_growth(system, jc.Method(), state, push, 1e-2, 8)
+        jc.analysis.gradient_growth(system, jc.Method(), state, push, 1e-2, 8)
 
 
 def test_no_freedom_is_refused():
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
-    scene.add(jc.Coincident("pin", jc.WORLD, "bob", point=(1.0, 0.0)))
+    scene.add(jc.joints.Coincident("pin", jc.WORLD, "bob", point=(1.0, 0.0)))
     system, state = scene.build()
     with pytest.raises(ValueError, match="no freedom"):
-        jc.gradient_growth(system, jc.Method(), state, None, 1e-2, 10)
+        jc.analysis.gradient_growth(system, jc.Method(), state, None, 1e-2, 10)
     with pytest.raises(ValueError, match="dt must be positive"):
-        jc.gradient_growth(system, jc.Method(), state, None, 0.0, 10)
+        jc.analysis.gradient_growth(system, jc.Method(), state, None, 0.0, 10)

@@ -1,4 +1,4 @@
-"""Derivatives in many states, singular ones among them: none is NaN, and none is wrong."""
+"""Derivatives in many states, singular ones included: none is NaN or wrong."""
 
 import dataclasses
 import sys
@@ -30,16 +30,16 @@ def test_a_thousand_states_have_finite_derivatives_of_both_modes(choice):
 
 
 def test_a_ball_that_hardly_leaves_its_plane_has_finite_derivatives():
-    """Restitution weighs works of 1e-20 J there, and one over their squares is beyond float32."""
+    """Restitution weighs works of 1e-20 J, whose inverse squares overflow in float32."""
     row = gradient_states.measure("ball on a plane", 3, "projection", "float32", 486, 0)
     assert row.broken == 0, row
 
 
 def test_a_bounce_and_its_derivatives_are_the_same_at_every_speed():
-    """A rod strikes with its end; restitution is held back in a few of many states.
+    """A rod strikes with its end; in a few of many states the energy cap limits the restitution.
 
-    Without gravity the outcome is proportional to the velocities; works of 1e-22 J have squares
-    beyond float32.
+    Without gravity the outcome is proportional to the velocities. Works of 1e-22 J have squares
+    that underflow in float32.
     """
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=jnp.float32)
     scene.add_body("rod", mass=1.0, inertia=0.08, position=(0.0, 0.4))
@@ -61,16 +61,18 @@ def test_a_bounce_and_its_derivatives_are_the_same_at_every_speed():
     energy = np.array([0.5, 0.5, 0.04]) * ways**2
     kept = np.sum(np.array([0.5, 0.5, 0.04]) * v**2, axis=1) / np.sum(energy, axis=1)
     struck = np.abs(v - ways).max(axis=1) > 1e-3
-    assert np.sum(struck & (np.abs(kept - 1) < 1e-5)) > 5  # held back, so that none is gained
+    assert np.sum(struck & (np.abs(kept - 1) < 1e-5)) > 5  # limited by the energy cap
     for size in (1e-9, 1e-12, 1e-16):
         slow = map(np.asarray, run(jnp.asarray(ways * size, jnp.float32)))
         for got, own in zip(slow, (v * size, forward, reverse), strict=True):
             np.testing.assert_allclose(got, own, rtol=0, atol=2e-5 * np.max(np.abs(own)))
 
 
-@pytest.mark.parametrize("integrator", [jc.RATTLE(), jc.GeneralizedAlpha(0.9)], ids=repr)
+@pytest.mark.parametrize(
+    "integrator", [jc.integrators.RATTLE(), jc.integrators.GeneralizedAlpha(0.9)], ids=repr
+)
 def test_steps_of_hardly_any_length_have_finite_tangents_in_single_precision(integrator):
-    """Their equations are divided by h or h², whose derivatives are beyond float32."""
+    """The equations are divided by h or h², whose derivatives overflow in float32."""
     scene = jc.Scene(dim=2, dtype=jnp.float32)
     scene.add_particle("bob", mass=2.0, position=(1.0, 0.0), velocity=(0.0, 0.5))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -87,14 +89,14 @@ def test_steps_of_hardly_any_length_have_finite_tangents_in_single_precision(int
 
 
 def drag(a, b, t, u, p):
-    """A force of finite size, whose derivative is not where the gap has no length."""
+    """Returns a finite force whose derivative is not finite where the gap is zero."""
     gap = b.position - a.position
     wrench = jnp.append(p["stiffness"] * gap * jnp.sqrt(jnp.sqrt(gap @ gap)), 0.0 * t)
     return wrench, -wrench
 
 
 def test_what_is_not_finite_is_counted_where_it_occurs(monkeypatch):
-    own = jc.CustomForce("joint", ("a", "b"), drag, params={"stiffness": 2.0})
+    own = jc.forces.CustomForce("joint", ("a", "b"), drag, params={"stiffness": 2.0})
     monkeypatch.setitem(gradient_scenes.ELEMENTS, "spring", ((2,), lambda n: [own]))
     row = gradient_states.measure("spring", 2, "Baumgarte", "float64", 300, 0)
     met = {kind: count for kind, count in row.reverse.items() if count}

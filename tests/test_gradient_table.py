@@ -1,4 +1,4 @@
-"""Parts of methods, in pairs, on every joint: derivatives of both modes against differences."""
+"""Pairs of method parts, on every joint: derivatives of both modes compared with differences."""
 
 import functools
 import itertools
@@ -19,9 +19,10 @@ from jaxcon.scenes import four_bar  # noqa: E402
 
 
 def pairs(choice):
-    """Pairs that differ in code: solvers see no stabilizer, and tables not how long they are.
+    """Returns the pairs of parts of a choice whose code interacts.
 
-    The benchmark takes all pairs, and the whole product.
+    Solvers do not see the stabilizer, and all Runge–Kutta tableaus run the same code. The benchmark
+    covers all pairs, and the whole product.
     """
     table = "Heun" if choice.integrator == "RK4" else choice.integrator
     acts = {choice.stabilizer, choice.solver}
@@ -30,14 +31,17 @@ def pairs(choice):
 
 CHOICES = gradient_table.covering(gradient_table.choices(), pairs)
 JOINTS = scenes.names("between")
-SLOW = {"telescope-3d-between": "universal-3d-between"}  # a minute to compile, of one kind of row
+SLOW = {"telescope-3d-between": "universal-3d-between"}  # the telescope takes a minute to compile
 SPACE = [SLOW.get(name, name) for name in JOINTS if "3d" in name][::3]
 PLANE = [name for name in JOINTS if "2d" in name]
 HELD = [name for name in PLANE if scenes.JOINTS[name.split("-")[0]].held is None]
 
 
 def cases():
-    """The cheapest integrator on every joint; the others take joints in turn, RATTLE with a φ."""
+    """Returns the cheapest integrator with every joint, and each other integrator with one joint.
+
+    RATTLE takes joints whose rows all have a φ.
+    """
     cheap = [choice for choice in CHOICES if choice.integrator == "semi-implicit Euler"]
     turns = {name: itertools.cycle(PLANE) for name in gradient_table.INTEGRATORS}
     turns["RATTLE"] = itertools.cycle(HELD)
@@ -55,16 +59,16 @@ def test_both_modes_are_differences(name, choice):
 
 METHODS = {
     "default": jc.Method(),
-    "projected": jc.Method(jc.Heun(), jc.Projection()),
+    "projected": jc.Method(jc.integrators.Heun(), jc.Projection()),
     "hybrid": jc.Method(stabilizer=gradient_table.STABILIZERS["hybrid"]),
-    "RATTLE": jc.Method(jc.RATTLE()),
+    "RATTLE": jc.Method(jc.integrators.RATTLE()),
 }
 SPOTS = [*((2, "float64", name) for name in METHODS), (2, "float32", "default")]
 SPOTS += [(3, "float32", "default")]
 
 
 def straight(dim, dtype):
-    """A straight chain at rest, φ = 0, unturned, and a spring of no length at its end."""
+    """A straight chain at rest with φ = 0, and a spring of length zero at its end."""
     scene = jc.Scene(dim=dim, gravity=(0.0,) * dim, dtype=dtype)
     axis = None if dim == 2 else (0.0, 1.0, 0.0)
     places, before = np.eye(dim)[0], jc.WORLD

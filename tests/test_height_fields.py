@@ -1,4 +1,4 @@
-"""Balls and points on ground given by heights: against planes, parabolas and differences."""
+"""Contacts with height fields, compared with planes, parabolas and differences."""
 
 import dataclasses
 
@@ -9,30 +9,33 @@ import pytest
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
-from jaxcon.constraints.bounds import linearize_bounds
-from jaxcon.constraints.height_fields import above
+from jaxcon.contact.height_fields import above
+from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
 from jaxcon.geometry.heights import Surface
 
-QUICK = jc.GaussSeidel(sweeps=40)
+QUICK = jc.solvers.GaussSeidel(sweeps=40)
 G = 9.81
 
 
 def rolling(system, state, steps):
-    """h → the states on the way, for contacts so few that sweeps solve them."""
-    method = jc.Method(bounded=QUICK)
+    """Returns the function from h to the trajectory; the few contacts are solved by sweeps."""
+    method = jc.Method(contact_solver=QUICK)
     state = jc.init(system, method, state.q, state.v)
     return jax.jit(lambda h: jc.rollout(system, method, state, None, h, steps)[1])
 
 
 def surface(heights, size, lanes):
-    """One surface, looked at from several lanes."""
+    """A surface that all lanes (pairs in contact) share."""
     edges = Vector(*(jnp.full(lanes, x) for x in size))
     return Surface(jnp.asarray(heights)[None], np.zeros(lanes, int), edges)
 
 
 def test_a_quadratic_is_met_exactly_and_goes_on_straight():
-    """Heights, slopes and bends inside up to the edges; beyond them, along the tangent."""
+    """Heights, slopes and curvatures are exact up to the edges.
+
+    Beyond, the surface is its tangent.
+    """
     x, y = np.linspace(-1, 1, 6), np.linspace(-1.5, 1.5, 4)
     rng = np.random.default_rng(0)
 
@@ -54,7 +57,7 @@ def test_a_quadratic_is_met_exactly_and_goes_on_straight():
 
 
 def test_slopes_are_continuous_and_are_those_of_the_heights():
-    """Over cells, edges and corners of rough ground, by automatic differentiation."""
+    """Checks cells, edges and corners of rough ground by automatic differentiation."""
     rough = np.random.default_rng(1).normal(size=(6, 5))
 
     def height(place):
@@ -72,7 +75,7 @@ def test_slopes_are_continuous_and_are_those_of_the_heights():
 
 
 def test_distances_are_those_to_the_nearest_point():
-    """Over gentle ground, against a fine search."""
+    """Compares distances over smooth ground with those of a fine search."""
     rng = np.random.default_rng(2)
     heights, size = 0.05 * rng.normal(size=(7, 6)), (2.0, 3.0)
     px, py = rng.uniform(-0.8, 0.8, 8), rng.uniform(-1.2, 1.2, 8)
@@ -89,7 +92,7 @@ def test_distances_are_those_to_the_nearest_point():
 
 
 def test_on_rough_ground_the_search_ends_where_the_way_is_level():
-    """Never further off than straight below, and for nearly all points perpendicular."""
+    """No distance exceeds the vertical one; nearly all results are perpendicular to the ground."""
     rough, count = 2.0 * np.random.default_rng(3).normal(size=(8, 8)), 1000
     rng = np.random.default_rng(4)
     px, py = rng.uniform(-1, 1, (2, count))
@@ -108,19 +111,19 @@ def test_on_rough_ground_the_search_ends_where_the_way_is_level():
 @pytest.mark.parametrize("dim", [2, 3])
 @pytest.mark.parametrize("shape", ["ball", "box"])
 def test_an_inclined_field_is_a_plane(dim, shape):
-    """What is rough bounces, rolls and slides over it and beyond its edge as on the plane.
+    """A rough ball, or a box on its corners, bounces, rolls and slides as on a plane.
 
-    A ball, and a box on its corners.
+    The motion continues beyond the edge of the field.
     """
     turn = -0.5 if dim == 2 else np.array([np.cos(0.2), np.sin(0.2), 0.0, 0.0])
-    pose = jc.Pose(jnp.zeros(dim), jnp.asarray(turn))
+    pose = jc.extend.Pose(jnp.zeros(dim), jnp.asarray(turn))
     slope = np.array([-0.3, 0.1])[: dim - 1]
     line = np.linspace(-0.5, 0.5, 5)
     heights = slope[0] * line if dim == 2 else slope[0] * line[:, None] + slope[1] * line[None]
     up = np.asarray(pose.direction(jnp.asarray([*-slope, 1.0])))
     middle = np.array([0.1, -0.2, 0.3])[-dim:]
     start = middle + 0.12 * up / np.linalg.norm(up)
-    corners = jc.box_corners((0.16, 0.12, 0.1)[:dim], start)
+    corners = jc.contacts.box_corners((0.16, 0.12, 0.1)[:dim], start)
     own = {"radius": 0.1} if shape == "ball" else {"center": corners}
     touch = {"friction": 0.3, "restitution": 0.5} | own
     size = 1.0 if dim == 2 else (1.0, 1.0)
@@ -128,7 +131,7 @@ def test_an_inclined_field_is_a_plane(dim, shape):
     ends = []
     for floor in (
         jc.PlaneContact("floor", jc.WORLD, "ball", normal=up, point=middle, **touch),
-        jc.HeightFieldContact("floor", jc.WORLD, "ball", heights, size, **place, **touch),
+        jc.contacts.HeightFieldContact("floor", jc.WORLD, "ball", heights, size, **place, **touch),
     ):
         scene = jc.Scene(dim=dim)
         inertia = 0.004 if dim == 2 else jc.inertia.sphere(1.0, 0.1)
@@ -137,7 +140,7 @@ def test_an_inclined_field_is_a_plane(dim, shape):
         scene.add(floor)
         ends.append(rolling(*scene.build(), 120)(5e-3))
     assert float(jnp.abs(ends[0].q[-1, :dim] - middle).max()) > 0.5
-    assert float(jnp.abs(ends[0].v[:, dim:]).max()) > 1.0  # the ground turned it
+    assert float(jnp.abs(ends[0].v[:, dim:]).max()) > 1.0  # rotated by friction
     np.testing.assert_allclose(ends[1].q, ends[0].q, atol=1e-12)
 
 
@@ -151,10 +154,10 @@ def parabola(count, dim=2, edge=2.0):
 
 
 def swing(foot, radius, share, time):
-    """Where the foot of a disc is that rolls or slides in z = x²/2R, started at rest.
+    """Returns the contact point x of a disc that rolls or slides in z = x²/2R from rest.
 
-    With x of the foot, θ the slope angle and κ = cos³θ/R, the centre moves by σ = (1 − r κ)/cos θ
-    a unit of x; (1 + share) ½ σ² ẋ² + g z is conserved, so σ ẍ + σ′ ẋ² = −g z′/σ (1 + share).
+    With the slope angle θ and κ = cos³θ/R, the center moves by σ = (1 − r κ)/cos θ per unit of x.
+    The conserved energy is (1 + share) ½ σ² ẋ² + g z, so σ ẍ + σ′ ẋ² = −g z′/σ (1 + share).
     """
 
     def acceleration(x, v):
@@ -178,7 +181,7 @@ def swing(foot, radius, share, time):
 
 
 def test_discs_in_a_parabolic_valley():
-    """One slides and one rolls, against their own equations of motion, at first order in h."""
+    """One disc slides and one rolls; the error of their motions is of first order in h."""
     radius, foot = 0.1, 0.3
     up = np.array([-foot / R, 1.0]) / np.hypot(foot / R, 1.0)
     start = np.array([foot, foot**2 / (2 * R)]) + radius * up
@@ -188,7 +191,9 @@ def test_discs_in_a_parabolic_valley():
         scene.add_body(name, mass=1.0, inertia=0.5 * radius**2, position=start)
         touch = {"radius": radius, "friction": 5.0 if share else 0.0}
         heights = parabola(11)
-        scene.add(jc.HeightFieldContact(f"{name} on", jc.WORLD, name, heights, 2.0, **touch))
+        scene.add(
+            jc.contacts.HeightFieldContact(f"{name} on", jc.WORLD, name, heights, 2.0, **touch)
+        )
     system, state = scene.build()
     run = rolling(system, state, 600)
     paths = {2e-3: run(2e-3).q[299], 1e-3: run(1e-3).q[599]}
@@ -201,7 +206,7 @@ def test_discs_in_a_parabolic_valley():
 
 
 def test_a_ball_circles_in_a_paraboloid():
-    """Without friction at ω² = g tan θ/ρ of its centre, at a height that stays."""
+    """Without friction the center circles with ω² = g tan θ/ρ at constant height."""
     radius, foot = 0.1, 0.3
     tilt = np.arctan(foot / R)
     ρ, z = foot - radius * np.sin(tilt), foot**2 / (2 * R) + radius * np.cos(tilt)
@@ -209,7 +214,7 @@ def test_a_ball_circles_in_a_paraboloid():
     scene = jc.Scene()
     inertia = jc.inertia.sphere(1.0, radius)
     scene.add_body("ball", inertia=inertia, position=(ρ, 0, z), velocity=(0, ρ * ω, 0))
-    bowl = jc.HeightFieldContact(
+    bowl = jc.contacts.HeightFieldContact(
         "bowl", jc.WORLD, "ball", parabola(9, 3), (2.0, 2.0), radius=radius
     )
     scene.add(bowl)
@@ -226,13 +231,13 @@ def test_a_ball_circles_in_a_paraboloid():
 
 
 def terrain(dtype=None):
-    """A disc that falls on rough ground, which is a body's that moves too."""
+    """A disc falls on rough ground that belongs to a moving body."""
     rng = np.random.default_rng(5)
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_body("land", mass=5.0, inertia=1.0, position=(0.0, -0.2), angle=0.05)
     place = {"position": (0.02, 0.1), "velocity": (0.2, -1.0)}
     scene.add_body("disc", mass=2.0, inertia=0.003, **place)
-    ground = jc.HeightFieldContact(
+    ground = jc.contacts.HeightFieldContact(
         "ground", "land", "disc", 0.03 * rng.normal(size=6), 1.0, radius=0.05, friction=0.4,
         position=(0.0, 0.0), orientation=0.0,
     )  # fmt: skip
@@ -241,9 +246,9 @@ def terrain(dtype=None):
 
 
 def test_gradients_by_heights():
-    """A batch of worlds, each with ground of its own, has the differences."""
+    """The differences come from a batch of worlds, each with its own ground."""
     system, state = terrain()
-    method = jc.Method(bounded=QUICK)
+    method = jc.Method(contact_solver=QUICK)
     state = jc.init(system, method, state.q, state.v)
     given = system.params["ground"]["heights"]
     assert given.shape == (6,)
@@ -260,8 +265,8 @@ def test_gradients_by_heights():
 
 
 def test_a_step_in_float32_is_that_in_float64():
-    """With its derivative by the heights, of a disc that the ground stops."""
-    found, method = [], jc.Method(bounded=jc.GaussSeidel(sweeps=40, warm=False))
+    """Compares velocities and their derivatives by heights, for a disc that hits the ground."""
+    found, method = [], jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=40, warm=False))
     for dtype in (jnp.float64, jnp.float32):
         system, state = terrain(dtype)
         height = 0.04 if dtype == jnp.float64 else jnp.float32(0.04)
@@ -281,12 +286,14 @@ def test_a_step_in_float32_is_that_in_float64():
 
 
 def test_a_box_stands_on_its_corners():
-    """The gaps are those of its corners over the plane that the field is."""
+    """The field is a plane, so the gaps are the distances of the corners from that plane."""
     line = np.linspace(-0.5, 0.5, 4)
-    corners = jc.box_corners((0.4, 0.3), (0.1, 0.6), 0.2)
+    corners = jc.contacts.box_corners((0.4, 0.3), (0.1, 0.6), 0.2)
     scene = jc.Scene(dim=2)
     scene.add_body("box", mass=1.0, inertia=0.02, position=(0.1, 0.6), angle=0.2)
-    ground = jc.HeightFieldContact("ground", jc.WORLD, "box", 0.5 * line, 1.0, center=corners)
+    ground = jc.contacts.HeightFieldContact(
+        "ground", jc.WORLD, "box", 0.5 * line, 1.0, center=corners
+    )
     scene.add(ground)
     system, state = scene.build()
     found = linearize_bounds(system, state.q, state.v, state.time, None, jnp.asarray(1e-3))
@@ -321,7 +328,7 @@ def test_bad_numbers_are_refused(given, match):
     scene.add_body("ball", inertia=jc.inertia.sphere(1.0, 0.1))
     scene.add_particle("dot", mass=1.0)
     usual = {"body_a": jc.WORLD, "body_b": "ball", "heights": FLAT, "size": (1.0, 1.0)}
-    scene.add(jc.HeightFieldContact("h", **(usual | given)))
+    scene.add(jc.contacts.HeightFieldContact("h", **(usual | given)))
     with pytest.raises(ValueError, match=match):
         scene.build()
 

@@ -1,4 +1,4 @@
-"""What is evaluated with NumPy on the host is what JAX computes."""
+"""Functions evaluated with NumPy on the host give the values of JAX."""
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scenes
 
+from jaxcon.constraints.rank import linearized
 from jaxcon.core import host
-from jaxcon.dynamics.rank import linearized
 
 X = np.linspace(-1.7, 2.3, 12).reshape(3, 4)
 FUNCTIONS = {

@@ -1,4 +1,4 @@
-"""Parameters come back from recordings, with honest errors, and what is not told is named."""
+"""Identification of parameters from recordings: values, errors, and unidentifiable parameters."""
 
 import runpy
 from pathlib import Path
@@ -11,7 +11,7 @@ import pytest
 import scenes
 
 import jaxcon as jc
-from jaxcon.learning.least_squares import Precision, Progress, least_squares, side_by_side
+from jaxcon.learning.least_squares import FitProgress, Precision, least_squares, side_by_side
 from jaxcon.learning.leaves import space_of
 from jaxcon.learning.stretches import Stretches
 
@@ -22,7 +22,7 @@ POSITIVE = ("size", "gain", "decay")
 
 
 def ringing(p):
-    """Size and gain enter by their product alone."""
+    """A decaying wave in which size and gain enter only as their product."""
     wave = p["size"] * p["gain"] * jnp.exp(-p["decay"] * TIMES) * jnp.cos(3 * TIMES)
     return {"x": wave + p["offset"]}
 
@@ -52,7 +52,7 @@ def test_a_recording_with_gaps_gives_parameters_noise_and_errors():
 
 @pytest.mark.parametrize("start", [(20.0, 0.05), (100.0, 30.0), (1000.0, 0.01)])
 def test_a_far_start_does_not_lead_out_of_all_numbers(start):
-    """A step without reach by these logarithms went to 1e-300, where data seem to tell nothing."""
+    """An unbounded step in the logarithms went to 1e-300, where the data seem uninformative."""
     height = scenes.hanging()
     seen = height({"stiffness": 8.0, "damping": 1.0})
     guess = dict(zip(("stiffness", "damping"), start, strict=True))
@@ -64,7 +64,7 @@ def test_a_far_start_does_not_lead_out_of_all_numbers(start):
 
 @pytest.mark.parametrize(("steps", "noise"), [(120, 0.1), (200, 0.0), (600, 0.15)])
 def test_local_minima_of_long_recordings_are_left_by_way_of_their_first_parts(steps, noise):
-    """A fit of the whole at once ends at k = 76 or k = 46 from most of these starts."""
+    """A fit of the whole recording at once ends at k = 76 or k = 46 from most of these starts."""
     height, truth = scenes.hanging(steps=steps), {"stiffness": 8.0, "damping": 1.0}
     data = height(truth) + noise * np.random.default_rng(1).normal(size=steps)
     near = jc.identify(height, truth, data, positive=True)
@@ -80,7 +80,10 @@ def test_local_minima_of_long_recordings_are_left_by_way_of_their_first_parts(st
 @pytest.mark.parametrize("shape", [(300,), (3, 100), (100, 3)])
 @pytest.mark.parametrize("given", [None, 0.05])
 def test_residuals_that_noise_does_not_explain_are_no_convergence(given, shape):
-    """The recording has a second wave that the model lacks; noise alone has none."""
+    """The recording contains a second wave that the model lacks.
+
+    With noise alone the fit converges.
+    """
     lacking = np.asarray(0.3 * jnp.sin(0.8 * TIMES))
 
     def model(p):
@@ -137,7 +140,7 @@ def test_what_is_masked_was_not_seen():
 
 
 def test_errors_are_those_of_linear_least_squares():
-    """σ² (XᵀX)⁻¹, in the units of the parameters."""
+    """The errors follow σ² (XᵀX)⁻¹, in the units of the parameters."""
     X = np.random.default_rng(1).normal(size=(50, 3))
     y = X @ np.array([1.0, -2.0, 0.0]) + 0.1
     found = jc.identify(lambda b: jnp.asarray(X) @ b, jnp.array([3.0, 0.0, 1.0]), y, noise=0.2)
@@ -158,7 +161,7 @@ def test_adam_finds_the_same():
     found = jc.identify(simulate, start, data, positive=("size", "decay"))
     assert not found.untold
     tuned = jc.tune(
-        lambda p: jc.losses.tracking(simulate(p), data),
+        lambda p: jc.learning.losses.tracking(simulate(p), data),
         start,
         steps=300,
         positive=("size", "decay"),
@@ -181,14 +184,14 @@ def test_bounds_hold_and_an_optimum_may_lie_on_one():
 
 
 def fitted(function, start, steps=50):
-    """The fit of one search."""
+    """Returns the result of one search."""
     free, precision = np.full(2, np.inf), Precision(1e-8, 1.0)
-    search = least_squares(Progress(start), (-free, free), steps, precision)
+    search = least_squares(FitProgress(start), (-free, free), steps, precision)
     return side_by_side([search], lambda asked: {0: function(asked[0])})[0]
 
 
 def test_an_interrupt_keeps_what_was_found():
-    """Rosenbrock's valley, left after a few evaluations."""
+    """Rosenbrock's valley, interrupted after a few evaluations."""
     calls = []
 
     def valley(z):
@@ -220,7 +223,7 @@ def test_all_may_lie_on_their_bounds():
 
 
 def wave(p):
-    """Linear in both parameters."""
+    """A model that is linear in both parameters."""
     return p["a"] * jnp.cos(3 * TIMES) + p["b"]
 
 
@@ -228,7 +231,7 @@ WAVE = np.asarray(wave({"a": 2.0, "b": 0.4})) + 0.01 * np.random.default_rng(0).
 
 
 def test_a_bound_holds_the_errors_of_the_others_and_has_none():
-    """The errors of the other numbers are as if the bound were known."""
+    """The errors of the other parameters are those for a known value at the bound."""
     found = jc.identify(wave, {"a": 1.0, "b": 0.1}, WAVE, bounds={"b": (0.0, 0.2)})
     given = jc.identify(lambda a: wave({"a": a, "b": 0.2}), 1.0, WAVE)
     np.testing.assert_allclose(found.errors["a"], given.errors, rtol=1e-9)
@@ -254,7 +257,7 @@ def test_a_start_near_zero_is_no_reason_to_stay_there(dtype, start):
 
 
 def test_a_weak_parameter_is_found_beside_a_strong_one_in_float32():
-    """Their columns differ by 2e4 in length, and hardly in what they share."""
+    """Their columns differ by a factor of 2e4 in length and are nearly orthogonal."""
     times = np.asarray(TIMES)
     X = np.stack([1e3 * np.cos(3 * times), 0.2 * np.sin(5 * times)], 1)
     data = X @ np.array([2.0, 1.0]) + 1e-2 * np.random.default_rng(0).normal(size=300)
@@ -280,7 +283,7 @@ def test_a_wall_of_what_is_no_number_is_no_convergence():
 
 
 def test_data_that_are_met_exactly_are_known_to_rounding():
-    """Numbers that are their own prediction leave no residual at all."""
+    """A model that reproduces its data leaves a residual of exactly zero."""
     data = np.array([1.0, 2.0, 4.0, 8.0])
     found = jc.identify(lambda a: a * jnp.asarray(data), jnp.asarray(1.0), data)
     rounding = np.finfo(float).eps * np.linalg.norm(data) / 2
@@ -291,7 +294,7 @@ def test_data_that_are_met_exactly_are_known_to_rounding():
 
 
 def test_no_degree_of_freedom_tells_no_noise():
-    """Two numbers and two parameters; with a known noise the errors are known."""
+    """Two data and two parameters; if the noise is given, the errors are known."""
     X, data = np.array([[1.0, 1.0], [2.0, 1.0]]), np.array([1.1, 1.9])
     found = jc.identify(lambda b: jnp.asarray(X) @ b, jnp.array([1.0, 0.5]), data)
     np.testing.assert_allclose(found.params, np.linalg.solve(X, data))
@@ -303,7 +306,7 @@ def test_no_degree_of_freedom_tells_no_noise():
 
 
 def test_directions_that_are_not_told_take_no_degree_of_freedom():
-    """Two of three parameters enter by their sum; the residual is that of a line in one."""
+    """Two of three parameters enter only as their sum; the residual is that of a straight line."""
     times, data = np.arange(5.0), np.array([0.1, -0.2, 0.15, 0.05, -0.1])
 
     def line(p):
@@ -315,7 +318,10 @@ def test_directions_that_are_not_told_take_no_degree_of_freedom():
 
 
 def test_leaves_that_are_not_searched_are_kept_as_they_are():
-    """Whole numbers can be counted with; they have no errors."""
+    """Integer leaves stay concrete, so that the model can use them as counts.
+
+    They have no errors.
+    """
 
     data = np.array([8.0, 8.1, 7.9])
 
@@ -342,7 +348,7 @@ def test_what_a_simulation_reads_elsewhere_may_change_between_two_calls():
 
 
 def oscillate(rate, node):
-    """A stretch of 20 samples of ẍ = −ω² x, and its end."""
+    """Returns a segment of 20 samples of ẍ = −ω² x from a node, and the state at its end."""
     t = 0.05 * jnp.arange(21.0)
     c, s = jnp.cos(rate * t), jnp.sin(rate * t)
     x = node["x"] * c + node["v"] / rate * s
@@ -356,7 +362,10 @@ def long_recording(stretches):
 
 
 def test_a_long_recording_is_fitted_in_stretches_or_in_longer_and_longer_parts():
-    """The least over ω of a long cosine has a narrow basin; that of short ones is wide."""
+    """A long cosine has a narrow basin around its minimum over ω.
+
+    Short segments have a wide one.
+    """
     x = long_recording(10)
     times = 0.05 * jnp.arange(200.0)
     one = jc.identify(lambda rate: jnp.cos(rate * times), jnp.asarray(4.0), x, positive=True)
@@ -372,7 +381,10 @@ def test_a_long_recording_is_fitted_in_stretches_or_in_longer_and_longer_parts()
 
 
 def interrupt(monkeypatch, when, error=KeyboardInterrupt):
-    """Ends an identification where when(points so far) is true; the points of all calls."""
+    """Raises an error in an identification when when(points so far) is true.
+
+    Returns the points of all evaluations.
+    """
     evaluate, seen = Stretches.evaluate, []
 
     def watched(problem, points):
@@ -388,10 +400,10 @@ def interrupt(monkeypatch, when, error=KeyboardInterrupt):
 @pytest.mark.parametrize("where", [1, 3])
 @pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("no room")])
 def test_what_ends_the_second_decade_ends_the_search(where, error, monkeypatch):
-    """At its first evaluation or later; what was found before is kept."""
+    """The error comes at the first evaluation of the decade or later; earlier results are kept."""
 
     def second(seen):
-        widths = [points[0][1] for points in seen[1:]]  # the start is looked at first
+        widths = [points[0][1] for points in seen[1:]]  # the start is evaluated first
         return len(set(widths)) == 2 and widths.count(widths[-1]) == where
 
     seen = interrupt(monkeypatch, second, error)
@@ -408,7 +420,7 @@ def test_what_ends_the_second_decade_ends_the_search(where, error, monkeypatch):
 def test_interrupted_and_resumed_is_the_same_as_uninterrupted(
     kind, restarts, tmp_path, monkeypatch
 ):
-    """The process may be killed at any evaluation: it goes on from the last step."""
+    """The process is killed at some evaluations; the search resumes at the last step."""
     file = tmp_path / "search.npz"
     data, options = long_recording(4).reshape(4, 20), {"positive": True}
     if restarts > 1:
@@ -417,7 +429,7 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(
     if kind == "parts":
         times = 0.05 * jnp.arange(80.0)
         problem = (lambda rate: jnp.cos(rate * times), jnp.asarray(5.0), data.ravel())
-        calls_until_killed = (20, 30, 10, 15)  # of 77, of which the first 42 fit the whole
+        calls_until_killed = (20, 30, 10, 15)  # of 77 calls, 42 of them for the whole
     elif kind == "stretches":
         options["nodes"] = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(4)}
         problem = (oscillate, jnp.asarray(4.0), data)
@@ -430,7 +442,7 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(
     ended = 0
     for calls in calls_until_killed:
         with monkeypatch.context() as patch:
-            killed = MemoryError()  # which nothing catches, as if the process had been killed
+            killed = MemoryError()  # not caught, as if the process were killed
             interrupt(patch, lambda seen, calls=calls: len(seen) == calls, killed)
             with pytest.raises(MemoryError):
                 jc.identify(*problem, checkpoint=file, **options)
@@ -476,9 +488,9 @@ def test_more_steps_may_be_asked_of_a_checkpoint_and_nothing_else(tmp_path):
 
 
 def test_restarts_find_the_better_of_two_rates():
-    """A long cosine has a narrow basin; starts at which nothing is finite harm no other.
+    """A long cosine has a narrow basin; starts that are not finite do not affect the others.
 
-    In no order of time there is no first part with a wider one.
+    The data are shuffled in time, so that the search cannot begin with a short first part.
     """
     order = np.random.default_rng(0).permutation(200)
     times, data = 0.05 * jnp.arange(200.0)[order], long_recording(10)[order]
@@ -490,7 +502,7 @@ def test_restarts_find_the_better_of_two_rates():
     found = jc.identify(simulate, jnp.asarray(4.0), data, **options)
     assert abs(found.params - 3) < 3 * found.errors
     assert found.ends.shape == (12,)
-    assert found.ends[0] > 2 * found.ends.min()  # the one given
+    assert found.ends[0] > 2 * found.ends.min()  # of the given start
     assert "the best of 12 starts" in str(found)
     alone = jc.identify(simulate, jnp.asarray(4.0), data, positive=True)
     np.testing.assert_allclose(alone.costs[-1], found.ends[0], rtol=1e-9)
@@ -504,7 +516,7 @@ def test_restarts_find_the_better_of_two_rates():
 
 
 def test_noise_of_each_number_counts_in_its_own_stretch():
-    """Equal noise of all is as one number; a stretch that hardly counts is as one not seen."""
+    """Uniform noise equals a single number; segments with huge noise count as not recorded."""
     data = long_recording(4).reshape(4, 20)
     nodes = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(4)}
 
@@ -523,7 +535,7 @@ def test_noise_of_each_number_counts_in_its_own_stretch():
 
 @pytest.mark.parametrize("unit", [1.0, 1e3, 1e-3])
 def test_how_nearly_ends_meet_nodes_does_not_depend_on_the_unit_of_the_data(unit):
-    """Noise that nobody gave is estimated before it is weighed against gaps."""
+    """Noise that is not given is estimated first; gaps between segments are weighed with it."""
     data = long_recording(6).reshape(6, 20)
     nodes = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(6)}
 
@@ -547,7 +559,7 @@ def test_a_recording_without_noise_is_met_to_rounding():
 
 
 def test_errors_with_nodes_are_those_of_the_whole_motion():
-    """With ends that meet, stretches tell as much as one motion whose start is unknown."""
+    """With continuity, segments are as informative as one motion with an unknown start."""
     data = long_recording(4).reshape(4, 20)
     nodes = {"x": jnp.asarray(data[:, 0]), "v": jnp.zeros(4)}
     options = {"noise": 0.05, "continuity": 1e-5}
@@ -565,7 +577,7 @@ def test_errors_with_nodes_are_those_of_the_whole_motion():
 
 @pytest.mark.parametrize("noise", [0.05, None])
 def test_ends_that_meet_far_below_the_noise_hide_nothing_in_float32(noise):
-    """Gaps weigh 5·10⁵ times what the data do; their rank must be judged apart."""
+    """Gaps weigh 5·10⁵ times as much as the data, so their rank must be determined separately."""
     data = long_recording(4).reshape(4, 20)
 
     def found(dtype, continuity):
@@ -602,7 +614,7 @@ def test_the_jacobian_of_stretches_is_the_derivative_of_their_residuals():
 
 
 def test_stretches_of_a_mechanism_have_states_in_minimal_coordinates():
-    """The length of a pendulum from its angle alone, its starts and rates unknown."""
+    """Identifies a pendulum's length from its angle, with unknown angles and rates at nodes."""
     steps, dt, count = 40, 1e-2, 3
 
     def stretch(length, node):
@@ -617,7 +629,7 @@ def test_stretches_of_a_mechanism_have_states_in_minimal_coordinates():
             x, y = s.q
             return jnp.arctan2(x, -y), (x * s.v[1] - y * s.v[0]) / (x * x + y * y)
 
-        method = jc.Method(solver=jc.Schur())
+        method = jc.Method(solver=jc.solvers.Schur())
         _, (angles, rates) = jc.rollout(system, method, state, None, dt, steps, record=record)
         return angles[3::4], (angles[-1], rates[-1])
 
@@ -685,7 +697,7 @@ def test_what_does_not_fit_is_refused_in_words():
     with pytest.raises(ValueError, match="nodes={} hold no array; leave them out"):
         jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes={})
     nodes = {"x": jnp.ones(3), "v": jnp.ones(3)}
-    # these would otherwise be compared with a node number by number, or be shared among its numbers
+    # without an error, these ends would be compared with the wrong numbers, or broadcast
     ends = {"0 .., 1 ..": lambda n: (n["v"], n["x"]), "an array ..": lambda n: n["x"]}
     for words, end in ends.items():
         with pytest.raises(ValueError, match=f"an end like a node, v .., x .*returns is {words}"):
@@ -694,7 +706,7 @@ def test_what_does_not_fit_is_refused_in_words():
         jc.identify(lambda p, n: p * n["x"], 3.0, np.ones(3), nodes=nodes)
     with pytest.raises(ValueError, match="3 nodes the data must have a first axis"):
         jc.identify(oscillate, 3.0, np.ones((4, 20)), nodes=nodes)
-    for x in (np.ones(4, int), np.ones(3), 1.0):  # whole numbers would be rounded to at each step
+    for x in (np.ones(4, int), np.ones(3), 1.0):  # integers would be rounded at each step
         with pytest.raises(
             ValueError, match=r"nodes must be .* float64 \(4,\), (int64|float64) \("
         ):
@@ -717,7 +729,7 @@ def test_gravity_alone_does_not_tell_masses(pendulum):
 
 
 def test_with_a_known_torque_errors_are_of_the_order_of_the_bound(pendulum):
-    """Over draws of noise the squares of errors by their deviation have the mean 1."""
+    """Over many draws of noise, the mean of (deviation/error)² is 1."""
     truth = jax.tree.leaves(pendulum["TRUTH"])
     squares = []
     for seed in range(20):
@@ -729,7 +741,7 @@ def test_with_a_known_torque_errors_are_of_the_order_of_the_bound(pendulum):
 
 
 def test_a_small_step_at_the_end_is_taken_in_full():
-    """In float32 a damped last step would leave a weak direction by many of its errors."""
+    """In float32 a damped last step would leave a weak direction off by many standard errors."""
     t = np.arange(2000, dtype=np.float32)
     data = jnp.asarray(1.0 + 1.0 * (1 + 0.02 * t), jnp.float32)
 

@@ -10,23 +10,23 @@ from scipy.integrate import solve_ivp
 
 import jaxcon as jc
 from jaxcon.analysis import encounters
-from jaxcon.analysis.known import Known
+from jaxcon.analysis.setup import Setup
 from jaxcon.analysis.traps import impact, listed
 from jaxcon.core import notices
 
 G, R, H = 9.81, 0.1, 1e-3
 ONE_PERCENT, TWO_PERCENT = 1e-2, 2e-2
-"""What derivatives of plain steps at 1 ms are held to, and differences over 5 mm."""
+"""Tolerances of derivatives with plain steps of 1 ms, and of differences over 5 mm."""
 INTEGRATORS = {
     "SIE": jc.SemiImplicitEuler(),
     "RK4": jc.RK4(),
-    "Heun": jc.Heun(),
-    "Euler": jc.ExplicitEuler(),
+    "Heun": jc.integrators.Heun(),
+    "Euler": jc.integrators.ExplicitEuler(),
 }
 
 
 def landed(system, state, integrator, time, where, of):
-    """(change of the start, parameters) → some numbers of the end."""
+    """Returns the function (change of the start, parameters) → values `of` the final state."""
     method = jc.Method(integrator)
 
     def run(x, params):
@@ -41,15 +41,17 @@ def landed(system, state, integrator, time, where, of):
 
 
 def held_to(run, x, params, want, mode="forward", tight=ONE_PERCENT):
-    """Derivatives at 7 phases of a step, and differences over 5 mm, beside those of a closed form.
+    """Compares derivatives of a rollout with exact ones and with differences over 5 mm.
+
+    The start takes 7 positions, so that the impact falls at 7 phases of a step.
 
     Args:
-        run: (x, params) → (numbers).
-        x: a number to differentiate by.
-        params: by case, with a leading axis, or None.
-        want: (x, case) → (numbers), exactly; None for differences alone.
+        run: (x, params) → values, (n,).
+        x: the number to differentiate by.
+        params: parameters by case (leading axis), or None.
+        want: the exact (x, case) → values; None to compare with differences alone.
         mode: "forward" or "reverse".
-        tight: relative to the largest of the numbers' derivatives.
+        tight: tolerance relative to the largest derivative.
     """
     cases = 1 if params is None else len(jax.tree.leaves(params)[0])
     phases = x + np.linspace(0, 1.5e-3, 7)
@@ -79,7 +81,7 @@ def held_to(run, x, params, want, mode="forward", tight=ONE_PERCENT):
 
 
 def disc(dtype=None, friction=0.5, restitution=None):
-    """1.3 kg and 0.1 m over a floor, moving sideways."""
+    """A disc of 1.3 kg and 0.1 m over a floor, moving sideways."""
     scene = jc.Scene(dim=2, dtype=dtype)
     moving = {"position": (0.0, 1.1), "velocity": (1.0, 0.0)}
     scene.add_body("disc", mass=1.3, inertia=1.3 * R * R / 2, **moving)
@@ -93,7 +95,10 @@ def by_height(state, z):
 
 
 def bounced(z, friction, e, time):
-    """(x, z) of the disc: slip ends in the impact if μ (1 + e) v suffices, for a third of it."""
+    """Returns the exact (x, z) of the disc after one bounce or landing.
+
+    With μ (1 + e) v large enough the slip ends in the impact, and the speed falls by a third.
+    """
     v = np.sqrt(2 * G * (z - R))
     rest = time - v / G
     along = max(1 - friction * (1 + e) * v, 2 / 3)
@@ -115,7 +120,7 @@ DISC = {"friction": np.array([0.5, 0.02, 0.5, 0.02]), "restitution": np.array([0
     ],
 )
 def test_a_disc_bounces_or_lands_sticking_and_sliding(name, mode, dtype):
-    """At 0.9 s, d(x, z)/dz is (0.0753, 0.9892) where it bounces and sticks."""
+    """A case that bounces and sticks has d(x, z)/dz = (0.0753, 0.9892) at 0.9 s."""
     system, state = disc(dtype, restitution=0.6)
     run = landed(system, state, INTEGRATORS[name], 0.9, by_height, lambda s: s.q[:2])
     params = {"floor": {k: jnp.asarray(x, dtype) for k, x in DISC.items()}}
@@ -130,7 +135,7 @@ def test_a_disc_bounces_or_lands_sticking_and_sliding(name, mode, dtype):
 
 @pytest.mark.parametrize("name", ["SIE", "RK4"])
 def test_a_ball_bounces(name):
-    """At 0.8 s its height has the derivative 0.7617 by that of the start."""
+    """At 0.8 s the derivative of the height by the initial height is 0.7617."""
     scene = jc.Scene(dim=3)
     scene.add_body("ball", mass=1.0, inertia=(4e-3,) * 3, position=(0.0, 0.0, 1.0))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=R, restitution=0.8))
@@ -152,7 +157,7 @@ def test_a_ball_bounces(name):
 
 
 def test_a_disc_lands_without_restitution():
-    """The landing of a contact that has no restitution is an impact, too."""
+    """A landing of a contact without restitution is an impact, too."""
     system, state = disc()
     run = landed(system, state, jc.SemiImplicitEuler(), 0.9, by_height, lambda s: s.q[:1])
     params = {"floor": {"friction": jnp.asarray([0.5, 0.02])}}
@@ -160,7 +165,7 @@ def test_a_disc_lands_without_restitution():
 
 
 def test_a_block_lands_and_slides_to_rest():
-    """v t* + (v − μ g t*)²/2μg, t* = √(2z/g)."""
+    """The block travels v t* + (v − μ g t*)²/2μg, with the time of the fall t* = √(2z/g)."""
     scene = jc.Scene(dim=2)
     scene.add_particle("block", mass=2.0, position=(0.0, 0.3), velocity=(4.0, 0.0))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "block", friction=0.45))
@@ -175,7 +180,7 @@ def test_a_block_lands_and_slides_to_rest():
 
 
 def test_a_block_slides_into_a_wall_and_back():
-    """Friction on the table turns round at the time of the impact."""
+    """The friction of the table changes its direction at the time of the impact."""
     scene = jc.Scene(dim=2)
     scene.add_particle("block", mass=1.0, position=(0.0, 0.0), velocity=(3.0, 0.0))
     scene.add(jc.PlaneContact("table", jc.WORLD, "block", friction=0.3))
@@ -199,7 +204,7 @@ def test_a_block_slides_into_a_wall_and_back():
 
 @pytest.mark.parametrize("name", ["SIE", "RK4"])
 def test_a_hinged_rod_strikes_a_floor_with_its_end(name):
-    """Through a joint, and at an end that moves on a circle: θ̇ leaves with −e of what it was."""
+    """The impact passes through a joint, and the end moves on a circle; θ̇ changes to −e θ̇."""
     inertia, mass, arm = 0.06, 1.0, 0.4
     scene = jc.Scene(dim=2)
     moving = {"velocity": (0.0, -arm), "angular_velocity": -1.0}
@@ -234,12 +239,12 @@ def test_a_hinged_rod_strikes_a_floor_with_its_end(name):
 
 @pytest.mark.parametrize("e", [0.5, None])
 def test_a_weight_on_a_rope_jerks(e):
-    """It is thrown, falls on a parabola, and goes on with the speed across the rope."""
+    """A thrown weight falls until the rope is taut, and keeps its speed across the rope."""
     scene = jc.Scene(dim=2)
     scene.add_particle("weight", mass=2.0, position=(0.3, -0.5), velocity=(1.0, 0.0))
     own = {} if e is None else {"restitution": e}
     rope = {"length": 1.0, "point_a": (0.0, 0.0)} | own
-    scene.add(jc.Rope("rope", jc.WORLD, "weight", **rope))
+    scene.add(jc.contacts.Rope("rope", jc.WORLD, "weight", **rope))
     system, state = scene.build()
     time = 0.35
     run = landed(system, state, jc.SemiImplicitEuler(), time, by_height, lambda s: s.q)
@@ -273,14 +278,14 @@ def test_a_weight_on_a_rope_jerks(e):
     [("SIE", (0.05, 1.0), 0.7), ("RK4", (1.0,), 0.7), ("SIE", (0.05, 1.0), 0.0)],
 )
 def test_two_discs_strike_aslant(name, frictions, e):
-    """Sliding and sticking along a tangent that turns as they approach each other."""
+    """Contacts that slide or stick along a tangent that rotates while the discs approach."""
     m, inertia, time = np.array([1.0, 0.7]), np.array([5e-3, 4e-3]), 0.8
     p0, v0 = np.array([[0.0, 0.0], [0.8, 0.08]]), np.array([[2.0, 0.0], [-0.5, 0.1]])
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     for k, body in enumerate("ab"):
         scene.add_body(body, mass=m[k], inertia=inertia[k], position=p0[k], velocity=v0[k])
     touch = {"radius_a": R, "radius_b": R, "friction": 1.0, "restitution": e}
-    scene.add(jc.CapsuleContact("touch", "a", "b", **touch))
+    scene.add(jc.contacts.CapsuleContact("touch", "a", "b", **touch))
     system, state = scene.build()
 
     def where(state, x):
@@ -313,11 +318,11 @@ def test_two_discs_strike_aslant(name, frictions, e):
 
 
 def test_a_slide_with_a_spring_and_a_damper_strikes_a_stop():
-    """What damps has another force after the impact than before it."""
+    """The force of the damper jumps at the impact."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("slide", mass=1.0, inertia=1.0)
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
-    scene.add(jc.JointSpring("spring", "rail", stiffness=4.0, damping=0.5))
+    scene.add(jc.forces.JointSpring("spring", "rail", stiffness=4.0, damping=0.5))
     scene.add(jc.Limit("stop", "rail", lower=-0.2, restitution=0.5))
     system, state = scene.build()
 
@@ -351,7 +356,7 @@ CORNER = np.array([0.05, 0.04, -0.05])
 
 
 def turned(q):
-    """The matrix of a quaternion."""
+    """Returns the rotation matrix of a quaternion."""
     w, x, y, z = q
     return np.array(
         [
@@ -363,10 +368,10 @@ def turned(q):
 
 
 def thrown(z, time, corner, sticks, e=0.6, mass=1.3):
-    """Position and quaternion after one impact, by Newton's and Euler's equations.
+    """Returns position and quaternion after one impact, by Newton's and Euler's equations.
 
-    Where it sticks, (1 + e) times the velocity along the normal and all of the others are taken
-    away from the point of contact; else the impulse is along the normal alone.
+    In a sticking impact the contact point loses its tangential velocity and (1 + e) times its
+    normal velocity. Without friction the impulse is along the normal alone.
     """
 
     def arm(y):
@@ -400,7 +405,7 @@ def thrown(z, time, corner, sticks, e=0.6, mass=1.3):
 
 @pytest.mark.parametrize("name", ["SIE", "RK4"])
 def test_a_body_that_spins_fast_in_space_strikes_a_floor(name):
-    """Its corner or its rim, sticking and without friction, and moments that differ."""
+    """Impacts of a corner or a rim, sticking or frictionless, with unequal moments of inertia."""
     z, time = 0.6, 0.44
     scene = jc.Scene()
     moving = {"velocity": THROWN, "angular_velocity": SPIN, "position": (0.0, 0.0, z)}
@@ -416,9 +421,9 @@ def test_a_body_that_spins_fast_in_space_strikes_a_floor(name):
     sticks = np.array([True, False, True, False])
     params = {"friction": jnp.where(sticks, 2.0, 0.0), "radius": jnp.where(corner, 0.0, R)}
     params["anchor_b"] = jnp.where(corner[:, None], CORNER, 0.0)
-    # the free flight of semi-implicit Euler is of first order, and so are its derivatives
+    # skipped: the free flight of semi-implicit Euler and its derivatives are of first order
     want = None if name == "SIE" else lambda z, i: thrown(z, time, corner[i], sticks[i])
-    # the error is a share of h|ω|, here 0.026
+    # the error is a fraction of h|ω|, here 0.026
     held_to(run, z, {"floor": params}, want, tight=1.5e-2)
 
 
@@ -432,7 +437,7 @@ def bar(restitution=None):
 
 
 def height_by(system, state, method):
-    """z → height a step later."""
+    """Returns the function from the height z to the height one step later."""
 
     def height(z):
         start = jc.init(system, method, state.q.at[1].set(z), state.v)
@@ -442,10 +447,13 @@ def height_by(system, state, method):
 
 
 def test_a_gradient_that_lacks_the_time_of_impacts_warns_once(monkeypatch):
-    """Where it is traced, not where the step is; and is named by the report and the check."""
+    """The warning comes when the gradient is traced, not when the step is.
+
+    Report and check repeat it.
+    """
     monkeypatch.setattr(notices, "_given", set())
     system, state = bar()
-    method = jc.Method(bounded=jc.GaussSeidel())
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel())
     height = height_by(system, state, method)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -474,18 +482,18 @@ def test_no_gradient_warns_that_has_the_time_of_impacts(case, monkeypatch):
         scene.add_particle("ball", mass=1.0, position=(0.0, 0.5))
         scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", friction=0.5))
         system, state = scene.build()
-    sweeps = {"bounded": jc.GaussSeidel()}
+    sweeps = {"contact_solver": jc.solvers.GaussSeidel()}
     parts = {"default": {}, "RK4": sweeps | {"integrator": jc.RK4()}}
-    parts["events"] = sweeps | {"events": jc.Events()}
+    parts["events"] = sweeps | {"events": jc.integrators.Events()}
     method = jc.Method(**parts.get(case, sweeps))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jax.jit(jax.grad(height_by(system, state, method))).lower(0.5)
-    assert impact(Known.of(system, state, method, H)) is None
+    assert impact(Setup.of(system, state, method, H)) is None
 
 
 def vee(restitution=0.6):
-    """A ball over two planes that meet below it."""
+    """A ball over two planes that meet below it in a V."""
     scene = jc.Scene(dim=2)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.1))
     for name, x in (("left", 0.5), ("right", -0.5)):
@@ -506,7 +514,7 @@ def ball(restitution):
 
 
 def started(scene, place, time):
-    """x → the place and velocity some time after a start at x."""
+    """Returns the function from a start x to the position and velocity after a given time."""
     system, state = scene
     method = jc.Method()
 
@@ -527,7 +535,7 @@ def started(scene, place, time):
     ids=["simultaneous", "grazing"],
 )
 def test_impacts_that_may_have_no_derivative_are_named(scene, place, at, time, case):
-    """On the way from x, and from both sides of it."""
+    """Checks the rollout from x and the rollouts from both neighbors of x."""
     run = started(scene, place, time)
     found = encounters.cases(lambda x: run(x[0]), [jnp.asarray(at)], [[jnp.asarray(5e-3)]])
     assert any(case in words for words in found)
@@ -553,7 +561,7 @@ def test_a_report_names_what_has_impacts():
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_tumbling_box_that_lands_on_corners_warns_once(dim, monkeypatch):
-    """Without restitution, under semi-implicit Euler; the report says it, too."""
+    """Covers contacts without restitution under semi-implicit Euler; the report says the same."""
     monkeypatch.setattr(notices, "_given", set())
     scene = jc.Scene(dim=dim)
     where = (0.0, 0.5) if dim == 2 else (0.0, 0.0, 0.5)
@@ -566,7 +574,7 @@ def test_a_tumbling_box_that_lands_on_corners_warns_once(dim, monkeypatch):
         corner = (*side, 0.4)
         scene.add(jc.PlaneContact(names[-1], jc.WORLD, "box", center=corner, friction=0.5))
     system, state = scene.build()
-    method = jc.Method(bounded=jc.GaussSeidel())
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel())
 
     def height(z):
         start = jc.init(system, method, state.q.at[dim - 1].set(z), state.v)

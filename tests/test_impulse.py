@@ -1,4 +1,4 @@
-"""What bounded rows do to each other's velocities, G = h J_b K J_bᵀ, beside dense algebra."""
+"""The response matrix of inequality rows, G = h J_b K J_bᵀ, compared with dense algebra."""
 
 import jax
 import jax.numpy as jnp
@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.simulation.attempt import dynamics_at
 
 H = 2e-3
 
 
 def scene(corners):
-    """A box on a hinged arm, some of whose corners may touch the floor; 12 velocities."""
+    """A box on a hinged arm with 12 velocities; `corners` of the box may touch the floor."""
     scene = jc.Scene()
     scene.add_body("arm", mass=1.5, inertia=(0.02, 0.1, 0.11), position=(0.5, 0.0, 0.3))
     scene.add_body("box", inertia=jc.inertia.box(2.0, (0.4, 0.3, 0.1)), position=(1.0, 0.0, 0.3))
@@ -25,7 +24,9 @@ def scene(corners):
 
 
 @pytest.mark.parametrize("corners", [2, 5], ids=["by rows", "by velocities"])
-@pytest.mark.parametrize("solver", [jc.Sparse(), jc.Schur()], ids=["Sparse", "Schur"])
+@pytest.mark.parametrize(
+    "solver", [jc.solvers.Sparse(), jc.solvers.Schur()], ids=["Sparse", "Schur"]
+)
 def test_the_matrix_is_that_of_dense_algebra(corners, solver):
     system, state = scene(corners)
     method = jc.Method(solver=solver)
@@ -49,8 +50,8 @@ def test_the_matrix_is_that_of_dense_algebra(corners, solver):
 
 
 def test_fewer_velocities_than_rows_are_enough():
-    """The joints are solved once for each velocity where there are more rows."""
-    widths, method = [], jc.Method(solver=jc.Sparse())
+    """With more rows than velocities, the joints are solved once for each velocity."""
+    widths, method = [], jc.Method(solver=jc.solvers.Sparse())
     for corners in (2, 5):
         system, state = scene(corners)
         known = jax.eval_shape(lambda s, own=system: begun(own, method, s).answers, state)
@@ -59,8 +60,10 @@ def test_fewer_velocities_than_rows_are_enough():
 
 
 def begun(system, method, state):
-    """How bounded rows act in a step from a state."""
+    """Returns the contact problem of a step from a state."""
     dt, at = jnp.asarray(H), (state.q, state.v, state.time)
-    dynamics = dynamics_at(system, method, state, None, dt)
-    _, law, problem = dynamics._problem(*at, None)
-    return dynamics._impulse(dynamics.bounds(*at, dt), law, problem, dt, None)
+    dynamics = method.dynamics(system, state, None, dt)
+    rows = dynamics.linearize(*at)
+    equations = dynamics.stabilizer.constraint_equations(rows, (), dt)
+    problem = dynamics.assemble(equations, *at)
+    return dynamics.contact._impulse(dynamics, rows.inequalities, problem, dt, None)

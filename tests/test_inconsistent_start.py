@@ -1,4 +1,4 @@
-"""Starts that are off the constraints by a tenth of the scene: recovered from, or refused."""
+"""Starts with violations of a tenth of the scene's size: corrected, or refused with a status."""
 
 import dataclasses
 import sys
@@ -28,7 +28,7 @@ PAIRS = [("four_bar", EULER, law) for law in LAWS] + [
 
 
 def displaced(name):
-    """The scene with every coordinate moved by up to a tenth [m, rad]."""
+    """Returns the scene with every coordinate displaced by up to 0.1 m or rad."""
     system, state = SCENES[name]()
     step = np.random.default_rng(0).uniform(-0.1, 0.1, state.v.shape)
     return system, dataclasses.replace(state, q=system.retract(state.q, jnp.asarray(step)))
@@ -52,8 +52,8 @@ def run(name, integrator, law):
 @pytest.mark.parametrize(("name", "integrator", "law"), PAIRS)
 def test_a_method_finds_its_way_back(name, integrator, law):
     status, off = run(name, integrator, law)
-    assert status in (jc.Status.OK, jc.Status.CONFLICT)  # of the first steps
-    assert off < (5e-3 if law == "PID" else 1e-3)  # what it has summed up takes long to go
+    assert status in (jc.Status.OK, jc.Status.CONFLICT)  # CONFLICT in the first steps
+    assert off < (5e-3 if law == "PID" else 1e-3)  # the integral of PID decays slowly
 
 
 def test_without_a_stabilizer_it_stays_off():

@@ -1,4 +1,4 @@
-"""One-sided constraints from a user's function, against contacts and hand calculations."""
+"""User-defined inequality constraints, compared with contacts and hand calculations."""
 
 import dataclasses
 
@@ -13,27 +13,27 @@ G = 9.81
 H = 1e-3
 both = pytest.mark.parametrize("dim", [2, 3])
 solvers = pytest.mark.parametrize(
-    "solver", [jc.InteriorPoint(), jc.GaussSeidel()], ids=lambda x: type(x).__name__
+    "solver", [jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel()], ids=lambda x: type(x).__name__
 )
 
 
 def above(pose, t, params):
-    """Height over a plane."""
+    """Returns φ, the height over a plane."""
     return pose.position[-1:] - params
 
 
 def inside(pose, t, params):
-    """(r² − |x|²)/2 in a bowl about the origin."""
+    """Returns φ = (r² − |x|²)/2 of a bowl about the origin."""
     return (params**2 - pose.position @ pose.position)[None] / 2
 
 
 def corner(q, t, params):
-    """Right of one wall and above another, which moves."""
+    """Returns the distances from a fixed wall and from a moving one."""
     return q - jnp.stack([params["wall"], params["speed"] * t])
 
 
 def ball(dim, element, velocity=0.0, dtype=None):
-    """A ball of 2 kg, one metre up."""
+    """A ball of 2 kg at a height of one meter."""
     rest = (0.0,) * (dim - 1)
     scene = jc.Scene(dim=dim, dtype=dtype)
     inertia = 1.0 if dim == 2 else (1.0, 1.0, 1.0)
@@ -55,7 +55,7 @@ def roll(system, state, steps, method=None, h=H):
 @both
 @pytest.mark.parametrize("numbers", [{"restitution": 0.6}, {"stiffness": 4e3, "damping": 9.0}])
 def test_height_over_a_plane_is_a_contact_without_friction(dim, numbers):
-    own = jc.Inequality(above, ("ball",), "floor", jnp.asarray(0.2), **numbers)
+    own = jc.contacts.Inequality(above, ("ball",), "floor", jnp.asarray(0.2), **numbers)
     point = (*(0.0,) * (dim - 1), 0.2)
     given = jc.PlaneContact("floor", jc.WORLD, "ball", point=point, **numbers)
     found, expected = (roll(*ball(dim, element), 900)[1] for element in (own, given))
@@ -68,16 +68,16 @@ def test_height_over_a_plane_is_a_contact_without_friction(dim, numbers):
 @pytest.mark.parametrize(
     ("dim", "solver", "dtype"),
     [
-        (3, jc.InteriorPoint(), "float64"),
-        (2, jc.InteriorPoint(), "float32"),
-        (3, jc.GaussSeidel(), "float32"),
+        (3, jc.solvers.InteriorPoint(), "float64"),
+        (2, jc.solvers.InteriorPoint(), "float32"),
+        (3, jc.solvers.GaussSeidel(), "float32"),
     ],
 )
 def test_a_ball_rests_in_a_bowl(dim, solver, dtype):
-    """φ = (r² − |x|²)/2 has J = −xᵀ, so that at the bottom λ = m g/r."""
-    element = jc.Inequality(inside, ("ball",), "bowl", 2.0)
+    """φ = (r² − |x|²)/2 has J = −xᵀ, so that λ = m g/r at the bottom."""
+    element = jc.contacts.Inequality(inside, ("ball",), "bowl", 2.0)
     system, state = ball(dim, element, dtype=jnp.dtype(dtype))
-    method = jc.Method(bounded=solver)
+    method = jc.Method(contact_solver=solver)
     final, (q, _, reactions) = roll(system, state, 1500, method)
     tight = 1e-9 if dtype == "float64" else 2e-6
     np.testing.assert_allclose(jc.position(system, final, "ball")[-1], -2.0, rtol=tight)
@@ -87,14 +87,14 @@ def test_a_ball_rests_in_a_bowl(dim, solver, dtype):
 
 @solvers
 def test_two_walls_on_generalized_coordinates(solver):
-    """A particle pressed by (−3, −5) N into a corner of which one wall moves at 0.5 m/s."""
+    """A force of (−3, −5) N presses a particle into a corner; one wall moves at 0.5 m/s."""
     system = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.full(2, p["mass"]),
         force=lambda q, v, t, u, p: jnp.asarray([-3.0, -5.0]),
-        constraints=[jc.Inequality(corner, name="walls")],
+        constraints=[jc.contacts.Inequality(corner, name="walls")],
         params={"mass": jnp.asarray(2.0), "wall": jnp.asarray(-1.0), "speed": jnp.asarray(0.5)},
     )
-    method = jc.Method(bounded=solver)
+    method = jc.Method(contact_solver=solver)
     state = jc.init(system, method, jnp.asarray([0.0, 0.3]), jnp.zeros(2))
     final, (_, v, reactions) = roll(system, state, 2000, method)
     np.testing.assert_allclose(final.q, [-1.0, 1.0], atol=1e-9)
@@ -103,12 +103,12 @@ def test_two_walls_on_generalized_coordinates(solver):
 
 
 def fall(dim=2):
-    element = jc.Inequality(inside, ("ball",), "bowl", jnp.asarray(1.5), restitution=0.5)
+    element = jc.contacts.Inequality(inside, ("ball",), "bowl", jnp.asarray(1.5), restitution=0.5)
     return ball(dim, element, velocity=-1.0)
 
 
 def landing(system, state, radius, speed):
-    """Where a ball is after it has bounced off a bowl."""
+    """Returns the height of a ball after it bounces off a bowl."""
     system = system.with_params({"bowl": {"params": radius}})
     start = dataclasses.replace(state, v=state.v * speed)
     final, _ = jc.rollout(system, jc.Method(), start, None, jnp.asarray(2e-3), 400)
@@ -130,19 +130,19 @@ def test_derivatives_are_differences_and_batches_are_loops():
 
 
 def apart(a, b, t, params):
-    """The square of a distance, whose derivative vanishes with it."""
+    """Returns φ from a squared distance, whose gradient vanishes at distance zero."""
     gap = b.position - a.position
     return (gap @ gap - params)[None]
 
 
 def test_a_tangent_is_finite_where_a_row_hardly_moves_anything():
-    """G is 1e-20 there, and 1/G² beyond float32, which zero times must not make NaN."""
+    """There G is 1e-20, and 1/G² overflows in float32; times zero, it must not give NaN."""
 
     def tangents(dtype):
         scene = jc.Scene(dim=2, dtype=dtype)
         for name in ("a", "b"):
             scene.add_body(name, mass=1.0, inertia=0.8)
-        scene.add(jc.Inequality(apart, ("a", "b"), "law", jnp.asarray(1.0, dtype)))
+        scene.add(jc.contacts.Inequality(apart, ("a", "b"), "law", jnp.asarray(1.0, dtype)))
         system, state = scene.build()
         step = lambda q: jc.step(system, jc.Method(), dataclasses.replace(state, q=q), None, 0.01)  # noqa: E731
         near = state.q.at[system.layout.q("b")[0]].set(2e-10)
@@ -157,8 +157,8 @@ def test_it_goes_with_events_and_with_the_nearest_rows():
     system, state = fall()
     methods = (
         jc.Method(),
-        jc.Method(bounded=jc.Nearest(jc.InteriorPoint(), stops=1)),
-        jc.Method(events=jc.Events()),
+        jc.Method(contact_solver=jc.solvers.ActiveSet(jc.solvers.InteriorPoint(), stops=1)),
+        jc.Method(events=jc.integrators.Events()),
     )
     ends = [roll(system, state, 400, m)[0].q for m in methods]
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-10)
@@ -171,7 +171,7 @@ def test_its_numbers_are_leaves():
     assert changed.params["bowl"]["restitution"] == 0.25
     assert jc.violation(changed, state).worst == 0
     with pytest.raises(ValueError, match=r"restitution given as the number 0 leaves no rows"):
-        ball(2, jc.Inequality(inside, ("ball",), "bowl", 2.0))[0].with_params(
+        ball(2, jc.contacts.Inequality(inside, ("ball",), "bowl", 2.0))[0].with_params(
             {"bowl": {"restitution": 0.5}}
         )
 
@@ -179,12 +179,21 @@ def test_its_numbers_are_leaves():
 @pytest.mark.parametrize(
     ("element", "message"),
     [
-        (jc.Inequality(lambda p, t, x: p.position[0], ("ball",), "one"), r"must return an array"),
-        (jc.Inequality(above, ("bat",), "one", 0.0), "body 'bat' is unknown"),
-        (jc.Inequality(above, ("ball",), "one", 0.0, restitution=1.5), "must lie in 0 to 1"),
-        (jc.Inequality(above, ("ball",), "one", 0.0, stiffness=-1.0), "stiffness must be positive"),
-        (jc.Inequality(above, ("ball",), "one", 0.0, 0.5, 10.0), "one or the other"),
-        (jc.Inequality(above, (), "one", 0.0), "bodies must be a tuple of names"),
+        (
+            jc.contacts.Inequality(lambda p, t, x: p.position[0], ("ball",), "one"),
+            r"must return an array",
+        ),
+        (jc.contacts.Inequality(above, ("bat",), "one", 0.0), "body 'bat' is unknown"),
+        (
+            jc.contacts.Inequality(above, ("ball",), "one", 0.0, restitution=1.5),
+            "must lie in 0 to 1",
+        ),
+        (
+            jc.contacts.Inequality(above, ("ball",), "one", 0.0, stiffness=-1.0),
+            "stiffness must be positive",
+        ),
+        (jc.contacts.Inequality(above, ("ball",), "one", 0.0, 0.5, 10.0), "one or the other"),
+        (jc.contacts.Inequality(above, (), "one", 0.0), "bodies must be a tuple of names"),
     ],
 )
 def test_what_is_refused(element, message):
@@ -193,13 +202,13 @@ def test_what_is_refused(element, message):
 
 
 def test_restitution_on_generalized_coordinates():
-    """A ball on a floor, of which the force does not tell what is gravity."""
+    """A ball on a floor; the system does not know which part of the force is gravity."""
 
     def force(q, v, t, control, g):
         return jnp.stack([-g])
 
     def height(e, g):
-        floor = jc.Inequality(lambda q, t, p: q, name="floor", restitution=e)
+        floor = jc.contacts.Inequality(lambda q, t, p: q, name="floor", restitution=e)
         system = jc.GeneralizedSystem(
             mass=lambda q, g: jnp.ones(1), force=force, constraints=[floor], params=g
         )

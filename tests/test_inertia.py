@@ -1,4 +1,4 @@
-"""Solids against Gauss quadrature over their volume."""
+"""Inertia of solids, compared with Gauss quadrature over their volume."""
 
 import itertools
 
@@ -20,14 +20,14 @@ def gauss(low, high, n=12):
 
 
 def product(*rules):
-    """Points (k, axis) and weights (k,) of a product of one-dimensional rules."""
+    """Returns points (k, axis) and weights (k,) of a product of one-dimensional rules."""
     points = np.array(list(itertools.product(*(x for x, _ in rules))))
     weights = np.array([np.prod(w) for w in itertools.product(*(w for _, w in rules))])
     return points, weights
 
 
 def ring(n=16):
-    """The rule for a periodic function over a turn, exact for trigonometric polynomials."""
+    """Returns the periodic trapezoidal rule, exact for trigonometric polynomials."""
     return 2 * np.pi * np.arange(n) / n, np.full(n, 2 * np.pi / n)
 
 
@@ -42,7 +42,7 @@ def cylinder(radius, low, high):
 
 
 def ball(radius, low=-1.0, high=1.0, center=0.0):
-    """The part of a ball with low < cos(polar angle) < high."""
+    """The zone of a ball with low < cos(polar angle) < high."""
     polar, weights = product(gauss(0, radius), ring(), gauss(low, high))
     r, angle, c = polar.T
     s = np.sqrt(1 - c**2)
@@ -55,7 +55,7 @@ def together(*parts):
 
 
 def moments(points, weights):
-    """Moments about the axes of a solid of the mass MASS."""
+    """Returns the moments of inertia of a solid of mass MASS about the axes."""
     density = MASS / np.sum(weights)
     squares = np.sum(density * weights[:, None] * points**2, axis=0)
     return np.sum(squares) - squares
@@ -142,7 +142,7 @@ def test_gradient_of_moments_is_that_of_eigenvalues_where_they_repeat():
 
 
 def turn_after_build(tensor):
-    """How a body turned after 0.2 s, from its tensor."""
+    """Returns the orientation of a free body after 0.2 s, by its inertia tensor."""
     scene = jc.Scene(gravity=(0, 0, 0))
     scene.add_body("top", mass=1.0, inertia=tensor, angular_velocity=(1.0, 2.0, 0.5))
     system, state = scene.build()
@@ -152,7 +152,7 @@ def turn_after_build(tensor):
 
 
 def test_motion_does_not_depend_on_the_choice_of_axes():
-    """A body given by a tensor turns as Euler's equations in the user's own frame say."""
+    """A body given by a tensor follows Euler's equations in the user's own frame."""
     tensor, omega = TENSORS["distinct"], np.array([1.0, 2.0, 0.5])
     turn, h = np.eye(3), 1e-4
     for _ in range(2000):
@@ -167,7 +167,7 @@ def test_motion_does_not_depend_on_the_choice_of_axes():
 
 @pytest.mark.parametrize("name", TENSORS)
 def test_the_derivative_by_the_tensor_is_that_of_the_motion(name):
-    """By products of inertia, too, where moments coincide and axes jump."""
+    """Includes products of inertia where moments coincide, so that principal axes jump."""
     tensor, direction = TENSORS[name], random_tensor([0.3, -0.2, 0.5], seed=1)
     slope = np.sum(gradient_after_build(jnp.asarray(tensor)) * direction)
     ends = [value_after_build(jnp.asarray(tensor + h * direction)) for h in (1e-4, -1e-4)]

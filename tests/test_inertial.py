@@ -1,8 +1,8 @@
-"""All ten inertial parameters, changed after the build: the body moves as one built with them.
+"""Inertial parameters changed after the build give the body that is built with them.
 
-What elements fix to a body stays where it is on it, so that every φ and φ̇ at the same place and
-motion of the bodies is what it was; forces do the same work; and accelerations are those of closed
-forms, of MuJoCo, and of a scene that was built so.
+Points and axes of elements stay fixed to the body: at the same motion every φ and φ̇ is unchanged,
+and forces do the same work. Accelerations equal closed forms, those of MuJoCo, and those of a scene
+that was built with the new parameters.
 """
 
 import jax
@@ -17,13 +17,13 @@ from jaxcon.constraints.couplings import Couplings
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.lanes import Vector
 from jaxcon.geometry import inertia
-from jaxcon.model.elements import Elements, Grid
-from jaxcon.model.forces import CustomForces
-from jaxcon.model.inertial import DIRECTIONS, POINTS
+from jaxcon.system.elements import Elements, Grid
+from jaxcon.system.forces import CustomForces
+from jaxcon.system.inertial import DIRECTIONS, POINTS
 
 
 def random_solid(random, dim, dtype="float64"):
-    """Mass, centre of mass and inertia of a body that can exist."""
+    """Returns mass, center of mass and inertia of a physically possible body."""
     center = jnp.asarray(0.3 * random.normal(size=dim), dtype)
     mass = jnp.asarray(random.uniform(0.5, 2.0), dtype)
     if dim == 2:
@@ -37,7 +37,7 @@ def random_solid(random, dim, dtype="float64"):
 
 
 def with_random_solids(system, seed=0):
-    """The system with other numbers for every rigid body."""
+    """Returns the system with random inertial parameters of every rigid body."""
     random = np.random.default_rng(seed)
     dim, dtype = system.layout.dim, system.gravity.dtype
     rigid = [name for name in system.layout.bodies if "center" in system.params[name]]
@@ -45,7 +45,7 @@ def with_random_solids(system, seed=0):
 
 
 def user_motions(system, state):
-    """Where every body's own frame is and how it moves."""
+    """Returns pose and motion of every body's own frame."""
     return [system.motion(name, state.q, state.v) for name in system.layout.bodies]
 
 
@@ -62,7 +62,7 @@ PLACES = [name for dim in (2, 3) for name in scenes.parts(dim, "loop")]
 def test_what_is_fixed_to_a_body_stays_where_it_is_on_it(name):
     built = scenes.build(name)
     changed = with_random_solids(built.system)
-    state = jc.restate(built.off, built.system, changed)
+    state = jc.systems.restate(built.off, built.system, changed)
     assert float(jnp.max(jnp.abs(state.q - built.off.q))) > 0.01
     close(user_motions(changed, state), user_motions(built.system, built.off))
     before, after = norms(built.system, built.off), norms(changed, state)
@@ -70,9 +70,9 @@ def test_what_is_fixed_to_a_body_stays_where_it_is_on_it(name):
 
 
 def norms(system, state):
-    """‖φ‖ and ‖φ̇‖ of every constraint but momenta, which are not of the place of a body.
+    """Returns ‖φ‖ and ‖φ̇‖ of every constraint except momenta, and all joint coordinates and rates.
 
-    And every coordinate of its joints, with its rate.
+    Momenta depend on the inertial parameters.
     """
     rows, read = jax.jit(lambda: (linearize(system, *place(state)), coordinates(system, state)))()
     found = {
@@ -94,8 +94,8 @@ def coordinates(system, state):
         for group in system.constraints
         if not isinstance(group, Couplings)
         for name in group.names
-        for coordinate in getattr(getattr(group, "joint", None), "coordinates", ())
-        if system.layout.dim == 3 or coordinate != "y"  # of a point on a line of the plane
+        for coordinate in getattr(group.law, "coordinates", ())
+        if system.layout.dim == 3 or coordinate != "y"  # y of a point on a line in the plane
     ]
     return {
         f"{name}.{key}": [f(system, state, name, key) for f in (jc.coordinate, jc.coordinate_rate)]
@@ -104,7 +104,7 @@ def coordinates(system, state):
 
 
 def elements():
-    """All groups of elements between bodies of the joints' table, contacts and forces."""
+    """Yields all groups of joints of the table, contacts and forces between bodies."""
     for dim in (2, 3):
         scene = jc.Scene(dim=dim)
         for kind in [kind for kind, joint in scenes.JOINTS.items() if dim in joint.dims]:
@@ -115,7 +115,7 @@ def elements():
 
 
 PLAIN = {"force", "value", "size", "heights", "coefficients", "parts", "relaxed"}
-"""First words of fields of several numbers that are no point or direction of a body."""
+"""First words of the names of array fields that are not points or directions of a body."""
 
 
 def test_every_field_of_several_numbers_is_known_by_its_name():
@@ -130,26 +130,26 @@ def test_every_field_of_several_numbers_is_known_by_its_name():
 
 
 def twisted():
-    """A twist, which has no rows, and what reads it."""
+    """A twist, which has no rows, and a spring on it."""
     scene = jc.Scene()
     random = np.random.default_rng(8)
     for name in ("first", "second"):
         scenes.add_random_body(scene, name, random)
-    scene.add(jc.Twist("twist", "first", "second", axis=(1.0, 2.0, 0.5)))
-    scene.add(jc.JointSpring("coil", "twist", stiffness=2.0))
+    scene.add(jc.joints.Twist("twist", "first", "second", axis=(1.0, 2.0, 0.5)))
+    scene.add(jc.forces.JointSpring("coil", "twist", stiffness=2.0))
     return scene.build()
 
 
 def test_a_twist_reads_what_it_did():
     system, state = twisted()
     changed = with_random_solids(system)
-    after = jc.restate(state, system, changed)
+    after = jc.systems.restate(state, system, changed)
     close(coordinates(changed, after), coordinates(system, state))
     assert len(coordinates(system, state)) == 1
 
 
 def contacts_scene():
-    """Every element that has bounded multipliers between bodies, with points of its own."""
+    """Every kind of inequality element between bodies, with points off their frames."""
     random = np.random.default_rng(1)
     scene = jc.Scene(dim=3)
     for name in ("first", "second", "third"):
@@ -160,15 +160,19 @@ def contacts_scene():
     ends = {"segment_a": points[:2], "segment_b": points[2:4], "radius_a": 0.1, "radius_b": 0.2}
     scene.add(jc.PlaneContact("ball", "first", "second", center=points[1], point=points[2]))
     scene.add(jc.PlaneContact("points", "second", "first", center=points, friction=0.3))
-    scene.add(jc.BoxContact("box", "second", "third", friction=0.2, **box))
-    scene.add(jc.HeightFieldContact("ground", "third", "first", **field))
-    scene.add(jc.CapsuleContact("capsules", "first", "third", **ends))
-    scene.add(jc.Rope("rope", "first", "second", point_a=points[4], point_b=points[5], length=0.5))
+    scene.add(jc.contacts.BoxContact("box", "second", "third", friction=0.2, **box))
+    scene.add(jc.contacts.HeightFieldContact("ground", "third", "first", **field))
+    scene.add(jc.contacts.CapsuleContact("capsules", "first", "third", **ends))
+    scene.add(
+        jc.contacts.Rope(
+            "rope", "first", "second", point_a=points[4], point_b=points[5], length=0.5
+        )
+    )
     return scene.build()
 
 
 def gaps(system, state):
-    """φ and φ̇ of every bounded row."""
+    """Returns φ and φ̇ of every inequality row."""
     snapshot = system.snapshot(state.q, state.v, state.time)
     sets = [group.bounds(snapshot, None, jnp.asarray(1e-3)) for group in system.bounds]
     return [(row.value, row.rate) for rows in sets for row in rows.rows[:1]]
@@ -177,12 +181,12 @@ def gaps(system, state):
 def test_what_touches_stays_where_it_is_on_its_body():
     system, state = contacts_scene()
     changed = with_random_solids(system)
-    got, expected = gaps(changed, jc.restate(state, system, changed)), gaps(system, state)
-    close(got, expected, 1e-8)  # the nearest point of a height field is found by a descent
+    got, expected = gaps(changed, jc.systems.restate(state, system, changed)), gaps(system, state)
+    close(got, expected, 1e-8)  # the search of a height field is iterative
 
 
 def pushed_scene():
-    """Forces between bodies, at points of their own."""
+    """Forces between bodies, at points off their frames."""
     random = np.random.default_rng(2)
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
     for name in ("first", "second", "third"):
@@ -190,18 +194,18 @@ def pushed_scene():
     p = random.normal(size=(7, 3))
     scene.add(jc.Spring("spring", "first", "second", 3.0, 0.2, 0.5, point_a=p[0], point_b=p[1]))
     ends = {"point_a": p[2], "point_b": p[3], "point_c": p[4]}
-    scene.add(jc.Bending("strip", "first", "second", "third", 2.0, **ends))
-    scene.add(jc.Force("wind", "third", force=(1.0, 2.0, 3.0), point=p[5]))
-    scene.add(jc.ExternalWrench("push", "second", point=p[6]))
+    scene.add(jc.forces.Bending("strip", "first", "second", "third", 2.0, **ends))
+    scene.add(jc.forces.Force("wind", "third", force=(1.0, 2.0, 3.0), point=p[5]))
+    scene.add(jc.forces.ExternalWrench("push", "second", point=p[6]))
     return scene.build()
 
 
 def test_forces_do_the_same_work():
-    """f·v of springs and bending, of a force at a point and of a wrench; gravity is another."""
+    """Compares the power f·v of springs, bending, a point force and a wrench, without gravity."""
     system, state = pushed_scene()
     changed = with_random_solids(system)
     control = jnp.asarray(np.random.default_rng(3).normal(size=6))
-    after = jc.restate(state, system, changed)
+    after = jc.systems.restate(state, system, changed)
     power = system.applied(state.q, state.v, state.time, control) @ state.v
     same = changed.applied(after.q, after.v, after.time, control) @ after.v
     np.testing.assert_allclose(same, power, rtol=DERIVATIVE)
@@ -210,7 +214,7 @@ def test_forces_do_the_same_work():
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_a_body_pinned_off_its_centre_swings_as_the_closed_form_says(dtype):
-    """θ̈ = −m g d cos θ / (I + m d²) of a bar that leaves the level with its centre at d."""
+    """θ̈ = −m g d cos θ / (I + m d²) for a level bar with its center of mass at distance d."""
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
     scene.add(jc.Revolute("pin", jc.WORLD, "bar", point=(0.0, 0.0)))
@@ -221,7 +225,7 @@ def test_a_body_pinned_off_its_centre_swings_as_the_closed_form_says(dtype):
         changed = system.with_params(
             {"bar": {"mass": mass, "inertia": moment, "center": jnp.stack([center, 0 * center])}}
         )
-        state = jc.restate(level, system, changed)
+        state = jc.systems.restate(level, system, changed)
         found = jc.forward_dynamics(changed, state, None, jc.Method(), 1e-3)
         return found.acceleration[2]
 
@@ -247,15 +251,15 @@ def spinning():
 
 
 def turned(system, state, params):
-    """ω̇ in the frame of the body as given, of a body that turns freely."""
+    """Returns ω̇ of a free body in its own frame."""
     changed = system.with_params({"stone": params})
-    after = jc.restate(state, system, changed)
+    after = jc.systems.restate(state, system, changed)
     a = jc.forward_dynamics(changed, after, None, jc.Method(), 1e-3).acceleration
     return jc.quaternion.rotate(changed.params["stone"]["axes"], a[3:])
 
 
 def euler(tensor, ω):
-    """I ω̇ = −ω × I ω."""
+    """Returns ω̇ of Euler's equation I ω̇ = −ω × I ω."""
     return jnp.linalg.solve(tensor, -jnp.cross(ω, tensor @ ω))
 
 
@@ -269,13 +273,13 @@ def test_a_free_body_turns_as_eulers_equation_says():
 
 
 def symmetric(slope):
-    """A derivative by a matrix as one by its symmetric part."""
+    """Returns the symmetric part of a derivative by a matrix."""
     return (slope + slope.swapaxes(-1, -2)) / 2
 
 
 @pytest.mark.parametrize("by", ["axes", "inertia", "center", "mass"])
 def test_derivatives_of_a_ball_are_finite_and_right(by):
-    """Where every axis is principal, none of them matters."""
+    """All axes of a ball are principal, so the choice of axes has no effect."""
     system, state = spinning()
     known = system.params["stone"]["axes" if by == "axes" else by]
     slope = jax.jit(jax.jacrev(lambda x: turned(system, state, {by: x})))(known)
@@ -286,7 +290,7 @@ def test_derivatives_of_a_ball_are_finite_and_right(by):
 
 @pytest.mark.parametrize("dim", [2, 3])
 def test_it_is_the_body_that_a_scene_is_built_with(dim):
-    """All four at once by an `Inertia`, beside a scene with it from the start."""
+    """Sets all four parameters at once by an `Inertia`, and compares with a scene built with it."""
     given = random_solid(np.random.default_rng(4), dim)
     moments, axes = given["inertia"], None
     if dim == 3:
@@ -306,20 +310,20 @@ def test_it_is_the_body_that_a_scene_is_built_with(dim):
     got = plain.with_params({"link": {"inertia": solid}})
     assert jax.tree.structure(got) == jax.tree.structure(wanted)
     close(jax.tree.leaves(got), jax.tree.leaves(wanted))
-    close(jc.restate(state, plain, got), begin)
+    close(jc.systems.restate(state, plain, got), begin)
     back = got.with_params({"link": plain.params["link"]})
     close(back.constraints[0].params, plain.constraints[0].params)
 
 
 def test_a_loop_closes_again_and_the_way_is_differentiable():
-    """Energy at assembly by the coupler's centre of mass: m g is its slope upwards."""
+    """The derivative of the potential energy by the coupler's center of mass is m g upwards."""
     from jaxcon.scenes import four_bar
 
     system, state = four_bar()
 
     def potential(center):
         changed = system.with_params({"coupler": {"center": center}})
-        moved = jc.restate(state, system, changed)
+        moved = jc.systems.restate(state, system, changed)
         closed = jc.assemble(changed, moved, hold="crank").state
         return jc.energy(changed, closed).potential
 
@@ -332,7 +336,7 @@ def test_a_loop_closes_again_and_the_way_is_differentiable():
 
 
 def test_links_of_a_model_of_mujoco_move_as_there():
-    """MuJoCo's own links with another mass, centre, axes and moments."""
+    """Compares with MuJoCo's links after a change of mass, center, axes and moments."""
     mujoco = pytest.importorskip("mujoco")
     model = mujoco.MjModel.from_xml_string(ARM)
     read = jc.from_mjcf(model)
@@ -354,7 +358,7 @@ def test_links_of_a_model_of_mujoco_move_as_there():
     changed = read.with_params(changes)
     state = changed.state(jnp.asarray(data.qpos), jnp.asarray(data.qvel))
     close(changed.qpos(state), data.qpos)
-    method = jc.Method(jc.RK4(), jc.Unstabilized(), jc.Dense())
+    method = jc.Method(jc.RK4(), jc.stabilizers.Unstabilized(), jc.solvers.Dense())
     a = jc.forward_dynamics(changed.system, state, jnp.zeros(0), method, 1e-3).acceleration
     close(changed.qacc(state, a), data.qacc, 1e-8)
     close(changed.qpos(changed.start), read.qpos(read.start))
@@ -386,7 +390,7 @@ def test_every_choice_of_ten_numbers_is_a_body():
 
 
 def test_a_box_has_the_ten_numbers_of_its_integrals():
-    """Σ of a box is diagonal, m b²/12 along each edge b."""
+    """The second moment Σ of a box is diagonal, m b²/12 along each edge b."""
     edges = np.array([0.3, 0.5, 0.9])
     theta = inertia.log_cholesky(inertia.box(2.5, tuple(edges)))
     expected = [np.log(2.5) / 2, *np.log(edges**2 / 12) / 2, 0, 0, 0, 0, 0, 0]
@@ -396,12 +400,12 @@ def test_a_box_has_the_ten_numbers_of_its_integrals():
 def test_a_state_without_other_frames_stays_what_it_is():
     built = scenes.build("mixed-3d")
     heavier = built.system.with_params({"first": {"mass": 3.0}})
-    close(jc.restate(built.state, built.system, heavier), built.state, 1e-15)
+    close(jc.systems.restate(built.state, built.system, heavier), built.state, 1e-15)
 
 
 def rod_scene():
     scene = jc.Scene(dim=3)
-    jc.rod(scene, "rod", np.linspace((0, 0, 0), (1, 0, 0), 3), 1.0, radius=0.01, bending=1.0)
+    jc.chains.rod(scene, "rod", np.linspace((0, 0, 0), (1, 0, 0), 3), 1.0, radius=0.01, bending=1.0)
     return scene.build()
 
 
@@ -442,7 +446,7 @@ def test_what_goes_by_principal_axes_says_so():
         system.with_params({name: {"axes": (1.0, 1.0, 0.0, 0.0)}})
     with pytest.raises(ValueError, match="principal axes of their bodies, which must not turn"):
         system.with_params({name: {"inertia": jnp.diag(jnp.asarray([3.0, 1.0, 2.5]))}})
-    same = jax.jit(system.with_params)(system.params)  # numbers of which nothing is known
+    same = jax.jit(system.with_params)(system.params)  # traced parameters
     close(same.forces[0].params, system.forces[0].params)
 
 
@@ -452,7 +456,7 @@ def shape(tree):
 
 @pytest.mark.parametrize("build", [rod_scene, lambda: (scenes.build("mixed-3d").system, None)])
 def test_a_traced_mass_leaves_frames_and_structure_alone(build):
-    """Under jit too, where no number is known: what is not given has not moved."""
+    """Under jit no number is known, yet parameters that are not given stay the same."""
     system, _ = build()
     name = next(n for n in system.layout.bodies if "center" in system.params[n])
 
@@ -486,26 +490,28 @@ def test_an_inertia_without_a_centre_in_single_precision():
 
 def test_what_a_method_remembers_is_not_of_the_new_frames():
     system, state = spinning()
-    method = jc.Method(jc.GeneralizedAlpha(), jc.Unstabilized())
+    method = jc.Method(jc.integrators.GeneralizedAlpha(), jc.stabilizers.Unstabilized())
     state = jc.init(system, method, state.q, state.v)
     turned = system.with_params({"stone": {"axes": (1.0, 1.0, 0.0, 0.0)}})
-    after = jc.restate(state, system, turned)
+    after = jc.systems.restate(state, system, turned)
     with pytest.raises((TypeError, ValueError), match="init"):
         jc.step(turned, method, after, None, 1e-3)
-    assert jc.restate(state, system, system.with_params({"stone": {"mass": 2.0}})).memory != ()
+    assert (
+        jc.systems.restate(state, system, system.with_params({"stone": {"mass": 2.0}})).memory != ()
+    )
 
 
 def test_systems_of_other_bodies_have_other_states():
     one, other = scenes.build("mixed-3d"), scenes.build("mixed-2d")
     with pytest.raises(ValueError, match="the same bodies in the same order"):
-        jc.restate(one.state, one.system, other.system)
+        jc.systems.restate(one.state, one.system, other.system)
 
 
 def test_a_recording_under_known_forces_tells_all_ten():
-    """A body thrown and pushed at a point of its frame, seen with noise; θ within its errors."""
+    """A body is thrown and pushed at a point of its frame; θ lies within its errors."""
     scene = jc.Scene(dim=3)
     scene.add_body("stone", mass=1.0, inertia=(0.1, 0.1, 0.1), angular_velocity=(1.0, 2.0, -1.0))
-    scene.add(jc.ExternalWrench("push", "stone", point=(0.0, 0.0, 0.0)))
+    scene.add(jc.forces.ExternalWrench("push", "stone", point=(0.0, 0.0, 0.0)))
     system, state = scene.build()
     random = np.random.default_rng(7)
     pushes = jnp.asarray(random.normal(size=(80, 6)) * np.repeat([3.0, 0.5], 3))
@@ -513,7 +519,7 @@ def test_a_recording_under_known_forces_tells_all_ten():
 
     def seen(theta):
         body = system.with_params({"stone": {"inertia": inertia.from_log_cholesky(theta)}})
-        start = jc.restate(state, system, body)
+        start = jc.systems.restate(state, system, body)
 
         def look(s, info):
             motion = body.motion("stone", s.q, s.v)
@@ -534,6 +540,6 @@ def test_a_recording_under_known_forces_tells_all_ten():
 
 
 def random_tensor(random):
-    """Returns the inertia of a body of about a metre."""
+    """Returns the inertia of a body of about one meter."""
     axes, _ = np.linalg.qr(random.normal(size=(3, 3)))
     return axes @ np.diag([0.12, 0.2, 0.25]) @ axes.T

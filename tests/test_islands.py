@@ -1,16 +1,16 @@
-"""Islands of equality rows, and those in which a stop or contact acts."""
+"""Islands of equality rows, and the islands in which a stop or contact is active."""
 
 import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
-from jaxcon.constraints.bounds import linearize_at_rest
 from jaxcon.constraints.rows import linearize
-from jaxcon.dynamics.islands import islands, largest_by_island, rows_beside_contact
+from jaxcon.contact.rows import linearize_at_rest
+from jaxcon.linear.islands import islands, largest_by_island, rows_beside_contact
 
 
 def doors(stops=(0, 1)):
-    """Two doors, the first of two leaves, some with stops, a ball on the second, and friction."""
+    """Two doors, the first with a second leaf; stops, a ball on a floor, and friction."""
     scene = jc.Scene(dim=2)
     for i in range(2):
         scene.add_body(f"door{i}", mass=1.0, inertia=0.1, position=(10.0 * i + 0.5, 0.0))
@@ -20,7 +20,7 @@ def doors(stops=(0, 1)):
     scene.add_body("loose", mass=1.0, inertia=0.1, position=(50.0, 0.0))
     for i in stops:
         scene.add(jc.Limit(f"stop{i}", f"post{i}", 0.0, 1.0))
-    scene.add(jc.JointFriction("rub", "post0", 1.0))
+    scene.add(jc.contacts.JointFriction("rub", "post0", 1.0))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "loose", friction=0.5))
     system, state = scene.build()
     rows = linearize(system, state.q, state.v, state.time)
@@ -50,7 +50,10 @@ def test_the_largest_number_is_that_of_the_island():
 
 
 def test_a_stop_that_acts_marks_the_rows_of_its_island_alone():
-    """World by world; joint friction, and a contact of a body without joints, mark none."""
+    """Marks differ by world.
+
+    Joint friction and the contact of a body without joints mark no rows.
+    """
     _, rows, bounds = doors()
     own = {name: bounds.layout.rows(name) for name in bounds.layout.names}
     λ = np.zeros((bounds.kinds.size, 5))

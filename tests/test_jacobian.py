@@ -5,12 +5,12 @@ import scenes
 from tolerances import IDENTITY
 
 from jaxcon.core.lanes import Vector
-from jaxcon.solvers.jacobian import Block, Columns, Jacobian
+from jaxcon.linear.jacobian import Block, Columns, Jacobian
 
 
 @pytest.fixture
 def small():
-    """Two rows each on bodies 0 and 2 of three, with two components, after a column of others."""
+    """Four rows on bodies 0 and 2, one on body 1; column 0 belongs to other coordinates."""
     columns = Columns(start=1, components=2, bodies=3, indices=(0, 2))
     one, two = jnp.asarray([1.0, 2.0]), jnp.asarray([3.0, 4.0])
     block = Block((Vector(one, 0.0), Vector(1.0, two)), 0, columns)

@@ -1,7 +1,7 @@
-"""No joint prefers a frame: turned scenes move alike, axes have no length or sign, no row is idle.
+"""Joints have no preferred frame: rotated scenes move alike, and the length of axes has no effect.
 
-The directions normal to an axis are chosen by where it points in the world, so a turned scene has
-other ones in its bodies.
+The directions normal to an axis depend on its direction in the world. In a rotated scene they are
+therefore other directions of the bodies.
 """
 
 import dataclasses
@@ -18,14 +18,14 @@ import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 
 LEFT_OUT = ("holonomic", "velocity_level", "driven_planar")
-"""Functions of the tests themselves, and the coordinate y, whose direction is a chosen one."""
+"""Functions of the tests themselves, and the coordinate y, whose direction is conventional."""
 
 TURN = np.array([0.3, -0.7, 0.5, 0.4]) / np.linalg.norm([0.3, -0.7, 0.5, 0.4])
 ANGLE = 0.8
 
 
 def rotation(dim):
-    """A turn of the whole scene."""
+    """The rotation of the whole scene."""
     if dim == 3:
         return np.asarray(jc.quaternion.matrix(jnp.asarray(TURN)))
     c, s = np.cos(ANGLE), np.sin(ANGLE)
@@ -34,11 +34,11 @@ def rotation(dim):
 
 @dataclasses.dataclass(frozen=True)
 class Variant:
-    """How a scene differs from the one that it is compared with."""
+    """The differences of a scene from its reference."""
 
     turned: bool = False
     stretch: float = 1.0
-    """A factor of every axis."""
+    """The factor of every axis."""
 
 
 def turn_of(dim, variant):
@@ -46,7 +46,10 @@ def turn_of(dim, variant):
 
 
 PARTS = [(dim, part) for dim, parts in scenes.PARTS.items() for part in range(parts)]
-"""Dimensions and parts of the table; one scene of all joints compiles several times as long."""
+"""Dimensions and parts of the table.
+
+One scene of all joints would compile several times as long.
+"""
 
 
 def kinds_in(dim, part):
@@ -55,7 +58,7 @@ def kinds_in(dim, part):
 
 
 def pair(scene, kind, variant):
-    """The two bodies of a joint, at random places, and the joint."""
+    """Adds the two bodies of a joint, at random places, and the joint."""
     dim, random = scene.dim, scenes.seeded(kind, scene.dim, "frames")
     r = turn_of(dim, variant)
     for body, near in (("first", (0.1, -0.1)), ("second", (1.5, 0.5))):
@@ -72,8 +75,8 @@ def pair(scene, kind, variant):
     axis = r @ random.normal(size=dim)
     site = scenes.Site(f"first_{kind}", f"second_{kind}", dim, point, axis, other, "_" + kind)
     elements = scenes.JOINTS[kind].make(site)
-    # of drives and cams the axis says in which sense they turn
-    sense = kind == "cam" or any(isinstance(element, jc.Drive) for element in elements)
+    # for drives and cams the sign of the axis matters
+    sense = kind == "cam" or any(isinstance(element, jc.joints.Drive) for element in elements)
     stretch = abs(variant.stretch) if sense else variant.stretch
     for element in elements:
         given = [f for f in ("axis", "axis_a", "axis_b") if getattr(element, f, None) is not None]
@@ -83,7 +86,7 @@ def pair(scene, kind, variant):
 
 @functools.cache
 def build(dim, part, variant):
-    """Every joint of a part between two bodies of its own."""
+    """Builds every joint of a part, each between two bodies of its own."""
     gravity = turn_of(dim, variant) @ np.array((0.3, 1.0, -9.81)[-dim:])
     scene = jc.Scene(dim=dim, gravity=gravity)
     for kind in kinds_in(dim, part):
@@ -94,7 +97,7 @@ def build(dim, part, variant):
 
 @jax.jit
 def equations(system, q, v, t):
-    """φ, φ̇, J, γ, M and f. One trace for all variants."""
+    """Returns φ, φ̇, J, γ, M and f, by one trace for all variants."""
     rows = linearize(system, q, v, t)
     forces = system.mass(q).dense(), system.force(q, v, t)
     return rows.residual, rows.rate, rows.jacobian.dense(), rows.bias, *forces
@@ -105,13 +108,13 @@ move = jax.jit(lambda system, q, step: system.retract(q, step))
 
 @functools.cache
 def moments(dim, part):
-    """Two moving states that the joints allow: at assembly, and far from there."""
+    """Returns two moving states that satisfy the joints: at assembly, and far from it."""
     system, state = build(dim, part, Variant())
     random = scenes.seeded(dim, part, "moments")
     far = move(system, state.q, jnp.asarray(0.3 * random.normal(size=state.v.shape)))
     found = []
     for q, t in ((state.q, 0.0), (far, 0.3)):
-        for _ in range(12):  # of Newton's method, by the shortest way
+        for _ in range(12):  # of Newton's method with the least correction
             residual, _, jacobian, *_ = equations(system, q, state.v, t)
             q = move(system, q, -jnp.linalg.pinv(jacobian) @ residual)
         v = jnp.asarray(random.normal(size=state.v.shape))
@@ -122,7 +125,7 @@ def moments(dim, part):
 
 
 def turn(system, q, v):
-    """A state of the scene as it is after the turn."""
+    """Returns the state of the rotated scene."""
     dim = system.layout.dim
     r = rotation(dim)
     for name in system.layout.bodies:
@@ -136,7 +139,7 @@ def turn(system, q, v):
 
 @functools.cache
 def solved(dim, part, variant):
-    """By joint and moment: a and Jᵀλ of its two bodies, (2, d), and the joint's own J."""
+    """Returns by joint and state: a and Jᵀλ of both bodies, (2, d), and the joint's own J."""
     system, state = build(dim, part, variant)
     rows = scenes.linearized(system, state.q, state.v, state.time).layout
     result = {}
@@ -168,7 +171,7 @@ VARIANTS = {
 @pytest.mark.parametrize(("dim", "part"), PARTS)
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_joints_prefer_no_frame_and_no_axis(dim, part, variant):
-    """Accelerations and forces turn with the scene; those about the axes of bodies stay."""
+    """Accelerations and forces rotate with the scene; components in body frames do not change."""
     r = turn_of(dim, VARIANTS[variant])
     expected, found = (solved(dim, part, v) for v in (Variant(), VARIANTS[variant]))
     for key, (*motion, _) in expected.items():
@@ -181,7 +184,7 @@ def test_joints_prefer_no_frame_and_no_axis(dim, part, variant):
 
 @pytest.mark.parametrize(("dim", "part"), PARTS)
 def test_no_row_of_a_joint_depends_on_the_others(dim, part):
-    """Where the joint was assembled and elsewhere; the row of its drive included."""
+    """Rows have full rank at assembly and far from it, including the row of a drive."""
     for key, (_, _, jacobian) in solved(dim, part, Variant()).items():
         sizes = np.linalg.svd(jacobian, compute_uv=False)
         assert len(sizes) == len(jacobian), key

@@ -1,4 +1,4 @@
-"""Stops, dry friction, rate motors and rate limits of joints, against hand calculations."""
+"""Joint limits, dry friction, rate motors and rate limits, compared with hand calculations."""
 
 import dataclasses
 
@@ -12,13 +12,13 @@ import jaxcon as jc
 
 both = pytest.mark.parametrize("dim", [2, 3])
 solvers = pytest.mark.parametrize(
-    "solver", [jc.InteriorPoint(), jc.GaussSeidel()], ids=lambda x: type(x).__name__
+    "solver", [jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel()], ids=lambda x: type(x).__name__
 )
 H = 1e-3
 
 
 def slider(dim, *elements, dtype=None, gravity=0.0, velocity=0.0):
-    """A slider of 2 kg along the first axis, under gravity along it."""
+    """A slider of 2 kg on a rail along the first axis, with gravity along the rail."""
     rest = (0.0,) * (dim - 1)
     scene = jc.Scene(dim=dim, gravity=(gravity, *rest), dtype=dtype)
     inertia = 1.0 if dim == 2 else (1.0, 1.0, 1.0)
@@ -30,7 +30,7 @@ def slider(dim, *elements, dtype=None, gravity=0.0, velocity=0.0):
 
 
 def run(system, state, steps, control=None, method=None, h=H):
-    """Position, velocity, reactions and status of each step."""
+    """Returns position, velocity, reactions and status of each step."""
     method = jc.Method() if method is None else method
     state = jc.init(system, method, state.q, state.v)
     h = jnp.asarray(h, state.q.dtype)
@@ -47,10 +47,10 @@ def run(system, state, steps, control=None, method=None, h=H):
 @solvers
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_a_slider_stops_at_its_end(dim, solver, dtype):
-    """Falling by 4.905 t² it reaches 0.1 m and stays, held by m g."""
+    """The slider falls by 4.905 t², reaches 0.1 m and stays, held by the force m g."""
     stop = jc.Limit("end", "rail", upper=0.1)
     system, state = slider(dim, stop, dtype=dtype, gravity=9.81)
-    x, v, reactions, status = run(system, state, 300, method=jc.Method(bounded=solver))
+    x, v, reactions, status = run(system, state, 300, method=jc.Method(contact_solver=solver))
     tight = 1e-12 if dtype == jnp.float64 else 1e-6
     assert np.all(status == 0)
     assert float(x.max()) < 0.1 + tight
@@ -70,7 +70,7 @@ def test_between_its_ends_nothing_acts(dim):
 @both
 @pytest.mark.parametrize("e", [0.0, 0.5, 1.0])
 def test_restitution(dim, e):
-    """It hits the end at 0.1 m after 0.2 s, and comes back with e v from that time on."""
+    """The slider hits the stop at 0.1 m after 0.2 s, and comes back with speed e v."""
     system, state = slider(dim, jc.Limit("end", "rail", upper=0.1, restitution=e), velocity=0.5)
     x, v, _, _ = run(system, state, 350)
     np.testing.assert_allclose(v[-1], -0.5 * e, atol=1e-12)
@@ -79,7 +79,7 @@ def test_restitution(dim, e):
 
 @both
 def test_a_soft_end_is_a_spring_and_a_damper(dim):
-    """At rest it is in by m g/k."""
+    """At rest the slider is m g/k beyond the stop."""
     stop = jc.Limit("end", "rail", upper=0.1, stiffness=1e4, damping=100.0)
     system, state = slider(dim, stop, gravity=9.81)
     x, _, reactions, _ = run(system, state, 3000)
@@ -90,21 +90,25 @@ def test_a_soft_end_is_a_spring_and_a_damper(dim):
 @both
 @solvers
 def test_dry_friction_brakes_and_holds(dim, solver):
-    """Braked by τ/m, it stops after v m/τ and stays, though pushed by less than τ."""
-    system, state = slider(dim, jc.JointFriction("rub", "rail", most=3.0), velocity=0.3)
-    _, v, _, _ = run(system, state, 300, method=jc.Method(bounded=solver))
+    """Braked by τ/m, the slider stops after v m/τ; a push of less than τ does not move it."""
+    system, state = slider(
+        dim, jc.contacts.JointFriction("rub", "rail", max_force=3.0), velocity=0.3
+    )
+    _, v, _, _ = run(system, state, 300, method=jc.Method(contact_solver=solver))
     np.testing.assert_allclose(v[99], 0.3 - 1.5 * 0.1, rtol=1e-9)
     np.testing.assert_allclose(v[-1], 0.0, atol=1e-12)
-    system, state = slider(dim, jc.JointFriction("rub", "rail", most=3.0), gravity=1.0)
-    _, v, reactions, _ = run(system, state, 50, method=jc.Method(bounded=solver))
+    system, state = slider(
+        dim, jc.contacts.JointFriction("rub", "rail", max_force=3.0), gravity=1.0
+    )
+    _, v, reactions, _ = run(system, state, 50, method=jc.Method(contact_solver=solver))
     np.testing.assert_allclose(v[-1], 0.0, atol=1e-12)
     np.testing.assert_allclose(reactions["rub"][-1], [-2.0], rtol=1e-9)
 
 
 @both
 def test_a_rate_motor_saturates(dim):
-    """It accelerates by τ/m up to the rate wanted, and no further."""
-    system, state = slider(dim, jc.RateMotor("motor", "rail", most=4.0))
+    """The motor accelerates the slider by τ/m up to the target rate, and no further."""
+    system, state = slider(dim, jc.contacts.RateMotor("motor", "rail", max_force=4.0))
     _, v, reactions, _ = run(system, state, 400, control=jnp.asarray([0.5]))
     np.testing.assert_allclose(v[99], 0.2, rtol=1e-9)
     np.testing.assert_allclose(v[-1], 0.5, rtol=1e-9)
@@ -114,15 +118,17 @@ def test_a_rate_motor_saturates(dim):
 @both
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_rate_limit(dim, sign):
-    system, state = slider(dim, jc.RateLimit("slow", "rail", rate=0.2), gravity=9.81 * sign)
+    system, state = slider(
+        dim, jc.contacts.RateLimit("slow", "rail", rate=0.2), gravity=9.81 * sign
+    )
     _, v, _, _ = run(system, state, 100)
     np.testing.assert_allclose(v[-1], 0.2 * sign, rtol=1e-9)
     assert np.abs(v).max() < 0.2 + 1e-12
 
 
-@pytest.mark.parametrize("integrator", [jc.Heun(), jc.RK4()], ids=["Heun", "RK4"])
+@pytest.mark.parametrize("integrator", [jc.integrators.Heun(), jc.RK4()], ids=["Heun", "RK4"])
 def test_runge_kutta_beside_a_stop(integrator):
-    """The impact is at its time: the stop is met, where a force over the step passed it."""
+    """The step is split at the impact; a force over the whole step would pass the stop."""
     for h in (2e-3, 1e-3):
         system, state = slider(2, jc.Limit("end", "rail", upper=0.1), gravity=9.81)
         x, _, _, _ = run(system, state, 400, method=jc.Method(integrator=integrator), h=h)
@@ -131,7 +137,7 @@ def test_runge_kutta_beside_a_stop(integrator):
 
 
 def test_what_has_passed_comes_back_slowly():
-    """From 0.5 m beyond the end it comes back at the rate of recovery, and leaves no faster."""
+    """A slider 0.5 m beyond the stop comes back at the recovery speed and leaves no faster."""
     system, state = slider(3, jc.Limit("end", "rail", upper=-0.5, recovery=0.2))
     x, v, _, status = run(system, state, 4000)
     assert np.all(status == 0)
@@ -141,7 +147,7 @@ def test_what_has_passed_comes_back_slowly():
 
 
 def swinging(dim):
-    """A chain that swings down into its stops; of two in the plane, of one in space."""
+    """A chain that swings into its stops: two links in the plane, one in space."""
     scene = jc.Scene(dim=dim)
     inertia = 0.08 if dim == 2 else (0.01, 0.08, 0.08)
     rest = (0.0,) * (dim - 1)
@@ -157,9 +163,9 @@ def swinging(dim):
 @both
 @solvers
 def test_gradients_by_the_place_of_a_stop(dim, solver):
-    """By differences, in reverse mode, and in forward mode along one direction."""
+    """Compares reverse mode, forward mode along one direction, and differences."""
     system, state = swinging(dim)
-    method = jc.Method(bounded=solver)
+    method = jc.Method(contact_solver=solver)
     state = jc.init(system, method, state.q, state.v)
 
     def loss(x):
@@ -180,13 +186,13 @@ def test_gradients_by_the_place_of_a_stop(dim, solver):
 
 
 def test_smoothing_lets_a_stop_be_felt_before_it_is_reached():
-    """By the place of a stop that is not reached, the sharp derivative is zero, the smooth not."""
+    """The derivative by an unreached stop is zero without smoothing, and positive with it."""
 
     system, state = slider(2, jc.Limit("end", "rail", upper=0.1), velocity=0.5)
 
     @jax.jit
     def slope(smoothing):
-        method = jc.Method(bounded=jc.InteriorPoint(smoothing=smoothing))
+        method = jc.Method(contact_solver=jc.solvers.InteriorPoint(smoothing=smoothing))
 
         def end(upper):
             changed = system.with_params({"end": {"upper": upper}})
@@ -201,9 +207,11 @@ def test_smoothing_lets_a_stop_be_felt_before_it_is_reached():
 
 
 def test_worlds_are_apart():
-    """vmap is a loop, a world that fails stays alone, and float32 survives."""
+    """A batch equals single runs, a failed world affects no other, and float32 is enough."""
     stop = jc.Limit("end", "rail", upper=0.1, restitution=0.3)
-    system, state = slider(3, stop, jc.JointFriction("rub", "rail", 1.0), dtype=jnp.float32)
+    system, state = slider(
+        3, stop, jc.contacts.JointFriction("rub", "rail", 1.0), dtype=jnp.float32
+    )
     method = jc.Method()
 
     def end(speed):
@@ -233,9 +241,9 @@ def test_worlds_are_apart():
         (jc.Limit("s", "rail", 0.0, 1.0, damping=1.0), "damping is of a soft stop"),
         (jc.Limit("s", "rail", 0.0, 0.0), "lower must be below upper, got 0.0 and 0.0"),
         (jc.Limit("s", "door", 0.0, 1.0), "joint 'door' is unknown"),
-        (jc.JointFriction("f", "rail", -1.0), "most"),
-        (jc.RateLimit("r", "rail", -1.0), "rate"),
-        (jc.RateMotor("m", "rail", -1.0), "most"),
+        (jc.contacts.JointFriction("f", "rail", -1.0), "max_force"),
+        (jc.contacts.RateLimit("r", "rail", -1.0), "rate"),
+        (jc.contacts.RateMotor("m", "rail", -1.0), "max_force"),
     ],
 )
 def test_bad_numbers_are_refused(element, match):
@@ -244,7 +252,7 @@ def test_bad_numbers_are_refused(element, match):
 
 
 def test_parameters_go_back_into_a_system_with_one_stop():
-    """The side without a stop is infinite, and may be given so."""
+    """A missing stop has an infinite limit, which `with_params` accepts."""
     system, _ = slider(2, jc.Limit("end", "rail", upper=0.1))
     again = system.with_params(system.params)
     assert again.params["end"]["lower"] == -jnp.inf
@@ -256,7 +264,7 @@ def test_parameters_go_back_into_a_system_with_one_stop():
 
 @both
 def test_a_soft_end_acts_behind_the_gap(dim):
-    """Its damper neither, however strong: before the end is reached nothing acts."""
+    """Before the stop is reached neither its spring nor its strong damper acts."""
     stop = jc.Limit("end", "rail", upper=0.1, stiffness=1e2, damping=200.0)
     system, state = slider(dim, stop, velocity=1.0)
     x, v, reactions, _ = run(system, state, 99)
@@ -276,9 +284,9 @@ def test_a_step_of_no_length_has_a_derivative():
 
 @solvers
 def test_a_stop_may_be_moved_out_of_reach(solver):
-    """To infinity, as its other side is: in one batch with one that is reached, and derivatives."""
+    """A stop at infinity works in one batch with a stop that is reached, and has derivatives."""
     system, state = slider(2, jc.Limit("end", "rail", upper=0.1), velocity=1.0)
-    method = jc.Method(bounded=solver)
+    method = jc.Method(contact_solver=solver)
     state = jc.init(system, method, state.q, state.v)
 
     def motion(upper, h):
@@ -292,8 +300,8 @@ def test_a_stop_may_be_moved_out_of_reach(solver):
     found = jax.jit(jax.vmap(slopes, in_axes=(0, None)))(uppers, 2e-3)
     slopes, (motions, forces, status) = found
     np.testing.assert_array_equal(status, 0)
-    # sweeps share the landing between two steps
-    swept = isinstance(solver, jc.GaussSeidel)
+    # sweeps spread the landing over two steps
+    swept = isinstance(solver, jc.solvers.GaussSeidel)
     speed, by_upper, by_step = (0.5, 500.0, -250.0) if swept else (0.0, 0.0, 0.0)
     np.testing.assert_allclose(motions, [[2e-3, 1.0], [1e-3, speed]], atol=1e-9)
     np.testing.assert_allclose(forces, [0.0, 1000.0 * (1 - speed)], rtol=1e-9)
@@ -302,7 +310,7 @@ def test_a_stop_may_be_moved_out_of_reach(solver):
 
 
 def between(start, speed, time, half=0.1):
-    """Where a point is that bounces between ±half without loss."""
+    """Returns the position of a point that bounces between ±half without loss."""
     way = np.mod(start + half + speed * time, 4 * half)
     return np.where(way <= 2 * half, way, 4 * half - way) - half
 
@@ -310,14 +318,14 @@ def between(start, speed, time, half=0.1):
 FAST = {
     "euler": jc.Method(),
     "rk4": jc.Method(jc.RK4()),
-    "events": jc.Method(jc.RK4(), events=jc.Events()),
+    "events": jc.Method(jc.RK4(), events=jc.integrators.Events()),
 }
 
 
 @both
 @pytest.mark.parametrize("name", FAST)
 def test_a_rebound_through_the_whole_range_is_a_status(dim, name):
-    """Within the range, and right up to the step that would leave it; other worlds go on."""
+    """The slider stays within the range until a step would leave it; other worlds go on."""
     system, state = slider(dim, jc.Limit("ends", "rail", -0.1, 0.1, restitution=1.0))
     method = FAST[name]
     start = jc.init(system, method, state.q, state.v)
@@ -341,7 +349,7 @@ def test_a_rebound_through_the_whole_range_is_a_status(dim, name):
 @both
 @pytest.mark.parametrize(("e", "lost"), [(0.0, False), (0.5, True), (0.1, False)])
 def test_slow_rebounds_stay_between_the_stops(dim, e, lost):
-    """1000 m/s ends in the range with 0 and 100 m/s, and would not with 500 m/s."""
+    """From 1000 m/s, rebounds at 0 and 100 m/s end within the range; one at 500 m/s would not."""
     stop = jc.Limit("ends", "rail", -0.1, 0.1, restitution=e)
     system, state = slider(dim, stop, velocity=1000.0)
     x, _, _, status = run(system, state, 50)
@@ -350,10 +358,10 @@ def test_slow_rebounds_stay_between_the_stops(dim, e, lost):
 
 
 def test_events_follow_as_many_impacts_as_they_may():
-    """At 500 m/s a step has at most three."""
+    """At 500 m/s a step has at most three impacts."""
     stop = jc.Limit("ends", "rail", -0.1, 0.1, restitution=1.0)
     system, state = slider(2, stop, velocity=500.0)
-    method = jc.Method(jc.RK4(), events=jc.Events(splits=4))
+    method = jc.Method(jc.RK4(), events=jc.integrators.Events(splits=4))
     x, _, _, status = run(system, state, 50, method=method)
     assert np.all(status == 0)
     np.testing.assert_allclose(x, between(0.0, 500.0, H * np.arange(1, 51)), atol=1e-9)

@@ -16,16 +16,16 @@ from jaxcon.core.pytree import pytree
 
 G, H = 9.81, 1e-3
 ONE_PERCENT, TWO_PERCENT = 1e-2, 2e-2
-"""Bounds of derivatives at 1 ms, and of central differences over 5 mm."""
+"""Tolerances of derivatives with steps of 1 ms, and of central differences over 5 mm."""
 INTEGRATORS = {"SIE": jc.SemiImplicitEuler(), "RK4": jc.RK4()}
 ARM, RADIUS, INERTIA = 0.3, 0.05, 0.03
 FRICTION = 0.05, 2.0
-"""With the first the end slides in the impact, with the second it sticks."""
+"""With the first friction the end slides in the impact, with the second it sticks."""
 EXACTLY = {"rtol": 1e-11, "atol": 1e-12}
 
 
 def run_of(system, state, integrator, time, start, read=lambda q: q):
-    """Returns (x, params) → what is read of q at the end of a rollout."""
+    """Returns the function (x, params) → `read` of q at the end of a rollout."""
     method = jc.Method(integrator)
 
     def run(x, params):
@@ -39,13 +39,15 @@ def run_of(system, state, integrator, time, start, read=lambda q: q):
 
 
 def check(run, x, params, want, reverse=False):
-    """Compares derivatives at 5 phases of a step, and differences over 5 mm, with exact ones.
+    """Compares derivatives of a rollout with exact ones and with differences over 5 mm.
+
+    The start takes 5 positions, so that the landing falls at 5 phases of a step.
 
     Args:
-        run: (x, params) → (n,).
-        x: a number.
-        params: by case, with a leading axis.
-        want: by case, functions x → (n,), exactly.
+        run: (x, params) → values, (n,).
+        x: the number to differentiate by.
+        params: parameters by case (leading axis).
+        want: by case, the exact function x → values, (n,).
         reverse: whether derivatives are taken in reverse mode.
     """
     phases = x + np.linspace(0, 1.5e-3, 5)
@@ -71,7 +73,7 @@ def rod(dim, angle, spin):
     scene = jc.Scene(dim=dim)
     place, end = (0.0, 1.0), (-ARM * np.cos(angle), 1 - ARM * np.sin(angle))
     turns = {"inertia": INERTIA, "angle": angle, "angular_velocity": spin}
-    if dim == 3:  # in the plane of x and z, about −y
+    if dim == 3:  # in the plane of x and z the rod rotates about −y
         place, end = (0.0, 0.0, 1.0), (end[0], 0.0, end[1])
         half = (np.cos(angle / 2), 0.0, -np.sin(angle / 2), 0.0)
         moments = (0.01, INERTIA, 0.02)
@@ -84,21 +86,22 @@ def rod(dim, angle, spin):
 
 
 def in_plane(q):
-    """(x, z, θ) of the rod, (3,)."""
+    """Returns (x, z, θ) of the rod, (3,)."""
     if len(q) == 3:
         return q
     return jnp.stack([q[0], q[2], -2 * jnp.arctan2(q[5], q[3])])
 
 
 def rows(θ):
-    """J of the normal and the tangent of the end, (2, 3)."""
+    """Returns the normal and the tangential row of the Jacobian J of the end, (2, 3)."""
     return np.array([[0, 1, -ARM * np.cos(θ)], [1, 0, ARM * np.sin(θ) + RADIUS]])
 
 
 def pulls(softness, wanted, friction):
-    """The multipliers that change normal and slip as wanted, (2,), and the sign of what slides.
+    """Returns multipliers (2,) that change normal and slip as wanted, and the sign of sliding.
 
-    The tangent sticks if friction is enough; else it slides the way it would without friction.
+    The sign is 0 if friction is large enough to stick. Else the end slides in the direction that it
+    would take without friction.
     """
     λ = np.linalg.solve(softness, wanted)
     if abs(λ[1]) <= friction * λ[0]:
@@ -109,7 +112,7 @@ def pulls(softness, wanted, friction):
 
 
 def landed(height, friction, angle, spin, time, lifts):
-    """(x, z, θ) at the end by Newton's and Euler's equations, one impact, and contact after it."""
+    """Returns the exact final (x, z, θ): free fall, one impact, then contact or free flight."""
     inverse = np.array([1, 1, 1 / INERTIA])
     fall = np.array([0, -G, 0])
 
@@ -129,7 +132,7 @@ def landed(height, friction, angle, spin, time, lifts):
     y[3:] += inverse * (j.T @ impulse)
 
     def bent(y):
-        """J a + J̇ v without contact, (2,)."""
+        """Returns the acceleration J a + J̇ v of the end without contact, (2,)."""
         return rows(y[2]) @ fall + ARM * y[5] ** 2 * np.array([np.sin(y[2]), np.cos(y[2])])
 
     assert (bent(y)[0] > 0) == lifts
@@ -164,7 +167,7 @@ LIFTS = {"angle": 0.2, "spin": 0.9, "height": 2.0, "time": 0.68, "lifts": True}
     ],
 )
 def test_a_rod_lands_on_one_end(name, dim, case, friction, reverse):
-    """After the impact it turns at 9 to 17 rad/s; the end lifts off where sin θ is large."""
+    """After the impact the rod turns at 9 to 17 rad/s; the end lifts off where sin θ is large."""
     angle, spin, height, time, lifts = case.values()
     system, state = rod(dim, angle, spin)
 
@@ -178,9 +181,9 @@ def test_a_rod_lands_on_one_end(name, dim, case, friction, reverse):
 
 
 def test_an_arm_of_two_links_lands_on_its_stop():
-    """The impulse at the stop depends on how the second link hangs, though J of the stop does not.
+    """The impulse depends on the second link's angle, although the Jacobian of the stop does not.
 
-    Exact numbers are those of `RK4` beside `Events`, whose steps are split at the impact.
+    The exact values are those of `RK4` with `Events`, whose steps are split at the impact.
     """
     scene = jc.Scene(dim=2)
     scene.add_body("upper", mass=1.0, inertia=0.06, position=(0.4, 0.5))
@@ -194,7 +197,7 @@ def test_an_arm_of_two_links_lands_on_its_stop():
         return state.q, -x * jnp.array([0.0, 0.0, 0.4, 1.0, 1.0, 1.0])
 
     time = 0.4
-    method = jc.Method(jc.RK4(), events=jc.Events())
+    method = jc.Method(jc.RK4(), events=jc.integrators.Events())
 
     @jax.jit
     def exact(x):
@@ -207,26 +210,29 @@ def test_an_arm_of_two_links_lands_on_its_stop():
 
 
 def test_a_body_at_rest_makes_no_impact():
-    """A box that slides to rest on two corners moves as with sweeps, which make no impacts."""
+    """A box slides to rest on two corners.
+
+    The motion equals that of sweeps, which make no impacts.
+    """
     ends = {}
-    for solver in (jc.InteriorPoint(), jc.GaussSeidel(200)):
+    for solver in (jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel(200)):
         scene = jc.Scene(dim=2)
         scene.add_body("box", mass=1.0, inertia=0.01, position=(0.0, 0.1), velocity=(1.0, 0.0))
         for side in (-0.1, 0.1):
             touch = {"center": (side, 0.0), "friction": 0.3}
             scene.add(jc.PlaneContact(f"{side}", jc.WORLD, "box", **touch))
         system, state = scene.build()
-        method = jc.Method(bounded=solver)
+        method = jc.Method(contact_solver=solver)
         first = jc.init(system, method, state.q, state.v)
         last = jc.rollout(system, method, first, None, H, 400, record=lambda s, i: i.reactions)
         ends[solver] = last[0].q, last[1].multipliers
     (one, forces), (other, _) = ends.values()
     np.testing.assert_allclose(one, other, atol=1e-9)
-    assert np.abs(forces).max() < 20  # an impact of a step would be hundreds of newtons
+    assert np.abs(forces).max() < 20  # an impact within a step would need hundreds of newtons
 
 
 def test_a_landing_leaves_no_gap():
-    """The end stays on the floor, left or right, however slowly the rod moves sideways."""
+    """The left or right end stays on the floor, however slowly the rod moves sideways."""
     system, state = rod(2, 0.15, 0.0)
     method = jc.Method()
 
@@ -239,14 +245,14 @@ def test_a_landing_leaves_no_gap():
     found = jax.jit(jax.vmap(jax.vmap(run, (None, 0)), (0, None)))(angles, speeds)
     gaps, forces = found.gap[..., 0].reshape(8, -1), found.multipliers[..., 0].reshape(8, -1)
     for gap, force in zip(gaps, forces, strict=True):
-        after = np.argmax(force > 100) + 1  # the impulse of the landing over h
+        after = np.argmax(force > 100) + 1  # the impulse of the landing, divided by h
         assert after < 440 - 5
         assert np.abs(gap[after : after + 5]).max() < 1e-6
 
 
 @pytest.mark.parametrize(("angle", "spin"), [(1.0, 10.0), (2.3, -10.0)])
 def test_a_landing_late_in_a_step_belongs_to_that_step(angle, spin):
-    """However late it is: 400 phases of steps of 5 ms, and a rod that turns as it lands."""
+    """A rotating rod lands at 400 phases of a step of 5 ms, never penetrating at its end."""
     scene = jc.Scene(dim=2)
     moving = {"angle": angle, "angular_velocity": spin, "velocity": (0.0, -2.0)}
     scene.add_body("rod", mass=1.0, inertia=INERTIA, position=(0.0, 1.0), **moving)
@@ -263,14 +269,14 @@ def test_a_landing_late_in_a_step_belongs_to_that_step(angle, spin):
         return last.q[1], gaps.min()
 
     heights, gaps = map(np.asarray, jax.jit(jax.vmap(run))(0.55 + np.linspace(0, 0.02, 400)))
-    assert gaps.min() > -1e-6  # it was −3.5e-4 m
+    assert gaps.min() > -1e-6  # −3.5e-4 m if the landing is left to the next step
     steps = np.abs(np.diff(heights))
-    assert steps.max() < 5 * np.median(steps)  # the value moves with the phase
+    assert steps.max() < 5 * np.median(steps)  # the final height depends smoothly on the phase
 
 
 @pytest.mark.parametrize("name", INTEGRATORS)
 def test_a_function_that_ends_within_a_step_has_a_derivative(name):
-    """A dome over −1 < x < 1: q lies on it, q ⊕ h v does not."""
+    """A dome is defined for −1 < x < 1: q is in that domain, q ⊕ h v is not."""
 
     def dome(body, t, params):
         x, y = body.position
@@ -278,7 +284,7 @@ def test_a_function_that_ends_within_a_step_has_a_derivative(name):
 
     scene = jc.Scene(dim=2)
     scene.add_particle("p", mass=1.0, position=(0.9995, 2.0), velocity=(1.0, 0.0))
-    scene.add(jc.Inequality(dome, ("p",), name="dome"))
+    scene.add(jc.contacts.Inequality(dome, ("p",), name="dome"))
     system, state = scene.build()
     method = jc.Method(INTEGRATORS[name])
 
@@ -291,7 +297,7 @@ def test_a_function_that_ends_within_a_step_has_a_derivative(name):
 
 @pytest.mark.parametrize("gap", [0.0, 1e-12, -1e-12, -1e-9, 1e-7])
 def test_a_box_on_the_floor_stays_there_wherever_it_was_put(gap):
-    """A step closes gaps and small overlaps whole: nothing is left of a change of height."""
+    """A step closes gaps and small overlaps completely: a change of height has no effect."""
     scene = jc.Scene(dim=2)
     scene.add_body("box", mass=1.0, inertia=0.01, position=(0.0, 0.1))
     corners = np.array([(-0.1, 0.0), (0.1, 0.0)])
@@ -304,15 +310,15 @@ def test_a_box_on_the_floor_stays_there_wherever_it_was_put(gap):
         return jc.rollout(system, method, start, None, 1e-3, 3)[0].q
 
     slopes = jax.jacfwd(end)(state.q.at[1].add(gap))
-    np.testing.assert_allclose(slopes[1:], 0, atol=1e-9)  # of height and tilt
-    assert abs(slopes[0, 2] - 0.1) < 1e-3  # it comes down about its middle
+    np.testing.assert_allclose(slopes[1:], 0, atol=1e-9)  # rows of height and tilt
+    assert abs(slopes[0, 2] - 0.1) < 1e-3  # the box tilts about its center of mass
 
 
 @pytest.mark.parametrize(("dtype", "mode"), [(np.float32, jax.jacrev), (np.float64, jax.jacfwd)])
 def test_a_box_lands_on_four_corners_and_slides_to_rest(dtype, mode):
-    """Its corners bear more rows than it has freedoms, and rounding leaves some above the floor.
+    """The contacts have more rows than the box has degrees of freedom; rounding lifts some corners.
 
-    The derivatives by the speed add up to what it changes.
+    The derivatives by the speed integrate to the difference of the final positions.
     """
     scene = jc.Scene(dim=3, dtype=dtype)
     tilt = np.array([1.0, 0.04, 0.03, 0.0]) / np.linalg.norm([1.0, 0.04, 0.03])
@@ -334,13 +340,13 @@ def test_a_box_lands_on_four_corners_and_slides_to_rest(dtype, mode):
     speeds = jnp.asarray(0.5 + np.linspace(0, 0.02, 5), dtype)
     slopes, (ends, codes, speed) = jax.jit(jax.vmap(mode(run, has_aux=True)))(speeds)
     assert np.all(codes == jc.Status.OK)
-    assert speed.max() < 1e-3  # it rests
+    assert speed.max() < 1e-3  # the box rests
     mean = (slopes[1:] + slopes[:-1]).mean(axis=0) / 2
     np.testing.assert_allclose(mean, (ends[-1] - ends[0]) / 0.02, atol=1.3e-3)  # 1 % of the larger
 
 
 def test_a_capsule_lands_on_a_capsule():
-    """One end sticks: the energy of ½ uᵀ K⁻¹ u is lost, u the velocity there, K its mobility."""
+    """One end sticks and loses the energy ½ uᵀ K⁻¹ u, with its velocity u and mobility K."""
     arm, fall = 0.3, 0.45
     shift = H / 2 * G * np.sqrt(2 * G * fall)  # of energies, as v belongs half a step before q
     scene = jc.Scene(dim=2)
@@ -348,7 +354,7 @@ def test_a_capsule_lands_on_a_capsule():
     segments = {"segment_a": [[-2.0, 0.0], [2.0, 0.0]]}
     segments["segment_b"] = [[-arm, 0.1 + fall], [arm, 0.1 + fall]]
     touch = {"radius_a": RADIUS, "radius_b": RADIUS, "friction": 2.0}
-    scene.add(jc.CapsuleContact("touch", jc.WORLD, "log", **segments, **touch))
+    scene.add(jc.contacts.CapsuleContact("touch", jc.WORLD, "log", **segments, **touch))
     system, state = scene.build()
     method = jc.Method()
 
@@ -370,17 +376,20 @@ def test_a_capsule_lands_on_a_capsule():
             fallen = fall + height - arm * np.sin(tilt)
             want = energy[0] - G * fallen * np.linalg.inv(softness)[0, 0]
             hit = np.argmax(force > 100)
-            # the other end of the flatter one may strike within the same step, and lose some more
+            # with a small tilt the other end may strike within the same step and lose more energy
             assert np.max(energy[hit : hit + 4]) < want + 0.01
             if tilt > 1e-2:
                 np.testing.assert_allclose(energy[hit : hit + 4], want, atol=shift)
 
 
 def test_a_taut_rope_turns_a_weight():
-    """Released level it pulls 3 m g y at a depth y; a whirled weight keeps its energy."""
+    """Released level, the weight has a rope force 3 m g y at depth y.
+
+    A weight whirled at 30 m/s keeps its energy.
+    """
     scene = jc.Scene(dim=2)
     scene.add_particle("weight", mass=1.0, position=(1.0, 0.0))
-    scene.add(jc.Rope("rope", jc.WORLD, "weight", length=1.0))
+    scene.add(jc.contacts.Rope("rope", jc.WORLD, "weight", length=1.0))
     system, state = scene.build()
     method = jc.Method()
 
@@ -404,11 +413,14 @@ def test_a_taut_rope_turns_a_weight():
 
 @pytest.mark.parametrize("name", ["SIE", "RK4"])
 def test_a_slack_rope_lets_a_weight_pass_its_anchor(name):
-    """At a distance d from the anchor J̇ v is −v²/d, which no force may answer."""
+    """At a distance d from the anchor J̇ v is −v²/d.
+
+    The slack rope must not respond with a force.
+    """
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("weight", mass=1.0, position=(-0.05, 0.0), velocity=(10.0, 0.0))
     rope = {"length": 0.1, "point_a": (0.0, 0.0)}
-    scene.add(jc.Rope("rope", jc.WORLD, "weight", **rope))
+    scene.add(jc.contacts.Rope("rope", jc.WORLD, "weight", **rope))
     system, state = scene.build()
     method = jc.Method(INTEGRATORS[name])
 
@@ -427,7 +439,7 @@ def test_a_slack_rope_lets_a_weight_pass_its_anchor(name):
 
 
 def bowl(body, t, p):
-    """y − 0.1 |x|^1.5, of which the second derivative at x = 0 is infinite."""
+    """Returns φ = y − 0.1 |x|^1.5, whose second derivative is infinite at x = 0."""
     x, y = body.position
     return (y - 0.1 * jnp.abs(x) ** 1.5)[None]
 
@@ -435,7 +447,7 @@ def bowl(body, t, p):
 def test_a_floor_without_a_second_derivative_holds():
     scene = jc.Scene(dim=2)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.0))
-    scene.add(jc.Inequality(bowl, ("ball",), name="floor"))
+    scene.add(jc.contacts.Inequality(bowl, ("ball",), name="floor"))
     system, state = scene.build()
     method = jc.Method()
 
@@ -450,13 +462,16 @@ def test_a_floor_without_a_second_derivative_holds():
 
 
 def test_capsules_that_are_nearly_parallel_gain_little_energy():
-    """The closest points run along the axes, and J with them: at most a twentieth of the fall."""
+    """The closest points, and with them the Jacobian, move quickly along the capsules.
+
+    The gain stays below a twentieth of the energy of the fall.
+    """
     scene = jc.Scene(dim=3)
     scene.add_body("log", mass=1.0, inertia=(0.001, 0.03, 0.03), position=(0.0, 0.0, 0.2))
     ends = np.array([[-0.3, 0.0, 0.0], [0.3, 0.0, 0.0]])
     segments = {"segment_a": ends, "segment_b": ends + np.array([0.0, 0.0, 0.2])}
     touch = {"radius_a": RADIUS, "radius_b": RADIUS, "friction": 0.5}
-    scene.add(jc.CapsuleContact("touch", jc.WORLD, "log", **segments, **touch))
+    scene.add(jc.contacts.CapsuleContact("touch", jc.WORLD, "log", **segments, **touch))
     system, state = scene.build()
     method = jc.Method()
 
@@ -479,7 +494,7 @@ def test_capsules_that_are_nearly_parallel_gain_little_energy():
 
 
 def test_a_solver_of_a_user_lands_without_further_attributes():
-    """Landings are then shared between two steps, which asks less of a solver."""
+    """Landings are then spread over two steps, which needs fewer attributes of a solver."""
 
     @pytree
     class Own:
@@ -487,13 +502,13 @@ def test_a_solver_of_a_user_lands_without_further_attributes():
         smoothing = None
 
         def solve(self, problem, start):
-            return jc.GaussSeidel(60, warm=False).solve(problem, start)
+            return jc.solvers.GaussSeidel(60, warm=False).solve(problem, start)
 
     scene = jc.Scene(dim=2)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.1))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", friction=0.3))
     system, state = scene.build()
-    method = jc.Method(bounded=Own())
+    method = jc.Method(contact_solver=Own())
     first = jc.init(system, method, state.q, state.v)
     last, _ = jc.rollout(system, method, first, None, H, 200, record=lambda s, i: None)
     assert last.status == 0

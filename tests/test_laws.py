@@ -1,4 +1,7 @@
-"""What mechanics promises of ideal constraints: power, energy, momentum; plane and space agree."""
+"""Laws of ideal constraints: power, energy and momentum.
+
+Motions in the plane and in space agree.
+"""
 
 import dataclasses
 import functools
@@ -13,13 +16,13 @@ from tolerances import IDENTITY
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 
-IDEAL = jc.Method(integrator=jc.RK4(), stabilizer=jc.Unstabilized())
+IDEAL = jc.Method(integrator=jc.RK4(), stabilizer=jc.stabilizers.Unstabilized())
 both = pytest.mark.parametrize("dim", [2, 3])
 
 
 @functools.cache
 def ideal_scene(dim, topology):
-    """Every joint that does not move in time, side by side, and the names of its bodies."""
+    """Returns names and a scene of all joints that do not depend on time."""
     kinds = ("coincident", "spherical", "distance", "revolute", "prismatic", "universal", "fixed")
     kinds = tuple(kind for kind in kinds if dim in scenes.JOINTS[kind].dims)
     return kinds, scenes.joints_scene(kinds, dim, topology, jnp.dtype("float64"))
@@ -27,7 +30,7 @@ def ideal_scene(dim, topology):
 
 @pytest.mark.parametrize("name", scenes.SELECTED)
 def test_virtual_power(name):
-    """v · (M a − f) = λ · (J v), and both vanish where no constraint moves in time."""
+    """v · (M a − f) = λ · (J v), and both are zero if no constraint depends on time."""
     built = scenes.build(name)
     s = built.off
 
@@ -61,13 +64,13 @@ def test_ideal_constraints_do_no_work(dim):
 
 @functools.cache
 def marching(dim, topology):
-    """Twenty steps without feedback, of a system, from a state, at a step size."""
+    """Returns a function (system, state, dt) → state after 20 steps without feedback."""
     return jax.jit(lambda system, state, dt: jc.rollout(system, IDEAL, state, None, dt, 20)[0])
 
 
 @both
 def test_energy_drifts_with_the_fourth_power_of_the_step(dim):
-    """A method of order four loses what it loses at order four: half the step, a sixteenth."""
+    """With a method of fourth order, half the step gives a sixteenth of the energy error."""
     _, built = ideal_scene(dim, "loop")
     system, start = built.system, built.state
     run = functools.partial(marching(dim, "loop"), system)
@@ -80,7 +83,7 @@ def test_energy_drifts_with_the_fourth_power_of_the_step(dim):
 
 
 def momentum(system, state, names):
-    """Linear momentum of some bodies, and angular momentum about their centre of mass."""
+    """Returns linear momentum, and angular momentum about the common center of mass."""
     dim, mass, parts = system.layout.dim, 0.0, []
     for name in names:
         p, motion = system.params[name], system.principal_motion(name, state.q, state.v)
@@ -104,7 +107,7 @@ def _cross(x, y):
 @both
 @pytest.mark.parametrize("falling", [False, True])
 def test_momentum_of_free_multibodies(dim, falling):
-    """Linear momentum to rounding, angular momentum about the centre of mass as RK4 keeps it."""
+    """Linear momentum is exact to rounding, angular momentum to the accuracy of RK4."""
     kinds, built = ideal_scene(dim, "between")
     gravity = jnp.asarray((0.3, 1.0, -9.81)[-dim:]) * float(falling)
     system = built.system.with_params({"gravity": gravity})
@@ -119,12 +122,12 @@ def test_momentum_of_free_multibodies(dim, falling):
 
 
 def lift(x):
-    """A point of the plane in the plane y = 0 of space."""
+    """Maps a point of the plane to the plane y = 0 of space."""
     return np.array([x[0], 0.0, x[1]])
 
 
 def mechanism(dim, rail):
-    """Crank, link and a slider or a tie, with a spring, a particle and a push, in the plane."""
+    """A planar mechanism of crank, link and slider or tie, with a spring, a particle and a push."""
     scene = jc.Scene(dim=dim)
     to = lift if dim == 3 else np.asarray
     normal = {"axis": (0.0, -1.0, 0.0)} if dim == 3 else {}
@@ -152,7 +155,7 @@ def mechanism(dim, rail):
         scene.add(jc.Revolute("b", "crank", "link", point=to(np.array([0.8, 0.6])), **normal))
     scene.add(jc.Distance("c", "link", "bob", point_a=to(np.array([1.8, 0.2]))))
     scene.add(jc.Spring("s", jc.WORLD, "link", 20.0, 0.5, 0.3))
-    scene.add(jc.JointSpring("j", "b", 3.0, 0.2, 0.1))
+    scene.add(jc.forces.JointSpring("j", "b", 3.0, 0.2, 0.1))
     return scene.build()
 
 
@@ -177,11 +180,11 @@ def test_plane_and_space_agree(rail, integrator):
 
 @both
 def test_a_damper_takes_what_the_energy_loses(dim):
-    """dE/dt = −c ṙ² for a damper between two centres of mass, whatever the joint does."""
+    """dE/dt = −c ṙ² for a damper between two centers of mass, for any joint."""
     scene, random = jc.Scene(dim=dim), np.random.default_rng(4)
     for body in ("first", "second"):
         scenes.add_random_body(scene, body, random)
-    scene.add(jc.Coincident("joint", "first", "second", point=random.normal(size=dim)))
+    scene.add(jc.joints.Coincident("joint", "first", "second", point=random.normal(size=dim)))
     scene.add(jc.Spring("damper", "first", "second", stiffness=0.0, damping=0.7, rest_length=0.0))
     system, state = scene.build()
     state = dataclasses.replace(state, v=scenes.allowed(system, state, state.v))

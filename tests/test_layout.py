@@ -12,8 +12,8 @@ def built():
     scene.add_particle("p", mass=1, position=(6, 7), velocity=(8, 9))
     scene.add_body("b", mass=1, inertia=1, position=(10, 11), angle=6, angular_velocity=13)
     scene.add_body("wall", fixed=True, position=(1, 1))
-    scene.add(jc.ExternalWrench("pull", "p"))
-    scene.add(jc.ExternalWrench("push", "b"))
+    scene.add(jc.forces.ExternalWrench("pull", "p"))
+    scene.add(jc.forces.ExternalWrench("push", "b"))
     return scene.build()
 
 

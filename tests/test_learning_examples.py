@@ -1,4 +1,4 @@
-"""What the examples of tuning claim, in small."""
+"""Small versions of the examples of tuning and learning support their claims."""
 
 import runpy
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Losses are what their equations say, blind where nobody looked, and NaN where a world failed."""
+"""Losses follow their formulas, ignore missing data, and are NaN for failed worlds."""
 
 import dataclasses
 
@@ -34,9 +34,9 @@ def test_tracking_is_the_mean_of_squares_by_quantity_and_scale():
     wanted = {"angle": np.array([1.0, np.nan, 1.0]), "tip": np.zeros((3, 2))}
     scale = {"angle": 2.0, "tip": np.array([[1.0, 2.0]])}
     expected = ((0 + (2 / 2) ** 2) / 2 + (1 + 1 / 4) / 2) / 2
-    np.testing.assert_allclose(jc.losses.tracking(path, wanted, scale), expected)
-    slope = jax.grad(lambda p: jc.losses.tracking(p, wanted, scale))(path)
-    assert slope["angle"][1] == 0.0  # not NaN
+    np.testing.assert_allclose(jc.learning.losses.tracking(path, wanted, scale), expected)
+    slope = jax.grad(lambda p: jc.learning.losses.tracking(p, wanted, scale))(path)
+    assert slope["angle"][1] == 0.0  # missing data
     np.testing.assert_allclose(slope["angle"][2], 0.25)
 
 
@@ -44,46 +44,50 @@ def test_what_is_masked_is_not_tracked():
     seen = np.ma.masked_array([1.0, 99.0, 1.0], [False, True, False])
     path = jnp.array([1.0, 2.0, 3.0])
     known = np.array([1.0, np.nan, 1.0])
-    assert jc.losses.tracking(path, seen) == jc.losses.tracking(path, known) == 2.0
-    assert jax.jit(jc.losses.tracking)(path, known) == 2.0
-    np.testing.assert_array_equal(jc.losses.misfit(path, seen), [0.0, 0.0, 2.0])
+    assert (
+        jc.learning.losses.tracking(path, seen) == jc.learning.losses.tracking(path, known) == 2.0
+    )
+    assert jax.jit(jc.learning.losses.tracking)(path, known) == 2.0
+    np.testing.assert_array_equal(jc.learning.losses.misfit(path, seen), [0.0, 0.0, 2.0])
     whole = np.ma.masked_array([1, 99, 1], [False, True, False])
-    assert jc.losses.tracking(path, whole) == 2.0
+    assert jc.learning.losses.tracking(path, whole) == 2.0
 
 
 def test_tracking_says_what_does_not_fit():
     with pytest.raises(ValueError, match="a reference must be real numbers.*got bool"):
-        jc.losses.tracking(jnp.ones(3), np.ones(3, bool))
+        jc.learning.losses.tracking(jnp.ones(3), np.ones(3, bool))
     with pytest.raises(ValueError, match="tip .3, 2.*tip .4, 2."):
-        jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})
+        jc.learning.losses.tracking({"tip": jnp.ones((3, 2))}, {"tip": np.zeros((4, 2))})
     with pytest.raises(ValueError, match=r"scale of shape \(4, 1\).*\(3, 1\)"):
-        jc.losses.tracking(jnp.ones((3, 1)), np.zeros((3, 1)), np.ones((4, 1)))
+        jc.learning.losses.tracking(jnp.ones((3, 1)), np.zeros((3, 1)), np.ones((4, 1)))
     with pytest.raises(ValueError, match="reference is NaN throughout"):
-        jc.losses.tracking({"tip": jnp.ones(3)}, {"tip": np.full(3, np.nan)})
+        jc.learning.losses.tracking({"tip": jnp.ones(3)}, {"tip": np.full(3, np.nan)})
     with pytest.raises(ValueError, match="structure"):
-        jc.losses.tracking({"tip": jnp.ones((3, 2))}, {"toe": np.zeros((3, 2))})
+        jc.learning.losses.tracking({"tip": jnp.ones((3, 2))}, {"toe": np.zeros((3, 2))})
 
 
 def test_violation_is_the_size_of_position_and_of_velocity_over_a_step(path):
     _, (_, off, _, states) = path
     q, v = (np.asarray(x) for x in (states.q, states.v))
-    # info is of the state before a step: of all but the last
+    # an info describes the state before its step, so it lacks the last state
     length = np.linalg.norm(q, axis=1)
     position, velocity = length - 1, np.sum(q * v, axis=1) / length
     np.testing.assert_allclose(off.position[1:, 0], position[:-1], atol=1e-12)
     square = np.mean(np.asarray(off.position) ** 2) + np.mean((1e-2 * velocity[:-1]) ** 2) * 49 / 50
-    np.testing.assert_allclose(jc.losses.violation(off, 1e-2), np.log10(square) / 2, rtol=1e-6)
+    np.testing.assert_allclose(
+        jc.learning.losses.violation(off, 1e-2), np.log10(square) / 2, rtol=1e-6
+    )
     still = dataclasses.replace(off, position=0 * off.position, velocity=0 * off.velocity)
-    assert jnp.isfinite(jc.losses.violation(still, 1e-2))
-    assert jc.losses.mean_violation(still, 1e-2) == 0.0
-    np.testing.assert_allclose(jc.losses.mean_violation(off, 1e-2), square, rtol=1e-6)
+    assert jnp.isfinite(jc.learning.losses.violation(still, 1e-2))
+    assert jc.learning.losses.mean_violation(still, 1e-2) == 0.0
+    np.testing.assert_allclose(jc.learning.losses.mean_violation(off, 1e-2), square, rtol=1e-6)
 
 
 def test_a_scene_without_rows_has_no_violation(path):
     _, (_, off, _, _) = path
     none = jax.tree.map(lambda x: x[:, :0], off)
     with pytest.raises(ValueError, match="no constraints"):
-        jc.losses.violation(none, 1e-2)
+        jc.learning.losses.violation(none, 1e-2)
 
 
 def test_energy_drift_is_that_of_the_energy(path):
@@ -91,20 +95,22 @@ def test_energy_drift_is_that_of_the_energy(path):
     by_hand = np.sum(np.asarray(states.v) ** 2, axis=1) + 2.0 * 9.81 * np.asarray(states.q)[:, 1]
     change = (by_hand - by_hand[0]) / np.max(np.sum(np.asarray(states.v) ** 2, axis=1))
     np.testing.assert_allclose(
-        jc.losses.energy_drift(energy), np.sqrt(np.mean(change**2)), rtol=1e-9
+        jc.learning.losses.energy_drift(energy), np.sqrt(np.mean(change**2)), rtol=1e-9
     )
     still = jax.tree.map(jnp.ones_like, energy)
-    assert jax.grad(lambda e: jc.losses.energy_drift(e))(still).kinetic[0] == 0.0
-    assert np.isnan(jc.losses.energy_drift(jax.tree.map(lambda x: x.at[1].set(jnp.nan), still)))
+    assert jax.grad(lambda e: jc.learning.losses.energy_drift(e))(still).kinetic[0] == 0.0
+    assert np.isnan(
+        jc.learning.losses.energy_drift(jax.tree.map(lambda x: x.at[1].set(jnp.nan), still))
+    )
 
 
 def test_a_sum_comes_with_its_terms():
     terms = {"task": jnp.asarray(2.0), "drift": jnp.asarray(3.0)}
-    value, aux = jc.losses.weighted(terms, {"task": 1.0, "drift": 0.5})
+    value, aux = jc.learning.losses.weighted(terms, {"task": 1.0, "drift": 0.5})
     assert value == 3.5
     assert aux == terms
     with pytest.raises(ValueError, match="must be named as terms"):
-        jc.losses.weighted(terms, {"task": 1.0})
+        jc.learning.losses.weighted(terms, {"task": 1.0})
 
 
 def test_a_failed_world_has_no_loss():
@@ -112,26 +118,35 @@ def test_a_failed_world_has_no_loss():
     failed = dataclasses.replace(state, status=jnp.asarray(Status.SINGULAR, jnp.int32))
     noted = dataclasses.replace(state, status=jnp.asarray(Status.CONFLICT, jnp.int32))
     one = jnp.asarray(1.0)
-    assert jc.losses.unless_failed(one, state) == one
-    assert jc.losses.unless_failed(one, noted) == one
-    assert jnp.isnan(jc.losses.unless_failed({"x": one}, failed)["x"])
+    assert jc.learning.losses.unless_failed(one, state) == one
+    assert jc.learning.losses.unless_failed(one, noted) == one
+    assert jnp.isnan(jc.learning.losses.unless_failed({"x": one}, failed)["x"])
     batch = jax.tree.map(lambda *x: jnp.stack(x), state, failed)
-    rows = jc.losses.unless_failed({"each": jnp.ones((2, 3)), "mean": one}, batch)
+    rows = jc.learning.losses.unless_failed({"each": jnp.ones((2, 3)), "mean": one}, batch)
     np.testing.assert_array_equal(np.isnan(rows["each"]), [[False] * 3, [True] * 3])
     assert jnp.isnan(rows["mean"])
-    assert jnp.isnan(jc.losses.unless_failed(1.0, jax.device_get(failed)))
+    assert jnp.isnan(jc.learning.losses.unless_failed(1.0, jax.device_get(failed)))
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: jc.losses.unless_failed(1.0, 2.0), "state must be the state .* got float"),
         (
-            lambda: jc.losses.mean_violation(np.ones(3), 0.1),
+            lambda: jc.learning.losses.unless_failed(1.0, 2.0),
+            "state must be the state .* got float",
+        ),
+        (
+            lambda: jc.learning.losses.mean_violation(np.ones(3), 0.1),
             "off must be info.violation .* ndarray",
         ),
-        (lambda: jc.losses.energy_drift(np.ones(3)), r"energy must be jc.energy\(.* got ndarray"),
-        (lambda: jc.losses.weighted({"a": np.ones(3)}, {"a": 1}), r"term 'a' .* got shape \(3,\)"),
+        (
+            lambda: jc.learning.losses.energy_drift(np.ones(3)),
+            r"energy must be jc.energy\(.* got ndarray",
+        ),
+        (
+            lambda: jc.learning.losses.weighted({"a": np.ones(3)}, {"a": 1}),
+            r"term 'a' .* got shape \(3,\)",
+        ),
     ],
     ids=["state", "violation", "energy", "term"],
 )

@@ -1,4 +1,4 @@
-"""What a world takes, against what XLA plans for batches that were not asked about."""
+"""Memory estimates by world, compared with XLA's plans for batches of other sizes."""
 
 import dataclasses
 import functools
@@ -12,11 +12,11 @@ import jaxcon as jc
 from jaxcon import scenes as scenes_of_library
 
 CLOSE = 0.2
-"""The relative error of a memory estimate of a batch; XLA decides the rest anew for each."""
+"""Relative tolerance of a memory estimate; XLA plans each batch size anew."""
 
 
 def chain(links, dtype):
-    """Rods on hinges in space; of one, the pendulum."""
+    """A chain of rods on hinges in space; with one rod, a pendulum."""
     scene, before = jc.Scene(dtype=dtype), jc.WORLD
     for i in range(links):
         rod = jc.inertia.rod(1.0, length=1.0, radius=0.05)
@@ -35,7 +35,7 @@ SCENES = {
 
 
 def planned(function, state, worlds):
-    """Arguments, and results with what lies between, of a batch as XLA plans it [B]."""
+    """Returns the bytes that XLA plans for a batch: (arguments, results and temporaries)."""
     batch = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), state)
     plan = jax.jit(jax.vmap(function)).lower(batch).compile().memory_analysis()
     return plan.argument_size_in_bytes, plan.output_size_in_bytes + plan.temp_size_in_bytes
@@ -44,14 +44,14 @@ def planned(function, state, worlds):
 @pytest.mark.parametrize(
     ("name", "solver"),
     [
-        *((name, jc.Sparse()) for name in SCENES),
-        ("four-bar", jc.Schur()),
-        ("four-bar", jc.RankSafe()),
+        *((name, jc.solvers.Sparse()) for name in SCENES),
+        ("four-bar", jc.solvers.Schur()),
+        ("four-bar", jc.solvers.RankSafe()),
     ],
 )
 def test_memory_of_other_batches_is_foretold(name, solver):
     (system, state), method = SCENES[name](), jc.Method(solver=solver)
-    memory = jc.memory(system, method, state)
+    memory = jc.analysis.memory(system, method, state)
     for worlds in (100, 2000):
         given, other = planned(lambda s: jc.step(system, method, s, None, 2e-3), state, worlds)
         assert given == memory.state * worlds
@@ -60,10 +60,10 @@ def test_memory_of_other_batches_is_foretold(name, solver):
 
 
 def test_a_rollout_takes_what_a_step_takes():
-    """But for what a step tells, which this one does not keep; with a branch it takes less."""
+    """A rollout without records needs the memory of a step, less that of the info."""
     system, state = scenes_of_library.four_bar()
-    method = jc.Method(solver=jc.Sparse())
-    memory = jc.memory(system, method, state)
+    method = jc.Method(solver=jc.solvers.Sparse())
+    memory = jc.analysis.memory(system, method, state)
 
     def run(s):
         return jc.rollout(system, method, s, None, 2e-3, 50, record=lambda s, i: None)[0]
@@ -78,8 +78,8 @@ def test_a_report_has_it_where_a_method_is_given():
     system, state = chain(1, jnp.float32)
     assert jc.report(system, state).memory is None
     report = jc.report(system, state, jc.Method(), measure=True)
-    assert report.memory == jc.memory(system, jc.Method(), state)
-    assert report.memory.state == (7 + 6 + 2 + 1) * 4  # time in two parts
+    assert report.memory == jc.analysis.memory(system, jc.Method(), state)
+    assert report.memory.state == (7 + 6 + 2 + 1) * 4  # time has two parts
     assert "64 B of state" in str(report)
 
 
@@ -87,21 +87,21 @@ def test_control_is_that_of_a_step():
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     system, state = scene.build()
     control = [1.0] * system.layout.n_u
-    assert jc.memory(system, jc.Method(), state, control).working > 0
+    assert jc.analysis.memory(system, jc.Method(), state, control).working > 0
     with pytest.raises(ValueError, match=r"control must have shape .*got a dict with push \(2,\)"):
-        jc.memory(system, jc.Method(), state, {"push": np.zeros(2)})
+        jc.analysis.memory(system, jc.Method(), state, {"push": np.zeros(2)})
     with pytest.raises(ValueError, match="control must have shape"):
-        jc.memory(system, jc.Method(), state, [*control, 1.0])
+        jc.analysis.memory(system, jc.Method(), state, [*control, 1.0])
 
 
 LENGTHS = (100, 1000, 10000)
 
 
 def bob():
-    """A bob on a rod in the plane."""
+    """A pendulum bob on a rod in the plane."""
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -109,7 +109,7 @@ def bob():
 
 
 def planned_gradient(system, method, state, steps, adjoint, worlds=300):
-    """Returns the memory of a gradient by positions, as XLA plans it [B]."""
+    """Returns the bytes that XLA plans for a gradient by initial positions."""
 
     def end(q, state):
         start = dataclasses.replace(state, q=q)
@@ -120,9 +120,9 @@ def planned_gradient(system, method, state, steps, adjoint, worlds=300):
 
 
 def test_memory_of_gradients_is_foretold_and_grows_as_a_root():
-    (system, state), method = bob(), jc.Method(solver=jc.Sparse())
-    memory = jc.gradient_memory(system, method, state)
-    adjoints = {"every step": jc.EveryStep(), "root": jc.Checkpoints()}
+    (system, state), method = bob(), jc.Method(solver=jc.solvers.Sparse())
+    memory = jc.analysis.gradient_memory(system, method, state)
+    adjoints = {"every step": jc.adjoints.EveryStep(), "root": jc.adjoints.Checkpoints()}
     exponents = {}
     for name, adjoint in adjoints.items():
         found = []
@@ -133,8 +133,8 @@ def test_memory_of_gradients_is_foretold_and_grows_as_a_root():
         exponents[name] = np.polyfit(np.log(LENGTHS), np.log(growing), 1)[0]
     assert abs(exponents["every step"] - 1.0) < 0.02
     assert abs(exponents["root"] - 0.5) < 0.02
-    assert memory.of(300, 1000, jc.Truncated(5, jc.Checkpoints())) == memory.of(
-        300, 1000, jc.Checkpoints()
+    assert memory.of(300, 1000, jc.adjoints.Truncated(5, jc.adjoints.Checkpoints())) == memory.of(
+        300, 1000, jc.adjoints.Checkpoints()
     )
     assert f"{memory.state} B by checkpoint" in str(memory)
     with pytest.raises(ValueError, match="worlds must be a whole number from 1, got 1.5"):

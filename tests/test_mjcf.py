@@ -1,4 +1,4 @@
-"""Models of MuJoCo against MuJoCo itself: accelerations at random states, maps, what is refused."""
+"""Models of MuJoCo, compared with MuJoCo: accelerations, coordinates, refused features."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.simulation.choice import words
+from jaxcon.methods.choice import words
 
 mujoco = pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks import mjcf_agreement as agreement  # noqa: E402
 
 AGREE = 1e-9
-"""Accelerations, relative to the largest one of the state."""
+"""Tolerance of accelerations, relative to the largest one of a state."""
 BODY = '<inertial pos="0.1 0.02 -0.2" mass="1.3" fullinertia="0.06 0.05 0.04 0.01 0.005 -0.004"/>'
 SMALL = '<inertial pos="0 0.1 0" quat="1 0.3 0 0.2" mass="0.7" diaginertia="0.02 0.03 0.025"/>'
 
@@ -93,7 +93,7 @@ LOADED = (
 
 
 def tree(name):
-    """Joints between a body that moves and one with another welded to it at an angle."""
+    """Two moving bodies and the joint between them; a third is welded to one at an angle."""
     joints = JOINTS[name].replace("{0}", name)
     welded = f'<body pos="0.1 0.2 0" euler="0.3 0.2 0.1">{SMALL}</body>'
     inner = f'<body pos="0.2 0.1 0.3" euler="0.5 0.1 -0.4">{joints}{BODY}{welded}</body>'
@@ -133,7 +133,7 @@ def test_flags_of_the_options_are_obeyed():
     np.testing.assert_array_equal(system.params["gravity"], 0)
     fields = [set(numbers) for numbers in system.params.values() if isinstance(numbers, dict)]
     assert not any({"stiffness", "damping", "control_range"} & own for own in fields)
-    assert any("inertia" in own and "mass" not in own for own in fields)  # rotors stay
+    assert any("inertia" in own and "mass" not in own for own in fields)  # rotors remain
 
 
 def test_positions_count_turns_where_that_is_asked_for():
@@ -147,7 +147,7 @@ def test_positions_count_turns_where_that_is_asked_for():
 
 
 def test_names_are_those_of_the_model():
-    """In MuJoCo a body, its joint and its motor may have one name."""
+    """MuJoCo allows one name for a body, its joint and its motor; here they get a suffix."""
     inner = f'<body><joint type="slide"/>{SMALL}</body>'
     bodies = f'<body name="arm"><joint name="arm"/>{BODY}{inner}</body>'
     actuator = '<actuator><motor name="arm" joint="arm"/></actuator>'
@@ -181,15 +181,18 @@ def test_a_model_unpacks_and_runs_in_single_precision():
 
 
 def test_a_model_says_which_method_suits_it():
-    """The solver is that of the structure, other parts are as given, and a state is enough."""
+    """The solver follows from the structure, other parts are as given.
+
+    A start state is included.
+    """
     arm = model(f"<body>{HINGES.format(1, AXES[0], '').format(0)}{BODY}</body>")
     read = jc.from_mjcf(arm)
     found = read.method()
     assert words(found.solver) == words(jc.Method.auto(*read).solver) == "Sparse()"
-    assert jax.tree.structure(found) == jax.tree.structure(jc.Method(solver=jc.Sparse()))
-    given = read.method(integrator=jc.RK4(), solver=jc.Dense(), batch=4)
-    assert isinstance(given.integrator, jc.RungeKutta)
-    assert isinstance(given.solver, jc.Dense)
+    assert jax.tree.structure(found) == jax.tree.structure(jc.Method(solver=jc.solvers.Sparse()))
+    given = read.method(integrator=jc.RK4(), solver=jc.solvers.Dense(), batch=4)
+    assert isinstance(given.integrator, jc.integrators.RungeKutta)
+    assert isinstance(given.solver, jc.solvers.Dense)
     with pytest.raises(TypeError, match="unexpected keyword"):
         read.method(dt=1e-3)
     end, _ = jc.rollout(read.system, found, read.start, None, float(read.timestep), 3)
@@ -198,34 +201,34 @@ def test_a_model_says_which_method_suits_it():
 
 @pytest.mark.parametrize("name", ["hopper", "ant"])
 def test_robots_on_the_floor_are_swept_by_default(name):
-    """And their report names that."""
+    """The report names that solver, too."""
     read = jc.from_mjcf(str(agreement.ASSETS / f"{name}.xml"))
     method = read.method()
     assert words(method.solver) == "Sparse()"
-    assert words(method.resolve(*read).bounded) == "GaussSeidel()"
+    assert words(method.resolve(*read).contact_solver) == "GaussSeidel()"
     start = read.state(read.tree.reference, np.zeros(read.tree.size))
-    rows = start.memory.bounded.shape[0]
+    rows = start.memory.contact_multipliers.shape[0]
     assert rows == {"hopper": 30, "ant": 83}[name]
     found = jc.report(read.system, start, method, float(read.timestep))
     assert found.cost.contact_solver == "GaussSeidel()"
-    # gradients through landings; the ankles of an ant at 0 are 0.52 rad outside their limits
+    # "impacts": gradients through landings; "range": ankles of the ant start 0.52 rad off limits
     assert set(found.warnings) == {"hopper": {"impacts"}, "ant": {"impacts", "range"}}[name]
-    assert len(found.warnings["impacts"]) < 400  # of 25 contacts three are named
+    assert len(found.warnings["impacts"]) < 400  # names three of 25 contacts
     if name == "ant":
         assert "ankle_1 limit (0.52 rad below lower)" in found.warnings["range"]
         assert "and 22 others takes two steps" in found.warnings["impacts"]
         assert "40 joint rows of rank 40 and 8 rotor rows: 14 degrees of freedom" in str(found)
-    slow = jc.report(read.system, start, jc.Method(bounded=jc.InteriorPoint()))
+    slow = jc.report(read.system, start, jc.Method(contact_solver=jc.solvers.InteriorPoint()))
     assert f"inverts a matrix of {rows} inequality rows" in slow.warnings["dense"]
 
 
 def test_the_map_to_states_is_differentiable():
-    """dq/dqpos along qvel is q̇ = N(q) v."""
+    """The derivative of q by qpos along qvel is q̇ = N(q) v."""
     read = jc.from_mjcf(model(ARM))
     qpos, qvel = jnp.asarray([0.4, 0.2]), jnp.asarray([0.7, -0.3])
     slope = jax.jvp(lambda x: read.state(x, qvel).q, (qpos,), (qvel,))[1]
     state = read.state(qpos, qvel)
-    np.testing.assert_array_equal(read.state(qpos).v, 0.0 * state.v)  # at rest unless told
+    np.testing.assert_array_equal(read.state(qpos).v, 0.0 * state.v)  # at rest by default
     np.testing.assert_allclose(slope, read.system.kinematics(state.q, state.v), atol=1e-12)
 
 
@@ -246,7 +249,7 @@ URDF = """
 
 
 def test_the_map_to_states_hardly_grows_with_the_model():
-    """Links and joints are lanes and turns of a loop."""
+    """Links are lanes of arrays and joints are iterations of a loop, so the trace hardly grows."""
     sizes = []
     for links in (2, 6):
         link = '<body pos="0 0 1"><joint axis="0 1 0"/>' + BODY
@@ -254,12 +257,12 @@ def test_the_map_to_states_hardly_grows_with_the_model():
         still = jnp.zeros(read.tree.size)
         program = jax.make_jaxpr(lambda q, v, r=read: r.tree.flat(r.system, q, v))(still, still)
         sizes.append(len(str(program).splitlines()))
-    assert sizes[1] - sizes[0] < 4 * 8  # lines, of links that are put side by side
+    assert sizes[1] - sizes[0] < 4 * 8  # a few lines to stack each link
     assert sizes[0] > 100
 
 
 def test_urdf():
-    """A fixed joint makes one body of two: 2 kg at 0.2 m and 0.5 kg at 0.4 m along z."""
+    """A fixed joint merges two links into one body: 2 kg at 0.2 m and 0.5 kg at 0.4 m along z."""
     read = jc.from_mjcf(URDF)
     assert dict(read.joints) == {"shoulder": ("shoulder", "angle")}
     upper = read.system.params["upper"]
@@ -287,7 +290,7 @@ EQUALITIES = {
 
 @pytest.mark.parametrize("equality", EQUALITIES.values(), ids=list(EQUALITIES))
 def test_equalities_are_violated_as_much_as_in_mujoco(equality):
-    """At random states: the gap of the points as MuJoCo sees it, and the sine of half the turn."""
+    """Positions agree; for an angle θ MuJoCo's error is sin θ/2, jaxcon's 2 sin θ/2."""
     m = mujoco.MjModel.from_xml_string(model(WELDED, f"<equality>{equality}</equality>"))
     read, data = jc.from_mjcf(m), mujoco.MjData(m)
     qpos, qvel, _ = agreement.random_states(m, 3)
@@ -295,7 +298,7 @@ def test_equalities_are_violated_as_much_as_in_mujoco(equality):
         data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
         mujoco.mj_forward(m, data)
         found = jc.violation(read.system, read.state(qpos[i], qvel[i]))
-        expected = data.efc_pos.copy()  # of a weld: its turns in a frame of its own
+        expected = data.efc_pos.copy()  # MuJoCo has the angles of a weld in another frame
         rows = np.array(found.position)
         pairs = [(rows[:3], expected[:3])]
         if len(rows) == 6:
@@ -305,7 +308,7 @@ def test_equalities_are_violated_as_much_as_in_mujoco(equality):
 
 
 def test_coupled_joints():
-    """A cubic of one coordinate, against MuJoCo's residual, and a joint held where it is."""
+    """A cubic coupling, compared with MuJoCo's residual, and a locked joint."""
     equality = (
         '<joint name="cam" joint1="out" joint2="turn" polycoef="0.1 0.2 0.3 -0.4 0.5"/>'
         '<joint name="lock" joint1="turn" polycoef="0.2 0 0 0 0"/>'

@@ -1,4 +1,4 @@
-"""Ranges, dry friction and contacts of MuJoCo's models against MuJoCo's own constraint rows."""
+"""Joint limits, dry friction and contacts of models, compared with MuJoCo's constraint rows."""
 
 import sys
 from pathlib import Path
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.constraints.bounds import linearize_bounds
+from jaxcon.contact.rows import linearize_bounds
 
 mujoco = pytest.importorskip("mujoco")
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -18,7 +18,7 @@ from benchmarks import legged  # noqa: E402
 from benchmarks import mjcf_agreement as agreement  # noqa: E402
 
 EXACT = 1e-9
-"""The accuracy of gaps and their rates, in metres and seconds."""
+"""Tolerance of gaps and their rates, in meters and seconds."""
 
 
 def model(bodies, rest="", default="", flag=""):
@@ -29,7 +29,7 @@ def model(bodies, rest="", default="", flag=""):
 
 
 def moved(m, seed=0, qpos=None):
-    """MuJoCo's data at a random state, and the bounded rows of jaxcon there."""
+    """Returns MuJoCo's data at a random state, and the inequality rows of jaxcon there."""
     read, data = jc.from_mjcf(m), mujoco.MjData(m)
     data.qpos[:], data.qvel[:] = (x[0] for x in agreement.random_states(m, 1, seed)[:2])
     data.qpos[:] = data.qpos if qpos is None else qpos
@@ -38,13 +38,13 @@ def moved(m, seed=0, qpos=None):
 
 
 def rows(read, qpos, qvel):
-    """The bounded rows at a state."""
+    """Returns the inequality rows at a state."""
     state, control = read.state(qpos, qvel), jnp.zeros(read.system.layout.n_u)
     return linearize_bounds(read.system, state.q, state.v, state.time, control, jnp.asarray(1e-3))
 
 
 def elements(found):
-    """Name → gap, its rate and friction of every bounded element."""
+    """Returns gap, rate and friction of every inequality element, by name."""
     first = [np.arange(len(found.rate))[found.layout.rows(n)][0] for n in found.layout.names]
     friction = np.concatenate([np.zeros(found.kinds.normal), found.friction])
     return {
@@ -54,7 +54,7 @@ def elements(found):
 
 
 def touching(m, data):
-    """Names of two geoms → gaps, their rates, frictions and condims of MuJoCo's contacts."""
+    """Returns gap, rate, friction and condim of MuJoCo's contacts, by the names of two geoms."""
     result = {}
     for c in (data.contact[i] for i in range(data.ncon)):
         names = " and ".join(m.geom(int(g)).name for g in c.geom)
@@ -64,7 +64,7 @@ def touching(m, data):
 
 
 def own(found, pair):
-    """The elements of a pair: one, or one for each of its points."""
+    """Returns the elements of a pair: one, or one for each of its points."""
     numbered = {n for n in found if n.startswith(f"{pair} ") and n.rsplit(" ", 1)[1].isdigit()}
     return [np.array(found[n]) for n in found if n == pair or n in numbered]
 
@@ -84,12 +84,12 @@ SHAPES = """
   conaffinity="0"/></body>
 """
 FAR = '<geom margin="5"/>'
-"""All geoms are near enough to each other to be listed."""
+"""A margin so large that MuJoCo lists all pairs of geoms."""
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_gaps_and_their_rates_are_those_of_mujoco(seed):
-    """MuJoCo lists the four lower corners of a box; of others, all points."""
+    """MuJoCo lists the four lower corners of a box; for other shapes it lists all points."""
     m = model(SHAPES, default=FAR)
     data, found = moved(m, seed)
     found, expected = elements(found), touching(m, data)
@@ -125,11 +125,11 @@ LISTED = """<contact><exclude body1="a" body2="c"/><exclude body1="e" body2="d"/
 
 @pytest.mark.parametrize("flag", ["", '<flag filterparent="disable"/>'])
 def test_pairs_and_their_friction_are_those_of_mujoco(flag):
-    """Masks, parents, welded bodies, excluded ones, listed pairs and priorities, all in one."""
+    """Covers masks, parents, welds, exclusions, listed pairs and priorities in one model."""
     m = model(FILTERED, LISTED, '<geom margin="5"/><pair margin="9"/>', flag)
     data, found = moved(m)
     found, expected = elements(found), touching(m, data)
-    expected.pop("d1 and d2")  # of one body: they cannot move in each other
+    expected.pop("d1 and d2")  # geoms of one body cannot move relative to each other
     assert set(found) == set(expected)
     for pair, ((gap, _, friction, condim),) in expected.items():
         rough = friction if condim > 1 else 0.0
@@ -137,7 +137,7 @@ def test_pairs_and_their_friction_are_those_of_mujoco(flag):
 
 
 def test_contacts_between_what_moves_can_be_left_out():
-    """The ground and the walls remain, and `contact` leaves out all."""
+    """Contacts with the ground and the walls remain; ignoring "contact" removes all."""
     m = model(FILTERED, LISTED)
     names = {n for group in jc.from_mjcf(m).system.bounds for n in group.names}
     left = jc.from_mjcf(m, ignore=("self_contact",)).system.bounds
@@ -156,7 +156,7 @@ RUBS = 'frictionloss="0.3"'
 
 
 def test_ranges_are_limits():
-    """MuJoCo's row of a stop within its margin is pos − margin."""
+    """MuJoCo's row of a joint limit within its margin is pos − margin."""
     m = model(JOINTS.format(*RANGES, ""))
     data, found = moved(m, qpos=[-0.4, 0.35, 1, 0, 0, 0])
     rows, found = data.efc_type == int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT), elements(found)
@@ -167,7 +167,7 @@ def test_ranges_are_limits():
 
 
 def test_frictionloss_is_dry_friction():
-    """Friction of hinges acts along their angle, of balls about the axes of their body."""
+    """Friction of a hinge acts along its angle, friction of a ball joint about the body's axes."""
     data, found = moved(model(JOINTS.format("", "", RUBS)))
     assert found.kinds.boxes == len(found.rate) == 4
     np.testing.assert_allclose(found.upper, data.efc_frictionloss)
@@ -184,10 +184,13 @@ def test_ranges_and_friction_can_be_left_out(ignore, flag):
 
 
 def test_hopper_stands_on_its_foot():
-    """It falls 4 cm and stays above the floor; the impulse of the floor is that of its weight."""
+    """The hopper falls 4 cm and stays above the floor; the floor's mean force equals the weight."""
     m = legged.load("hopper")
     read = jc.from_mjcf(m)
-    system, method = read.system, jc.Method(solver=jc.Sparse(), bounded=jc.GaussSeidel(30))
+    system, method = (
+        read.system,
+        jc.Method(solver=jc.solvers.Sparse(), contact_solver=jc.solvers.GaussSeidel(30)),
+    )
     state = jc.init(system, method, read.start.q, read.start.v)
 
     def record(state, info):

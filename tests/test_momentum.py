@@ -1,4 +1,4 @@
-"""Momentum against its definition, and as a constraint: rows, solvers, what it does to motion."""
+"""Momentum: compared with its definition, and as a constraint in rows, solvers and motions."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from jaxcon.constraints.rows import linearize
 
 
 def cloud(dim, *elements):
-    """Four bodies, one of them with its frame off its principal one, and a particle, moving."""
+    """Four moving bodies, one with its frame off its principal axes, and a particle."""
     scene, random = jc.Scene(dim=dim), np.random.default_rng(dim)
     places = random.normal(size=(5, dim))
     for i, place in enumerate(places[:4]):
@@ -29,7 +29,7 @@ def cloud(dim, *elements):
             scene.add_body(f"b{i}", mass=1.0 + i, inertia=solid, **motion)
     scene.add_particle("bob", mass=0.7, position=places[4], velocity=random.normal(size=dim))
     for i in range(3):
-        scene.add(jc.Coincident(f"pin{i}", f"b{i}", f"b{i + 1}", point=places[i]))
+        scene.add(jc.joints.Coincident(f"pin{i}", f"b{i}", f"b{i + 1}", point=places[i]))
     scene.add(jc.Distance("rod", "b3", "bob"))
     for element in elements:
         scene.add(element)
@@ -41,7 +41,7 @@ def cross(x, y):
 
 
 def by_hand(system, state, names):
-    """m, x, ẋ and R I ω of each body."""
+    """Returns m, x, ẋ and R I ω of each body."""
     result = []
     for name in names:
         motion = system.principal_motion(name, state.q, state.v)
@@ -76,8 +76,8 @@ def test_momentum_is_the_sum_over_bodies(dim, names):
 
 def prescribed(dim):
     value = 0.3 if dim == 2 else (0.1, 0.2, 0.3)
-    total = jc.AngularMomentum("L", value=value)
-    return cloud(dim, total, jc.LinearMomentum("P", ("b0", "b2", "bob")))
+    total = jc.joints.AngularMomentum("L", value=value)
+    return cloud(dim, total, jc.joints.LinearMomentum("P", ("b0", "b2", "bob")))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -104,10 +104,15 @@ def test_rows_are_the_derivatives_of_the_momentum(dim):
 @pytest.mark.parametrize("dim", [2, 3])
 def test_every_solver_meets_rows_that_touch_all_bodies(dim):
     system, state = prescribed(dim)
-    solvers = (jc.Dense(), jc.Sparse(run=2), jc.Sparse(order="levels"), jc.Schur())
+    solvers = (
+        jc.solvers.Dense(),
+        jc.solvers.Sparse(run=2),
+        jc.solvers.Sparse(order="levels"),
+        jc.solvers.Schur(),
+    )
 
     def accelerations(s):
-        methods = [jc.Method(stabilizer=jc.Unstabilized(), solver=x) for x in solvers]
+        methods = [jc.Method(stabilizer=jc.stabilizers.Unstabilized(), solver=x) for x in solvers]
         return [jc.forward_dynamics(system, s, None, m, 1e-3) for m in methods]
 
     reference, *others = jax.jit(accelerations)(state)
@@ -118,27 +123,27 @@ def test_every_solver_meets_rows_that_touch_all_bodies(dim):
 
 
 def test_it_holds_against_an_outer_torque():
-    """A rod under a torque would spin; with L = 0 prescribed λ takes the torque up."""
+    """A torque would spin the rod; with L = 0 prescribed, λ balances the torque."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("rod", mass=1.0, inertia=0.5)
-    scene.add(jc.ExternalWrench("push", "rod"))
-    scene.add(jc.AngularMomentum("still", ("rod",)))
+    scene.add(jc.forces.ExternalWrench("push", "rod"))
+    scene.add(jc.joints.AngularMomentum("still", ("rod",)))
     system, state = scene.build()
     control = jnp.asarray([0.0, 0.0, 3.0])
     info = jc.forward_dynamics(system, state, control, jc.Method(), 1e-3)
     np.testing.assert_allclose(info.acceleration, 0, atol=IDENTITY)
-    np.testing.assert_allclose(jc.wrench(system, state, info, "still")[2], -3.0, rtol=IDENTITY)
+    np.testing.assert_allclose(jc.wrench(info, "still")[2], -3.0, rtol=IDENTITY)
     other = system.with_params({"still": {"value": 0.25}})
     found = jc.assemble(other, state)
     np.testing.assert_allclose(found.v, (0, 0, 0.5), atol=IDENTITY)
 
 
 MISTAKES = {
-    "unknown": (jc.AngularMomentum("L", ("b9",)), "'b9' is unknown"),
-    "world": (jc.AngularMomentum("L", ("b0", jc.WORLD)), "'world' is fixed to the world"),
-    "no tuple": (jc.LinearMomentum("P", "b0"), "bodies must be a tuple"),
-    "shape": (jc.AngularMomentum("L", ("b0",), (1.0, 2.0)), r"value must have shape \(\)"),
-    "nan": (jc.LinearMomentum("P", ("b0",), (np.nan, 0.0)), "value must be finite"),
+    "unknown": (jc.joints.AngularMomentum("L", ("b9",)), "'b9' is unknown"),
+    "world": (jc.joints.AngularMomentum("L", ("b0", jc.WORLD)), "'world' is fixed to the world"),
+    "no tuple": (jc.joints.LinearMomentum("P", "b0"), "bodies must be a tuple"),
+    "shape": (jc.joints.AngularMomentum("L", ("b0",), (1.0, 2.0)), r"value must have shape \(\)"),
+    "nan": (jc.joints.LinearMomentum("P", ("b0",), (np.nan, 0.0)), "value must be finite"),
 }
 
 

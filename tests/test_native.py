@@ -1,4 +1,4 @@
-"""Functions batched natively give what plain vmap gives, under every transformation."""
+"""Functions batched along the last axis equal plain vmap under every transformation."""
 
 import dataclasses
 
@@ -10,18 +10,18 @@ from tolerances import IDENTITY
 
 import jaxcon as jc
 from jaxcon import scenes as scenes_of_library
-from jaxcon.core import native
+from jaxcon.staging import batch_last
 
 
 def swing(q, p):
-    """Two coordinates by lanes: written for any number of trailing batch axes."""
+    """A function of two coordinates, written for any number of trailing batch axes."""
     x, y = q[0], q[1]
     pull = p["stiffness"] * (x * x + y * y)
     return {"q": jnp.stack([y - pull * x, jnp.sin(x) * p["gain"][1] + y]), "size": jnp.sqrt(pull)}
 
 
 def called(q, p):
-    return native.call(swing, q, p)
+    return batch_last.call(swing, q, p)
 
 
 RANDOM = np.random.default_rng(0)
@@ -46,12 +46,12 @@ def close(got, expected):
 
 
 def total(function):
-    """A number from everything that the function returns."""
+    """Returns a function whose value is the sum of squares of all results."""
     return lambda q, p: sum(jnp.sum(x**2) for x in jax.tree.leaves(function(q, p)))
 
 
 def transformations(f):
-    """What is made of a function of one world, by name."""
+    """Returns transformations of a function of one world, by name."""
     g = total(f)
     return {
         "value": f,
@@ -82,7 +82,7 @@ def test_vmap_outside(what, q, p, axes):
 
 @batches
 def test_vmap_inside_grad(q, p, axes):
-    """The gradient of a shared number is the sum over worlds, of an own number its own."""
+    """The gradient by a shared number is the sum over worlds."""
 
     def loss(f):
         return lambda q, p: jnp.sum(jax.vmap(total(f), in_axes=axes)(q, p))
@@ -125,11 +125,11 @@ def counted(q):
 
 def test_integers_pass_without_a_derivative():
     def value(q):
-        found = native.call(counted, q)
+        found = batch_last.call(counted, q)
         return jnp.sum(found["x"]) + 0.0 * found["n"].astype(float)
 
     close(jax.vmap(jax.grad(value))(Q), np.full((5, 2), 2.0))
-    assert jax.vmap(lambda q: native.call(counted, q)["n"])(Q).dtype == jnp.int32
+    assert jax.vmap(lambda q: batch_last.call(counted, q)["n"])(Q).dtype == jnp.int32
 
 
 def test_a_function_is_traced_once_for_a_shape():
@@ -140,8 +140,8 @@ def test_a_function_is_traced_once_for_a_shape():
         return x * 2
 
     for _ in range(3):
-        native.call(traced, jnp.ones(2))
-        jax.vmap(lambda x: native.call(traced, x))(jnp.ones((4, 2)))
+        batch_last.call(traced, jnp.ones(2))
+        jax.vmap(lambda x: batch_last.call(traced, x))(jnp.ones((4, 2)))
     assert traces == [(2, 1), (2, 4, 1)], "the batch is the last axis but for one of one"
 
 
@@ -162,7 +162,7 @@ def test_a_force_that_closes_over_a_traced_number_is_refused(transform):
     def final(k):
         scene = jc.Scene(dim=2)
         scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
-        scene.add(jc.CustomForce("pull", ("bob",), lambda m, t, u, p: -k * m.position))
+        scene.add(jc.forces.CustomForce("pull", ("bob",), lambda m, t, u, p: -k * m.position))
         system, state = scene.build()
         return jc.rollout(system, jc.Method(), state, None, 1e-2, 2)[0].q[0]
 
@@ -171,10 +171,12 @@ def test_a_force_that_closes_over_a_traced_number_is_refused(transform):
 
 
 def test_systems_of_one_structure_keep_their_rows():
-    """Pendulums of two and of three coordinates, whose functions do not say how many."""
+    """Pendulums with two and with three coordinates share functions that do not fix the size."""
 
     def system(n):
-        own = jc.GeneralizedSystem(mass=ones, force=fall, constraints=(jc.Holonomic(length),))
+        own = jc.GeneralizedSystem(
+            mass=ones, force=fall, constraints=(jc.joints.Holonomic(length),)
+        )
         return own, jc.init(own, jc.Method(), jnp.eye(n)[0], jnp.zeros(n))
 
     both = [system(n) for n in (2, 3)]
@@ -196,7 +198,7 @@ def length(q, t, p):
 
 
 def test_single_precision_is_traced_anew_where_double_is_off():
-    """One function and one shape: its constants follow what JAX now takes for real."""
+    """A cached program is traced again once JAX's default float changes, as its constants do."""
     x = jnp.ones(2, jnp.float32)
 
     def real(x):
@@ -205,12 +207,12 @@ def test_single_precision_is_traced_anew_where_double_is_off():
     found = []
     for double in (True, False, True):
         with jax.enable_x64(double):
-            found.append(float(jax.vmap(lambda y: native.call(real, y))(x)[0]))
+            found.append(float(jax.vmap(lambda y: batch_last.call(real, y))(x)[0]))
     assert found == [8, 4, 8]
 
 
 def test_numbers_that_a_program_knows_are_constants_of_it():
-    """A step under jit of a system closed over has the state and h as its only arguments.
+    """Under jit, a closed-over system is constant: only the state and h are arguments of the step.
 
     Values and tangents are those of a step that takes the system as an argument.
     """
@@ -240,26 +242,26 @@ def test_numbers_that_a_program_knows_are_constants_of_it():
 
 
 def test_equal_constants_share_a_trace():
-    before = native._with_constants.cache_info().misses
+    before = batch_last._with_constants.cache_info().misses
     for _ in range(3):
-        jax.make_jaxpr(lambda q: native.call(swing, q, {"stiffness": 1.37, "gain": P["gain"]}))(
+        jax.make_jaxpr(lambda q: batch_last.call(swing, q, {"stiffness": 1.37, "gain": P["gain"]}))(
             Q[0]
         )
-    assert native._with_constants.cache_info().misses == before + 1
+    assert batch_last._with_constants.cache_info().misses == before + 1
 
 
 def test_a_batch_outside_jit_compiles_once_for_all_values():
-    """Nothing is a constant where a function runs at once: another number costs no compilation."""
+    """Outside of jit no number is a constant, so that other values need no compilation."""
     compiled = []
     for stiffness in (1.1, 1.2):
         p = {"stiffness": jnp.asarray(stiffness), "gain": P["gain"]}
         close(jax.vmap(lambda q, p=p: called(q, p))(Q), jax.vmap(lambda q, p=p: swing(q, p))(Q))
-        compiled.append(native._shared.cache_info().misses)
+        compiled.append(batch_last._shared.cache_info().misses)
     assert compiled[0] == compiled[1]
 
 
 def test_a_rollout_outside_jit_has_no_constants():
-    """Another mass costs it no other program: the loop is one, though its body is traced."""
+    """Another mass compiles nothing: numbers of the loop are arguments, although it is traced."""
     made = []
     for mass in (1.0, 1.5):
         scene = jc.Scene(dim=2)
@@ -267,6 +269,6 @@ def test_a_rollout_outside_jit_has_no_constants():
         scene.add(jc.Distance("rod", jc.WORLD, "bob"))
         system, state = scene.build()
         jc.rollout(system, jc.Method(), state, None, 1e-3, 7)
-        caches = native._shared, native._with_constants
+        caches = batch_last._shared, batch_last._with_constants
         made.append([x.cache_info().misses for x in caches])
     assert made[0] == made[1]

@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom, each in a kernel of its own, without a warning."""
+"""The notebooks run from top to bottom without warnings, each in its own kernel."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Each guard at its singular point, next to it, and in a batch with one singular row."""
+"""Guarded functions at their singular point, next to it, and in a batch with one singular row."""
 
 import functools
 
@@ -25,7 +25,7 @@ def arctan2(x):
     return numerics.safe_arctan2(x[0], x[1])
 
 
-# name: (guard of an array, the plain function, singular point, value there, a regular point)
+# name: (guarded function, plain function, singular point, value there, regular point)
 GUARDS = {
     "sqrt": (lambda x: numerics.safe_sqrt(x[0]), lambda x: np.sqrt(x[0]), [0.0], 0.0, [2.0]),
     "divide": (
@@ -67,7 +67,7 @@ every_guard = pytest.mark.parametrize("name", GUARDS)
 
 
 def derivatives(guard):
-    """Value and first and second derivatives, in both modes."""
+    """Returns the function of value, first and second derivatives, in both modes."""
     return lambda x: (guard(x), jax.jacrev(guard)(x), jax.jacfwd(guard)(x), jax.hessian(guard)(x))
 
 
@@ -145,7 +145,7 @@ def test_cos_sinc_is_exact_within_and_across_half_turns():
         got, slope = jax.jvp(numerics.cos_sinc, (root**2,), (1.0,))
         cos, sinc = np.cos(root), np.sin(root) / root
         np.testing.assert_allclose(got, [cos, sinc], rtol=0, atol=4e-16 * (1 + root))
-        near = -1 / 6 + root**2 / 60  # of sin √s / √s
+        near = -1 / 6 + root**2 / 60  # the derivative of sin √s / √s
         bent = near if root < 1e-2 else (cos - sinc) / (2 * root**2)
         np.testing.assert_allclose(slope, [-sinc / 2, bent], rtol=0, atol=2e-14)
 

@@ -1,6 +1,6 @@
 """Second derivatives through every solver, and first ones in both orders of grad and vmap.
 
-Each is held to the same equations solved by LAPACK, and differentiated as such.
+The reference solves the same equations with LAPACK and differentiates that solution.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from test_solvers import COMPLIANCE, FORCE, MASS, TARGET, small
 from tolerances import DERIVATIVE
 
 import jaxcon as jc
-from jaxcon.solvers.bounded import Bounded, Kinds, implicit_multipliers
+from jaxcon.contact.bounded import Bounded, RowCounts, implicit_multipliers
 
 RANDOM = np.random.default_rng(4)
 ROWS = RANDOM.normal(size=(3, 2, 4))
@@ -24,7 +24,7 @@ X = jnp.asarray(RANDOM.normal(size=(2, 3)))
 
 @dataclasses.dataclass(frozen=True)
 class Named:
-    """Which rows belong to which constraint."""
+    """A layout that assigns rows to named constraints."""
 
     names: tuple = ("high", "low")
 
@@ -33,7 +33,7 @@ class Named:
 
 
 def equations(x):
-    """J, M, f, b and C, none of them linear in x."""
+    """Returns J, M, f, b and C, all nonlinear in x."""
     jacobian = ROWS[0] + jnp.sin(x[0]) * ROWS[1] + x[1] * x[2] * ROWS[2]
     soft = (1 + x[2] ** 2) * COMPLIANCE
     return jacobian, (1 + x[1] ** 2) * MASS, x[2] ** 2 * FORCE, jnp.cos(x[0]) * TARGET, soft
@@ -57,7 +57,7 @@ def eliminated(x):
 
 @functools.cache
 def derivatives(value):
-    """Worlds → vmap of the Hessian and of grad, and grad of vmap."""
+    """Returns a function of worlds: vmap of Hessian and gradient, and gradient of vmap."""
 
     def slope(x, *known):
         own = jax.grad(value)(x, *known)
@@ -74,12 +74,12 @@ def same(found, expected):
 
 
 SOLVERS = {
-    "schur": jc.Schur(),
-    "dense": jc.Dense(),
-    "sparse": jc.Sparse(),
-    "cg": jc.ConjugateGradients(tolerance=1e-15, iterations=10),
-    "rank-safe": jc.RankSafe(jc.Schur(), always=True),
-    "priority": jc.Priority({"low": 1}),
+    "schur": jc.solvers.Schur(),
+    "dense": jc.solvers.Dense(),
+    "sparse": jc.solvers.Sparse(),
+    "cg": jc.solvers.ConjugateGradients(tolerance=1e-15, iterations=10),
+    "rank-safe": jc.solvers.RankSafe(jc.solvers.Schur(), always=True),
+    "priority": jc.solvers.Priority({"low": 1}),
 }
 
 
@@ -88,13 +88,13 @@ def test_equalities(name):
     same(derivatives(functools.partial(solved, SOLVERS[name]))(), derivatives(eliminated)())
 
 
-KINDS = Kinds(single=1, boxes=1, contacts=1, tangents=2)
+KINDS = RowCounts(single=1, boxes=1, contacts=1, tangents=2)
 SPREAD = RANDOM.normal(size=(5, 7))
 OFFSET = np.array([-3.0, -9.0, -4.0, 5.0, 3.0])
 
 
 def problem(x):
-    """A stop that is hit, a brake at its bound, and a contact that slips."""
+    """Returns a problem of a stop that is hit, a brake at its bound, and a sliding contact."""
     spread = SPREAD * (1 + 0.1 * jnp.sin(x[0])) + 0.1 * x[1] * x[2]
     offset = OFFSET * (1 + 0.1 * jnp.cos(x[1])) + 0.1 * x[2] ** 2
     most = 0.5 + 0.1 * jnp.sin(x[0])
@@ -107,7 +107,7 @@ def bounded(x):
 
 
 def differentiated(x, found):
-    """As a step does it: found by constants, and then with the derivative of the laws."""
+    """Solves with constants, then applies the implicit derivative of the laws, as a step does."""
     own = bounded(x)
     live = own.lower, own.upper, own.coefficients
     fixed = jax.lax.stop_gradient(own)
@@ -116,7 +116,7 @@ def differentiated(x, found):
 
 
 def slipping(x):
-    """Slips law by law, by Newton's method; two steps from a root have its two derivatives."""
+    """Solves the active laws by Newton's method; two last iterations carry two derivatives."""
     matrix, offset, most, friction = problem(x)
 
     def unmet(y):
@@ -132,7 +132,7 @@ def slipping(x):
     return outcome(newton(newton(jax.lax.stop_gradient(root))))
 
 
-LAWS = {"interior point": jc.InteriorPoint(), "sweeps": jc.GaussSeidel(sweeps=100)}
+LAWS = {"interior point": jc.solvers.InteriorPoint(), "sweeps": jc.solvers.GaussSeidel(sweeps=100)}
 
 
 @pytest.mark.parametrize("name", LAWS)

@@ -1,4 +1,4 @@
-"""What is built from the checkout installs, and works from outside of it."""
+"""Packages built from the checkout can be installed and work outside of it."""
 
 import email
 import os
@@ -14,7 +14,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 QUICK = ("test_quaternion.py", "test_layout.py")
-"""Tests that run from the unpacked sources on the installed wheel."""
+"""Tests that run from the unpacked source package on the installed wheel."""
 
 
 def run(*command, **options):
@@ -27,7 +27,7 @@ def run(*command, **options):
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
-    """The sources, the wheel that is built from them, and where it is installed."""
+    """Returns the source package, the wheel built from it, and the folder of its installation."""
     place = tmp_path_factory.mktemp("dist")
     run("-m", "build", "--no-isolation", "--outdir", place, ROOT)
     (source,), (wheel,) = place.glob("*.tar.gz"), place.glob("*.whl")
@@ -38,7 +38,7 @@ def built(tmp_path_factory):
 
 
 def outside(site, place):
-    """Options of a process that finds the installed package and not the checkout."""
+    """Returns options of a process that imports the installed package, not the checkout."""
     return {"cwd": place, "env": os.environ | {"PYTHONPATH": str(site)}}
 
 
@@ -50,7 +50,7 @@ def test_the_wheel_has_the_package_whole_and_nothing_else(built):
     package = ROOT / "jaxcon"
     own = {p.relative_to(ROOT).as_posix() for p in package.rglob("*") if p.is_file()}
     own = {name for name in own if "__pycache__" not in name}
-    assert "jaxcon/py.typed" in own
+    assert {"jaxcon/py.typed", "jaxcon/renamed.json"} <= own
     about = {name for name in names if ".dist-info/" in name}
     assert names - about == own
     assert [name for name in about if name.endswith("licenses/LICENSE")]

@@ -18,8 +18,8 @@ def scene_with_everything():
     scene.add(jc.Revolute("hinge", jc.WORLD, "link", point=(0.0, 0.0)))
     scene.add(jc.Distance("rod", "link", "bob"))
     scene.add(jc.Spring("spring", jc.WORLD, "bob", stiffness=20.0, damping=0.1))
-    scene.add(jc.JointSpring("coil", "hinge", stiffness=2.0, damping=0.3, rest=0.1))
-    scene.add(jc.Force("wind", "bob", force=(1.0, 2.0)))
+    scene.add(jc.forces.JointSpring("coil", "hinge", stiffness=2.0, damping=0.3, rest=0.1))
+    scene.add(jc.forces.Force("wind", "bob", force=(1.0, 2.0)))
     return scene.build()
 
 
@@ -80,7 +80,7 @@ def after(system, state, steps=10):
 
 
 def test_gradient_by_every_number_against_differences():
-    """One direction in the space of all numbers at once."""
+    """Differentiates along one random direction in the space of all numbers."""
     system, state = scene_with_everything()
     params = system.params
     random = np.random.default_rng(0)
@@ -190,4 +190,4 @@ def test_some_of_the_parameters_of_generalized_coordinates_are_changed_by_name()
     for unknown in ({"n": 1.0}, {"spring": {"c": 1.0}}):
         with pytest.raises(ValueError, match="is unknown; known are"):
             system.with_params(unknown)
-    assert system.with_params(jnp.ones(2)).params.shape == (2,)  # another kind of θ
+    assert system.with_params(jnp.ones(2)).params.shape == (2,)  # replaces all of θ

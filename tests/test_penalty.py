@@ -1,4 +1,4 @@
-"""Springs, multipliers and mixtures in place of hard rows."""
+"""Penalty springs, augmented multipliers and mixtures in place of hard rows."""
 
 import dataclasses
 from typing import Any
@@ -26,15 +26,15 @@ def along_x(p, t, _):
 
 
 def oscillator():
-    """A particle whose constraint x = 0 is to be a spring; nothing acts along y."""
+    """A particle whose constraint x = 0 becomes a spring; no force acts along y."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("a", mass=MASS, position=(0.1, 0.0))
-    scene.add(jc.Holonomic(along_x, ("a",), name="spring"))
+    scene.add(jc.joints.Holonomic(along_x, ("a",), name="spring"))
     return scene.build()
 
 
 def pendulum(dtype="float64", rod=True):
-    """A link on a hinge, and a bob on a rod at its end."""
+    """A link on a hinge, with a bob on a rod at its end."""
     scene = jc.Scene(dim=2, dtype=dtype)
     inertia, place = 1 / 12, (0.5, 0.0)
     scene.add_body("arm", mass=1.0, inertia=inertia, position=place, angular_velocity=0.4)
@@ -46,18 +46,18 @@ def pendulum(dtype="float64", rod=True):
 
 
 def rolled(built, method, steps, dt=H):
-    """The last state, and the x of every state."""
+    """Returns the last state, and x in every state."""
     system, state = built
     start = jc.init(system, method, state.q, state.v)
     return jc.rollout(system, method, start, None, dt, steps, record=lambda s, _: s.q[0])
 
 
 def test_a_penalty_has_the_frequency_of_a_spring():
-    """√(k/m), and λ is the force of the spring (exercise 4)."""
+    """The frequency is √(k/m), and λ is the force of the spring (exercise 4)."""
     k = 50.0
     ω = np.sqrt(k / MASS)
     dt = 2 * np.pi / ω / 200
-    method = jc.Method(jc.RK4(), jc.Penalty(k, implicit=False))
+    method = jc.Method(jc.RK4(), jc.stabilizers.Penalty(k, implicit=False))
     built = oscillator()
     _, path = jax.jit(lambda: rolled(built, method, 600, dt))()
     expected = 0.1 * np.cos(ω * dt * np.arange(1, 601))
@@ -73,18 +73,20 @@ def test_an_explicit_spring_is_stable_below_four_masses_by_the_square_of_the_ste
     @jax.jit
     @jax.vmap
     def largest(share):
-        method = jc.Method(stabilizer=jc.Penalty(share * limit, implicit=False))
+        method = jc.Method(stabilizer=jc.stabilizers.Penalty(share * limit, implicit=False))
         return jnp.max(jnp.abs(rolled(oscillator(), method, 3000)[1]))
 
     below, above = largest(jnp.asarray([0.999, 1.001]))
-    assert below < 4.0  # of 0.1; the orbit is a long ellipse there
+    assert below < 4.0  # 0.1 at first; here the orbit is a long ellipse
     assert not above < 1e10
 
 
 @pytest.mark.parametrize(("share", "warned"), [(0.999, False), (1.001, True)])
 def test_beyond_it_a_warning_says_so(share, warned, recwarn):
     system, state = oscillator()
-    method = jc.Method(stabilizer=jc.Penalty({"spr*": share * 4 * MASS / H**2}, implicit=False))
+    method = jc.Method(
+        stabilizer=jc.stabilizers.Penalty({"spr*": share * 4 * MASS / H**2}, implicit=False)
+    )
     jax.jit(lambda: jc.rollout(system, method, state, None, H, 1)).trace()
     text = [str(warning.message) for warning in recwarn]
     assert len(text) == warned
@@ -93,13 +95,13 @@ def test_beyond_it_a_warning_says_so(share, warned, recwarn):
 
 @pytest.fixture(scope="module")
 def implicit():
-    """The last states under a stiffness and damping, one world each, and the hard one."""
+    """Returns final states by (stiffness, damping), in a batch, and that of hard rows."""
     built = pendulum()
 
     @jax.jit
     @jax.vmap
     def soft(k, d):
-        return rolled(built, jc.Method(stabilizer=jc.Penalty(k, d)), 300)
+        return rolled(built, jc.Method(stabilizer=jc.stabilizers.Penalty(k, d)), 300)
 
     hard = jax.jit(lambda: rolled(built, jc.Method(), 300))()
     return soft, hard
@@ -110,17 +112,17 @@ def test_an_implicit_spring_of_any_stiffness_is_stable_and_in_the_limit_hard(imp
     k = 10.0 ** np.arange(0, 13, 2)
     final, path = soft(jnp.asarray(k), jnp.zeros(len(k)))
     assert np.all(np.asarray(final.status) == jc.Status.OK)
-    assert np.max(np.abs(path)) < 30  # a bob on the weakest one falls ½ g t² = 44 m, mostly along y
+    assert np.max(np.abs(path)) < 30  # with the weakest spring the bob falls ½ g t² = 44 m
     gap = np.max(np.abs(np.asarray(final.q) - np.asarray(hard.q)), axis=-1)
     assert gap[-1] < 1e-8
-    np.testing.assert_allclose(gap[4] / gap[5], 100, rtol=0.01)  # 1e8 and 1e10: of first order
+    np.testing.assert_allclose(gap[4] / gap[5], 100, rtol=0.01)  # 1e8, 1e10: order one in 1/k
 
 
 def test_no_stiffness_is_no_constraint(implicit):
     soft, _ = implicit
     zero = jnp.zeros(1)
     final, _ = soft(zero, zero)
-    # λ stands for the force, and gravity acts on each alone: y⁺ = y + h v⁺ with v⁺ = v − h g
+    # no force acts between the bodies: y⁺ = y + h v⁺ with v⁺ = v − h g
     fall = -9.81 * H**2 * 300 * 301 / 2
     arm, bob = (np.asarray(final.q[0])[pendulum()[0].layout.v(name)] for name in ("arm", "bob"))
     np.testing.assert_allclose(arm, [0.5, fall, 0.4 * 3.0], atol=1e-9)
@@ -132,13 +134,13 @@ def test_the_gradient_where_there_is_no_spring_is_that_of_the_spring(which):
     built = pendulum()
 
     def value(k, d):
-        final, _ = rolled(built, jc.Method(stabilizer=jc.Penalty(k, d)), 20)
+        final, _ = rolled(built, jc.Method(stabilizer=jc.stabilizers.Penalty(k, d)), 20)
         return jnp.sum(final.q * jnp.arange(1.0, 6.0))
 
     zero = jnp.zeros(())
     slope = jax.jit(jax.grad(value, which))(zero, zero)
     run = jax.jit(value)
-    step = 1e-2  # a spring that pushes is refused, so to one side only
+    step = 1e-2  # one-sided differences, as negative stiffness is refused
     args = [[(i * step if j == which else 0.0) for j in (0, 1)] for i in range(5)]
     at = [float(run(*map(jnp.asarray, x))) for x in args]
     expected = np.dot([-25, 48, -36, 16, -3], at) / (12 * step)
@@ -149,9 +151,9 @@ def test_the_gradient_where_there_is_no_spring_is_that_of_the_spring(which):
 def test_a_time_and_a_damping_ratio_stand_for_the_mass_of_the_row():
     built = oscillator()
     for implicit in (True, False):
-        by_time = jc.Penalty.from_time({"spring": 0.2}, 0.3, implicit=implicit)
+        by_time = jc.stabilizers.Penalty.from_time({"spring": 0.2}, 0.3, implicit=implicit)
         k, d = MASS / 0.2**2, 2 * 0.3 * MASS / 0.2
-        known = jc.Penalty({"spring": k}, {"spring": d}, implicit=implicit)
+        known = jc.stabilizers.Penalty({"spring": k}, {"spring": d}, implicit=implicit)
         ends = [
             jax.jit(lambda x=x: rolled(built, jc.Method(stabilizer=x), 50))()
             for x in (by_time, known)
@@ -162,7 +164,9 @@ def test_a_time_and_a_damping_ratio_stand_for_the_mass_of_the_row():
 @pytest.mark.parametrize("implicit", [True, False])
 def test_what_is_not_named_stays_hard(implicit):
     system, state = built = pendulum()
-    soft = jc.Penalty({"r*": 1e3}, {"rod": 5.0}, implicit=implicit, others=jc.PID(integral=10.0))
+    soft = jc.stabilizers.Penalty(
+        {"r*": 1e3}, {"rod": 5.0}, implicit=implicit, others=jc.stabilizers.PID(integral=10.0)
+    )
     method = jc.Method(stabilizer=soft)
     final, _ = jax.jit(lambda: rolled(built, method, 200))()
     violation = jc.violation(system, final)
@@ -174,7 +178,7 @@ def test_what_is_not_named_stays_hard(implicit):
     if not implicit:
         expected = -1e3 * rows.residual - 5.0 * rows.rate
         np.testing.assert_allclose(solution.multipliers[own], expected[own], rtol=1e-9)
-    # the motion is that of the forces reported
+    # the reported forces cause the motion
     force = system.force(final.q, final.v, final.time, None)
     force = force + rows.jacobian.transpose(solution.multipliers)
     np.testing.assert_allclose(system.mass(final.q).apply(solution.acceleration), force, atol=1e-9)
@@ -185,17 +189,21 @@ def test_rotors_and_rows_of_velocities():
     scene = jc.Scene(dim=2)
     scene.add_body("arm", mass=1.0, inertia=1 / 12, position=(0.5, 0.0))
     scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
-    scene.add(jc.Armature("rotor", "hinge", 0.3))
-    scene.add(jc.KnifeEdge("edge", jc.WORLD, "arm", edge=(1.0, 0.0), center=(0.5, 0.0)))
+    scene.add(jc.joints.Armature("rotor", "hinge", 0.3))
+    scene.add(jc.joints.KnifeEdge("edge", jc.WORLD, "arm", edge=(1.0, 0.0), center=(0.5, 0.0)))
     system, state = scene.build()
     rows = linearize(system, state.q, state.v, state.time)
-    penalty = jc.Penalty(1e4)
+    penalty = jc.stabilizers.Penalty(1e4)
     soft = penalty.soft(rows.layout)
     assert not soft[rows.layout.rows("rotor")].any()
     assert soft[rows.layout.rows("hinge")].all()
     stiffness, _ = penalty.constants(rows)
     np.testing.assert_array_equal(stiffness != 0, rows.layout.holonomic)
-    for law in (penalty, jc.Penalty(1e4, 1.0, implicit=False), jc.AugmentedLagrangian()):
+    for law in (
+        penalty,
+        jc.stabilizers.Penalty(1e4, 1.0, implicit=False),
+        jc.stabilizers.AugmentedLagrangian(),
+    ):
         method = jc.Method(stabilizer=law)
         start = jc.init(system, method, state.q, state.v)
         a, λ, _ = jc.forward_dynamics(system, start, None, method, H)
@@ -204,14 +212,14 @@ def test_rotors_and_rows_of_velocities():
 
 
 def test_multipliers_come_nearer_by_the_stiffness_in_each_round():
-    """With one row, λ after k rounds from 0 lacks (1 + stiffness)⁻ᵏ of the hard one."""
+    """With one row, the error of λ after k rounds from 0 is (1 + stiffness)⁻ᵏ of the hard λ."""
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.5, position=(0.6, -0.8), velocity=(0.8, 0.6))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     system, state = scene.build()
     hard = jc.forward_dynamics(system, state, None, jc.Method(), H).multipliers
     for rounds in (1, 3):
-        method = jc.Method(stabilizer=jc.AugmentedLagrangian(9.0, iterations=rounds))
+        method = jc.Method(stabilizer=jc.stabilizers.AugmentedLagrangian(9.0, iterations=rounds))
         start = jc.init(system, method, state.q, state.v)
         λ = jc.forward_dynamics(system, start, None, method, H).multipliers
         np.testing.assert_allclose(λ, hard * (1 - 10.0**-rounds), rtol=1e-12)
@@ -222,7 +230,7 @@ def test_multipliers_come_nearer_by_the_stiffness_in_each_round():
 def test_multipliers_hold_a_closed_loop():
     built = four_bar()
     ends = []
-    for law in (jc.Baumgarte(), jc.AugmentedLagrangian(100.0, iterations=2)):
+    for law in (jc.Baumgarte(), jc.stabilizers.AugmentedLagrangian(100.0, iterations=2)):
         final, _ = jax.jit(lambda law=law: rolled(built, jc.Method(stabilizer=law), 400, 1e-3))()
         assert final.status == jc.Status.OK
         assert jc.violation(built[0], final).worst < 1e-4
@@ -231,7 +239,7 @@ def test_multipliers_hold_a_closed_loop():
 
 
 def boxes_on_hinges(links, dtype):
-    """A chain of boxes in space, its hinges oblique to gravity, released level."""
+    """A level chain of boxes in space, at rest, with hinges oblique to gravity."""
     turned = np.asarray(quaternion.matrix(quaternion.exp(jnp.asarray((0.5, -0.3, 0.8)))))
     attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turned)))
     scene, before = jc.Scene(dim=3, dtype=dtype), jc.WORLD
@@ -246,7 +254,7 @@ def boxes_on_hinges(links, dtype):
 
 
 def worst_of(built, law, seconds, dt):
-    """The largest violation of a motion [m], and the status of its end."""
+    """Returns the largest violation of a motion [m], and its final status."""
     system, state = built
     method = jc.Method(stabilizer=law)
     start = jc.init(system, method, state.q, state.v)
@@ -263,18 +271,20 @@ def worst_of(built, law, seconds, dt):
 @pytest.mark.parametrize(("dt", "bound"), [(1e-3, 1e-4), (1e-2, 2e-2)])
 def test_multipliers_hold_a_chain_with_default_numbers(dt, bound, dtype):
     built = boxes_on_hinges(4, dtype)
-    worst, status = jax.jit(lambda: worst_of(built, jc.AugmentedLagrangian(), 3.0, dt))()
+    worst, status = jax.jit(
+        lambda: worst_of(built, jc.stabilizers.AugmentedLagrangian(), 3.0, dt)
+    )()
     assert status == jc.Status.OK
     assert worst < bound
 
 
 @pytest.mark.parametrize("rounds", [1, 2, 4])
 def test_multipliers_hold_a_chain_whatever_the_stiffness(rounds):
-    """From rows softer than themselves to hard ones; what is left shrinks with the stiffness."""
+    """From soft to hard rows the violation decreases with the stiffness, then levels off."""
     built, dt = boxes_on_hinges(4, jnp.float64), 1e-3
 
     def worst(stiffness):
-        law = jc.AugmentedLagrangian(stiffness, iterations=rounds)
+        law = jc.stabilizers.AugmentedLagrangian(stiffness, iterations=rounds)
         return worst_of(built, law, 1.0, dt)
 
     found, status = jax.jit(jax.vmap(worst))(10.0 ** jnp.arange(-1.0, 7.0))
@@ -285,14 +295,14 @@ def test_multipliers_hold_a_chain_whatever_the_stiffness(rounds):
 
 def test_more_rounds_leave_less_of_the_error():
     built, dt = boxes_on_hinges(4, jnp.float64), 1e-3
-    laws = [jc.AugmentedLagrangian(1.0, iterations=k) for k in (1, 2, 4, 8, 16)]
+    laws = [jc.stabilizers.AugmentedLagrangian(1.0, iterations=k) for k in (1, 2, 4, 8, 16)]
     found = [float(jax.jit(lambda law=law: worst_of(built, law, 1.0, dt)[0])()) for law in laws]
     assert all(after < 0.8 * before for before, after in zip(found[:-1], found[1:], strict=True))
 
 
 @pytree
-class Homing(jc.Unstabilized):
-    """A correction that takes the particle to the origin, at rest."""
+class Homing(jc.stabilizers.Unstabilized):
+    """A stabilizer whose correction puts the particle at the origin, at rest."""
 
     def correct(self, system, solver, before, state, memory, dt):
         code = jnp.zeros_like(state.status)
@@ -300,20 +310,20 @@ class Homing(jc.Unstabilized):
 
 
 def mixture(**changes: Any):
-    parts = {"small": jc.Penalty(1e3, 10.0), "middle": jc.Baumgarte(5.0, 6.0)}
-    return jc.Hybrid(**parts, soft_below=1e-3, **changes)
+    parts = {"small": jc.stabilizers.Penalty(1e3, 10.0), "middle": jc.Baumgarte(5.0, 6.0)}
+    return jc.stabilizers.Hybrid(**parts, soft_below=1e-3, **changes)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_a_rod_without_length_leaves_no_multiplier_to_the_next_step(dtype):
-    """Its row is zero, and what W alone made of it threw the bodies off as soon as they parted."""
+    """The row is zero; a multiplier from W alone would push the bodies apart in the next step."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=dtype)
     for name, place in (("a", (0.0, 0.0)), ("b", (1.0, 0.0)), ("c", (0.0, 1.0))):
         scene.add_particle(name, mass=1.0, position=place)
     scene.add(jc.Distance("rod", "a", "b"))
     scene.add(jc.Distance("other", jc.WORLD, "c"))
     system, state = scene.build()
-    method = jc.Method(stabilizer=jc.AugmentedLagrangian(jnp.asarray(100.0, dtype)))
+    method = jc.Method(stabilizer=jc.stabilizers.AugmentedLagrangian(jnp.asarray(100.0, dtype)))
     q = state.q.at[system.layout.q("b")].set(state.q[system.layout.q("a")])
     v = state.v.at[system.layout.v("b")].set(jnp.asarray([0.01, 0.02], dtype))
 
@@ -329,7 +339,11 @@ def test_a_rod_without_length_leaves_no_multiplier_to_the_next_step(dtype):
 
 def test_a_mixture_is_each_of_its_laws_where_the_violation_is_its_own():
     system, state = oscillator()
-    own = {"small": jc.Penalty(1e3, 10.0), "middle": jc.Baumgarte(5.0, 6.0), "all": mixture()}
+    own = {
+        "small": jc.stabilizers.Penalty(1e3, 10.0),
+        "middle": jc.Baumgarte(5.0, 6.0),
+        "all": mixture(),
+    }
 
     def acceleration(law, x):
         at = dataclasses.replace(state, q=jnp.stack([x, 0.0 * x]))
@@ -339,7 +353,7 @@ def test_a_mixture_is_each_of_its_laws_where_the_violation_is_its_own():
     for x, name, rtol in ((1e-5, "small", 1e-6), (1.0, "middle", 1e-6)):
         both = [acceleration(own[key], jnp.asarray(x)) for key in (name, "all")]
         np.testing.assert_allclose(*both, rtol=rtol)
-    # where φ = soft_below half of each: (1/m + C/2) λ = ½ b₁ + ½ b₂
+    # at φ = soft_below both laws have weight ½: (1/m + C/2) λ = ½ b₁ + ½ b₂
     s, x = H * (10.0 + H * 1e3), 1e-3
     λ = -(1e3 * x / s + 36 * x) / 2 / (1 / MASS + 0.5 / s)
     got = acceleration(own["all"], jnp.asarray(x))
@@ -358,7 +372,7 @@ def test_a_mixture_projects_by_the_share_of_the_violation():
     law = mixture(large=Homing(), project_above=0.05)
     for x, share in ((0.05, 0.5), (5.0, 1.0), (5e-4, 0.0)):
         at = dataclasses.replace(state, q=jnp.asarray([x, 0.3]), v=jnp.asarray([2.0, 1.0]))
-        new, _ = law.correct(system, jc.RankSafe(), at, at, (), jnp.asarray(H))
+        new, _ = law.correct(system, jc.solvers.RankSafe(), at, at, (), jnp.asarray(H))
         np.testing.assert_allclose(new.q, (1 - share) * at.q, atol=1e-7)
         np.testing.assert_allclose(new.v, (1 - share) * at.v, atol=1e-7)
 
@@ -366,7 +380,7 @@ def test_a_mixture_projects_by_the_share_of_the_violation():
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("sharpness", [1, 6, 40])
 def test_a_sharp_mixture_is_finite_however_far_it_is_off(sharpness, dtype):
-    """w = 1/(1 + x⁻²ⁿ) and dw/dx² = n/(xⁿ⁺¹ + x¹⁻ⁿ)², from x² = 0 to beyond all numbers."""
+    """w = 1/(1 + x⁻²ⁿ) and dw/dx² = n/(xⁿ⁺¹ + x¹⁻ⁿ)² are finite, from x² = 0 to infinity."""
     weight = jax.value_and_grad(mixture(sharpness=sharpness).beyond)
     largest = float(jnp.finfo(dtype).max)
     for square in (0.0, 0.7, 1.0, 1.3, 1e10, largest, np.inf):
@@ -380,13 +394,20 @@ def test_a_sharp_mixture_is_finite_however_far_it_is_off(sharpness, dtype):
 
 
 STABILIZERS = {
-    "implicit": (jc.Penalty, {"stiffness": 3e3, "damping": 7.0}),
-    "explicit": (lambda **x: jc.Penalty(**x, implicit=False), {"stiffness": 3e3, "damping": 7.0}),
-    "time": (jc.Penalty.from_time, {"time": 0.03, "damping_ratio": 0.4}),
-    "multipliers": (jc.AugmentedLagrangian, {"stiffness": 20.0}),
+    "implicit": (jc.stabilizers.Penalty, {"stiffness": 3e3, "damping": 7.0}),
+    "explicit": (
+        lambda **x: jc.stabilizers.Penalty(**x, implicit=False),
+        {"stiffness": 3e3, "damping": 7.0},
+    ),
+    "time": (jc.stabilizers.Penalty.from_time, {"time": 0.03, "damping_ratio": 0.4}),
+    "multipliers": (jc.stabilizers.AugmentedLagrangian, {"stiffness": 20.0}),
     "hybrid": (
-        lambda stiffness, beta: jc.Hybrid(
-            jc.Penalty(stiffness, 5.0), jc.PID(beta**2, 2 * beta), Homing(), 1e-3, 3.0
+        lambda stiffness, beta: jc.stabilizers.Hybrid(
+            jc.stabilizers.Penalty(stiffness, 5.0),
+            jc.stabilizers.PID(beta**2, 2 * beta),
+            Homing(),
+            1e-3,
+            3.0,
         ),
         {"stiffness": 3e3, "beta": 15.0},
     ),
@@ -411,7 +432,7 @@ def test_a_float32_world_stays_float32(name):
     system, state = pendulum("float32")
     single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), numbers)
     law = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), kind(**single))
-    solver = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), jc.RankSafe())
+    solver = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), jc.solvers.RankSafe())
     method = jc.Method(stabilizer=law, solver=solver)
     start = jc.init(system, method, state.q, state.v)
 
@@ -427,9 +448,9 @@ def test_a_float32_world_stays_float32(name):
 
 @pytest.mark.parametrize("name", ["arm", "polar"])
 def test_generalized_coordinates(name):
-    """Worlds of a system with its own mass matrix, soft by time and by multipliers."""
+    """Batches of systems with a user's mass matrix, with springs or augmented multipliers."""
     built = scenes.build(name)
-    for law in (jc.Penalty.from_time(0.05), jc.AugmentedLagrangian()):
+    for law in (jc.stabilizers.Penalty.from_time(0.05), jc.stabilizers.AugmentedLagrangian()):
         method = jc.Method(stabilizer=law)
         start = jc.init(built.system, method, built.off.q, built.off.v)
 
@@ -445,30 +466,53 @@ def test_generalized_coordinates(name):
 @pytest.mark.parametrize(
     ("stabilizer", "words"),
     [
-        (lambda: jc.Penalty(), ["Penalty", "stiffness", "time"]),
-        (lambda: jc.Penalty(-1.0), ["Penalty", "stiffness", "zero or more", "-1"]),
-        (lambda: jc.Penalty({"spring": -1.0}), ["stiffness of 'spring'"]),
-        (lambda: jc.Penalty(1.0, -2.0), ["damping", "-2"]),
-        (lambda: jc.Penalty.from_time(0.0), ["time", "positive"]),
-        (lambda: jc.Penalty({"sprong*": 1.0}), ["Penalty", r"sprong\*", "spring"]),
-        (lambda: jc.Penalty({"spring": 1.0}, {"sp": 1.0}), ["Penalty", r"\['sp'\]"]),
-        (lambda: jc.Penalty(jnp.ones(4)), ["Penalty", r"\(1,\)", r"\(4,\)"]),
-        (lambda: jc.AugmentedLagrangian(0.0), ["AugmentedLagrangian", "stiffness", "positive"]),
+        (lambda: jc.stabilizers.Penalty(), ["Penalty", "stiffness", "time"]),
+        (lambda: jc.stabilizers.Penalty(-1.0), ["Penalty", "stiffness", "zero or more", "-1"]),
+        (lambda: jc.stabilizers.Penalty({"spring": -1.0}), ["stiffness of 'spring'"]),
+        (lambda: jc.stabilizers.Penalty(1.0, -2.0), ["damping", "-2"]),
+        (lambda: jc.stabilizers.Penalty.from_time(0.0), ["time", "positive"]),
+        (lambda: jc.stabilizers.Penalty({"sprong*": 1.0}), ["Penalty", r"sprong\*", "spring"]),
+        (lambda: jc.stabilizers.Penalty({"spring": 1.0}, {"sp": 1.0}), ["Penalty", r"\['sp'\]"]),
+        (lambda: jc.stabilizers.Penalty(jnp.ones(4)), ["Penalty", r"\(1,\)", r"\(4,\)"]),
         (
-            lambda: jc.AugmentedLagrangian(iterations=0),
+            lambda: jc.stabilizers.AugmentedLagrangian(0.0),
+            ["AugmentedLagrangian", "stiffness", "positive"],
+        ),
+        (
+            lambda: jc.stabilizers.AugmentedLagrangian(iterations=0),
             ["iterations must be a whole number from 1"],
         ),
-        (lambda: jc.Hybrid(jc.Penalty(1.0, implicit=False)), ["Hybrid", "implicit"]),
-        (lambda: jc.Hybrid(jc.Penalty(-1.0)), ["Penalty", "stiffness"]),
         (
-            lambda: jc.Penalty(1.0, others=jc.Projection()),
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0, implicit=False)),
+            ["Hybrid", "implicit"],
+        ),
+        (lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(-1.0)), ["Penalty", "stiffness"]),
+        (
+            lambda: jc.stabilizers.Penalty(1.0, others=jc.Projection()),
             ["others=Projection", "soft constraints"],
         ),
-        (lambda: jc.Hybrid(jc.Penalty(1.0), sharpness=0), ["Hybrid", "sharpness"]),
-        (lambda: jc.Hybrid(jc.Penalty(1.0), large=jc.Baumgarte()), ["Hybrid", "corrects nothing"]),
-        (lambda: jc.Hybrid(jc.Penalty(1.0), large=jc.Penalty(2.0)), ["Hybrid", "corrects nothing"]),
-        (lambda: jc.Hybrid(jc.Penalty(1.0), jc.Projection()), ["Hybrid", "corrects after a step"]),
-        (lambda: jc.Hybrid(jc.Penalty(1.0), soft_below=1.0), ["Hybrid", "must not exceed"]),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), sharpness=0),
+            ["Hybrid", "sharpness"],
+        ),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), large=jc.Baumgarte()),
+            ["Hybrid", "corrects nothing"],
+        ),
+        (
+            lambda: jc.stabilizers.Hybrid(
+                jc.stabilizers.Penalty(1.0), large=jc.stabilizers.Penalty(2.0)
+            ),
+            ["Hybrid", "corrects nothing"],
+        ),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), jc.Projection()),
+            ["Hybrid", "corrects after a step"],
+        ),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), soft_below=1.0),
+            ["Hybrid", "must not exceed"],
+        ),
     ],
 )
 def test_bad_numbers_are_refused(stabilizer, words):
@@ -484,22 +528,34 @@ def test_bad_numbers_are_refused(stabilizer, words):
 @pytest.mark.parametrize(
     ("stabilizer", "words"),
     [
-        (lambda: jc.Penalty(1.0, others=None), "Penalty: others must be a stabiliser"),
-        (lambda: jc.AugmentedLagrangian(feedback=None), "AugmentedLagrangian: feedback must be"),
+        (lambda: jc.stabilizers.Penalty(1.0, others=None), "Penalty: others must be a stabiliser"),
         (
-            lambda: jc.AugmentedLagrangian(feedback=jc.Baumgarte),
+            lambda: jc.stabilizers.AugmentedLagrangian(feedback=None),
             "AugmentedLagrangian: feedback must be",
         ),
-        (lambda: jc.Hybrid(jc.Penalty), "Hybrid: small must be"),
-        (lambda: jc.Hybrid(jc.Penalty(1.0), middle=None), "Hybrid: middle must be"),
-        (lambda: jc.Hybrid(jc.Penalty(1.0), large="Projection"), "Hybrid: large must be"),
-        (lambda: jc.Hybrid(jc.Penalty(1.0, others=None)), "Penalty: others must be a stabiliser"),
         (
-            lambda: jc.Hybrid(jc.Penalty(1.0), soft_below={"rod": 1e-3}),
+            lambda: jc.stabilizers.AugmentedLagrangian(feedback=jc.Baumgarte),
+            "AugmentedLagrangian: feedback must be",
+        ),
+        (lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty), "Hybrid: small must be"),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), middle=None),
+            "Hybrid: middle must be",
+        ),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), large="Projection"),
+            "Hybrid: large must be",
+        ),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0, others=None)),
+            "Penalty: others must be a stabiliser",
+        ),
+        (
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), soft_below={"rod": 1e-3}),
             "soft_below must be one number",
         ),
         (
-            lambda: jc.Hybrid(jc.Penalty(1.0), project_above=None),
+            lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), project_above=None),
             "project_above must be one number",
         ),
     ],
@@ -511,7 +567,7 @@ def test_parts_that_are_none_are_refused(stabilizer, words):
 
 def test_damping_for_what_is_hard_is_refused():
     system, state = pendulum()
-    method = jc.Method(stabilizer=jc.Penalty({"rod": 1.0}, {"hinge": 1.0}))
+    method = jc.Method(stabilizer=jc.stabilizers.Penalty({"rod": 1.0}, {"hinge": 1.0}))
     with pytest.raises(ValueError, match="damping is given for .*hinge.*only .*rod.* soft"):
         jax.eval_shape(lambda s: jc.step(system, method, s, None, H), state)
 
@@ -522,7 +578,7 @@ def test_a_hybrid_comes_back_from_a_tenth_off(integrator):
     scene.add_particle("bob", mass=1.0, position=(1.1, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
     system, state = scene.build()
-    method = jc.Method(integrator, jc.Hybrid(jc.Penalty(1e3)))
+    method = jc.Method(integrator, jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1e3)))
     final, _ = jax.jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 2000))(
         jc.init(system, method, state.q, state.v)
     )
@@ -532,7 +588,7 @@ def test_a_hybrid_comes_back_from_a_tenth_off(integrator):
 
 
 def turned(turn, kind):
-    """A body on another that hangs in the world, with the world turned."""
+    """Two bodies in a chain that hangs in the world, with the whole scene rotated."""
 
     def place(x):
         return quaternion.rotate(turn, jnp.asarray(x))
@@ -548,7 +604,7 @@ def turned(turn, kind):
     joints = {
         "revolute": lambda: jc.Revolute("second", "a", "b", axis=axis, **points),
         "prismatic": lambda: jc.Prismatic("second", "a", "b", axis=axis, **points),
-        "planar": lambda: jc.Planar("second", "a", "b", axis=axis, **points),
+        "planar": lambda: jc.joints.Planar("second", "a", "b", axis=axis, **points),
     }
     scene.add(joints[kind]())
     return scene.build()
@@ -556,8 +612,8 @@ def turned(turn, kind):
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic", "planar"])
 def test_a_spring_by_its_time_does_not_see_how_the_world_is_turned(kind):
-    """The motion in a world turned by a random rotation is the same motion, turned."""
-    method = jc.Method(stabilizer=jc.Penalty.from_time(0.05, 0.2))
+    """In a world with a random rotation the motion is the rotated motion."""
+    method = jc.Method(stabilizer=jc.stabilizers.Penalty.from_time(0.05, 0.2))
 
     def ends(turn):
         system, state = turned(turn, kind)
@@ -569,7 +625,7 @@ def test_a_spring_by_its_time_does_not_see_how_the_world_is_turned(kind):
     turns = np.random.default_rng(3).normal(size=(2, 4))
     turns = jnp.asarray(np.concatenate([[[1.0, 0, 0, 0]], turns / norms(turns)]))
     places, left = jax.jit(jax.vmap(ends))(turns)
-    assert np.min(left.worst) > 1e-3  # the springs do give way
+    assert np.min(left.worst) > 1e-3  # the springs yield
     for other in places[1:]:
         np.testing.assert_allclose(other, places[0], rtol=0, atol=1e-9)
 
@@ -579,9 +635,9 @@ def norms(x):
 
 
 def test_a_spring_by_its_time_has_one_stiffness_in_all_directions():
-    """A meeting point takes the mean of A_ii over its axes, a hinge that of its two turns, too.
+    """A point joint uses the mean of A_ii over its axes, and a hinge the mean of both angles.
 
-    The rod of 1.5 kg turns about its middle, 0.5 m from the point: A = 1/m + r²/I across it.
+    The rod of 1.5 kg has its center 0.5 m from the point: A = 1/m + r²/I across it.
     """
     scene = jc.Scene(dim=3)
     moments = (0.15, 0.3, 0.4)
@@ -590,7 +646,7 @@ def test_a_spring_by_its_time_has_one_stiffness_in_all_directions():
     system, state = scene.build()
     rows = linearize(system, state.q, state.v, state.time)
     rows = dataclasses.replace(rows, mass=system.mass(state.q))
-    k, d = jc.Penalty.from_time(0.1, 0.3).constants(rows)
+    k, d = jc.stabilizers.Penalty.from_time(0.1, 0.3).constants(rows)
     lengths = np.mean([1 / 1.5, 1 / 1.5 + 0.25 / 0.4, 1 / 1.5 + 0.25 / 0.3])
     turns = np.mean([1 / 0.3, 1 / 0.4])
     mass = 1 / np.array([lengths] * 3 + [turns] * 2)
@@ -608,7 +664,10 @@ def test_multipliers_judge_contradictions_as_their_solver_is_told(apart, conflic
     scene.add(jc.Distance("short", jc.WORLD, "bob", length=1 - apart))
     scene.add(jc.Distance("long", jc.WORLD, "bob", length=1 + apart))
     system, state = scene.build()
-    method = jc.Method(stabilizer=jc.AugmentedLagrangian(), solver=jc.RankSafe(conflict=conflict))
+    method = jc.Method(
+        stabilizer=jc.stabilizers.AugmentedLagrangian(),
+        solver=jc.solvers.RankSafe(conflict=conflict),
+    )
     state = jc.init(system, method, state.q, state.v)
     _, info = jc.step(system, method, state, None, 1e-2)
     assert info.status == jc.Status[status]

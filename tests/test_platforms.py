@@ -1,4 +1,4 @@
-"""Programs for a GPU, lowered on a machine without one: nothing is compiled or run."""
+"""Programs for a GPU are lowered on a machine without one; nothing is compiled or run."""
 
 import jax
 import jax.numpy as jnp
@@ -18,20 +18,28 @@ def arm(dtype):
 
 
 def ball(dtype):
-    """Falls on a floor; beside it a pendulum on a servo, whose turns are counted."""
+    """A ball that falls on a floor, and a pendulum on a servo, whose turns are counted."""
     scene = jc.Scene(dim=3, dtype=dtype)
     scene.add_body("ball", mass=1.0, inertia=(0.004, 0.004, 0.004), position=(0.0, 0.0, 0.2))
     scene.add_body("rod", mass=1.0, inertia=(0.1, 0.1, 0.01), position=(1.0, 0.0, -0.5))
     floor = jc.PlaneContact("floor", jc.WORLD, "ball", friction=0.5, radius=0.1, restitution=0.6)
     scene.add(floor)
     scene.add(jc.Revolute("hinge", jc.WORLD, "rod", point=(1.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)))
-    scene.add(jc.PositionServo("servo", "hinge", 10.0, 1.0))
+    scene.add(jc.forces.PositionServo("servo", "hinge", 10.0, 1.0))
     return scene.build()
 
 
-EVENTS = jc.Method(jc.RK4(), events=jc.Events())
-CASES = [(ball, jc.Method()), (ball, EVENTS), (arm, jc.Method()), (arm, jc.Method(jc.RATTLE()))]
-CASES += [(arm, jc.Method(jc.RK4(), jc.Projection())), (arm, jc.Method(jc.GeneralizedAlpha()))]
+EVENTS = jc.Method(jc.RK4(), events=jc.integrators.Events())
+CASES = [
+    (ball, jc.Method()),
+    (ball, EVENTS),
+    (arm, jc.Method()),
+    (arm, jc.Method(jc.integrators.RATTLE())),
+]
+CASES += [
+    (arm, jc.Method(jc.RK4(), jc.Projection())),
+    (arm, jc.Method(jc.integrators.GeneralizedAlpha())),
+]
 
 
 @pytest.mark.parametrize("form", ["one world", "batch", "gradient"])

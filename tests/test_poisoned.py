@@ -1,4 +1,4 @@
-"""A number of one world is NaN or infinite: it says so, and the others do not notice."""
+"""A NaN or infinite number of one world gives that world a status and affects no other world."""
 
 import dataclasses
 import sys
@@ -20,7 +20,7 @@ from benchmarks import poisoned  # noqa: E402
 @pytest.mark.filterwarnings("ignore:.*unstable")
 @pytest.mark.parametrize("name", poisoned.QUICK)
 def test_the_world_is_told_and_others_do_not_notice(name):
-    """Every number of a scene and of its method, in values and in both modes of derivatives."""
+    """Tries every number of scene and method, in values and in derivatives of both modes."""
     counts = poisoned.measure(name, quick=True)
     assert counts.clean, poisoned.words(name, counts)
     assert counts.tried >= 70
@@ -28,14 +28,14 @@ def test_the_world_is_told_and_others_do_not_notice(name):
 
 
 def test_a_spoiled_number_is_found():
-    """The study itself: a force hides its number, but not in its derivative."""
+    """Tests the study itself: a force hides a NaN parameter, but its derivative does not."""
 
     def hides(a, t, u, p):
         return (jnp.where(p["gain"] > 0, p["gain"] * a.position[0], 0.0) * jnp.ones(3),)
 
     scene = jc.Scene(dim=2)
     scene.add_body("a", mass=1.0, inertia=0.1, position=(1.0, 0.0))
-    scene.add(jc.CustomForce("pull", ("a",), hides, params={"gain": 2.0}))
+    scene.add(jc.forces.CustomForce("pull", ("a",), hides, params={"gain": 2.0}))
     study = poisoned.Study(*scene.build(), jc.Method())
     cases = [case for case in study.cases() if "gain" in case.path]
     counts = study.run(cases)
@@ -54,9 +54,9 @@ def pendulum():
 
 
 def test_recovery_does_not_go_back_to_a_state_that_is_not_finite(pendulum):
-    """A start that is NaN fails at once; a step that fails from a good one is rolled back."""
+    """A NaN at the start fails at once; a failing step from a finite state is rolled back."""
     system, state = pendulum
-    method = jc.Method(recovery=jc.Recovery())
+    method = jc.Method(recovery=jc.stabilizers.Recovery())
     start = jc.init(system, method, state.q, state.v)
 
     def one(v, h):
@@ -72,19 +72,21 @@ def test_recovery_does_not_go_back_to_a_state_that_is_not_finite(pendulum):
 ZERO = {
     "Euler": jc.Method(),
     "RK4": jc.Method(jc.RK4()),
-    "RATTLE": jc.Method(jc.RATTLE()),
-    "PID": jc.Method(stabilizer=jc.PID()),
-    "limited window": jc.Method(stabilizer=jc.SlidingWindowBaumgarte(rate=5.0, limit=10.0)),
-    "generalized-α": jc.Method(jc.GeneralizedAlpha()),
-    "window": jc.Method(stabilizer=jc.SlidingWindowBaumgarte()),
+    "RATTLE": jc.Method(jc.integrators.RATTLE()),
+    "PID": jc.Method(stabilizer=jc.stabilizers.PID()),
+    "limited window": jc.Method(
+        stabilizer=jc.stabilizers.SlidingWindowBaumgarte(rate=5.0, limit=10.0)
+    ),
+    "generalized-α": jc.Method(jc.integrators.GeneralizedAlpha()),
+    "window": jc.Method(stabilizer=jc.stabilizers.SlidingWindowBaumgarte()),
 }
 
 
 @pytest.mark.parametrize("name", ZERO)
 def test_a_step_of_no_length_stands_still_or_says_so(pendulum, name):
-    """Methods that divide by h fail; the derivative of other worlds by h is their own."""
+    """Methods that divide by h fail; the derivatives of other worlds by h are not affected."""
     system, state = pendulum
-    method, steps = ZERO[name], 10  # more than a window
+    method, steps = ZERO[name], 10  # more than the window of a stabilizer
 
     def one(h, share):
         start = jc.init(system, method, state.q, state.v)
@@ -109,12 +111,12 @@ def test_a_step_of_no_length_stands_still_or_says_so(pendulum, name):
 
 
 def test_a_failed_world_has_no_impacts():
-    """None at a time of 0, by an element 0, which are those of a world that goes on."""
+    """Failed worlds report no impact at time 0 of element 0, which another world may have."""
     scene = jc.Scene(dim=2)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.01), velocity=(0.0, -3.0))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", restitution=0.5))
     system, state = scene.build()
-    method = jc.Method(events=jc.Events())
+    method = jc.Method(events=jc.integrators.Events())
 
     def one(v):
         return jc.step(system, method, dataclasses.replace(state, v=v), None, 1e-2)[1].impacts
@@ -124,3 +126,73 @@ def test_a_failed_world_has_no_impacts():
     np.testing.assert_array_equal(seen.elements[:, 0], [0, -1])
     assert seen.times[0, 0] < 1e-2
     assert seen.times[1, 0] == np.inf
+
+
+@pytest.mark.parametrize("field", ["before", "after"])
+@pytest.mark.parametrize("length", [np.inf, -np.inf])
+def test_an_infinite_length_of_bending_is_told(field, length):
+    """The force divides by that length and would become zero without an error."""
+    scene = jc.Scene(dim=2)
+    for i, name in enumerate(("first", "second")):
+        scene.add_particle(name, mass=1.0, position=(1.0 + i, 0.1 * i))
+    scene.add(jc.forces.Bending("bend", jc.WORLD, "first", "second", 2.0, point_a=(0.0, 0.0)))
+    system, state = scene.build()
+
+    def one(x):
+        poisoned = system.with_params({"bend": {field: x}})
+        return jc.step(poisoned, jc.Method(), state, None, 1e-2)[0].status
+
+    codes = jax.jit(jax.vmap(one))(jnp.array([1.0, length]))
+    np.testing.assert_array_equal(codes, [jc.Status.OK, jc.Status.NON_FINITE])
+
+
+@pytest.mark.parametrize("poison", poisoned.POISONS)
+def test_heights_that_the_search_reads_are_told_and_others_take_no_part(poison):
+    """A large ball beside a slope: heights 4 to 7 are below it, and its search reads height 8."""
+    line = np.linspace(-5.5, 5.5, 12)
+    scene = jc.Scene(dim=2)
+    scene.add_body("ball", mass=1.0, inertia=0.1, position=(0.2, 4.0))
+    ground = "ground", jc.WORLD, "ball", 0.3 * line, 11.0
+    scene.add(jc.contacts.HeightFieldContact(*ground, radius=3.9))
+    system, state = scene.build()
+
+    def one(heights, gravity):
+        changed = system.with_params({"ground": {"heights": heights}, "gravity": gravity})
+        new, _ = jc.step(changed, jc.Method(), state, None, 1e-2)
+        return new.v, new.status
+
+    heights = np.tile(0.3 * line, (13, 1))
+    heights[np.arange(12), np.arange(12)] = poison
+    derivative = jax.vmap(jax.jacrev(one, 1, has_aux=True), (0, None))
+    gravity = system.params["gravity"]
+    v, codes = jax.jit(jax.vmap(one, (0, None)))(heights, gravity)
+    slopes, _ = jax.jit(derivative)(heights, gravity)
+    told = [4, 5, 6, 7, 8]
+    assert list(np.flatnonzero(codes)) == told
+    free = np.setdiff1d(np.arange(12), told)
+    for x in (v, slopes):
+        np.testing.assert_array_equal(x[free], np.broadcast_to(x[12], x[free].shape))
+    np.testing.assert_array_equal(slopes[np.array(told)], 0.0)
+
+
+def test_zero_axes_and_quaternions_beside_springs_about_several_axes():
+    """Such worlds continue with angles that have no derivative; other gradients do not change."""
+
+    def gimbal(dim):
+        joint = jc.joints.Compound("joint", "a", "b", hinges=tuple(np.eye(dim)))
+        names = [f"angle_{i}" for i in (1, 2, 3)]
+        springs = [jc.forces.JointSpring(f"by {x}", "joint", 3.0, 0.2, coordinate=x) for x in names]
+        return [joint, *springs]
+
+    elements = {"gimbal": ((3,), gimbal), "twist": poisoned.FORCES["twist"]}
+    system, state = poisoned.stage(3, elements)
+    study = poisoned.Study(system, state, jc.Method(), thorough=True)
+    fields = ("q", "orientation", "axis")
+    cases = [
+        case
+        for case in study.cases()
+        if case.poison == 0.0 and case.path.rsplit("/", 1)[-1].startswith(fields)
+    ]
+    counts = study.run(cases)
+    assert counts.clean, poisoned.words("zeros", counts)
+    assert counts.tried >= 50

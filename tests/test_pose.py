@@ -20,7 +20,7 @@ def random_motion(dim):
 
 
 def moved(motion, h):
-    """The pose a short time h later, at a constant rate."""
+    """Returns the pose a short time h later, at constant velocities."""
     if motion.position.shape == (2,):
         turned = motion.orientation + h * motion.angular_velocity
     else:

@@ -1,7 +1,7 @@
-"""Rows written by hand against derivatives of their residual, off the constraints.
+"""Hand-written rows compared with derivatives of their residual, off the constraints.
 
-Along q̇ = N(q) v with v constant: φ̇ = ∂φ/∂q N v + ∂φ/∂t, J = ∂φ̇/∂v, γ = dφ̇/dt. The residuals
-themselves are held against formulas written here, with matrices.
+For q̇ = N(q) v with v constant: φ̇ = ∂φ/∂q N v + ∂φ/∂t, J = ∂φ̇/∂v, γ = dφ̇/dt. The residuals are
+compared with formulas that are written here with matrices.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ def by_hand(system, q, v, t):
 
 
 def by_derivation(system, level, q, v, t):
-    """φ̇, J, γ and ∂φ/∂t from φ alone; from ψ alone in rows where `level`."""
+    """Returns φ̇, J, γ and ∂φ/∂t by differentiation of φ, or of ψ in rows where `level` is True."""
 
     def residual(q, t):
         return linearize(system, q, jnp.zeros_like(v), t).residual
@@ -34,7 +34,7 @@ def by_derivation(system, level, q, v, t):
         derived = jax.jvp(residual, (q, t), (system.kinematics(q, v), jnp.ones_like(t)))[1]
         return jnp.where(level, given, derived)
 
-    # one program, and so one compilation, for every derivative of the rate
+    # one compilation for all derivatives of the rate
     derive = jax.jit(lambda v, dq, dv, dt: jax.jvp(rate, (q, v, t), (dq, dv, dt)))
     still, moving = jnp.zeros_like(q), jnp.zeros_like(v)
     value, bias = derive(v, system.kinematics(q, v), moving, jnp.ones_like(t))
@@ -43,7 +43,7 @@ def by_derivation(system, level, q, v, t):
 
 
 def level_rows(built):
-    """Which rows have no φ."""
+    """Returns a mask of the rows that have no φ."""
     layout = layout_of(built)
     level = np.zeros(layout.size, bool)
     for name, held in built.velocity_level:
@@ -57,7 +57,7 @@ def layout_of(built):
 
 @pytest.mark.parametrize("name", [n for n in scenes.NAMES if "loop" not in n])
 def test_rows_are_derivatives_of_the_residual(name):
-    """A joint that closes a loop has the rows of a joint between two moving bodies."""
+    """Loops are left out: their joints have the rows of joints between two moving bodies."""
     built = scenes.build(name)
     level, s = level_rows(built), built.off
     residual, rate, jacobian, bias = by_hand(built.system, s.q, s.v, s.time)
@@ -79,7 +79,7 @@ def test_rows_are_derivatives_of_the_residual(name):
 
 @pytest.mark.parametrize("name", [n for n in scenes.ALL if "between" in n])
 def test_rows_of_single_precision_are_those_of_double_precision(name):
-    """At the same numbers, but for the rounding of what is added up."""
+    """The results differ only by rounding of sums of the same float32 numbers."""
     built = scenes.build(name, "float32")
     state = built.off
     found = by_hand(built.system, state.q, state.v, state.time)
@@ -113,7 +113,7 @@ def test_rates_along_a_motion_in_time(dim):
 
 
 class Body:
-    """A body's frame by a matrix, from the coordinates; the world where there is no name."""
+    """A body's frame, as position and rotation matrix; the world's frame for the name WORLD."""
 
     def __init__(self, built, name):
         dim = built.system.layout.dim
@@ -133,7 +133,7 @@ class Body:
 
 
 def matrix(q):
-    """The rotation matrix of a unit quaternion, from (w + k)(w + k) with k the cross product."""
+    """Returns the rotation matrix (w + k)(w + k) of a unit quaternion, with k the cross product."""
     w, (x, y, z) = q[0], q[1:]
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * k + 2 * k @ k
@@ -159,7 +159,7 @@ def universal(p, a, b):
 
 
 def turned(p, a, b):
-    """The angle left in the plane, 2 sin(θ/2) n of the turn left in space."""
+    """Returns the remaining angle in the plane, or 2 sin(θ/2) n of the rotation in space."""
     if a.x.shape == (2,):
         left = a.r.T @ b.r
         angle = np.arctan2(left[1, 0], left[0, 0]) - p["orientation"]
@@ -180,7 +180,7 @@ def prismatic(p, a, b):
 
 
 def across(p, a, b):
-    """Cosines between an axis of a and the two normals of the axis in b."""
+    """Returns the cosines between an axis of a and the two normals of the axis in b."""
     return [(a.r @ p["axis"]) @ (b.r @ p[side]) for side in ("first_b", "second_b")]
 
 
@@ -202,7 +202,7 @@ def cylindrical(p, a, b):
 
 
 def screw(p, a, b):
-    """The nut is where its turns say, up to whole ones."""
+    """Returns φ of the screw: travel minus lead times turns, modulo whole turns."""
     pointer = b.r @ p["first_b"]
     turns = np.arctan2((a.r @ p["second_a"]) @ pointer, (a.r @ p["first_a"]) @ pointer) / 2 / np.pi
     left = (a.r @ p["axis"]) @ gap(p, a, b) / p["lead"] - turns
@@ -210,13 +210,13 @@ def screw(p, a, b):
 
 
 def constant_velocity(p, a, b):
-    """(1 + cos β) sin τ: the bend from the shafts, the twist left after undoing it."""
+    """Returns φ = (1 + cos β) sin τ, with the bend β of the shafts and the remaining twist τ."""
     n, m = (
         np.cross(x.r @ p["first" + s], x.r @ p["second" + s]) for x, s in ((a, "_a"), (b, "_b"))
     )
     k = np.cross(m, n)
     cross = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
-    back = np.eye(3) + cross + cross @ cross / (1 + n @ m)  # the shortest turn from m to n
+    back = np.eye(3) + cross + cross @ cross / (1 + n @ m)  # the smallest rotation from m to n
     u, w, pointer = a.r @ p["first_a"], a.r @ p["second_a"], back @ b.r @ p["first_b"]
     return [*gap(p, a, b), (1 + n @ m) * np.sin(np.arctan2(w @ pointer, u @ pointer))]
 
@@ -259,7 +259,7 @@ def test_residual_is_the_formula(name):
     expected = np.array(RESIDUALS[name.split("-")[0]](p, *(Body(built, b) for b in pair)))
     off = built.off
     got = np.array(scenes.linearized(built.system, off.q, off.v, off.time).residual)
-    if "orientation" in p and built.system.layout.dim == 2:  # angles there count whole turns
+    if "orientation" in p and built.system.layout.dim == 2:  # planar angles include whole turns
         got[-1] = np.angle(np.exp(1j * got[-1]))
     np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-12)
 
@@ -333,9 +333,9 @@ def test_a_distance_of_zero_has_no_direction_and_is_finite(dim):
         assert jnp.all(jnp.isfinite(leaf))
 
 
-@pytest.mark.parametrize("stabilizer", [jc.Baumgarte, jc.AdaptiveBaumgarte])
+@pytest.mark.parametrize("stabilizer", [jc.Baumgarte, jc.stabilizers.AdaptiveBaumgarte])
 def test_a_rod_flung_far_away_has_its_derivative_in_float32(stabilizer):
-    """As from next to a distance of zero: what is divided must not be multiplied first."""
+    """Large intermediate products must not overflow; the formula divides before it multiplies."""
 
     def slope(dtype):
         scene = jc.Scene(dim=2, dtype=dtype)
@@ -358,7 +358,7 @@ def test_a_rod_flung_far_away_has_its_derivative_in_float32(stabilizer):
     "kind", ["fixed", "prismatic", "driven_revolute", "screw", "telescope", "gimbal"]
 )
 def test_derivatives_of_rows_at_the_identity_are_finite(kind):
-    """Where both bodies are upright and the joint is as at assembly."""
+    """Both bodies have the identity orientation, and the joint is as at assembly."""
     scene = jc.Scene()
     for name in ("first", "second"):
         scene.add_body(name, mass=1.0, inertia=(1.0, 1.0, 1.0))
@@ -376,7 +376,7 @@ def test_derivatives_of_rows_at_the_identity_are_finite(kind):
 
 @pytest.mark.parametrize("radius", [0.0, 1e-10, 1e-8, 1e-6, 0.1])
 def test_an_angle_has_derivatives_close_to_its_axis_in_float32(radius):
-    """θ, θ̇ and γ of atan2 by (c, s, ċ, ṡ), against float64; on the axis itself they are zero."""
+    """θ, θ̇ and γ of atan2 by (c, s, ċ, ṡ) equal those in float64; on the axis they are zero."""
 
     def angle(x):
         c, s = (primitives.Row(x[i], x[i + 2], 0 * x[i], (x[i], x[i])) for i in (0, 1))

@@ -1,4 +1,4 @@
-"""Levels of constraints against null-space projections by numpy, and against solvers without."""
+"""Priority levels of constraints, compared with null-space projections and with other solvers."""
 
 import dataclasses
 
@@ -10,19 +10,18 @@ import scenes
 from tolerances import DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
-from jaxcon.constraints.rows import RowLayout, linearize
+from jaxcon.constraints.rows import RowLayout, linearize, saddle
 from jaxcon.core.lanes import Vector
-from jaxcon.dynamics.forward import saddle
+from jaxcon.linear.jacobian import Block, Columns, Jacobian
+from jaxcon.linear.saddle import Diagonal, Full, Saddle
 from jaxcon.scenes import CRANK_ROCKER, four_bar
-from jaxcon.solvers.jacobian import Block, Columns, Jacobian
-from jaxcon.solvers.saddle import Diagonal, Full, Saddle
 
 RANDOM = np.random.default_rng(3)
 NAMES = ("hold", "reach", "reach_far", "rest")
 LEVELS = {"reach*": 1, "rest": 2}
 J = RANDOM.normal(size=(5, 5))
-J[2] = 0.7 * J[0] - 0.2 * J[1]  # "reach" asks for what "hold" has decided
-J[4] = J[3] + J[1]  # "rest" as well, with "reach_far"
+J[2] = 0.7 * J[0] - 0.2 * J[1]  # depends on the rows of "hold"
+J[4] = J[3] + J[1]  # depends on "reach_far" and "hold"
 ROWS = {"hold": [0, 1], "reach": [2], "reach_far": [3], "rest": [4]}
 SPREAD = RANDOM.normal(size=(5, 5))
 MASS = SPREAD @ SPREAD.T + np.eye(5)
@@ -31,7 +30,7 @@ BY_LEVEL = ([0, 1], [2, 3], [4])
 
 
 def problem(j=J, mass=MASS, force=FORCE, target=TARGET, order=NAMES):
-    """A saddle system whose rows have names; `order` is that of its constraints."""
+    """A saddle system with named rows, listed by constraint in the given order."""
     rows = np.concatenate([ROWS[name] for name in order])
     starts = np.cumsum([0, *(len(ROWS[name]) for name in order)])
     entries = tuple(
@@ -45,7 +44,7 @@ def problem(j=J, mass=MASS, force=FORCE, target=TARGET, order=NAMES):
 
 
 def by_null_spaces(j, mass, force, target, levels):
-    """a of the lexicographic problem by projections on null spaces, rows of length 1."""
+    """Returns a of the lexicographic problem by null-space projections of normalized rows."""
     root = np.linalg.cholesky(mass)
     b = np.linalg.solve(root, j.T).T
     length = np.linalg.norm(b, axis=1)
@@ -63,14 +62,14 @@ def by_null_spaces(j, mass, force, target, levels):
 def test_levels_that_contradict_each_other(mass):
     given = np.diag(mass) if np.count_nonzero(mass) == 5 else mass
     system, _ = problem(mass=given)
-    a, λ, status = jc.Priority(LEVELS).solve(system)
+    a, λ, status = jc.solvers.Priority(LEVELS).solve(system)
     expected = by_null_spaces(J, mass, FORCE, TARGET, BY_LEVEL)
     np.testing.assert_allclose(a, expected, rtol=1e-10)
     np.testing.assert_allclose(J[:2] @ a, TARGET[:2], rtol=1e-12)
     np.testing.assert_allclose(J[3] @ a, TARGET[3], rtol=1e-12)
     assert abs(J[2] @ a - TARGET[2]) > 0.1
     np.testing.assert_allclose(mass @ a, FORCE + J.T @ λ, atol=1e-12)
-    np.testing.assert_allclose(λ[jnp.array([2, 4])], 0, atol=1e-12)  # they can change nothing
+    np.testing.assert_allclose(λ[jnp.array([2, 4])], 0, atol=1e-12)  # dependent rows have no effect
     assert status == jc.Status.OK
 
 
@@ -78,22 +77,22 @@ def test_one_level_that_contradicts_itself_is_met_by_least_squares_and_says_so()
     j = J.copy()
     j[1] = 2 * j[0]
     system, _ = problem(j)
-    a, _, status = jc.Priority(LEVELS).solve(system)
+    a, _, status = jc.solvers.Priority(LEVELS).solve(system)
     expected = by_null_spaces(j, MASS, FORCE, TARGET, BY_LEVEL)
     np.testing.assert_allclose(a, expected, rtol=1e-10)
     assert status == jc.Status.CONFLICT
-    assert jc.Priority(LEVELS, conflict=np.inf).solve(system).status == jc.Status.OK
+    assert jc.solvers.Priority(LEVELS, conflict=np.inf).solve(system).status == jc.Status.OK
     agreeing = TARGET.copy()
     agreeing[1] = 2 * agreeing[0]
     system, _ = problem(j, target=agreeing)
-    assert jc.Priority(LEVELS).solve(system).status == jc.Status.OK
+    assert jc.solvers.Priority(LEVELS).solve(system).status == jc.Status.OK
 
 
 def test_order_within_a_level_does_not_matter():
-    reference = jc.Priority(LEVELS).solve(problem()[0])
+    reference = jc.solvers.Priority(LEVELS).solve(problem()[0])
     for order in (NAMES[::-1], ("reach_far", "rest", "hold", "reach")):
         system, rows = problem(order=order)
-        a, λ, _ = jc.Priority(LEVELS).solve(system)
+        a, λ, _ = jc.solvers.Priority(LEVELS).solve(system)
         np.testing.assert_allclose(a, reference.acceleration, rtol=1e-12)
         np.testing.assert_allclose(λ, reference.multipliers[rows], rtol=1e-11, atol=1e-12)
 
@@ -101,7 +100,7 @@ def test_order_within_a_level_does_not_matter():
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("numbers", [{}, {"damping": 0.0}, {"damping": 0.0, "cutoff": 0.0}])
 def test_value_and_gradient_hold_where_rank_is_lost(numbers, dtype):
-    """Against numpy's projections and their differences; dependent rows stay so along the way."""
+    """Compares with NumPy's projections and their differences, along a path of constant rank."""
     weight = np.arange(1.0, 6.0)
     direction = [RANDOM.normal(size=x.shape) for x in (J, MASS, FORCE, TARGET)]
     direction[1] = direction[1] + direction[1].T
@@ -117,7 +116,7 @@ def test_value_and_gradient_hold_where_rank_is_lost(numbers, dtype):
 
     def ours(s):
         numbers_in = moved(s, lambda x: jnp.asarray(x, dtype))
-        solution = jc.Priority(LEVELS, **numbers).solve(problem(*numbers_in)[0])
+        solution = jc.solvers.Priority(LEVELS, **numbers).solve(problem(*numbers_in)[0])
         return jnp.asarray(weight, dtype) @ solution.acceleration
 
     ahead, behind = (
@@ -136,7 +135,7 @@ def test_value_and_gradient_hold_where_rank_is_lost(numbers, dtype):
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("name", ["polar", "four-bar"])
 def test_where_all_agree_levels_change_nothing(name, dtype):
-    """Against the whole matrix: a full M, and a closed loop of which each hinge has its level."""
+    """Compares with the full solution for a full M, and for a loop with a level per hinge."""
     if name == "polar":
         built = scenes.build(name, dtype)
         solved, s = built.system, built.off
@@ -151,7 +150,7 @@ def test_where_all_agree_levels_change_nothing(name, dtype):
         target = jnp.asarray(random.normal(size=rows.bias.shape), dtype)
         system = saddle(solved, s.q, rows, force, target)
         levels = {name: i % 4 for i, name in enumerate(rows.layout.names)}
-        return jc.Priority(levels).solve(system), jc.Dense().solve(system)
+        return jc.solvers.Priority(levels).solve(system), jc.solvers.Dense().solve(system)
 
     found, expected = both()
     assert found.status == jc.Status.OK
@@ -162,10 +161,12 @@ def test_where_all_agree_levels_change_nothing(name, dtype):
 
 
 def test_rows_with_a_compliance_are_met_as_such():
-    """J a + C λ = b is J a + √C z = b, with velocities z of unit mass on which no force acts."""
+    """J a + C λ = b is equivalent to J a + √C z = b with force-free velocities z of unit mass."""
     c = np.array([0.0, 0.3, 0.2, 0.0, 0.5])
     system, _ = problem()
-    a, λ, status = jc.Priority(LEVELS).solve(dataclasses.replace(system, compliance=jnp.asarray(c)))
+    a, λ, status = jc.solvers.Priority(LEVELS).solve(
+        dataclasses.replace(system, compliance=jnp.asarray(c))
+    )
     mass = np.block([[MASS, np.zeros((5, 5))], [np.zeros((5, 5)), np.eye(5)]])
     wider = np.hstack([J, np.diag(np.sqrt(c))])
     force = np.concatenate([FORCE, np.zeros(5)])
@@ -177,14 +178,14 @@ def test_rows_with_a_compliance_are_met_as_such():
 
 
 def test_a_world_of_a_batch_goes_on_with_what_its_levels_leave():
-    """A slider on a rail at one end of two rods of fixed length, which cannot both be kept."""
+    """A slider on a rail is joined to two rods whose lengths cannot both be kept."""
     scene = jc.Scene(dim=2)
     scene.add_body("slider", mass=1.0, inertia=1.0, position=(1.0, 0.0))
     scene.add(jc.Prismatic("rail", jc.WORLD, "slider", axis=(1.0, 0.0)))
     scene.add(jc.Distance("rod", jc.WORLD, "slider", length=1.5, point_a=(0.0, 0.8)))
     scene.add(jc.Distance("other", jc.WORLD, "slider", length=1.2, point_a=(2.0, 0.5)))
     system, state = scene.build()
-    method = jc.Method(solver=jc.Priority({"rod": 1, "other": 2}))
+    method = jc.Method(solver=jc.solvers.Priority({"rod": 1, "other": 2}))
     final, info = jax.jit(jax.vmap(lambda s: jc.rollout(system, method, s, None, 1e-3, 400)))(
         jax.tree.map(lambda x: jnp.stack([x, x]), state)
     )
@@ -201,7 +202,7 @@ def test_a_row_of_zeros_leaves_solution_and_gradient_finite():
     j[0] = j[3] = 0
 
     def value(j, target):
-        a, λ, _ = jc.Priority(LEVELS).solve(problem(j, target=target)[0])
+        a, λ, _ = jc.solvers.Priority(LEVELS).solve(problem(j, target=target)[0])
         return jnp.sum(a**2) + jnp.sum(λ**2)
 
     slopes = jax.jit(jax.grad(value, (0, 1)))(jnp.asarray(j), jnp.asarray(TARGET))
@@ -211,7 +212,9 @@ def test_a_row_of_zeros_leaves_solution_and_gradient_finite():
 
 
 def test_a_level_near_the_one_above_it_gives_way():
-    """Two unit rows at an angle θ: S = sin²θ below, and (μ²/(S² + μ²))⁶ of its row is not met."""
+    """Two unit rows enclose an angle θ. With damping μ the row of the lower level misses the share
+    (μ²/(S² + μ²))⁶ of its target, S = sin²θ.
+    """
     entries = (("above", 0, 1, 1), ("below", 1, 1, 1))
 
     def unmet(angle, damping):
@@ -220,7 +223,9 @@ def test_a_level_near_the_one_above_it_gives_way():
         jacobian = Jacobian((Block(value, 0, Columns(0, 2, 1, (0,))),), (2, 2))
         target, layout = jnp.array([0.0, 1.0]), RowLayout(entries)
         system = Saddle(Diagonal(jnp.ones(2)), jnp.zeros(2), jacobian, target, layout=layout)
-        return 1 - j[1] @ jc.Priority({"below": 1}, damping=damping).solve(system).acceleration
+        return (
+            1 - j[1] @ jc.solvers.Priority({"below": 1}, damping=damping).solve(system).acceleration
+        )
 
     def share(angle, damping):
         return (damping**2 / (jnp.sin(angle) ** 4 + damping**2)) ** 6
@@ -234,8 +239,8 @@ def test_a_level_near_the_one_above_it_gives_way():
 
 def test_dependent_rows_that_agree_move_as_without_levels():
     system, _ = problem(target=J @ TARGET)
-    expected = jc.RankSafe(always=True).solve(system)
-    found = jc.Priority(LEVELS).solve(system)
+    expected = jc.solvers.RankSafe(always=True).solve(system)
+    found = jc.solvers.Priority(LEVELS).solve(system)
     np.testing.assert_allclose(found.acceleration, expected.acceleration, rtol=1e-7)
     np.testing.assert_allclose(J @ found.acceleration, J @ TARGET, rtol=1e-12)
     assert found.status == jc.Status.OK
@@ -243,33 +248,35 @@ def test_dependent_rows_that_agree_move_as_without_levels():
 
 def test_what_levels_are_refused():
     with pytest.raises(ValueError, match="'rod' must be 0, 1, 2 or 3, got 4"):
-        jc.Priority({"rod": 4})
+        jc.solvers.Priority({"rod": 4})
     with pytest.raises(ValueError, match=r"no constraint 'rood\*'; there are \['hold'"):
-        jc.Priority({"rood*": 1}).solve(problem()[0])
+        jc.solvers.Priority({"rood*": 1}).solve(problem()[0])
     for x in (-1.0, np.nan):
         with pytest.raises(ValueError, match=f"conflict must be zero or more, got {x}"):
-            jc.Priority({}, conflict=x).check()
+            jc.solvers.Priority({}, conflict=x).check()
     with pytest.raises(ValueError, match="conflict must be a real number, got 'some'"):
-        jc.Priority({}, conflict="some").check()
+        jc.solvers.Priority({}, conflict="some").check()
     for conflict in (None, np.inf):
-        jc.Priority({}, conflict=conflict).check()
+        jc.solvers.Priority({}, conflict=conflict).check()
     unnamed = dataclasses.replace(problem()[0], layout=None)
     with pytest.raises(ValueError, match="no constraint 'rest'"):
-        jc.Priority({"rest": 1}).solve(unnamed)
+        jc.solvers.Priority({"rest": 1}).solve(unnamed)
 
 
 @pytest.mark.parametrize("rate", [5.0, 20.0, 50.0])
 def test_a_rod_too_short_to_reach_disturbs_no_higher_level(rate):
-    """A bob at 1 m from the origin that a rod of 1.9 m should hold to a point 3 m away.
+    """A bob stays 1 m from the origin; a rod of 1.9 m should hold it to a point 3 m away.
 
-    It comes to the end of its reach, 2 m from that point, where the rod's row is that of the rail.
+    The bob reaches the nearest place, 2 m from that point, where both rows are parallel.
     """
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(0.6, 0.8))
     scene.add(jc.Distance("left", jc.WORLD, "bob", length=1.0))
     scene.add(jc.Distance("right", jc.WORLD, "bob", length=1.9, point_a=(3.0, 0.0)))
     system, state = scene.build()
-    method = jc.Method(stabilizer=jc.Baumgarte.critical(rate), solver=jc.Priority({"right": 1}))
+    method = jc.Method(
+        stabilizer=jc.Baumgarte.critical(rate), solver=jc.solvers.Priority({"right": 1})
+    )
 
     def record(s, _):
         found = jc.violation(system, s)
@@ -278,6 +285,6 @@ def test_a_rod_too_short_to_reach_disturbs_no_higher_level(rate):
     run = jax.jit(lambda s: jc.rollout(system, method, s, None, 1e-3, 10000, record=record))
     final, (left, right) = run(state)
     assert final.status == jc.Status.OK
-    assert np.max(left) < 1e-2  # while it is pulled in, at up to 80 m/s
+    assert np.max(left) < 1e-2  # while the bob is pulled in, at up to 80 m/s
     assert np.max(left[-1000:]) < 1e-5
     np.testing.assert_allclose(right[-1000:], 0.1, rtol=2e-2)

@@ -1,4 +1,4 @@
-"""Projections: nearest points by hand, what they keep, and their derivatives."""
+"""Projections: nearest points, conserved quantities, and derivatives."""
 
 import dataclasses
 import functools
@@ -20,8 +20,8 @@ STANDING, HERE = np.eye(3), np.zeros(3)
 
 
 def projecting(system, stabilizer=PROJECTION, solver=None):
-    """The compiled function (system, state) → state that does nothing but project."""
-    solver = jc.RankSafe() if solver is None else solver
+    """Returns the compiled function (system, state) → projected state."""
+    solver = jc.solvers.RankSafe() if solver is None else solver
     method = jc.Method(stabilizer=stabilizer, solver=solver)
 
     @jax.jit
@@ -33,7 +33,7 @@ def projecting(system, stabilizer=PROJECTION, solver=None):
 
 
 def moved(state, size, seed=0, velocity=0.0):
-    """The state off its constraints."""
+    """Returns a state off its constraints."""
     rng = np.random.default_rng(seed)
     q, v = (rng.normal(size=x.shape) for x in (state.q, state.v))
     dtype = state.q.dtype
@@ -45,7 +45,7 @@ def moved(state, size, seed=0, velocity=0.0):
 
 
 def dumbbell(masses=(1.0, 3.0)):
-    """Two particles at a distance of 1, in the plane."""
+    """Two particles at a distance of 1 in the plane."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     for i, mass in enumerate(masses):
         scene.add_particle(f"p{i}", mass=mass, position=(float(i), 0.0))
@@ -54,7 +54,7 @@ def dumbbell(masses=(1.0, 3.0)):
 
 
 def arm(turn=STANDING, shift=HERE, hinges=1, dtype=None):
-    """A link in space on a door with one or two hinges, turned and shifted as a whole."""
+    """A link in space on a door with one or two hinges; the scene is rotated and shifted."""
     scene = jc.Scene(gravity=tuple(turn @ (0.0, 0.0, -9.81)), dtype=dtype)
     attitude = np.asarray(quaternion.from_matrix(jnp.asarray(turn)))
     solid = {"mass": 2.0, "inertia": (0.1, 0.2, 0.15), "quaternion": attitude}
@@ -73,13 +73,13 @@ def skate():
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("skate", mass=2.0, inertia=0.5, position=(1.0, 0.0), angle=0.3)
     scene.add(jc.Distance("rod", jc.WORLD, "skate"))
-    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(0.0, 1.0)))
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(0.0, 1.0)))
     return scene.build()
 
 
 @pytest.mark.parametrize(("metric", "shares"), [("mass", (0.75, 0.25)), ("euclidean", (0.5, 0.5))])
 def test_a_dumbbell_by_hand(metric, shares):
-    """Lengths and speeds along the rod are shared in inverse proportion to masses, or equally."""
+    """Corrections along the rod are inversely proportional to the masses, or equal."""
     system, state = dumbbell()
     q, v = jnp.array([-0.2, 1.2, 0.0, 0.0]), jnp.array([0.0, 1.0, 2.0, 5.0])
     state = dataclasses.replace(state, q=q, v=v)
@@ -94,7 +94,7 @@ def test_a_dumbbell_by_hand(metric, shares):
     [("mass", jnp.float64, 1e-12), ("euclidean", jnp.float32, 2e-6)],
 )
 def test_a_door_with_two_hinges_is_projected_to_rounding(metric, dtype, bound):
-    """Redundant rows, an error of a tenth of the scene's size."""
+    """The rows are redundant, and the error is a tenth of the scene's size."""
     system, state = arm(hinges=2, dtype=dtype)
     new = projecting(system, jc.Projection(metric=metric))(system, moved(state, 0.1, 1, 1.0))
     left = jc.violation(system, new)
@@ -104,7 +104,7 @@ def test_a_door_with_two_hinges_is_projected_to_rounding(metric, dtype, bound):
 
 
 def test_the_point_solves_its_equations():
-    """M d = J(q*)ᵀ μ and φ(q* ⊕ d) = 0, and a change of velocity M Δv = J(q)ᵀ μ."""
+    """M d = J(q*)ᵀ μ and φ(q* ⊕ d) = 0; for velocities M Δv = J(q)ᵀ μ."""
     system, state = four_bar()
     start = moved(state, 0.05, 2, 1.0)
     new = projecting(system)(system, start)
@@ -118,7 +118,7 @@ def test_the_point_solves_its_equations():
 
 
 def test_symmetries_are_kept():
-    """Exercise 3: a turned and shifted scene is projected alike."""
+    """Exercise 3: rotating and shifting the scene commutes with the projection."""
     system, state = arm()
     start, project = moved(state, 0.05, 3, 0.5), projecting(system)
     new = project(system, start)
@@ -142,7 +142,7 @@ def test_symmetries_are_kept():
 
 
 def triangle(order):
-    """Three particles held by rods, listed in some order."""
+    """Three particles joined by rods, which are listed in the given order."""
     scene = jc.Scene(dim=2)
     for i, place in enumerate([(0.0, 0.0), (1.0, 0.0), (0.3, 0.8)]):
         scene.add_particle(f"p{i}", mass=1.0 + i, position=place)
@@ -174,18 +174,18 @@ def test_rows_of_velocities_are_part_of_the_second_projection_only():
 
 
 def test_a_motion_in_time_is_followed():
-    """A rotor and a driven angle: φ̇ = 0 contains ∂φ/∂t, and the rotor adds to the inertia."""
+    """A rotor and a driven coordinate: φ̇ = 0 contains ∂φ/∂t, and the rotor adds inertia."""
     scene = jc.Scene(dim=2)
     scene.add_body("a", mass=1.0, inertia=1.0)
     scene.add_body("b", mass=1.0, inertia=1.0)
     scene.add(jc.Prismatic("rail", jc.WORLD, "a", axis=(1.0, 0.0)))
     scene.add(jc.Prismatic("slide", "a", "b", axis=(1.0, 0.0)))
-    scene.add(jc.Drive("drive", "slide", lambda t, p: 2.0 * t))
-    scene.add(jc.Armature("rotor", "rail", inertia=2.0))
+    scene.add(jc.joints.Drive("drive", "slide", lambda t, p: 2.0 * t))
+    scene.add(jc.joints.Armature("rotor", "rail", inertia=2.0))
     system, state = scene.build()
     state = dataclasses.replace(state, time=jnp.asarray(0.5))
     new = projecting(system)(system, state)
-    np.testing.assert_allclose(new.q[:2], [-0.25, 0.75], atol=IDENTITY)  # 1 m between 3 kg and 1 kg
+    np.testing.assert_allclose(new.q[:2], [-0.25, 0.75], atol=IDENTITY)  # 3 kg and 1 kg share 1 m
     np.testing.assert_allclose(new.v[:2], [-0.5, 1.5], atol=IDENTITY)
 
 
@@ -194,7 +194,7 @@ def test_generalized_coordinates_with_a_full_mass_matrix():
     system = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.asarray(mass),
         force=lambda q, v, t, u, p: jnp.zeros_like(q),
-        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q @ q - 1.0]), name="circle"),),
+        constraints=(jc.joints.Holonomic(lambda q, t, p: jnp.stack([q @ q - 1.0]), name="circle"),),
     )
     method = jc.Method(stabilizer=PROJECTION)
     start = jc.init(system, method, jnp.array([1.0, 0.2]), jnp.array([1.0, 1.0]))
@@ -202,12 +202,12 @@ def test_generalized_coordinates_with_a_full_mass_matrix():
     new = jax.tree.map(lambda x: x[0], project(jax.tree.map(lambda x: x[None], start)))
     assert abs(float(new.q @ new.q) - 1) < IDENTITY
     assert abs(float(new.q @ new.v)) < IDENTITY
-    pull = mass @ (new.q - start.q)  # along J(q*)
+    pull = mass @ (new.q - start.q)  # parallel to J(q*)
     assert abs(pull[0] * start.q[1] - pull[1] * start.q[0]) < IDENTITY
 
 
 def test_every_third_step_and_the_batch():
-    """The error is gone after the third step, not before; worlds may be at different counts."""
+    """Projects in the third step only; worlds of a batch may have different step counts."""
     system, state = dumbbell()
     method = jc.Method(stabilizer=jc.Projection(every=3))
     start = jc.init(system, method, moved(state, 0.1).q, state.v)
@@ -232,8 +232,8 @@ def test_what_does_not_arrive_says_so():
     once = projecting(system, jc.Projection(iterations=1))(system, start)
     first, then = (jc.violation(system, s).worst for s in (start, once))
     assert int(once.status) == jc.Status.OK
-    assert 1e-5 < then < first**2  # linearized
-    easy = jc.Projection(tolerance=jc.Tolerance(0.05, speed=100.0, force=1.0))
+    assert 1e-5 < then < first**2  # the projection is linearized
+    easy = jc.Projection(tolerance=jc.stabilizers.Tolerance(0.05, speed=100.0, force=1.0))
     np.testing.assert_array_equal(projecting(system, easy)(system, start).q, start.q)
 
 
@@ -245,14 +245,14 @@ def test_half_steps_halve_the_error():
 
 
 def test_coupled_velocities_contain_the_correction():
-    """As if the step had led there: v + d/h, before v is projected; along d nothing is left."""
+    """The velocity is v + d/h, as if the step had led there, less its part along the rod."""
     system, state = dumbbell((1.0, 1.0))
     q = jnp.array([-0.1, 1.1, 0.0, 0.3])
     start = dataclasses.replace(state, q=q, v=jnp.zeros(4))
     method = jc.Method(stabilizer=jc.Projection(coupled=True))
     start = jc.init(system, method, start.q, start.v)
     new = jax.jit(lambda s: jc.step(system, method, s, None, 0.1)[0])(start)
-    d = np.asarray(new.q - q)  # nothing moves otherwise
+    d = np.asarray(new.q - q)  # without the correction nothing moves
     along = np.array([new.q[1] - new.q[0], new.q[3] - new.q[2]])
     normal = np.array([-along[0], along[0], -along[1], along[1]])
     expected = d / 0.1 - normal * (normal @ d / 0.1) / (normal @ normal)
@@ -267,7 +267,7 @@ def test_choices_that_do_not_exist_are_refused():
 
 
 def on_circle(q):
-    """A particle taken to a circle of radius 1: the point and its derivatives by hand."""
+    """Returns a linear function of the projection of a particle to a circle of radius 1."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("bead", mass=2.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bead"))
@@ -289,7 +289,7 @@ def test_first_and_second_derivatives_by_hand():
 
 
 def by_newton(system, start):
-    """q = q* ⊕ M⁻¹J(q*)ᵀ μ by many rounds of Newton's method, dense, as it stands."""
+    """Returns q = q* ⊕ M⁻¹J(q*)ᵀ μ by 12 iterations of Newton's method with dense matrices."""
     normal = linearize(system, start.q, start.v, start.time).jacobian.dense()
     away = normal.T / system.mass(start.q).values[:, None]
 
@@ -302,7 +302,7 @@ def by_newton(system, start):
 
 
 def test_the_derivative_is_that_of_the_root():
-    """By a length and by q*: of the dense iteration as it is, and central differences."""
+    """Derivatives by a length and by q* equal those of the dense iteration, and differences."""
     system, state = four_bar()
     start = moved(state, 0.05, 5)
     weight = jnp.asarray(np.random.default_rng(6).normal(size=9))
@@ -331,7 +331,9 @@ def test_the_derivative_is_that_of_the_root():
     np.testing.assert_allclose(forward, gradient(x), rtol=1e-9)
 
 
-@pytest.mark.parametrize("solver", [jc.Dense(), jc.ConjugateGradients()], ids=["dense", "cg"])
+@pytest.mark.parametrize(
+    "solver", [jc.solvers.Dense(), jc.solvers.ConjugateGradients()], ids=["dense", "cg"]
+)
 def test_solvers_agree_and_batches_are_loops(solver):
     system, state = four_bar()
     worlds = [moved(state, 0.03, seed, 1.0) for seed in range(3)]
@@ -345,7 +347,7 @@ def test_solvers_agree_and_batches_are_loops(solver):
 
 
 def door():
-    """On two hinges: ten rows of rank five."""
+    """A door on two hinges: ten rows of rank five."""
     scene = jc.Scene()
     scene.add_body("door", mass=20.0, inertia=(2.0, 3.0, 1.0), position=(0.5, 0.1, 1.0))
     for name, height in (("lower", 0.3), ("upper", 1.7)):
@@ -355,17 +357,20 @@ def door():
 
 
 def test_a_linearized_projection_hears_a_solver_that_does_not_converge():
-    """A door off both of its hinges: rows that contradict each other."""
+    """A door that is off both of its hinges has contradictory rows."""
     system, state = door()
     still, off = jc.Projection(iterations=1, velocity=False), moved(state, 1e-3)
-    few = jc.ConjugateGradients(iterations=2)
-    for solver, expected in ((few, jc.Status.NOT_CONVERGED), (jc.RankSafe(), jc.Status.OK)):
+    few = jc.solvers.ConjugateGradients(iterations=2)
+    for solver, expected in ((few, jc.Status.NOT_CONVERGED), (jc.solvers.RankSafe(), jc.Status.OK)):
         _, code = still.project(system, solver, off, off, jnp.asarray(1e-3))
         assert code == expected
 
 
 def test_conjugate_gradients_project_redundant_rows_with_their_gradient():
-    """Three bars that swing a coupler, where two would do: as by elimination."""
+    """Three bars carry a coupler, so that rows are redundant.
+
+    Results equal those of elimination.
+    """
     scene = jc.Scene(dim=2)
     half = 0.5 * np.array([np.cos(1.9), -np.sin(1.9)])
     solid = {"mass": 1.0, "inertia": 0.1}
@@ -386,7 +391,7 @@ def test_conjugate_gradients_project_redundant_rows_with_their_gradient():
         return final.q[0], code
 
     found = []
-    for solver in (jc.RankSafe(), jc.ConjugateGradients()):
+    for solver in (jc.solvers.RankSafe(), jc.solvers.ConjugateGradients()):
         run = jax.jit(jax.value_and_grad(functools.partial(end, solver), has_aux=True))
         (place, code), slope = run(-9.81)
         assert np.all(code == jc.Status.OK)
@@ -397,10 +402,10 @@ def test_conjugate_gradients_project_redundant_rows_with_their_gradient():
 
 @pytest.mark.parametrize("tolerance", [None, 1e-5])
 def test_a_linearized_projection_leaves_what_is_there(tolerance):
-    """The rows of a door contradict each other by rounding alone, which no solver can mend."""
+    """The rows contradict each other only by rounding, which the projection must ignore."""
     system, state = door()
     still = jc.Projection(iterations=1, velocity=False, tolerance=tolerance)
-    few = jc.ConjugateGradients(iterations=30)
+    few = jc.solvers.ConjugateGradients(iterations=30)
     noise = 1e-16 * np.random.default_rng(1).standard_normal((4, 7))
 
     def place(shift, noise):
@@ -412,12 +417,12 @@ def test_a_linearized_projection_leaves_what_is_there(tolerance):
     (_, (change, code)), slope = places(0.0, noise)
     assert (code == jc.Status.OK).all()
     np.testing.assert_allclose(change, 0, atol=1e-14)
-    # what a push along x leaves is its share of the turn about the hinges, m y²/(m r² + I)
+    # of a shift along x, the share of a rotation about the hinges remains: m y²/(m r² + I)
     np.testing.assert_allclose(slope, 20 * 0.1**2 / (20 * 0.26 + 1.0), rtol=1e-9)
 
 
 def test_projection_keeps_the_order_of_runge_kutta():
-    """Fourth order on a double pendulum, by halving the step."""
+    """Halving the step on a double pendulum shows the fourth order."""
     scene = jc.Scene(dim=2)
     for i in range(2):
         scene.add_particle(f"p{i}", mass=1.0, position=(i + 1.0, 0.0))
@@ -437,18 +442,18 @@ def test_projection_keeps_the_order_of_runge_kutta():
     assert 3.8 < order < 4.4
 
 
-@pytest.mark.parametrize("solver", [jc.InteriorPoint(), jc.GaussSeidel()])
+@pytest.mark.parametrize("solver", [jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel()])
 def test_a_contact_follows_what_is_projected(solver):
-    """A ball on a lift, y* = A (1 − cos ωt): λ = m (g + ÿ*) to first order in h, two steps late."""
+    """A ball on a lift y* = A (1 − cos ωt): λ = m (g + ÿ*) to first order, two steps late."""
     size, rate, m, g = 0.1, 6.0, 2.0, 9.81
     scene = jc.Scene(dim=2, gravity=(0.0, -g))
     scene.add_body("lift", mass=3.0, inertia=1.0)
     scene.add_body("ball", mass=m, inertia=0.01, position=(0.0, 0.1))
     scene.add(jc.Prismatic("rail", jc.WORLD, "lift", axis=(0.0, 1.0)))
-    scene.add(jc.Drive("motor", "rail", lambda t, p: size * (1 - jnp.cos(rate * t))))
+    scene.add(jc.joints.Drive("motor", "rail", lambda t, p: size * (1 - jnp.cos(rate * t))))
     scene.add(jc.PlaneContact("floor", "lift", "ball", radius=0.1, friction=0.5))
     system, state = scene.build()
-    method = jc.Method(stabilizer=jc.Projection(), bounded=solver)
+    method = jc.Method(stabilizer=jc.Projection(), contact_solver=solver)
     state = jc.init(system, method, state.q, state.v)
 
     def run(h):
@@ -465,6 +470,6 @@ def test_a_contact_follows_what_is_projected(solver):
     want = m * (g + size * rate**2 * jnp.cos(rate * (time - h / 2)))
     late = jnp.abs(force - want)[:, 2:] / (m * size * rate**3 * h)
     assert jnp.all(late < 2)
-    # a step is off by ÿ* h²/2, of which an overlap loses a fifth in the next
+    # a step errs by ÿ* h²/2; the next step corrects a fifth of an overlap
     assert jnp.all(jnp.abs(gap) < 5 * size * rate**2 * h**2 / 2)
     assert max(float(jnp.max(x)) for x in off) < 1e-14

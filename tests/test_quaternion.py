@@ -16,7 +16,7 @@ def random_unit(seed, shape=()):
 
 
 def rodrigues(phi):
-    """The rotation matrix of a rotation vector, by Rodrigues' formula."""
+    """Returns the matrix of a rotation vector, by Rodrigues' formula."""
     angle = np.linalg.norm(phi)
     x, y, z = phi / angle
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -97,6 +97,13 @@ def test_log_of_exp_has_the_identity_for_its_derivative(size):
     close(jax.jacrev(there_and_back)(phi), np.eye(3))
 
 
+def test_log_of_zero_has_finite_derivatives():
+    """A zero quaternion in one world must not spoil the gradient of a batch."""
+    _, pull = jax.vjp(quaternion.log, jnp.zeros(4))
+    np.testing.assert_array_equal(pull(jnp.zeros(3))[0], 0.0)
+    assert np.all(np.isfinite(pull(jnp.ones(3))[0]))
+
+
 def test_exp_undoes_log_up_to_sign():
     for q in (random_unit(0), -random_unit(0), random_unit(1)):
         back = quaternion.exp(quaternion.log(q))
@@ -171,7 +178,7 @@ def test_from_matrix_can_be_differentiated_at_every_turn(turn):
 @jax.jit
 @jax.jacrev
 def turned_back(phi, r):
-    """φ, from the matrix of r turned by φ."""
+    """Returns φ, recovered from the matrix of r exp(φ)."""
     back = quaternion.from_matrix(quaternion.matrix(quaternion.multiply(r, quaternion.exp(phi))))
     return quaternion.log(quaternion.multiply(quaternion.conjugate(r), back))
 

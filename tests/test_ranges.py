@@ -1,4 +1,4 @@
-"""Numbers of bounded elements that are changed later are held to the ranges of the first ones."""
+"""Changed numbers of inequality elements must lie in the ranges required at the build."""
 
 import jax
 import jax.numpy as jnp
@@ -14,12 +14,14 @@ def system():
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
     touch = {"radius": 0.1, "friction": 0.3, "restitution": 0.5, "rolling": 0.01}
     scene.add(jc.PlaneContact("floor", jc.WORLD, "slide", **touch))
-    scene.add(jc.BoxContact("box", jc.WORLD, "slide", size=(0.1, 0.2)))
+    scene.add(jc.contacts.BoxContact("box", jc.WORLD, "slide", size=(0.1, 0.2)))
     scene.add(jc.Limit("ends", "rail", -1.0, 1.0, restitution=0.5))
     scene.add(jc.Limit("soft", "rail", upper=1.0, stiffness=10.0))
-    scene.add(jc.JointFriction("rub", "rail", most=1.0))
-    scene.add(jc.RateLimit("slow", "rail", rate=1.0))
-    scene.add(jc.Inequality(lambda p, t, x: p.position[:1], ("slide",), "wall", restitution=0.5))
+    scene.add(jc.contacts.JointFriction("rub", "rail", max_force=1.0))
+    scene.add(jc.contacts.RateLimit("slow", "rail", rate=1.0))
+    scene.add(
+        jc.contacts.Inequality(lambda p, t, x: p.position[:1], ("slide",), "wall", restitution=0.5)
+    )
     return scene.build()[0]
 
 
@@ -36,7 +38,7 @@ def system():
         ("ends", {"lower": 1.0}, "ends: lower must be below upper, got 1.0 and 1.0"),
         ("ends", {"lower": 2.0, "upper": 1.5}, "ends: lower must be below upper, got 2.0 and 1.5"),
         ("soft", {"stiffness": 0.0}, "soft: stiffness must be positive"),
-        ("rub", {"most": -1.0}, "rub: most must be zero or more"),
+        ("rub", {"max_force": -1.0}, "rub: max_force must be zero or more"),
         ("slow", {"rate": -1.0}, "slow: rate must be zero or more"),
         ("wall", {"restitution": 2.0}, "wall: restitution must lie in 0 to 1"),
     ],
@@ -47,8 +49,8 @@ def test_what_is_out_of_range_is_refused(system, name, change, match):
 
 
 def test_what_is_in_range_is_taken(system):
-    """Both stops beyond where they were, and numbers that are traced, which have no value."""
-    changed = system.with_params({"ends": {"lower": 2.0, "upper": 3.0}, "rub": {"most": 0.0}})
+    """Both stops may move beyond their old places; traced numbers have no value to check."""
+    changed = system.with_params({"ends": {"lower": 2.0, "upper": 3.0}, "rub": {"max_force": 0.0}})
     assert changed.params["ends"]["lower"] == 2.0
     changed = lambda x: system.with_params({"floor": {"friction": x}})  # noqa: E731
     slope = jax.grad(lambda x: changed(x).params["floor"]["friction"])
@@ -61,13 +63,16 @@ def test_a_known_number_is_checked_within_a_traced_function(system):
 
 
 def test_a_negative_friction_that_is_traced_is_none():
-    """It would push along the slip, and so would what resists rolling."""
+    """Negative friction would push along the slip.
+
+    Negative rolling resistance would drive the disc.
+    """
     scene = jc.Scene(dim=2)
     scene.add_body("disc", mass=1.0, inertia=0.01, position=(0.0, 0.1), velocity=(1.0, 0.0))
     touch = {"radius": 0.1, "friction": 0.4, "rolling": 0.01}
     scene.add(jc.PlaneContact("floor", jc.WORLD, "disc", **touch))
     system, state = scene.build()
-    method = jc.Method(bounded=jc.GaussSeidel(5, warm=False))
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel(5, warm=False))
 
     def end(friction, rolling):
         changed = system.with_params({"floor": {"friction": friction, "rolling": rolling}})
@@ -79,7 +84,7 @@ def test_a_negative_friction_that_is_traced_is_none():
 
 
 def slid(element, changes, controls=None):
-    """φ and φ̇ of 2 kg on a rail that start at 1 m/s, over three seconds; numbers are traced."""
+    """Returns φ and φ̇ of 2 kg on a rail, from 1 m/s over three seconds; the numbers are traced."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("slide", mass=2.0, inertia=1.0, velocity=(1.0, 0.0))
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0)))
@@ -100,21 +105,21 @@ def slid(element, changes, controls=None):
 @pytest.mark.parametrize(
     ("element", "changes", "speed"),
     [
-        (jc.JointFriction("it", "rail", 1.0), {"most": -1.0}, 1.0),
-        (jc.RateMotor("it", "rail", 1.0), {"most": -1.0}, 1.0),
-        (jc.RateLimit("it", "rail", 0.5), {"rate": -0.5}, 0.0),
+        (jc.contacts.JointFriction("it", "rail", 1.0), {"max_force": -1.0}, 1.0),
+        (jc.contacts.RateMotor("it", "rail", 1.0), {"max_force": -1.0}, 1.0),
+        (jc.contacts.RateLimit("it", "rail", 0.5), {"rate": -0.5}, 0.0),
     ],
     ids=["friction", "motor", "rate"],
 )
 def test_negative_traced_bounds_are_zero(element, changes, speed):
-    """A friction of −1 N would push with 1 N, and a limit of −0.5 m/s turn the motion round."""
-    controls = jnp.zeros((1500, 1)) if isinstance(element, jc.RateMotor) else None
+    """A friction of −1 N would push, and a rate limit of −0.5 m/s would reverse the motion."""
+    controls = jnp.zeros((1500, 1)) if isinstance(element, jc.contacts.RateMotor) else None
     v = slid(element, changes, controls)[1]
     assert jnp.allclose(v, speed, atol=1e-12)
 
 
 def test_negative_traced_damping_is_none():
-    """It would add energy without end."""
+    """Negative damping would add energy without limit."""
     v = slid(jc.Limit("it", "rail", upper=0.1, stiffness=100.0, damping=1.0), {"damping": -5.0})[1]
     none = jc.Limit("it", "rail", upper=0.1, stiffness=100.0)
     assert jnp.allclose(v, slid(none, {"stiffness": 100.0})[1], atol=1e-12)
@@ -128,17 +133,17 @@ def test_a_traced_restitution_above_one_adds_no_energy():
 
 @pytest.mark.parametrize("changes", [{"lower": 0.2}, {"lower": 0.2, "upper": -0.2}])
 def test_traced_stops_that_have_crossed_hold_what_is_between_them(changes):
-    """About their middle, no faster than what has passed a stop comes back."""
+    """The body stays in the middle of the crossed stops and returns there at the recovery speed."""
     x, v = slid(jc.Limit("it", "rail", -0.1, 0.1, recovery=0.3), changes)
     middle = (changes["lower"] + changes.get("upper", 0.1)) / 2
     assert jnp.max(jnp.abs(v)) <= 1.0 + 1e-12
-    assert jnp.max(jnp.abs(x[750:] - middle)) < 0.3 * 2e-3 + 1e-12  # a step's way
+    assert jnp.max(jnp.abs(x[750:] - middle)) < 0.3 * 2e-3 + 1e-12  # the travel of a step
     assert jnp.max(jnp.abs(v[750:])) < 0.3 + 1e-12
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_a_soft_stop_without_stiffness_and_damping_is_none(dtype):
-    """What passes it goes on; numbers of zero, below zero, or all but zero have a derivative."""
+    """The body passes the stop; values of zero, below zero, or nearly zero have derivatives."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0), dtype=dtype)
     scene.add_body("slide", mass=2.0, inertia=1.0, position=(0.1, 0.0), velocity=(1.0, 0.0))
     scene.add(jc.Prismatic("rail", jc.WORLD, "slide", axis=(1.0, 0.0), point=(0.0, 0.0)))

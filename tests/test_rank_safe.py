@@ -1,4 +1,4 @@
-"""Rows that depend on each other: the motion of the independent ones, and λ of least norm."""
+"""Dependent rows: the motion equals that of independent rows, and λ has least norm."""
 
 import dataclasses
 
@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
+from jaxcon.constraints.rows import linearize, saddle
 from jaxcon.core.status import Status, first
-from jaxcon.dynamics.forward import saddle
 from jaxcon.geometry import quaternion
 from jaxcon.verification import singular
 from tests.tolerances import DIFFERENCE
 
 GENTLE = jc.Method(stabilizer=jc.Baumgarte.critical(10.0))
 ACCURACY = {jnp.float64: 1e-9, jnp.float32: 1e-4}
-"""The accuracy of accelerations, relative to the largest."""
+"""Tolerance of accelerations, relative to the largest one."""
 SHARED = 1e-5
-"""The accuracy of multipliers of dependent rows."""
+"""Tolerance of multipliers of dependent rows."""
 
 
 def cast(built, dtype):
@@ -39,7 +38,7 @@ def door(hinges):
     for i in range(hinges):
         point = (0.0, 0.0, 0.2 + 0.8 * i)
         scene.add(jc.Revolute(f"hinge{i}", jc.WORLD, "door", point=point, axis=(0.0, 0.0, 1.0)))
-    scene.add(jc.JointSpring("closer", "hinge0", stiffness=30.0, damping=1.0))
+    scene.add(jc.forces.JointSpring("closer", "hinge0", stiffness=30.0, damping=1.0))
     return scene.build()
 
 
@@ -47,9 +46,9 @@ OBLIQUE = (0.5, -0.3, 0.8)
 
 
 def doubled_hinges(links, turn, dtype):
-    """A chain of links of half a metre, each on two parallel hinges, and the axis of all of them.
+    """A chain of links of 0.5 m, each on two parallel hinges; returns also their common axis.
 
-    The chain is level before it is turned by a rotation vector.
+    The chain is level and then rotated by a rotation vector.
     """
     scene = jc.Scene(dim=3, dtype=dtype)
     turned = np.asarray(quaternion.matrix(quaternion.exp(jnp.asarray(turn))))
@@ -70,13 +69,15 @@ def table(legs):
     scene.add_body("table", inertia=jc.inertia.box(30.0, (1.2, 0.8, 0.05)), position=(0, 0, 0.7))
     for i, (x, y) in enumerate([(0.5, 0.3), (-0.5, 0.3), (0.5, -0.3), (-0.5, -0.3)][:legs]):
         foot = (x, y, 0.0)
-        scene.add(jc.PointOnPlane(f"leg{i}", jc.WORLD, "table", axis=(0.0, 0.0, 1.0), point=foot))
-    scene.add(jc.Force("push", "table", force=(7.0, 3.0, 0.0), point=(0.3, 0.1, 0.7)))
+        scene.add(
+            jc.joints.PointOnPlane(f"leg{i}", jc.WORLD, "table", axis=(0.0, 0.0, 1.0), point=foot)
+        )
+    scene.add(jc.forces.Force("push", "table", force=(7.0, 3.0, 0.0), point=(0.3, 0.1, 0.7)))
     return scene.build()
 
 
 def parallelogram(bars):
-    """A coupler on two or three parallel bars, off its singular positions."""
+    """A coupler on two or three parallel bars, not in a singular position."""
     scene = jc.Scene(dim=2)
     angle = 1.1
     half = 0.5 * np.array([np.cos(angle), np.sin(angle)])
@@ -123,16 +124,16 @@ def test_accelerations_are_those_of_the_independent_rows(plain, redundant, dtype
     np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=0, atol=bound)
     assert got.status == Status.OK
     assert jc.forward_dynamics(system, state, None, GENTLE, 1e-3).acceleration.dtype == dtype
-    strict = dataclasses.replace(GENTLE, solver=jc.Sparse())
+    strict = dataclasses.replace(GENTLE, solver=jc.solvers.Sparse())
     assert jc.forward_dynamics(system, state, None, strict, 1e-3).status == Status.SINGULAR
 
 
 @pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
 def test_a_redundant_link_leaves_the_motion_of_a_parallelogram(dtype):
-    """The third bar is a body of its own, so the comparison is with minimal coordinates.
+    """The third bar has mass of its own, so the reference uses minimal coordinates.
 
     With all bars at the angle θ, E = ½ I θ̇² + W sin θ with I = n (¼ + i) m + M and
-    W = (n/2 m + M) g, all lengths 1.
+    W = (n/2 m + M) g; all lengths are 1.
     """
     system, state = cast(parallelogram(3), dtype)
     a = jc.forward_dynamics(system, state, None, GENTLE, 1e-3).acceleration
@@ -142,28 +143,33 @@ def test_a_redundant_link_leaves_the_motion_of_a_parallelogram(dtype):
     np.testing.assert_allclose(got, expected, rtol=ACCURACY[dtype])
 
 
-DENSE, SCHUR = jc.RankSafe(jc.Dense()), jc.RankSafe(jc.Schur())
+DENSE, SCHUR = jc.solvers.RankSafe(jc.solvers.Dense()), jc.solvers.RankSafe(jc.solvers.Schur())
 CREEPING = {
     "default": (jc.Method(), 2, OBLIQUE, 10_000),
     "Schur": (jc.Method(solver=SCHUR), 4, OBLIQUE, 10_000),
     "Dense": (jc.Method(solver=DENSE), 4, OBLIQUE, 1000),
     "RK4": (jc.Method(jc.RK4(), solver=SCHUR), 4, OBLIQUE, 1000),
-    "RATTLE": (jc.Method(jc.RATTLE(), solver=SCHUR), 4, OBLIQUE, 1000),
-    "alpha": (jc.Method(jc.GeneralizedAlpha(), solver=SCHUR), 4, OBLIQUE, 1000),
+    "RATTLE": (jc.Method(jc.integrators.RATTLE(), solver=SCHUR), 4, OBLIQUE, 1000),
+    "alpha": (jc.Method(jc.integrators.GeneralizedAlpha(), solver=SCHUR), 4, OBLIQUE, 1000),
     "projection": (jc.Method(stabilizer=jc.Projection(), solver=SCHUR), 4, OBLIQUE, 1000),
-    "PID": (jc.Method(stabilizer=jc.PID(4e4, 400.0, 1e4), solver=SCHUR), 4, OBLIQUE, 1000),
-    "gradients": (jc.Method(solver=jc.ConjugateGradients()), 4, OBLIQUE, 1000),
-    "priority": (jc.Method(solver=jc.Priority({"hinge*": 0})), 4, OBLIQUE, 1000),
+    "PID": (
+        jc.Method(stabilizer=jc.stabilizers.PID(4e4, 400.0, 1e4), solver=SCHUR),
+        4,
+        OBLIQUE,
+        1000,
+    ),
+    "gradients": (jc.Method(solver=jc.solvers.ConjugateGradients()), 4, OBLIQUE, 1000),
+    "priority": (jc.Method(solver=jc.solvers.Priority({"hinge*": 0})), 4, OBLIQUE, 1000),
 }
-"""Methods, with a number of links, how the chain is turned, and steps of a millisecond."""
+"""Cases by name: method, number of links, rotation of the chain, number of steps of 1 ms."""
 
 
 @pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
 @pytest.mark.parametrize("name", CREEPING)
 def test_doubled_hinges_do_not_creep_along_their_axis(name, dtype):
-    """1 nm in 10 s in float64; in float32 no more than rounding leaves, and none of it grows.
+    """At most 1 nm in 10 s in float64, and rounding in float32; the displacement does not grow.
 
-    A row compares places of up to 2 m, and its rounding of 4 spacings adds up over the hinges.
+    A row compares places of up to 2 m. Its rounding error of 4 spacings adds up over the hinges.
     """
     method, links, turn, steps = CREEPING[name]
     system, state, axis = doubled_hinges(links, turn, dtype)
@@ -187,9 +193,9 @@ def test_doubled_hinges_do_not_creep_along_their_axis(name, dtype):
 
 
 def test_multipliers_are_of_least_norm_in_the_scaled_rows():
-    """λ = D^−½ (D^−½ A D^−½)⁺ D^−½ r, by singular values.
+    """λ = D^−½ (D^−½ A D^−½)⁺ D^−½ r, computed by singular values.
 
-    How dependent rows share a force is known to rounding over ε = 1e-9 of the iteration.
+    The distribution among dependent rows is accurate to rounding over the iteration's ε = 1e-9.
     """
     for system, state in (door(2), repeated(5), table(4)):
         rows = linearize(system, state.q, state.v, state.time)
@@ -201,14 +207,22 @@ def test_multipliers_are_of_least_norm_in_the_scaled_rows():
         inverse = np.linalg.pinv(scale[:, None] * a * scale[None], rcond=1e-10, hermitian=True)
         expected = scale * (inverse @ (scale * right))
         problem = saddle(system, state.q, rows, force, -rows.bias)
-        for solver in (jc.RankSafe(), jc.RankSafe(jc.Schur()), jc.RankSafe(jc.Dense())):
+        for solver in (
+            jc.solvers.RankSafe(),
+            jc.solvers.RankSafe(jc.solvers.Schur()),
+            jc.solvers.RankSafe(jc.solvers.Dense()),
+        ):
             got = solver.solve(problem).multipliers
             np.testing.assert_allclose(got, expected, atol=SHARED * np.max(np.abs(expected)))
 
 
 def test_independent_rows_feel_nothing():
     system, state = parallelogram(2)
-    solvers = (jc.Dense(), jc.RankSafe(), jc.RankSafe(jc.Schur(), always=True))
+    solvers = (
+        jc.solvers.Dense(),
+        jc.solvers.RankSafe(),
+        jc.solvers.RankSafe(jc.solvers.Schur(), always=True),
+    )
     methods = [dataclasses.replace(GENTLE, solver=solver) for solver in solvers]
     exact, *others = (jc.forward_dynamics(system, state, None, m, 1e-3) for m in methods)
     for got in others:
@@ -227,11 +241,11 @@ def test_a_tree_is_solved_directly():
     assert count["default"] == count["strict"]
 
 
-SOLVERS = {"default": jc.RankSafe(), "strict": jc.Sparse()}
+SOLVERS = {"default": jc.solvers.RankSafe(), "strict": jc.solvers.Sparse()}
 
 
 def test_rest_is_no_conflict():
-    """With nothing asked of the rows, what rounding leaves of them contradicts nothing."""
+    """The target of the rows is zero; its rounding errors must not count as a contradiction."""
     system, state = table(4)
     still = dataclasses.replace(state, v=jnp.zeros_like(state.v))
     for s in (system, system.with_params({"gravity": (0.0, 0.0, 0.0)})):
@@ -240,12 +254,12 @@ def test_rest_is_no_conflict():
 
 
 def torso_on_legs(turn, sides, dtype):
-    """A scene with a floating torso whose legs have four-bar knees: shanks on two parallel bars.
+    """A floating torso on legs with four-bar knees: each shank hangs on two parallel bars.
 
     Args:
-        turn: rotation vector of the whole, about the origin.
-        sides: name of each leg and its place beside the middle [m].
-        dtype: of the scene.
+        turn: rotation vector of the scene about the origin.
+        sides: by leg, its name and its offset from the middle [m].
+        dtype: dtype of the scene.
 
     Returns:
         The scene, and the rotation matrix.
@@ -272,10 +286,10 @@ def torso_on_legs(turn, sides, dtype):
     return scene, turned
 
 
-@pytest.mark.parametrize("stabilizer", [jc.Projection(), jc.AugmentedLagrangian()])
+@pytest.mark.parametrize("stabilizer", [jc.Projection(), jc.stabilizers.AugmentedLagrangian()])
 @pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
 def test_a_free_fall_is_no_conflict(dtype, stabilizer):
-    """Gravity asks nothing of the hinges, but for the rounding in which its parts cancel."""
+    """In free fall the right-hand side is zero, except for rounding where gravity terms cancel."""
     method = jc.Method(stabilizer=stabilizer)
     solve = jax.jit(lambda system, state: jc.forward_dynamics(system, state, None, method, 1e-3))
     for turn in np.random.default_rng(1).normal(size=(10, 3)):
@@ -286,12 +300,12 @@ def test_a_free_fall_is_no_conflict(dtype, stabilizer):
 
 @pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
 def test_a_biped_with_four_bar_knees_stands(dtype):
-    """For a second on four points under each foot, its knees held by springs that bend a little."""
+    """Stands for a second on four points under each foot; springs hold the knees slightly bent."""
     legs = {"left": 0.15, "right": -0.15}
     scene, turned = torso_on_legs((0.0, 0.0, 0.7), legs, dtype)
     for side, y in legs.items():
         spring = {"stiffness": 400.0, "damping": 20.0, "rest": 0.02}
-        scene.add(jc.JointSpring(f"{side}_spring", f"{side}_front_hip", **spring))
+        scene.add(jc.forces.JointSpring(f"{side}_spring", f"{side}_front_hip", **spring))
         sole = [turned @ (x, y + z, 0.0) for x in (-0.15, 0.15) for z in (-0.06, 0.06)]
         foot = f"{side}_shank"
         scene.add(jc.PlaneContact(f"{side}_sole", jc.WORLD, foot, center=sole, friction=0.8))
@@ -324,7 +338,7 @@ def two_lengths(short, long):
 
 @pytest.mark.parametrize("dtype", list(ACCURACY), ids=["float64", "float32"])
 def test_contradicting_rows_are_met_by_least_squares(dtype):
-    """The bob swings on the mean of the two lengths, and the world says that they disagree."""
+    """The bob swings on the mean of the two lengths, and the status reports the contradiction."""
     system, state = cast(two_lengths(1.0, 1.1), dtype)
     method = jc.Method(stabilizer=jc.Baumgarte.critical(50.0))
     run = jax.jit(lambda s: jc.rollout(system, method, s, None, jnp.asarray(1e-3, dtype), 500))
@@ -369,7 +383,7 @@ def test_a_singular_world_leaves_the_others_as_they_are():
 
 
 def test_the_derivative_is_that_of_the_independent_rows():
-    """By the stiffness of a closer, through a rollout of a door on one and on two hinges."""
+    """Differentiates rollouts of a door on one and on two hinges by the stiffness of its closer."""
 
     def angle(stiffness, built):
         system, state = built
@@ -396,7 +410,7 @@ def test_rows_of_generalized_coordinates():
         system = jc.GeneralizedSystem(
             mass=lambda q, p: jnp.eye(2) * 2.0,
             force=lambda q, v, t, u, p: jnp.stack([0.0 * q[0], -9.81 * 2.0]),
-            constraints=(jc.Holonomic(function),),
+            constraints=(jc.joints.Holonomic(function),),
         )
         state = jc.init(system, GENTLE, jnp.array([0.6, -0.8]), jnp.array([0.8, 0.6]))
         found.append(jc.forward_dynamics(system, state, None, GENTLE, 1e-3))
@@ -410,16 +424,16 @@ def test_rows_of_generalized_coordinates():
 CONFLICT, LATE = Status.CONFLICT, Status.NOT_CONVERGED
 TOLD = {
     "feedback": (jc.Method(), CONFLICT),
-    "multipliers": (jc.Method(stabilizer=jc.AugmentedLagrangian()), CONFLICT),
-    "implicit": (jc.Method(jc.GeneralizedAlpha()), CONFLICT),
-    "RATTLE": (jc.Method(jc.RATTLE()), LATE),
+    "multipliers": (jc.Method(stabilizer=jc.stabilizers.AugmentedLagrangian()), CONFLICT),
+    "implicit": (jc.Method(jc.integrators.GeneralizedAlpha()), CONFLICT),
+    "RATTLE": (jc.Method(jc.integrators.RATTLE()), LATE),
     "projection": (jc.Method(jc.RK4(), jc.Projection()), LATE),
 }
 
 
 @pytest.mark.parametrize("name", list(TOLD))
 def test_every_method_tells_a_contradiction(name):
-    """By least squares and a note, or by a failure where positions must be met."""
+    """The status is CONFLICT with least squares, or a failure if positions must be satisfied."""
     method, expected = TOLD[name]
 
     @jax.jit
@@ -449,7 +463,7 @@ def test_two_drives_that_agree():
     scene.add_body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0), angular_velocity=0.3)
     scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
     for name in ("first", "second"):
-        scene.add(jc.Drive(name, "hinge", slowly))
+        scene.add(jc.joints.Drive(name, "hinge", slowly))
     system, state = scene.build()
     solution = jc.forward_dynamics(system, state, None, GENTLE, 1e-3)
     assert solution.status == Status.OK
@@ -461,7 +475,7 @@ def slowly(t, params):
 
 
 def problem_of(built):
-    """The saddle system of a start under its own forces."""
+    """Returns the saddle system of a start under its own forces."""
     system, state = built
     rows = linearize(system, state.q, state.v, state.time)
     force = system.force(state.q, state.v, state.time)
@@ -469,7 +483,7 @@ def problem_of(built):
 
 
 def beside(problem, factors):
-    """Worlds along last axes, whose numbers are those of one world times a factor."""
+    """Returns a batch (last axis) whose numbers are those of one problem times a factor."""
 
     def spread(x):
         if not isinstance(x, jax.Array) or not jnp.issubdtype(x.dtype, jnp.floating):
@@ -480,7 +494,7 @@ def beside(problem, factors):
 
 
 def test_a_world_that_is_not_finite_does_not_make_the_others_iterate(monkeypatch):
-    iterate, rounds = jc.RankSafe._iterated, []
+    iterate, rounds = jc.solvers.RankSafe._iterated, []
 
     def seen(self, system):
         solve = iterate(self, system)
@@ -491,10 +505,10 @@ def test_a_world_that_is_not_finite_does_not_make_the_others_iterate(monkeypatch
 
         return told
 
-    monkeypatch.setattr(jc.RankSafe, "_iterated", seen)
+    monkeypatch.setattr(jc.solvers.RankSafe, "_iterated", seen)
     for times in (1, 2):
         worlds = beside(problem_of(repeated(times)), (1.0, jnp.nan))
-        found = jax.jit(lambda x=worlds: jc.RankSafe(always=True).solve(x))()
+        found = jax.jit(lambda x=worlds: jc.solvers.RankSafe(always=True).solve(x))()
         jax.effects_barrier()
         assert len(rounds) == times - 1
         np.testing.assert_array_equal(found.status, [Status.OK, Status.NON_FINITE])

@@ -1,4 +1,4 @@
-"""RATTLE: order, reversibility, bounded energy, conserved momenta, and its derivatives."""
+"""RATTLE: order, reversibility, bounded energy, conserved momenta, and derivatives."""
 
 import dataclasses
 import functools
@@ -12,11 +12,11 @@ from tolerances import DIFFERENCE, IDENTITY
 import jaxcon as jc
 from jaxcon.core import numerics
 
-METHOD = jc.Method(jc.RATTLE())
+METHOD = jc.Method(jc.integrators.RATTLE())
 
 
 def pendulum():
-    """A particle on a rod of 1 m, starting level and at rest."""
+    """A particle on a rod of 1 m, released level."""
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=2.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -24,7 +24,7 @@ def pendulum():
 
 
 def double_pendulum():
-    """Two rods in the plane, starting level."""
+    """Two rods in the plane, released level."""
     scene = jc.Scene(dim=2)
     for i in range(2):
         before = f"b{i - 1}" if i else jc.WORLD
@@ -34,19 +34,19 @@ def double_pendulum():
 
 
 def chain():
-    """Two bodies in space: a ball joint and a hinge, turning freely."""
+    """Two bodies in space on a ball joint and a hinge, in free rotation."""
     scene = jc.Scene()
     scene.add_body("a", mass=1.0, inertia=(0.02, 0.05, 0.04), position=(0.5, 0.0, 0.0))
     scene.add_body("b", mass=0.5, inertia=(0.01, 0.03, 0.02), position=(1.0, 0.4, 0.0))
     scene.add(jc.Spherical("ball", jc.WORLD, "a", point=(0.0, 0.0, 0.0)))
     scene.add(jc.Revolute("hinge", "a", "b", point=(1.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0)))
     system, state = scene.build()
-    v = state.v.at[jnp.array([6, 7])].set(jnp.array([3.0, -2.0]))  # ω_x, which the joints allow
+    v = state.v.at[jnp.array([6, 7])].set(jnp.array([3.0, -2.0]))  # ω_x, allowed by the joints
     return system, dataclasses.replace(state, v=v)
 
 
 def top():
-    """A heavy top, spinning fast about its axis."""
+    """A heavy top that spins fast about its axis."""
     scene = jc.Scene()
     scene.add_body(
         "top",
@@ -62,7 +62,7 @@ def top():
 
 
 def tumbling():
-    """A free body that turns about its middle axis, two of them joined by a rod."""
+    """Two free bodies joined by a rod; one rotates about its middle axis."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_body("a", mass=1.0, inertia=(1.0, 2.0, 3.0), angular_velocity=(0.1, 2.0, 0.1))
     scene.add_body("b", mass=2.0, inertia=(1.0, 1.5, 2.0), position=(1.0, 0.5, 0.0))
@@ -76,7 +76,7 @@ SCENES = {f.__name__: f for f in (pendulum, double_pendulum, chain, top, tumblin
 
 @functools.cache
 def scene(name):
-    """The scene, its state, and (state, h, n) → states after n steps and after each of 64 parts."""
+    """Returns system, state, and (state, h, n) → states after n steps and at 8 times."""
     system, state = SCENES[name]()
 
     @jax.jit
@@ -95,7 +95,7 @@ def scene(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_second_order_and_reversible(name):
-    """By halving the step; and back to the start when velocities are reversed."""
+    """Halving the step shows the order; reversed velocities lead back to the start."""
     system, state, run = scene(name)
     time = 0.1 if name == "top" else 0.4
     ends = [run(state, time / n, n)[0] for n in (40, 80, 160)]
@@ -103,20 +103,20 @@ def test_second_order_and_reversible(name):
     assert 1.9 < np.log2(errors[0] / errors[1]) < 2.1
     left = jc.violation(system, ends[0])
     assert float(left.worst) < IDENTITY
-    assert float(left.worst_rate) < 1e-11  # speeds of up to 60 rad/s
+    assert float(left.worst_rate) < 1e-11  # speeds are up to 60 rad/s
     back, _ = run(dataclasses.replace(ends[0], v=-ends[0].v), time / 40, 40)
     assert float(jnp.max(jnp.abs(back.q - state.q))) < IDENTITY
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_energy_stays_within_a_band(name):
-    """Over a long run its error in the second half is that in the first: no drift."""
+    """The energy error in the second half of a long run is that of the first half: no drift."""
     system, state, run = scene(name)
     steps, dt = (8000, 1e-3) if name == "top" else (8000, 1e-2)
     if name == "double_pendulum":
         dt = 4e-3
     parts = [state]
-    for _ in range(4):  # 32 places to look at
+    for _ in range(4):  # records 32 states
         parts.append(run(parts[-1], dt, steps // 4)[0])
     path = [run(s, dt, steps // 4)[1] for s in parts[:-1]]
     energy = jax.vmap(lambda s: jc.energy(system, s))(
@@ -139,7 +139,7 @@ def test_momenta_of_a_free_system_are_kept():
 
 
 def test_one_step_of_a_particle_by_hand():
-    """Falling from rest: q⁺ = (cos θ, −sin θ) with sin θ = g h²/2, the rod's force upright −0."""
+    """From rest q⁺ = (cos θ, −sin θ) with sin θ = g h²/2."""
     system, state = pendulum()
     h, g, m = 0.1, 9.81, 2.0
     new, info = jax.jit(lambda s: jc.step(system, METHOD, s, None, h))(state)
@@ -155,11 +155,11 @@ def test_one_step_of_a_particle_by_hand():
 
 
 def test_a_motion_in_time_is_followed():
-    """A slider on a driven rail: both levels hold at every end of a step."""
+    """A slider on a driven rail: positions and velocities are exact at the end of every step."""
     motion = jc.Scene(dim=2)
     motion.add_body("slider", mass=1.0, inertia=1.0)
     motion.add(jc.Prismatic("rail", jc.WORLD, "slider", axis=(1.0, 0.0)))
-    motion.add(jc.Drive("drive", "rail", lambda t, p: jnp.sin(t)))
+    motion.add(jc.joints.Drive("drive", "rail", lambda t, p: jnp.sin(t)))
     system, state = motion.build()
     state = dataclasses.replace(state, v=state.v.at[0].set(1.0))
     end, path = jax.jit(lambda s: jc.rollout(system, METHOD, s, None, 0.1, 10))(state)
@@ -168,7 +168,7 @@ def test_a_motion_in_time_is_followed():
 
 
 def damped(parameter):
-    """The height of a pendulum on a damped spring after some steps."""
+    """Returns the height of a pendulum on a damped spring after ten steps."""
     hung = jc.Scene(dim=2)
     hung.add_particle("bob", mass=2.0, position=(1.0, 0.0))
     hung.add(jc.Distance("rod", jc.WORLD, "bob"))
@@ -183,7 +183,7 @@ def damped(parameter):
 
 
 def test_forces_of_velocities_and_derivatives():
-    """The gradient is that of the equations: central differences, forward and reverse mode."""
+    """The gradient equals central differences in forward and in reverse mode."""
     x, h = jnp.array([3.0, 0.4]), 1e-5
     value, gradient = jax.jit(damped), jax.jit(jax.grad(damped))
     differences = [(value(x + h * e) - value(x - h * e)) / (2 * h) for e in jnp.eye(2)]
@@ -192,7 +192,7 @@ def test_forces_of_velocities_and_derivatives():
 
 
 def test_the_derivative_of_a_step_in_space():
-    """By velocities and a moment of inertia, at a turn of a fifth of a radian a step."""
+    """Differentiates by velocities and a moment of inertia, at a rotation of 0.2 rad a step."""
     system, state = top()
 
     def end(x):
@@ -220,7 +220,7 @@ def test_float32_and_batches():
 
 
 def test_the_energy_of_float32_does_not_drift():
-    """A double pendulum over 1e5 steps; momenta solved as wholes would drift by 5e-3 J."""
+    """A double pendulum over 1e5 steps; solving for whole momenta would drift by 5e-3 J."""
     system, state = jax.tree.map(
         lambda x: x.astype(np.float32) if x.dtype == float else x, double_pendulum()
     )
@@ -232,11 +232,11 @@ def test_the_energy_of_float32_does_not_drift():
     end, energy = run(state)
     assert int(end.status) == jc.Status.OK
     tenths = np.float64(energy).reshape(10, -1).mean(axis=1)
-    assert np.max(np.abs(tenths - tenths[0])) < 1.5e-3  # 1e-4 of the 15 J that it falls through
+    assert np.max(np.abs(tenths - tenths[0])) < 1.5e-3  # 1e-4 of the 15 J of the fall
 
 
 def total_energy(system):
-    """Returns a record function for rollouts: the total energy [J]."""
+    """Returns a function that records the total energy [J] of a rollout."""
     return lambda state, info: jc.energy(system, state).total
 
 
@@ -247,20 +247,20 @@ def test_steps_too_large_say_so():
 
 
 def test_what_it_refuses():
-    """With the reason, and what to do instead."""
+    """Messages give the reason, and what to do instead."""
     system, state = pendulum()
     for stabilizer in (jc.Baumgarte.critical(10.0), jc.Projection()):
         with pytest.raises(ValueError, match="keeps positions and velocities"):
-            jc.step(system, jc.Method(jc.RATTLE(), stabilizer), state, None, 0.1)
+            jc.step(system, jc.Method(jc.integrators.RATTLE(), stabilizer), state, None, 0.1)
     skating = jc.Scene(dim=2)
     skating.add_body("skate", mass=1.0, inertia=1.0)
-    skating.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    skating.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
     with pytest.raises(ValueError, match="blade"):
         jc.step(skating.build()[0], METHOD, skating.build()[1], None, 0.1)
     spun = jc.Scene(dim=2)
     spun.add_body("wheel", mass=1.0, inertia=1.0)
     spun.add(jc.Revolute("axle", jc.WORLD, "wheel", point=(0.0, 0.0)))
-    spun.add(jc.Armature("rotor", "axle", inertia=1.0))
+    spun.add(jc.joints.Armature("rotor", "axle", inertia=1.0))
     with pytest.raises(ValueError, match="rotor"):
         jc.step(spun.build()[0], METHOD, spun.build()[1], None, 0.1)
     curved = jc.GeneralizedSystem(
@@ -271,7 +271,10 @@ def test_what_it_refuses():
 
 
 def test_the_coefficient_of_the_inverse_exponential():
-    """By hand at π, and smooth where the series takes over."""
+    """The values equal those of the formula, also at π.
+
+    The derivative is continuous where the series takes over.
+    """
     s = jnp.array([0.0, 1 - 1e-9, 1 + 1e-9, np.pi**2, 25.0])
     θ = np.sqrt(np.asarray(s[1:]))
     expected = [1 / 12, *((1 - θ / 2 / np.tan(θ / 2)) / θ**2)]

@@ -1,4 +1,4 @@
-"""Steps that fail are repaired in their world alone: rolled back, projected, relaxed."""
+"""Failed steps are repaired in their world alone: rolled back, projected, or relaxed."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ OK, ROLLED_BACK, PROJECTED, RELAXED = 0, 17, 18, 19
 LIMIT, SHRINK, GROWTH, DAMPING, RETRIES = 0.02, 0.5, 1.25, 0.25, 4
 METHOD = jc.Method(
     stabilizer=jc.Baumgarte.critical(rate=20.0),
-    recovery=jc.Recovery(LIMIT, SHRINK, GROWTH, DAMPING, retries=RETRIES),
+    recovery=jc.stabilizers.Recovery(LIMIT, SHRINK, GROWTH, DAMPING, retries=RETRIES),
 )
 
 
@@ -26,14 +26,14 @@ def scene():
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(0.6, 0.8), velocity=(0.4, -0.3))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     system, state = scene.build()
     return system, jc.init(system, METHOD, state.q, state.v)
 
 
 @pytest.fixture(scope="module")
 def simulate(scene):
-    """Final state, and state and info of every step, of all worlds."""
+    """Returns the function that simulates all worlds: final states, and (state, info) by step."""
     system, start = scene
 
     def one(x):
@@ -47,7 +47,7 @@ def simulate(scene):
 
 
 def numbers(state):
-    """Returns the numbers of healthy worlds."""
+    """Returns the numbers of a batch of healthy worlds."""
     return {
         "q": np.tile(state.q, (WORLDS, 1)),
         "control": np.tile([[0.0, 1.0]], (WORLDS, STEPS, 1)) * np.arange(WORLDS)[:, None, None],
@@ -57,7 +57,7 @@ def numbers(state):
 
 
 def sicken(x, **changes):
-    """Returns the batch with one world changed."""
+    """Returns the batch with the numbers of one world changed."""
     x = {name: np.array(value) for name, value in x.items()}
     for name, change in changes.items():
         change(x[name][SICK], x[name])
@@ -65,7 +65,7 @@ def sicken(x, **changes):
 
 
 def put(index, value):
-    """Writes a value into the numbers of the world that is to fall sick."""
+    """Returns a function that writes a value into the numbers of the failing world."""
 
     def change(_, whole):
         whole[(SICK, *index)] = value
@@ -81,7 +81,7 @@ def test_a_failed_step_is_rolled_back_and_tried_again_with_weaker_feedback(scene
         np.testing.assert_array_equal(np.asarray(a)[HEALTHY], np.asarray(b)[HEALTHY])
     codes = np.asarray(infos.status)
     np.testing.assert_array_equal(codes[HEALTHY], OK)
-    # 0.5 grows by 1.25 a step, back to 1 after four
+    # relaxation grows from 0.5 by 1.25 a step and is 1 after four
     expected = [OK] * 5 + [ROLLED_BACK] + [RELAXED] * 4 + [OK] * (STEPS - 10)
     np.testing.assert_array_equal(codes[SICK], expected)
     np.testing.assert_array_equal(states.q[SICK, 5], states.q[SICK, 4])
@@ -102,7 +102,7 @@ def test_a_state_off_its_constraints_is_projected_to_the_nearest(scene, simulate
     x = sicken(numbers(state), q=put((), far))
     final, (states, infos) = simulate(x)
     np.testing.assert_array_equal(infos.status[SICK, :2], [PROJECTED, RELAXED])
-    np.testing.assert_allclose(states.q[SICK, 0], far / 1.5, rtol=1e-12)  # on the same ray
+    np.testing.assert_allclose(states.q[SICK, 0], far / 1.5, rtol=1e-12)  # in the same direction
     direction = far / 1.5
     kept = (1 - DAMPING) * np.asarray(state.v)
     np.testing.assert_allclose(states.v[SICK, 0], kept - direction * (direction @ kept), rtol=1e-12)
@@ -122,13 +122,13 @@ def test_after_so_many_attempts_the_failure_sticks(scene, simulate):
 
 
 def test_the_limit_that_cannot_be_kept_is_named():
-    """A particle that two rods hold: no configuration is valid."""
+    """Two rods hold a particle such that no configuration satisfies both."""
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     for name, length in (("rod", 1.0), ("longer", 1.1)):
         scene.add(jc.Distance(name, jc.WORLD, "bob", length=length))
     system, state = scene.build()
-    method = jc.Method(recovery=jc.Recovery(limit=0.01, retries=2))
+    method = jc.Method(recovery=jc.stabilizers.Recovery(limit=0.01, retries=2))
     state = jc.init(system, method, state.q, state.v)
     final, _ = jc.rollout(system, method, state, None, DT, 5)
     assert final.status == jc.Status.VIOLATED
@@ -137,11 +137,14 @@ def test_the_limit_that_cannot_be_kept_is_named():
 
 
 def test_gains_that_are_unstable_are_relaxed_until_they_hold(scene):
-    """φ̇⁺ = (1 − 2hα) φ̇ − …: beyond hα = 0.83 errors grow, and a world stops them by itself."""
+    """φ̇⁺ = (1 − 2hα) φ̇ − …: for hα > 0.83 errors grow, and recovery lowers the gains."""
     system, start = scene
     wild = jc.Baumgarte.critical(rate=1.5 / DT)
     worst, codes = {}, {}
-    for name, recovery in (("without", None), ("with", jc.Recovery(limit=1e-3, retries=20))):
+    for name, recovery in (
+        ("without", None),
+        ("with", jc.stabilizers.Recovery(limit=1e-3, retries=20)),
+    ):
         method = jc.Method(stabilizer=wild, recovery=recovery)
         state = jc.init(system, method, start.q, start.v)
 
@@ -160,7 +163,7 @@ def test_gains_that_are_unstable_are_relaxed_until_they_hold(scene):
 
 
 def test_gradients_are_finite_and_those_of_what_was_done(scene, simulate):
-    """A batch has a world that was rolled back, one that was projected, and a healthy one."""
+    """One world of the batch was rolled back, one projected, and one is healthy."""
     system, start = scene
     x = numbers(start)
     x["control"][0, 5] = np.nan
@@ -186,9 +189,9 @@ def test_gradients_are_finite_and_those_of_what_was_done(scene, simulate):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_generalized_coordinates_recover_too(dtype):
-    """World by world, and with another projector; each dtype stays what it is."""
+    """Covers batches, a user-defined correction, and both dtypes."""
 
-    class Straight(jc.Unstabilized):
+    class Straight(jc.stabilizers.Unstabilized):
         def correct(self, system, solver, before, state, memory, dt):
             return dataclasses.replace(state, q=jnp.zeros_like(state.q).at[0].set(1)), state.status
 
@@ -196,10 +199,10 @@ def test_generalized_coordinates_recover_too(dtype):
     rod = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.stack([p, p]),
         force=lambda q, v, t, u, p: jnp.stack([0 * q[0], -9.81 * p]),
-        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q @ q - 1]), name="length"),),
+        constraints=(jc.joints.Holonomic(lambda q, t, p: jnp.stack([q @ q - 1]), name="length"),),
         params=jnp.ones((), dtype),
     )
-    method = jc.Method(recovery=jc.Recovery(limit=0.1, projector=straight()))
+    method = jc.Method(recovery=jc.stabilizers.Recovery(limit=0.1, projector=straight()))
     state = jc.init(rod, method, jnp.array([1.0, 0.0], dtype), jnp.zeros(2, dtype))
     starts = jnp.array([[1.0, 0.0], [2.0, 3.0]], dtype)
     final, codes = jax.vmap(
@@ -213,9 +216,9 @@ def test_generalized_coordinates_recover_too(dtype):
 
 
 def test_numbers_that_are_arrays_are_checked_inside_a_trace_too():
-    """Numbers of a tuned method are arrays, which a function that has them does not trace."""
+    """The numbers of a tuned method are arrays, concrete in a trace that closes over them."""
 
-    recovery = jax.tree.map(jnp.asarray, jc.Recovery(limit=0.1, shrink=0.5))
+    recovery = jax.tree.map(jnp.asarray, jc.stabilizers.Recovery(limit=0.1, shrink=0.5))
     jax.make_jaxpr(recovery.check)()
     wrong = jax.tree.map(lambda x: jnp.where(x == 0.5, 1.5, x), recovery)
     with pytest.raises(ValueError, match="shrink must be above 0 and at most 1"):
@@ -226,70 +229,96 @@ def test_what_is_refused(scene):
     system, state = scene
     for wrong, kind, words in (
         (
-            lambda: jc.Recovery(growth=float("nan")),
+            lambda: jc.stabilizers.Recovery(growth=float("nan")),
             ValueError,
             "growth must be 1 or more and finite",
         ),
         (
-            lambda: jc.Recovery(growth=float("inf")),
+            lambda: jc.stabilizers.Recovery(growth=float("inf")),
             ValueError,
             "growth must be 1 or more and finite",
         ),
         (
-            lambda: jc.Recovery(shrink=2.0),
+            lambda: jc.stabilizers.Recovery(shrink=2.0),
             ValueError,
             "shrink must be above 0 and at most 1, got 2.0",
         ),
-        (lambda: jc.Recovery(shrink="a"), ValueError, "shrink must be a real number, got 'a'"),
-        (lambda: jc.Recovery(limit=1j), ValueError, "limit must be a real number, got 1j"),
-        (lambda: jc.Recovery(limit=True), ValueError, "limit must be a real number, got True"),
-        (lambda: jc.Recovery(limit=-1.0), ValueError, "limit must be positive"),
         (
-            lambda: jc.Recovery(projector=jc.Baumgarte()),
+            lambda: jc.stabilizers.Recovery(shrink="a"),
+            ValueError,
+            "shrink must be a real number, got 'a'",
+        ),
+        (
+            lambda: jc.stabilizers.Recovery(limit=1j),
+            ValueError,
+            "limit must be a real number, got 1j",
+        ),
+        (
+            lambda: jc.stabilizers.Recovery(limit=True),
+            ValueError,
+            "limit must be a real number, got True",
+        ),
+        (lambda: jc.stabilizers.Recovery(limit=-1.0), ValueError, "limit must be positive"),
+        (
+            lambda: jc.stabilizers.Recovery(projector=jc.Baumgarte()),
             ValueError,
             "Baumgarte corrects no positions",
         ),
         (
-            lambda: jc.Recovery(projector=jc.Penalty(1.0)),
+            lambda: jc.stabilizers.Recovery(projector=jc.stabilizers.Penalty(1.0)),
             ValueError,
             "Penalty corrects no positions",
         ),
         (
-            lambda: jc.Recovery(projector=jc.Projection(position=False)),
+            lambda: jc.stabilizers.Recovery(projector=jc.Projection(position=False)),
             ValueError,
             "Projection corrects no positions",
         ),
         (
-            lambda: jc.Recovery(
-                projector=jc.Hybrid(jc.Penalty(1.0), large=jc.Projection(position=False))
+            lambda: jc.stabilizers.Recovery(
+                projector=jc.stabilizers.Hybrid(
+                    jc.stabilizers.Penalty(1.0), large=jc.Projection(position=False)
+                )
             ),
             ValueError,
             "Hybrid corrects no positions",
         ),
         (
-            lambda: jc.Recovery(
-                projector=jc.Hybrid(jc.Penalty(1.0), large=jc.Projection(every=10))
+            lambda: jc.stabilizers.Recovery(
+                projector=jc.stabilizers.Hybrid(
+                    jc.stabilizers.Penalty(1.0), large=jc.Projection(every=10)
+                )
             ),
             ValueError,
             "Hybrid has a memory",
         ),
         (
-            lambda: jc.Recovery(projector=jc.AugmentedLagrangian(feedback=jc.Projection())),
+            lambda: jc.stabilizers.Recovery(
+                projector=jc.stabilizers.AugmentedLagrangian(feedback=jc.Projection())
+            ),
             ValueError,
             "AugmentedLagrangian has a memory",
         ),
         (
-            lambda: jc.Recovery(projector=jc.Projection(metric="Mass")),
+            lambda: jc.stabilizers.Recovery(projector=jc.Projection(metric="Mass")),
             ValueError,
             "metric must be one of",
         ),
         (
-            lambda: jc.Recovery(projector=jc.Projection(factor=3.0)),
+            lambda: jc.stabilizers.Recovery(projector=jc.Projection(factor=3.0)),
             ValueError,
             "factor must be above 0 and at most 1",
         ),
-        (lambda: jc.Recovery(projector="projection"), TypeError, "projector must be a stabiliser"),
-        (lambda: jc.Recovery, TypeError, r"recovery must be a value such as Recovery\(\)"),
+        (
+            lambda: jc.stabilizers.Recovery(projector="projection"),
+            TypeError,
+            "projector must be a stabiliser",
+        ),
+        (
+            lambda: jc.stabilizers.Recovery,
+            TypeError,
+            r"recovery must be a value such as Recovery\(\)",
+        ),
     ):
         with pytest.raises(kind, match=words):
             jc.step(system, jc.Method(recovery=wrong()), state, None, DT)

@@ -1,4 +1,4 @@
-"""The library against the reference numbers of others, one test a case."""
+"""Compares the library with reference values from other sources, one test for each case."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Degrees of freedom, rank and redundant rows of mechanisms known from textbooks."""
+"""Reports: degrees of freedom, rank and redundant rows of textbook mechanisms, and costs."""
 
 import dataclasses
 
@@ -19,7 +19,7 @@ def add_link(scene, name, start, end):
 
 
 def four_bar(dim):
-    """World – crank – coupler – rocker – world, hinged about the normal of its plane."""
+    """World – crank – coupler – rocker – world, hinged about the normal of the plane."""
     corners = np.array([[0.0, 0.0], [0.0, 1.0], [2.0, 1.5], [2.5, 0.0]])
     axis = None
     if dim == 3:
@@ -43,7 +43,7 @@ def test_planar_four_bar():
 
 
 def test_spatial_four_bar_of_four_revolutes():
-    """It moves although 18 − 20 < 0: three rows of the last hinge are redundant."""
+    """The linkage moves although 18 − 20 < 0: three rows of the last hinge are redundant."""
     report = jc.report(*four_bar(3))
     assert (report.velocities, report.rows, report.rank) == (18, 20, 17)
     assert report.degrees_of_freedom == 1
@@ -54,7 +54,7 @@ def test_spatial_four_bar_of_four_revolutes():
 
 
 def test_a_door_on_two_hinges():
-    """One of the hinges adds nothing: five redundant rows, named."""
+    """One of the hinges is redundant: the report names its five rows."""
     scene = jc.Scene()
     scene.add_body("door", mass=20.0, inertia=(2.0, 3.0, 1.0), position=(0.5, 0.0, 1.0))
     for name, height in (("lower", 0.3), ("upper", 1.7)):
@@ -77,7 +77,7 @@ def test_the_same_constraint_twice_is_named():
 
 
 def test_condition_does_not_depend_on_units_of_rows():
-    """Two orthogonal rods have condition 1, at an angle θ it is (1 + c)/(1 − c)."""
+    """Two orthogonal rods have condition 1; rods at an angle θ have (1 + c)/(1 − c), c = cos θ."""
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=3.0)
     c = np.cos(0.5)
@@ -97,7 +97,7 @@ def test_violation_is_listed_by_constraint():
 
 
 def test_a_rod_too_short_to_reach_is_sent_to_assemble():
-    """Its rows are independent where it starts, and no rank tells that they cannot be met."""
+    """The rows are independent at the start, so that the rank does not show the contradiction."""
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(0.6, 0.8))
     scene.add(jc.Distance("left", jc.WORLD, "bob", length=1.0))
@@ -111,10 +111,13 @@ def test_a_rod_too_short_to_reach_is_sent_to_assemble():
 
 
 def test_a_skate_that_slips_is_where_it_may_be():
-    """Its row holds a velocity, ψ = 0.5 m/s, and no position that assembly could mend."""
+    """The row constrains a velocity, ψ = 0.5 m/s.
+
+    There is no position error for assembly to correct.
+    """
     scene = jc.Scene(dim=2)
     scene.add_body("skate", mass=60.0, inertia=2.0, velocity=(3.0, 0.5))
-    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
     system, state = scene.build()
@@ -155,7 +158,7 @@ def test_float32_has_its_own_tolerance():
     for name, height in (("lower", 0.3), ("upper", 1.7)):
         point = (0.0, 0.0, height)
         scene.add(jc.Revolute(name, jc.WORLD, "door", point=point, axis=(0.1, 0.2, 1.0)))
-    # the axes are parallel, the points not on one axis: the door cannot move at all
+    # parallel axes through points that are not on one axis: the door cannot move
     assert jc.report(*scene.build()).degrees_of_freedom == 0
 
 
@@ -168,7 +171,7 @@ def test_generalized_coordinates_have_a_report():
 
 
 def crawler(count):
-    """A chain of links on the floor, hinged, with a stop in each hinge: 3 count − 1 rows."""
+    """A chain of links on the floor with a stop in each hinge: 3 count − 1 inequality rows."""
     scene = jc.Scene(dim=2)
     for i in range(count):
         scene.add_body(f"link{i}", mass=1.0, inertia=0.1, position=(i, 0.0))
@@ -180,23 +183,25 @@ def crawler(count):
 
 
 def test_a_report_compiles_nothing_of_the_scene(caplog):
-    """Neither its rows nor a step, unless it is asked to measure."""
+    """Without `measure` neither the rows nor a step are compiled."""
     system, state = crawler(12)
-    exact = jc.Method(bounded=jc.InteriorPoint())
+    exact = jc.Method(contact_solver=jc.solvers.InteriorPoint())
     with jax.log_compiles(), caplog.at_level("WARNING"):
         report = jc.report(system, state, exact, 1e-3)
         compiled = [x.getMessage() for x in caplog.records if "Compiling" in x.getMessage()]
         assert not [x for x in compiled if "linearize" in x or "step" in x or "_run" in x]
-        assert len(compiled) < 20  # single operations of default gains and the like
+        assert len(compiled) < 20  # single operations, as for default gains
     assert report.memory is report.work is report.probe is report.seconds is None
     assert report.degrees_of_freedom == 36 - 22
     assert "35 inequality rows" in report.warnings["dense"]
     assert "GaussSeidel()" in report.warnings["dense"]
 
 
-@pytest.mark.parametrize("solver", [jc.Sparse(), jc.Schur(), jc.Dense()], ids=str)
+@pytest.mark.parametrize(
+    "solver", [jc.solvers.Sparse(), jc.solvers.Schur(), jc.solvers.Dense()], ids=str
+)
 def test_the_cost_by_structure_is_near_that_of_the_trace(solver):
-    """Leading terms, right within a factor of 2.5."""
+    """The estimate has leading terms only and is right within a factor of 2.5."""
     system, state = crawler(12)
     method = jc.Method(solver=solver)
     found = jc.report(system, state, method).cost
@@ -209,16 +214,16 @@ def test_the_cost_by_structure_is_near_that_of_the_trace(solver):
 
 
 def test_the_cost_of_few_rows_of_many():
-    """With n = 35 contact rows and stops, 2 · 8 + 4 are solved at a time."""
+    """There are n = 35 rows of contacts and stops, of which 2 · 8 + 4 are solved at a time."""
     system, state = crawler(12)
-    nearest = jc.Nearest(jc.GaussSeidel(10), contacts=8, stops=4)
-    found = jc.report(system, state, jc.Method(bounded=nearest)).cost
+    nearest = jc.solvers.ActiveSet(jc.solvers.GaussSeidel(10), contacts=8, stops=4)
+    found = jc.report(system, state, jc.Method(contact_solver=nearest)).cost
     assert found.contact == 10 * (2 * 20**2 + 6 * 20)
-    slow = jc.report(system, state, jc.Method(bounded=jc.InteriorPoint())).cost
+    slow = jc.report(system, state, jc.Method(contact_solver=jc.solvers.InteriorPoint())).cost
     assert slow.contact == 15 * (2 * 35**3 + 6 * 35**2)
 
 
 def test_a_cost_that_is_not_known_is_not_made_up():
-    found = jc.report(*four_bar(2), jc.Method(solver=jc.Priority({"hinge0": 1}))).cost
+    found = jc.report(*four_bar(2), jc.Method(solver=jc.solvers.Priority({"hinge0": 1}))).cost
     assert found.solver is None
     assert "no estimate for the solver" in str(found)

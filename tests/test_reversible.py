@@ -1,4 +1,4 @@
-"""Gradients of rollouts whose states are found again by stepping back, and when that is refused."""
+"""Reversible adjoints: states are recomputed backwards, and lost states are detected."""
 
 import dataclasses
 import functools
@@ -9,26 +9,26 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.simulation.step import undo
+from jaxcon.execution.step import undo
 
-METHOD = jc.Method(jc.RATTLE())
+METHOD = jc.Method(jc.integrators.RATTLE())
 DT = 2e-3
 
 
 def double_pendulum():
-    """Two rods in the plane, starting level, with a motor and a damper between them."""
+    """Two rods in the plane, released level, with a motor and a damper between them."""
     scene = jc.Scene(dim=2)
     for i in range(2):
         before = f"b{i - 1}" if i else jc.WORLD
         scene.add_body(f"b{i}", mass=1.0, inertia=1 / 12, position=(i + 0.5, 0.0))
         scene.add(jc.Revolute(f"hinge{i}", before, f"b{i}", point=(float(i), 0.0)))
-    scene.add(jc.JointDamper("friction", "hinge1", damping=0.05))
+    scene.add(jc.forces.JointDamper("friction", "hinge1", damping=0.05))
     scene.add(jc.Motor("motor", "hinge1"))
     return scene.build()
 
 
 def test_a_thousand_steps_have_the_gradient_of_every_step():
-    """By a start off the constraints, masses, dampers, controls and h, with what was recorded."""
+    """Derivatives by initial velocity, mass, damping, controls and h agree, records included."""
     system, state = double_pendulum()
 
     def value(x, adjoint):
@@ -47,7 +47,7 @@ def test_a_thousand_steps_have_the_gradient_of_every_step():
     x = jax.tree.map(jnp.asarray, x)
     found, expected = (
         jax.jit(jax.value_and_grad(functools.partial(value, adjoint=adjoint)))(x)
-        for adjoint in (jc.Reversible(), jc.EveryStep())
+        for adjoint in (jc.adjoints.Reversible(), jc.adjoints.EveryStep())
     )
     assert min(np.max(np.abs(x)) for x in jax.tree.leaves(expected)) > 1e-4
     for got, wanted in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
@@ -55,23 +55,23 @@ def test_a_thousand_steps_have_the_gradient_of_every_step():
 
 
 def bob(damping=0.0, dtype=jnp.float64):
-    """A particle on a rod, pulled by a damper and pushed."""
+    """A particle on a rod with a damper and a control force."""
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0), velocity=(0.0, 1.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     place = {"point_a": (0.0, 2.0)}
     scene.add(jc.Spring("spring", jc.WORLD, "bob", stiffness=1.0, damping=damping, **place))
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     return scene.build()
 
 
 SYSTEM, STATE = bob(0.3)
 WORLDS = jnp.array([[0.0, 1.0], [0.0, -0.5], [jnp.nan, 0.0]])
-"""Three worlds, the last of which fails at once."""
+"""Three worlds; the last one fails at once."""
 
 
 def along(v, mass, adjoint, every=1, steps=12):
-    """By a velocity and a mass; the record closes over both."""
+    """Returns a value of a rollout by velocity and mass; the record closes over both."""
     system = SYSTEM.with_params({"bob": {"mass": mass}})
     start = dataclasses.replace(STATE, v=v)
     controls = jnp.stack([0.1 * jnp.arange(1.0 * steps)] * 2, axis=1) * v[1]
@@ -85,16 +85,16 @@ def along(v, mass, adjoint, every=1, steps=12):
 
 
 def test_batches_in_both_orders_strides_and_failed_worlds():
-    """A gradient is cut every five steps; a world that fails leaves it to the others."""
+    """The gradient is truncated every five steps; a failed world does not affect the others."""
 
     def one(v, mass, adjoint):
         return jax.grad(along, argnums=(0, 1))(v, mass, adjoint, 3)
 
-    back = jc.Truncated(5, within=jc.Reversible(segments=4))
+    back = jc.adjoints.Truncated(5, within=jc.adjoints.Reversible(segments=4))
 
     @jax.jit
     def expected(worlds):
-        return jax.vmap(lambda v: one(v, 1.0, jc.Truncated(5)))(worlds)
+        return jax.vmap(lambda v: one(v, 1.0, jc.adjoints.Truncated(5)))(worlds)
 
     @jax.jit
     def inside(worlds):
@@ -118,13 +118,13 @@ def test_batches_in_both_orders_strides_and_failed_worlds():
 
 
 def test_a_step_back_of_a_body_in_space_that_counts_its_turns():
-    """Past the angle where an angle that is not counted would jump."""
+    """The rotation passes the angle at which an uncounted angle would jump by 2 π."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
     body = {"inertia": jc.inertia.box(1.0, (0.4, 0.3, 0.2)), "position": (0.2, 0.0, 0.0)}
     scene.add_body("body", **body, velocity=(0.0, 0.0, -1.8), angular_velocity=(0.0, 9.0, 0.0))
     scene.add(jc.Revolute("hinge", jc.WORLD, "body", point=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0)))
-    scene.add(jc.JointSpring("spring", "hinge", stiffness=0.2))
-    scene.add(jc.JointDamper("damper", "hinge", damping=0.01))
+    scene.add(jc.forces.JointSpring("spring", "hinge", stiffness=0.2))
+    scene.add(jc.forces.JointDamper("damper", "hinge", damping=0.01))
     system, state = scene.build()
     state = jc.init(system, METHOD, state.q, state.v)
 
@@ -143,15 +143,15 @@ def test_a_step_back_of_a_body_in_space_that_counts_its_turns():
 
 
 def test_a_step_back_undoes_a_step():
-    """With a damper, a control and a drive that moves with time."""
+    """The scene has a damper, a control, and a time-dependent drive."""
     scene = jc.Scene(dim=2)
     scene.add_body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0))
     scene.add_particle("bob", mass=0.5, position=(2.0, 0.0), velocity=(0.0, 1.0))
     scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
     scene.add(jc.Distance("rod", "arm", "bob", point_a=(1.0, 0.0)))
-    scene.add(jc.Drive("turn", "hinge", lambda t, _: jnp.sin(3.0 * t)))
+    scene.add(jc.joints.Drive("turn", "hinge", lambda t, _: jnp.sin(3.0 * t)))
     scene.add(jc.Spring("spring", jc.WORLD, "bob", stiffness=20.0, damping=2.0))
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     system, state = scene.build()
     state = jc.assemble(system, state).check()
     control = jnp.array([3.0, -1.0])
@@ -169,7 +169,7 @@ def test_a_step_back_undoes_a_step():
 
 
 def test_states_that_are_lost_on_the_way_leave_no_wrong_gradient():
-    """Rounding grows on the way back as the damper slows what it damps: by e^36 here, or e^1.8."""
+    """Backwards, rounding grows as the damper damps: by e^36 here, or by e^1.8 in segments."""
     system, state = bob(12.0, jnp.float32)
 
     def end(mass, adjoint):
@@ -180,14 +180,18 @@ def test_states_that_are_lost_on_the_way_leave_no_wrong_gradient():
 
     lost, kept, expected = (
         jax.jit(jax.grad(functools.partial(end, adjoint=adjoint)))(jnp.float32(0.5))
-        for adjoint in (jc.Reversible(), jc.Reversible(segments=30), jc.EveryStep())
+        for adjoint in (
+            jc.adjoints.Reversible(),
+            jc.adjoints.Reversible(segments=30),
+            jc.adjoints.EveryStep(),
+        )
     )
     assert np.isnan(lost)
     np.testing.assert_allclose(kept, expected, rtol=1e-3)
 
 
 def test_small_motions_are_as_lost_as_large_ones():
-    """A loss without size: a stiff damper, from starts of a metre and of a micrometre."""
+    """The loss of states does not depend on the scale: a stiff damper, from 1 m and from 1 µm."""
     slow = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.ones_like(q), force=lambda q, v, t, u, p: -q - p * v, params=10.0
     )
@@ -195,7 +199,7 @@ def test_small_motions_are_as_lost_as_large_ones():
     def share(damping, size):
         own = dataclasses.replace(slow, params=damping)
         state = jc.init(own, METHOD, jnp.array([size]), jnp.array([-0.1 * size]))
-        final, _ = jc.rollout(own, METHOD, state, None, 1e-2, 370, adjoint=jc.Reversible())
+        final, _ = jc.rollout(own, METHOD, state, None, 1e-2, 370, adjoint=jc.adjoints.Reversible())
         return (final.q[0] / size) ** 2
 
     found = jax.jit(jax.vmap(jax.grad(share), (None, 0)))(10.0, jnp.array([1.0, 1e-6]))
@@ -203,7 +207,7 @@ def test_small_motions_are_as_lost_as_large_ones():
 
 
 def planned(steps, adjoint, worlds=300):
-    """What XLA plans for a gradient by velocities [B]."""
+    """Returns the bytes that XLA plans for a gradient by velocities."""
 
     def end(v):
         start = dataclasses.replace(STATE, v=v)
@@ -215,19 +219,22 @@ def planned(steps, adjoint, worlds=300):
 
 
 def test_memory_does_not_grow_with_the_steps():
-    """But for their numbers, once for all worlds; and it is foretold."""
-    short, long = planned(100, jc.Reversible()), planned(10_000, jc.Reversible())
+    """Only the step numbers grow, once for all worlds; the estimate agrees with XLA's plan."""
+    short, long = planned(100, jc.adjoints.Reversible()), planned(10_000, jc.adjoints.Reversible())
     assert long - short < 10 * 9_900
-    memory = jc.gradient_memory(SYSTEM, METHOD, STATE)
-    assert abs(memory.of(300, 10_000, jc.Reversible()) / long - 1) < 0.1
+    memory = jc.analysis.gradient_memory(SYSTEM, METHOD, STATE)
+    assert abs(memory.of(300, 10_000, jc.adjoints.Reversible()) / long - 1) < 0.1
     assert long < memory.of(300, 100)
 
 
 REFUSED = {
     "Euler": (jc.Method(), "SemiImplicitEuler is not undone"),
     "Runge–Kutta": (jc.Method(jc.RK4()), "RungeKutta is not undone"),
-    "implicit": (jc.Method(jc.GeneralizedAlpha()), "GeneralizedAlpha is not undone"),
-    "recovery": (jc.Method(jc.RATTLE(), recovery=jc.Recovery()), "a Recovery leads on"),
+    "implicit": (jc.Method(jc.integrators.GeneralizedAlpha()), "GeneralizedAlpha is not undone"),
+    "recovery": (
+        jc.Method(jc.integrators.RATTLE(), recovery=jc.stabilizers.Recovery()),
+        "a Recovery leads on",
+    ),
 }
 
 
@@ -236,16 +243,18 @@ def test_methods_that_forget_are_refused(name):
     method, why = REFUSED[name]
     start = jc.init(SYSTEM, method, STATE.q, STATE.v)
     with pytest.raises(ValueError, match=rf"Reversible: .*{why}.*take Checkpoints\(\)"):
-        jc.rollout(SYSTEM, method, start, None, DT, 5, adjoint=jc.Reversible())
+        jc.rollout(SYSTEM, method, start, None, DT, 5, adjoint=jc.adjoints.Reversible())
 
 
 def test_controls_that_are_a_function_of_the_state_are_refused():
     with pytest.raises(ValueError, match=r"a function of the state.*take Checkpoints\(\)"):
-        jc.rollout(SYSTEM, METHOD, STATE, lambda s: -s.v, DT, 5, adjoint=jc.Reversible())
+        jc.rollout(SYSTEM, METHOD, STATE, lambda s: -s.v, DT, 5, adjoint=jc.adjoints.Reversible())
     with pytest.raises(ValueError, match="segments must be a whole number"):
-        jc.rollout(SYSTEM, METHOD, STATE, None, DT, 5, adjoint=jc.Reversible(segments=0))
+        jc.rollout(SYSTEM, METHOD, STATE, None, DT, 5, adjoint=jc.adjoints.Reversible(segments=0))
 
 
 def test_forward_mode_is_refused():
-    with pytest.raises(TypeError, match=r"no forward-mode derivative.*adjoint=jc.EveryStep\(\)"):
-        jax.jvp(lambda v: along(v, 1.0, jc.Reversible()), (WORLDS[0],), (WORLDS[1],))
+    with pytest.raises(
+        TypeError, match=r"no forward-mode derivative.*adjoint=jc.adjoints.EveryStep\(\)"
+    ):
+        jax.jvp(lambda v: along(v, 1.0, jc.adjoints.Reversible()), (WORLDS[0],), (WORLDS[1],))

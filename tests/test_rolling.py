@@ -1,4 +1,4 @@
-"""Rolling and blades: the slip by the velocities of material points, and motions known by hand."""
+"""Rolling and blades: slip as velocity of material points, and motions with closed forms."""
 
 import dataclasses
 
@@ -13,16 +13,16 @@ import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.status import Status
 
-IDEAL = jc.Method(integrator=jc.RK4(), stabilizer=jc.Unstabilized())
+IDEAL = jc.Method(integrator=jc.RK4(), stabilizer=jc.stabilizers.Unstabilized())
 
 
 def slip_at(a, b, contact):
-    """The velocity of the point of b at a place, less that of the point of a there."""
+    """Returns the velocity of b relative to a, of the material points at the contact."""
     return b.point_velocity(b.local_point(contact)) - a.point_velocity(a.local_point(contact))
 
 
 def pieces(name):
-    """The scene, its rows, the numbers of the joint, and the motions of its bodies off it."""
+    """Returns rows, joint parameters, and motions of both bodies, off the constraints."""
     built = scenes.build(name)
     s = built.off
     rows = scenes.linearized(built.system, s.q, s.v, s.time)
@@ -31,7 +31,7 @@ def pieces(name):
 
 
 def compare(rows, p, a, slip, expected):
-    """φ, and the slip along the tangents; φ̇ is what the point at the contact does along n."""
+    """Checks φ, then φ̇ and ψ against the slip along the normal n and the tangents."""
     index = rows.layout.rows("joint")
     n, u, w = (a.direction(p[key]) for key in ("normal", "first_a", "second_a"))
     held = len(expected)
@@ -98,14 +98,18 @@ def test_a_blade_slips_to_its_left_only(dim):
 
 
 def on_a_slope(dim, shape, slope=0.3):
-    """A solid that starts from rest on a plane inclined in the x direction."""
+    """A solid at rest on a plane inclined in the x direction."""
     gravity = np.zeros(dim)
     gravity[0], gravity[-1] = 9.81 * np.sin(slope), -9.81 * np.cos(slope)
     scene = jc.Scene(dim=dim, gravity=gravity)
     place = (0.0,) * (dim - 1) + (0.2,)
     moments = {2: 0.5 * 0.04, 3: (0.01, 0.02, 0.01)}[dim]
     scene.add_body("solid", mass=1.0, inertia=moments, position=place)
-    joint = {"disc": jc.RollingDisc, "cylinder": jc.RollingCylinder, "sphere": jc.RollingSphere}
+    joint = {
+        "disc": jc.joints.RollingDisc,
+        "cylinder": jc.joints.RollingCylinder,
+        "sphere": jc.joints.RollingSphere,
+    }
     axis = {} if dim == 2 or shape == "sphere" else {"axis": (0.0, 1.0, 0.0)}
     scene.add(joint[shape]("roll", jc.WORLD, "solid", radius=0.2, **axis))
     return scene.build()
@@ -115,28 +119,28 @@ def on_a_slope(dim, shape, slope=0.3):
     ("dim", "shape"), [(2, "disc"), (3, "disc"), (3, "cylinder"), (3, "sphere")]
 )
 def test_a_solid_rolls_down_a_slope(dim, shape):
-    """a = g sin α / (1 + I/(m r²)), friction −m a I/(m r²), normal force m g cos α."""
+    """a = g sin α / (1 + I/(m r²)); friction is −m a I/(m r²) and the normal force m g cos α."""
     system, state = on_a_slope(dim, shape)
     solution = jc.forward_dynamics(system, state, None, IDEAL, 1e-3)
     expected = 9.81 * np.sin(0.3) / 1.5
     np.testing.assert_allclose(solution.acceleration[0], expected, rtol=1e-12)
-    force = jc.wrench(system, state, solution, "roll")[:dim]
+    force = jc.wrench(solution, "roll")[:dim]
     weight = 9.81 * np.cos(0.3)
     np.testing.assert_allclose(force, [-expected / 2, *[0.0] * (dim - 2), weight], atol=1e-12)
 
 
 def test_a_ball_on_a_driven_turntable():
-    """v̇ = (2/7) Ω z × v in the world, with the table a body that a motor turns."""
+    """v̇ = (2/7) Ω z × v in the world; a motor turns the table, which is a body."""
     scene = jc.Scene()
     scene.add_body("table", mass=1.0, inertia=(1.0, 1.0, 2.0), angular_velocity=(0.0, 0.0, 2.0))
     start, velocity = np.array([0.5, 0.0, 0.1]), np.array([0.1, 0.2, 0.0])
-    # no slip: v + ω × (−r z) = Ω z × x
+    # without slip, v + ω × (−r z) = Ω z × x
     spin = ((0.0 + 2.0 * 0.5 - 0.2) / 0.1, 0.1 / 0.1, 0.3)
     ball = jc.inertia.sphere(1.0, 0.1)
     scene.add_body("ball", inertia=ball, position=start, velocity=velocity, angular_velocity=spin)
     scene.add(jc.Revolute("shaft", jc.WORLD, "table", point=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)))
-    scene.add(jc.Drive("motor", "shaft", turning, params={"speed": 2.0}))
-    scene.add(jc.RollingSphere("roll", "table", "ball", radius=0.1))
+    scene.add(jc.joints.Drive("motor", "shaft", turning, params={"speed": 2.0}))
+    scene.add(jc.joints.RollingSphere("roll", "table", "ball", radius=0.1))
     system, state = scene.build()
     violation = jc.violation(system, state)
     assert violation.worst < 1e-14
@@ -153,10 +157,10 @@ def turning(t, p):
 
 
 def test_errors_of_both_kinds_are_fed_back_and_read_by_name():
-    """φ̈ + 2α φ̇ + β² φ = 0 of the contact, ψ̇ = −2α ψ of the slip."""
+    """φ̈ + 2α φ̇ + β² φ = 0 for the contact, and ψ̇ = −2α ψ for the slip."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_body("wheel", mass=1.0, inertia=0.02, position=(0.0, 0.25), velocity=(1.0, 0.0))
-    scene.add(jc.RollingDisc("roll", jc.WORLD, "wheel", radius=0.2, point=(0.0, 0.0)))
+    scene.add(jc.joints.RollingDisc("roll", jc.WORLD, "wheel", radius=0.2, point=(0.0, 0.0)))
     system, state = scene.build()
     method = jc.Method(integrator=jc.RK4(), stabilizer=jc.Baumgarte.critical(rate=4.0))
     for _ in range(5):
@@ -174,9 +178,9 @@ def test_layout_of_several_wheels_tells_their_rows_apart():
     scene = jc.Scene(dim=2)
     for i in range(3):
         scene.add_body(f"wheel{i}", mass=1.0, inertia=0.02, position=(float(i), 0.2))
-        scene.add(jc.RollingDisc(f"roll{i}", jc.WORLD, f"wheel{i}", radius=0.2))
+        scene.add(jc.joints.RollingDisc(f"roll{i}", jc.WORLD, f"wheel{i}", radius=0.2))
     scene.add(jc.Distance("rod", "wheel0", "wheel1"))
-    scene.add(jc.KnifeEdge("skate", jc.WORLD, "wheel2", edge=(1.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("skate", jc.WORLD, "wheel2", edge=(1.0, 0.0)))
     system, state = scene.build()
     layout = jc.violation(system, state).layout
     expected = np.ones(layout.size, bool)
@@ -188,11 +192,11 @@ def test_layout_of_several_wheels_tells_their_rows_apart():
 
 
 def disc_at(tilt, dtype=jnp.float64):
-    """Rows and their derivatives for a disc whose axis leans this far from the normal [rad]."""
+    """A disc whose axis is tilted from the normal by an angle [rad]."""
     scene = jc.Scene(dtype=dtype)
     turn = jc.quaternion.from_axis_angle(jnp.asarray([1.0, 0.0, 0.0], dtype), 0.5 * np.pi)
     scene.add_body("disc", mass=1.0, inertia=(0.01, 0.01, 0.02), quaternion=turn)
-    scene.add(jc.RollingDisc("roll", jc.WORLD, "disc", radius=0.2, axis=(0.0, 1.0, 0.0)))
+    scene.add(jc.joints.RollingDisc("roll", jc.WORLD, "disc", radius=0.2, axis=(0.0, 1.0, 0.0)))
     system, state = scene.build()
     lean = jnp.asarray([tilt, 0.0, 0.0], dtype)
     turned = jc.quaternion.multiply(jc.quaternion.exp(lean), jnp.eye(4, dtype=dtype)[0])
@@ -207,7 +211,10 @@ def numbers_of_rows(system, q, v):
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_rows_of_a_disc_are_finite_upright_flat_and_next_to_it(dtype):
-    """The axis of the disc in its frame is z after the turn at assembly; identity lies flat."""
+    """After the rotation at assembly the axis is z in the body.
+
+    The identity orientation lies flat.
+    """
     with jax.numpy_dtype_promotion("standard"):
         system, state = disc_at(0.0, jnp.dtype(dtype))
         tilts = jnp.asarray([0.0, 1e-7, 1e-3, np.pi / 2, np.pi], dtype)
@@ -227,7 +234,7 @@ def test_rows_of_a_disc_are_finite_upright_flat_and_next_to_it(dtype):
 def test_a_blade_on_its_tip_has_no_direction_and_is_finite():
     scene = jc.Scene()
     scene.add_body("skate", mass=1.0, inertia=(1.0, 1.0, 1.0))
-    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0, 0.0)))
     system, state = scene.build()
     up = jc.quaternion.from_axis_angle(jnp.asarray([0.0, 1.0, 0.0]), -np.pi / 2)
     exact = jnp.asarray([np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0])
@@ -240,7 +247,7 @@ def test_a_blade_on_its_tip_has_no_direction_and_is_finite():
 
 
 def test_gradients_of_rolling_at_rest_and_upright():
-    """By central differences through a rollout that starts from rest."""
+    """Central differences of a rollout that starts at rest."""
     system, state = on_a_slope(3, "disc")
 
     def travelled(radius):
@@ -253,7 +260,7 @@ def test_gradients_of_rolling_at_rest_and_upright():
 
 
 def test_energy_of_rolling_converges_to_a_constant_with_the_order():
-    """An ideal constraint on velocities does no work: what is lost, the integrator loses."""
+    """An ideal velocity constraint does no work, so the energy error is that of the integrator."""
     scene = jc.Scene()
     lean = jc.quaternion.from_axis_angle(jnp.asarray([1.0, 0.0, 0.0]), 0.2)
     axis = np.array([0.0, np.cos(0.2), np.sin(0.2)])
@@ -270,12 +277,12 @@ def test_energy_of_rolling_converges_to_a_constant_with_the_order():
         velocity=velocity,
         angular_velocity=omega_b,
     )
-    scene.add(jc.RollingDisc("roll", jc.WORLD, "disc", radius=0.5, axis=axis))
+    scene.add(jc.joints.RollingDisc("roll", jc.WORLD, "disc", radius=0.5, axis=axis))
     system, state = scene.build()
     assert jc.violation(system, state).worst_rate < 1e-14
     before = jc.energy(system, state).total
-    for integrator, order, steps in ((jc.Heun(), 2, 200), (jc.RK4(), 4, 100)):
-        method = jc.Method(integrator=integrator, stabilizer=jc.Unstabilized())
+    for integrator, order, steps in ((jc.integrators.Heun(), 2, 200), (jc.RK4(), 4, 100)):
+        method = jc.Method(integrator=integrator, stabilizer=jc.stabilizers.Unstabilized())
 
         @jax.jit
         def loss(steps, method=method):

@@ -1,4 +1,4 @@
-"""Resistance to rolling and to spinning: closed forms, the law itself, gradients."""
+"""Rolling and spinning resistance: closed forms, the law itself, and gradients."""
 
 import dataclasses
 
@@ -9,15 +9,18 @@ import pytest
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
-from jaxcon.constraints.bounds import linearize_bounds
-from jaxcon.solvers.bounded import Bounded, Disc, Kinds
+from jaxcon.contact.bounded import Bounded, FrictionDisc, RowCounts
+from jaxcon.contact.rows import linearize_bounds
 
 G, R = 9.81, 0.1
-POINT, SWEEPS = jc.InteriorPoint(), jc.GaussSeidel(sweeps=60)
+POINT, SWEEPS = jc.solvers.InteriorPoint(), jc.solvers.GaussSeidel(sweeps=60)
 
 
 def ball(dim=3, slope=0.0, dtype=None, velocity=(0.0, 0.0), spin=0.0, **contact):
-    """A ball, or a disc in the plane, that rolls over a floor; gravity is turned, not the floor."""
+    """A ball (in the plane a disc) that rolls over a floor.
+
+    The slope tilts gravity, not the floor.
+    """
     gravity = (G * np.sin(slope), *(0.0,) * (dim - 2), -G * np.cos(slope))
     scene = jc.Scene(dim=dim, gravity=gravity, dtype=dtype)
     u, w = velocity
@@ -33,8 +36,8 @@ def ball(dim=3, slope=0.0, dtype=None, velocity=(0.0, 0.0), spin=0.0, **contact)
 
 
 def rolled(system, state, h, steps, solver=SWEEPS):
-    """The end, and the reactions of the floor on the way."""
-    method = jc.Method(bounded=solver)
+    """Returns the final state, and the reactions of the floor in each step."""
+    method = jc.Method(contact_solver=solver)
     state = jc.init(system, method, state.q, state.v)
     h = jnp.asarray(h, state.q.dtype)
     return jax.jit(
@@ -50,7 +53,10 @@ def rolled(system, state, h, steps, solver=SWEEPS):
     ids=["disc", "float32", "ball"],
 )
 def test_what_rolls_stops_after_its_distance(dim, solver, dtype):
-    """m (1 + s) v̇ = −c m g/r with s = I/m r², so d = (1 + s) v² r/(2 c g), to first order in h."""
+    """The distance is d = (1 + s) v² r/(2 c g) with s = I/m r², to first order in h.
+
+    It follows from m (1 + s) v̇ = −c m g/r.
+    """
     c, share, velocity = 0.02, 0.5 if dim == 2 else 0.4, (0.4, 0.3 * (dim == 3))
     speed = np.hypot(*velocity)
     system, state = ball(dim, velocity=velocity, rolling=c, dtype=dtype)
@@ -72,7 +78,7 @@ def test_what_rolls_stops_after_its_distance(dim, solver, dtype):
 
 @pytest.mark.parametrize("share", [0.9, 1.5])
 def test_on_a_slope_it_holds_or_rolls(share):
-    """It stays while tan α < c/r, held by m g r sin α, and rolls with what is left of gravity."""
+    """The ball stays while tan α < c/r, held by the moment m g r sin α; else it rolls."""
     slope = 0.1
     c = R * np.tan(slope) / share
     system, state = ball(slope=slope, rolling=c)
@@ -89,7 +95,7 @@ def test_on_a_slope_it_holds_or_rolls(share):
 
 
 def test_what_spins_stops_and_others_in_the_scene_do_not():
-    """I ω̇ = −c m g about the normal; contacts of every kind beside each other."""
+    """I ω̇ = −c m g about the normal; contacts of every kind are in one scene."""
     scene = jc.Scene()
     kinds = {"free": {}, "spun": {"spinning": 0.01}, "both": {"rolling": 0.02, "spinning": 0.02},
              "ice": {"friction": 0.0}, "rolled": {"rolling": 0.02}}  # fmt: skip
@@ -100,8 +106,8 @@ def test_what_spins_stops_and_others_in_the_scene_do_not():
         scene.add(jc.PlaneContact(f"{name} floor", jc.WORLD, name, **contact))
     system, state = scene.build()
     found = linearize_bounds(system, state.q, state.v, state.time, None, jnp.asarray(1e-3))
-    assert found.kinds == Kinds(1, 0, 4, 2, (Disc(1, 2, 2), Disc(2, 2, 1)))
-    method = jc.Method(bounded=SWEEPS)
+    assert found.kinds == RowCounts(1, 0, 4, 2, (FrictionDisc(1, 2, 2), FrictionDisc(2, 2, 1)))
+    method = jc.Method(contact_solver=SWEEPS)
     state = jc.init(system, method, state.q, state.v)
     final, forces = jax.jit(
         lambda s: jc.rollout(system, method, s, None, 2e-3, 20, record=lambda _, i: i.reactions)
@@ -121,8 +127,11 @@ def test_what_spins_stops_and_others_in_the_scene_do_not():
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_the_interior_point_solves_random_rows(dtype):
-    """Discs of some contacts only, of all ranks, beside stops and boxes."""
-    kinds = Kinds(1, 1, 3, 2, (Disc(1, 2, 2), Disc(2, 1, 1)))
+    """Only some contacts have extra friction discs, of one or two rows.
+
+    Stops and boxes are included.
+    """
+    kinds = RowCounts(1, 1, 3, 2, (FrictionDisc(1, 2, 2), FrictionDisc(2, 1, 1)))
     rng, worlds = np.random.default_rng(3), 500
     jacobian = rng.normal(size=(kinds.size, 20, worlds))
     matrix = np.einsum("irb,jrb->ijb", jacobian, jacobian)
@@ -131,7 +140,7 @@ def test_the_interior_point_solves_random_rows(dtype):
     sizes = (matrix, offset, -most, most, 0.1 * rng.uniform(size=(3, worlds)))
     more = tuple(jnp.asarray(0.1 * rng.uniform(size=(k, worlds)), dtype) for k in (2, 1))
     problem = Bounded(*(jnp.asarray(x, dtype) for x in sizes), kinds, more)
-    # without fused multiply and add, float32 loses one world of a hundred at the tip of a cone
+    # without fused multiply-add, one world in a hundred fails at the tip of a cone in float32
     costly = {"xla_backend_optimization_level": 3}
     options = None if dtype == jnp.float64 else costly
     solve = jax.jit(lambda p: POINT.solve(p, jnp.zeros_like(p.offset)), compiler_options=options)
@@ -147,7 +156,7 @@ def test_the_interior_point_solves_random_rows(dtype):
 
 
 def test_gradients_of_where_it_stops():
-    """By the length, while it rolls and while it slides too, in a batch, against differences."""
+    """Derivatives by the resistance length, rolling or sliding, in a batch, equal differences."""
     system, state = ball(2, velocity=(0.3, 0.0), rolling=0.02)
 
     def end(x):

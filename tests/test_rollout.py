@@ -12,7 +12,7 @@ def pushed():
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=2.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     return scene.build()
 
 
@@ -21,7 +21,7 @@ DT = 0.01
 
 
 def loop(system, state, controls, steps):
-    """Rolls out by a Python loop: every state after a step, and what the steps saw."""
+    """Rolls out in a Python loop; returns the states and infos of all steps."""
     states, infos = [], []
     for i in range(steps):
         state, info = jc.step(system, METHOD, state, controls(i, state), DT)
@@ -142,11 +142,11 @@ def test_what_is_no_record_and_no_policy_is_refused(pushed):
 
 @pytest.fixture(scope="module")
 def single():
-    """The scene and start in float32, while float64 is on."""
+    """A float32 scene, while float64 is enabled."""
     scene = jc.Scene(dim=2, dtype=jnp.float32)
     scene.add_particle("bob", mass=2.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     return scene.build()
 
 

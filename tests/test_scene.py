@@ -1,4 +1,4 @@
-"""What the builder makes of a scene."""
+"""The systems and states that the scene builder returns."""
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ def test_a_quaternion_is_brought_to_unit_length():
 
 @both
 def test_positions_are_read_in_the_frame_in_which_they_were_given(dim):
-    """Although the simulated frame of "second" lies elsewhere, at its centre of mass."""
+    """The simulated frame of "second" is at its center of mass, not where the user gave it."""
     scene = jc.Scene(dim=dim)
     place, speed = np.arange(1.0, dim + 1), np.arange(2.0, dim + 2)
     spin = 0.7 if dim == 2 else np.array([0.7, -0.2, 0.4])
@@ -62,7 +62,7 @@ def test_positions_are_read_in_the_frame_in_which_they_were_given(dim):
 @pytest.mark.parametrize("kind", ["coincident", "distance", "revolute", "prismatic", "fixed"])
 @pytest.mark.parametrize("wall", ["first", "second"])
 def test_joints_to_a_fixed_body_hold_at_assembly(dim, kind, wall):
-    """A fixed body is part of the world wherever it lies."""
+    """A fixed body belongs to the world, wherever it is."""
     scene = jc.Scene(dim=dim)
     turn = {"angle": 0.4} if dim == 2 else {"quaternion": (0.5, 0.5, 0.5, -0.5)}
     for name in ("first", "second"):
@@ -79,7 +79,7 @@ def test_joints_to_a_fixed_body_hold_at_assembly(dim, kind, wall):
 
 @both
 def test_a_hinge_on_a_fixed_body_is_a_hinge_on_the_world(dim):
-    """The motion is the same, whichever of the two the user names."""
+    """The motion is the same, whether the user names the world or the fixed body."""
     point, finals = np.full(dim, 0.7), []
     axis = None if dim == 2 else (0.0, 1.0, 1.0)
     for base in (jc.WORLD, "wall"):
@@ -123,14 +123,14 @@ def test_a_scene_is_built_under_jit_vmap_and_grad():
         solution = jc.forward_dynamics(system, state, None, jc.Method(), 1e-3)
         return solution.acceleration[2]
 
-    # a rod falls from the horizontal with −3g/2l
+    # a rod released level has the acceleration −3g/2l
     lengths = jnp.asarray([1.0, 2.0])
     np.testing.assert_allclose(jax.jit(jax.vmap(height))(lengths), -1.5 * 9.81 / lengths)
     np.testing.assert_allclose(jax.grad(height)(2.0), 1.5 * 9.81 / 4, rtol=1e-10)
 
 
 def test_a_scene_in_space_is_built_under_jit():
-    """With numbers that are known and numbers that are traced."""
+    """Some numbers are known and some are traced."""
     known = jnp.asarray([1.0, 1.0, 1.0])
 
     def start(mass, moment):
@@ -148,7 +148,7 @@ def test_a_scene_in_space_is_built_under_jit():
 
 
 def test_mixed_dimensions_of_rank_are_not_needed():
-    """Integers, lists, tuples and numpy arrays are numbers."""
+    """Integers, lists, tuples and NumPy arrays are accepted as numbers."""
     scene = jc.Scene(dim=3, gravity=[0, 0, -10], dtype=jnp.float32)
     scene.add_body("a", mass=1, inertia=[1, 1, 1], position=np.ones(3), quaternion=[1, 0, 0, 0])
     scene.add_particle("b", mass=np.float64(2), position=[0, 0, 1])

@@ -1,4 +1,4 @@
-"""A small version of the study of cost against size."""
+"""Small version of the study of cost by size."""
 
 import sys
 from pathlib import Path
@@ -14,14 +14,14 @@ from jaxcon.constraints.rows import layout_of  # noqa: E402
 
 def test_exponents_are_those_of_the_last_sizes():
     rows = [{"n": n, "step": 1e-6 * n**2.5} for n in (1, 10, 100, 1000)]
-    rows[0]["step"] = 1.0  # below ten, where other things take the time
+    rows[0]["step"] = 1.0  # sizes below ten are left out: overhead dominates there
     assert size.exponent(rows, "step") == pytest.approx(2.5)
     assert size.exponent(rows[:2], "step") is None
     assert size.exponent(rows, "compile") is None
 
 
 def test_elimination_is_linear_where_nothing_meets_and_matrices_are_cubic():
-    """By operations, which no machine changes."""
+    """Counts operations, which do not depend on the machine."""
     found = {name: list(size.series("posts", name, 0, 60.0, (10, 40))) for name in size.SOLVERS}
     powers = {name: size.exponent(rows, "operations") for name, rows in found.items()}
     for name in ("Sparse", "RankSafe", "ConjugateGradients"):
@@ -51,7 +51,7 @@ def test_what_is_too_large_is_not_begun_and_says_so():
     assert size.shown(stopped) == "over 0 s"
 
 
-SIZES = {  # of ten: velocities and rows
+SIZES = {  # velocities and rows at size 10
     "rope": (20, 10),
     "chain": (60, 50),
     "posts": (20, 10),

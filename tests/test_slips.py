@@ -1,4 +1,4 @@
-"""Steps split where sliding ends: where things stop or begin to roll, and its derivatives."""
+"""Steps split where sliding ends: stops, transitions to rolling, and derivatives."""
 
 import dataclasses
 
@@ -12,12 +12,12 @@ from jaxcon.verification import references
 
 FORMS = {case["id"]: case for case in references.load("contact_closed_forms")["cases"]}
 EXACT = 1e-6
-"""What event-located stepping is held to against closed forms."""
+"""Tolerance of event-located stepping against closed forms."""
 G, INERTIA, R = 9.81, 0.02, 0.1
 
 
 def disc():
-    """A disc of 1 kg on a floor; with radius zero it is a block, which has no cause to turn."""
+    """A disc of 1 kg on a floor; with radius zero it is a block that does not rotate."""
     scene = jc.Scene(dim=2)
     scene.add_body("disc", mass=1.0, inertia=INERTIA, position=(0.0, 0.0))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "disc", radius=R, friction=0.4))
@@ -25,28 +25,32 @@ def disc():
 
 
 def stops(v, friction):
-    """v²/(2 μ g)."""
+    """Returns the stopping distance v²/(2 μ g)."""
     return v**2 / (2 * friction * G)
 
 
 def slides_back(v, friction, slope=np.pi / 6):
-    """Up a slope v²/2a with a = g (sin α + μ cos α), then back with b = g (sin α − μ cos α)."""
+    """Returns the position after sliding up a slope by v²/2a, and back.
+
+    Upwards the speed falls at the rate a = g (sin α + μ cos α); downwards it grows at the rate
+    b = g (sin α − μ cos α).
+    """
     along, across = G * np.sin(slope), friction * G * np.cos(slope)
     up, down = along + across, along - across
     return v**2 / (2 * up) - down * (1 - v / up) ** 2 / 2
 
 
 def rolls(v, friction):
-    """It slides until v − μ g t = r ω with ω = μ g r t/I."""
+    """Returns the position of a disc that slides until v − μ g t = r ω with ω = μ g r t/I."""
     ends = v / (friction * G * (1 + R**2 / INERTIA))
     return v - friction * G * (ends**2 / 2 + ends * (1 - ends))
 
 
 def test_where_sliding_ends_is_exact_and_so_are_derivatives():
-    """At 50 steps of RK4 in a second; without `slips` derivatives are missed by a thousandth."""
+    """50 steps of RK4 in a second; without `slips` the derivatives are off by a thousandth."""
     system, state = disc()
-    some = jc.GaussSeidel(8, warm=False)
-    method = jc.Method(jc.RK4(), bounded=some, events=jc.Events(slips=True))
+    some = jc.solvers.GaussSeidel(8, warm=False)
+    method = jc.Method(jc.RK4(), contact_solver=some, events=jc.integrators.Events(slips=True))
 
     def place(v, friction, slope, radius):
         gravity = -G * jnp.stack([jnp.sin(slope), jnp.cos(slope)])
@@ -79,4 +83,4 @@ def test_where_sliding_ends_is_exact_and_so_are_derivatives():
 def test_the_choice_is_true_or_false():
     system, state = disc()
     with pytest.raises(ValueError, match="slips must be True or False, got 'yes'"):
-        jc.step(system, jc.Method(events=jc.Events(slips="yes")), state, None, 1e-3)
+        jc.step(system, jc.Method(events=jc.integrators.Events(slips="yes")), state, None, 1e-3)

@@ -1,4 +1,4 @@
-"""All solvers leave no residual, agree, and say when there is no solution."""
+"""All solvers leave no residual, agree with each other, and report systems without a solution."""
 
 import dataclasses
 
@@ -10,19 +10,19 @@ import scenes
 from tolerances import DIFFERENCE, ROUND_OFF
 
 import jaxcon as jc
+from jaxcon.constraints.rows import saddle
 from jaxcon.core.lanes import Vector
-from jaxcon.dynamics.forward import saddle
-from jaxcon.solvers.jacobian import Block, Columns, Jacobian
-from jaxcon.solvers.saddle import Diagonal, Full, Saddle
-from jaxcon.solvers.sparse import Sparse
+from jaxcon.linear.jacobian import Block, Columns, Jacobian
+from jaxcon.linear.saddle import Diagonal, Full, Saddle
+from jaxcon.linear.sparse import Sparse
 
-SOLVERS = {"schur": jc.Schur(), "dense": jc.Dense(), "sparse": Sparse()}
+SOLVERS = {"schur": jc.solvers.Schur(), "dense": jc.solvers.Dense(), "sparse": Sparse()}
 every_solver = pytest.mark.parametrize("solver", SOLVERS.values(), ids=SOLVERS)
 
 
 def iterative(dtype):
-    """Conjugate gradients to a few units of rounding."""
-    return {"cg": jc.ConjugateGradients(tolerance=8 * float(jnp.finfo(dtype).eps))}
+    """Returns conjugate gradients with a tolerance of eight units of rounding."""
+    return {"cg": jc.solvers.ConjugateGradients(tolerance=8 * float(jnp.finfo(dtype).eps))}
 
 
 MORE = SOLVERS | iterative("float64")
@@ -30,7 +30,7 @@ every_solver_and_iterative = pytest.mark.parametrize("solver", MORE.values(), id
 
 
 def problem(name, dtype="float64"):
-    """The saddle system of a scene off its constraints, with a random right side."""
+    """The saddle system of a scene off its constraints, with a random right-hand side."""
     built = scenes.build(name, dtype)
     s, random = built.off, scenes.seeded(name, "solvers")
     rows = scenes.linearized(built.system, s.q, s.v, s.time)
@@ -75,7 +75,7 @@ def test_all_solvers_leave_no_residual_and_agree(name, dtype):
 
 
 def small(jacobian, mass, force, target, compliance=None):
-    """A system from plain arrays."""
+    """Returns the saddle system of plain arrays."""
     rows, n = jacobian.shape
     columns = Columns(0, n, 1, (0,))
     value = tuple(Vector(*(jnp.asarray([x]) for x in row)) for row in jacobian)
@@ -124,7 +124,7 @@ def test_no_rows_is_free_motion(solver):
 
 @every_solver_and_iterative
 def test_derivative_by_every_number_is_that_of_the_solution(solver):
-    """Forward, reverse and central differences of numpy's solution agree."""
+    """Forward and reverse mode equal central differences of NumPy's solution."""
     names = ("jacobian", "mass", "force", "target", "compliance")
     values = dict(zip(names, (J, FULL, FORCE, TARGET, COMPLIANCE), strict=True))
     direction = {name: np.random.default_rng(1).normal(size=x.shape) for name, x in values.items()}

@@ -1,4 +1,4 @@
-"""Sparse elimination against the dense solver on chains, trees, loops and unconnected parts."""
+"""Sparse elimination compared with the dense solver on chains, trees, loops and separate parts."""
 
 import dataclasses
 
@@ -9,15 +9,14 @@ import pytest
 from tolerances import DIFFERENCE
 
 import jaxcon as jc
-from jaxcon.constraints.rows import linearize
-from jaxcon.dynamics.forward import saddle
-from jaxcon.solvers import graphs, ordering
-from jaxcon.solvers.saddle import Diagonal, Saddle
-from jaxcon.solvers.sparse import Sparse
+from jaxcon.constraints.rows import linearize, saddle
+from jaxcon.linear import graphs, ordering
+from jaxcon.linear.saddle import Diagonal, Saddle
+from jaxcon.linear.sparse import Sparse
 
 
 def particles(places, rods, ground=()):
-    """Particles at places, rods between pairs of them, and to the world."""
+    """Particles joined by rods in pairs, and to the world."""
     scene, random = jc.Scene(dim=2), np.random.default_rng(0)
     for i, place in enumerate(places):
         mass, velocity = random.uniform(0.5, 2.0), random.normal(size=2)
@@ -30,7 +29,7 @@ def particles(places, rods, ground=()):
 
 
 def scatter(n):
-    """Points along a line, off it by random amounts."""
+    """Returns points along a line with random offsets."""
     return np.column_stack([np.arange(n), np.random.default_rng(1).normal(size=n)])
 
 
@@ -54,7 +53,7 @@ def links(n, closed):
 
 
 def with_a_global_row(n):
-    """A chain of particles, and two rows of which each touches all of them."""
+    """A chain of particles, and two rows that each involve all of them."""
     scene, random = jc.Scene(dim=2), np.random.default_rng(7)
     for i, place in enumerate(scatter(n)):
         scene.add_particle(f"p{i}", mass=random.uniform(0.5, 2.0), position=place)
@@ -66,7 +65,7 @@ def with_a_global_row(n):
         mean = sum(x.position for x in args[:-2]) / n
         return mean - jnp.array([5.5, 0.0])
 
-    scene.add(jc.Holonomic(centre, bodies, name="centre"))
+    scene.add(jc.joints.Holonomic(centre, bodies, name="centre"))
     return scene.build()
 
 
@@ -115,7 +114,7 @@ WAYS = {
 @pytest.mark.parametrize("way", WAYS)
 def test_the_solution_is_that_of_the_dense_solver(name, way):
     system = problem(name)
-    expected = jc.Dense().solve(system)
+    expected = jc.solvers.Dense().solve(system)
     got = jax.jit(lambda: WAYS[way].solve(system))()
     assert got.status == jc.Status.OK
     np.testing.assert_allclose(got.acceleration, expected.acceleration, rtol=1e-9, atol=1e-9)
@@ -123,7 +122,7 @@ def test_the_solution_is_that_of_the_dense_solver(name, way):
 
 
 def steps_of(name, **options):
-    """What is eliminated together."""
+    """Returns the steps of the elimination, each a set of nodes eliminated together."""
     return steps_for(problem(name).jacobian, **options)
 
 
@@ -147,7 +146,7 @@ def test_levels_of_a_chain_grow_with_its_logarithm():
         assert sum(len(step.nodes) for step in steps) == n
         assert max(len(step.nodes) for step in steps) >= n // 2 - 1
         counts.append(len(steps))
-    assert max(np.diff(counts)) <= 2  # one level more, in which an end has fewer neighbours
+    assert max(np.diff(counts)) <= 2  # an end has fewer neighbors, so there may be a level more
 
 
 def test_levels_beside_a_row_that_touches_everything_grow_with_the_logarithm():
@@ -189,7 +188,7 @@ def test_levels_beside_a_row_that_touches_everything_solve_it():
     def solutions():
         rows = linearize(system, state.q, state.v, state.time)
         problem = saddle(system, state.q, rows, force, target)
-        return [solver.solve(problem) for solver in (Sparse(order="levels"), jc.Dense())]
+        return [solver.solve(problem) for solver in (Sparse(order="levels"), jc.solvers.Dense())]
 
     (*found, status), (*expected, _) = solutions()
     assert status == jc.Status.OK
@@ -198,12 +197,12 @@ def test_levels_beside_a_row_that_touches_everything_solve_it():
 
 
 def is_batch(step):
-    return isinstance(step, ordering.Batch)
+    return isinstance(step, ordering.EliminationBatch)
 
 
 def test_equal_branches_are_eliminated_at_once():
     steps = steps_of("star")
-    assert max(len(step.nodes) for step in steps) == 1  # all touch each other at the centre
+    assert max(len(step.nodes) for step in steps) == 1  # all nodes are neighbors at the center
     legs = steps_of("two chains", run=1000)
     assert len(legs) < 16
 
@@ -213,7 +212,7 @@ def test_with_compliance(name):
     system = problem(name)
     compliance = jnp.asarray(np.random.default_rng(4).uniform(0, 1, size=system.target.shape))
     system = dataclasses.replace(system, compliance=compliance)
-    expected = jc.Dense().solve(system)
+    expected = jc.solvers.Dense().solve(system)
     got = jax.jit(lambda: Sparse().solve(system))()
     np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-9, atol=1e-9)
 
@@ -225,8 +224,8 @@ def test_compliance_and_regularisation_are_one_problem(name):
     system = dataclasses.replace(system, compliance=compliance)
     j, w = system.jacobian.dense(), 1 / system.mass.values
     added = 0.1 * (jnp.einsum("ri,i,ri->r", j, w, j) + compliance)
-    expected = jc.Dense().solve(dataclasses.replace(system, compliance=compliance + added))
-    for solver in (jc.Sparse, jc.Schur, jc.ConjugateGradients):
+    expected = jc.solvers.Dense().solve(dataclasses.replace(system, compliance=compliance + added))
+    for solver in (jc.solvers.Sparse, jc.solvers.Schur, jc.solvers.ConjugateGradients):
         got = jax.jit(lambda s=solver: s(tikhonov=0.1).solve(system))()
         np.testing.assert_allclose(got.multipliers, expected.multipliers, rtol=1e-7, atol=1e-9)
 
@@ -235,7 +234,9 @@ def test_compliance_and_regularisation_are_one_problem(name):
 def test_a_system_may_be_an_argument_of_a_compiled_function(way):
     system = problem("tree")
     got = jax.jit(WAYS[way].solve)(system)
-    np.testing.assert_allclose(got.multipliers, jc.Dense().solve(system).multipliers, rtol=1e-9)
+    np.testing.assert_allclose(
+        got.multipliers, jc.solvers.Dense().solve(system).multipliers, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("name", ["tree", "links in a loop"])
@@ -250,7 +251,7 @@ def test_its_gradient_is_that_of_the_dense_solver(name):
         return jnp.broadcast_to(x, block.shape[1:])
 
     def value(solver, mass, force, target, scale):
-        """By the numbers of the system and a factor of each block of its Jacobian."""
+        """Returns a value by numbers of the system and a factor of each Jacobian block."""
         scaled = [
             dataclasses.replace(block, value=tuple(row * spread(block, x) for row in value))
             for block, value, x in zip(system.jacobian.blocks, blocks, scale, strict=True)
@@ -263,7 +264,7 @@ def test_its_gradient_is_that_of_the_dense_solver(name):
     numbers = (system.mass.values, system.force, system.target, jnp.ones(len(blocks)))
     ours, dense = (
         jax.jit(jax.grad(lambda *x, s=solver: value(s, *x), argnums=(0, 1, 2, 3)))(*numbers)
-        for solver in (Sparse(), jc.Dense())
+        for solver in (Sparse(), jc.solvers.Dense())
     )
     for got, expected in zip(ours, dense, strict=True):
         np.testing.assert_allclose(got, expected, rtol=DIFFERENCE, atol=1e-8)
@@ -284,7 +285,7 @@ def test_a_batch_is_a_loop():
 
 @pytest.mark.parametrize("name", ["short chain", "long chain", "links"])
 def test_a_dependent_row_is_singular(name):
-    """The last rod is given twice, at the end of the order or in the middle of it."""
+    """The last rod occurs twice, at the end of the elimination order or in its middle."""
     system, state = GRAPHS[name]()
     rows = linearize(system, state.q, state.v, state.time)
     last = rows.jacobian.blocks[-1]
@@ -311,7 +312,7 @@ def hinge_twice(dtype):
     return scene.build()
 
 
-@pytest.mark.parametrize("solver", [jc.Sparse, jc.Schur])
+@pytest.mark.parametrize("solver", [jc.solvers.Sparse, jc.solvers.Schur])
 @pytest.mark.parametrize(
     ("dtype", "share", "bound"), [("float32", 1e-5, 1e-3), ("float64", 1e-10, 1e-8)]
 )
@@ -322,7 +323,7 @@ def test_regularised_redundant_rows_share_the_load(solver, dtype, share, bound):
     method = jc.Method(solver=solver(tikhonov=share))
     found = jc.forward_dynamics(system, state, None, method, 1e-3)
     assert found.status == jc.Status.OK
-    # the point of a rod hung at its end falls freely about the hinge: a = m g l / (I + m l²) l
+    # the end of the rod falls freely about the hinge: a = m g l / (I + m l²) l
     turn = -9.81 * 0.5 / (0.1 + 0.25)
     np.testing.assert_allclose(found.acceleration, [0.0, 0.5 * turn, turn], rtol=bound, atol=bound)
     one, two = found.multipliers.reshape(2, 2).T
@@ -334,10 +335,10 @@ def test_a_regularised_solution_has_a_gradient():
 
     def turn(mass):
         changed = system.with_params({"link": {"mass": mass}})
-        method = jc.Method(solver=jc.Sparse(tikhonov=1e-10))
+        method = jc.Method(solver=jc.solvers.Sparse(tikhonov=1e-10))
         return jc.forward_dynamics(changed, state, None, method, 1e-3).acceleration[2]
 
-    # −m g l / (I + m l²) by m
+    # derivative of −m g l / (I + m l²) by m
     exact = -9.81 * 0.5 * 0.1 / (0.1 + 0.25) ** 2
     np.testing.assert_allclose(jax.grad(turn)(1.0), exact, rtol=1e-6)
 
@@ -346,7 +347,9 @@ def test_a_full_mass_matrix_is_regularised_too():
     rod = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.array([[2.0, 0.5], [0.5, 1.0]]),
         force=lambda q, v, t, u, p: jnp.array([1.0, -2.0]),
-        constraints=(jc.Holonomic(lambda q, t, p: jnp.stack([q[0], 2 * q[0]]), name="twice"),),
+        constraints=(
+            jc.joints.Holonomic(lambda q, t, p: jnp.stack([q[0], 2 * q[0]]), name="twice"),
+        ),
     )
     state = jc.init(rod, jc.Method(), jnp.zeros(2), jnp.zeros(2))
     method = jc.Method(solver=Sparse(tikhonov=1e-10))

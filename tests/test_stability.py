@@ -1,4 +1,4 @@
-"""The stable gains that are predicted, against what a simulation does."""
+"""Predicted limits of stable gains, compared with simulations."""
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,8 @@ import jaxcon as jc
 
 INTEGRATORS = {
     "semi-implicit": jc.SemiImplicitEuler(),
-    "explicit": jc.ExplicitEuler(),
-    "heun": jc.Heun(),
+    "explicit": jc.integrators.ExplicitEuler(),
+    "heun": jc.integrators.Heun(),
     "rk4": jc.RK4(),
 }
 every_integrator = pytest.mark.parametrize("name", INTEGRATORS)
@@ -25,20 +25,20 @@ LIMITS = {"semi-implicit": np.sqrt(8) - 2, "explicit": 2.0, "heun": 2.0, "rk4": 
 @every_integrator
 @pytest.mark.parametrize("dt", [1e-3, 0.02])
 def test_the_limit_of_critical_damping(name, dt):
-    limit = jc.largest_stable_rate(INTEGRATORS[name], dt)
+    limit = jc.stabilizers.largest_stable_rate(INTEGRATORS[name], dt)
     assert limit * dt == pytest.approx(LIMITS[name], rel=1e-6)
 
 
 @pytest.fixture(scope="module")
 def gap():
-    """A particle at a distance from where its constraint wants it: φ is linear in q."""
+    """A particle off the point to which it is constrained: φ is linear in q."""
 
     def residual(p, t, _):
         return p.position
 
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("a", mass=1.0, position=(0.1, 0.0))
-    scene.add(jc.Holonomic(residual, bodies=("a",), name="hold"))
+    scene.add(jc.joints.Holonomic(residual, bodies=("a",), name="hold"))
     return scene.build()
 
 
@@ -47,7 +47,7 @@ def gap():
 def test_errors_decay_below_the_limit_and_grow_above_it(gap, name, ratio):
     system, state = gap
     dt, integrator = 0.01, INTEGRATORS[name]
-    limit = jc.largest_stable_rate(integrator, dt, ratio)
+    limit = jc.stabilizers.largest_stable_rate(integrator, dt, ratio)
 
     @jax.jit
     def after(rate):
@@ -61,7 +61,7 @@ def test_errors_decay_below_the_limit_and_grow_above_it(gap, name, ratio):
 
 @every_integrator
 def test_growth_is_the_factor_of_one_step(gap, name):
-    """The spectral radius of the linear map from error to error, taken from steps."""
+    """Compares `growth` with the spectral radius of the linear error map of a step."""
     system, _ = gap
     dt, alpha, beta, integrator = 0.01, 30.0, 45.0, INTEGRATORS[name]
     method = jc.Method(integrator, jc.Baumgarte(alpha, beta))

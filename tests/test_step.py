@@ -1,4 +1,4 @@
-"""One step of each integrator against its definition."""
+"""One step of each integrator, compared with its definition."""
 
 import dataclasses
 
@@ -11,7 +11,7 @@ from tolerances import IDENTITY
 
 import jaxcon as jc
 
-FREE = jc.Method(stabilizer=jc.Unstabilized())
+FREE = jc.Method(stabilizer=jc.stabilizers.Unstabilized())
 
 
 def falling(dim=2):
@@ -33,8 +33,8 @@ def test_semi_implicit_euler_by_hand():
 @pytest.mark.parametrize(
     ("integrator", "q"),
     [
-        (jc.ExplicitEuler(), [1.3, 1.3]),
-        (jc.Heun(), [1.3, 1.3 - 9.81 * 0.005]),
+        (jc.integrators.ExplicitEuler(), [1.3, 1.3]),
+        (jc.integrators.Heun(), [1.3, 1.3 - 9.81 * 0.005]),
         (jc.RK4(), [1.3, 1.3 - 9.81 * 0.005]),
     ],
 )
@@ -59,9 +59,12 @@ ORDERS = {"ExplicitEuler": 1, "SemiImplicitEuler": 1, "Heun": 2, "RK4": 4}
 
 @pytest.mark.parametrize("name", ORDERS)
 def test_order_on_a_forced_pendulum(name):
-    """The error at time 1 falls with h to the order, against a fine solution in numpy."""
+    """The error at time 1 falls with h at the expected order.
+
+    The reference is a fine NumPy solution.
+    """
     system = jc.GeneralizedSystem(mass=one, force=swing, params=jnp.asarray(4.0))
-    method = jc.Method(integrator=getattr(jc, name)())
+    method = jc.Method(integrator=getattr(jc.integrators, name)())
     state = jc.init(system, method, jnp.asarray([1.0]), jnp.asarray([0.0]))
     run = jax.jit(lambda dt, n: _march(system, method, state, dt, n), static_argnums=1)
     exact = fine_pendulum()
@@ -75,7 +78,7 @@ def _march(system, method, state, dt, n):
 
 
 def fine_pendulum(steps=4000):
-    """q(1) of q̈ = −4 sin q + cos t by the classical method with small steps."""
+    """Returns q(1) of q̈ = −4 sin q + cos t by classical Runge–Kutta with small steps."""
     y, h = np.array([1.0, 0.0]), 1.0 / steps
 
     def f(t, y):
@@ -91,9 +94,9 @@ def fine_pendulum(steps=4000):
     return y[0]
 
 
-@pytest.mark.parametrize("solver", [jc.Schur(), jc.Dense()])
+@pytest.mark.parametrize("solver", [jc.solvers.Schur(), jc.solvers.Dense()])
 def test_pendulum_forces_by_hand(solver):
-    """At rest and horizontal the rod does nothing; moving below, it carries m (g + v²/l)."""
+    """At rest and level the rod force is 0; moving at the bottom it is m (g + v²/l)."""
     for place, speed, expected in (((2.0, 0.0), (0.0, 0.0), 0.0), ((0.0, -2.0), (3.0, 0.0), 14.31)):
         scene = jc.Scene(dim=2)
         scene.add_particle("bob", mass=1.0, position=place, velocity=speed)
@@ -107,7 +110,7 @@ def test_pendulum_forces_by_hand(solver):
 
 @pytest.mark.parametrize("name", ["revolute-3d-loop", "mixed-2d", "arm"])
 def test_feedback_makes_errors_decay_as_they_should(name):
-    """J a + γ = −2α φ̇ − β² φ, with gains by number, by row and by name."""
+    """J a + γ = −2α φ̇ − β² φ, with gains as a number, by row, and by name."""
     built = scenes.build(name)
     rows = scenes.linearized(built.system, built.off.q, built.off.v, built.off.time)
     size, names = rows.layout.size, rows.layout.names
@@ -141,7 +144,7 @@ def test_from_rate_and_critical():
     assert (gains.alpha, gains.beta) == (2.0, 4.0)
 
 
-@pytest.mark.parametrize("integrator", [jc.SemiImplicitEuler(), jc.Heun(), jc.RK4()])
+@pytest.mark.parametrize("integrator", [jc.SemiImplicitEuler(), jc.integrators.Heun(), jc.RK4()])
 def test_quaternions_stay_of_unit_length(integrator):
     built = scenes.build("revolute-3d-loop")
     method = jc.Method(integrator=integrator)
@@ -152,7 +155,7 @@ def test_quaternions_stay_of_unit_length(integrator):
 
 def test_info_is_what_the_step_saw_at_its_start():
     built = scenes.build("mixed-2d")
-    method = jc.Method(jc.Heun())
+    method = jc.Method(jc.integrators.Heun())
     _, info = jc.step(built.system, method, built.off, None, 1e-3)
     expected = jc.forward_dynamics(built.system, built.off, None, method, 1e-3)
     np.testing.assert_allclose(info.acceleration, expected.acceleration, rtol=IDENTITY)
@@ -169,5 +172,5 @@ def test_control_reaches_the_body():
     alone, _ = jc.step(built.system, jc.Method(), built.state, None, 1e-3)
     assert np.any(np.abs(pushed.v - alone.v) > 1e-4)
     nothing, _ = jc.step(built.system, jc.Method(), built.state, 0 * control, 1e-3)
-    # two programs, in which the compiler contracts other products and sums
+    # two programs, which round differently where multiplications and additions are fused
     np.testing.assert_allclose(nothing.v, alone.v, rtol=IDENTITY, atol=1e-16)

@@ -1,4 +1,4 @@
-"""The suite of benchmarks, its comparison with a baseline, and costs at equal error."""
+"""The benchmark suite: comparison with a baseline, and costs at equal error."""
 
 import json
 import sys
@@ -19,7 +19,7 @@ from benchmarks.suite import HIGHER, LOWER, Baseline, Entry, Found, Metric, Outc
 from benchmarks.work_precision import Point  # noqa: E402
 
 PARTS = {"peers", "roofline", "work_precision_peers"}
-"""Modules with a command of their own that are parts of an entry of another name."""
+"""Modules with their own command that belong to an entry of another name."""
 NAN, INF = float("nan"), float("inf")
 
 
@@ -32,7 +32,7 @@ NAN, INF = float("nan"), float("inf")
         (LOWER, 14.9, 10.0, False),
         (LOWER, 15.1, 10.0, True),
         (LOWER, 0.1, 10.0, False),
-        (LOWER, 0.9, 0.0, False),  # both are below the floor
+        (LOWER, 0.9, 0.0, False),  # both values are below the floor
         (LOWER, 1.6, 0.0, True),
         (LOWER, NAN, 10.0, True),
         (HIGHER, INF, 10.0, True),
@@ -65,7 +65,7 @@ def test_a_baseline_keeps_what_transfers_and_names_what_got_worse(tmp_path):
 
 @pytest.fixture
 def fakes(monkeypatch):
-    """Entries of two numbers, of none, and one that is left out; the numbers can be set."""
+    """Entries of a fake suite: one with settable values, one that fails, one that is skipped."""
     values = {"fast": 4.0}
 
     def fast(quick):
@@ -91,7 +91,7 @@ def test_the_command_compares_and_updates(fakes, tmp_path, capsys):
     assert kept["entries"]["fast"]["metrics"][0]["value"] == 4.0
     assert (tmp_path / kept["entries"]["fast"]["picture"]).exists()
     assert command.main(["fast", *compare]) == 0
-    assert command.main(["fast", "--quick", *compare]) == 0  # has numbers of its own
+    assert command.main(["fast", "--quick", *compare]) == 0  # quick runs have their own baseline
     fakes["fast"] = 1.0
     assert command.main(["fast", *compare]) == 1
     assert "fast: ratio was 4 and is 1" in capsys.readouterr().out
@@ -108,7 +108,7 @@ def test_the_command_says_what_there_is(fakes, capsys):
     assert "Is fast." in capsys.readouterr().out
     with pytest.raises(SystemExit):
         command.main(["slow"])
-    assert "unknown are ['slow']" in capsys.readouterr().err
+    assert "unknown benchmarks ['slow']" in capsys.readouterr().err
 
 
 def test_every_study_is_in_the_suite():
@@ -135,7 +135,7 @@ STEPS = {"pendulum": 2000, "double pendulum": 600, "four-bar": 200, "Andrews": 1
 
 @pytest.mark.parametrize("name", list(motions.MOTIONS))
 def test_both_codes_come_to_the_known_end(name):
-    """MuJoCo, which closes loops softly, runs only where it is installed."""
+    """The comparison with MuJoCo, which closes loops softly, runs only if MuJoCo is installed."""
     motion, steps = motions.MOTIONS[name](), STEPS[name]
     for form in motion.forms:
         assert runs.Ours(motion, form, "RK4", "float64").error(steps) < 5e-6
@@ -145,7 +145,7 @@ def test_both_codes_come_to_the_known_end(name):
 
 
 def line(errors, cost=1.0, setting="a", code="jaxcon"):
-    """Runs at halved steps, each of twice the cost of the one before."""
+    """Returns runs at halved steps, each twice as costly as the one before."""
     steps = enumerate(errors)
     return [Point(code, setting, 0.5**i, error, cost * 2.0**i) for i, error in steps]
 
@@ -194,11 +194,11 @@ def test_what_cannot_be_compared_is_said(fakes, tmp_path, capsys):
     assert command.main(["fast", "breaks", "--update", "--compare", base]) == 1
     assert Baseline.read(Path(base)).of("full", "fast") == {"ratio": 4.0}
     assert command.main(["fast", "--quick", "--compare", base]) == 0
-    assert "baseline.json has nothing to compare with of fast" in capsys.readouterr().out
+    assert "baseline.json has no values for fast" in capsys.readouterr().out
 
 
 def test_the_picture_of_equal_error_is_small_and_says_what_is_on_its_axes(tmp_path, monkeypatch):
-    """From made-up runs of as many methods as a study has."""
+    """Draws invented runs of as many methods as in a real study."""
     errors, kept = 10.0 ** -np.arange(12), {}
     runs_of = [
         line(0.5 * errors, 1e-6 * (1 + i) * 10**j, f"method {i}", code)
@@ -228,7 +228,7 @@ def test_steps_are_halved_until_they_no_longer_matter():
     assert min(found.values()) <= runs.ENOUGH < sorted(found.values())[1]
     stalled = list(runs.halved(motion, lambda n: max(1.0 / n, 1e-3), 1e9))
     assert [error > 1e-3 for _, error in stalled[-4:]] == [True, False, False, False]
-    errors = iter([1e-3, 5e-3, 1e-3, 1e-5, 1e-10])  # the first is small by luck
+    errors = iter([1e-3, 5e-3, 1e-3, 1e-5, 1e-10])  # the first error is small by chance
     assert len(list(runs.halved(motion, lambda n: next(errors), 1e9))) == 5
     assert len(list(runs.halved(motion, lambda n: INF, 0.0))) == 1
 

@@ -1,4 +1,4 @@
-"""Time as the sum of two floats: its rounding, what is computed from it, and where it is kept."""
+"""Time as a sum of two floats: rounding, functions of time, and storage in states."""
 
 import dataclasses
 import pickle
@@ -15,8 +15,12 @@ F32 = jnp.float32
 METHODS = {
     "euler": jc.Method(),
     "rk4": jc.Method(integrator=jc.RK4()),
-    "rattle": jc.Method(integrator=jc.RATTLE(), stabilizer=jc.Unstabilized()),
-    "alpha": jc.Method(integrator=jc.GeneralizedAlpha(), stabilizer=jc.Unstabilized()),
+    "rattle": jc.Method(
+        integrator=jc.integrators.RATTLE(), stabilizer=jc.stabilizers.Unstabilized()
+    ),
+    "alpha": jc.Method(
+        integrator=jc.integrators.GeneralizedAlpha(), stabilizer=jc.stabilizers.Unstabilized()
+    ),
 }
 
 
@@ -35,12 +39,12 @@ def wheel(motion=turning, params=2.0):
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0), dtype=F32)
     scene.add_body("wheel", mass=1.0, inertia=(0.4, 0.5, 0.7))
     scene.add(jc.Revolute("hub", jc.WORLD, "wheel", point=(0, 0, 0), axis=(0, 0, 1)))
-    scene.add(jc.Drive("drive", "hub", motion, params=params))
+    scene.add(jc.joints.Drive("drive", "hub", motion, params=params))
     return scene.build()
 
 
 def started(system, method, time, rate=2.0):
-    """The wheel where its drive wants it at a time."""
+    """Returns the state of the wheel that its drive prescribes at a time."""
     half = np.mod(rate * time, 2 * np.pi) / 2
     q = np.zeros(7, np.float32)
     q[3], q[6] = np.cos(half), np.sin(half)
@@ -50,7 +54,7 @@ def started(system, method, time, rate=2.0):
 
 
 def left(state, steps, dt):
-    """steps h less the time of a state, in float64 [s]."""
+    """Returns steps · h minus the time of a state, in float64 [s]."""
     return steps * float(np.float32(dt)) - float(state.time) - float(state.time_remainder)
 
 
@@ -58,7 +62,7 @@ def left(state, steps, dt):
 @pytest.mark.parametrize("dt", [1e-3, 1e-4 / 3])
 @pytest.mark.parametrize("count", [10**6, 10**8])
 def test_a_hundred_million_additions_are_rounded_once(dt, constant, count):
-    """The sum of a float32, whether it is known when compiling or not."""
+    """The sum of a float32 step, known when compiling or given as an argument."""
     h, start = np.float32(dt), Doubled.of(jnp.zeros((), F32))
 
     def summed(h):
@@ -67,7 +71,7 @@ def test_a_hundred_million_additions_are_rounded_once(dt, constant, count):
     total = jax.jit(lambda: summed(h))() if constant else jax.jit(summed)(h)
     exact = count * float(h)
     assert float(total.high) == float(np.float32(exact))
-    # each remainder is rounded, too, which adds up to no more than one rounding of the sum
+    # the rounding of remainders adds up to at most one rounding of the sum
     bound = 1e-9 if count == 10**6 else np.spacing(np.float32(exact))
     assert abs(exact - float(total.high) - float(total.low)) < bound
 
@@ -94,12 +98,12 @@ def test_each_world_of_a_batch_has_its_own_time():
 
 
 def test_parts_of_a_step_add_up():
-    """A ball that bounces on the floor, steps split at the impacts."""
+    """A ball bounces on the floor; steps are split at the impacts."""
     scene = jc.Scene(dim=2, gravity=(0.0, -10.0), dtype=F32)
     scene.add_particle("ball", mass=1.0, position=(0.0, 0.2))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, restitution=0.9))
     system, state = scene.build()
-    method = jc.Method(events=jc.Events())
+    method = jc.Method(events=jc.integrators.Events())
     start = jc.init(system, method, state.q, state.v, 1e4)
     end, _ = jc.rollout(system, method, start, None, 1e-3, 400)
     assert int(end.status) == jc.Status.OK
@@ -121,7 +125,10 @@ def test_derivatives_by_time_and_step():
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize(("time", "dt"), [(1e3, 1e-3), (3e3, 1e-4), (1e5, 1e-3)])
 def test_a_drive_keeps_its_rate(name, time, dt):
-    """Within 1e-5 of it over a thousand steps, and its speed at every step."""
+    """The angle is within 1e-5 of its change over a thousand steps.
+
+    The speed is right at every step.
+    """
     system, _ = wheel()
     start = started(system, METHODS[name], time)
     end, speeds = jc.rollout(
@@ -136,7 +143,7 @@ def test_a_drive_keeps_its_rate(name, time, dt):
 
 
 def test_a_drive_late_is_a_drive_early_in_a_batch():
-    """The target of a wave, its rate and its bias at 1e5 s, in float32, by world."""
+    """Target, rate and bias of a sine at 1e5 s, in float32, by world."""
     params = {"size": jnp.asarray(0.4, F32), "rate": jnp.asarray(3.7, F32)}
 
     def wave(t, p):
@@ -160,13 +167,13 @@ def test_a_drive_late_is_a_drive_early_in_a_batch():
 
 
 def custom(x):
-    """Softplus with a derivative of its own, in jnp operations of all kinds."""
+    """Returns softplus by jnp operations of many kinds, with a custom derivative."""
     return jax.nn.softplus(x)
 
 
 @jax.custom_jvp
 def wave(t):
-    """A sine with a derivative of its own, which differs from it to be told apart."""
+    """Returns a sine with a custom derivative, of opposite sign to make its use visible."""
     return jnp.sin(7.0 * t)
 
 
@@ -180,7 +187,7 @@ def loop(t, last):
 
 
 def table(t):
-    """Returns a number made of all kinds of results of a scan."""
+    """Returns a number that depends on all kinds of results of a scan."""
     carry, stacked = jax.lax.scan(lambda c, w: (c + w * t, jnp.sin(w * t)), t, MANY)
     return jnp.cos(carry) + stacked[0] + stacked[1]
 
@@ -232,7 +239,7 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_functions_of_two_floats(name):
-    """The value at 1e5 + 3e-3, and the derivative of the rounded function there."""
+    """Compares the value at 1e5 + 3e-3, and the derivative of the rounded function there."""
     function, exact = FUNCTIONS[name]
     x = Doubled(jnp.asarray(1e5, F32), jnp.asarray(3e-3, F32))
     value = jax.jit(lambda x: evaluate(function, x))(x)
@@ -261,12 +268,12 @@ WHOLE = {
         1 / EXACT_PERIOD,
     ),
 }
-"""Functions with jumps: in two floats, exactly, and their slope."""
+"""Functions with jumps by name: the function of two floats, the exact function, and its slope."""
 
 
 @pytest.mark.parametrize("name", WHOLE)
 def test_jumps_of_remainders_and_whole_numbers_are_not_rounded(name):
-    """Times within 1 µs of a jump near 1e5 s, where float32 has multiples of 8 ms."""
+    """Times lie within 1 µs of jumps near 1e5 s, where float32 has multiples of 8 ms."""
     function, exact, expected_slope = WHOLE[name]
     jumps = EXACT_PERIOD * np.arange(270_000, 270_200)
     t = np.concatenate([jumps - 1e-6, jumps + 1e-6, np.linspace(1e5, 1e5 + 1, 999)])
@@ -280,7 +287,7 @@ def test_jumps_of_remainders_and_whole_numbers_are_not_rounded(name):
 
 
 def test_a_derivative_of_its_own():
-    """The value of a `jax.custom_jvp`, and its rule in place of the derivative, late."""
+    """At a late time a `jax.custom_jvp` keeps its value, and its rule replaces the derivative."""
     x = Doubled(jnp.asarray(1e5, F32), jnp.asarray(3e-3, F32))
     t = 1e5 + float(x.low)
     value, slope = jax.value_and_grad(lambda h: evaluate(wave, Doubled(h, x.low)).high)(x.high)
@@ -305,7 +312,7 @@ def test_a_drive_that_rounds_its_time_warns():
 
 @pytest.mark.filterwarnings("error")
 def test_a_drive_by_a_loop_keeps_its_phase():
-    """Its value, rate and acceleration at 1e5 s in a batch of worlds."""
+    """Compares value, rate and acceleration at 1e5 s in a batch of worlds."""
     system, _ = wheel(looped, 7.0)
     drive = system.constraints[1]
     high, low = jnp.asarray([1e5, 2e5], F32), jnp.asarray([3e-3, -2e-3], F32)
@@ -325,7 +332,7 @@ def test_an_overflow_is_no_nan():
 
 
 def test_states_made_by_hand_and_saved_before():
-    """With the fields of before, by position, by name, by tree and from a file."""
+    """States with the fields of earlier versions: by position, by name, as trees and from files."""
     system, state = ball()
     old = {"q": state.q, "v": state.v, "time": state.time, "status": state.status}
     for known in (

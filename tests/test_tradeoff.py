@@ -1,4 +1,4 @@
-"""Methods against each other on one scene, checked by integrators and laws of others."""
+"""Methods compared on one scene, checked by other integrators and by theory."""
 
 import dataclasses
 import json
@@ -21,9 +21,9 @@ from jaxcon.analysis.trials import Course, Inputs, Observer, Points, Problem, Tr
 
 G, HORIZON = 9.81, 1.0
 METHODS = {
-    "Euler": jc.Method(solver=jc.Sparse()),
-    "RK4": jc.Method(jc.RK4(), solver=jc.Sparse()),
-    "both": jc.Method(jc.RATTLE(), jc.Projection()),
+    "Euler": jc.Method(solver=jc.solvers.Sparse()),
+    "RK4": jc.Method(jc.RK4(), solver=jc.solvers.Sparse()),
+    "both": jc.Method(jc.integrators.RATTLE(), jc.Projection()),
 }
 
 
@@ -108,14 +108,14 @@ def test_the_front_falls_and_nothing_cheaper_is_as_accurate(result):
 
 
 def test_the_limit_of_stability_is_that_of_the_exact_law():
-    """Feedback of rate β is stable under RK4 up to β h = 2.785; runs above are shown as such."""
+    """Feedback of rate β is stable under RK4 up to β h = 2.785; failed runs above it are listed."""
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     scene.add_particle("bob", mass=1.0, position=(0.1, -math.sqrt(0.99)))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
-    stiff = {"stiff": jc.Method(jc.RK4(), jc.Baumgarte.critical(100.0), jc.Sparse())}
+    stiff = {"stiff": jc.Method(jc.RK4(), jc.Baumgarte.critical(100.0), jc.solvers.Sparse())}
     known = {"dtypes": ("float64",), "dts": (0.3, 0.06, 0.03, 0.02, 0.01), "gradients": False}
     found = jc.tradeoff(*scene.build(), 3.0, methods=stiff, batch=4, **known, progress=False)
-    exact = jc.largest_stable_rate(jc.RK4(), 1.0) / 100.0
+    exact = jc.stabilizers.largest_stable_rate(jc.RK4(), 1.0) / 100.0
     (limit,) = found.limits
     assert 0.95 * exact < limit.stable < limit.unstable < 1.05 * exact
     bad = [run for run in found.runs if not run.ok]
@@ -125,7 +125,7 @@ def test_the_limit_of_stability_is_that_of_the_exact_law():
 
 
 def test_a_scene_at_rest_does_not_diverge_by_rounding():
-    """Nothing moves, and float32 has the energy to seven digits only."""
+    """Nothing moves, while float32 resolves the energy to seven digits only."""
     down = np.array([math.sin(0.3), -math.cos(0.3)])
     scene = jc.Scene(dim=2, gravity=G * down)
     scene.add_particle("bob", mass=1.3, position=1.1 * down)
@@ -156,7 +156,7 @@ def test_a_second_call_goes_on_and_lists_what_it_has_no_time_for(result, file, m
 
     monkeypatch.setattr(sweep.Sweep, "measure", never)
     monkeypatch.setattr(sweep.Sweep, "gradients", never)
-    more = METHODS | {"Heun": jc.Method(jc.Heun())}
+    more = METHODS | {"Heun": jc.Method(jc.integrators.Heun())}
     again = compare(file=file, methods=more, budget=1e-3)
     assert [run.plain() for run in again.runs] == [run.plain() for run in result.runs]
     late = [x.name for x in again.left_out if "no time" in x.reason]
@@ -171,7 +171,7 @@ def test_the_keyboard_ends_it_with_what_was_found(result, file, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(sweep.Sweep, "measure", pressed)
-    found = compare(file=file, methods=METHODS | {"Heun": jc.Method(jc.Heun())})
+    found = compare(file=file, methods=METHODS | {"Heun": jc.Method(jc.integrators.Heun())})
     assert found.runs
     assert [x.name for x in found.left_out if "keyboard" in x.reason] == ["Heun", "Heun"]
 
@@ -230,7 +230,7 @@ def test_the_error_of_the_reference_is_no_less_than_it_is():
     found = made(2.0)
     q = found.points.q[1:].reshape(10, 2, 2)
     off = np.linalg.norm(np.swapaxes(q, 1, 2) - by_others(found.points.time[1:]), axis=-1)
-    assert np.all(np.max(off, axis=1) <= found.error + 1e-11)  # what the others may be off by
+    assert np.all(np.max(off, axis=1) <= found.error + 1e-11)  # error of by_others
     assert found.floor < 1e-9
     assert found.until == 2.0
 
@@ -244,7 +244,7 @@ def test_a_chaotic_motion_is_compared_as_far_as_the_reference_is_good():
 
 
 class Told:
-    """A course whose runs are off by what is told, by part, (10,) or a number."""
+    """A fake course whose runs have given errors at ten times: arrays (10,) or numbers."""
 
     def __init__(self, *off):
         self.problem = Problem(*free_mass_at_rest(), 1.0, Inputs(10))
@@ -275,7 +275,7 @@ def test_a_reference_does_not_trust_two_runs_that_agree_by_chance():
 
 def test_of_chaotic_runs_those_that_agree_the_longest_are_the_reference():
     late = np.where(np.arange(10) < 8, 0.0, 1.0)
-    wild = [0.5 + 0.0 * late, -0.4 + 0.0 * late]  # apart by 0.9, less than the others in the end
+    wild = [0.5 + 0.0 * late, -0.4 + 0.0 * late]  # 0.9 apart, less than the others at the end
     fine = [1e-5 + late, 2e-5 - 0.3 * late, 2e-5 + 1.2 * late, 2e-5 - late]
     course = Told(*wild, *fine)
     with pytest.MonkeyPatch.context() as patch:
@@ -285,15 +285,15 @@ def test_of_chaotic_runs_those_that_agree_the_longest_are_the_reference():
 
 
 def free_mass():
-    """2 kg in the plane that nothing holds."""
+    """A free particle of 2 kg in the plane."""
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
     scene.add_particle("mass", mass=2.0, position=(1.0, 0.0))
-    scene.add(jc.ExternalWrench("push", "mass"))
+    scene.add(jc.forces.ExternalWrench("push", "mass"))
     return scene.build()
 
 
 def test_the_first_run_of_a_program_is_not_timed(monkeypatch):
-    """It can take ten times as long as the next one; here it counts as 1,000 s."""
+    """A first run can take ten times as long as the next; here it pretends to take 1,000 s."""
     go, begun = Course.go, set()
 
     def slow_at_first(self, dt, count):
@@ -312,7 +312,7 @@ def test_the_first_run_of_a_program_is_not_timed(monkeypatch):
 
 
 def test_single_precision_where_double_is_turned_off():
-    """Under forces that change every half second RK4 is exact at every step."""
+    """RK4 is exact at every step under forces that change every half second."""
     with jax.enable_x64(False):
         system, state = free_mass()
         push = np.array([[2.0, 0.0], [-4.0, 6.0]])
@@ -329,7 +329,7 @@ def test_single_precision_where_double_is_turned_off():
 
 @pytest.mark.parametrize("kind", ["rows", "policy"])
 def test_inputs_mean_the_same_at_every_step(kind):
-    """Forces held for 0.2 s are integrated exactly by RK4: two steps in a hold, or seven."""
+    """RK4 integrates forces held for 0.2 s exactly, with two or seven steps each."""
     system, state = free_mass()
     rows = np.random.default_rng(0).normal(size=(5, 2))
     held = {"rows": (rows, None), "policy": (lambda s: -3.0 * s.q - s.v, 0.2)}[kind]
@@ -350,7 +350,7 @@ def test_inputs_mean_the_same_at_every_step(kind):
 def test_inputs_are_held_for_the_same_time_at_every_step():
     scene = jc.Scene(dim=2)
     scene.add_particle("mass", mass=1.0)
-    scene.add(jc.ExternalWrench("push", "mass"))
+    scene.add(jc.forces.ExternalWrench("push", "mass"))
     system, _ = scene.build()
     assert Inputs.of(system, None, None, 1.0).parts == 10
     assert Inputs.of(system, np.ones(2), None, 1.0).rows.shape == (10, 2)
@@ -368,7 +368,7 @@ def test_inputs_are_held_for_the_same_time_at_every_step():
 
 
 def test_a_turn_in_space_counts_as_the_way_of_its_points():
-    """k² = 0.3/2 for the largest moment, and √(d² + k²θ²) for a turn by θ and a way d."""
+    """A rotation θ and a displacement d give √(d² + k²θ²); k² = 0.3/2 for the largest moment."""
     scene = jc.Scene()
     scene.add_body("block", mass=2.0, inertia=(0.3, 0.2, 0.15))
     system, state = scene.build()
@@ -403,7 +403,7 @@ def test_bad_options_are_named(options, error, words):
 
 
 def test_a_step_asked_for_that_takes_longer_than_the_budget_is_listed():
-    """Ten billion steps; nobody waits for them."""
+    """That step would need ten billion steps, so that it is not run."""
     system, state = free_mass()
     known = {"methods": {"RK4": jc.Method(jc.RK4())}, "batch": 2, "gradients": False}
     asked = {"dts": (0.1, 1e-10), "dtypes": ("float64",), "budget": 30.0, "progress": False}
@@ -414,7 +414,7 @@ def test_a_step_asked_for_that_takes_longer_than_the_budget_is_listed():
 
 
 def test_the_first_gradient_is_not_begun_where_it_may_outlast_the_budget():
-    """Which compiles for longer than anything before it; a second one is as long as the first."""
+    """The first gradient compiles longer than any run; a second one lasts as long as the first."""
     clock = ledger.Clock(300.0)
     assert clock.lasts("runs")
     clock.longest["runs"] = 36.0
@@ -427,7 +427,7 @@ def test_the_first_gradient_is_not_begun_where_it_may_outlast_the_budget():
 
 
 class Watch:
-    """A clock by hand, in place of `time`."""
+    """A manual clock in place of `time`."""
 
     now = 0.0
 
@@ -446,7 +446,7 @@ class Watch:
     ],
 )
 def test_the_budget_bounds_all_of_it(monkeypatch, slow, runs, gradients):
-    """On a machine on which each piece takes so many times longer; what is left out is listed."""
+    """Every part takes `slow` times as long; parts that are left out are listed."""
     watch, done, slopes = Watch(), [], []
     monkeypatch.setattr(ledger, "time", watch)
     run = Run("", "float64", 0.1, "ok", 1e-3, True, 0.0, 0.0, 0.0, 1.0, cost=1.0)

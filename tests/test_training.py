@@ -1,4 +1,4 @@
-"""Examples of learning, in small; what a policy earns; Brax's interface."""
+"""Small learning examples, returns of policies, and the interface of Brax."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ from benchmarks import curricula, exploration, training  # noqa: E402
 
 @pytest.fixture(autouse=True)
 def promoting():
-    """Optax and Brax mix integers with floating point numbers."""
+    """Allows mixed dtypes, because Optax and Brax mix integers and floats."""
     with jax.numpy_dtype_promotion("standard"):
         yield
 
@@ -37,7 +37,7 @@ def cart():
 
 
 def test_a_return_is_the_sum_until_an_episode_ends(cart):
-    """One that is pushed over the end of a short track, beside one whose time is up."""
+    """One episode ends because the cart leaves a short track, another at its time limit."""
     cart = dataclasses.replace(cart, horizon=80)
 
     def push(seen):
@@ -60,7 +60,7 @@ def test_a_return_is_the_sum_until_an_episode_ends(cart):
 
 
 def test_analytic_gradients_improve_the_window_they_come_from(cart):
-    """Twenty steps from the same copies; the gradient is that of differences."""
+    """Twenty updates from the same copies improve the reward; the gradient equals differences."""
     setting = learn_apg.Setting(0.0, 20, copies=3, window=8, rate=0.02)
     learner = learn_apg.begin(cart, setting, jax.random.key(0))
     update = jax.jit(learn_apg.update, static_argnums=1)
@@ -127,7 +127,7 @@ def test_arms_of_the_study_are_what_they_are_called():
 
 
 def test_a_cart_that_is_pushed_to_the_end_of_its_track_stops_where_limits_say():
-    """With all the force there is, either way, for a second and a half."""
+    """Pushes with full force, either way, for a second and a half."""
     arms = exploration.arms()
 
     def pushed(name, push):
@@ -145,7 +145,7 @@ def test_a_cart_that_is_pushed_to_the_end_of_its_track_stops_where_limits_say():
     np.testing.assert_allclose(x[:, -1], exploration.KEPT * pushes, atol=0.03)
 
 
-@pytest.mark.filterwarnings("ignore")  # of what Brax imports
+@pytest.mark.filterwarnings("ignore")  # warnings of Brax's own imports
 def test_brax_sees_the_same_episodes(cart):
     pytest.importorskip("brax")
     from brax.envs.wrappers.training import wrap
@@ -168,7 +168,7 @@ def test_brax_sees_the_same_episodes(cart):
     assert jnp.all(step(state, jnp.full((2, 1), jnp.nan)).done)
 
 
-@pytest.mark.filterwarnings("ignore")  # of what Brax imports
+@pytest.mark.filterwarnings("ignore")  # warnings of Brax's own imports
 def test_brax_draws_worlds_for_its_copies(cart):
     pytest.importorskip("brax")
     from brax.envs.wrappers.training import wrap
@@ -217,7 +217,7 @@ for name, options in own.items():
 
 
 def test_what_trains_on_brax_trains_on_ours():
-    """A few updates, of which nobody learns; in single precision, as Brax has it."""
+    """A few updates run, too few to learn, in float32 as in Brax."""
     pytest.importorskip("brax")
     own = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
     program = [sys.executable, "-W", "ignore", "-c", TRAINED_BY_BRAX]

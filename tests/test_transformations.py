@@ -1,4 +1,4 @@
-"""jit, vmap, grad and jvp of a step, over the table of joints, integrators and solvers."""
+"""jit, vmap, grad and jvp of a step, for all joints with several integrators and solvers."""
 
 import dataclasses
 import functools
@@ -12,11 +12,11 @@ from derivatives import assert_batched_either_way
 from tolerances import DIFFERENCE, IDENTITY
 
 import jaxcon as jc
-from jaxcon.solvers.sparse import Sparse
+from jaxcon.linear.sparse import Sparse
 
-INTEGRATORS = {"euler": jc.SemiImplicitEuler(), "heun": jc.Heun(), "rk4": jc.RK4()}
-SOLVERS = {"schur": jc.Schur(), "dense": jc.Dense(), "sparse": Sparse()}
-SOLVERS["cg"] = jc.ConjugateGradients(tolerance=1e-14)
+INTEGRATORS = {"euler": jc.SemiImplicitEuler(), "heun": jc.integrators.Heun(), "rk4": jc.RK4()}
+SOLVERS = {"schur": jc.solvers.Schur(), "dense": jc.solvers.Dense(), "sparse": Sparse()}
+SOLVERS["cg"] = jc.solvers.ConjugateGradients(tolerance=1e-14)
 DT = 1e-3
 
 
@@ -25,7 +25,7 @@ def method_of(integrator, solver):
 
 
 def close(got, expected, tolerance=IDENTITY):
-    """Leaf by leaf, relative to the largest entry of each."""
+    """Compares leaf by leaf, relative to the largest entry of each."""
     for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
         a, b = np.asarray(a), np.asarray(b)
         np.testing.assert_allclose(
@@ -45,7 +45,7 @@ CASES = [
     ("polar", "rk4", "sparse"),
     ("arm", "rk4", "schur"),
 ]
-"""Scenes, which together hold every kind of row twice, with each integrator and each solver."""
+"""Scenes with every kind of row twice; each integrator and each solver occurs."""
 EAGER = [case for case in CASES if case[0] not in scenes.core(3, "loop")]
 
 
@@ -64,13 +64,13 @@ def test_jit_is_eager(name, integrator, solver):
 
 
 def same_step(got, expected):
-    """States agree to rounding; forces less, since feedback divides the rounding of φ by h²."""
+    """States agree to rounding; forces agree less, since feedback divides rounding of φ by h²."""
     close(got[0], expected[0])
     close(got[1], expected[1], 1e-16 / DT**2 * 1e3)
 
 
 def several(built):
-    """Three worlds: the state, the state off the constraints, and one in between."""
+    """Returns states on the constraints, off them, and at twice the velocity; also as a batch."""
     states = [built.state, built.off, dataclasses.replace(built.state, v=2 * built.state.v)]
     return states, jax.tree.map(lambda *x: jnp.stack(x), *states)
 
@@ -102,14 +102,14 @@ GRADIENTS = [
 
 
 def numbers(built):
-    """What the rollout is differentiated by: state, masses, and a number of each joint."""
+    """Returns the numbers to differentiate by: position, velocity, masses, one of each joint."""
     params = built.system.params
     own = {f"{name}.{field}": params[name][field] for name, field in built.parameters}
     return {"position": jnp.zeros_like(built.state.v), "velocity": built.state.v} | own
 
 
 def outcome(built, method, x):
-    """A number that every coordinate of the final state enters."""
+    """Returns a number that depends on every coordinate of the final state."""
     changes = {}
     for name, field in built.parameters:
         changes.setdefault(name, {})[field] = x[f"{name}.{field}"]
@@ -134,7 +134,7 @@ def test_reverse_and_forward_mode_are_central_differences(name, integrator, solv
     for name, direction in directions(x):
         forward = along(x, direction)[1]
         reverse = dot(gradient, direction)
-        # feedback throws a displaced state back within a step, far from linearly
+        # feedback moves a displaced state back within a step, which is far from linear
         slope = difference(
             lambda x: along(x, x)[0], x, direction, 5e-5 if name == "position" else 3e-4
         )
@@ -144,7 +144,7 @@ def test_reverse_and_forward_mode_are_central_differences(name, integrator, solv
 
 
 def directions(x):
-    """One random direction for each of the numbers, the others at rest."""
+    """Yields one random direction for each named number, zero in the others."""
     random = np.random.default_rng(1)
     for name in x:
         yield (
@@ -163,7 +163,7 @@ def dot(a, b):
 
 
 def difference(f, x, direction, h=3e-4):
-    """The derivative along a direction by central differences of fourth order."""
+    """Returns the derivative along a direction by fourth-order central differences."""
 
     def at(s):
         return f(jax.tree.map(lambda a, d: a + s * h * d, x, direction))
@@ -172,7 +172,7 @@ def difference(f, x, direction, h=3e-4):
 
 
 def test_gradients_at_rest_and_at_the_identity_are_finite():
-    """Upright, at rest, without gravity; a spring of length zero on a body of each joint."""
+    """Bodies are upright and at rest without gravity; each joint has a spring of length zero."""
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
     for kind in ("fixed", "revolute", "prismatic", "driven_revolute", "holonomic"):
         pair = f"{kind} first", f"{kind} second"
@@ -223,7 +223,7 @@ def test_a_step_is_traced_once_for_three_sets_of_numbers():
     scene = jc.Scene(dim=2)
     scene.add_body("link", mass=1.0, inertia=1.0, position=(1.0, 0.0))
     params = {"anchor": jnp.zeros(2), "square": 1.0}
-    scene.add(jc.Holonomic(counted, (jc.WORLD, "link"), name="joint", params=params))
+    scene.add(jc.joints.Holonomic(counted, (jc.WORLD, "link"), name="joint", params=params))
     system, state = scene.build()
     step = jax.jit(lambda *args: jc.step(*args))
     seen = []
@@ -254,7 +254,7 @@ def test_a_second_build_of_a_scene_is_not_a_second_trace():
 @pytest.mark.parametrize(("name", "integrator", "solver"), CASES)
 def test_no_float64_in_a_float32_step(name, integrator, solver):
     built, method = scenes.build(name, "float32"), method_of(integrator, solver)
-    if integrator == "euler":  # the others have the default gains
+    if integrator == "euler":  # the other integrators have the default gains
         gain = jnp.asarray(20.0, jnp.float32)
         method = dataclasses.replace(method, stabilizer=jc.Baumgarte(gain, gain))
     solver = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), method.solver)
@@ -293,7 +293,10 @@ def test_a_float32_world_survives_a_thousand_steps(name):
 
 
 def test_a_force_may_branch():
-    """By `lax.cond`, in both orders of `grad` and `vmap`; the other branch has no derivative."""
+    """A `lax.cond` works in both orders of `grad` and `vmap`.
+
+    Its other branch has no derivative.
+    """
 
     def force(q, v, t, control, k):
         return jax.lax.cond(q[0] > 0, lambda: -k * jnp.sqrt(q), lambda: -k * q)

@@ -1,4 +1,4 @@
-"""Each trap of the chapter is warned of in a scene that is in it, and not in others."""
+"""Each trap of the guide's chapter is reported in scenes that have it, and in no others."""
 
 import dataclasses
 
@@ -9,9 +9,9 @@ from test_auto import rope
 from test_report import four_bar
 
 import jaxcon as jc
-from jaxcon.analysis.known import Known
 from jaxcon.analysis.probe import Probe
-from jaxcon.analysis.traps import TRAPS, found, listed
+from jaxcon.analysis.setup import Setup
+from jaxcon.analysis.traps import TRAPS, listed, warnings_of
 
 DT = 1e-3
 
@@ -26,12 +26,12 @@ def bob(*elements, position=(1.0, 0.0), velocity=(0.0, 0.0), dtype=None):
 
 
 def rod(name="rod", point=(0.0, 0.0), length=None):
-    """From a point of the world."""
+    """A rod from a point of the world to the bob."""
     return jc.Distance(name, jc.WORLD, "bob", length=length, point_a=point)
 
 
 def arm(lower, **stop):
-    """On a hinge with limits, at the angle 0."""
+    """A body on a hinge with limits, at angle 0."""
     scene = jc.Scene(dim=2)
     scene.add_body("arm", mass=1.0, inertia=0.1, position=(0.5, 0.0))
     scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
@@ -48,7 +48,7 @@ def disc(height, **contact):
 
 
 def flat():
-    """A parallelogram of rods, all along one line: there its three rows have rank 2."""
+    """A parallelogram of rods, all in line: there its three rows have rank 2."""
     scene = jc.Scene(dim=2)
     scene.add_particle("a", mass=1.0, position=(1.0, 0.0))
     scene.add_particle("b", mass=1.0, position=(2.0, 0.0))
@@ -59,7 +59,7 @@ def flat():
 
 
 def straight():
-    """Three cranks with a coupler of two rods, and a third along both: a row too many anywhere."""
+    """Three cranks, a coupler of two rods, and a third rod along both: one row is redundant."""
     scene = jc.Scene(dim=2)
     for i, name in enumerate("abc"):
         scene.add_particle(name, mass=1.0, position=(i, 1.0))
@@ -70,18 +70,18 @@ def straight():
 
 
 def hung(load=100.0):
-    """Ropes that hold a load by light beads: sweeps are slow where it is heavy."""
+    """A load hung on ropes by light beads: sweeps converge slowly for a heavy load."""
     scene = jc.Scene(dim=2)
     for i in range(3):
         scene.add_particle(f"p{i}", mass=load if i == 2 else 0.1, position=(0.0, -i - 1.0))
         first = {"point_a": (0.0, 0.0)} if i == 0 else {}
         above = f"p{i - 1}" if i else jc.WORLD
-        scene.add(jc.Rope(f"rope{i}", above, f"p{i}", length=1.0, **first))
+        scene.add(jc.contacts.Rope(f"rope{i}", above, f"p{i}", length=1.0, **first))
     return scene.build()
 
 
 def crowd():
-    """Particles that lie on a rough floor: two bounded rows each."""
+    """Particles that lie on a rough floor: two inequality rows each."""
     scene = jc.Scene(dim=2)
     for i in range(24):
         scene.add_particle(f"p{i}", mass=1.0, position=(float(i), 0.0))
@@ -91,15 +91,15 @@ def crowd():
 
 
 def skate():
-    """A blade that slips at the start."""
+    """A blade with initial slip."""
     scene = jc.Scene(dim=2)
     scene.add_body("skate", mass=60.0, inertia=2.0, velocity=(3.0, 0.5))
-    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
     return scene.build()
 
 
 def weight():
-    """Ten tonnes that hang by a gram, so that both rods pull at the gram alone."""
+    """Ten tonnes hang on a gram: both rods act on the gram."""
     scene = jc.Scene(dim=2)
     scene.add_particle("light", mass=1e-3, position=(0.0, -1.0))
     scene.add_particle("heavy", mass=1e4, position=(0.0, -2.0))
@@ -109,19 +109,19 @@ def weight():
 
 
 def far():
-    """Two rods that meet at (½, √¾), seen from close to the line between their ends."""
+    """Two rods that meet at (½, √¾), with the bob near the line between their other ends."""
     return bob(rod(length=1.0), rod("other", (1.0, 0.0), 1.0), position=(0.5, 0.1))
 
 
 def with_(**parts):
-    """A method."""
+    """Returns a method with these parts."""
     return jc.Method(**parts)
 
 
 GENTLE = jc.Baumgarte.critical(rate=50.0)
-SWEEPS = jc.GaussSeidel(sweeps=2)
-SPARSE = {"solver": jc.Sparse()}
-CASES = {  # scene, method, the traps in which they are, and a word of what is said
+SWEEPS = jc.solvers.GaussSeidel(sweeps=2)
+SPARSE = {"solver": jc.solvers.Sparse()}
+CASES = {  # scene, method, expected traps, and a word of the message
     "pendulum": (lambda: bob(rod()), with_(), (), ""),
     "four-bar": (lambda: four_bar(2), with_(), (), ""),
     "rope": (lambda: rope(14), with_(), (), ""),
@@ -139,10 +139,15 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
         "Move away from this position",
     ),
     "masses": (weight, with_(), ("step", "singular"), "not by their position but by the masses"),
-    "masses damped": (weight, with_(integrator=jc.GeneralizedAlpha()), ("singular",), "masses"),
+    "masses damped": (
+        weight,
+        with_(integrator=jc.integrators.GeneralizedAlpha()),
+        ("singular",),
+        "masses",
+    ),
     "passes": (flat, with_(), ("singular",), "RankSafe takes them"),
     "stops": (flat, with_(**SPARSE), ("singular",), "refuses them as SINGULAR"),
-    "sweeps": (hung, with_(bounded=SWEEPS), ("order",), "2 sweeps leave"),
+    "sweeps": (hung, with_(contact_solver=SWEEPS), ("order",), "2 sweeps leave"),
     "at once": (hung, with_(), (), ""),
     "twice": (lambda: bob(rod(), rod("again")), with_(), ("over-constrained",), "again"),
     "straight": (straight, with_(), ("over-constrained",), "1 row of"),
@@ -165,37 +170,42 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
     ),
     "iterated": (far, with_(stabilizer=jc.Projection()), ("start",), "jc.assemble"),
     "gentle": (far, with_(stabilizer=GENTLE), ("start",), "jc.assemble"),
-    "dense": (lambda: rope(14), with_(solver=jc.Dense()), ("dense",), "fewer operations: Sparse()"),
+    "dense": (
+        lambda: rope(14),
+        with_(solver=jc.solvers.Dense()),
+        ("dense",),
+        "fewer operations: Sparse()",
+    ),
     "many contacts": (
         crowd,
-        with_(bounded=jc.InteriorPoint()),
+        with_(contact_solver=jc.solvers.InteriorPoint()),
         ("dense",),
         "a matrix of 48 inequality rows in each iteration, about 3.5e+06 operations a step",
     ),
     "nearest contacts": (
         crowd,
-        with_(bounded=jc.Nearest(jc.InteriorPoint(), contacts=4)),
+        with_(contact_solver=jc.solvers.ActiveSet(jc.solvers.InteriorPoint(), contacts=4)),
         ("impacts",),
         "have the time of the first",
     ),
     "many by default": (crowd, with_(), (), ""),
-    "many swept": (crowd, with_(bounded=jc.GaussSeidel()), (), ""),
-    "few rows": (lambda: rope(3), with_(solver=jc.Dense()), (), ""),
+    "many swept": (crowd, with_(contact_solver=jc.solvers.GaussSeidel()), (), ""),
+    "few rows": (lambda: rope(3), with_(solver=jc.solvers.Dense()), (), ""),
     "swept": (
         lambda: bob(rod()),
-        with_(solver=jc.ConjugateGradients()),
+        with_(solver=jc.solvers.ConjugateGradients()),
         ("iterations",),
         "100 iterations for 1 row,",
     ),
     "swept rope": (
         lambda: rope(14),
-        with_(solver=jc.ConjugateGradients(iterations=30)),
+        with_(solver=jc.solvers.ConjugateGradients(iterations=30)),
         ("iterations",),
         "times the operations",
     ),
     "sweeps on": (
         lambda: hung(0.1),
-        with_(bounded=jc.GaussSeidel(sweeps=5000)),
+        with_(contact_solver=jc.solvers.GaussSeidel(sweeps=5000)),
         ("iterations",),
         "sweeps=5000",
     ),
@@ -211,27 +221,27 @@ CASES = {  # scene, method, the traps in which they are, and a word of what is s
 @pytest.mark.parametrize("name", CASES)
 def test_a_trap_is_seen_where_it_is(name):
     scene, method, expected, words = CASES[name]
-    known = Known.of(*scene(), method, DT)
-    said = found(known)
+    known = Setup.of(*scene(), method, DT)
+    said = warnings_of(known)
     assert set(said) == set(expected), said
     assert words in " ".join(said.values())
 
 
 def test_each_trap_of_the_chapter_is_there():
     assert set(TRAPS) == {name for _, _, names, _ in CASES.values() for name in names}
-    assert len(TRAPS) == 12  # eight of the chapter, long steps, impacts, joint limits, overlaps
+    assert len(TRAPS) == 12  # eight of the guide, long steps, impacts, joint limits, overlaps
 
 
 def test_a_method_that_remembers_needs_no_state_of_its_own():
     system, state = bob(rod())
-    forgets = with_(stabilizer=jc.SlidingWindowBaumgarte())
+    forgets = with_(stabilizer=jc.stabilizers.SlidingWindowBaumgarte())
     report = jc.report(system, state, forgets, DT, measure=True)
     assert report.probe.status == jc.Status.OK
     assert "gains" not in str(dataclasses.replace(report, gains=(0.0, 0.0, np.inf), choice=None))
 
 
 def test_a_start_in_a_contact_is_told_without_a_method():
-    """And how fast the bodies really part."""
+    """The report gives the recovery speed, which equals the speed after a step."""
     system, state = disc(0.05, recovery=0.3)
     assert set(jc.report(system, state).warnings) == {"overlap"}
     text = str(jc.report(system, state))
@@ -241,7 +251,7 @@ def test_a_start_in_a_contact_is_told_without_a_method():
 
 
 def test_a_start_outside_joint_limits_is_told_without_a_method():
-    """And how fast each joint really returns: after a step, 0.3 rad/s or a fifth of the way."""
+    """The report gives the recovery rate: 0.3 rad/s, or a fifth of the violation a step."""
     system, state = arm(0.4, recovery=0.3)
     assert set(jc.report(system, state).warnings) == {"range"}
     text = str(jc.report(system, state))
@@ -260,21 +270,21 @@ def test_many_names_are_cut():
 
 
 def test_float32_is_no_trap():
-    known = Known.of(*bob(rod(), dtype=jnp.float32), jc.Method(), DT)
-    assert found(known) == {}
+    known = Setup.of(*bob(rod(), dtype=jnp.float32), jc.Method(), DT)
+    assert warnings_of(known) == {}
     assert np.isfinite(known.probe.violation)
 
 
 def test_without_a_step_nothing_is_said_of_it():
     wild = with_(stabilizer=jc.Baumgarte.critical(rate=5e3))
-    known = Known.of(*bob(rod()), wild)
+    known = Setup.of(*bob(rod()), wild)
     assert known.probe is None
-    assert "gains" not in found(known)
+    assert "gains" not in warnings_of(known)
 
 
 def test_a_report_is_a_checklist():
     system, state = bob(rod())
-    wild = with_(stabilizer=jc.Baumgarte.critical(rate=5e3), solver=jc.Dense())
+    wild = with_(stabilizer=jc.Baumgarte.critical(rate=5e3), solver=jc.solvers.Dense())
     report = jc.report(system, state, wild, DT, measure=True, timed=True)
     assert report.gains[:2] == (5e3, 5e3)
     assert report.gains[2] == pytest.approx((2 * np.sqrt(2) - 2) / DT)
@@ -295,7 +305,7 @@ def test_a_report_is_a_checklist():
     fails = dataclasses.replace(report, probe=Probe(32, 0.0, 0.0, jc.Status.SINGULAR))
     assert "32 steps from here fail, SINGULAR: the constraint rows are dependent" in str(fails)
     assert "expected violation" not in str(fails)
-    α, β, most = jc.report(system, state, with_(), DT).gains  # x² + 2x = 4 for x = hβ, α = β/2
+    α, β, most = jc.report(system, state, with_(), DT).gains  # x² + 2x = 4 for x = hβ and α = β/2
     assert α / β == pytest.approx(0.5)
     assert β < most == pytest.approx((np.sqrt(5) - 1) / DT)
     calm = jc.report(system, state)

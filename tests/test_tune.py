@@ -1,4 +1,4 @@
-"""Minima are found, whatever happens on the way; bounds hold, and a search goes on where it was."""
+"""Searches find minima in spite of failures; bounds hold, and interrupted searches resume."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ BOWL = {"a": jnp.array([1.0, 3.0]), "b": {"c": 0.0, "n": jnp.asarray(3)}}
 
 
 def bowl(p):
-    """0 at a = e, c = 2; the aux is the sum of a."""
+    """Returns a loss with minimum 0 at a = e, c = 2; aux is the sum of a."""
     off = jnp.sum((jnp.log(p["a"]) - 1) ** 2) + (p["b"]["c"] - 2.0) ** 2
     return off, jnp.sum(p["a"])
 
@@ -38,7 +38,7 @@ def test_the_least_of_a_bowl_is_found_and_its_history_kept():
 
 
 def test_the_default_rate_reaches_what_is_a_hundred_times_larger():
-    """In as many steps as a first call may ask for, with a second leaf a hundred times smaller."""
+    """60 steps suffice, also for a second leaf that is a hundred times smaller."""
 
     def loss(x):
         return jnp.sum(jnp.log(x / jnp.array([100.0, 0.01])) ** 2)
@@ -69,7 +69,7 @@ def test_an_optimum_beyond_a_bound_is_left_for_the_bound_itself():
     assert found.params["b"]["c"] == found.aux == 1.5
     assert found.bounded == ("b/c",)
     assert "b/c = 1.5, on its bound" in str(found)
-    assert max(seen) == 1.5  # reached and never passed
+    assert max(seen) == 1.5  # reaches the bound and never passes it
     assert min(seen) >= -1.0
 
 
@@ -82,15 +82,15 @@ def test_leaves_are_named_by_path_by_part_and_by_pattern(name):
     assert jax.tree.structure(again) == jax.tree.structure(space)
     np.testing.assert_array_equal(space.low[1], -1.0)
     assert np.all(space.high[0] > 1e307)
-    assert np.all(np.isfinite(np.exp(space.limits[1][0])))  # of a logarithm
+    assert np.all(np.isfinite(np.exp(space.limits[1][0])))  # limits of logarithms stay finite
 
 
 def test_bounds_of_positive_leaves_hold_to_the_last_bit_and_let_go_again():
-    """exp(log x) may round beyond x; at the bound there still is a derivative."""
+    """exp(log x) may round beyond x; at the bound the derivative is not zero."""
     bound = jnp.asarray(np.random.default_rng(0).uniform(0.1, 100.0, 1000))
     space = space_of(bound, True, (None, bound), "test")
     y = space.encode(bound)
-    assert not np.all(np.exp(y[0]) <= bound)  # some would
+    assert not np.all(np.exp(y[0]) <= bound)  # rounding would exceed some bounds
     assert np.all(space.decode(y) <= bound)
     slope = jax.grad(lambda y: jnp.sum(space.decode(y)))(y)
     np.testing.assert_allclose(slope[0], bound)
@@ -111,7 +111,7 @@ SPRING = {"stiffness": 8.0, "damping": 1.0}
 def spring_loss(dtype):
     height = scenes.hanging(dtype)
     seen = height({name: dtype(x) for name, x in SPRING.items()})
-    return lambda p: jc.losses.tracking(height(p), seen)
+    return lambda p: jc.learning.losses.tracking(height(p), seen)
 
 
 @pytest.mark.parametrize(
@@ -135,13 +135,15 @@ def test_the_default_search_gets_to_the_end_of_a_narrow_valley(dtype, start, clo
 
 @pytest.mark.parametrize("factors", [(0.03, 0.03), (1.0, 30.0), (30.0, 0.03), (30.0, 30.0)])
 def test_a_search_ends_no_worse_than_it_began_and_converges_to_minima_alone(factors):
-    """A fit of 6 s has local minima, and one without damping, which lies beyond all logarithms."""
+    """A fit of 6 s has local minima, and one at zero damping, whose logarithm is −∞."""
     height = scenes.hanging(steps=600)
     seen = height(SPRING)
 
     def loss(log):
         stiffness, damping = jnp.exp(log)
-        return jc.losses.tracking(height({"stiffness": stiffness, "damping": damping}), seen)
+        return jc.learning.losses.tracking(
+            height({"stiffness": stiffness, "damping": damping}), seen
+        )
 
     start = np.array(list(SPRING.values())) * factors
     guess = dict(zip(SPRING, start, strict=True))
@@ -160,7 +162,7 @@ def test_a_search_ends_no_worse_than_it_began_and_converges_to_minima_alone(fact
 
 
 def test_a_slide_through_a_valley_is_not_called_converged():
-    """It hardly lowers the loss any more, by 1e-10 a step."""
+    """The loss decreases by 1e-10 a step only."""
     adam = optax.adam(optax.cosine_decay_schedule(0.1, 150))
     guess = {"stiffness": 5.0, "damping": 0.3}
     found = jc.tune(spring_loss(jnp.float64), guess, positive=True, steps=150, optimizer=adam)
@@ -174,7 +176,10 @@ def test_a_slide_through_a_valley_is_not_called_converged():
 
 
 def test_batches_share_parameters_and_starts_are_searched_beside_each_other():
-    """Four worlds of other masses, one stiffness and damping; restarts end alike."""
+    """Four worlds differ in mass and share stiffness and damping.
+
+    Restarts end at the same minimum.
+    """
 
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
@@ -189,12 +194,12 @@ def test_batches_share_parameters_and_starts_are_searched_beside_each_other():
             return jc.rollout(own, jc.Method(), state, None, 1e-2, 40, record=lambda s, i: s.q[1])
 
         last, y = jax.vmap(one)(masses)
-        return jc.losses.unless_failed(y, last)
+        return jc.learning.losses.unless_failed(y, last)
 
     seen = heights(SPRING)
     options = {"restarts": 3, "spread": 1.0, "key": jax.random.key(0), "positive": True}
     found = jc.tune(
-        lambda p: jc.losses.tracking(heights(p), seen),
+        lambda p: jc.learning.losses.tracking(heights(p), seen),
         {"stiffness": 5.0, "damping": 0.3},
         **options,
     )
@@ -212,7 +217,7 @@ def test_batches_share_parameters_and_starts_are_searched_beside_each_other():
     ],
 )
 def test_a_step_that_runs_away_is_taken_back_and_tried_again_shorter(scale, optimizer):
-    """Beyond x = 2 the loss is 1e14, as of gains that are no longer stable, and flat."""
+    """Beyond x = 2 the loss is 1e14 and flat, as it is for unstable gains."""
 
     def loss(x):
         width = 0.5 if scale == "ratio" else 1e-3
@@ -231,7 +236,10 @@ def test_a_step_that_runs_away_is_taken_back_and_tried_again_shorter(scale, opti
 
 
 def test_a_retry_begins_where_the_optimizer_was():
-    """Its memory after the accepted point, half the step: momentum is not fed by what failed."""
+    """A retry takes half the step and the optimizer state of the accepted point.
+
+    The failed step therefore does not enter the momentum.
+    """
     seen = []
 
     def loss(x):
@@ -241,8 +249,8 @@ def test_a_retry_begins_where_the_optimizer_was():
     momentum = optax.sgd(0.1, momentum=0.9)
     found = jc.tune(loss, jnp.asarray(0.0), steps=4, optimizer=momentum)
     first = 0.6
-    second = first + 0.9 * 0.6 + 0.1 * 2 * (3.0 - first)  # beyond 1
-    half = first + 0.5 * (second - first)  # so is this
+    second = first + 0.9 * 0.6 + 0.1 * 2 * (3.0 - first)  # beyond 1, so it fails
+    half = first + 0.5 * (second - first)  # beyond 1, too
     quarter = first + 0.25 * (second - first)
     np.testing.assert_allclose(np.asarray(seen).ravel(), [0.0, first, second, half], rtol=1e-12)
     assert found.refused == 2
@@ -259,7 +267,7 @@ def test_a_search_with_samples_goes_back_to_the_last_end_of_a_chunk_that_was_goo
     options = {"samples": 8, "key": jax.random.key(0), "chunk": 5}
     found = jc.tune(loss, jnp.asarray(0.0), steps=200, optimizer=optax.sgd(0.05), **options)
     assert 0.9 < found.params < 1.0
-    assert found.history[-40:].min() < 1.0  # it is not lost beyond
+    assert found.history[-40:].min() < 1.0  # the search returns from there
 
 
 def test_a_start_stops_where_the_loss_falls_no_more():
@@ -270,7 +278,7 @@ def test_a_start_stops_where_the_loss_falls_no_more():
 
 
 def valley(x):
-    """Minima at 1, of 0.5, and at −2, of 0; a start at 2 finds the worse one."""
+    """Returns a loss with minima 0.5 at 1 and 0 at −2; a start at 2 finds the former."""
     return jnp.minimum((x - 1) ** 2 + 0.5, (x + 2) ** 2)
 
 
@@ -281,12 +289,12 @@ def test_restarts_find_the_better_of_two_minima():
     found = jc.tune(valley, start, restarts=8, spread=3.0, key=jax.random.key(0), **options)
     assert found.loss < 1e-2
     assert found.histories.shape == (8, 80)
-    np.testing.assert_allclose(found.histories[0], alone.history)  # the first is the one given
+    np.testing.assert_allclose(found.histories[0], alone.history)  # of the given start
     assert "the best of 8 starts" in str(found)
 
 
 def cliff(x):
-    """Falls towards 1.05, from where on it is no number: steps of 0.3 lead beyond."""
+    """Returns a loss that decreases up to x = 1.05 and is NaN beyond; steps of 0.3 pass it."""
     return jnp.where(x < 1.05, 2 - x, jnp.nan)
 
 
@@ -300,7 +308,7 @@ def test_a_loss_that_is_not_finite_somewhere_is_approached_with_shorter_steps():
 
 def test_a_gradient_that_is_not_finite_ends_the_start_and_keeps_the_best():
     found = jc.tune(lambda x: jnp.sqrt(jnp.abs(x)) + 1, jnp.asarray(0.0), steps=100)
-    assert found.loss == 1.0  # whose derivative is NaN
+    assert found.loss == 1.0  # its derivative is NaN
     assert found.steps < 30
     assert found.refused == found.steps
     assert f"{found.steps} steps were taken back" in str(found)
@@ -331,7 +339,7 @@ def test_a_start_without_a_number_harms_no_other():
 
 
 def test_the_least_of_an_expectation():
-    """E (x − k)², k normal around 1: the least is the variance, at the mean."""
+    """The minimum of E (x − k)² with normal k is the variance of k, at its mean 1."""
 
     def loss(x, key):
         return (x - 1 - 0.5 * jax.random.normal(key)) ** 2
@@ -340,11 +348,11 @@ def test_the_least_of_an_expectation():
     found = jc.tune(loss, jnp.asarray(0.0), steps=150, **options)
     assert abs(found.params - 1) < 4 * 0.5 / 64**0.5
     assert 0.15 < found.loss < 0.4
-    assert found.loss > found.history.min()  # a lucky draw is not taken for the best
+    assert found.loss > found.history.min()  # a lucky draw is not the result
 
 
 def test_a_start_that_is_the_best_is_what_comes_back():
-    """Steps by single draws lead away from the least of an expectation."""
+    """Steps with few samples lead away from the minimum of the expectation at the start."""
 
     def loss(x, key):
         return x**2 + 3 * x * jax.random.normal(key)
@@ -355,7 +363,7 @@ def test_a_start_that_is_the_best_is_what_comes_back():
 
 
 def test_samples_without_a_number_are_left_out_and_counted():
-    """Their gradient, too; but no search goes where more of them fail, however low the rest."""
+    """NaN samples, and their gradients, are left out; a step may not increase their number."""
 
     def loss(x, key):
         chance = jax.random.uniform(key)
@@ -371,7 +379,7 @@ def test_samples_without_a_number_are_left_out_and_counted():
 
 
 def test_forward_mode_takes_the_same_way_and_goes_through_loops():
-    """A loop whose length is found on the way has no reverse mode."""
+    """A while loop has no reverse mode."""
 
     def looped(p):
         def more(known):
@@ -429,7 +437,7 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(options, tmp_path,
         part = jc.tune(loss, start, checkpoint=file, **options)
     assert part.steps == 20
     assert "interrupted" in part.stopped
-    assert part.loss <= part.history[0]  # the best so far came back
+    assert part.loss <= part.history[0]  # the best point so far is returned
     again = jc.tune(loss, start, checkpoint=file, **options)
     assert again.steps == 45
     np.testing.assert_array_equal(again.params, whole.params)
@@ -439,7 +447,7 @@ def test_interrupted_and_resumed_is_the_same_as_uninterrupted(options, tmp_path,
 
 
 def test_a_search_that_goes_on_is_judged_where_it_would_have_been(tmp_path, monkeypatch):
-    """At the same ends of chunks, whatever number of steps it was asked for before."""
+    """Chunks end at the same steps, whatever number of steps an earlier call requested."""
     from jaxcon.learning import tuning
 
     options = {"samples": 2, "key": jax.random.key(2), "optimizer": optax.adam(0.1), "chunk": 10}
@@ -490,7 +498,7 @@ def test_a_traced_search_is_refused():
 
 
 def damaged_header(file):
-    """A compression that nobody knows."""
+    """Writes a file with an unknown compression method."""
     np.savez(file, about=np.array("{}"))
     written = bytearray(file.read_bytes())
     written[written.rindex(b"PK\x01\x02") + 10] = 99
@@ -543,7 +551,7 @@ def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_search(tmp_pa
             {"restarts": 2, "spread": np.nan, "key": jax.random.key(0)},
             "spread must be zero or more",
         ),
-        (  # which would otherwise be one for each start
+        (  # without an error, it would be one spread for each start
             {"restarts": 2, "spread": np.ones(2), "key": jax.random.key(0)},
             r"broadcasts to the shape \(\) of 'b/c', got \(2,\)",
         ),
@@ -559,7 +567,7 @@ def test_what_makes_no_sense_is_refused_in_words(options, what):
 
 
 def test_an_optimizer_that_loses_its_way_is_named():
-    """After three steps its own are not finite, while loss and gradient are."""
+    """After three steps the optimizer's step is NaN, although loss and gradient are finite."""
     lost = optax.scale_by_schedule(lambda count: jnp.where(count < 3, -0.1, jnp.nan))
     found = jc.tune(lambda x: (x - 1.0) ** 2, 0.0, optimizer=lost, steps=20)
     assert found.stopped.startswith("the optimizer's step from the last point is not finite")
@@ -594,7 +602,7 @@ def test_a_loss_must_be_a_scalar_and_parameters_numbers():
     for whole in (3, np.int64(3), np.array([3])):
         with pytest.raises(ValueError, match="'stiffness' is a whole number.*write it as a float"):
             jc.tune(lambda p: p["stiffness"], {"stiffness": whole, "damping": 0.1})
-    for other in ("rod", "float32", jnp.sum):  # the second is the name of a dtype
+    for other in ("rod", "float32", jnp.sum):  # also the name of a dtype
         with pytest.raises(ValueError, match="'name' is .* and no number; leave it out"):
             jc.tune(lambda p: p["x"], {"x": 1.0, "name": other})
     with pytest.raises(ValueError, match="must be finite"):
@@ -604,8 +612,8 @@ def test_a_loss_must_be_a_scalar_and_parameters_numbers():
 def pendulum(dtype=None):
     scene = jc.Scene(dim=2, dtype=dtype)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.3))
-    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))  # off by 4 cm
-    scene.add(jc.ExternalWrench("push", "bob"))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))  # 4 cm too short
+    scene.add(jc.forces.ExternalWrench("push", "bob"))
     return scene.build()
 
 
@@ -628,22 +636,22 @@ def test_gains_of_a_method_are_leaves_like_others(dtype):
 
 
 def test_a_tuned_method_runs_under_jit():
-    """Its gains are arrays then, which checks of their values must not take for traced ones."""
+    """Tuned gains are arrays, which checks under jit must not take for traced values."""
     system, state = pendulum()
 
     def loss(method):
         start = jc.init(system, method, state.q, state.v)
         run = jc.rollout(system, method, start, None, 1e-2, 10, record=lambda s, i: i.violation)
-        return jc.losses.violation(run[1], 1e-2)
+        return jc.learning.losses.violation(run[1], 1e-2)
 
-    method = jc.Method(stabilizer=jc.PID(25.0, 10.0, 1.0))
+    method = jc.Method(stabilizer=jc.stabilizers.PID(25.0, 10.0, 1.0))
     found = jc.tune(loss, method, steps=np.int64(2), positive="stabilizer")
     assert isinstance(found.params.stabilizer.integral, jax.Array)
     np.testing.assert_allclose(jax.jit(lambda: loss(found.params))(), found.loss)
 
 
 def test_numbers_of_a_system_a_start_and_controls_together():
-    """A length, the first velocity and forces over time bring a bob to a place."""
+    """A length, the initial velocity and the forces over time bring a bob to a target."""
     system, state = pendulum()
     goal = jnp.array([0.6, -1.5])
 
@@ -662,19 +670,19 @@ def test_numbers_of_a_system_a_start_and_controls_together():
 
 
 def test_the_stiffness_of_a_constraint_that_is_least_in_expectation():
-    """argmin E[L_task + α L_constraint(k)] is one call; starts are drawn with each key."""
+    """One call finds argmin E[L_task + α L_constraint(k)]; each key draws another start."""
     system, state = pendulum()
 
     def loss(k, key):
-        method = jc.Method(stabilizer=jc.Penalty(k, 1.0))
+        method = jc.Method(stabilizer=jc.stabilizers.Penalty(k, 1.0))
         start = dataclasses.replace(state, v=0.3 * jax.random.normal(key, (2,)))
         final, (q, off) = jc.rollout(
             system, method, start, None, 1e-2, 20, record=lambda s, i: (s.q, i.violation)
         )
-        task = jc.losses.tracking(q, np.tile([1.0, 0.0], (20, 1)))
-        terms = {"task": task, "constraint": jc.losses.violation(off, 1e-2)}
-        value, terms = jc.losses.weighted(terms, {"task": 1.0, "constraint": 0.3})
-        return jc.losses.unless_failed(value, final), terms
+        task = jc.learning.losses.tracking(q, np.tile([1.0, 0.0], (20, 1)))
+        terms = {"task": task, "constraint": jc.learning.losses.violation(off, 1e-2)}
+        value, terms = jc.learning.losses.weighted(terms, {"task": 1.0, "constraint": 0.3})
+        return jc.learning.losses.unless_failed(value, final), terms
 
     options = {"samples": 8, "key": jax.random.key(0), "optimizer": optax.adam(0.2)}
     found = jc.tune(loss, jnp.asarray(10.0), positive=True, steps=40, **options)
@@ -687,11 +695,11 @@ def test_the_stiffness_of_a_constraint_that_is_least_in_expectation():
 
 
 KEY = jax.random.key(9)
-"""The key of draws that no search has seen."""
+"""A key for samples that no search has used."""
 
 
 def test_samples_that_fail_at_first_do_not_end_a_search():
-    """Every step has fresh keys: those of the first fail, and yet all steps are taken."""
+    """Every step has new keys: samples of the first one fail, yet all steps are made."""
 
     def loss(x, key):
         fails = jax.random.uniform(key) < 0.4

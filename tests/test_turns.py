@@ -1,4 +1,4 @@
-"""Joints that turn far in a step, and how many whole turns they have made."""
+"""Joints that turn far within a step, and the count of their whole turns."""
 
 import dataclasses
 
@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.model.turning import continued, cos_sin, reduced
+from jaxcon.system.turning import continued, cos_sin, reduced
 
 RIGHT = np.pi / 2
 METHODS = {
     "euler": jc.Method(),
     "rk4": jc.Method(integrator=jc.RK4()),
-    "events": jc.Method(events=jc.Events()),
-    "seidel": jc.Method(bounded=jc.GaussSeidel()),
+    "events": jc.Method(events=jc.integrators.Events()),
+    "seidel": jc.Method(contact_solver=jc.solvers.GaussSeidel()),
 }
 both = pytest.mark.parametrize("dim", [2, 3])
 dtypes = pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 
 
 def rod(dim, dtype, lower=0.0, upper=RIGHT, **stop):
-    """A rod of 0.12 m, 0.08 kg on a hinge with damping and a strong servo, maybe with stops."""
+    """A rod of 0.12 m and 0.08 kg on a hinge with damping, a strong servo and, if given, stops."""
     length, mass = 0.12, 0.08
     scene = jc.Scene(dim=dim, gravity=(0, -9.81) if dim == 2 else (0, 0, -9.81), dtype=dtype)
     inertia = mass * length**2 / 12
@@ -33,13 +33,13 @@ def rod(dim, dtype, lower=0.0, upper=RIGHT, **stop):
     scene.add(jc.Revolute("hinge", jc.WORLD, "rod", point=(0.0,) * dim, axis=axis))
     if upper is not None:
         scene.add(jc.Limit("range", "hinge", lower, upper, **stop))
-    scene.add(jc.JointDamper("damper", "hinge", 0.02))
-    scene.add(jc.PositionServo("servo", "hinge", 100.0))
+    scene.add(jc.forces.JointDamper("damper", "hinge", 0.02))
+    scene.add(jc.forces.PositionServo("servo", "hinge", 100.0))
     return scene.build()
 
 
 def moved(system, method, state, target, steps=1000, dt=2e-3):
-    """The angles after each step, λ of the stop where there is one, and the final state."""
+    """Returns the angles and the multipliers of the stop of each step, and the final state."""
     start = jc.init(system, method, state.q, state.v)
     controls = jnp.full((steps, 1), target, state.q.dtype)
 
@@ -55,7 +55,10 @@ def moved(system, method, state, target, steps=1000, dt=2e-3):
 @pytest.mark.parametrize("name", METHODS)
 @pytest.mark.parametrize(("target", "stop"), [(12.2, RIGHT), (-12.2, 0.0)])
 def test_a_servo_rests_at_the_stop_that_one_step_would_pass(name, dim, dtype, target, stop):
-    """Without it the first step would be two turns; the stop bears what the servo pushes."""
+    """Without the stop the first step would make two turns.
+
+    The stop balances the servo and the weight.
+    """
     if name in ("events", "seidel") and dtype == jnp.float64:
         pytest.skip("as in float32")
     system, state = rod(dim, dtype)
@@ -70,7 +73,10 @@ def test_a_servo_rests_at_the_stop_that_one_step_would_pass(name, dim, dtype, ta
 
 @pytest.mark.parametrize("kind", ["hard", "bouncing", "soft"])
 def test_one_step_ends_at_the_far_stop(kind):
-    """From anywhere in the range, 2 mrad off at most for how the arm turns within the step."""
+    """From anywhere in the range a step ends within 2 mrad of the stop.
+
+    The remainder is the rotation of the arm within the step.
+    """
     choice = {"bouncing": {"restitution": 0.5}, "soft": {"stiffness": 1e9, "damping": 1e5}}
     for start in (0.0, 0.5, 1.5):
         system, state = rod(2, jnp.float64, -start, RIGHT - start, **choice.get(kind, {}))
@@ -82,7 +88,7 @@ def test_one_step_ends_at_the_far_stop(kind):
 
 
 def test_the_gradient_of_a_step_to_the_far_stop():
-    """Where it ends depends on the stop and on nothing else, in both modes."""
+    """In both modes the final angle depends on the stop alone, not on the torque."""
     system, state = rod(2, jnp.float64)
 
     def end(upper, torque):
@@ -115,7 +121,7 @@ def _last(system, state, target):
 
 
 def test_turning_further_than_can_be_told_is_a_status():
-    """The rod without stops: two turns in the first step, of which a joint in space sees none."""
+    """Without stops the rod turns twice in the first step, which a joint in space cannot see."""
     system, state = rod(3, jnp.float64, upper=None)
     start = jc.init(system, jc.Method(), state.q, state.v)
     end, info = jc.step(system, jc.Method(), start, jnp.asarray([12.2]), 2e-3)
@@ -132,14 +138,14 @@ def spinning(speed, dtype):
     spin = (0, 0, speed)
     scene.add_body("wheel", mass=1.0, inertia=(0.4, 0.5, 0.7), angular_velocity=spin)
     scene.add(jc.Revolute("hub", jc.WORLD, "wheel", point=(0, 0, 0), axis=(0, 0, 1)))
-    scene.add(jc.TurnCounter("count", "hub"))
+    scene.add(jc.joints.TurnCounter("count", "hub"))
     return scene.build()
 
 
 @dtypes
 @pytest.mark.parametrize("turn", [0.4, 2.0, 3.6, -10.0, 50.0])
 def test_turns_are_counted_at_any_speed(turn, dtype):
-    """An angle of many half turns a step is told by the velocity."""
+    """The velocity tells how many half turns a joint makes within a step."""
     system, state = spinning(turn / 2e-3, dtype)
     start = jc.init(system, jc.Method(), state.q, state.v)
     end, _ = jc.rollout(system, jc.Method(), start, None, 2e-3, 50)
@@ -151,13 +157,15 @@ def test_turns_are_counted_at_any_speed(turn, dtype):
     "method",
     [
         jc.Method(integrator=jc.RK4()),
-        jc.Method(integrator=jc.RATTLE(), stabilizer=jc.Unstabilized()),
-        jc.Method(integrator=jc.GeneralizedAlpha(), stabilizer=jc.Unstabilized()),
+        jc.Method(integrator=jc.integrators.RATTLE(), stabilizer=jc.stabilizers.Unstabilized()),
+        jc.Method(
+            integrator=jc.integrators.GeneralizedAlpha(), stabilizer=jc.stabilizers.Unstabilized()
+        ),
     ],
     ids=["rk4", "rattle", "alpha"],
 )
 def test_stages_tell_less_than_half_a_turn(method):
-    """Angles are read within the step there."""
+    """Methods with stages read angles within a step, which limits them to half a turn a step."""
     for turn, status in ((1.0, jc.Status.OK), (3.6, jc.Status.LOST_TURNS)):
         system, state = spinning(turn / 2e-3, jnp.float64)
         start = jc.init(system, method, state.q, state.v)
@@ -166,7 +174,7 @@ def test_stages_tell_less_than_half_a_turn(method):
 
 
 def rolled(system, method, state, steps, seen):
-    """The state after steps of a millisecond, which must be OK, and what is seen on the way."""
+    """Rolls out with steps of 1 ms, checks the status, and returns final state and record."""
     end, path = jc.rollout(system, method, state, None, 1e-3, steps, record=seen)
     assert int(end.status) == jc.Status.OK
     return end, path
@@ -176,7 +184,9 @@ FLAT = {
     "euler": jc.Method(),
     "projection": jc.Method(stabilizer=jc.Projection()),
     "rk4": jc.Method(integrator=jc.RK4()),
-    "rattle": jc.Method(integrator=jc.RATTLE(), stabilizer=jc.Unstabilized()),
+    "rattle": jc.Method(
+        integrator=jc.integrators.RATTLE(), stabilizer=jc.stabilizers.Unstabilized()
+    ),
 }
 TURNED = float(np.float32(200 * np.pi))
 
@@ -204,18 +214,21 @@ def four_bar(dtype, *elements):
 
 @pytest.mark.parametrize("name", FLAT)
 def test_a_linkage_turned_a_hundred_times_holds_as_one_that_is_not(name):
-    """φ in float32, where angles as users see them are multiples of 6e-5."""
+    """Checks φ in float32, where the continuous angles are multiples of 6e-5."""
     system, state = four_bar(jnp.float32)
     start = jc.init(system, FLAT[name], state.q.at[6:].add(TURNED), state.v)
     end, worst = rolled(system, FLAT[name], start, 1000, lambda s, info: info.violation.worst)
     assert float(worst[500:].max()) < 3e-6
     assert float(jc.violation(system, end).worst) < 3e-6
-    assert float(np.abs(end.q[6:] - TURNED).max()) < 5  # users see angles that go on
+    assert float(np.abs(end.q[6:] - TURNED).max()) < 5  # users see continuous angles
 
 
 def test_readers_see_angles_that_go_on():
-    """Joint coordinates, servos and q itself, beside the linkage unturned."""
-    servo = jc.PositionServo("servo", "pin0", 0.3)
+    """Joint coordinates, servos and q are continuous.
+
+    The result matches the linkage without turns.
+    """
+    servo = jc.forces.PositionServo("servo", "pin0", 0.3)
     system, state = four_bar(jnp.float32, servo)
     ends = []
     for shift in (0.0, TURNED):
@@ -236,7 +249,7 @@ def test_readers_see_angles_that_go_on():
 
 
 def test_the_derivative_of_the_reduction_is_one():
-    """By the angle at the start, in both modes and in a batch, beside the linkage unturned."""
+    """Derivatives by the initial angle, in both modes and in a batch, equal those without turns."""
     system, state = four_bar(jnp.float32)
 
     def end(angle, shift):
@@ -253,7 +266,7 @@ def test_the_derivative_of_the_reduction_is_one():
 
 
 def test_states_without_a_remainder_of_angles_step():
-    """States made by hand and saved before keep their structure."""
+    """States without remainders, made by hand or saved earlier, keep their structure."""
     system, state = four_bar(jnp.float32)
     bare = jc.State(state.q.at[6:].add(TURNED), state.v, state.time, state.status)
     end, _ = jc.step(system, jc.Method(), bare, None, 1e-3)
@@ -274,7 +287,7 @@ def test_a_replaced_angle_forgets_its_remainder():
 
 @pytest.mark.parametrize("turns", [0, 1, -3, 100, -5000, 60000])
 def test_reduction_and_return_are_exact_to_rounding(turns):
-    """r of θ + ε, and θ⁺ + ε⁺ of r⁺, by float64."""
+    """Compares the reduced angle, and the angle after a step plus its remainder, with float64."""
     exact = 2 * np.pi * turns + np.float64(np.float32([0.1, -3.1, 3.0, 1e-7]))
     angle = np.float32(exact)
     remainder = np.float32(exact - angle)
@@ -291,7 +304,7 @@ def test_reduction_and_return_are_exact_to_rounding(turns):
 
 
 def pendulum(*elements, links=2):
-    """Links of a pendulum that swings in the plane, in float32."""
+    """A pendulum of several links in the plane, in float32."""
     scene = jc.Scene(dim=2, gravity=(0.0, -9.81), dtype=jnp.float32)
     for i in range(links):
         scene.add_body(f"link{i}", mass=1.0, inertia=0.1, position=(i + 0.5, 0.0))
@@ -303,7 +316,10 @@ def pendulum(*elements, links=2):
 
 
 def turned_by(system, state, turns):
-    """The state after whole turns of all bodies, with what rounding takes of their angles."""
+    """Returns the state after whole turns of all bodies.
+
+    Rounding errors go to `angle_remainder`.
+    """
     angles = system.layout.angles
     exact = np.float64(state.q[angles]) + 2 * np.pi * turns
     rounded = np.float32(exact)
@@ -335,7 +351,10 @@ def test_a_double_pendulum_turned_ten_thousand_times_moves_as_one_that_is_not():
 
 
 def test_rattle_keeps_the_energy_of_a_linkage_that_turns():
-    """Over 1e5 steps from 0 and from 200 π; momenta solved as wholes would drift by 3e-3."""
+    """Energies are compared over 1e5 steps from 0 and from 200 π.
+
+    Solving for momenta instead of their increments would drift by 3e-3.
+    """
     system, state = four_bar(jnp.float32)
     method = FLAT["rattle"]
     crank = jnp.asarray([-2.4, 1.8, 12.0], jnp.float32)  # about its pin at the origin
@@ -355,8 +374,8 @@ def test_rattle_keeps_the_energy_of_a_linkage_that_turns():
 
 
 def test_a_drive_in_the_plane_is_smooth_after_a_day():
-    """At 1e5 s its target is 2e5 rad, a multiple of 0.016 in float32."""
-    drive = jc.Drive("drive", "pin0", lambda t, speed: speed * t, params=jnp.float32(2.0))
+    """At 1e5 s the target is 2e5 rad; float32 resolves it to 0.016 only."""
+    drive = jc.joints.Drive("drive", "pin0", lambda t, speed: speed * t, params=jnp.float32(2.0))
     system, state = pendulum(drive, links=1)
     late, target = 1e5, 2e5
     turns = round(target / (2 * np.pi))
@@ -378,7 +397,7 @@ def test_gears_mesh_after_many_turns(ratio):
     for i in range(2):
         scene.add_body(f"gear{i}", mass=1.0, inertia=0.1, position=(float(i), 0.0))
         scene.add(jc.Revolute(f"pin{i}", jc.WORLD, f"gear{i}", point=(float(i), 0.0)))
-    scene.add(jc.Gear("mesh", "pin0", "pin1", ratio=ratio))
+    scene.add(jc.joints.Gear("mesh", "pin0", "pin1", ratio=ratio))
     system, state = scene.build()
     exact = np.float64(np.float32(ratio)) * 2 * np.pi * 3000
     angles = np.array([2 * np.pi * 3000, exact])
@@ -397,7 +416,7 @@ def test_gears_mesh_after_many_turns(ratio):
 @pytest.mark.parametrize("most", [1.0, np.pi, 1e3, 1e5])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_cosines_and_sines_are_right_to_the_last_place(dtype, most):
-    """A float32 between 0.5 and 1 is a multiple of 6e-8."""
+    """Errors are below one unit of rounding: 6e-8 for a float32 between 0.5 and 1."""
     places = np.linspace(-most, most, 100_001).astype(dtype)
     angle = jnp.asarray(places)
     (cos, sin), rates = jax.jvp(jax.jit(cos_sin), (angle,), (jnp.ones_like(angle),))
@@ -408,26 +427,26 @@ def test_cosines_and_sines_are_right_to_the_last_place(dtype, most):
 
 
 def _circle(angle):
-    """cos, sin, and their derivatives."""
+    """Returns cos, sin, and their derivatives."""
     return np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
 
 
 def test_cosines_of_what_is_not_finite_are_not_numbers():
-    """As NumPy has it."""
+    """cos and sin of NaN and infinities are NaN, as in NumPy."""
     found = cos_sin(jnp.asarray([np.nan, np.inf, -np.inf], np.float32))
     assert np.isnan(found).all()
 
 
 def test_users_functions_see_continuous_angles():
-    """A torque of one's own that is the angle, after a hundred turns."""
+    """A custom torque equals the angle after a hundred turns."""
 
     def torque(motion, t, control, params):
         return jnp.stack([*jnp.zeros_like(motion.position), motion.orientation])
 
-    system, state = pendulum(jc.CustomForce("spring", ("link0",), torque), links=1)
-    method = jc.Method(stabilizer=jc.Unstabilized())
+    system, state = pendulum(jc.forces.CustomForce("spring", ("link0",), torque), links=1)
+    method = jc.Method(stabilizer=jc.stabilizers.Unstabilized())
     start = turned_by(system, jc.init(system, method, state.q, state.v), 100)
-    inertia = 0.1 + 0.25  # about the pin
+    inertia = 0.1 + 0.25  # moment of inertia about the pin
     expected = (TURNED - 9.81 / 2) / inertia
     a, _, _ = jc.forward_dynamics(system, start, None, method, 1e-3)
     np.testing.assert_allclose(a[2], expected, rtol=1e-5)

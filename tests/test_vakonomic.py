@@ -1,4 +1,4 @@
-"""The variational equations: what they conserve, when they are the physical ones, and errors."""
+"""Variational (vakonomic) equations: conserved quantities, relation to physics, and errors."""
 
 import dataclasses
 
@@ -10,15 +10,15 @@ import pytest
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 
-IDEAL = jc.Method(integrator=jc.RK4(), stabilizer=jc.Unstabilized())
+IDEAL = jc.Method(integrator=jc.RK4(), stabilizer=jc.stabilizers.Unstabilized())
 RATE, PULL, MASS, MOMENT = 1.5, 4.905, 1.3, 0.1
 
 
 def skate():
-    """On an incline, x downhill, spinning, at rest, its edge along x."""
+    """A skate on an incline with x downhill, spinning, its edge along x."""
     scene = jc.Scene(dim=2, gravity=(PULL, 0.0))
     scene.add_body("skate", mass=MASS, inertia=MOMENT, angular_velocity=RATE)
-    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
     return scene.build()
 
 
@@ -27,8 +27,8 @@ def run(system, state, dt=1e-3, steps=500, every=100):
 
 
 def test_skate_keeps_energy_and_momentum_of_the_augmented_lagrangian():
-    """With μ of ψ = −ẋ sin θ + ẏ cos θ: m ẋ − μ sin θ − m g t and m ẏ + μ cos θ."""
-    system, state = jc.vakonomic(*skate(), {"blade": -0.1})
+    """Conserves m ẋ − μ sin θ − m g t and m ẏ + μ cos θ, with μ of ψ = −ẋ sin θ + ẏ cos θ."""
+    system, state = jc.systems.vakonomic(*skate(), {"blade": -0.1})
     path = run(system, state)
     angle, v = path.q[:, 2], path.v.T
     μ = v[3]
@@ -44,20 +44,23 @@ def test_skate_keeps_energy_and_momentum_of_the_augmented_lagrangian():
 
 
 def suslov(body, t, axis):
-    """a·ω = 0 with a fixed in the body."""
+    """Returns ψ = a·ω with the axis a fixed in the body."""
     return (axis @ body.angular_velocity)[None]
 
 
 def test_momentum_of_a_body_with_a_forbidden_spin_is_constant_in_space():
-    """Suslov's problem by variation: R (I ω + μ a) stays, as L + μ·ψ does under turns."""
+    """In the variational Suslov problem R (I ω + μ a) is constant.
+
+    The reason is that rotations leave L + μ·ψ unchanged.
+    """
     moments, axis = np.array([1.0, 1.4, 2.1]), np.array([0.3, -0.5, 0.8])
     spin = np.cross(axis, [1.0, 2.0, 0.5])
     scene = jc.Scene(gravity=(0.0, 0.0, 0.0))
     scene.add_body(
         "body", mass=1.0, inertia=moments, quaternion=(0.8, 0.1, -0.5, 0.3), angular_velocity=spin
     )
-    scene.add(jc.VelocityLevel(suslov, ("body",), name="spin", params=axis))
-    system, state = jc.vakonomic(*scene.build(), {"spin": 0.7})
+    scene.add(jc.joints.VelocityLevel(suslov, ("body",), name="spin", params=axis))
+    system, state = jc.systems.vakonomic(*scene.build(), {"spin": 0.7})
 
     def momentum(s):
         own = moments * s.v[3:6] + system.multipliers(s, "spin") * axis
@@ -73,15 +76,15 @@ def test_momentum_of_a_body_with_a_forbidden_spin_is_constant_in_space():
     ("integrator", "change"), [(jc.RK4(), 1e-8), (jc.SemiImplicitEuler(), 0.15)], ids=["RK4", "SIE"]
 )
 def test_a_body_on_a_point_with_a_forbidden_spin_is_projected(integrator, change):
-    """It stays on its point to rounding; energy is that of the order of the method [J]."""
+    """The point stays to rounding; the energy error [J] has the order of the method."""
     axis, place = np.array([0.3, -0.5, 0.8]), np.array([0.1, 0.0, 0.0])
     spin = np.cross(axis, [10.0, 20.0, 5.0])
     moving = {"velocity": np.cross(spin, place), "angular_velocity": spin, "position": place}
     scene = jc.Scene()
     scene.add_body("body", mass=1.0, inertia=(0.01, 0.014, 0.021), **moving)
     scene.add(jc.Spherical("point", jc.WORLD, "body", point=(0.0, 0.0, 0.0)))
-    scene.add(jc.VelocityLevel(suslov, ("body",), name="spin", params=axis))
-    system, state = jc.vakonomic(*scene.build(), {"spin": 0.05})
+    scene.add(jc.joints.VelocityLevel(suslov, ("body",), name="spin", params=axis))
+    system, state = jc.systems.vakonomic(*scene.build(), {"spin": 0.05})
     method = jc.Method(integrator, jc.Projection())
 
     def seen(state, info):
@@ -98,19 +101,19 @@ def test_a_body_on_a_point_with_a_forbidden_spin_is_projected(integrator, change
 
 
 def test_rolling_in_space_keeps_energy_and_the_momenta_of_its_symmetries():
-    """A disc on a level plane: L + μ·ψ does not change when the plane is shifted."""
+    """A disc on a level plane: translations in the plane leave L + μ·ψ unchanged."""
     scene = jc.Scene()
     scene.add_body("disc", mass=2.0, inertia=(0.2, 0.3, 0.2), angular_velocity=(0.3, 4.0, 0.8))
     axis = (0.0, 1.0, 0.2)
-    scene.add(jc.RollingDisc("roll", jc.WORLD, "disc", radius=0.5, axis=axis))
+    scene.add(jc.joints.RollingDisc("roll", jc.WORLD, "disc", radius=0.5, axis=axis))
     system, state = scene.build()
     rows = linearize(system, state.q, state.v, state.time)
     slip = np.linalg.pinv(np.asarray(rows.jacobian.dense())) @ np.asarray(rows.rate)
     state = dataclasses.replace(state, v=state.v - slip)
-    system, state = jc.vakonomic(system, state, {"roll": np.array([0.4, -0.2])})
+    system, state = jc.systems.vakonomic(system, state, {"roll": np.array([0.4, -0.2])})
 
     def kept(s):
-        """Energy, ∂(L + μ·ψ)/∂ẋ and ∂/∂ẏ."""
+        """Returns the energy, ∂(L + μ·ψ)/∂ẋ and ∂(L + μ·ψ)/∂ẏ."""
         rows = linearize(system.system, s.q, s.v[:6], s.time)
         μ = jnp.zeros(3).at[system.free].set(system.multipliers(s, "roll"))
         shift = 2.0 * s.v[:6] + rows.jacobian.transpose(μ)
@@ -135,10 +138,10 @@ def swinging(constraint):
 
 
 def test_integrable_rows_move_as_the_physical_ones_whatever_the_multiplier():
-    system, state = swinging(jc.VelocityLevel(radius_rate, name="row"))
+    system, state = swinging(jc.joints.VelocityLevel(radius_rate, name="row"))
     physical = run(system, state).q
     for μ in (0.0, 3.0):
-        path = run(*jc.vakonomic(system, state, {"row": μ}))
+        path = run(*jc.systems.vakonomic(system, state, {"row": μ}))
         np.testing.assert_allclose(path.q, physical, atol=1e-9)
 
 
@@ -151,17 +154,17 @@ def contact(q, v, t, p):
 
 
 def test_stationary_action_of_a_full_mass_matrix_by_euler_lagrange():
-    """d/dt ∂L*/∂q̇ = ∂L*/∂q with L* = ½ q̇ᵀMq̇ + μ ψ, all derivatives automatic."""
+    """d/dt ∂L*/∂q̇ = ∂L*/∂q with L* = ½ q̇ᵀMq̇ + μ ψ, by automatic differentiation."""
     p = {"slope": jnp.asarray(0.8)}
     system = jc.GeneralizedSystem(
         mass=full_mass,
         force=lambda q, v, t, u, p: jnp.zeros_like(q),
-        constraints=(jc.VelocityLevel(contact, name="row"),),
+        constraints=(jc.joints.VelocityLevel(contact, name="row"),),
         params=p,
     )
     q, v, μ = jnp.asarray([0.3, 0.5, 0.1]), jnp.asarray([1.0, -0.4, 0.4]), jnp.asarray([0.6])
     state = jc.init(system, IDEAL, q, v)
-    system, state = jc.vakonomic(system, state, {"row": μ})
+    system, state = jc.systems.vakonomic(system, state, {"row": μ})
     rates = jc.forward_dynamics(system, state, None, IDEAL, 1e-3).acceleration
     a, μ̇ = rates[:3], rates[3:]
 
@@ -176,7 +179,7 @@ def test_stationary_action_of_a_full_mass_matrix_by_euler_lagrange():
 
 
 def test_batches_and_gradients():
-    system, state = jc.vakonomic(*skate(), {"blade": 0.2})
+    system, state = jc.systems.vakonomic(*skate(), {"blade": 0.2})
 
     def end(μ, mass):
         start = jc.State(state.q, state.v.at[3].set(μ), state.time, state.status)
@@ -197,8 +200,8 @@ def test_batches_and_gradients():
 def test_float32_has_no_float64():
     scene = jc.Scene(dim=2, dtype=jnp.float32)
     scene.add_body("skate", mass=1.0, inertia=0.1, angular_velocity=1.5)
-    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
-    system, state = jc.vakonomic(*scene.build(), {"blade": 0.1})
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    system, state = jc.systems.vakonomic(*scene.build(), {"blade": 0.1})
     dt = jnp.asarray(1e-3, jnp.float32)
     text = str(jax.make_jaxpr(lambda s: jc.step(system, IDEAL, s, None, dt))(state))
     assert "f64" not in text
@@ -206,27 +209,29 @@ def test_float32_has_no_float64():
 
 def test_readers_and_errors():
     system, state = skate()
-    wide, start = jc.vakonomic(system, state, {"blade": 0.2})
+    wide, start = jc.systems.vakonomic(system, state, {"blade": 0.2})
     np.testing.assert_array_equal(wide.multipliers(start, "blade"), [0.2])
     np.testing.assert_array_equal(wide.physical(start).v, state.v)
     np.testing.assert_array_equal(jc.position(wide, start, "skate"), [0.0, 0.0])
     with pytest.raises(ValueError, match="'blad' is unknown"):
-        jc.vakonomic(system, state, {"blad": 0.2})
+        jc.systems.vakonomic(system, state, {"blad": 0.2})
     with pytest.raises(ValueError, match="'blade'.*\\(1,\\).*\\(2,\\)"):
-        jc.vakonomic(system, state, {"blade": np.ones(2)})
+        jc.systems.vakonomic(system, state, {"blade": np.ones(2)})
     with pytest.raises(ValueError, match=r"state.v must have shape \(4,\), got \(3,\)"):
         jc.step(wide, IDEAL, state, None, 1e-3)
     scene = jc.Scene(dim=2)
     scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
     scene.add(jc.Distance("rod", jc.WORLD, "bob"))
     with pytest.raises(ValueError, match="'rod' has a φ in each of its rows"):
-        jc.vakonomic(*scene.build(), {"rod": 0.2})
+        jc.systems.vakonomic(*scene.build(), {"rod": 0.2})
 
 
 def test_bounded_rows_have_no_variational_form():
     scene = jc.Scene(dim=2)
     scene.add_particle("bead", mass=1.0)
-    scene.add(jc.Rope("leash", jc.WORLD, "bead", length=1.0, point_a=(0.5, 0.0)))
+    scene.add(jc.contacts.Rope("leash", jc.WORLD, "bead", length=1.0, point_a=(0.5, 0.0)))
     system, state = scene.build()
-    with pytest.raises(ValueError, match=r"no variational form of the bounded rows of \['leash'\]"):
-        jc.vakonomic(system, state)
+    with pytest.raises(
+        ValueError, match=r"no variational form of the inequality rows of \['leash'\]"
+    ):
+        jc.systems.vakonomic(system, state)

@@ -1,4 +1,4 @@
-"""The script that tries the versions of Python and JAX: what it decides before it runs anything."""
+"""Decisions of the script that tests versions of Python and JAX, before it runs anything."""
 
 import os
 import re

@@ -41,7 +41,7 @@ def test_an_animation_moves_the_lines_of_a_drawing_and_its_axes_hold_all_of_them
             np.testing.assert_array_equal(line.get_xydata(), points)
             inside = axes.transAxes.inverted().transform(axes.transData.transform(points))
             assert np.all((inside > 0) & (inside < 1))
-    assert np.ptp(path, axis=0).max() > 0.1  # it did move
+    assert np.ptp(path, axis=0).max() > 0.1  # the scene moves
     animation.save(tmp_path / "motion.gif", writer="pillow")
     with Image.open(tmp_path / "motion.gif") as picture:
         assert picture.n_frames == 3

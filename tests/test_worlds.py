@@ -1,4 +1,4 @@
-"""`where_wanted` evaluates a function in the chosen worlds of a batch and keeps the others."""
+"""`where_wanted` evaluates a function in chosen worlds of a batch and keeps the other values."""
 
 from functools import partial
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.core import worlds
+from jaxcon.staging import worlds
 
 BATCHES = [(), (1,), (5,), (64,), (67, 1), (5, 13)]
 
@@ -36,7 +36,7 @@ def test_worlds_get_what_they_want_and_others_what_is_given(batch, share):
         return worlds.where_wanted(wanted, squares, (x, args[1], y), others)
 
     def expected(x, y):
-        return worlds.keep(wanted, squares((x, args[1], y)), others)
+        return worlds.where_tree(wanted, squares((x, args[1], y)), others)
 
     given = args[0], args[2]
     for a, b in zip(jax.jit(found)(*given), expected(*given), strict=True):
@@ -49,7 +49,7 @@ def test_worlds_get_what_they_want_and_others_what_is_given(batch, share):
 
 
 def test_few_worlds_are_evaluated_for_few():
-    """On one CPU, 64 worlds are evaluated in chunks of 8; chunks that nobody wants are skipped."""
+    """On one CPU, 64 worlds are evaluated in chunks of 8; chunks without a choice are skipped."""
     in_chunks = jax.default_backend() == "cpu" and jax.device_count() == 1
     seen = []
 
@@ -69,7 +69,7 @@ def test_few_worlds_are_evaluated_for_few():
 
 
 def test_landings_of_some_worlds_are_those_of_each_alone():
-    """Final states and reverse derivatives of forty balls that land one after another."""
+    """Compares final states and reverse derivatives of forty balls that land one after another."""
     scene = jc.Scene(dim=3)
     scene.add_body("ball", mass=1.3, inertia=(0.005,) * 3, position=(0.0, 0.0, 0.6))
     scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", friction=0.5, radius=0.1))

@@ -1,6 +1,6 @@
-"""Wrong calls of every public door are refused, with a word for the argument.
+"""Wrong calls of every public function are refused with a message that names the argument.
 
-`python -m benchmarks.wrong_calls` tries them all, ten times as many.
+`python -m benchmarks.wrong_calls` tries all of them, ten times as many.
 """
 
 import random
@@ -18,13 +18,13 @@ from benchmarks.wrong_doors import SPECIAL, Door, Takes, hesitant, motor
 from jaxcon.core import checks
 
 SHARE = 10
-"""One of so many calls is tried here."""
+"""One in `SHARE` calls is tried here."""
 
 LONG_COMPILED = ("tradeoff", "identify", "tune", "gradient_growth")
-"""Doors whose right arguments take long: left to the command."""
+"""Functions that take long with valid arguments: tested by the command only."""
 
 MUJOCO = ("from_mjcf", "MujocoModel", "HalfCheetah")
-"""Doors of models that MuJoCo compiles."""
+"""Functions whose models MuJoCo compiles."""
 
 
 @pytest.mark.parametrize("part", range(8))
@@ -50,7 +50,7 @@ def test_a_wrong_call_is_refused(name):
 
 
 def test_the_counts_tell_what_is_accepted_raw_and_hung():
-    """The fuzzer itself: what does nothing, fails in Python, or does not end, is found."""
+    """Tests the fuzzer itself: it counts calls that pass, fail in Python code, or do not end."""
 
     def forever(_):
         while True:
@@ -95,7 +95,7 @@ def test_what_is_a_real_number_of_the_scene(x):
 
 
 def test_a_step_reads_no_array_of_jax(monkeypatch):
-    """A device may still compute it: its shape and dtype are enough, the status says the rest."""
+    """Arrays may still be computed: shape and dtype suffice, the status reports the rest."""
     system, state = motor()
     read = []
     ask = checks.is_concrete
@@ -108,7 +108,7 @@ def test_a_step_reads_no_array_of_jax(monkeypatch):
 
     method = jc.Method(
         stabilizer=jc.Baumgarte(jnp.ones((), jnp.float32), jnp.ones((), jnp.float32)),
-        solver=jc.Sparse(tikhonov=jnp.asarray(1e-6, jnp.float32)),
+        solver=jc.solvers.Sparse(tikhonov=jnp.asarray(1e-6, jnp.float32)),
     )
     monkeypatch.setattr(checks, "is_concrete", spy)
     control, dt = jnp.zeros(1, jnp.float32), jnp.asarray(1e-3, jnp.float32)
@@ -125,21 +125,42 @@ NO_INTEGRATOR = r"Method: integrator must be a value such as SemiImplicitEuler\(
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: jc.Sparse(tikhonov=-1.0), "Sparse: tikhonov must be zero or more and finite, got"),
-        (lambda: jc.Sparse(tikhonov=jnp.asarray([1.0, -1.0])), "Sparse: tikhonov must be zero or"),
-        (lambda: jc.Sparse(tikhonov=[1.0, 1.0]), r"Sparse: tikhonov must have shape \(\), got"),
-        (lambda: jc.RankSafe(rounds=0), "RankSafe: rounds must be a whole number from 1, got 0"),
-        (lambda: jc.RankSafe(share=np.nan), "RankSafe: share must be zero or more and finite, got"),
+        (
+            lambda: jc.solvers.Sparse(tikhonov=-1.0),
+            "Sparse: tikhonov must be zero or more and finite, got",
+        ),
+        (
+            lambda: jc.solvers.Sparse(tikhonov=jnp.asarray([1.0, -1.0])),
+            "Sparse: tikhonov must be zero or",
+        ),
+        (
+            lambda: jc.solvers.Sparse(tikhonov=[1.0, 1.0]),
+            r"Sparse: tikhonov must have shape \(\), got",
+        ),
+        (
+            lambda: jc.solvers.RankSafe(rounds=0),
+            "RankSafe: rounds must be a whole number from 1, got 0",
+        ),
+        (
+            lambda: jc.solvers.RankSafe(share=np.nan),
+            "RankSafe: share must be zero or more and finite, got",
+        ),
         (lambda: jc.Projection(tolerance="1"), "Projection: tolerance must be a real number, got"),
-        (lambda: jc.PID(integral=None), "PID: integral must be real numbers, got None"),
+        (lambda: jc.stabilizers.PID(integral=None), "PID: integral must be real numbers, got None"),
         (lambda: jc.Baumgarte({"rod": True}, 1.0), "Baumgarte: alpha of 'rod' must be a real numb"),
-        (lambda: jc.GeneralizedAlpha(rho=2.0), "GeneralizedAlpha: rho must lie between 0 and 1"),
+        (
+            lambda: jc.integrators.GeneralizedAlpha(rho=2.0),
+            "GeneralizedAlpha: rho must lie between 0 and 1",
+        ),
         (lambda: jc.Method(jc.RK4), NO_INTEGRATOR + r"jc\.RK4; call it: jc\.RK4\(\)\.$"),
         (
-            lambda: jc.Method(jc.RATTLE),
-            NO_INTEGRATOR + r"jc\.RATTLE; call it: jc\.RATTLE\(\)\.$",
+            lambda: jc.Method(jc.integrators.RATTLE),
+            NO_INTEGRATOR + r"jc\.integrators\.RATTLE; call it: jc\.integrators\.RATTLE\(\)\.$",
         ),
-        (lambda: jc.Method(jc.Events), NO_INTEGRATOR + r"jc\.Events; that is one for events=\.$"),
+        (
+            lambda: jc.Method(jc.integrators.Events),
+            NO_INTEGRATOR + r"jc\.integrators\.Events; that is one for events=\.$",
+        ),
     ],
 )
 def test_a_constructor_refuses_what_it_can_see(make, words):
@@ -149,7 +170,9 @@ def test_a_constructor_refuses_what_it_can_see(make, words):
 
 def test_a_part_is_rebuilt_without_a_check():
     """Trees of gradients, tracers, axes and placeholders have the structure of a method."""
-    method = jc.Method(stabilizer=jc.PID(4.0, 2.0, 1.0), solver=jc.Sparse(tikhonov=1.0))
+    method = jc.Method(
+        stabilizer=jc.stabilizers.PID(4.0, 2.0, 1.0), solver=jc.solvers.Sparse(tikhonov=1.0)
+    )
     slope = jax.grad(lambda m: -m.solver.tikhonov - m.stabilizer.integral)(method)
     assert (float(slope.solver.tikhonov), float(slope.stabilizer.integral)) == (-1.0, -1.0)
     leaves, structure = jax.tree.flatten(method)
@@ -158,8 +181,8 @@ def test_a_part_is_rebuilt_without_a_check():
         tree = jax.tree.unflatten(structure, [placed] * len(leaves))
         assert tree.solver.tikhonov is placed
     rates = jnp.asarray([1.0, 2.0])
-    made = jax.vmap(lambda x: jc.Method(solver=jc.Sparse(tikhonov=x)))(rates)
-    assert made == jc.Method(solver=jc.Sparse(tikhonov=rates))  # one by one, or all at once
+    made = jax.vmap(lambda x: jc.Method(solver=jc.solvers.Sparse(tikhonov=x)))(rates)
+    assert made == jc.Method(solver=jc.solvers.Sparse(tikhonov=rates))  # batched construction
     paths = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(made)]
     assert paths == [".solver.tikhonov"]
 
@@ -167,7 +190,7 @@ def test_a_part_is_rebuilt_without_a_check():
 def test_a_constructor_within_a_step_reads_no_array():
     wrong = jnp.asarray(-1.0)
     with checks.without_waiting():
-        assert jc.Sparse(tikhonov=wrong).tikhonov is wrong
+        assert jc.solvers.Sparse(tikhonov=wrong).tikhonov is wrong
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -181,7 +204,7 @@ def test_quaternions_hand_on_what_is_not_finite(dtype):
 
 
 def wrongly(alpha):
-    """A method whose gains are traced when it is constructed."""
+    """Constructs a method with traced gains."""
     return jax.jit(lambda x: jc.Method(stabilizer=jc.Baumgarte(x, x)))(alpha)
 
 
@@ -213,7 +236,7 @@ def test_degrees_are_warned_of():
         limited(angle=90.0, lower=0.0)
     with pytest.warns(UserWarning, match="Limit 'stop': upper is 45 rad"):
         limited(lower=0.0, upper=45.0)
-    limited(angle=2 * np.pi, lower=-6.28319, upper=np.inf)  # a turn, as models round it
+    limited(angle=2 * np.pi, lower=-6.28319, upper=np.inf)  # a full turn, rounded as in models
 
 
 def test_a_limit_of_travel_is_no_angle():
@@ -228,7 +251,7 @@ def test_a_spiral_counts_its_turns():
     s = np.linspace(0, 6 * np.pi, 60)
     points = (1 + s / 10)[:, None] * np.stack([np.cos(s), np.sin(s)], axis=1)
     scene = jc.Scene(dim=2)
-    jc.rod(scene, "spring", points, 1.0, bending=1.0)
+    jc.chains.rod(scene, "spring", points, 1.0, bending=1.0)
     _, state = scene.build()
     assert np.max(np.asarray(state.q)) > 2 * np.pi
 

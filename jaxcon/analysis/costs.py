@@ -1,4 +1,4 @@
-"""What a step costs in a batch on this device: time, memory, and the time of its gradient."""
+"""Measured costs of a step in a batch on this device: time, memory and time of the gradient."""
 
 from __future__ import annotations
 
@@ -10,33 +10,40 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.stages import Compiled
 
 from jaxcon.analysis.memory import nothing
 from jaxcon.analysis.reference import Reference
 from jaxcon.analysis.trials import Lowered, Points, Problem
 from jaxcon.core.precision import cast, precision
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.step import step_quietly
+from jaxcon.core.typing import Array, DType, PyTree
+from jaxcon.execution.rollout import rollout
+from jaxcon.execution.step import step_quietly
+from jaxcon.methods.method import Method
+from jaxcon.system.state import State
 
 STEPS = 16
-"""The number of steps of the rollouts whose gradients are timed."""
+"""The number of steps of a rollout whose gradient is timed."""
 LONG = 0.03
-"""What one repeat should take [s]; its steps are chosen for that, from `FEW` to `MANY`."""
+"""The intended duration of one timed run [s], from which its number of steps is computed."""
 FEW, MANY = 4, 1000
+"""The least and the largest number of steps of a timed run."""
 REPEATS = 5
+"""The number of timed runs; their median is used."""
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Worlds that start all along the reference, so that no two beside each other are alike.
+    """A batch of worlds that start at different points of the reference motion.
+
+    Neighboring worlds therefore have different states.
 
     Attributes:
-        problem: of one world.
-        points: where they start, with a first axis of worlds.
-        rows: their control inputs, likewise; None without, or where a policy gives them.
-        worlds: how many.
+        problem: the problem of one world.
+        points: initial points, with a leading axis of worlds.
+        rows: control inputs, with a leading axis of worlds. None without control inputs, or with a
+            policy.
+        worlds: number of worlds.
     """
 
     problem: Problem
@@ -46,30 +53,33 @@ class Batch:
 
     @classmethod
     def of(cls, problem: Problem, reference: Reference, worlds: int) -> Batch:
-        """At the starts of the parts that the reference is good for, in turn."""
+        """Returns a batch whose worlds start at the reference's points in turn.
+
+        Only starts of parts in which the reference is good are used.
+        """
         index = np.arange(worlds) % reference.last
         points = jax.tree.map(lambda x: x[index], reference.points)
         return cls(problem, points, jax.tree.map(lambda x: x[index], problem.inputs.rows), worlds)
 
 
 class Pace(Lowered):
-    """The steps of a batch under one method, with h and their number traced."""
+    """The program that steps a batch with one method. h and the number of steps are traced."""
 
-    def __init__(self, batch: Batch, method: Method, dtype: Any) -> None:
+    def __init__(self, batch: Batch, method: Method, dtype: str | DType) -> None:
         self.batch, self.dtype = batch, np.dtype(dtype)
         with precision(dtype):
-            system, own = cast((batch.problem.system, method), dtype)
+            system, method = cast((batch.problem.system, method), dtype)
             policy = batch.problem.inputs.policy
 
-            def many(points: Points, rows: PyTree, h: Array, count: Array) -> Any:
-                def world(point: Points, control: PyTree) -> Any:
-                    state = point.begin(system, own)
+            def many(points: Points, rows: PyTree, h: Array, count: Array) -> State:
+                def world(point: Points, control: PyTree) -> State:
+                    state = point.begin(system, method)
                     control = control if policy is None else policy(state)
 
-                    def one(_: Any, state: Any) -> Any:
-                        return step_quietly(system, own, state, control, h)[0]
+                    def step(_: Array, state: State) -> State:
+                        return step_quietly(system, method, state, control, h)[0]
 
-                    return jax.lax.fori_loop(0, count, one, state)
+                    return jax.lax.fori_loop(0, count, step, state)
 
                 return jax.vmap(world)(points, rows)
 
@@ -78,37 +88,44 @@ class Pace(Lowered):
 
     @property
     def memory(self) -> float:
-        """The memory of the batch by world: its states, the new ones, and what lies between [B]."""
+        """Memory per world of the batch [B]: states before and after a step, and temporaries."""
         return planned(self.program) / self.batch.worlds
 
     def seconds(self, dt: float) -> float:
-        """Returns the time of a step of one world: the median of several runs of the batch [s]."""
+        """Returns the time of a step per world [s], the median of several runs of the batch.
+
+        Args:
+            dt: step size [s].
+        """
         with precision(self.dtype):
 
             def run(count: int) -> Callable[[], Any]:
                 numbers = self.numbers(dt, count)
                 return lambda: self.program(*self.args, *numbers)
 
-            timed(run(FEW))  # the first touches memory that the later ones have
+            timed(run(FEW))  # the first run allocates memory
             count = int(np.clip(FEW * LONG / timed(run(FEW)), FEW, MANY))
             spent = np.median([timed(run(count)) for _ in range(REPEATS)])
         return float(spent) / count / self.batch.worlds
 
 
 class Slope(Lowered):
-    """The gradient of a rollout of `STEPS` steps by its start, in a batch, with h traced."""
+    """The program that differentiates short rollouts of a batch by their initial q and v.
 
-    def __init__(self, batch: Batch, method: Method, dtype: Any) -> None:
+    h is traced.
+    """
+
+    def __init__(self, batch: Batch, method: Method, dtype: str | DType) -> None:
         self.batch, self.dtype = batch, np.dtype(dtype)
         with precision(dtype):
-            system, own = cast((batch.problem.system, method), dtype)
+            system, method = cast((batch.problem.system, method), dtype)
             policy = batch.problem.inputs.policy
 
-            def end(moved: Any, point: Points, control: PyTree, h: Array) -> Array:
-                state = point._replace(q=moved[0], v=moved[1]).begin(system, own)
+            def end(moved: tuple[Array, Array], point: Points, control: PyTree, h: Array) -> Array:
+                state = point._replace(q=moved[0], v=moved[1]).begin(system, method)
                 rows = jax.tree.map(lambda x: jnp.stack([x] * STEPS), control)
-                given = (state, policy or rows, h, STEPS)
-                final, _ = rollout(system, own, *given, record=nothing)
+                controls = policy or rows
+                final, _ = rollout(system, method, state, controls, h, STEPS, record=nothing)
                 return jnp.sum(final.q) + jnp.sum(final.v)
 
             def many(points: Points, rows: PyTree, h: Array) -> Any:
@@ -121,7 +138,11 @@ class Slope(Lowered):
             self.lowered = jax.jit(many).lower(*self.args, jnp.asarray(1e-3, self.dtype))
 
     def seconds(self, dt: float) -> float:
-        """Returns the time of value and gradient by step of one world [s]."""
+        """Returns the time to compute value and gradient, per step and world [s].
+
+        Args:
+            dt: step size [s].
+        """
         with precision(self.dtype):
             h = jnp.asarray(dt, self.dtype)
 
@@ -133,17 +154,17 @@ class Slope(Lowered):
         return float(spent) / STEPS / self.batch.worlds
 
 
-def planned(program: Any) -> float:
-    """Arguments, results and temporary memory of a compiled program [B]; NaN where unknown."""
+def planned(program: Compiled) -> float:
+    """Returns a compiled program's memory, including arguments and results [B]; NaN if unknown."""
     plan = program.memory_analysis()
     if plan is None:
         return float("nan")
-    kept = plan.argument_size_in_bytes + plan.output_size_in_bytes
-    return float(kept + plan.temp_size_in_bytes)
+    ends = plan.argument_size_in_bytes + plan.output_size_in_bytes
+    return float(ends + plan.temp_size_in_bytes)
 
 
 def timed(run: Callable[[], Any]) -> float:
-    """How long it takes until its results are there [s]."""
+    """Calls a function and returns the time until its results are ready [s]."""
     begin = time.perf_counter()
     jax.block_until_ready(run())
     return time.perf_counter() - begin

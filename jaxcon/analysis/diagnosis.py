@@ -1,56 +1,61 @@
-"""Where the violation of a simulation comes from, and which gains suit it (chapter 3.5.1)."""
+"""The causes of constraint violation in a simulation, and suitable gains (chapter 3.5.1)."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.analysis.quantities import angular_momentum, energy, momentum
 from jaxcon.analysis.report import Report, report
+from jaxcon.builders.assembly import assemble
+from jaxcon.constraints.rank import UnitRows, linearized
 from jaxcon.constraints.rows import linearize
 from jaxcon.core import checks
 from jaxcon.core.status import MEANING, Status
-from jaxcon.core.typing import Array
-from jaxcon.dynamics.assembly import assemble
-from jaxcon.dynamics.rank import UnitRows, linearized
-from jaxcon.model.state import State, at
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.stability import default_gains, instability, largest_stable_rate
-from jaxcon.simulation.step import controls_in
+from jaxcon.core.typing import Array, PyTree, Scalar
+from jaxcon.execution.rollout import rollout
+from jaxcon.execution.validation import controls_in
+from jaxcon.methods.method import Method
+from jaxcon.methods.stability import default_gains, instability, largest_stable_rate
+from jaxcon.protocols import System
+from jaxcon.readout.quantities import angular_momentum, energy, momentum
+from jaxcon.step import StepInfo
+from jaxcon.system.body_system import BodySystem
+from jaxcon.system.state import State, checked_system
 
 WEAK = 1e-2
-"""Singular values of the rows, scaled to unit length, below which a direction is nearly lost."""
+"""The threshold on singular values of unit-length rows below which rows are nearly dependent."""
 
 METHODS = {
-    "initial": "what is gone when the start is assembled first; take jc.assemble",
-    "integration": "what is gone when the step is halved; take a smaller one, or a projection",
-    "round-off": "ε Σ |∂φ/∂q| |q|: what rounding of q alone makes of φ; take float64",
-    "conflict": "what least squares leave of φ: no motion takes it away; see report",
-    "rank": "what lies in combinations of rows that hardly any motion changes; see report",
+    "initial": "disappears when the start is assembled first; use jc.assemble",
+    "integration": "decreases when the step is halved; use a smaller step, or a projection",
+    "round-off": "ε Σ |∂φ/∂q| |q|, the error of φ by rounding q; use float64",
+    "conflict": "least-squares residual of φ, which no motion removes; see report",
+    "rank": "φ in combinations of rows that hardly any motion changes; see report",
 }
-"""Each source of an error: how it is told from the others, and what helps."""
+"""For each cause of violation: how it is measured, and its remedy."""
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Where the violation of a simulation comes from; `print` it.
+    """The causes of the constraint violation in a simulation; `print` it.
 
     Attributes:
         violation: the largest |φ| of the simulation.
-        sources: the part of it by source, as of `METHODS`; they need not add up.
-        gains: (α, β) of the method's feedback at this step unless others are given [1/s].
-        stable_rate: the largest α = β that is stable at this step [1/s].
-        energy: at the start and at the end [J].
-        momentum: linear and angular at the start and at the end; None where there are no bodies.
-        report: of the start.
-        trouble: what the status of the end says, and which gains are unstable, in words.
+        sources: the estimated violation from each cause, with the keys of `METHODS`. The estimates
+            need not add up to `violation`.
+        gains: default feedback gains (α, β) of the method at this step size [1/s].
+        stable_rate: the largest stable α = β at this step size [1/s].
+        energy: energy at the start and at the end [J].
+        momentum: (linear, angular) momentum at the start and at the end; None for systems without
+            bodies.
+        report: report on the initial state.
+        trouble: warnings: the meaning of a failure status at the end, and unstable gains.
     """
 
     violation: float
@@ -64,7 +69,7 @@ class Diagnosis:
 
     @property
     def main_source(self) -> str:
-        """The largest; "unknown" where the run grew without bound, so that none can be told."""
+        """The key of the largest cause in `sources`; "unknown" if the simulation diverged."""
         if not all(np.isfinite(x) for x in (self.violation, *self.sources.values())):
             return "unknown"
         return max(self.sources, key=lambda name: self.sources[name])
@@ -86,24 +91,31 @@ class Diagnosis:
 
 
 def diagnose(
-    system: Any, method: Method, state: State, controls: Any, dt: float, steps: int = 100
+    system: System,
+    method: Method,
+    state: State,
+    controls: PyTree | Callable[[State], PyTree],
+    dt: float,
+    steps: int = 100,
 ) -> Diagnosis:
-    """Simulates three times and tells the sources of the violation apart.
+    """Simulates three times to separate the causes of constraint violation.
 
-    As given, from the assembled start, and from there with half the step: what the first two differ
-    by came with the start, what the last two differ by is made by the step. Round-off, conflict and
-    rank are found by the rows where the first one ends. `METHODS` says it of each.
+    The first run begins at the given state. The second begins at the assembled state, which
+    satisfies the constraints. The third begins there too, with half the step size. The difference
+    of the first two runs shows the error of the initial state. The difference of the last two shows
+    the integration error. Errors by round-off, conflicting rows and rank deficiency follow from the
+    constraint rows at the end of the first run.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: the start, of one world.
-        controls: as of `rollout`.
-        dt: h, () [s].
-        steps: how many.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: initial state of one world.
+        controls: control inputs, as in `jc.rollout`.
+        dt: step size h, () [s].
+        steps: number of steps.
 
     Returns:
-        A `Diagnosis`.
+        A `jc.analysis.Diagnosis`.
     """
     checks.count("diagnose", "steps", steps)
     checks.check("diagnose", "dt", dt, (), above=0)
@@ -113,41 +125,48 @@ def diagnose(
     if controls is not None and not callable(controls):
         controls = controls_in(state.q.dtype, controls)
         finer = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), 2, axis=0), controls)
-    end, given = _simulate(system, method, state, controls, dt, steps)
-    _, closed = _simulate(system, method, assembled, controls, dt, steps)
-    _, halved = _simulate(system, method, assembled, finer, dt / 2, 2 * steps, every=2)
+    end, φ_given = _simulate(system, method, state, controls, dt, steps)
+    _, φ_assembled = _simulate(system, method, assembled, controls, dt, steps)
+    _, φ_halved = _simulate(system, method, assembled, finer, dt / 2, 2 * steps, every=2)
     sources = {
-        "initial": _largest(given - closed),
-        "integration": _largest(closed - halved),
+        "initial": _largest(φ_given - φ_assembled),
+        "integration": _largest(φ_assembled - φ_halved),
         "round-off": _rounding(system, end),
         **_lost(system, end),
     }
     gains = default_gains(method, jnp.asarray(dt, state.q.dtype))
-    bodies = hasattr(system, "layout")
+    momenta = None
+    if isinstance(system, BodySystem):
+        momenta = _momenta(system, state), _momenta(system, end)
+    code = Status(int(end.status))
+    ended = f"{code.name} at {float(end.time):.4g} s: {MEANING[code]}" if code else None
+    notes = ended, instability(method, float(dt), system, state)
     return Diagnosis(
-        violation=_largest(given),
+        violation=_largest(φ_given),
         sources=sources,
         gains=(float(gains[0]), float(gains[1])),
         stable_rate=largest_stable_rate(method.integrator, float(dt)),
         energy=(float(energy(system, state).total), float(energy(system, end).total)),
-        momentum=(_momenta(system, state), _momenta(system, end)) if bodies else None,
+        momentum=momenta,
         report=report(system, state),
-        trouble=_trouble(system, method, state, end, float(dt)),
+        trouble=tuple(note for note in notes if note),
     )
 
 
-def _trouble(system: Any, method: Method, state: State, end: State, dt: float) -> tuple[str, ...]:
-    """What became of the world, and which gains are unstable, in words."""
-    code = Status(int(end.status))
-    ended = f"{code.name} at {float(end.time):.4g} s: {MEANING[code]}" if code else None
-    found = ended, instability(method, dt, system, state)
-    return tuple(words for words in found if words)
-
-
 def _simulate(
-    system: Any, method: Method, state: State, controls: Any, dt: Any, steps: int, every: int = 1
+    system: System,
+    method: Method,
+    state: State,
+    controls: PyTree | Callable[[State], PyTree],
+    dt: Scalar,
+    steps: int,
+    every: int = 1,
 ) -> tuple[State, np.ndarray]:
-    """The end, and φ at the start and after each recorded step, (steps / every + 1, n_c)."""
+    """Runs a rollout and records the constraint residual φ.
+
+    Returns:
+        The final state, and φ at the start and at each recorded step, (steps / every + 1, n_c).
+    """
     policy = controls if callable(controls) else None
     arrays = None if policy else controls
     end, path = _run(policy, steps, every, system, method, state, arrays, dt)
@@ -155,34 +174,44 @@ def _simulate(
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
-def _run(policy: Any, steps: int, every: int, *args: Any) -> tuple[State, Array]:
-    system, method, state, controls, dt = args
+def _run(
+    policy: Callable[[State], PyTree] | None,
+    steps: int,
+    every: int,
+    system: System,
+    method: Method,
+    state: State,
+    controls: PyTree,
+    dt: Scalar,
+) -> tuple[State, Array]:
+    """Runs a rollout. Returns the final state, and φ at the start and after each recorded step."""
 
-    def record(state: State, _: Any = None) -> Array:
-        return linearize(at(system, state), state.q, state.v, state.instant).residual
+    def record(state: State, _: StepInfo | None = None) -> Array:
+        return linearize(checked_system(system, state), state.q, state.v, state.instant).residual
 
-    controls = policy or controls
-    end, path = rollout(system, method, state, controls, dt, steps, record=record, every=every)
+    inputs = policy or controls
+    end, path = rollout(system, method, state, inputs, dt, steps, record=record, every=every)
     return end, jnp.concatenate([record(state)[None], path])
 
 
 def _largest(path: np.ndarray) -> float:
+    """Returns the largest absolute value of an array; 0 if it is empty."""
     return float(np.max(np.abs(path), initial=0))
 
 
-def _rounding(system: Any, state: State) -> float:
-    """ε max_i Σ_j |∂φ_i/∂q_j| |q_j|: what rounding each q_j does to φ."""
+def _rounding(system: System, state: State) -> float:
+    """Returns the error of φ when each q_j is rounded, ε max_i Σ_j |∂φ_i/∂q_j| |q_j|."""
 
     def residual(q: Array) -> Array:
-        return linearize(at(system, state), q, state.v, state.instant).residual
+        return linearize(checked_system(system, state), q, state.v, state.instant).residual
 
     slope = np.asarray(jax.jit(jax.jacfwd(residual))(state.q), np.float64)
     return _largest(np.abs(slope) @ np.abs(state.q)) * float(jnp.finfo(state.q.dtype).eps)
 
 
-def _lost(system: Any, state: State) -> dict[str, float]:
-    """The parts of φ in combinations of rows that no motion changes, or hardly any."""
-    rows, jacobian, mass = linearized(at(system, state), state)
+def _lost(system: System, state: State) -> dict[str, float]:
+    """Returns the parts of φ that no motion removes ("conflict") and hardly any motion ("rank")."""
+    rows, jacobian, mass = linearized(checked_system(system, state), state)
     unit = UnitRows(rows.layout, jacobian, mass)
     return {
         "conflict": _largest(unit.within(rows.residual, -1.0, unit.tolerance)),
@@ -190,6 +219,6 @@ def _lost(system: Any, state: State) -> dict[str, float]:
     }
 
 
-def _momenta(system: Any, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Linear and angular momentum of all bodies."""
+def _momenta(system: BodySystem, state: State) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the linear and the angular momentum of all bodies."""
     return np.asarray(momentum(system, state)), np.asarray(angular_momentum(system, state))

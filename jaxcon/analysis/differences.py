@@ -1,9 +1,9 @@
-"""Derivatives along directions by central differences that choose their own step. Host code."""
+"""Directional derivatives by extrapolated central differences. Host code."""
 
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -12,65 +12,69 @@ import numpy as np
 from jaxcon.core.typing import Array
 
 LEVELS = 10
-"""The number of differences, each with half the step of the one before."""
+"""The number of central differences; each uses half the step of the previous one."""
 ROUNDING = 64
-"""What a long computation makes of the rounding of one number, in spacings of the result."""
+"""The assumed rounding error of a long computation, in units of ε times its result."""
 
 
 def steps(eps: float) -> np.ndarray:
-    """From ε^⅛ down by halves, relative."""
+    """Returns the relative step sizes of the differences: ε^⅛, then halved at each level."""
     return eps**0.125 * 0.5 ** np.arange(LEVELS)
 
 
 def unseen(eps: float) -> float:
-    """The derivative that rounding hides, relative to the values of f."""
+    """Returns the smallest derivative that differences can resolve, relative to the value of f."""
     return ROUNDING * eps / steps(eps)[0]
 
 
 def differences(
-    of: Any, at: list[Array], moves: list[Array], eps: float
+    f: Callable[[list[Array]], Array], at: list[Array], moves: list[Array], eps: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives along directions, and how exact they are.
+    """Computes directional derivatives of f by central differences, with uncertainties.
 
     Args:
-        of: a list of arrays → a number.
-        at: where.
-        moves: directions, (n, …) in each array.
-        eps: ε of the coarsest number on the way.
+        f: function from a list of arrays to a number.
+        at: the arrays at which f is differentiated.
+        moves: n directions, an array (n, …) for each array of `at`.
+        eps: ε of the coarsest dtype in the computation.
 
     Returns:
-        Derivatives (n,), extrapolated from all `steps`, and their uncertainties (n,).
+        Derivatives (n,), extrapolated to step size zero, and their uncertainties (n,).
     """
     sizes = jnp.asarray(steps(eps), at[0].dtype)
 
     def along(move: list[Array], step: Array) -> Array:
-        return of([x + step.astype(x.dtype) * dx for x, dx in zip(at, move, strict=True)])
+        return f([x + step.astype(x.dtype) * dx for x, dx in zip(at, move, strict=True)])
 
-    every = jax.jit(jax.vmap(jax.vmap(along, (None, 0)), (0, None)))
-    values = np.asarray(every(moves, jnp.concatenate([sizes, -sizes])), np.float64)
+    all_moves = jax.jit(jax.vmap(jax.vmap(along, (None, 0)), (0, None)))
+    values = np.asarray(all_moves(moves, jnp.concatenate([sizes, -sizes])), np.float64)
     ahead, behind = np.split(values, 2, axis=1)
     return ridders((ahead - behind) / (2 * np.asarray(sizes, np.float64)))
 
 
 def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The limit of central differences whose steps are halved, and its uncertainty.
+    """Extrapolates central differences with halved steps to zero step size.
 
-    Each column of Neville's table takes away the next even power of the step. The entry that
-    differs least from the two that it is made of is taken for the best. That one may owe it to
-    chance, and so the fourth least of these differences says how exact it is, or its `scatter`
-    where that is more. `scatter` does not choose the entry, since a kink within the larger steps
-    makes it large for all of them.
+    Each column of Neville's table eliminates the next even power of the step. Each entry is
+    computed from two entries of the column before. The best entry is the one closest to both. One
+    entry may be close by chance. The uncertainty is therefore the fourth smallest of these
+    distances, or the entry's rounding error (`scatter`) if that is larger. The rounding error does
+    not select the entry: a kink within the larger steps makes it large everywhere.
 
     Args:
-        slopes: (directions, levels), from the largest step on.
+        slopes: central differences, (directions, levels), the largest step first.
+
+    Returns:
+        Derivatives (directions,) and their uncertainties (directions,).
     """
     columns = neville(slopes)
-    apart = [
+    distances = [
         np.maximum(np.abs(after - before[:, 1:]), np.abs(after - before[:, :-1]))
         for before, after in itertools.pairwise(columns)
     ]
-    table, spread = np.concatenate(columns[1:], axis=1), np.concatenate(apart, axis=1)
+    table, spread = np.concatenate(columns[1:], axis=1), np.concatenate(distances, axis=1)
     order = np.argsort(np.where(np.isfinite(spread), spread, np.inf), axis=1)
+    # ten levels give 45 entries, so the fourth smallest spread is still among the best
     best, fourth = order[:, :1], order[:, 3:4]
     noise = np.nan_to_num(scatter(slopes), nan=np.inf)
     value, rounding = (np.take_along_axis(x, best, axis=1) for x in (table, noise))
@@ -79,7 +83,11 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def neville(slopes: np.ndarray) -> list[np.ndarray]:
-    """The columns of Neville's table: (directions, levels), (directions, levels − 1) and so on."""
+    """Returns the columns of Neville's table: (directions, levels), (directions, levels − 1), ….
+
+    Args:
+        slopes: central differences, (directions, levels), the largest step first.
+    """
     columns = [slopes]
     for power in range(1, slopes.shape[1]):
         factor, last = 4.0**power, columns[-1]
@@ -88,17 +96,22 @@ def neville(slopes: np.ndarray) -> list[np.ndarray]:
 
 
 def scatter(slopes: np.ndarray) -> np.ndarray:
-    """What rounding makes of each entry of Neville's table after its first column, (directions, n).
+    """Estimates the rounding errors in Neville's table.
 
-    Rounding of f over the step is taken for independent noise of size σ 2ᵏ in the slope k, and what
-    Neville's table makes of that is known. σ is told by the differences of the third column at the
-    smallest steps, where the motion itself, of the order h⁶, adds less.
+    The rounding error of f, divided by the step, is modeled as independent noise with standard
+    deviation σ 2ᵏ in difference k. Neville's table combines the differences linearly. σ is
+    estimated from the third column at the smallest steps. There the truncation error, of order h⁶,
+    is smaller than the noise.
 
     Args:
-        slopes: (directions, levels), from the largest step on.
+        slopes: central differences, (directions, levels), the largest step first.
+
+    Returns:
+        Standard deviations of all entries after the first column, column by column, (directions,
+        n).
     """
     columns, unit = neville(slopes), neville(np.diag(2.0 ** np.arange(slopes.shape[1])))
     between = np.linalg.norm(np.diff(unit[2], axis=1), axis=0)
     last = (np.diff(columns[2], axis=1) / between)[:, -3:]
-    own = np.sqrt(np.mean(last**2, axis=1, keepdims=True))
-    return own * np.concatenate([np.linalg.norm(x, axis=0) for x in unit[1:]])
+    σ = np.sqrt(np.mean(last**2, axis=1, keepdims=True))
+    return σ * np.concatenate([np.linalg.norm(x, axis=0) for x in unit[1:]])

@@ -1,33 +1,33 @@
-"""Which impacts a function meets where its derivatives are wrong. Host code."""
+"""Finds the impacts that make derivatives of a function wrong. Host code."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
+from jaxcon.contact.impacts import Seen
 from jaxcon.core import notices
-from jaxcon.core.typing import Array
-from jaxcon.dynamics.impacts import Seen
+from jaxcon.core.typing import Array, PyTree
 
 MANY = 3
-"""Impacts of a row within `FEW` steps that count as accumulating."""
+"""The number of impacts of a row within `FEW` steps at which they count as accumulating."""
 FEW = 20
-"""Steps within which they do."""
+"""The number of steps within which `MANY` impacts of a row count as accumulating."""
 
 
 class Hit(NamedTuple):
-    """An impact of one row of one world.
+    """An impact of one contact or limit row in one world.
 
     Attributes:
-        name: of the element.
-        row: its number, and that of the world.
-        bounces: whether it is fast enough to bounce.
-        time: at the start of the step [s].
-        dt: h [s].
+        name: name of the element.
+        row: (row index, world index).
+        bounces: True if the impact is fast enough to bounce.
+        time: time at the start of the step [s].
+        dt: step size h [s].
     """
 
     name: str
@@ -37,21 +37,26 @@ class Hit(NamedTuple):
     dt: float
 
 
-def cases(of: Callable[[Any], Any], at: list[Array], moves: Iterable[list[Array]]) -> list[str]:
-    """Names the impacts on the way at which derivatives do not exist.
+def cases(
+    f: Callable[[list[Array]], PyTree], at: list[Array], moves: Iterable[list[Array]]
+) -> list[str]:
+    """Describes impacts during the evaluation of f at which derivatives do not exist.
+
+    Such impacts are simultaneous, grazing or accumulating.
 
     Args:
-        of: a list of arrays → a pytree of arrays.
-        at: where.
-        moves: of it, to both sides of each of which impacts are counted as well.
+        f: function from a list of arrays to a pytree of arrays.
+        at: the arrays at which f is differentiated.
+        moves: changes of `at`. Impacts are also counted at `at` plus and minus each change.
     """
     with notices.observed() as seen:
-        program = jax.jit(of)
+        program = jax.jit(f)
 
         def met(x: list[Array]) -> list[Hit]:
-            seen.clear()
+            seen.clear()  # observations of the previous point
             jax.block_until_ready(program(x))
-            return [hit for one in seen if isinstance(one[0], Seen) for hit in _hits(*one)]
+            impacts = [observation for observation in seen if isinstance(observation[0], Seen)]
+            return [hit for observation in impacts for hit in _hits(*observation)]
 
         here = met(at)
         beside = [
@@ -59,12 +64,18 @@ def cases(of: Callable[[Any], Any], at: list[Array], moves: Iterable[list[Array]
             for move in moves
             for sign in (1, -1)
         ]
-    told = (_simultaneous(here), _grazing(here, beside), _accumulating(here))
-    return [words for words in told if words]
+    notes = (_simultaneous(here), _grazing(here, beside), _accumulating(here))
+    return [note for note in notes if note]
 
 
 def _hits(kind: Seen, *values: np.ndarray) -> list[Hit]:
-    """The impacts of one step of all worlds."""
+    """Returns the impacts that all worlds had in one step.
+
+    Args:
+        kind: the observation's kind, with the layout of the inequality rows.
+        values: four arrays: masks of impacts and of bounces by row and world; times and step sizes
+            by world.
+    """
     hits, bounces = (x.reshape(len(x), -1) for x in values[:2])
     time, dt = (x.ravel() for x in values[2:])
     names, owners = kind.layout.names, kind.layout.owners
@@ -75,8 +86,8 @@ def _hits(kind: Seen, *values: np.ndarray) -> list[Hit]:
 
 
 def _simultaneous(hits: list[Hit]) -> str | None:
-    """Several rows of a world that hit within one step."""
-    steps: dict[Any, list[Hit]] = defaultdict(list)
+    """Describes simultaneous impacts: impacts of several rows of one world in one step."""
+    steps: dict[tuple[int, float], list[Hit]] = defaultdict(list)
     for hit in hits:
         steps[hit.row[1], hit.time].append(hit)
     for (_, time), together in steps.items():
@@ -87,13 +98,13 @@ def _simultaneous(hits: list[Hit]) -> str | None:
 
 
 def _grazing(here: list[Hit], beside: list[list[Hit]]) -> str | None:
-    """An impact too slow to bounce, or one that happens on one side of x only."""
+    """Describes a grazing impact: too slow to bounce, or absent after a small change of x."""
     slow = next((hit for hit in here if not hit.bounces), None)
     if slow is not None:
         return f"a grazing impact: {slow.name} hits at {slow.time:.6g} s too slowly to bounce"
     counts = [_by_name(hits) for hits in (here, *beside)]
-    for name in dict.fromkeys(name for known in counts for name in known):
-        numbers = sorted({known.get(name, 0) for known in counts})
+    for name in dict.fromkeys(name for count in counts for name in count):
+        numbers = sorted({count.get(name, 0) for count in counts})
         if len(numbers) > 1:
             several = " or ".join(map(str, numbers))
             return f"a grazing impact: {name} hits {several} times, depending on x"
@@ -101,12 +112,12 @@ def _grazing(here: list[Hit], beside: list[list[Hit]]) -> str | None:
 
 
 def _accumulating(hits: list[Hit]) -> str | None:
-    """Many impacts of a row within few steps."""
-    rows: dict[Any, list[Hit]] = defaultdict(list)
+    """Describes accumulating impacts: many impacts of one row within few steps."""
+    rows: dict[tuple[str, tuple[int, int]], list[Hit]] = defaultdict(list)
     for hit in hits:
         rows[hit.name, hit.row].append(hit)
-    for (name, _), every in rows.items():
-        for first, last in zip(every, every[MANY - 1 :], strict=False):
+    for (name, _), impacts in rows.items():
+        for first, last in zip(impacts, impacts[MANY - 1 :], strict=False):
             if last.time - first.time <= FEW * first.dt:
                 return (
                     f"accumulating impacts: {name} hits {MANY} times within {FEW} steps from"
@@ -116,7 +127,7 @@ def _accumulating(hits: list[Hit]) -> str | None:
 
 
 def _by_name(hits: list[Hit]) -> dict[str, int]:
-    """The number of impacts by element."""
+    """Returns the number of impacts of each element, by name."""
     counts: dict[str, int] = defaultdict(int)
     for hit in hits:
         counts[hit.name] += 1

@@ -1,40 +1,42 @@
-"""Estimates the operations of a world's accelerations from the structure of the scene. Host code.
+"""Estimates the operation count of a world's accelerations from its structure. Host code.
 
-Nothing is compiled and no step is traced, which takes seconds to minutes where there are hundreds
-of rows. `work` counts a whole step from its trace, and `seconds` measures it.
+No step is traced or compiled, which would take seconds to minutes for hundreds of rows. For exact
+counts, `work.work` traces a whole step; `work.seconds` measures its time.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 
-from jaxcon.constraints.bounds import kinds_of, linearize_at_rest
 from jaxcon.constraints.rows import linearize
-from jaxcon.core.operations import count
-from jaxcon.model.state import State
-from jaxcon.simulation.choice import Choice, innermost, words
-from jaxcon.simulation.method import Method
-from jaxcon.solvers import effort
-from jaxcon.solvers.bounded import Kinds
-from jaxcon.solvers.conjugate_gradients import ConjugateGradients
-from jaxcon.solvers.gauss_seidel import GaussSeidel
-from jaxcon.solvers.interior_point import InteriorPoint
-from jaxcon.solvers.nearest_rows import Nearest
+from jaxcon.contact.bounded import RowCounts
+from jaxcon.contact.gauss_seidel import GaussSeidel
+from jaxcon.contact.interior_point import InteriorPoint
+from jaxcon.contact.nearest_rows import ActiveSet
+from jaxcon.contact.rows import kinds_of, linearize_at_rest
+from jaxcon.linear import effort
+from jaxcon.linear.conjugate_gradients import ConjugateGradients
+from jaxcon.methods.choice import Choice, innermost, words
+from jaxcon.methods.method import Method
+from jaxcon.protocols import ContactSolver, Solver, System
+from jaxcon.staging.operations import count
+from jaxcon.system.state import State
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Operations of the accelerations of one world, by part; a step of `SemiImplicitEuler` is one.
+    """Estimated number of operations to compute the accelerations of one world, by part.
+
+    A step of `SemiImplicitEuler` evaluates the accelerations once.
 
     Attributes:
-        rows: linearization of constraints and inequality constraints, counted from its trace.
-        solver: factorization of the constraints and a substitution by inequality row; None where
-            the solver has no estimate.
-        contact: solution of the inequality constraints; 0 in a scene without.
-        contact_solver: their solver in words; empty in a scene without.
+        rows: operations to linearize equality and inequality constraints, counted from a trace.
+        solver: operations to factorize the constraint matrix and to substitute once per inequality
+            row. None if there is no estimate for the solver.
+        contact: operations to solve the inequality constraints; 0 if there are none.
+        contact_solver: description of the contact solver; empty without inequality constraints.
     """
 
     rows: float
@@ -44,7 +46,7 @@ class Cost:
 
     @property
     def operations(self) -> float:
-        """All parts that are known."""
+        """The sum over all parts, without parts that have no estimate."""
         return self.rows + (self.solver or 0.0) + self.contact
 
     def __str__(self) -> str:
@@ -55,54 +57,59 @@ class Cost:
         return f"about {self.operations:.2g} operations for the accelerations: {parts} (estimated)"
 
 
-def cost(system: Any, method: Method, state: State, choice: Choice) -> Cost:
-    """Estimates the operations of one evaluation of the accelerations.
+def cost(system: System, method: Method, state: State, choice: Choice) -> Cost:
+    """Estimates the number of operations to compute the accelerations once.
 
     Args:
-        system: as the state remembers it.
-        method: its solvers count.
-        state: of one world.
-        choice: of `choose`, whose efforts are those of the solvers on this structure.
+        system: the system, with the counted turns of the state.
+        method: the method with its solvers.
+        state: state of one world.
+        choice: result of `choose`, with the operation counts of all solvers for this structure.
     """
     kinds = kinds_of(system, state.q, state.v)
-    bounded = method.resolve(system, state).bounded
+    bounded = method.resolve(system, state).contact_solver
     contact, named = contact_operations(bounded, kinds), words(bounded) if kinds else ""
     return Cost(_rows(system, state), _of_solver(method.solver, choice), contact, named)
 
 
-def _of_solver(solver: Any, choice: Choice) -> float | None:
-    """Operations of the solver of the constraints; None where its effort is not known."""
+def _of_solver(solver: Solver, choice: Choice) -> float | None:
+    """Returns the operations of the constraint solver; None if they are unknown."""
     solver = innermost(solver)
     if not choice.efforts:
         return 0.0  # there are no constraints
-    known = choice.efforts.get(type(solver).__name__)
-    if known is None:
+    effort_of_solver = choice.efforts.get(type(solver).__name__)
+    if effort_of_solver is None:
         return None
     share = 1.0
-    if isinstance(solver, ConjugateGradients):  # whose effort is that of the default iterations
+    if isinstance(solver, ConjugateGradients):  # its effort assumes default iterations
         share = solver.iterations / ConjugateGradients().iterations
-    return share * known.operations
+    return share * effort_of_solver.operations
 
 
-def contact_operations(solver: Any, kinds: Kinds | None) -> float:
-    """Operations of a solver of inequality constraints.
+def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | None) -> float:
+    """Estimates the number of operations of a contact solver.
 
     Args:
-        solver: `InteriorPoint`, `GaussSeidel` or `Nearest` of one.
-        kinds: the numbers of rows by law; None in a scene without.
+        solver: `InteriorPoint`, `GaussSeidel`, or an `ActiveSet` around one of them.
+        kinds: number of inequality rows of each law; None without inequality constraints.
     """
     if kinds is None:
         return 0.0
     rows = solved_rows(solver, kinds)
-    inner = solver.solver if isinstance(solver, Nearest) else solver
+    inner = solver.solver if isinstance(solver, ActiveSet) else solver
     if isinstance(inner, GaussSeidel):
         return effort.gauss_seidel(rows, inner.sweeps)
     return effort.interior_point(rows) if isinstance(inner, InteriorPoint) else 0.0
 
 
-def solved_rows(solver: Any, kinds: Kinds) -> int:
-    """The number of inequality rows that a solver takes at once."""
-    if not isinstance(solver, Nearest):
+def solved_rows(solver: ContactSolver | GaussSeidel, kinds: RowCounts) -> int:
+    """Returns the number of inequality rows that a contact solver solves simultaneously.
+
+    Args:
+        solver: the contact solver.
+        kinds: number of inequality rows of each law.
+    """
+    if not isinstance(solver, ActiveSet):
         return kinds.size
     single = kinds.single if solver.stops is None else min(solver.stops, kinds.single)
     contacts = kinds.contacts if solver.contacts is None else min(solver.contacts, kinds.contacts)
@@ -110,10 +117,10 @@ def solved_rows(solver: Any, kinds: Kinds) -> int:
     return single + contacts * (1 + kinds.tangents) + others
 
 
-def _rows(system: Any, state: State) -> float:
-    """Operations of linearizing all rows of one world."""
+def _rows(system: System, state: State) -> float:
+    """Returns the number of operations to linearize all rows of one world."""
     point = state.q, state.v, state.time
-    own = count(jax.make_jaxpr(linearize)(system, *point).jaxpr)
+    operations = count(jax.make_jaxpr(linearize)(system, *point).jaxpr)
     if not system.bounds:
-        return own
-    return own + count(jax.make_jaxpr(linearize_at_rest)(system, state.q, state.v).jaxpr)
+        return operations
+    return operations + count(jax.make_jaxpr(linearize_at_rest)(system, state.q, state.v).jaxpr)

@@ -1,4 +1,4 @@
-"""Where a rollout first went wrong: step, world, and the term of the equations. Host code."""
+"""Locates the first failing step of a rollout: its step, world and wrong term. Host code."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,29 +16,33 @@ from jaxcon.analysis import findings
 from jaxcon.analysis.findings import Finding
 from jaxcon.constraints.rows import Rows
 from jaxcon.core import checks
+from jaxcon.core.doubled import Doubled
 from jaxcon.core.status import MEANING, Status, failed
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.dynamics.forward import Dynamics
-from jaxcon.model.state import MethodMemory, State, at_instant
-from jaxcon.simulation.attempt import dynamics_at
-from jaxcon.simulation.integrators import reached
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.step import check_step, controls_in, policy_in, step_quietly
-from jaxcon.solvers.saddle import Solution
+from jaxcon.core.typing import Array, PyTree, Scalar
+from jaxcon.execution.step import step_quietly
+from jaxcon.execution.validation import check_step, controls_in, policy_in
+from jaxcon.linear.saddle import Solution
+from jaxcon.methods.method import Method
+from jaxcon.protocols import System
+from jaxcon.step import Dynamics, Solved, reached
+from jaxcon.system.state import MethodMemory, State, at_instant, with_turns
+
+Carry: TypeAlias = tuple[Array, State, State, PyTree, Array]
+"""The step index; the states before and after the last step; its controls and status codes."""
 
 
 @dataclass(frozen=True)
 class Failure:
-    """The first step of a rollout that failed; `print` it.
+    """The first failing step of a rollout; `print` it.
 
     Attributes:
-        step: its number, from 0.
-        world: its number in the batch; None where there is but one.
-        time: at its start [s].
-        status: what it said.
-        findings: what was wrong, in the order in which a step computes; the first is the cause,
-            others at the same stage may follow from it.
-        stage: of the integrator, from 0.
+        step: index of the step, from 0.
+        world: index of the world in the batch; None for a single world.
+        time: time at the start of the step [s].
+        status: status of the step.
+        findings: the wrong terms, in the order in which a step computes them. The first one is the
+            cause. The others occur at the same stage and may be its consequences.
+        stage: index of the integrator's stage, from 0.
     """
 
     step: int
@@ -50,12 +54,12 @@ class Failure:
 
     @property
     def term(self) -> str:
-        """The term of the first finding."""
+        """The wrong term of the first finding, such as "force"."""
         return self.findings[0].term
 
     @property
     def name(self) -> str:
-        """The name in the first finding."""
+        """The name of the body, constraint, force or control channel in the first finding."""
         return self.findings[0].name
 
     def __str__(self) -> str:
@@ -67,25 +71,32 @@ class Failure:
 
 
 def find_first_failure(
-    system: Any, method: Method, state: State, controls: Any, dt: Any, steps: int
+    system: System,
+    method: Method,
+    state: State,
+    controls: PyTree | Callable[[State], PyTree],
+    dt: Scalar,
+    steps: int,
 ) -> Failure | None:
-    """Replays a rollout up to the first step that fails, and says what went wrong in it.
+    """Replays a rollout up to its first failing step, and reports the wrong terms of that step.
 
-    Failures that the state remembers are forgotten first, so that the final state of a rollout,
-    which is the last one before it failed, can be given as well. With a `Recovery` the first step
-    that is rolled back counts. The batch runs compiled; the step that failed is then evaluated once
-    more, term by term.
+    A failure status in the initial state is reset first. One may thus start from the final state of
+    a failed rollout, which is the last state before the failure. If the method has a `Recovery`,
+    the first repaired step counts as failed. The batch runs compiled. The failing step is then
+    evaluated once more, term by term.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: the start, of one world or of a batch, (worlds, …) in each leaf.
-        controls: as of `rollout`; arrays for a batch have a first axis of worlds, then of steps.
-        dt: h, () [s].
-        steps: how many.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: initial state of one world, or of a batch with a leading axis of worlds in each leaf.
+        controls: control inputs, as in `jc.rollout`. For a batch, arrays have a leading axis of
+            worlds, then one of steps.
+        dt: step size h, () [s].
+        steps: number of steps.
 
     Returns:
-        The `Failure`, of the first world where several fail in one step; None where none does.
+        A `jc.analysis.Failure`; None if no world fails. If several worlds fail in the same step, it
+        describes the one with the lowest index.
     """
     checks.count("find_first_failure", "steps", steps, 0)
     checks.check("find_first_failure", "dt", dt, least=0)
@@ -94,6 +105,7 @@ def find_first_failure(
     if not batch:
         state = jax.tree.map(lambda x: x[None], state)
         controls = controls if callable(controls) else jax.tree.map(lambda x: x[None], controls)
+    # the final state of a failed rollout keeps its status, which would stop the replay at once
     state = dataclasses.replace(state, status=jnp.zeros_like(state.status))
     policy = controls if callable(controls) else None
     args = (system, method, state, None if policy else controls, dt)
@@ -103,110 +115,137 @@ def find_first_failure(
         return None
     world = int(bad[0])
     before, control = jax.tree.map(lambda x: x[world], (before, control))
-    found, stage, code = _look(system, method, before, control, dt)
+    wrong, stage, code = _look(system, method, before, control, dt)
     code = Status(int(codes[world])) if failed(codes[world]) else code
     time = float(before.time)
-    return Failure(int(count) - 1, world if batch else None, time, code, tuple(found), stage)
+    return Failure(int(count) - 1, world if batch else None, time, code, tuple(wrong), stage)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
 def _replay(
     policy: Callable[[State], PyTree] | None,
     steps: int,
-    system: Any,
+    system: System,
     method: Method,
     state: State,
     controls: PyTree,
-    dt: Any,
+    dt: Scalar,
 ) -> tuple[Array, State, PyTree, Array]:
-    """Steps taken, the states before the last of them, its controls, and what became of it."""
+    """Runs a batch up to the first failing step.
+
+    Args:
+        policy: function from state to controls; None if controls are arrays.
+        steps: largest number of steps.
+        system: the system.
+        method: the method.
+        state: initial states, with a leading axis of worlds.
+        controls: control inputs, (worlds, steps, …); None with a policy.
+        dt: step size [s].
+
+    Returns:
+        The number of steps taken; then the states before the last step, the controls of that step,
+        and its status codes.
+    """
 
     def control(k: Array, state: State) -> PyTree:
         if policy:
             return jax.vmap(policy_in(policy))(state)
         return jax.tree.map(lambda x: jnp.asarray(x)[:, k], controls)
 
-    def go(carry: Any) -> Array:
+    def goes_on(carry: Carry) -> Array:
         k, _, _, _, codes = carry
         return (k < steps) & ~jnp.any(_wrong(codes))
 
-    def advance(carry: Any) -> Any:
+    def advance(carry: Carry) -> Carry:
         k, _, state, _, _ = carry
         u = control(k, state)
         new, info = jax.vmap(lambda s, u: step_quietly(system, method, s, u, dt))(state, u)
         return k + 1, state, new, u, info.status
 
     zero = jnp.zeros((), jnp.int32)
-    unknown = jax.tree.map(
+    no_control = jax.tree.map(
         lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(control, zero, state)
     )
-    first = (zero, state, state, unknown, jnp.zeros_like(state.status))
-    count, before, _, control_, codes = jax.lax.while_loop(go, advance, first)
-    return count, before, control_, codes
+    first = (zero, state, state, no_control, jnp.zeros_like(state.status))
+    count, before, _, last, codes = jax.lax.while_loop(goes_on, advance, first)
+    return count, before, last, codes
 
 
 def _wrong(codes: Array) -> Array:
-    """Returns True where a step failed, or would have but for a repair."""
+    """Returns True where a step failed or was repaired by a `Recovery`."""
     return failed(codes) | (codes == Status.ROLLED_BACK) | (codes == Status.PROJECTED)
 
 
 def _look(
-    system: Any, method: Method, state: State, control: PyTree, dt: Any
+    system: System, method: Method, state: State, control: PyTree, dt: Scalar
 ) -> tuple[list[Finding], int, Status]:
-    """What is wrong in one step of one world, the stage at which it is seen, and its status."""
+    """Evaluates one step of one world term by term.
+
+    Returns:
+        The wrong terms, the index of the integrator's stage where they occur, and the status.
+    """
     control = check_step(system, method, state, control)
     h = jnp.asarray(dt, state.q.dtype)
-    found = [*findings.given(system, state, control)]
-    if found:
-        return found, 0, Status.NON_FINITE
-    plain = dynamics_at(system, method, state, control, h)
+    wrong = [*findings.given(system, state, control)]
+    if wrong:
+        return wrong, 0, Status.NON_FINITE
+    turned = with_turns(system, state.turns, state.angle_remainder)
+    plain = method.dynamics(turned, state, control, h)
     watched = Watched(*(getattr(plain, f.name) for f in dataclasses.fields(plain)))
     memory = MethodMemory(*state.memory)
     advanced = method.integrator.advance(watched, state, memory.integrator, h)
-    if not watched.seen:  # an integrator that iterates shows no values
+    if not watched.seen:  # an iterating integrator calls the dynamics with traced values only
         watched(state.q, state.v, state.instant)
-    for stage, (found, code) in enumerate(watched.seen):
-        if found:
-            return found, stage, code
+    for stage, (wrong, code) in enumerate(watched.seen):
+        if wrong:
+            return wrong, stage, code
     q, v, time = advanced.point
     new = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, h))
-    found = [*findings.entries(system, "velocity", v), *findings.positions(system, q)]
-    if found:
-        return found, 0, Status.NON_FINITE
+    wrong = [*findings.entries(system, "velocity", v), *findings.positions(system, q)]
+    if wrong:
+        return wrong, 0, Status.NON_FINITE
     return [findings.worst(watched.system, new)], 0, Status.VIOLATED
 
 
 @dataclass(frozen=True)
 class Watched(Dynamics):
-    """Dynamics that keep what they find wrong at each stage.
+    """Dynamics that record the wrong terms at each stage of the integrator.
 
     Attributes:
-        seen: findings and status by stage.
+        seen: (wrong terms, status) for each stage.
     """
 
     seen: list[tuple[list[Finding], Status]] = field(default_factory=list)
 
-    def factored(self, q: Array, v: Array, t: Any, age: Any = None, ahead: Any = None) -> Any:
-        """`Dynamics.factored` at (q, v, t), watched."""
-        return self._watched(q, v, t, super().factored(q, v, t, age, ahead))
-
-    def _watched(self, q: Array, v: Array, t: Any, found: Any) -> Any:
-        """What was found, after a look at it."""
-        if checks.is_concrete((q, v, t, found[0])):
-            self.seen.append(self._judge(q, v, t, *found[:2]))
-        return found
+    def solve(
+        self,
+        rows: Rows,
+        q: Array,
+        v: Array,
+        t: Doubled | Array,
+        rate_delay: Array | None = None,
+        every_landing: bool = False,
+    ) -> Solved:
+        """Solves as `Dynamics.solve` does, and records the wrong terms of this stage."""
+        solved = super().solve(rows, q, v, t, rate_delay, every_landing)
+        if checks.is_concrete((q, v, t, solved.solution)):
+            self.seen.append(self._judge(q, v, t, solved.solution, solved.rows))
+        return solved
 
     def _judge(
-        self, q: Array, v: Array, t: Any, solution: Solution, rows: Rows
+        self, q: Array, v: Array, t: Doubled | Array, solution: Solution, rows: Rows
     ) -> tuple[list[Finding], Status]:
-        """What is wrong at one stage: of the terms, or else of what the solver made of them."""
+        """Returns the wrong terms at one stage, and the status.
+
+        If no term is wrong but the solver failed, its failure is the finding.
+        """
         code = Status(int(solution.status))
         system = self.system
-        found = [*findings.masses(system, q), *findings.forces(system, q, v, t, self.control)]
-        found += findings.terms(rows)
-        if not found and code == Status.SINGULAR:
-            found = findings.dependent(system, q, rows)
-        if not found and failed(solution.status):
+        wrong = [*findings.masses(system, q), *findings.forces(system, q, v, t, self.control)]
+        wrong += findings.terms(rows)
+        if not wrong and code == Status.SINGULAR:
+            wrong = findings.dependent(system, q, rows)
+        if not wrong and failed(solution.status):
             reason = "is not finite" if code == Status.NON_FINITE else "was not found"
-            found = [Finding("acceleration", type(self.solver).__name__, reason)]
-        return found, code if failed(solution.status) else Status.NON_FINITE
+            wrong = [Finding("acceleration", type(self.solver).__name__, reason)]
+        return wrong, code if failed(solution.status) else Status.NON_FINITE

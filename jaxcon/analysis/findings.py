@@ -1,31 +1,36 @@
-"""Which terms of the equations are not as they must be, and whose they are. Host code."""
+"""Finds wrong terms of the equations, and the bodies, constraints or forces that cause them.
+
+Host code.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.rank import UnitRows, dependent_rows
 from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
+from jaxcon.core.doubled import Doubled
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.dynamics.rank import UnitRows, dependent_rows
-from jaxcon.model.state import State
+from jaxcon.protocols import System
+from jaxcon.system.body_system import BodySystem
+from jaxcon.system.state import State
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A term of the equations that is not as it must be.
+    """A wrong term of the equations of motion, and the element that it belongs to.
 
     Attributes:
         term: "position", "velocity", "control", "parameter", "mass", "force", "residual", "rate",
             "jacobian", "bias", "compliance", "rows", "acceleration" or "violation".
-        name: whose it is: of a body, constraint, force element or control channel.
-        detail: what is wrong with it.
+        name: name of the body, constraint, force element or control channel.
+        detail: description of the error.
     """
 
     term: str
@@ -36,11 +41,11 @@ class Finding:
         return f"{self.term} of '{self.name}' {self.detail}"
 
 
-def given(system: Any, state: State, control: PyTree) -> Iterator[Finding]:
-    """State, control and parameters that are not finite."""
+def given(system: System, state: State, control: PyTree) -> Iterator[Finding]:
+    """Yields a finding for each position, velocity, control or parameter that is not finite."""
     yield from positions(system, state.q)
     yield from entries(system, "velocity", state.v)
-    channels = getattr(getattr(system, "layout", None), "controls", (("control", 0, None),))
+    channels = (("control", 0, None),) if system.layout is None else system.layout.controls
     for name, start, stop in channels:
         parts = [np.asarray(x)[start:stop] for x in jax.tree.leaves(control) if np.ndim(x)]
         if any(not np.all(np.isfinite(x)) for x in parts):
@@ -54,27 +59,41 @@ def given(system: Any, state: State, control: PyTree) -> Iterator[Finding]:
                 yield Finding("parameter", whole, f"is {checks.numerals(leaf)}")
 
 
-def positions(system: Any, q: Array) -> Iterator[Finding]:
-    """Bodies, or coordinates, whose position is not finite."""
-    return _infinite("position", q, getattr(system, "layout", None), "q")
+def positions(system: System, q: Array) -> Iterator[Finding]:
+    """Yields a finding for each body or coordinate whose position is not finite."""
+    layout = system.layout
+    return _infinite("position", q, layout and {name: layout.q(name) for name in layout.bodies})
 
 
-def entries(system: Any, term: str, x: Array) -> Iterator[Finding]:
-    """Bodies, or coordinates, whose part of an array (n_v,) is not finite."""
-    return _infinite(term, x, getattr(system, "layout", None), "v")
+def entries(system: System, term: str, x: Array) -> Iterator[Finding]:
+    """Yields a finding for each body or coordinate with a non-finite entry in an array (n_v,).
+
+    Args:
+        system: the system.
+        term: name of the wrong term, as in `Finding`.
+        x: the array to check, (n_v,).
+    """
+    layout = system.layout
+    return _infinite(term, x, layout and {name: layout.v(name) for name in layout.bodies})
 
 
-def _infinite(term: str, x: Array, layout: Any, kind: str) -> Iterator[Finding]:
-    own = {f"coordinate {i}": np.array([i]) for i in range(len(x))}
-    if layout is not None:
-        own = {name: getattr(layout, kind)(name) for name in layout.bodies}
-    for name, indices in own.items():
+def _infinite(term: str, x: Array, places: dict[str, np.ndarray] | None) -> Iterator[Finding]:
+    """Yields a finding for each body or coordinate with a non-finite entry in an array.
+
+    Args:
+        term: name of the wrong term, as in `Finding`.
+        x: the array to check, (n_q,) or (n_v,).
+        places: indices into x for each body; None for generalized coordinates.
+    """
+    if places is None:
+        places = {f"coordinate {i}": np.array([i]) for i in range(len(x))}
+    for name, indices in places.items():
         if not np.all(np.isfinite(x[indices])):
             yield Finding(term, name, f"is {checks.numerals(x[indices])}")
 
 
-def masses(system: Any, q: Array) -> Iterator[Finding]:
-    """Bodies whose mass or moments are not positive."""
+def masses(system: System, q: Array) -> Iterator[Finding]:
+    """Yields a finding for each body whose mass or moment of inertia is not positive."""
     mass = system.mass(q)
     wrong = jnp.where(mass.diagonal > 0, mass.diagonal, jnp.nan)
     yield from (Finding("mass", f.name, "is not positive") for f in entries(system, "mass", wrong))
@@ -82,49 +101,52 @@ def masses(system: Any, q: Array) -> Iterator[Finding]:
         yield Finding("mass", "the system", "is not positive definite")
 
 
-def forces(system: Any, q: Array, v: Array, t: Any, control: PyTree) -> Iterator[Finding]:
-    """Force elements whose force on a body is not finite, then bodies whose whole force is not."""
+def forces(
+    system: System, q: Array, v: Array, t: Doubled | Array, control: PyTree
+) -> Iterator[Finding]:
+    """Yields a finding for each force element, then each body, with a non-finite force."""
     snapshot = system.snapshot(q, v, t)
-    for group in getattr(system, "forces", ()):
-        for place, pull in group.pulls(snapshot, control):
-            size = sum(jnp.abs(jnp.asarray(lane)) for lane in pull)
-            for i in np.flatnonzero(~np.isfinite(np.atleast_1d(size))):
-                name = group.names[min(i, len(group.names) - 1)]
-                body = system.layout.groups[place.group].names[place.indices[i]]
-                yield Finding("force", name, f"on '{body}' is not finite")
+    if isinstance(system, BodySystem) and (layout := system.layout) is not None:
+        for group in system.forces:
+            for place, pull in group.pulls(snapshot, control):
+                size = sum(jnp.abs(jnp.asarray(component)) for component in pull)
+                for i in np.flatnonzero(~np.isfinite(np.atleast_1d(size))):
+                    name = group.names[min(i, len(group.names) - 1)]
+                    body = layout.groups[place.group].names[place.indices[i]]
+                    yield Finding("force", name, f"on '{body}' is not finite")
     yield from entries(system, "force", system.force(q, v, t, control))
 
 
 def terms(rows: Rows) -> Iterator[Finding]:
-    """Constraints of which a term is not finite."""
-    known = {"residual": rows.residual, "rate": rows.rate, "bias": rows.bias}
+    """Yields a finding for each constraint and each non-finite term of its linearization."""
+    values = {"residual": rows.residual, "rate": rows.rate, "bias": rows.bias}
     if rows.layout.size:
-        known["jacobian"] = rows.jacobian.dense()
+        values["jacobian"] = rows.jacobian.dense()
     if rows.compliance is not None:
-        known["compliance"] = rows.compliance
-    for term, value in known.items():
+        values["compliance"] = rows.compliance
+    for term, value in values.items():
         for name in rows.layout.names:
-            own = np.asarray(value)[rows.layout.rows(name)]
-            if not np.all(np.isfinite(own)):
-                yield Finding(term, name, f"is {checks.numerals(own)}")
+            entries = np.asarray(value)[rows.layout.rows(name)]
+            if not np.all(np.isfinite(entries)):
+                yield Finding(term, name, f"is {checks.numerals(entries)}")
 
 
-def dependent(system: Any, q: Array, rows: Rows) -> list[Finding]:
-    """Constraints whose rows are combinations of others."""
-    found: dict[str, list[int]] = {}
+def dependent(system: System, q: Array, rows: Rows) -> list[Finding]:
+    """Returns a finding for each constraint with rows that depend linearly on other rows."""
+    by_name: dict[str, list[int]] = {}
     unit = UnitRows(rows.layout, rows.jacobian.dense(), system.mass(q).dense())
     for i in dependent_rows(unit.values, unit.tolerance):
         name, row = unit.owners[i]
-        found.setdefault(name, []).append(row)
+        by_name.setdefault(name, []).append(row)
     return [
-        Finding("rows", name, f"depend on those before them: {', '.join(map(str, own))}")
-        for name, own in found.items()
+        Finding("rows", name, f"depend on those before them: {', '.join(map(str, numbers))}")
+        for name, numbers in by_name.items()
     ] or [Finding("rows", "the system", "depend on each other to working precision")]
 
 
-def worst(system: Any, state: State) -> Finding:
-    """The constraint that is furthest off."""
-    found = linearize(system, state.q, state.v, state.instant).violation
-    name = max(found.layout.names, key=lambda n: float(found[n]), default="none")
-    size = float(found[name]) if found.layout.names else 0.0
+def worst(system: System, state: State) -> Finding:
+    """Returns a finding that names the constraint with the largest violation."""
+    violation = linearize(system, state.q, state.v, state.instant).violation
+    name = max(violation.layout.names, key=lambda n: float(violation[n]), default="none")
+    size = float(violation[name]) if violation.layout.names else 0.0
     return Finding("violation", name, f"is {size:.3g} after the step")

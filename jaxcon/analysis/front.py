@@ -1,4 +1,4 @@
-"""What a comparison of methods found: runs, the Pareto front, and which method to take."""
+"""The result of `tradeoff`: all runs, the Pareto front, and the recommended method."""
 
 from __future__ import annotations
 
@@ -7,44 +7,49 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxcon.analysis.diagram import draw
 from jaxcon.analysis.listing import LEGEND, table
 from jaxcon.core.checks import check
-from jaxcon.simulation.method import Method
+from jaxcon.methods.method import Method
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 METERS, COORDINATES = "m", "of q"
-"""Units of the error: of bodies, and of generalized coordinates."""
+"""Units of the error, for systems of bodies and for generalized coordinates."""
 OK = "ok"
-"""The outcome of a run that neither failed nor left its bounds."""
+"""The outcome of a run that neither failed nor diverged."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """One method at one step in one precision.
+    """The result of one method with one step size in one precision.
 
     Attributes:
-        name: of the method.
+        name: name of the method.
         dtype: "float32" or "float64".
-        dt: h [s].
-        outcome: "ok", or what went wrong and when: the run diverged.
-        error: the largest distance from the reference at the ends of the parts [m], never below
-            the reference's own error; of a body √(d² + k²θ²), d between centres of mass, θ between
-            orientations and k the largest radius of gyration; on generalized coordinates the norm
-            of the difference of q. Infinite where the run diverged.
-        told: whether the error is more than that of the reference.
-        angle: the largest θ [rad].
-        violation: the worst |φ| of all steps [m, rad]; rows without a φ have none.
-        energy: the largest difference from the reference's [J].
-        cost: time on this device for a simulated second of one world in the batch [s/s]; NaN where
-            the run diverged, or there was no time to measure it.
-        alone: the same of a world that is alone on the device [s/s].
-        gradient: the same as `cost` of value and gradient of a rollout; NaN where not measured.
-        memory: of a world in the batch [B].
-        note: a status that does not end a run, such as CONFLICT.
-        unit: of `error`: "m" for bodies, "of q" for generalized coordinates.
-        method: the method itself.
+        dt: step size h [s].
+        outcome: "ok", or for a diverged run the failure and its time.
+        error: the largest distance from the reference solution [m], at the ends of the parts of the
+            horizon. It is at least the reference's own error, and infinite for a diverged run. A
+            body's distance is √(d² + k²θ²). Here d is the distance of centers of mass, θ the angle
+            between orientations, and k the largest radius of gyration. For generalized coordinates
+            the distance is ‖q − q_ref‖.
+        told: True if the error is resolved, that is, exceeds the reference's own error.
+        angle: the largest angle θ between orientations [rad].
+        violation: the largest |φ| over all steps [m, rad]. Velocity constraints have no φ.
+        energy: the largest energy difference from the reference [J].
+        cost: computing time per simulated second of one world in a batch on this device [s/s]. NaN
+            for a diverged run, or if there was no time to measure it.
+        alone: computing time per simulated second of a single world, without a batch [s/s].
+        gradient: computing time for value and gradient of a rollout, per simulated second of one
+            world in a batch [s/s]. NaN if not measured.
+        memory: memory per world of the batch [B].
+        note: name of a status that does not stop a run, such as CONFLICT; or empty.
+        unit: unit of `error`: "m" for bodies, "of q" for generalized coordinates.
+        method: the `jc.Method`.
     """
 
     name: str
@@ -66,11 +71,11 @@ class Run:
 
     @property
     def ok(self) -> bool:
-        """Returns True where it did not diverge."""
+        """True if the run did not diverge."""
         return self.outcome == OK
 
     def plain(self) -> dict[str, Any]:
-        """As JSON holds it, without the method; numbers that are not finite are None."""
+        """Returns all fields except the method, for JSON. Non-finite numbers become None."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "method"}
         bad = (k for k, x in values.items() if isinstance(x, float) and not math.isfinite(x))
         return values | dict.fromkeys(bad)
@@ -90,14 +95,15 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Limit:
-    """How long steps of a method may be.
+class StabilityLimit:
+    """The largest stable step size of a method.
 
     Attributes:
-        name: of the method.
+        name: name of the method.
         dtype: "float32" or "float64".
-        stable: the longest step up to which all that were tried were stable [s]; None without.
-        unstable: the shortest one above it that was not [s]; None where none was.
+        stable: the largest step size at which the method was stable, as at all smaller ones tried
+            [s]; None if there is none.
+        unstable: the smallest unstable step size above `stable` [s]; None if all were stable.
     """
 
     name: str
@@ -115,12 +121,12 @@ class Limit:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What was not run, and why.
+    """A method or measurement that was not run, with the reason.
 
     Attributes:
-        name: of the method.
-        dtype: its precision; empty for all.
-        reason: in words.
+        name: name of the method.
+        dtype: "float32" or "float64"; empty for both.
+        reason: the reason, as text.
     """
 
     name: str
@@ -133,22 +139,22 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """Error and cost of methods on one scene; `print` it.
+    """Errors and costs of methods on one scene; `print` it.
 
     Attributes:
-        runs: all that were made, also those that diverged.
-        limits: of each method and precision in the length of a step.
-        left_out: what was not run, and why.
-        horizon: how long each run was [s].
-        until: up to which errors are counted, as far as the reference is good [s].
-        floor: its own error there, below which no error can be told [m].
-        about: of the reference and the device, in words.
-        batch: how many worlds shared the device where `cost` was measured.
-        seconds: that all of it took.
+        runs: all runs, including diverged ones.
+        limits: the largest stable step size of each method in each precision.
+        left_out: methods and measurements that were skipped, with reasons.
+        horizon: simulated time of each run [s].
+        until: the time up to which the reference is accurate and errors are measured [s].
+        floor: error of the reference at time `until` [m]; smaller errors cannot be resolved.
+        about: description of the reference and the device, as lines of text.
+        batch: number of worlds in the batch for the cost measurements.
+        seconds: total time of the comparison [s].
     """
 
     runs: tuple[Run, ...]
-    limits: tuple[Limit, ...]
+    limits: tuple[StabilityLimit, ...]
     left_out: tuple[LeftOut, ...]
     horizon: float
     until: float
@@ -159,24 +165,26 @@ class Tradeoff:
 
     @property
     def front(self) -> tuple[Run, ...]:
-        """The runs that no other one beats in both error and cost, the cheapest first."""
+        """The Pareto front: runs that no other run beats in both error and cost, cheapest first."""
         return front_of(self.runs)
 
     def recommend(self, *, error: float | None = None, cost: float | None = None) -> Run:
-        """The cheapest run of at most this error, or the most accurate one of at most this cost.
+        """Returns the cheapest run within an error limit, or the most accurate within a cost limit.
 
-        Errors are those up to `until`; a chaotic motion that goes on is another beyond it.
+        Errors are measured up to the time `until`. After it, the motion may be chaotic, and no run
+        follows the reference.
 
         Args:
-            error: as of a `Run` [m].
-            cost: as of a `Run`, time for a simulated second of one world in the batch [s/s].
+            error: largest allowed `error` [m].
+            cost: largest allowed `cost` [s/s], the computing time per simulated second of one
+                world.
 
         Returns:
-            The run; its `method`, `dt` and `dtype` are ready to use.
+            The run. Simulate with its `method`, `dt` and `dtype`.
 
         Raises:
-            ValueError: none meets it; the message says what the best one reaches. Or not a positive
-                number.
+            ValueError: no run meets the limit, and the message gives the best value; or the limit
+                is not positive; or not exactly one limit is given.
         """
         check("recommend", "error= [m]", error, (), above=0, finite=False, optional=True)
         check("recommend", "cost= [s/s]", cost, (), above=0, finite=False, optional=True)
@@ -192,51 +200,51 @@ class Tradeoff:
                 f" {self.until:.3g} s; ask for more, or take a shorter horizon or a larger budget."
             )
         if error is not None:
-            able = [run for run in front if run.error <= error]
-            best, unit, what = front[-1].error, front[-1].unit, f"an error of at most {error:.2g}"
+            good = [run for run in front if run.error <= error]
+            best, unit, goal = front[-1].error, front[-1].unit, f"an error of at most {error:.2g}"
         else:
-            able = [run for run in front if run.cost <= (cost or 0.0)][-1:]
-            best, unit, what = front[0].cost, "s/s", f"a cost of at most {cost:.2g}"
-        if not able:
+            good = [run for run in front if run.cost <= (cost or 0.0)][-1:]
+            best, unit, goal = front[0].cost, "s/s", f"a cost of at most {cost:.2g}"
+        if not good:
             raise ValueError(
-                f"recommend: no run has {what} {unit}; the least is {best:.2g} {unit}. Other steps"
+                f"recommend: no run has {goal} {unit}; the least is {best:.2g} {unit}. Other steps"
                 " are tried by dts=, other methods by methods=, and more with a larger budget."
             )
-        return able[0]
+        return good[0]
 
-    def plot(self, onto: Any = None) -> Any:
-        """The work–precision diagram: error by cost, a line for each method and precision.
+    def plot(self, onto: Axes | str | Path | None = None) -> Axes:
+        """Plots the work–precision diagram: error over cost, with a line per method and precision.
 
         Args:
-            onto: matplotlib axes, or the path of a picture; new axes unless given.
+            onto: matplotlib axes, or the path of an image file; new axes by default.
 
         Returns:
-            The axes.
+            The matplotlib axes.
         """
         return draw(self, onto)
 
     @property
     def grouped(self) -> dict[tuple[str, str], list[Run]]:
-        """Runs by name and precision, the longest step first."""
-        found: dict[tuple[str, str], list[Run]] = {}
+        """Runs by (name, precision), the largest step size first."""
+        groups: dict[tuple[str, str], list[Run]] = {}
         for run in self.runs:
-            found.setdefault((run.name, run.dtype), []).append(run)
-        return {key: sorted(runs, key=lambda run: -run.dt) for key, runs in found.items()}
+            groups.setdefault((run.name, run.dtype), []).append(run)
+        return {key: sorted(runs, key=lambda run: -run.dt) for key, runs in groups.items()}
 
     @property
     def table(self) -> str:
-        """Every run, by method."""
+        """A text table of all runs, grouped by method."""
         return "\n".join(table([run for runs in self.grouped.values() for run in runs]))
 
     def to_json(self, path: str | Path | None = None) -> str:
-        """Everything but the methods themselves as JSON, also written to a path where one is given.
+        """Returns all results as JSON, without the method objects. Also writes a file if given.
 
-        Numbers that are not finite are null.
+        Numbers that are not finite become null.
 
         Args:
-            path: of a file; none unless given.
+            path: path of the file; None writes no file.
         """
-        found = {
+        contents = {
             "about": self.about,
             "horizon": self.horizon,
             "until": self.until,
@@ -248,7 +256,7 @@ class Tradeoff:
             "limits": [vars(x) for x in self.limits],
             "left_out": [vars(x) for x in self.left_out],
         }
-        text = json.dumps(found, indent=1)
+        text = json.dumps(contents, indent=1)
         if path is not None:
             Path(path).write_text(text + "\n")
         return text
@@ -274,18 +282,18 @@ class Tradeoff:
 
     @property
     def excuses(self) -> dict[str, list[str]]:
-        """By reason what was left out, each method with its precisions."""
-        found: dict[str, dict[str, list[str]]] = {}
+        """The skipped methods with their precisions, by reason."""
+        by_reason: dict[str, dict[str, list[str]]] = {}
         for x in self.left_out:
-            found.setdefault(x.reason, {}).setdefault(x.name, []).append(x.dtype)
+            by_reason.setdefault(x.reason, {}).setdefault(x.name, []).append(x.dtype)
         return {
-            reason: [", ".join(filter(None, [name, *dtypes])) for name, dtypes in own.items()]
-            for reason, own in found.items()
+            reason: [", ".join(filter(None, [name, *dtypes])) for name, dtypes in methods.items()]
+            for reason, methods in by_reason.items()
         }
 
     @property
     def without(self) -> str:
-        """Why there is no front."""
+        """The reason why the Pareto front is empty."""
         if self.runs:
             return "no run was both stable and timed; `result.table` says why"
         spent = f"no method was run in {self.seconds:.0f} s"
@@ -293,10 +301,10 @@ class Tradeoff:
 
 
 def front_of(runs: Iterable[Run]) -> tuple[Run, ...]:
-    """Returns the runs that no other one beats in both error and cost, the cheapest first."""
-    found: list[Run] = []
-    able = [run for run in runs if run.ok and math.isfinite(run.cost)]
-    for run in sorted(able, key=lambda run: (run.cost, run.error)):
-        if not found or run.error < found[-1].error:
-            found.append(run)
-    return tuple(found)
+    """Returns the Pareto front: runs that no other beats in both error and cost, cheapest first."""
+    front: list[Run] = []
+    timed = [run for run in runs if run.ok and math.isfinite(run.cost)]
+    for run in sorted(timed, key=lambda run: (run.cost, run.error)):
+        if not front or run.error < front[-1].error:
+            front.append(run)
+    return tuple(front)

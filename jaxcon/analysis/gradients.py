@@ -1,4 +1,4 @@
-"""Checks of derivatives: both modes against differences. Host code."""
+"""Checks derivatives by reverse and forward mode against finite differences. Host code."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import KeyEntry
 
 from jaxcon.analysis import encounters
 from jaxcon.analysis.differences import differences, steps, unseen
@@ -16,21 +17,22 @@ from jaxcon.core import checks, functions, notices
 from jaxcon.core.typing import Array, PyTree
 
 NO_DERIVATIVE = "there plain steps have no derivative that differences could confirm"
-"""The words for impacts that a wrong gradient meets."""
+"""The end of a note about impacts in a function whose gradient is wrong."""
 
 
 @dataclass(frozen=True)
 class LeafGradient:
-    """The derivative along directions of one leaf, by three ways.
+    """Directional derivatives of f by one leaf of x: reverse mode, forward mode and differences.
 
-    Directions are as long as the leaf: what is compared is the change of f by 100 % of it.
+    A direction is as long as the leaf itself. The derivative is thus the change of f per relative
+    change of the leaf.
 
     Attributes:
-        name: of the leaf in x.
-        reverse, forward, difference: by direction, (n,).
-        uncertainty: of the differences, as far as these tell, (n,).
-        scale: what errors are relative to, (n,).
-        tolerance: relative.
+        name: name of the leaf in x.
+        reverse, forward, difference: derivatives by direction, (n,).
+        uncertainty: estimated uncertainty of the differences, (n,).
+        scale: values by which errors are divided to make them relative, (n,).
+        tolerance: the largest allowed relative error.
     """
 
     name: str
@@ -43,35 +45,36 @@ class LeafGradient:
 
     @property
     def modes_apart(self) -> float:
-        """By how much forward and reverse mode differ, relative."""
+        """The largest relative difference between forward-mode and reverse-mode derivatives."""
         return self._largest(self.forward - self.reverse)
 
     @property
     def error(self) -> float:
-        """By how much the differences do beyond their own uncertainty, from the worse mode."""
+        """The largest relative error of both modes, minus the uncertainty of the differences."""
         return self._beyond(self.forward, self.reverse)
 
     @property
     def undecided(self) -> bool:
-        """Returns True where the differences are too inexact to tell."""
+        """True if the finite differences are too uncertain to judge the derivatives."""
         return not self._largest(self.uncertainty) <= self.tolerance
 
     @property
     def agrees(self) -> bool:
-        """True where all three agree; NaN never agrees."""
+        """True if both modes and the differences agree; False if a derivative is NaN."""
         return self.modes_apart <= self.tolerance and self.error <= self.tolerance
 
     @property
     def ok(self) -> bool:
-        """Returns True where they agree and the differences could tell."""
+        """True if the derivatives agree and the differences are accurate enough."""
         return self.agrees and not self.undecided
 
     def _beyond(self, *modes: np.ndarray) -> float:
-        """By how much the worst of these differs from the differences beyond their uncertainty."""
+        """Returns the largest relative error of given modes, minus the differences' uncertainty."""
         apart = np.maximum.reduce([np.abs(x - self.difference) for x in modes])
         return self._largest(np.maximum(apart - self.uncertainty, 0.0))
 
     def _largest(self, x: np.ndarray) -> float:
+        """Returns the largest absolute value of x, relative to `scale`."""
         return float(np.max(np.abs(x) / self.scale))
 
     def __str__(self) -> str:
@@ -79,6 +82,7 @@ class LeafGradient:
         return f"{head} differences by {self.error:.1e}{self._verdict()}"
 
     def _verdict(self) -> str:
+        """Returns the reason why the leaf is undecided or wrong; empty if it is right."""
         if self.ok:
             return ""
         if self.agrees:
@@ -86,14 +90,14 @@ class LeafGradient:
                 f"; UNDECIDED: differences tell no more than {self._largest(self.uncertainty):.1e}"
             )
         apart = np.maximum(*(np.abs(x - self.difference) for x in (self.reverse, self.forward)))
-        i = int(np.argmax(apart / self.scale))  # argmax finds NaN first
+        i = int(np.argmax(apart / self.scale))  # argmax returns the first NaN, if there is one
         return (
             f"; DISAGREES, {self._culprit()}: reverse {self.reverse[i]:.9g},"
             f" forward {self.forward[i]:.9g}, differences {self.difference[i]:.9g}"
         )
 
     def _culprit(self) -> str:
-        """Which modes the differences speak against, in words."""
+        """Returns a text that says which modes disagree with the differences."""
         modes = self.reverse, self.forward
         reverse, forward = (not self._beyond(mode) <= self.tolerance for mode in modes)
         if reverse and forward:
@@ -105,14 +109,13 @@ class LeafGradient:
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """The leaves of x, by what their derivatives are; `print` it.
+    """The result of a gradient check, by leaf of x; `print` it.
 
     Attributes:
-        leaves: one `LeafGradient` for each leaf of floating numbers.
-        tolerance: relative.
-        notes: cases in which derivatives of f may be wrong by structure, as of some impacts; and,
-            where a leaf is not right, the simultaneous, grazing or accumulating impacts of plain
-            steps that f meets at x.
+        leaves: one `LeafGradient` for each leaf with floating-point numbers.
+        tolerance: the largest allowed relative error.
+        notes: structural reasons why derivatives of f may be wrong, such as some impacts. If a leaf
+            is wrong, also the simultaneous, grazing or accumulating impacts of f at x.
     """
 
     leaves: tuple[LeafGradient, ...]
@@ -121,24 +124,25 @@ class GradientCheck:
 
     @property
     def ok(self) -> bool:
-        """Returns True where every leaf is right."""
+        """True if the derivatives by all leaves are right."""
         return all(leaf.ok for leaf in self.leaves)
 
     @property
     def error(self) -> float:
-        """The largest of the leaves, relative."""
+        """The largest relative error of all leaves, including differences between the modes."""
         return float(np.max([[leaf.error, leaf.modes_apart] for leaf in self.leaves]))
 
     @property
     def wrong(self) -> tuple[str, ...]:
-        """Names of leaves that disagree, or of which differences cannot tell."""
+        """Names of the leaves whose derivatives disagree or are undecided."""
         return tuple(leaf.name for leaf in self.leaves if not leaf.ok)
 
     def __str__(self) -> str:
-        off = [leaf.name for leaf in self.leaves if not leaf.agrees]
-        open_ = [leaf.name for leaf in self.leaves if leaf.agrees and leaf.undecided]
-        found = {"wrong for": off, "undecided for": open_}
-        verdict = ", ".join(f"{what} {names}" for what, names in found.items() if names) or "right"
+        wrong = [leaf.name for leaf in self.leaves if not leaf.agrees]
+        undecided = [leaf.name for leaf in self.leaves if leaf.agrees and leaf.undecided]
+        groups = {"wrong for": wrong, "undecided for": undecided}
+        verdict = ", ".join(f"{label} {names}" for label, names in groups.items() if names)
+        verdict = verdict or "right"
         head = f"gradients to {self.tolerance:.1e}: {verdict}"
         notes = (f"  note, {note}" for note in self.notes)
         return "\n".join([head, *(f"  {leaf}" for leaf in self.leaves), *notes])
@@ -152,29 +156,31 @@ def check_gradients(
     directions: int = 3,
     seed: int = 0,
 ) -> GradientCheck:
-    """Compares reverse mode, forward mode and central differences of f at x, leaf by leaf.
+    """Compares derivatives of f at x by reverse mode, forward mode and central differences.
 
-    A leaf of up to `directions` numbers is moved along each of them, a larger one along as many
-    random directions. Differences are central, at ten steps from ε^⅛ of the leaf's size down by
-    halves, and extrapolated to zero by Ridders' method, which also tells how exact they are; no
-    step need be chosen. Where f returns more than a number, it is tested by a random combination.
+    Each leaf of x is checked separately. A leaf of up to `directions` numbers is varied along each
+    of them. A larger leaf is varied along `directions` random directions. Central differences use
+    ten step sizes, from ε^⅛ of the leaf's size downward by halves. Ridders' method extrapolates
+    them to zero and estimates their uncertainty, so no step size needs to be chosen. If f returns
+    several numbers, a random linear combination of them is checked.
 
     Args:
-        f: x → a number, or a pytree of them; a rollout, say.
-        x: pytree; leaves that are no floating numbers, and empty ones, are left as they are.
-        tolerance: relative to the derivative by the number, or to the largest along random
-            directions; ε^⅓ unless given, which is 6e-6 in float64 and 5e-3 in float32, ε being that
-            of the coarsest number in x and f. A derivative that rounding hides from differences is
-            held to what they see.
-        directions: of a leaf.
-        seed: of random directions.
+        f: function from x to a number or a pytree of numbers, such as a rollout.
+        x: pytree of arguments. Leaves without floating-point numbers, and empty leaves, stay fixed.
+        tolerance: the largest allowed relative error, by default ε^⅓ of the coarsest dtype in x and
+            f: 6e-6 in float64, 5e-3 in float32. It is relative to the derivative by a single
+            number, or to the largest derivative along random directions. If rounding hides a
+            derivative from the differences, the error is relative to the smallest derivative that
+            they resolve.
+        directions: number of directions per leaf.
+        seed: seed of random directions.
 
     Returns:
-        The `GradientCheck`.
+        A `jc.analysis.GradientCheck`.
 
     Raises:
-        ValueError: x or f has no floating numbers, or some that are not finite.
-        TypeError: f is no function, or one of other arguments.
+        ValueError: x or f has no floating-point numbers, or has numbers that are not finite.
+        TypeError: f is not a function of x alone.
 
     References:
         Ridders, Accurate computation of F'(x) and F'(x)F''(x), Adv. Eng. Softw. 4 (1982).
@@ -188,18 +194,18 @@ def check_gradients(
     floating = [i for i, (_, leaf) in enumerate(named) if _is_floating(leaf)]
     if not floating:
         raise ValueError("check_gradients: x has no leaf of floating numbers to differentiate by.")
-    structure, given = jax.tree.structure(x), [leaf for _, leaf in named]
+    structure, all_leaves = jax.tree.structure(x), [leaf for _, leaf in named]
 
     def at(moved: list[Array]) -> PyTree:
-        chosen = dict(zip(floating, moved, strict=True))
+        replaced = dict(zip(floating, moved, strict=True))
         return functions.call(
             "check_gradients",
             "f",
             f,
-            structure.unflatten([chosen.get(i, leaf) for i, leaf in enumerate(given)]),
+            structure.unflatten([replaced.get(i, leaf) for i, leaf in enumerate(all_leaves)]),
         )
 
-    here = [jnp.asarray(given[i]) for i in floating]
+    here = [jnp.asarray(all_leaves[i]) for i in floating]
     for i, leaf in zip(floating, here, strict=True):
         checks.check("check_gradients", f"x.{named[i][0]}" if named[i][0] != "x" else "x", leaf)
     results = [y for y in jax.tree.leaves(jax.eval_shape(at, here)) if _is_floating(y)]
@@ -208,11 +214,12 @@ def check_gradients(
     eps = max(float(jnp.finfo(y.dtype).eps) for y in [*here, *results])
     ways = [_directions(leaf, directions, random) for leaf in here]
     with notices.collected() as notes:
-        found, size = _three_ways(_weighted(at, results, random), here, ways, eps)
+        derivatives, size = _three_ways(_weighted(at, results, random), here, ways, eps)
     allowed = eps ** (1 / 3) if tolerance is None else tolerance
+    # rounding of f hides smaller derivatives, so this is a lower bound of the scale
     hidden = unseen(eps) * size / allowed
     leaves = []
-    for i, leaf, result in zip(floating, here, found, strict=True):
+    for i, leaf, result in zip(floating, here, derivatives, strict=True):
         scale = _scale(result, hidden, leaf.size <= directions)
         leaves += [LeafGradient(named[i][0], *result, scale=scale, tolerance=allowed)]
     doubtful = [i for i, leaf in enumerate(leaves) if not leaf.ok]
@@ -223,18 +230,22 @@ def check_gradients(
 
 
 def _alone(at: list[Array], place: int, way: Array, eps: float) -> list[Array]:
-    """The largest move of differences, of one leaf along one of its directions."""
+    """Returns the differences' largest perturbation: of one leaf, along one of its directions."""
     step = steps(eps)[0]
     return [x.dtype.type(step) * way if i == place else 0 * x for i, x in enumerate(at)]
 
 
 def _scale(result: tuple[np.ndarray, ...], hidden: float, alone: bool) -> np.ndarray:
-    """The derivative by each number, or the largest along random directions; no less than is seen.
+    """Returns the values by which errors are divided to make them relative, (n,).
+
+    If each direction varies a single number, this is the derivative along it. Otherwise it is the
+    largest derivative over all directions.
 
     Args:
-        result: by three ways, and their uncertainty.
-        hidden: what differences see at least.
-        alone: whether each direction is one number.
+        result: four arrays (n,): derivatives by reverse mode, forward mode and differences, and
+            uncertainties.
+        hidden: lower bound of the result: the smallest derivative that the differences resolve.
+        alone: True if each direction varies a single number.
     """
     largest = np.fmax.reduce(np.abs(result[:3]), axis=0)
     largest = largest if alone else np.full_like(largest, np.fmax.reduce(largest, initial=0.0))
@@ -242,35 +253,45 @@ def _scale(result: tuple[np.ndarray, ...], hidden: float, alone: bool) -> np.nda
     return np.where(largest > 0, largest, 1.0)
 
 
-def _name(path: Any) -> str:
-    """Returns the name of a leaf, such as "params.rod.length"."""
+def _name(path: tuple[KeyEntry, ...]) -> str:
+    """Converts the path of a leaf to its name, such as "params.rod.length"."""
     return jax.tree_util.keystr(path, simple=True, separator=".") or "x"
 
 
-def _weighted(f: Callable[[Any], PyTree], results: list[Any], random: Any) -> Callable[[Any], Any]:
-    """x → f, or a random combination of its results, and the sum of sizes that this adds up."""
+def _weighted(
+    f: Callable[[list[Array]], PyTree],
+    results: list[jax.ShapeDtypeStruct],
+    random: np.random.Generator,
+) -> Callable[[list[Array]], tuple[Array, Array]]:
+    """Returns a function from x to (f(x), sum of the absolute terms).
+
+    If f has several results, f(x) is replaced by a random linear combination of them.
+    """
     alone = len(results) == 1 and results[0].size == 1
     weights = [np.ones(y.shape) if alone else random.normal(size=y.shape) for y in results]
     widest = max((y.dtype for y in results), key=lambda dtype: dtype.itemsize)
 
-    def value(x: Any) -> tuple[Array, Array]:
-        found = [y for y in jax.tree.leaves(f(x)) if _is_floating(y)]
-        pairs = zip(weights, found, strict=True)
-        every = jnp.concatenate(
+    def value(x: list[Array]) -> tuple[Array, Array]:
+        floating = [y for y in jax.tree.leaves(f(x)) if _is_floating(y)]
+        pairs = zip(weights, floating, strict=True)
+        terms = jnp.concatenate(
             [jnp.ravel(jnp.asarray(w, widest) * jnp.asarray(y, widest)) for w, y in pairs]
         )
-        return jnp.sum(every), jnp.sum(jnp.abs(every))
+        return jnp.sum(terms), jnp.sum(jnp.abs(terms))
 
     return value
 
 
 def _is_floating(x: Any) -> bool:
-    """Returns True where it has real numbers, and not none of them."""
+    """Returns True for a nonempty array of real floating-point numbers."""
     return bool(checks.is_floating(x) and np.prod(np.shape(x)) > 0)
 
 
-def _directions(leaf: Array, count: int, random: Any) -> Array:
-    """Returns random directions (n, …) of a leaf, as long as the leaf, or 1 where it is zero."""
+def _directions(leaf: Array, count: int, random: np.random.Generator) -> Array:
+    """Returns directions (n, …) in which a leaf is varied, with the leaf's size as length.
+
+    If the leaf is zero, their length is 1. Sizes and lengths are maximum norms.
+    """
     size = float(jnp.max(jnp.abs(leaf), initial=0)) or 1.0
     if leaf.size <= count:
         ways = np.eye(leaf.size)
@@ -280,30 +301,50 @@ def _directions(leaf: Array, count: int, random: Any) -> Array:
     return jnp.asarray(size * ways, leaf.dtype).reshape((len(ways), *leaf.shape))
 
 
-def _three_ways(of: Any, at: list[Array], ways: list[Array], eps: float) -> tuple[list[Any], float]:
-    """By leaf: reverse, forward, difference, uncertainty, by direction; and the size of f.
+def _three_ways(
+    f: Callable[[list[Array]], tuple[Array, Array]],
+    at: list[Array],
+    ways: list[Array],
+    eps: float,
+) -> tuple[list[tuple[np.ndarray, ...]], float]:
+    """Differentiates f by reverse mode, forward mode and central differences.
+
+    Args:
+        f: function from a list of arrays to a number and the sum of its absolute terms.
+        at: the arrays at which f is differentiated.
+        ways: n directions for each array, (n, …).
+        eps: ε of the coarsest dtype in the computation.
+
+    Returns:
+        For each array a tuple (reverse, forward, difference, uncertainty) of arrays (n,) by
+        direction; and the sum of the absolute terms of f.
 
     Raises:
-        ValueError: that is not finite.
+        ValueError: f is not finite.
     """
     counts = [len(way) for way in ways]
     total, ends = sum(counts), np.cumsum(counts)
-    # every direction moves one leaf and leaves the others
+    # one vmap over all directions: each moves one leaf by a nonzero amount
     moves = [
         jnp.zeros((total, *x.shape), x.dtype).at[end - len(way) : end].set(way)
         for x, way, end in zip(at, ways, ends, strict=True)
     ]
 
     def value(x: list[Array]) -> Array:
-        return of(x)[0]
+        return f(x)[0]
 
-    gradient, size = jax.jit(jax.grad(of, has_aux=True))(at)
+    gradient, size = jax.jit(jax.grad(f, has_aux=True))(at)
     if not np.isfinite(size):
         raise ValueError("check_gradients: f is not finite at x: it has no derivative there.")
     forward = jax.jit(jax.vmap(lambda move: jax.jvp(value, (at,), (move,))[1]))(moves)
     pairs = zip(ways, gradient, strict=True)
     reverse = [np.asarray(w.reshape(len(w), -1), np.float64) @ np.ravel(g) for w, g in pairs]
-    apart = differences(value, at, moves, eps)
-    known = np.concatenate(reverse), np.asarray(forward, np.float64), *apart
-    by_leaf = [tuple(x[end - n : end] for x in known) for n, end in zip(counts, ends, strict=True)]
+    columns = (
+        np.concatenate(reverse),
+        np.asarray(forward, np.float64),
+        *differences(value, at, moves, eps),
+    )
+    by_leaf = [
+        tuple(x[end - n : end] for x in columns) for n, end in zip(counts, ends, strict=True)
+    ]
     return by_leaf, float(size)

@@ -1,11 +1,11 @@
-"""How fast derivatives grow along a rollout, and when they say nothing any more. Host code."""
+"""Growth of derivatives along a rollout, and the time after which they are useless. Host code."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,29 +14,36 @@ import numpy as np
 from jaxcon.constraints.rows import linearize
 from jaxcon.core import checks
 from jaxcon.core.status import Status, failed
-from jaxcon.core.typing import Array
-from jaxcon.model.state import State, at
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
+from jaxcon.core.typing import Array, PyTree, Scalar
+from jaxcon.execution.rollout import rollout
+from jaxcon.methods.method import Method
+from jaxcon.protocols import System
+from jaxcon.system.state import State, checked_system
 
 FULL = 16
-"""Up to so many independent moves of (q, v) all are taken; beyond, as many random ones."""
+"""The largest number of perturbation directions of (q, v).
+
+If more are independent, this many random ones are used.
+"""
 
 
 POLYNOMIAL = 4.0
-"""exponent · time up to which growth may be that of a power: t² is fitted to 2.8 there."""
+"""The largest exponent · time at which growth may be polynomial rather than exponential.
+
+For growth ∝ t², the fitted exponent · time is 2.8.
+"""
 
 
 @dataclass(frozen=True)
 class GradientGrowth:
-    """‖∂x_t/∂x_0‖ along a rollout, x = (q, v); `print` it.
+    """Growth of the derivatives ‖∂x_t/∂x_0‖ along a rollout, with x = (q, v); `print` it.
 
     Attributes:
-        time: since the start, (n,) [s].
-        growth: what moves of the start that the constraints allow have become, the root of the
-            mean square over them, relative to what they were, (n,).
-        exponent: of growth ∝ e^(exponent t), fitted to the second half of the rollout [1/s].
-        spacing: ε, of floating numbers, relative.
+        time: time since the start, (n,) [s].
+        growth: root mean square size of perturbations at each time, relative to their initial size,
+            (n,). The mean is over perturbations that satisfy the constraints.
+        exponent: growth rate λ [1/s] of e^(λ t), fitted to the second half of the rollout.
+        spacing: machine epsilon ε of the state's dtype.
     """
 
     time: np.ndarray
@@ -45,24 +52,26 @@ class GradientGrowth:
     spacing: float
 
     def horizon(self, error: float | None = None) -> float:
-        """The time beyond which a derivative says nothing about the motion [s].
+        """Returns the time after which derivatives by the initial state are meaningless [s].
 
-        The state at the start is known to a relative error δ, at the least by its rounding. At the
-        time where growth · δ = 1 this has become as large as the state itself, and the derivative
-        is that of another motion than the one that was meant.
+        The initial state has a relative error δ, at least the rounding error. When growth · δ = 1,
+        this error has grown to the size of the state itself. The simulated motion, and hence its
+        derivative, then differs completely from the intended one.
 
         Args:
-            error: δ, such as that of a measured start or of the discretization; ε unless given.
+            error: relative error δ, for example of a measured initial state or of the
+                discretization; ε by default.
 
         Returns:
-            The time; beyond the rollout by the exponent, and infinite where so far nothing grows
-            faster than a power of time might: a longer rollout may tell.
+            The time since the start. Beyond the end of the rollout it is extrapolated with
+            `exponent`. It is infinite if the growth so far is not faster than polynomial; a longer
+            rollout may show exponential growth.
         """
         limit = 1 / (self.spacing if error is None else error)
         late = np.flatnonzero(~(self.growth < limit))
         if late.size:
             return float(self.time[late[0]])
-        # the phase of any pendulum moves away in proportion to t, which is no exponent
+        # a pendulum's phase error grows in proportion to t, which is not exponential
         if self.exponent * self.time[-1] <= POLYNOMIAL:
             return math.inf
         return float(self.time[-1] + math.log(limit / self.growth[-1]) / self.exponent)
@@ -80,34 +89,43 @@ class GradientGrowth:
 
 
 def gradient_growth(
-    system: Any, method: Method, state: State, controls: Any, dt: Any, steps: int, seed: int = 0
+    system: System,
+    method: Method,
+    state: State,
+    controls: PyTree | Callable[[State], PyTree],
+    dt: Scalar,
+    steps: int,
+    seed: int = 0,
 ) -> GradientGrowth:
-    """How ‖∂x_t/∂x_0‖ grows along a rollout, by forward mode.
+    """Computes the growth of the derivatives ‖∂x_t/∂x_0‖ along a rollout, with x = (q, v).
 
-    Moves of the start are those that keep φ = 0 and φ̇ = 0; others would be taken back by feedback
-    at once. The growth is ‖∂x_t/∂x_0‖_F/√n over n such moves, in SI units: all that there are, or
-    16 random ones where there are more.
+    Uses forward mode.
+
+    Only initial perturbations that keep φ and φ̇ unchanged are used; feedback would quickly remove
+    others. With n independent ones, the growth is ‖∂x_t/∂x_0‖_F/√n in SI units. If n > 16, 16
+    random ones are used.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: the start.
-        controls: as of `rollout`.
-        dt: h, () [s].
-        steps: how many.
-        seed: of random moves.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: the initial state.
+        controls: control inputs, as in `jc.rollout`.
+        dt: step size h, () [s].
+        steps: number of steps.
+        seed: seed of random perturbations.
 
     Returns:
-        The `GradientGrowth`, with a hundred times or two where the number of steps has a divisor
-        for that, or more.
+        A `jc.analysis.GradientGrowth` at 100 to 200 times, or at more times if the number of steps
+        has no suitable divisor.
 
     Raises:
-        ValueError: the constraints leave no freedom, the rollout fails, or what `rollout` refuses.
+        ValueError: the constraints leave no degree of freedom, the rollout fails, or `jc.rollout`
+            refuses an argument.
     """
     checks.count("gradient_growth", "steps", steps, 4)
     checks.count("gradient_growth", "seed", seed, 0)
     checks.check("gradient_growth", "dt", dt, (), above=0)
-    moves = _allowed(at(system, state), state)
+    moves = _allowed(checked_system(system, state), state)
     n = moves.shape[1]
     if n == 0:
         raise ValueError("gradient_growth: the constraints leave no freedom in which to move.")
@@ -118,7 +136,7 @@ def gradient_growth(
     def path(move: Array) -> tuple[Array, Array]:
         q = system.retract(state.q, move[: len(state.v)])
         start = dataclasses.replace(state, q=q, v=state.v + move[len(state.v) :])
-        final, kept = rollout(
+        final, recorded = rollout(
             system,
             method,
             start,
@@ -129,7 +147,7 @@ def gradient_growth(
             every=every,
         )
         first = jnp.concatenate([start.q, start.v])
-        return jnp.concatenate([first[None], kept]), final.status
+        return jnp.concatenate([first[None], recorded]), final.status
 
     def along(move: Array) -> tuple[Array, Array]:
         _, moved, code = jax.jvp(path, (jnp.zeros_like(move),), (move,), has_aux=True)
@@ -151,15 +169,15 @@ def gradient_growth(
 
 
 def _exponent(time: np.ndarray, growth: np.ndarray) -> float:
-    """Returns the rate of growth over the second half of the positive numbers [1/s]."""
-    told = np.isfinite(growth) & (growth > 0)
-    time, size = time[told], np.log(growth[told])
+    """Fits the exponential growth rate to the second half of the finite, positive values [1/s]."""
+    positive = np.isfinite(growth) & (growth > 0)
+    time, size = time[positive], np.log(growth[positive])
     half = len(time) // 2
     return float(np.polyfit(time[half:], size[half:], 1)[0])
 
 
-def _allowed(system: Any, state: State) -> np.ndarray:
-    """An orthonormal basis of the moves (δq, δv) that keep φ and φ̇, (2 n_v, n)."""
+def _allowed(system: System, state: State) -> np.ndarray:
+    """Returns an orthonormal basis of perturbations (δq, δv) that keep φ and φ̇, (2 n_v, n)."""
     n = len(state.v)
 
     def both(move: Array) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""What a comparison of methods has found so far: on disk, so that it can go on; and its time."""
+"""Saved results of `tradeoff`, from which it resumes, and its time budget."""
 
 from __future__ import annotations
 
@@ -17,30 +17,42 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxcon.analysis.front import LeftOut, Limit, Run
+from jaxcon.analysis.front import LeftOut, Run, StabilityLimit
 from jaxcon.analysis.reference import Reference
 from jaxcon.analysis.sweep import Unit
-from jaxcon.analysis.trials import Course, Points, Seen
+from jaxcon.analysis.trials import Course, Observation, Points
 from jaxcon.core import checkpoint as files
-from jaxcon.simulation.method import Method
+from jaxcon.methods.method import Method
 
 OWNER = "tradeoff"
 ROOT = Path(files.__file__).parents[1]
-"""The folder of the package."""
+"""The directory of the package."""
 SLOWER = 1.3
-"""How much longer a piece of work may take than the longest one before it."""
+"""The factor by which a task may take longer than the longest task of its kind so far."""
 FIRST = 5
-"""How much longer than those of others the first of a kind may take, as to compile a gradient: of
-RK4 on five bodies in space three minutes, where its runs in both batches took half of one."""
+"""The factor by which the first task of a kind may take longer than tasks of other kinds.
+
+For example, compiling a gradient of RK4 on five bodies in 3D takes three minutes. The runs of both
+batches take half a minute.
+"""
 
 GRADIENT = 3
-"""How much longer than compiling the runs of a method its gradient may take: 1.5 to 2.2 on a
-four-bar. This is for the first one; the next are judged by it."""
+"""The factor by which the first gradient may take longer than compiling the runs of its method.
+
+On a four-bar it is 1.5 to 2.2. The first gradient serves to predict later ones.
+"""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """A method in a precision, at steps that were asked for."""
+    """A method to measure, with precision and step sizes.
+
+    Attributes:
+        name: name of the method.
+        method: the method.
+        dtype: "float32" or "float64".
+        dts: the user's step sizes [s]; None for default step sizes.
+    """
 
     name: str
     method: Method
@@ -49,8 +61,9 @@ class Wanted:
 
     @property
     def key(self) -> str:
-        """Under which it is kept: the same in another process."""
+        """The key of this method's results in the ledger, equal in all processes."""
         leaves, structure = jax.tree.flatten(self.method)
+        # functions print with their addresses, which differ between processes
         plain = re.sub(r" at 0x[0-9a-f]+", "", str(structure))
         digest = files.digest(plain, str(self.dts), *leaves)
         return f"{self.name}, {self.dtype}, {digest}"
@@ -58,12 +71,12 @@ class Wanted:
 
 @dataclass
 class Ledger:
-    """The reference and the units found so far.
+    """The reference solution and the results so far, saved in a file.
 
     Attributes:
-        file: where they are kept; None, and they are not.
-        about: what they belong to.
-        contents: as JSON holds them.
+        file: path of the file; None keeps results in memory only.
+        about: the settings of the comparison, which must match those in the file.
+        contents: reference and results as JSON values.
     """
 
     file: Path | None
@@ -72,10 +85,11 @@ class Ledger:
 
     @classmethod
     def open(cls, file: str | Path | None, course: Course, batch: int) -> Ledger:
-        """Returns the ledger of a file, where there is one, or a new one.
+        """Returns the ledger of an existing file, or a new one.
 
         Raises:
-            ValueError: the file holds another comparison; the message says what is not the same.
+            ValueError: the file belongs to another comparison; the message says which setting
+                differs.
         """
         if file is None:
             return cls(None, {})
@@ -91,29 +105,32 @@ class Ledger:
             "the version of jax": jax.__version__,
             "the code of jaxcon": code(),
         }
-        found = cls(path, about)
+        ledger = cls(path, about)
         if path.exists():
             (text,) = files.read(path, [np.zeros(())], about, OWNER)
-            found.contents = json.loads(str(text))
-        return found
+            ledger.contents = json.loads(str(text))
+        return ledger
 
     def save(self) -> None:
-        """Writes all of it, where there is a file."""
+        """Writes the results to the file, if there is one."""
         if self.file is not None:
             files.write(self.file, self.about, [np.array(json.dumps(self.contents))])
 
     @property
     def reference(self) -> Reference | None:
-        """The reference, where there is one."""
-        known = self.contents["reference"]
-        if known is None:
+        """The saved reference solution; None if there is none yet."""
+        values = self.contents["reference"]
+        if values is None:
             return None
-        rows = {name: [np.array(x) for x in known[name]] for name in ("points", "seen")}
-        made = {"points": Points(*rows["points"]), "seen": Seen(*rows["seen"])}
-        return Reference(**known | made | {"error": np.array(known["error"])})
+        arrays = {
+            "points": Points(*map(np.array, values["points"])),
+            "seen": Observation(*map(np.array, values["seen"])),
+            "error": np.array(values["error"]),
+        }
+        return Reference(**values | arrays)
 
     def keep(self, reference: Reference) -> None:
-        """Takes the reference in."""
+        """Saves the reference solution."""
         self.contents["reference"] = {
             name: jax.tree.map(lambda x: x.tolist() if isinstance(x, np.ndarray) else x, value)
             for name, value in vars(reference).items()
@@ -124,35 +141,35 @@ class Ledger:
         return wanted.key in self.contents["units"]
 
     def __getitem__(self, wanted: Wanted) -> Unit:
-        known = self.contents["units"][wanted.key]
+        values = self.contents["units"][wanted.key]
         return Unit(
-            tuple(Run(**run, method=wanted.method) for run in known["runs"]),
-            Limit(**known["limit"]) if known["limit"] else None,
-            tuple(LeftOut(**x) for x in known["left_out"]),
-            known["differentiated"],
-            known["compiling"],
+            tuple(Run(**run, method=wanted.method) for run in values["runs"]),
+            StabilityLimit(**values["limit"]) if values["limit"] else None,
+            tuple(LeftOut(**x) for x in values["left_out"]),
+            values["differentiated"],
+            values["compiling"],
         )
 
     def __setitem__(self, wanted: Wanted, unit: Unit) -> None:
         runs = [dataclasses.replace(run, method=None) for run in unit.runs]
-        known = asdict(dataclasses.replace(unit, runs=()))
-        known["runs"] = [{k: x for k, x in asdict(run).items() if k != "method"} for run in runs]
-        self.contents["units"][wanted.key] = known
+        values = asdict(dataclasses.replace(unit, runs=()))
+        values["runs"] = [{k: x for k, x in asdict(run).items() if k != "method"} for run in runs]
+        self.contents["units"][wanted.key] = values
         self.save()
 
 
 @functools.cache
 def code() -> str:
-    """A digest of all modules of the package: what other code found is not to be gone on from."""
+    """Returns a digest of all modules of the package, since changed code may change results."""
     modules = sorted(ROOT.rglob("*.py"))
     return files.digest(*(f"{path.relative_to(ROOT)}\n{path.read_text()}" for path in modules))
 
 
 class Clock:
-    """How much of a budget of time is left.
+    """The time budget of a comparison.
 
     Attributes:
-        budget: [s].
+        budget: the budget [s].
     """
 
     def __init__(self, budget: float) -> None:
@@ -161,32 +178,33 @@ class Clock:
 
     @property
     def spent(self) -> float:
-        """So far [s]."""
+        """The elapsed time [s]."""
         return time.perf_counter() - self.begin
 
     @property
     def left(self) -> float:
-        """The rest of the budget [s]; negative beyond it."""
+        """The remaining budget [s]; negative once it is exceeded."""
         return self.budget - self.spent
 
     def asks(self, work: str, guess: float | None = None) -> float:
-        """The longest time that one more piece of this kind of work may take [s].
+        """Returns an upper estimate of the duration of one more task of a kind [s].
 
         Args:
-            work: its kind.
-            guess: for the first of its kind [s]; from the longest of other kinds unless given.
+            work: the kind of the task, such as "runs".
+            guess: estimate for the first task of its kind [s]; by default a multiple of the longest
+                task of any kind.
         """
         if guess is None:
             guess = FIRST * max(self.longest.values(), default=0.0)
         return SLOWER * self.longest.get(work, guess)
 
     def lasts(self, work: str, share: float = 1.0, guess: float | None = None) -> bool:
-        """Returns True where a share of the budget lasts for one more piece of this work."""
+        """Returns True if one more task of a kind is expected to end within a budget share."""
         return self.spent + self.asks(work, guess) < share * self.budget
 
     @contextlib.contextmanager
     def timing(self, work: str) -> Iterator[None]:
-        """Takes the time of a piece of work."""
+        """Measures the duration of a task of a kind, as a context manager."""
         begin = self.spent
         yield
         self.longest[work] = max(self.longest.get(work, 0.0), self.spent - begin)

@@ -1,13 +1,16 @@
-"""Runs of a comparison of methods as a table for people."""
+"""Text tables of the runs of `tradeoff`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jaxcon.analysis.front import Run
 
 COLUMNS = ("error", "angle", "violation", "energy", "cost", "alone", "gradient", "memory")
-"""Numbers of a `Run` that are shown."""
+"""The fields of a `Run` in the table."""
 LEGEND = (
     "error: the largest distance from the reference [m, or of q], < where it tells no less;"
     " angle: the largest turn from it [rad]",
@@ -15,11 +18,11 @@ LEGEND = (
     "cost, alone, gradient: time for a simulated second of one world [s]: in the batch, by itself,"
     " in the batch with its gradient; memory: of a world in the batch [B]",
 )
-"""What stands in the columns, and in which units."""
+"""The meaning and units of the columns."""
 
 
-def table(runs: Sequence[Any]) -> list[str]:
-    """A line for each `Run` under the names of its numbers; what was not measured is a dash."""
+def table(runs: Sequence[Run]) -> list[str]:
+    """Returns the lines of a table: a header, then a line per run. A dash means not measured."""
     width = max([len("method"), *(len(run.name) for run in runs)])
     head = f"{'method':{width}s}  {'precision':9s}  {'h [s]':8s}"
     lines = [head + "".join(f"{name:>11s}" for name in COLUMNS)]
@@ -29,8 +32,8 @@ def table(runs: Sequence[Any]) -> list[str]:
     return lines
 
 
-def figures(run: Any) -> str:
-    """The numbers of a run, or why there are none."""
+def figures(run: Run) -> str:
+    """Formats the measured values of a run as table cells, or the reason why it diverged."""
     if not run.ok:
         return f"  diverged: {run.outcome}"
     values = {name: getattr(run, name) for name in COLUMNS}

@@ -1,8 +1,9 @@
-"""How much memory a batch of worlds takes, as the compiler counts it. Host code, for people."""
+"""Memory use of a batch of worlds, as planned by the compiler. Host code."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,31 +12,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
-from jaxcon.core.typing import PyTree
-from jaxcon.model.state import State
-from jaxcon.simulation.adjoints import EVERY_STEP, check_adjoint
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
-from jaxcon.simulation.segments import bytes_of
-from jaxcon.simulation.step import check_step, controls_in, idle, step_quietly
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.execution.adjoints import EVERY_STEP, check_adjoint
+from jaxcon.execution.rollout import rollout
+from jaxcon.execution.segments import bytes_of
+from jaxcon.execution.step import step_quietly
+from jaxcon.execution.validation import check_step, controls_in, idle
+from jaxcon.methods.method import Method
+from jaxcon.protocols import Adjoint, System
+from jaxcon.step import StepInfo
+from jaxcon.system.state import State
 
 BATCHES = 64, 256
-"""Sizes that are compiled: what a world takes is in proportion from here on."""
+"""The two compiled batch sizes. From the first one on, memory grows in proportion to the batch."""
 SHORT, LONGER = 4, 68
-"""Steps of the gradients that are compiled."""
+"""The lengths of the two rollouts whose gradients are compiled [steps]."""
 DT = 1e-3
-"""A step [s]; sizes do not depend on it."""
+"""The step size [s]; memory does not depend on it."""
 
 
 @dataclass(frozen=True)
 class Memory:
-    """What a step of a batch takes: `shared` + worlds · (`state` + `working`).
+    """Memory to step a batch: `shared` + worlds · (`state` + `working`).
 
     Attributes:
-        state: all leaves of one world's state [B].
-        working: what a step needs for one world beside the state it is given: the new state, the
-            `StepInfo`, and what lies between [B].
-        shared: what does not grow with the batch [B].
+        state: size of all leaves of one world's state [B].
+        working: memory of a step per world, without its input state [B]: the new state, the
+            `StepInfo` and temporaries.
+        shared: memory that does not depend on the batch size [B].
     """
 
     state: int
@@ -43,10 +47,10 @@ class Memory:
     shared: float
 
     def of(self, worlds: int) -> float:
-        """Returns the memory of a step of some worlds, their states included [B].
+        """Returns the memory to step a batch, including its states [B].
 
         Args:
-            worlds: how many.
+            worlds: number of worlds.
         """
         return self.shared + worlds * (self.state + self.working)
 
@@ -57,28 +61,28 @@ class Memory:
         )
 
 
-def memory(system: Any, method: Method, state: State, control: PyTree = None) -> Memory:
-    """The memory of `jax.jit(jax.vmap(step))` by world, as XLA plans it for this device.
+def memory(system: System, method: Method, state: State, control: PyTree = None) -> Memory:
+    """Returns the memory per world of `jax.jit(jax.vmap(step))`, as XLA plans it for this device.
 
-    A step is compiled for two sizes of a batch, which takes seconds; the difference is what worlds
-    add. The scene's own numbers and the code are not counted, nor is what a derivative keeps.
+    A step is compiled for two batch sizes, which takes seconds. The difference gives the memory per
+    world. It does not include scene parameters, code, or residuals for derivatives.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: of one world.
-        control: of one world, as of `step`; motors idle unless given.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: state of one world.
+        control: control input of one world, as in `jc.step`; by default zero for all motors.
 
     Returns:
-        The `Memory`.
+        A `jc.analysis.Memory`.
 
     Raises:
-        ValueError: state and control do not fit, as in `step`.
-        RuntimeError: the compiler of this device does not say what it plans.
+        ValueError: state and control do not fit, as in `jc.step`.
+        RuntimeError: the compiler of this device does not report its memory plan.
     """
     control = jax.tree.map(jnp.asarray, check_step(system, method, state, idle(system, control)))
 
-    def step(state: State, control: PyTree) -> Any:
+    def step(state: State, control: PyTree) -> tuple[State, StepInfo]:
         return step_quietly(system, method, state, control, DT)
 
     small, large = (_planned(step, (state, control), worlds) for worlds in BATCHES)
@@ -88,15 +92,16 @@ def memory(system: Any, method: Method, state: State, control: PyTree = None) ->
 
 @dataclass(frozen=True)
 class GradientMemory:
-    """What the gradient of a rollout by its start takes, for any number of steps and any adjoint.
+    """Memory to differentiate a rollout by its initial state, for any length and adjoint.
 
     Attributes:
-        start: shapes and dtypes of the state of one world.
-        state: what a checkpoint keeps of one world [B].
-        step: what the derivative of a step needs of one world, beside parameters [B].
-        working: what one world needs at any length [B].
-        shared: what grows neither with the batch nor with the steps [B]; the numbers of the steps
-            come on top.
+        start: the state of one world, as shapes and dtypes.
+        state: size of one kept state of one world [B].
+        step: size of the residuals that the reverse pass needs per step and world, without
+            parameters [B].
+        working: memory per world that does not depend on the number of steps [B].
+        shared: memory that depends neither on the batch size nor on the number of steps [B]. The
+            step indices are not included.
     """
 
     start: State
@@ -105,23 +110,25 @@ class GradientMemory:
     working: float
     shared: float
 
-    def of(self, worlds: int, steps: int, adjoint: Any = EVERY_STEP) -> float:
-        """Returns the memory of a batch, without what is recorded and given as control [B].
+    def of(self, worlds: int, steps: int, adjoint: Adjoint = EVERY_STEP) -> float:
+        """Returns the memory to differentiate a batch of rollouts [B].
+
+        Recorded values and control inputs are not included.
 
         Args:
-            worlds: of the batch.
-            steps: of the rollout.
-            adjoint: as of `rollout`.
+            worlds: number of worlds.
+            steps: number of steps of the rollout.
+            adjoint: adjoint, as in `jc.rollout`.
 
         Raises:
-            ValueError: worlds or steps are no whole numbers, or too few.
+            ValueError: `worlds` or `steps` is not an integer, or is too small.
         """
         checks.count("gradient memory", "worlds", worlds)
         checks.count("gradient memory", "steps", steps, 0)
         check_adjoint(adjoint)
         *checkpoints, last = adjoint.kept(steps, self.start)
-        own = self.working + sum(checkpoints) * self.state + last * self.step
-        return self.shared + _numbers(steps) + worlds * own
+        world = self.working + sum(checkpoints) * self.state + last * self.step
+        return self.shared + _numbers(steps) + worlds * world
 
     def __str__(self) -> str:
         return (
@@ -131,33 +138,33 @@ class GradientMemory:
 
 
 def gradient_memory(
-    system: Any, method: Method, state: State, control: PyTree = None
+    system: System, method: Method, state: State, control: PyTree = None
 ) -> GradientMemory:
-    """The memory of `jax.jit(jax.vmap(jax.grad(…)))` of a rollout, as XLA plans it for this device.
+    """Returns the memory to differentiate a batch of rollouts, as XLA plans it for this device.
 
-    Gradients through a few steps are compiled for two sizes of a batch and two lengths, which takes
-    seconds; the differences are what worlds and steps add.
+    `jax.jit(jax.vmap(jax.grad(…)))` of a short rollout is compiled for two batch sizes and two
+    lengths, which takes seconds. The differences give the memory per world and per step.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: of one world.
-        control: of one step of one world, or a function of the state, as of `rollout`.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: state of one world.
+        control: control input of one world for one step, or a policy as in `jc.rollout`.
 
     Returns:
-        The `GradientMemory`.
+        A `jc.analysis.GradientMemory`.
 
     Raises:
-        ValueError: state and control do not fit, as in `step`.
-        RuntimeError: the compiler of this device does not say what it plans.
+        ValueError: state and control do not fit, as in `jc.step`.
+        RuntimeError: the compiler of this device does not report its memory plan.
     """
     policy = control if callable(control) else None
 
     def planned(steps: int, worlds: int) -> int:
-        one = None if policy else controls_in(state.q.dtype, idle(system, control))
-        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), one)
+        row = None if policy else controls_in(state.q.dtype, idle(system, control))
+        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), row)
 
-        def end(moved: tuple[Any, Any], rest: State) -> Any:
+        def end(moved: tuple[Array, Array], rest: State) -> Array:
             start = dataclasses.replace(rest, q=moved[0], v=moved[1])
             final, _ = rollout(system, method, start, controls, DT, steps, record=nothing)
             return jnp.sum(final.q) + jnp.sum(final.v)
@@ -166,27 +173,34 @@ def gradient_memory(
 
     small, large = (planned(SHORT, worlds) for worlds in BATCHES)
     longer = planned(LONGER, BATCHES[0])
-    own = (large - small) / (BATCHES[1] - BATCHES[0])
+    world = (large - small) / (BATCHES[1] - BATCHES[0])
+    # all worlds share the step indices, so their memory does not grow with the batch
     added = longer - small - _numbers(LONGER - SHORT)
     step = added / (LONGER - SHORT) / BATCHES[0]
     start = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
-    shared = small - _numbers(SHORT) - own * BATCHES[0]
-    return GradientMemory(start, bytes_of(state), step, own - SHORT * step, shared)
+    shared = small - _numbers(SHORT) - world * BATCHES[0]
+    return GradientMemory(start, bytes_of(state), step, world - SHORT * step, shared)
 
 
-def nothing(state: State, info: Any) -> None:
-    """Recorded of a step."""
+def nothing(state: State, info: StepInfo) -> None:
+    """Records no values; for rollouts of which only the final state is used."""
 
 
 def _numbers(steps: int) -> int:
-    """What the numbers of the steps take, which a rollout counts once for all worlds [B]."""
+    """Returns the memory of the step indices of a rollout, which all worlds share [B]."""
     return steps * np.dtype(jnp.result_type(int)).itemsize
 
 
-def _planned(step: Any, args: PyTree, worlds: int) -> int:
-    """Results and temporary memory of a compiled step of a batch [B]."""
+def _planned(f: Callable[..., Any], args: PyTree, worlds: int) -> int:
+    """Compiles a batched function; returns the memory of its results and temporaries [B].
+
+    Args:
+        f: function of one world.
+        args: arguments of one world.
+        worlds: number of worlds.
+    """
     batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((worlds, *x.shape), x.dtype), args)
-    plan = jax.jit(jax.vmap(step)).lower(*batch).compile().memory_analysis()
+    plan = jax.jit(jax.vmap(f)).lower(*batch).compile().memory_analysis()
     if plan is None:
         raise RuntimeError(
             f"memory: the compiler of '{jax.default_backend()}' does not say how much it plans."

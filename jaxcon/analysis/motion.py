@@ -1,36 +1,37 @@
-"""How far a scene turns or swings in a step, from its structure and one state. Host code."""
+"""Estimates how far the fastest motions turn or oscillate in one step. Host code."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.rank import UnitRows, linearized
 from jaxcon.constraints.rows import linearize
 from jaxcon.core import host
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.dynamics.rank import UnitRows, linearized
-from jaxcon.model.state import State
-from jaxcon.simulation.stability import largest_stable_rate
+from jaxcon.methods.stability import largest_stable_rate
+from jaxcon.protocols import System
+from jaxcon.system.state import State
 
 if TYPE_CHECKING:
-    from jaxcon.analysis.known import Known
+    from jaxcon.analysis.setup import Setup
 
 MOST_VELOCITIES = 150
-"""The largest n_v for which natural frequencies are computed; they cost O(n_v³)."""
+"""The largest n_v for which natural frequencies are computed, which costs O(n_v³) operations."""
 LEAST = 1e-12
-"""A length in the metric of M below which a direction is none."""
+"""The length of a velocity, in the metric of M, below which it counts as zero."""
 
 
 class Rate(NamedTuple):
-    """An angular speed.
+    """An angular speed, and the body or coordinate that has it.
 
     Attributes:
-        value: [rad/s].
-        name: of the body or coordinate that has it.
+        value: the angular speed [rad/s].
+        name: name of the body or coordinate.
     """
 
     value: float
@@ -39,17 +40,18 @@ class Rate(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class StepAngle:
-    """Angles of the fastest motions in one step.
+    """The angles by which the fastest motions turn or oscillate in one step.
 
     Attributes:
-        turning: with the velocities of the state.
-        swinging: with the velocities that gravity and springs can give from rest: the largest of
-            natural frequencies at this position, of √|α| of the bodies' angular accelerations, and
-            of √(κ |a|) along the curved way that constraints leave.
-        dt: h [s].
-        limit: h ω below which an undamped oscillation is stable with the integrator; 2 for
-            semi-implicit Euler, 0 where no step is, infinite where every step is; natural
-            frequencies are then left out of `swinging`.
+        turning: the largest angular speed at the velocities of the state.
+        swinging: the largest angular rate that gravity and springs can cause from rest. It is the
+            maximum of three rates: the natural frequencies at this position; √|α|, with a body's
+            angular acceleration α; and √(κ |a|), with the curvature κ of the constrained path and
+            the acceleration a along it.
+        dt: step size h [s].
+        limit: the largest h ω at which the integrator is stable for an undamped oscillation of
+            frequency ω; 2 for semi-implicit Euler. It is 0 if no step size is stable, and infinite
+            if every step size is. In the last case `swinging` ignores natural frequencies.
     """
 
     turning: Rate
@@ -59,12 +61,12 @@ class StepAngle:
 
     @property
     def turn(self) -> float:
-        """h |ω| of the fastest body at the velocities of the state [rad]."""
+        """The angle h |ω| of the fastest body at the velocities of the state [rad]."""
         return self.dt * self.turning.value
 
     @property
     def swing(self) -> float:
-        """h ω of gravity and springs [rad]."""
+        """The angle h ω of the fastest motion that gravity and springs can cause [rad]."""
         return self.dt * self.swinging.value
 
     def __str__(self) -> str:
@@ -78,62 +80,66 @@ class StepAngle:
         return f"fastest motion in a step: {'; '.join(parts)}"
 
 
-def step_angle(known: Known) -> StepAngle | None:
-    """The angles of the fastest motions in a step; None where no step is known."""
-    if known.dt is None:
+def step_angle(setup: Setup) -> StepAngle | None:
+    """Returns the angles of the fastest motions in one step; None without a step size."""
+    if setup.dt is None:
         return None
-    system, state, dtype = known.system, known.state, known.state.q.dtype
+    system, state, dtype = setup.system, setup.state, setup.state.q.dtype
     v = np.asarray(state.v, np.float64)
-    force = np.asarray(host.evaluate(_force, system, state, known.control), np.float64)
-    held, factor = _with_rotors(known)
-    # in the metric of M, forces from rest are split into those along the motion and reactions
+    force = np.asarray(host.evaluate(_force, system, state, setup.control), np.float64)
+    unit, factor = _with_rotors(setup)
+    # in the metric of M, splits the forces at rest into constraint reactions and the remainder
     pull = np.linalg.solve(factor, force)
-    inverse = np.linalg.pinv(held.values, rcond=held.tolerance) if len(held.values) else None
+    inverse = np.linalg.pinv(unit.values, rcond=unit.tolerance) if len(unit.values) else None
     reaction = np.zeros(0) if inverse is None else -(pull @ inverse)
-    along = pull if inverse is None else pull + held.values.T @ reaction
+    along = pull if inverse is None else pull + unit.values.T @ reaction
     a = np.linalg.solve(factor.T, along)
     at_rest = dataclasses.replace(state, v=np.zeros(len(v), dtype))
     driven = np.asarray(linearized(system, at_rest)[0].bias, np.float64)
-    bends = np.asarray(known.rows.bias, np.float64) - driven
-    turning = max(_spin(system, v), _curved(known, (held, factor), bends, v, inverse), key=_value)
-    falling = _spin(system, a)
-    swinging = [Rate(float(np.sqrt(falling.value)), falling.name)]
+    bends = np.asarray(setup.rows.bias, np.float64) - driven
+    turning = max(_spin(system, v), _curved(setup, (unit, factor), bends, v, inverse), key=_value)
+    swinging = [_root(_spin(system, a))]
     at_a = dataclasses.replace(state, v=np.asarray(a, dtype))
     bends = np.asarray(linearized(system, at_a)[0].bias, np.float64) - driven
-    swinging.append(_root(_curved(known, (held, factor), bends, a, inverse)))
-    limit = largest_stable_rate(known.method.integrator, 1.0, 0.0)
-    # what is stable at every step damps stiff springs and light masses, and is taken for that
+    swinging.append(_root(_curved(setup, (unit, factor), bends, a, inverse)))
+    limit = largest_stable_rate(setup.method.integrator, 1.0, 0.0)
+    # integrators stable at every step size are chosen for stiff springs and light masses
     if len(v) <= MOST_VELOCITIES and np.isfinite(limit):
-        λ = np.zeros(known.rows.layout.size)
-        λ[held.numbers] = reaction / held.length
-        swinging.append(_natural(known, held, factor, λ))
-    return StepAngle(turning, max(swinging, key=_value), known.dt, limit)
+        λ = np.zeros(setup.rows.layout.size)
+        λ[unit.numbers] = reaction / unit.length
+        swinging.append(_natural(setup, unit, factor, λ))
+    return StepAngle(turning, max(swinging, key=_value), setup.dt, limit)
 
 
-def _with_rotors(known: Known) -> tuple[UnitRows, np.ndarray]:
-    """The rows at unit length and L of M = L Lᵀ, with the inertia of rotors in M."""
-    mass, layout = np.asarray(known.mass, np.float64), known.rows.layout
+def _with_rotors(setup: Setup) -> tuple[UnitRows, np.ndarray]:
+    """Adds the inertia of rotors to the mass matrix M.
+
+    Returns:
+        The unit-length rows in the metric of this M, and its Cholesky factor L with M = L Lᵀ.
+    """
+    mass, layout = np.asarray(setup.mass, np.float64), setup.rows.layout
     if not layout.inertial:
-        return known.unit, np.linalg.cholesky(mass)
+        return setup.unit, np.linalg.cholesky(mass)
     rotors = np.concatenate([layout.rows(name) for name in layout.inertial])
-    j = np.asarray(known.jacobian, np.float64)[rotors]
-    inertia = 1 / np.asarray(known.rows.compliance, np.float64)[rotors]
+    j = np.asarray(setup.jacobian, np.float64)[rotors]
+    inertia = 1 / np.asarray(setup.rows.compliance, np.float64)[rotors]
     mass = mass + j.T @ (inertia[:, None] * j)
-    return UnitRows(layout, known.jacobian, mass), np.linalg.cholesky(mass)
+    return UnitRows(layout, setup.jacobian, mass), np.linalg.cholesky(mass)
 
 
 def _value(rate: Rate) -> float:
+    """Returns the speed of a `Rate`; a key function for `max`."""
     return rate.value
 
 
 def _root(rate: Rate) -> Rate:
-    """The rate that a curvature κ and an acceleration a give, √(κ |a|)."""
+    """Converts an angular acceleration x, or x = κ |a| [rad/s²], to the rate √x [rad/s]."""
     return Rate(float(np.sqrt(rate.value)), rate.name)
 
 
-def _spin(system: Any, v: np.ndarray) -> Rate:
-    """The fastest angular part of an array (n_v,) among bodies; 0 without any."""
-    layout = getattr(system, "layout", None)
+def _spin(system: System, v: np.ndarray) -> Rate:
+    """Returns the largest angular part of any body in an array (n_v,); 0 without bodies."""
+    layout = system.layout
     if layout is None:
         return Rate(0.0, "")
     rates = [
@@ -143,45 +149,54 @@ def _spin(system: Any, v: np.ndarray) -> Rate:
 
 
 def _curved(
-    known: Known,
+    setup: Setup,
     metric: tuple[UnitRows, np.ndarray],
     bends: np.ndarray,
     v: np.ndarray,
     inverse: np.ndarray | None,
 ) -> Rate:
-    """|Jᵀλ(γ)| / |v| in the metric of M: how fast constraints turn the direction of v.
+    """Returns the rate at which constraint forces turn the direction of v, in the metric of M.
+
+    It is |Jᵀλ| / |v|, with the multipliers λ that the velocity-dependent part of γ causes.
 
     Args:
-        known: the scene.
-        metric: the rows at unit length, and L of M = L Lᵀ.
-        bends: γ(v) − γ(0), (n_c,): without a drive's own acceleration, which turns nothing.
+        setup: the scene, its state and the method.
+        metric: the unit-length rows, and the Cholesky factor L of M = L Lᵀ.
+        bends: γ(v) − γ(0), (n_c,). The difference cancels the accelerations that drives prescribe.
         v: velocities, (n_v,).
-        inverse: the pseudoinverse of the rows; None without any.
+        inverse: pseudoinverse of the unit-length rows; None without rows.
     """
     if inverse is None:
         return Rate(0.0, "")
-    held, factor = metric
-    bend = inverse @ -(bends[held.numbers] / held.length)
+    unit, factor = metric
+    bend = inverse @ -(bends[unit.numbers] / unit.length)
     speed = float(np.linalg.norm(factor.T @ v))
     if speed < LEAST:
         return Rate(0.0, "")
-    return Rate(float(np.linalg.norm(bend)) / speed, _owner(known.system, bend))
+    return Rate(float(np.linalg.norm(bend)) / speed, _owner(setup.system, bend))
 
 
-def _natural(known: Known, held: UnitRows, factor: np.ndarray, λ: np.ndarray) -> Rate:
-    """√|κ| of the largest eigenvalue of the stiffness that the constraints leave free.
+def _natural(setup: Setup, unit: UnitRows, factor: np.ndarray, λ: np.ndarray) -> Rate:
+    """Returns the highest natural frequency √|κ|, with the eigenvalue κ of K of largest magnitude.
 
-    K = −∂(f + Jᵀλ)/∂q at the reactions λ of the scene at rest, projected onto the null space of J.
+    K = −∂(f + Jᵀλ)/∂q is the stiffness at the multipliers λ of the scene at rest. It is projected
+    onto the null space of J, in the metric of M.
+
+    Args:
+        setup: the scene, its state and the method.
+        unit: the unit-length rows.
+        factor: Cholesky factor L of M = L Lᵀ, (n_v, n_v).
+        λ: multipliers at rest, (n_c,).
     """
-    _, singular, vt = held.svd if len(held.values) else (0, (), np.eye(len(factor)))
-    rank = int(np.sum(np.asarray(singular) > held.tolerance))
+    _, σ, vt = unit.svd if len(unit.values) else (0, (), np.eye(len(factor)))
+    rank = int(np.sum(np.asarray(σ) > unit.tolerance))
     free = vt[rank:]
     if not len(free):
         return Rate(0.0, "")
-    dtype = known.state.q.dtype
+    dtype = setup.state.q.dtype
     moves = np.linalg.solve(factor.T, free.T).T  # of unit length in the metric of M
     change = host.evaluate(
-        _stiffness, known.system, known.state, known.control, λ.astype(dtype), moves.astype(dtype)
+        _stiffness, setup.system, setup.state, setup.control, λ.astype(dtype), moves.astype(dtype)
     )
     k = -np.asarray(change, np.float64) @ moves.T
     if not np.all(np.isfinite(k)):
@@ -189,26 +204,34 @@ def _natural(known: Known, held: UnitRows, factor: np.ndarray, λ: np.ndarray) -
     values, vectors = np.linalg.eigh((k + k.T) / 2)
     worst = int(np.argmax(np.abs(values)))
     shape = vectors[:, worst] @ free
-    return Rate(float(np.sqrt(np.abs(values[worst]))), _owner(known.system, shape))
+    return Rate(float(np.sqrt(np.abs(values[worst]))), _owner(setup.system, shape))
 
 
-def _owner(system: Any, x: np.ndarray) -> str:
-    """The body, or coordinate, with the largest share of an array (n_v,)."""
-    layout = getattr(system, "layout", None)
+def _owner(system: System, x: np.ndarray) -> str:
+    """Returns the name of the body or coordinate with the largest part in an array (n_v,)."""
+    layout = system.layout
     if layout is None:
         return f"coordinate {int(np.argmax(np.abs(x)))}"
     return max(layout.bodies, key=lambda name: float(np.linalg.norm(x[layout.v(name)])))
 
 
-@jax.jit  # so that a scene is traced once, however many of its states are looked at
-def _force(system: Any, state: State, control: PyTree) -> Array:
-    """f of the scene at rest, (n_v,)."""
+@jax.jit  # jit caches the trace: one trace serves all states of a scene
+def _force(system: System, state: State, control: PyTree) -> Array:
+    """Returns the applied force f with all velocities zero, (n_v,)."""
     return system.force(state.q, jnp.zeros_like(state.v), state.instant, control)
 
 
 @jax.jit
-def _stiffness(system: Any, state: State, control: PyTree, λ: Array, moves: Array) -> Array:
-    """The change of f + Jᵀλ along displacements (n, n_v), with λ held, (n, n_v)."""
+def _stiffness(system: System, state: State, control: PyTree, λ: Array, moves: Array) -> Array:
+    """Returns the derivative of f + Jᵀλ along displacements at constant λ, (n, n_v).
+
+    Args:
+        system: the system.
+        state: state of one world.
+        control: control input of a step, or None.
+        λ: multipliers, (n_c,).
+        moves: n displacements, (n, n_v).
+    """
     rest = jnp.zeros_like(state.v)
 
     def pull(step: Array) -> Array:

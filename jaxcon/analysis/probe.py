@@ -1,9 +1,8 @@
-"""A few steps of a method, to see what they leave open."""
+"""Runs a few steps of a method to measure the constraint violation that remains."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,24 +11,26 @@ import numpy as np
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.model.state import State, at
-from jaxcon.simulation.initialize import init
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
+from jaxcon.execution.initialize import init
+from jaxcon.execution.rollout import rollout
+from jaxcon.methods.method import Method
+from jaxcon.protocols import System
+from jaxcon.step import StepInfo
+from jaxcon.system.state import State, checked_system
 
 STEPS = 32
-"""The steps of a probe; a start that is off is corrected in the first half by default gains."""
+"""The number of steps. Default gains correct a violating initial state within the first half."""
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What some steps from a state left open.
+    """The constraint violation that remains after some steps.
 
     Attributes:
-        steps: how many.
-        violation: max |φ| over the second half of them, in the units of the rows.
-        missed: by how much laws of bounded rows were missed, the worst [m/s, rad/s].
-        status: at the end.
+        steps: number of steps.
+        violation: max |φ| over the second half of the steps, in the units of the rows.
+        missed: the largest residual of the inequality constraints [m/s, rad/s].
+        status: status at the end.
     """
 
     steps: int
@@ -38,31 +39,39 @@ class Probe:
     status: Status
 
 
-def probe(system: Any, method: Method, state: State, control: PyTree, dt: float) -> Probe:
-    """Some steps under a control that is held.
+def probe(system: System, method: Method, state: State, control: PyTree, dt: float) -> Probe:
+    """Takes `STEPS` steps with a constant control, and measures the remaining violation.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: of one world, as `begun` gives it.
-        control: as of `step`, or None.
-        dt: h [s].
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: state of one world, as returned by `begun`.
+        control: control input, as in `jc.step`, or None.
+        dt: step size h [s].
     """
-    end, (off, missed) = _run(method, system, state, control, jnp.asarray(dt, state.q.dtype))
-    later = np.asarray(off)[STEPS // 2 :]
+    end, (violation, missed) = _run(method, system, state, control, jnp.asarray(dt, state.q.dtype))
+    later = np.asarray(violation)[STEPS // 2 :]
     return Probe(STEPS, float(np.max(later)), float(np.max(missed)), Status(int(end.status)))
 
 
-def begun(system: Any, method: Method, state: State) -> State:
-    """The state with the memory of a method as at a start; that of another one is forgotten."""
+def begun(system: System, method: Method, state: State) -> State:
+    """Replaces the method memory of a state by the initial memory of the given method."""
     turns = state.turns if jax.tree.leaves(state.turns) else None
     return init(system, method, state.q, state.v, state.time, turns)
 
 
 @jax.jit
-def _run(method: Method, system: Any, start: State, control: PyTree, dt: Array) -> Any:
-    def record(state: State, info: Any) -> tuple[Array, Array]:
-        rows = linearize(at(system, state), state.q, state.v, state.instant)
+def _run(
+    method: Method, system: System, start: State, control: PyTree, dt: Array
+) -> tuple[State, tuple[Array, Array]]:
+    """Runs a rollout.
+
+    Returns:
+        The final state; and for each step max |φ| and the residual of the inequality constraints.
+    """
+
+    def record(state: State, info: StepInfo) -> tuple[Array, Array]:
+        rows = linearize(checked_system(system, state), state.q, state.v, state.instant)
         none = jnp.zeros((), state.q.dtype)
         missed = none if info.reactions is None else info.reactions.residual
         return jnp.max(jnp.abs(rows.residual), initial=0), missed

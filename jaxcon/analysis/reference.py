@@ -1,38 +1,46 @@
-"""What runs are compared with: a fine run of high order in float64 that knows its own error."""
+"""The reference solution: a high-order run with small steps in float64, and its error estimate."""
 
 from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from jaxcon.analysis.trials import Course, Observer, Points, Problem, Seen, Trip
+from jaxcon.analysis.trials import Course, Observation, Observer, Points, Problem, Trip
+from jaxcon.builders.assembly import assemble
 from jaxcon.core.precision import cast, precision
 from jaxcon.core.status import MEANING, SimulationError, Status
-from jaxcon.dynamics.assembly import assemble
-from jaxcon.simulation.events import Events
-from jaxcon.simulation.integrators import RK4, RungeKutta
-from jaxcon.simulation.method import Method
+from jaxcon.core.typing import Array
+from jaxcon.methods.events import Events
+from jaxcon.methods.integrators import RK4, RungeKutta
+from jaxcon.methods.method import Method
+from jaxcon.protocols import System
+from jaxcon.system.bodies import Particle
 
 FIRST = 64
-"""Steps of the coarsest run, about."""
+"""The approximate number of steps of the reference's first and coarsest run."""
 MOST = 1 << 20
-"""Steps of the finest run."""
+"""The largest number of steps of the reference's finest run."""
 GOAL = 1e-13
-"""Difference of two runs at which no finer one is asked for, of the size of the motion."""
+"""The difference of two runs, relative to the size of the motion, at which refinement stops."""
 GOOD = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-"""Errors, of the size of the motion, up to which a part is compared: the least with which at least
-half of the horizon is, or the largest."""
+"""Errors, relative to the size of the motion, up to which a reference counts as accurate.
+
+The first value that covers half of the horizon is used, or else the last one.
+"""
 REST = 1e-4
-"""The share of its energy that a scene at rest may gain before it counts as diverged."""
+"""The energy error, as a share of the total energy, at which a scene at rest counts as diverged."""
 ON = 1e-10
-"""φ and φ̇ up to which a start is on its constraints, of 1 + max |q| and 1 + max |v|."""
+"""The largest |φ| and |φ̇| of an initial state that counts as consistent.
+
+They are relative to 1 + max |q| and 1 + max |v|.
+"""
 
 
 def butcher() -> RungeKutta:
-    """A method of order six with seven stages, for reference solutions.
+    """Returns an explicit Runge–Kutta method of order six with seven stages.
 
     References:
         Butcher, On Runge-Kutta processes of high order, J. Australian Math. Soc. 4 (1964).
@@ -49,15 +57,16 @@ def butcher() -> RungeKutta:
 
 
 class Ruler:
-    """How far two configurations are apart, in metres; on generalized coordinates ‖q₁ − q₂‖.
+    """Measures the distance of two configurations [m]; ‖q₁ − q₂‖ for generalized coordinates.
 
-    Of a body it is √(d² + k²θ²), d the distance of its centres of mass, θ the angle between its two
-    orientations and k its largest radius of gyration: to first order no less than the root mean
-    square, over its mass, of how far its points are displaced. Of all bodies the largest counts.
+    A body's distance is √(d² + k²θ²). Here d is the distance of its centers of mass, θ the angle
+    between its orientations, and k its largest radius of gyration. To first order, it is at least
+    the root mean square displacement of the body's mass. The distance of two configurations is the
+    largest one of all bodies.
     """
 
-    def __init__(self, system: Any, q: np.ndarray) -> None:
-        self.layout = getattr(system, "layout", None)
+    def __init__(self, system: System, q: Array) -> None:
+        self.layout = system.layout
         if self.layout is not None:
             mass = np.asarray(system.mass(q).diagonal)
             blocks = [(g, _block(mass, g.v, g.kind.n_v, g.names)) for g in self.layout.groups]
@@ -68,45 +77,66 @@ class Ruler:
 
     @classmethod
     def of(cls, observe: Observer, problem: Problem) -> Ruler:
-        """Returns the ruler of a problem."""
+        """Returns the `Ruler` of a problem, with the radii of gyration of its bodies."""
         with precision(np.float64):
             return cls(observe.system, cast(problem.start.q, np.float64))
 
-    @np.errstate(over="ignore")  # of a run that went far away, which then is infinitely far
+    @np.errstate(over="ignore")  # a diverged run is infinitely far away
     def __call__(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The distance (n,) and the largest angle (n,) [rad] of configurations (n, n_q)."""
+        """Measures distances between configurations x and y, (n, n_q) each.
+
+        Returns:
+            The distance (n,) and the largest angle between orientations (n,) [rad].
+        """
         if self.layout is None:
             return np.linalg.norm(x - y, axis=-1), np.zeros(len(x))
-        far, turned = np.zeros(len(x)), np.zeros(len(x))
+        distance, turn = np.zeros(len(x)), np.zeros(len(x))
         for group, k in zip(self.layout.groups, self.gyration, strict=True):
             a, b = (_block(z, group.q, group.kind.n_q, group.names) for z in (x, y))
             angle, dim = _angle(a, b, group.kind), group.kind.dim
             d = np.linalg.norm(a[:, :dim] - b[:, :dim], axis=1)
-            far = np.fmax(far, np.max(np.hypot(d, k * angle), axis=1))
-            turned = np.fmax(turned, np.max(angle, axis=1))
-        return far, turned
+            distance = np.fmax(distance, np.max(np.hypot(d, k * angle), axis=1))
+            turn = np.fmax(turn, np.max(angle, axis=1))
+        return distance, turn
 
     def size(self, q: np.ndarray) -> float:
-        """Returns the size of a motion through configurations (n, n_q): places and k [m]."""
+        """Returns the size of a motion (n, n_q) [m], the unit of relative errors.
+
+        It is the largest range of positions along an axis plus the largest radius of gyration. For
+        generalized coordinates, it is the largest range of a coordinate.
+        """
         if self.layout is None:
             return float(np.max(np.ptp(q, axis=0), initial=0)) or 1.0
-        places = [
+        positions = [
             np.moveaxis(_block(q, g.q, g.kind.n_q, g.names)[:, : g.kind.dim], 1, -1)
             for g in self.layout.groups
         ]
-        spread = np.ptp(np.concatenate([x.reshape(-1, x.shape[-1]) for x in places]), axis=0)
+        spread = np.ptp(np.concatenate([x.reshape(-1, x.shape[-1]) for x in positions]), axis=0)
         widest = max(float(np.max(k, initial=0)) for k in self.gyration)
         return float(np.max(spread)) + widest or 1.0
 
 
 def _block(x: np.ndarray, first: int, components: int, names: tuple[str, ...]) -> np.ndarray:
-    """The coordinates of a group of bodies, (…, component, body)."""
-    own = x[..., first : first + components * len(names)]
-    return own.reshape(*x.shape[:-1], components, len(names))
+    """Extracts the coordinates of a group of bodies as an array (…, component, body).
+
+    Args:
+        x: positions or velocities, (…, n).
+        first: index of the group's first entry.
+        components: number of components per body.
+        names: names of the bodies.
+    """
+    group = x[..., first : first + components * len(names)]
+    return group.reshape(*x.shape[:-1], components, len(names))
 
 
-def _angle(a: np.ndarray, b: np.ndarray, kind: Any) -> np.ndarray:
-    """Between orientations in configurations (n, component, body), (n, body) [rad]."""
+def _angle(a: np.ndarray, b: np.ndarray, kind: Particle) -> np.ndarray:
+    """Returns the angle between two orientations of each body, (n, body) [rad].
+
+    Args:
+        a: coordinates of a group of bodies, (n, component, body).
+        b: coordinates of the same group in other configurations.
+        kind: the kind of the bodies, which gives the number of position components.
+    """
     a, b = a[:, kind.dim :], b[:, kind.dim :]
     if a.shape[1] < 2:
         return np.sum(np.abs(a - b), axis=1)
@@ -116,21 +146,22 @@ def _angle(a: np.ndarray, b: np.ndarray, kind: Any) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Reference:
-    """A fine run of high order in float64, and how far it is to be trusted.
+    """A high-order run with small steps in float64, and its error estimate.
 
     Attributes:
-        points: at the start and at the ends of the parts.
-        seen: energy and violation there.
-        error: by part, how far off it may be at its end or before, the difference of two runs, of
-            which the coarser has twice the step of this one (parts,) [m].
-        size: of the motion, what errors are to be compared with [m].
-        until: up to which it is good, and up to which runs are compared with it [s].
-        steps: how many it took.
-        moved: by how much the start was taken to the constraints, (Σ m d²)^½ [kg^½ m].
+        points: positions and velocities at the start and at the ends of the parts of the horizon.
+        seen: energies and violations at these points.
+        error: estimated largest error from the start to the end of each part, (parts,) [m]. It is
+            the difference from a run with twice the step size.
+        size: size of the motion [m], the unit of relative errors.
+        until: the time up to which the reference is accurate and other runs are compared with it
+            [s].
+        steps: number of steps.
+        moved: distance by which the start was moved onto the constraints, (Σ m d²)^½ [kg^½ m].
     """
 
     points: Points
-    seen: Seen
+    seen: Observation
     error: np.ndarray
     size: float
     until: float
@@ -139,28 +170,36 @@ class Reference:
 
     @property
     def last(self) -> int:
-        """How many parts are compared."""
-        whole = self.points.time[-1] - self.points.time[0]
-        return round(float(self.until / whole) * len(self.error))
+        """The number of parts of the horizon in which runs are compared with the reference."""
+        horizon = self.points.time[-1] - self.points.time[0]
+        return round(float(self.until / horizon) * len(self.error))
 
     @property
     def floor(self) -> float:
-        """Its own error up to there, below which no other can be told [m]."""
+        """The error of the reference at time `until` [m]; smaller errors cannot be resolved."""
         return float(self.error[self.last - 1])
 
     @property
     def scale(self) -> float:
-        """The scale of the energy: what moves or is exchanged, or may be rounded away [J]."""
+        """The energy by which energy errors are divided [J].
+
+        It is the largest kinetic energy or the range of the total energy, whichever is larger. For
+        scenes at rest it is a small share of the total energy.
+        """
         energy = self.seen.energy
-        moved = max(float(np.max(self.seen.kinetic)), float(np.ptp(energy)))
-        return max(moved, REST * float(np.max(np.abs(energy))))
+        exchanged = max(float(np.max(self.seen.kinetic)), float(np.ptp(energy)))
+        return max(exchanged, REST * float(np.max(np.abs(energy))))
 
 
 def started(problem: Problem, observe: Observer) -> tuple[Problem, float]:
-    """The problem with its start on the constraints, and by how much that moved it.
+    """Moves the initial state of a problem onto the constraints, unless it satisfies them.
+
+    Returns:
+        The problem, and the distance moved, (Σ m d²)^½ [kg^½ m].
 
     Raises:
-        SimulationError: no configuration nearby meets them; the message names those left open.
+        SimulationError: no nearby configuration satisfies the constraints; the message names the
+            violated ones.
     """
     points = problem.start
     seen = observe(Points(*(x[None] for x in points)))
@@ -168,26 +207,26 @@ def started(problem: Problem, observe: Observer) -> tuple[Problem, float]:
     if seen.violation[0] <= allowed[0] and seen.rate[0] <= allowed[1]:
         return problem, 0.0
     with precision(np.float64):
-        own = cast(points, np.float64)
-        met = assemble(observe.system, own.begin(observe.system, Method()))
-        on, moved = Points.of(met.check()), float(met.distance)
-    host = Points(*(np.asarray(x, np.float64) for x in on))
+        state = cast(points, np.float64).begin(observe.system, Method())
+        assembly = assemble(observe.system, state)
+        assembled, moved = Points.of(assembly.check()), float(assembly.distance)
+    host = Points(*(np.asarray(x, np.float64) for x in assembled))
     return dataclasses.replace(problem, start=host), moved
 
 
-def method_for(system: Any) -> Method:
-    """Returns the method of the reference: order six, or four with events beside bounded rows."""
+def method_for(system: System) -> Method:
+    """Returns the reference's method: order six, or RK4 with events if there are inequalities."""
     return Method(RK4(), events=Events()) if system.bounds else Method(butcher())
 
 
 def make(course: Course, observe: Observer, moved: float, seconds: float) -> Reference:
-    """Runs with halved steps until two agree, or agree no better, or time is up.
+    """Halves the step size until two runs agree, their agreement stops improving, or time is up.
 
     Args:
-        course: of `method_for` in float64 on the problem from `started`.
-        observe: reads energies.
-        moved: of the `Reference`.
-        seconds: for which the runs may go on, compilation not counted.
+        course: the program that simulates the problem from `started` by `method_for` in float64.
+        observe: evaluates energies and violations.
+        moved: distance by which `started` moved the initial state.
+        seconds: time budget for the runs, without compilation [s].
 
     Raises:
         SimulationError: no run reaches the end of the first part; the message says why.
@@ -202,8 +241,9 @@ def make(course: Course, observe: Observer, moved: float, seconds: float) -> Ref
         if before is not None and not trip.failed and not before.failed:
             size = ruler.size(trip.points.q)
             apart = np.maximum.accumulate(ruler(trip.points.q, before.points.q)[0])
-            best, better = _closer(best, Pair(before, trip, apart, count), size)
+            best, better = _closer(best, RunPair(before, trip, apart, count), size)
             idle = 0 if better else idle + 1
+            # beyond two refinements without improvement, rounding dominates
             if apart[-1] <= GOAL * size or idle > 1 and apart[-1] < GOOD[-1] * size:
                 break
         count, before = 2 * count, trip
@@ -214,8 +254,16 @@ def make(course: Course, observe: Observer, moved: float, seconds: float) -> Ref
     return _trusted(problem, observe, ruler, best, moved)
 
 
-class Pair(NamedTuple):
-    """Two runs, the finer of so many steps a part, and how far they are apart by each part."""
+class RunPair(NamedTuple):
+    """Two runs, the second with half the step size of the first.
+
+    Attributes:
+        coarse: the run with the larger step size.
+        fine: the run with the smaller step size.
+        apart: the largest distance of the runs from the start to the end of each part, (parts,)
+            [m].
+        each: number of steps per part of `fine`.
+    """
 
     coarse: Trip
     fine: Trip
@@ -223,11 +271,12 @@ class Pair(NamedTuple):
     each: int
 
 
-def _closer(best: Pair | None, new: Pair, size: float) -> tuple[Pair, bool]:
-    """The pair that agrees better, of all parts in the mean of the logarithms.
+def _closer(best: RunPair | None, new: RunPair, size: float) -> tuple[RunPair, bool]:
+    """Returns the pair of runs that agrees better, and True if it is the new one.
 
-    At the end of a motion that is chaotic any two runs may agree by chance. So may two runs before
-    a third one shows it: the finer of the best pair is then off by what it is from that one, too.
+    The mean logarithm of distances is compared. At the end of a chaotic motion two runs may agree
+    by chance, which a third run reveals. The error of the best pair is therefore at least the
+    distance of its finer run from the next run.
     """
     if best is None or _logarithm(new.apart, size) < _logarithm(best.apart, size):
         return new, True
@@ -237,17 +286,19 @@ def _closer(best: Pair | None, new: Pair, size: float) -> tuple[Pair, bool]:
 
 
 def _logarithm(apart: np.ndarray, size: float) -> float:
+    """Returns the mean logarithm of distances, each raised by the rounding error."""
     return float(np.mean(np.log(apart + np.finfo(float).eps * size)))
 
 
 def _trusted(
-    problem: Problem, observe: Observer, ruler: Ruler, best: Pair, moved: float
+    problem: Problem, observe: Observer, ruler: Ruler, best: RunPair, moved: float
 ) -> Reference:
-    """The reference, with the part of the horizon in which it is good."""
+    """Returns the best run as a `Reference`, limited to the time up to which it is accurate."""
     _, trip, apart, count = best
-    both = zip(problem.start, trip.points, strict=True)
-    points = Points(*(np.concatenate([x[None], y]) for x, y in both))
+    pairs = zip(problem.start, trip.points, strict=True)
+    points = Points(*(np.concatenate([x[None], y]) for x, y in pairs))
     size = ruler.size(points.q)
+    # two runs may agree by chance to less than the rounding error
     error = apart + 64 * np.finfo(float).eps * size
     ends = problem.horizon / problem.parts * np.arange(1, problem.parts + 1)
     counts = [int(np.sum(error <= share * size)) for share in GOOD]
@@ -263,7 +314,7 @@ def _trusted(
 
 
 def _hopeless(trip: Trip, steps: int) -> str:
-    """Why there is no reference."""
+    """Returns the error message that says why there is no reference."""
     code, when = trip.status, float(trip.points.time[-1])
     if not trip.failed:
         return (
@@ -273,5 +324,5 @@ def _hopeless(trip: Trip, steps: int) -> str:
     why = MEANING.get(code, "its numbers are not finite")
     return (
         f"tradeoff: the reference fails in {steps} steps, {Status(code).name} at {when:.3g} s:"
-        f" {why}. Take a horizon that ends before, or see jc.find_first_failure."
+        f" {why}. Take a horizon that ends before, or see jc.analysis.find_first_failure."
     )

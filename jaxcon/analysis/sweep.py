@@ -1,4 +1,4 @@
-"""One method in one precision over all steps: errors, the limit of stability, and costs."""
+"""Runs a method in one precision with several step sizes: errors, stability limit and costs."""
 
 from __future__ import annotations
 
@@ -15,31 +15,31 @@ import jax
 import numpy as np
 
 from jaxcon.analysis.costs import Batch, Pace, Slope
-from jaxcon.analysis.front import COORDINATES, METERS, OK, LeftOut, Limit, Run
+from jaxcon.analysis.front import COORDINATES, METERS, OK, LeftOut, Run, StabilityLimit
 from jaxcon.analysis.reference import Reference, Ruler
 from jaxcon.analysis.trials import Course, Observer, Problem, Trip
 from jaxcon.core.status import Status
-from jaxcon.simulation.method import Method
+from jaxcon.methods.method import Method
 
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
-"""Steps in a part of the horizon, as far as the horizon then has no more than `MOST`."""
+"""The default numbers of steps per part of the horizon, limited by `MOST`."""
 MOST = 20_000
 OPEN = 0.05
-"""max |φ| from which a run counts as diverged, of the size of the motion."""
+"""The largest max |φ| of a run that has not diverged, relative to the size of the motion."""
 GAINED = 1.0
-"""Difference in energy from which it does, of what moves or is exchanged."""
+"""The largest energy error of a run that has not diverged, relative to the exchanged energy."""
 BISECTIONS = 4
-"""The halvings of the gap between a stable and an unstable step, on a logarithmic scale."""
+"""The number of bisections between a stable and an unstable step size, on a logarithmic scale."""
 SHARE = 1 / 60
-"""The share of the budget that one run may take."""
+"""The share of the budget that a single run may take."""
 ASKED = 1 / 4
-"""The share of the budget that all runs of a method may take, also at steps that were asked for."""
+"""The share of the budget that all runs of a method may take, even at the user's step sizes."""
 FEW = 10
-"""Steps in a part by which the time of a first run is foretold."""
+"""The number of steps per part in a short run that predicts the time of the first full run."""
 NO_GAIN = 0.8
-"""The share of the least error so far above which a run gains nothing by its shorter step."""
+"""The share of the least error so far above which a smaller step is no improvement."""
 REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeError)
-"""What a method that does not fit a scene raises."""
+"""The exceptions raised by a method that does not fit a scene."""
 
 
 @dataclass(frozen=True)
@@ -47,15 +47,15 @@ class Unit:
     """The results of one method in one precision.
 
     Attributes:
-        runs: at all steps.
-        limit: of stability.
-        left_out: what was not run, and why.
-        differentiated: whether gradients were tried.
-        compiling: the time until its programs were compiled [s].
+        runs: one run for each step size.
+        limit: the largest stable step size.
+        left_out: skipped measurements, with reasons.
+        differentiated: True if timing of gradients was attempted.
+        compiling: time to trace and compile the programs [s].
     """
 
     runs: tuple[Run, ...] = ()
-    limit: Limit | None = None
+    limit: StabilityLimit | None = None
     left_out: tuple[LeftOut, ...] = ()
     differentiated: bool = False
     compiling: float = 0.0
@@ -63,16 +63,16 @@ class Unit:
 
 @dataclass(frozen=True)
 class Sweep:
-    """What all methods share.
+    """Measures methods on one problem, with data that all methods share.
 
     Attributes:
-        problem: with its start on the constraints.
-        reference: of it.
-        observe: reads energies.
-        batch: in which costs are measured.
-        dts: steps that were asked for [s]; None for those of the default.
-        budget: for all of it [s].
-        left: returns what is left of it [s].
+        problem: the problem; its initial state satisfies the constraints.
+        reference: reference solution of the problem.
+        observe: evaluates energies and violations.
+        batch: batch for the cost measurements.
+        dts: the user's step sizes [s]; None for default step sizes.
+        budget: time budget of the whole comparison [s].
+        left: function that returns the remaining budget [s].
     """
 
     problem: Problem
@@ -85,12 +85,12 @@ class Sweep:
 
     @cached_property
     def ruler(self) -> Ruler:
-        """The ruler of configurations."""
+        """Measures distances between configurations of this problem."""
         return Ruler.of(self.observe, self.problem)
 
     @property
     def counts(self) -> list[int]:
-        """Steps in a part, ascending; a step asked for that divides no part is shortened."""
+        """Numbers of steps per part, ascending. A step size that divides no part is reduced."""
         parts = self.problem.parts
         if self.dts is None:
             return [n for n in COUNTS if n == 1 or n * parts <= MOST]
@@ -98,7 +98,13 @@ class Sweep:
         return sorted({max(1, math.ceil(part / dt - 1e-9)) for dt in self.dts})
 
     def measure(self, name: str, method: Method, dtype: str) -> Unit:
-        """Runs a method at all steps; one that does not fit the scene says why."""
+        """Runs a method at all step sizes. A method that does not fit the scene is skipped.
+
+        Args:
+            name: name of the method.
+            method: the method.
+            dtype: "float32" or "float64".
+        """
         begin = time.perf_counter()
         try:
             course, pace = compiled_side_by_side(
@@ -110,26 +116,30 @@ class Sweep:
         try:
             unit = self._measured(course, pace, name, method)
             return dataclasses.replace(unit, compiling=spent)
-        except jax.errors.JaxRuntimeError as error:  # as where memory runs out
+        except jax.errors.JaxRuntimeError as error:  # for example, out of memory
             return Unit(left_out=(LeftOut(name, dtype, first_line(error)),))
 
     def _measured(self, course: Course, pace: Pace, name: str, method: Method) -> Unit:
-        """Errors first, then costs."""
+        """Measures the errors of a method, then its stability limit and its costs."""
         course.go(self.problem.dt(1), 1)  # the first run of a program takes longer than later ones
         runs, why = self._refined(course, name, method)
         limit = self._limit(course, name, runs) if runs else None
         timed, late = self._timed(pace, runs)
         dtype = course.dtype.name
-        left = [LeftOut(name, dtype, reason) for reason in (why, late) if reason]
-        return Unit(timed, limit, tuple(left))
+        left_out = [LeftOut(name, dtype, reason) for reason in (why, late) if reason]
+        return Unit(timed, limit, tuple(left_out))
 
     def _timed(self, pace: Pace, runs: list[Run]) -> tuple[tuple[Run, ...], str]:
-        """Returns the runs with costs while time is left, and why some have none.
+        """Adds costs to the stable runs as long as the budget lasts.
 
-        The first is timed in any case, and then the others from both ends of the steps in turn.
+        The run with the smallest step size comes first and is always timed. The others follow,
+        alternating between the largest and the smallest remaining step size.
+
+        Returns:
+            All runs; and the reason why some have no costs, or an empty text.
         """
-        able = [i for i, run in enumerate(runs) if run.ok]
-        order = [able.pop(0 if k % 2 else -1) for k in range(len(able))]
+        stable = [i for i, run in enumerate(runs) if run.ok]
+        order = [stable.pop(0 if k % 2 else -1) for k in range(len(stable))]
         timed, late = list(runs), ""
         for k, i in enumerate(order):
             if k and self.left() <= 0:
@@ -141,27 +151,34 @@ class Sweep:
         return tuple(timed), late
 
     def gradients(self, unit: Unit) -> Unit:
-        """Returns the unit with the costs of gradients."""
-        able = [run for run in unit.runs if run.ok]
-        one = able[0]
-        assert one.method is not None
+        """Adds the costs of gradients to the runs of a method.
+
+        Args:
+            unit: results of the method, with at least one stable run.
+        """
+        first = next(run for run in unit.runs if run.ok)
+        assert first.method is not None
         try:
-            slope = Slope(self.batch, one.method, one.dtype)
+            slope = Slope(self.batch, first.method, first.dtype)
             slope.compile()
         except REFUSED as error:
-            why = LeftOut(one.name, one.dtype, f"its gradient: {first_line(error)}")
-            left = (*unit.left_out, why)
-            return dataclasses.replace(unit, left_out=left, differentiated=True)
+            why = LeftOut(first.name, first.dtype, f"its gradient: {first_line(error)}")
+            left_out = (*unit.left_out, why)
+            return dataclasses.replace(unit, left_out=left_out, differentiated=True)
         runs = tuple(
             dataclasses.replace(run, gradient=slope.seconds(run.dt) / run.dt)
-            if run is one or run.ok and self.left() > 0
+            if run is first or run.ok and self.left() > 0
             else run
             for run in unit.runs
         )
         return dataclasses.replace(unit, runs=runs, differentiated=True)
 
     def _refined(self, course: Course, name: str, method: Method) -> tuple[list[Run], str]:
-        """Runs with shorter and shorter steps, and why there are no shorter ones."""
+        """Runs the method with smaller and smaller steps, as long as it is useful.
+
+        Returns:
+            The runs; and the reason why there are no smaller steps, or an empty text.
+        """
         runs: list[Run] = []
         stalled, least, trip, spent = 0, math.inf, None, 0.0
         for count in self.counts:
@@ -174,9 +191,12 @@ class Sweep:
                 return runs, f"steps from {dt:.3g} s on: each run would take {longer:.2g} s"
             if runs and self.dts is None:
                 if runs[-1].ok and not runs[-1].told:
-                    return runs, f"steps from {dt:.3g} s on: the reference tells them no more apart"
+                    return (
+                        runs,
+                        f"steps from {dt:.3g} s on: errors are below the reference error",
+                    )
                 if stalled > 1:
-                    return runs, f"steps from {dt:.3g} s on: the error falls no more"
+                    return runs, f"steps from {dt:.3g} s on: the error no longer falls"
             trip = course.go(dt, count)
             runs.append(self._run(trip, name, method, course.dtype.name))
             stalled = stalled + 1 if runs[-1].error > NO_GAIN * least and runs[-1].ok else 0
@@ -184,30 +204,40 @@ class Sweep:
         return runs, ""
 
     def _seconds(self, course: Course, trip: Trip | None, dt: float, count: int) -> float:
-        """How long a run will take, by the one before it or, at steps asked for, by a short one."""
+        """Predicts the duration of a run from the previous run [s].
+
+        Without a previous run, a short run is timed if the user gave step sizes. For default step
+        sizes the prediction is then 0.
+
+        Args:
+            course: the simulation program.
+            trip: the previous run, or None.
+            dt: step size of the next run [s].
+            count: its number of steps per part.
+        """
         if trip is not None:
             return trip.seconds * trip.dt / dt
         few = 0 if self.dts is None else min(count, FEW)
         return course.go(dt, few).seconds * count / few if few else 0.0
 
     def _run(self, trip: Trip, name: str, method: Method, dtype: str) -> Run:
-        """What a trip amounts to."""
+        """Converts a simulation to a `Run`, with its outcome and errors."""
         outcome, energy = self._outcome(trip)
         error, angle, told = math.inf, math.inf, True
         if outcome == OK:
             last = self.reference.last
-            far, turned = self.ruler(trip.points.q, self.reference.points.q[1:])
-            error, angle = float(np.max(far[:last])), float(np.max(turned[:last]))
+            distance, turn = self.ruler(trip.points.q, self.reference.points.q[1:])
+            error, angle = float(np.max(distance[:last])), float(np.max(turn[:last]))
             told = error > self.reference.floor
             error = max(error, self.reference.floor)
         alone = trip.seconds / self.problem.horizon
         note = trip.status.name if trip.status and outcome == OK else ""
-        known = (name, dtype, trip.dt, outcome, error, told, angle, trip.violation, energy, alone)
+        measured = (error, told, angle, trip.violation, energy, alone)
         unit = METERS if self.ruler.layout is not None else COORDINATES
-        return Run(*known, note=note, unit=unit, method=method)
+        return Run(name, dtype, trip.dt, outcome, *measured, note=note, unit=unit, method=method)
 
     def _outcome(self, trip: Trip) -> tuple[str, float]:
-        """Returns in words how a trip ended, and how far its energy is off [J]."""
+        """Returns the outcome of a simulation as text, and its energy error [J]."""
         points, reference = trip.points, self.reference
         if trip.failed:
             code = trip.status.name if trip.status else Status.NON_FINITE.name
@@ -215,15 +245,15 @@ class Sweep:
         seen = self.observe(points)
         exact = np.interp(points.time, reference.points.time, reference.seen.energy)
         energy = float(np.max(np.abs(seen.energy - exact)))
-        off = max(trip.violation, float(np.max(seen.violation)))
-        if not off <= OPEN * reference.size:
-            return f"violation {off:.2g}", energy
+        worst = max(trip.violation, float(np.max(seen.violation)))
+        if not worst <= OPEN * reference.size:
+            return f"violation {worst:.2g}", energy
         if reference.scale > 0 and not energy <= GAINED * reference.scale:
             return f"energy off by {energy:.2g} J", energy
         return OK, energy
 
-    def _limit(self, course: Course, name: str, runs: list[Run]) -> Limit:
-        """The longest step up to which all are stable, by bisection beside those that were run."""
+    def _limit(self, course: Course, name: str, runs: list[Run]) -> StabilityLimit:
+        """Finds the largest stable step size by bisection between stable and unstable runs."""
         tried = {run.dt: run.ok for run in runs}
         bad = min((dt for dt, ok in tried.items() if not ok), default=None)
         good = max((dt for dt in tried if bad is None or dt < bad), default=None)
@@ -236,22 +266,29 @@ class Sweep:
                 trip = course.go(middle, max(1, round(part / middle)))
                 stable = self._outcome(trip)[0] == OK
                 good, bad = (middle, bad) if stable else (good, middle)
-        return Limit(name, course.dtype.name, good, bad)
+        return StabilityLimit(name, course.dtype.name, good, bad)
 
 
 def compiled_side_by_side(*makers: Callable[[], Any]) -> list[Any]:
-    """Programs, each compiled on a core of its own while the next one is traced."""
+    """Traces programs one after another, and compiles each in a thread during the next trace.
+
+    Args:
+        makers: functions that trace a program; called in order.
+
+    Returns:
+        The compiled programs.
+    """
     with ThreadPoolExecutor(len(makers)) as pool:
-        programs, begun = [], []
+        programs, compilations = [], []
         for make in makers:
             programs.append(make())
-            begun.append(pool.submit(programs[-1].compile))
-        for one in begun:
-            one.result()
+            compilations.append(pool.submit(programs[-1].compile))
+        for compilation in compilations:
+            compilation.result()
     return programs
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says, without what follows its first line."""
+    """Returns the first line of an exception's message, as a reason for skipping a method."""
     text = str(error).strip().splitlines()
     return f"refused: {text[0]}" if text else f"refused: {type(error).__name__}"

@@ -1,10 +1,9 @@
-"""Which method to take on a scene: errors against a reference, costs on this device. Host code."""
+"""Compares methods on a scene: errors from a reference, costs on this device. Host code."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -17,32 +16,33 @@ from jaxcon.analysis.ledger import GRADIENT, Clock, Ledger, Wanted
 from jaxcon.analysis.sweep import Sweep
 from jaxcon.analysis.trials import Course, Inputs, Observer, Points, Problem
 from jaxcon.core import checks
-from jaxcon.core.ends import ENDS, bar, words
-from jaxcon.core.typing import PyTree
-from jaxcon.model.state import State, at
-from jaxcon.simulation.method import Method, check_method
+from jaxcon.core.interrupts import STOP_EXCEPTIONS, describe_error, progress_bar
+from jaxcon.core.typing import DType, PyTree
+from jaxcon.methods.method import Method, check_method
+from jaxcon.protocols import System
+from jaxcon.system.state import State, checked_system
 
 DTYPES = ("float64", "float32")
 NO_TIME = "no time was left of the budget"
 REFERENCE_SHARE = 0.1
-"""The share of the budget that the runs of the reference may take."""
+"""The share of the budget for the runs of the reference."""
 EARLY = 0.75
-"""The share of the budget up to which the gradient of the first method may last."""
+"""The share of the budget within which the gradient of the first method is timed early."""
 OVER = 1.5
-"""The share of the budget up to which the first method may last: without it there is no result."""
+"""The share of the budget for the first method; above 1, since any result needs one method."""
 RUNS_SHARE = 0.7
-"""The share of the budget after which only gradients are begun, where the rest lasts for one."""
+"""The share of the budget for runs. The rest is for gradients, if it suffices for at least one."""
 
 
 def tradeoff(
-    system: Any,
+    system: System,
     state: State,
     horizon: float,
     controls: PyTree | Callable[[State], PyTree] = None,
     *,
     hold: float | None = None,
     methods: Mapping[str, Method] | None = None,
-    dtypes: Sequence[Any] = DTYPES,
+    dtypes: Sequence[str | DType] | str = DTYPES,
     dts: Sequence[float] | float | None = None,
     batch: int = 256,
     budget: float = 300.0,
@@ -50,59 +50,66 @@ def tradeoff(
     file: str | Path | None = None,
     progress: bool | None = None,
 ) -> Tradeoff:
-    """Error against cost of integrators × stabilisers × solvers × precisions × h on one scene.
+    """Compares errors and costs of methods, precisions and step sizes on one scene.
 
-    The reference is made here: a run of order six (beside bounded rows RK4 with `Events`) in
-    float64 with halved steps until two agree, whose difference is what it may be off. Where a
-    motion is chaotic it is good for a part of the horizon only, and errors are counted up to there.
-    Errors are the largest distances at the ends of the parts, ten or more, of the horizon. Costs
-    are measured on this device, in a batch whose worlds start all along the reference. Runs that
-    diverge are among the results, as is what there was no time for, with the reason.
+    A method combines an integrator, a stabilizer and solvers.
 
-    A start that is off its constraints is taken to the nearest positions and velocities on them.
-    The configuration of JAX stays as it is, also where float64 is turned off.
+    The reference solution is a run of order six in float64. In scenes with inequality constraints,
+    it is a run of RK4 with `jc.integrators.Events`. Its step size is halved until two runs agree.
+    Their difference is the error estimate. For a chaotic motion the reference is accurate only up
+    to some time, and errors are measured up to that time.
+
+    The horizon is cut into ten or more equal parts. The error of a run is its largest distance from
+    the reference at the ends of these parts. Costs are measured on this device, in a batch whose
+    worlds start at different points of the reference. The result includes diverged runs. It also
+    lists all skipped methods and measurements, with reasons.
+
+    If the initial state violates constraints, it is moved to the nearest positions and velocities
+    that satisfy them. Runs in float64 work even if float64 is disabled in JAX; the JAX
+    configuration is not changed.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        state: of one world.
-        horizon: how long the runs are [s].
-        controls: None; an array with rows, each held for an equal part of the horizon, one row for
-            a constant; or a function of the state, read at the start of each `hold`. Inputs that
-            change within a step belong into the system, as forces of t.
-        hold: the time for which each value of a function is held, of which the horizon is a
-            multiple [s].
-        methods: by name, the most important first; unless given those that suit the scene.
-        dtypes: precisions, of "float32" and "float64", or one of them.
-        dts: steps, or one, each shortened until it divides a part of the horizon [s]; unless given
-            a tenth of the horizon, and 1/2, 1/5, 1/10, … of that as long as errors fall.
-        batch: how many worlds share the device where costs are measured.
-        budget: of time [s]. What it would not last for, judged by what was measured before, is
-            listed and not run. Only a compilation that was begun may outlast it.
-        gradients: whether gradients are timed: of the first method where three quarters of the
-            budget last for it, and after all else those of the front first.
-        file: written after each method. Where it exists what it holds is not run again.
-        progress: whether a bar of tqdm is shown; if None, in terminals and notebooks.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        state: state of one world.
+        horizon: simulated time of each run [s].
+        controls: None, an array, or a function of the state (a policy). Each row of an array is
+            held for an equal part of the horizon; a single row is a constant control. A policy is
+            evaluated at the start of each interval `hold`. Model inputs that change within a step
+            as time-dependent forces of the system.
+        hold: time for which each control value of a policy is held [s]; must divide the horizon.
+        methods: methods by name, the most important first; by default methods that suit the scene.
+        dtypes: "float32", "float64" or both.
+        dts: one or several step sizes [s], each reduced until it divides a part of the horizon. The
+            default is the length of a part and 1/2, 1/5, 1/10, … of it, as long as errors decrease.
+        batch: number of worlds in the batch for the cost measurements.
+        budget: time budget [s]. Measurements that are predicted to exceed it are skipped and
+            listed. Only a compilation that has begun may exceed it.
+        gradients: True also times gradients. The gradient of the first method is timed early, if it
+            fits in three quarters of the budget. The others are timed after all runs, methods on
+            the Pareto front first.
+        file: path of a file, written after each method. Results in an existing file are reused.
+        progress: True shows a tqdm progress bar; None shows it in terminals and notebooks.
 
     Returns:
-        The `Tradeoff`. What was done before the keyboard interrupts, too.
+        A `jc.analysis.Tradeoff`. After a keyboard interrupt it contains the results so far.
 
     Raises:
-        ValueError: bad numbers, controls that mean another thing at every step, or a file of
-            another scene.
-        TypeError: something else than methods.
-        SimulationError: the scene itself does not get through the horizon, or its start cannot be
-            brought onto its constraints.
+        ValueError: a number is out of range, a policy has no `hold`, or the file belongs to another
+            comparison.
+        TypeError: `methods` is not a mapping from names to methods.
+        SimulationError: the reference fails within the horizon, or the initial state cannot be
+            moved onto the constraints.
     """
     if np.ndim(getattr(state, "q", ())) > 1:
         raise ValueError(
             f"tradeoff: takes the start of one world, got a state with q of shape {state.q.shape};"
             " take one of a batch or a trajectory, jax.tree.map(lambda x: x[0], states)."
         )
-    at(system, state, "jc.tradeoff(system, s, horizon)")
+    checked_system(system, state, "jc.tradeoff(system, s, horizon)")
     checks.flag("tradeoff", "gradients", gradients)
     dtypes = (dtypes,) if isinstance(dtypes, str) else dtypes
     dts = (dts,) if isinstance(dts, int | float) else dts
-    _check(horizon, methods, dtypes, dts, (batch, budget))
+    _check(horizon, methods, dtypes, dts, batch, budget)
     clock, horizon = Clock(budget), float(horizon)
     start = Points(*(np.asarray(x, np.float64) for x in Points.of(state)))
     problem = Problem(system, start, horizon, Inputs.of(system, controls, hold, horizon))
@@ -118,14 +125,18 @@ def tradeoff(
     steps = None if dts is None else tuple(map(float, dts))
     shared = Batch.of(problem, reference, batch)
     sweep = Sweep(problem, reference, observe, shared, steps, budget, lambda: clock.left)
-    own = methods_for(observe.system, reference) if methods is None else methods
-    wanted = [Wanted(name, m, np.dtype(x).name, steps) for name, m in own.items() for x in dtypes]
-    left = _go(sweep, ledger, clock, wanted, (gradients, progress))
-    units = [ledger[one] for one in wanted if one in ledger]
+    by_name = methods_for(observe.system, reference) if methods is None else methods
+    wanted = [
+        Wanted(name, method, np.dtype(dtype).name, steps)
+        for name, method in by_name.items()
+        for dtype in dtypes
+    ]
+    late = _go(sweep, ledger, clock, wanted, (gradients, progress))
+    units = [ledger[choice] for choice in wanted if choice in ledger]
     return Tradeoff(
         tuple(run for unit in units for run in unit.runs),
         tuple(unit.limit for unit in units if unit.limit),
-        tuple([x for unit in units for x in unit.left_out] + left),
+        tuple([x for unit in units for x in unit.left_out] + late),
         horizon,
         reference.until,
         reference.floor,
@@ -142,66 +153,79 @@ def _go(
     wanted: list[Wanted],
     options: tuple[bool, bool | None],
 ) -> list[LeftOut]:
-    """Measures what is wanted, and then gradients; says what there was no time for."""
+    """Measures all methods, then gradients. Returns the measurements that did not fit the budget.
+
+    Args:
+        sweep: measures one method.
+        ledger: saved results, to which new ones are added.
+        clock: the remaining budget.
+        wanted: methods and precisions, the most important first.
+        options: (`gradients`, `progress`) of `tradeoff`.
+    """
     gradients, progress = options
-    shown = bar(progress, total=len(wanted) * (1 + gradients), desc="tradeoff", unit="method")
+    bar = progress_bar(
+        progress, total=len(wanted) * (1 + gradients), desc="tradeoff", unit="method"
+    )
     reason = NO_TIME
     try:
-        with shown:
-            for i, one in enumerate(wanted):
-                shown.set_postfix_str(f"{one.name}, {one.dtype}")
+        with bar:
+            for i, choice in enumerate(wanted):
+                bar.set_postfix_str(f"{choice.name}, {choice.dtype}")
                 first = ledger[wanted[0]].compiling if wanted[0] in ledger else 0.0
                 slope = clock.asks("gradients", GRADIENT * first or None)
-                kept = gradients and slope < (1 - RUNS_SHARE) * clock.budget
-                # the first gets all there is, as without any run there is nothing to say
-                share = OVER if i == 0 else RUNS_SHARE if kept else 1.0
+                reserved = gradients and slope < (1 - RUNS_SHARE) * clock.budget
+                # the first method gets all of the budget, since without any run there is no result
+                share = OVER if i == 0 else RUNS_SHARE if reserved else 1.0
                 guess = clock.longest.get("reference", 0.0)
-                if one not in ledger and clock.lasts("runs", share, guess):
+                if choice not in ledger and clock.lasts("runs", share, guess):
                     with clock.timing("runs"):
-                        ledger[one] = sweep.measure(one.name, one.method, one.dtype)
-                if gradients and i == 0:  # later there may be no time for any gradient
-                    _differentiate(sweep, ledger, clock, one, EARLY)
-                shown.update()
-            for one in _by_use(ledger, wanted) if gradients else ():
-                shown.set_postfix_str(f"gradient of {one.name}, {one.dtype}")
-                _differentiate(sweep, ledger, clock, one)
-                shown.update()
-    except ENDS as error:
-        reason = words(error)
-    late = [LeftOut(one.name, one.dtype, reason) for one in wanted if one not in ledger]
-    for one in _by_use(ledger, wanted) if gradients else ():
-        if not ledger[one].differentiated:
-            late.append(LeftOut(one.name, one.dtype, f"its gradient: {reason}"))
+                        ledger[choice] = sweep.measure(choice.name, choice.method, choice.dtype)
+                if gradients and i == 0:  # early: later there may be no time
+                    _differentiate(sweep, ledger, clock, choice, EARLY)
+                bar.update()
+            for choice in _by_use(ledger, wanted) if gradients else ():
+                bar.set_postfix_str(f"gradient of {choice.name}, {choice.dtype}")
+                _differentiate(sweep, ledger, clock, choice)
+                bar.update()
+    except STOP_EXCEPTIONS as error:
+        reason = describe_error(error)
+    late = [LeftOut(x.name, x.dtype, reason) for x in wanted if x not in ledger]
+    for choice in _by_use(ledger, wanted) if gradients else ():
+        if not ledger[choice].differentiated:
+            late.append(LeftOut(choice.name, choice.dtype, f"its gradient: {reason}"))
     return late
 
 
 def _differentiate(
-    sweep: Sweep, ledger: Ledger, clock: Clock, one: Wanted, share: float = 1.0
+    sweep: Sweep, ledger: Ledger, clock: Clock, choice: Wanted, share: float = 1.0
 ) -> None:
-    """Measures the gradients of a method that has runs, where a share of the budget lasts."""
-    if one not in ledger:
+    """Times the gradient of a measured method, if it fits in a share of the budget.
+
+    Does nothing if the method has no stable run or its gradient is already timed.
+    """
+    if choice not in ledger:
         return
-    unit = ledger[one]
+    unit = ledger[choice]
     if unit.differentiated or not any(run.ok for run in unit.runs):
         return
     guess = GRADIENT * unit.compiling or None
     if clock.lasts("gradients", share, guess):
         with clock.timing("gradients"):
-            ledger[one] = sweep.gradients(unit)
+            ledger[choice] = sweep.gradients(unit)
 
 
 def _by_use(ledger: Ledger, wanted: list[Wanted]) -> list[Wanted]:
-    """Returns what was measured and did not diverge everywhere, what is on the front first."""
-    able = [one for one in wanted if one in ledger and any(run.ok for run in ledger[one].runs)]
-    front = {(x.name, x.dtype) for x in front_of(run for one in able for run in ledger[one].runs)}
-    return sorted(able, key=lambda one: (one.name, one.dtype) not in front)
+    """Returns the measured methods with a stable run, methods on the Pareto front first."""
+    stable = [x for x in wanted if x in ledger and any(run.ok for run in ledger[x].runs)]
+    front = {(r.name, r.dtype) for r in front_of(run for x in stable for run in ledger[x].runs)}
+    return sorted(stable, key=lambda x: (x.name, x.dtype) not in front)
 
 
 def _words(sweep: Sweep) -> tuple[str, ...]:
-    """What a result says of the reference and of the device."""
+    """Describes the reference and the device in lines of text."""
     reference, problem = sweep.reference, sweep.problem
     device = f"{jax.devices()[0].device_kind} ({jax.default_backend()})"
-    unit = METERS if hasattr(problem.system, "layout") else COORDINATES
+    unit = METERS if problem.system.layout is not None else COORDINATES
     lines = [
         f"{problem.horizon:g} s; cost: time on {device} for a simulated second of one world,"
         f" alone or of {sweep.batch.worlds}",
@@ -210,8 +234,8 @@ def _words(sweep: Sweep) -> tuple[str, ...]:
     ]
     if reference.until < problem.horizon * (1 - 1e-9):
         lines.append(
-            f"that is up to {reference.until:.3g} s, as far as errors are counted; at the end it"
-            f" may be off by {reference.error[-1]:.1e}, so sensitive is the motion"
+            f"errors are measured up to {reference.until:.3g} s only; at the end the reference"
+            f" may be off by {reference.error[-1]:.1e}, since the motion is sensitive"
         )
     if reference.moved:
         lines.append(f"the start was off its constraints; it moved by {reference.moved:.2g} kg^½ m")
@@ -220,14 +244,20 @@ def _words(sweep: Sweep) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def _check(horizon: Any, methods: Any, dtypes: Any, dts: Any, numbers: tuple[Any, Any]) -> None:
-    """Checks what a user gave.
+def _check(
+    horizon: float,
+    methods: Mapping[str, Method] | None,
+    dtypes: Sequence[str | DType],
+    dts: Sequence[float] | None,
+    batch: int,
+    budget: float,
+) -> None:
+    """Checks the arguments of `tradeoff`.
 
     Raises:
-        ValueError: bad numbers.
-        TypeError: something else than methods.
+        ValueError: a number is out of range.
+        TypeError: `methods` is not a mapping from names to methods.
     """
-    batch, budget = numbers
     checks.check("tradeoff", "horizon", horizon, (), above=0)
     checks.check("tradeoff", "budget", budget, (), above=0)
     checks.count("tradeoff", "batch", batch)

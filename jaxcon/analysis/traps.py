@@ -1,136 +1,146 @@
-"""The traps of constrained dynamics, and whether a scene and a method are in one (chapter 3.11)."""
+"""Warnings about typical mistakes in constrained simulations ("traps", chapter 3.11). Host code.
+
+Each trap has a function. It returns a warning if the scene or the method makes this mistake, or
+None.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.analysis.estimate import contact_operations, solved_rows
-from jaxcon.analysis.known import Known, asked_gains
-from jaxcon.constraints.bounds import BoundRows, kinds_of, linearize_at_rest, linearize_bounds
-from jaxcon.constraints.contact import Rope, Touches
-from jaxcon.constraints.contact_default import EXACT_UP_TO, default_contact_solver
-from jaxcon.constraints.limits import Limit
-from jaxcon.core import host
-from jaxcon.dynamics.impacts import PREFIX, doubt
-from jaxcon.dynamics.rank import linearized
-from jaxcon.simulation.choice import innermost, several, words
-from jaxcon.simulation.integrators import SemiImplicitEuler
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.stability import instability, parts
-from jaxcon.solvers.bounded import is_exact
-from jaxcon.solvers.conjugate_gradients import ConjugateGradients
-from jaxcon.solvers.gauss_seidel import GaussSeidel
-from jaxcon.solvers.interior_point import InteriorPoint
-from jaxcon.solvers.nearest_rows import Nearest
-from jaxcon.solvers.priority import Lexicographic
-from jaxcon.solvers.proximal import RankSafe
+from jaxcon.analysis.setup import Setup, asked_gains
+from jaxcon.constraints.rank import linearized
+from jaxcon.contact.bounded import is_exact
+from jaxcon.contact.contact import Contacts, Rope
+from jaxcon.contact.contact_default import EXACT_UP_TO, default_contact_solver
+from jaxcon.contact.gauss_seidel import GaussSeidel
+from jaxcon.contact.impacts import PREFIX, doubt
+from jaxcon.contact.interior_point import InteriorPoint
+from jaxcon.contact.limits import Bounds, Limit
+from jaxcon.contact.nearest_rows import ActiveSet
+from jaxcon.contact.rows import BoundRows, kinds_of, linearize_at_rest, linearize_bounds
+from jaxcon.core import host, summary
+from jaxcon.core.typing import Array, Lane
+from jaxcon.linear.conjugate_gradients import ConjugateGradients
+from jaxcon.linear.priority import Lexicographic
+from jaxcon.linear.proximal import RankSafe
+from jaxcon.linear.schur import Schur
+from jaxcon.linear.sparse import Sparse
+from jaxcon.methods.choice import innermost, several, words
+from jaxcon.methods.integrators import SemiImplicitEuler
+from jaxcon.methods.method import Method
+from jaxcon.methods.multipliers import AugmentedLagrangian
+from jaxcon.methods.stability import instability, parts
+from jaxcon.protocols import ContactSolver, System
+from jaxcon.system.state import State
 
 OFF = 1e-4
-"""‖φ‖ [m, rad] from which on a report speaks of it."""
+"""The threshold on ‖φ‖ [m, rad] above which a report mentions it."""
 MOVING = 1e-3
-"""‖φ̇‖ or ‖ψ‖ [m/s, rad/s] from which on it speaks of that."""
+"""The threshold on ‖φ̇‖ or ‖ψ‖ [m/s, rad/s] above which a report mentions it."""
 WEAK = 1e-2
-"""Singular value of n unit rows, times n, below which a direction is nearly lost."""
+"""The threshold on n σ_min below which n unit-length rows count as nearly dependent.
+
+σ_min is their smallest singular value.
+"""
 CURVED = 0.1
-"""The share of φ that one linear correction may leave before the way is called curved."""
+"""The share of φ that may remain after a linear correction before constraints count as curved."""
 SUDDEN = 0.5
-"""h β from which on feedback takes an error away in about one step."""
+"""The threshold on step size times gain, h β, above which feedback removes an error in one step."""
 COARSE = 1.0
-"""Angle of the fastest motion in a step [rad] above which the step is called too long."""
+"""The angle of the fastest motion in a step [rad] above which the step counts as too long."""
 FINE = 0.2
-"""Angle of the fastest motion in a step [rad] that is recommended."""
+"""The recommended angle of the fastest motion in a step [rad]."""
 DEARER = 3.0
-"""How many times the operations of elimination are worth a word."""
+"""The factor in operations over a better solver above which a report warns."""
 MANY = 12
-"""Rows from which on that matters."""
+"""The least number of constraint rows at which `DEARER` applies."""
 FEW_NAMES = 3
-"""Names of elements that a report lists in one place."""
+"""The largest number of element names that a report lists in one place."""
 OF_SCENE = ("range", "overlap")
-"""Traps of a scene and a state alone, whatever the method."""
+"""Names of the traps that depend only on scene and state, not on the method."""
 
 
-def found(known: Known, only: Iterable[str] | None = None) -> dict[str, str]:
-    """Warnings by trap, of those of `TRAPS` in which the scene or the method is.
+def warnings_of(setup: Setup, only: Iterable[str] | None = None) -> dict[str, str]:
+    """Returns warnings about the mistakes that the scene or the method makes, by trap.
 
     Args:
-        known: the scene and the method.
-        only: names of the traps to look for; all unless given.
+        setup: the scene, its state and the method.
+        only: names of the traps to check; None for all.
     """
-    told = ((name, TRAPS[name][1](known)) for name in (TRAPS if only is None else only))
-    return {name: words for name, words in told if words}
+    checks = ((name, TRAPS[name][1](setup)) for name in (TRAPS if only is None else only))
+    return {name: warning for name, warning in checks if warning}
 
 
 def listed(names: Sequence[str]) -> str:
-    """Returns the first names, and how many others there are."""
-    rest = len(names) - FEW_NAMES
-    if rest <= 0:
-        return ", ".join(names)
-    return f"{', '.join(names[:FEW_NAMES])} and {several(rest, 'other')}"
+    """Returns a text of the first `FEW_NAMES` names and the number of the remaining ones."""
+    return summary.listed(names, FEW_NAMES, lambda rest: several(rest, "other"))
 
 
-def gains(known: Known) -> str | None:
-    """Trap 1: feedback or springs that the step cannot follow."""
-    if known.dt is None:
+def gains(setup: Setup) -> str | None:
+    """Trap 1: feedback gains or springs that are too stiff for the step size."""
+    if setup.dt is None:
         return None
-    return instability(known.method, known.dt, known.system, known.state)
+    return instability(setup.method, setup.dt, setup.system, setup.state)
 
 
-def coarse(known: Known) -> str | None:
-    """Trap 11: a step too long for the motion, whatever the constraints are held by."""
-    angle = known.angle
+def coarse(setup: Setup) -> str | None:
+    """Trap 11: a step size that is too large for the motion itself."""
+    angle = setup.angle
     if not angle or max(angle.turn, angle.swing) <= COARSE:
         return None
-    said = []
+    causes = []
     if angle.turn > COARSE:
-        said.append(f"'{angle.turning.name}' turns by {angle.turn:.2g} rad in a step")
+        causes.append(f"'{angle.turning.name}' turns by {angle.turn:.2g} rad in a step")
     if angle.swing > COARSE:
         where = ""
         if angle.limit and angle.swing > angle.limit:
-            name = type(known.method.integrator).__name__
+            name = type(setup.method.integrator).__name__
             where = f", where oscillations are stable with {name} below {angle.limit:.3g}"
-        said.append(
+        causes.append(
             f"gravity and springs can move '{angle.swinging.name}' at"
             f" {angle.swinging.value:.3g} rad/s, h ω = {angle.swing:.2g}{where}"
         )
     fastest = max(angle.turning.value, angle.swinging.value)
     return (
-        f"{'; '.join(said)}. Take dt of {FINE / fastest:.2g} s or less. A step that is too long may"
-        " end with status OK: a status tells failures, not errors. Watch info.violation and"
+        f"{'; '.join(causes)}. Take dt of {FINE / fastest:.2g} s or less. A step that is too long"
+        " may end with status OK: a status tells failures, not errors. Watch info.violation and"
         " jc.energy, or give the method a Recovery with a limit, which ends as VIOLATED."
     )
 
 
-def singular(known: Known) -> str | None:
-    """Trap 2: a position, or masses, in which rows lose their rank, or nearly do."""
-    if known.dependent:
-        if not known.passing:
+def singular(setup: Setup) -> str | None:
+    """Trap 2: a singular position, or rows that are nearly dependent due to extreme mass ratios."""
+    if setup.dependent:
+        if not setup.passing:
             return None
-        names = _numbered(known, known.dependent)
+        names = _numbered(setup, setup.dependent)
         return (
             f"rows of {names} depend on others here, but not beside this position: it is singular."
-            f" Its forces are not unique, and the motion may branch. {_taken(known)}"
+            f" Its forces are not unique, and the motion may branch. {_taken(setup)}"
         )
-    if not len(known.unit.values):
+    if not len(setup.unit.values):
         return None
-    u, _, _ = known.unit.svd
-    n, least = len(u), known.unit.least
-    eps = float(jnp.finfo(known.state.q.dtype).eps)
-    shares = 1 / np.maximum(np.diag(np.linalg.pinv(known.unit.values @ known.unit.values.T)), 1)
+    u, _, _ = setup.unit.svd
+    n, least = len(u), setup.unit.least
+    eps = float(jnp.finfo(setup.state.q.dtype).eps)
+    # the share of each row's squared length outside the span of all other rows
+    shares = 1 / np.maximum(np.diag(np.linalg.pinv(setup.unit.values @ setup.unit.values.T)), 1)
     if least > WEAK / n and np.min(shares) > 10 * n * eps:
         return None
-    names = _names(known, [int(i) for i in np.argsort(-np.abs(u[:, -1]))[:2]])
-    if known.even.least > WEAK / n:
+    names = _names(setup, [int(i) for i in np.argsort(-np.abs(u[:, -1]))[:2]])
+    if setup.even.least > WEAK / n:
         return (
             f"rows of {names} nearly depend on others, not by their position but by the masses:"
-            " something light holds something heavy, shakes faster than most steps can follow, and"
-            " what the heavy one adds is lost in rounding. Give the light one more mass, or take"
-            " GeneralizedAlpha(), which damps this shaking, and float64."
+            " a light body holds a heavy one, vibrates faster than most steps resolve, and loses"
+            " digits to rounding. Give the light body more mass, or use"
+            " GeneralizedAlpha(), which damps this vibration, and float64."
         )
     return (
         f"rows of {names} nearly depend on others: a force along them hardly moves anything, so"
@@ -140,75 +150,80 @@ def singular(known: Known) -> str | None:
     )
 
 
-def order(known: Known) -> str | None:
-    """Trap 3: what is left depends on the order in which rows are taken."""
-    swept = getattr(known.method.bounded, "solver", known.method.bounded)
-    if not isinstance(swept, GaussSeidel) or known.probe is None or not known.system.bounds:
+def order(setup: Setup) -> str | None:
+    """Trap 3: results that depend on the order of the inequality rows (`GaussSeidel`)."""
+    swept = _inner(setup.method.contact_solver)
+    if not isinstance(swept, GaussSeidel) or setup.probe is None or not setup.system.bounds:
         return None
-    if not known.probe.missed > float(jnp.finfo(known.state.q.dtype).eps) ** 0.5:
+    if not setup.probe.missed > float(jnp.finfo(setup.state.q.dtype).eps) ** 0.5:
         return None
     return (
-        f"GaussSeidel takes bounded rows one after the other, and {swept.sweeps} sweeps leave"
-        f" {known.probe.missed:.1g} m/s of their laws open: the result depends on the order in"
+        f"GaussSeidel takes inequality rows one after the other, and {swept.sweeps} sweeps leave"
+        f" a residual of {setup.probe.missed:.1g} m/s: the result depends on the order in"
         " which elements were added. Take more sweeps, or InteriorPoint(), which takes all rows at"
         " once; joints are always taken at once."
     )
 
 
-def overconstrained(known: Known) -> str | None:
-    """Trap 4: more rows than are needed, or rows that contradict each other."""
-    if known.conflicts:
+def _inner(solver: ContactSolver | None) -> ContactSolver | None:
+    """Returns the solver inside an `ActiveSet`, or the given contact solver itself."""
+    return solver.solver if isinstance(solver, ActiveSet) else solver
+
+
+def overconstrained(setup: Setup) -> str | None:
+    """Trap 4: redundant or contradicting constraint rows."""
+    if setup.conflicts:
         return (
-            f"{', '.join(known.conflicts)} contradict each other: no motion meets all of them."
-            " Leave one out, correct its numbers, or rank them by jc.Priority."
+            f"{', '.join(setup.conflicts)} contradict each other: no motion meets all of them."
+            " Leave one out, correct its numbers, or rank them by jc.solvers.Priority."
         )
-    if not known.dependent or known.passing:
+    if not setup.dependent or setup.passing:
         return None
-    count, names = len(known.dependent), _numbered(known, known.dependent)
+    count, names = len(setup.dependent), _numbered(setup, setup.dependent)
     return (
-        f"redundant: {several(count, 'row')} of {names} repeat what others say. The motion is"
+        f"redundant: {several(count, 'row')} of {names} depend on others. The motion is"
         " right, but how forces are shared among these rows is not determined: take joints with"
-        f" fewer rows if you need them. {_taken(known)}"
+        f" fewer rows if you need them. {_taken(setup)}"
     )
 
 
-def start(known: Known) -> str | None:
-    """Trap 5: a start off the constraints."""
-    layout, off, moving, slips = known.rows.layout, [], [], []
-    h = known.dt or 0.0
-    for name, (size, rate) in known.violation.items():
+def start(setup: Setup) -> str | None:
+    """Trap 5: an initial state that violates constraints."""
+    layout, off, fast, slips = setup.rows.layout, [], [], []
+    h = setup.dt or 0.0
+    for name, (size, rate) in setup.violation.items():
         if name in layout.inertial:
             continue
-        drift = h * float(np.linalg.norm(np.asarray(known.rows.bias)[layout.rows(name)]))
-        fast = rate > MOVING + drift  # v may be half a step old
+        drift = h * float(np.linalg.norm(np.asarray(setup.rows.bias)[layout.rows(name)]))
+        is_fast = rate > MOVING + drift  # v may lag by half a step
         if name in layout.velocity_level:
-            slips += [name] if fast else []
+            slips += [name] if is_fast else []
         elif size > OFF:
             off.append(name)
-        elif fast:
-            moving.append(name)
-    said = []
+        elif is_fast:
+            fast.append(name)
+    parts = []
     if off:
-        said.append(f"{', '.join(off)} are not closed (φ ≠ 0)")
-    if moving:
-        said.append(f"the velocities tear at {', '.join(moving)} (φ̇ ≠ 0)")
-    if off or moving:
-        said = [" and ".join(said) + ": begin with jc.assemble(system, state).state"]
+        parts.append(f"{', '.join(off)} are not closed (φ ≠ 0)")
+    if fast:
+        parts.append(f"the velocities tear at {', '.join(fast)} (φ̇ ≠ 0)")
+    if off or fast:
+        parts = [" and ".join(parts) + ": begin with jc.assemble(system, state).state"]
     if slips:
-        said.append(f"{', '.join(slips)} slip at the start, which feedback lets decay")
-    return "; ".join(said) + "." if said else None
+        parts.append(f"{', '.join(slips)} slip at the start, which feedback lets decay")
+    return "; ".join(parts) + "." if parts else None
 
 
-def curved(known: Known) -> str | None:
-    """Trap 6: one linear correction of an error for which the constraints are too curved."""
-    φ = np.asarray(known.rows.residual, np.float64)
-    if known.dt is None or not np.max(np.abs(φ), initial=0) > OFF or not _linear(known):
+def curved(setup: Setup) -> str | None:
+    """Trap 6: an initial violation that one linear correction cannot remove, due to curvature."""
+    φ = np.asarray(setup.rows.residual, np.float64)
+    if setup.dt is None or not np.max(np.abs(φ), initial=0) > OFF or not _linear(setup):
         return None
-    own = φ[known.unit.numbers] / known.unit.length
-    x = np.linalg.lstsq(known.unit.values, -own, rcond=known.unit.tolerance)[0]
-    there = known.moved(known.velocities(x))
-    left = np.asarray(linearized(known.system, there)[0].residual)
-    share = np.linalg.norm(left) / np.linalg.norm(φ)
+    unit_φ = φ[setup.unit.numbers] / setup.unit.length
+    x = np.linalg.lstsq(setup.unit.values, -unit_φ, rcond=setup.unit.tolerance)[0]
+    corrected = setup.moved(setup.velocities(x))
+    rest = np.asarray(linearized(setup.system, corrected)[0].residual)
+    share = np.linalg.norm(rest) / np.linalg.norm(φ)
     if share < CURVED:
         return None
     return (
@@ -219,69 +234,76 @@ def curved(known: Known) -> str | None:
     )
 
 
-def dense(known: Known) -> str | None:
-    """Trap 7: dense matrices where J is sparse, or where few of many contacts touch."""
-    if slow := _slow_contact(known):
+def dense(setup: Setup) -> str | None:
+    """Trap 7: dense matrices although J is sparse or few of many contacts are active."""
+    if slow := _slow_contact(setup):
         return slow
-    efforts, name = known.choice.efforts, type(innermost(known.method.solver)).__name__
-    if name not in ("Dense", "Schur") or "Sparse" not in efforts or known.rows.layout.size < MANY:
+    efforts, name = setup.choice.efforts, type(innermost(setup.method.solver)).__name__
+    if name not in ("Dense", "Schur") or "Sparse" not in efforts or setup.rows.layout.size < MANY:
         return None
     ratio = efforts[name].operations / efforts["Sparse"].operations
     if ratio < DEARER:
         return None
     return (
         f"{name}() fills a matrix with zeros: each joint touches two bodies only. Elimination along"
-        f" the structure takes {ratio:.0f} times fewer operations: {words(known.choice.solver)}."
+        f" the structure takes {ratio:.0f} times fewer operations: {words(setup.choice.solver)}."
     )
 
 
-def _slow_contact(known: Known) -> str | None:
-    """The warning of an interior point with more rows than it is fast for."""
-    kinds = kinds_of(known.system, known.state.q, known.state.v)
-    solver = getattr(known.method.bounded, "solver", known.method.bounded)
-    if kinds is None or not isinstance(solver, InteriorPoint):
+def _slow_contact(setup: Setup) -> str | None:
+    """Returns a warning if `InteriorPoint` has too many rows to be fast, or None."""
+    kinds = kinds_of(setup.system, setup.state.q, setup.state.v)
+    if kinds is None or not isinstance(_inner(setup.method.contact_solver), InteriorPoint):
         return None
-    rows = solved_rows(known.method.bounded, kinds)
+    rows = solved_rows(setup.method.contact_solver, kinds)
     other = contact_operations(GaussSeidel(), kinds)
-    if rows <= EXACT_UP_TO or known.cost.contact < DEARER * other:
+    if rows <= EXACT_UP_TO or setup.cost.contact < DEARER * other:
         return None
-    rest, point = known.cost.operations - known.cost.contact, (known.state.q, known.state.v)
-    said = (
+    rest = setup.cost.operations - setup.cost.contact
+    problem = (
         f"InteriorPoint() inverts a matrix of {rows} inequality rows in each iteration, about"
-        f" {known.cost.contact:.2g} operations a step, where GaussSeidel() takes {other:.2g} and"
+        f" {setup.cost.contact:.2g} operations a step, where GaussSeidel() takes {other:.2g} and"
         f" all else {rest:.2g}."
     )
-    nearest = "jc.Nearest(jc.InteriorPoint(), contacts=8) where only few act at a time"
-    if isinstance(default_contact_solver(known.system, *point), InteriorPoint):
+    nearest = (
+        "jc.solvers.ActiveSet(jc.solvers.InteriorPoint(), contacts=8) where only few act at a time"
+    )
+    default = default_contact_solver(setup.system, setup.state.q, setup.state.v)
+    if isinstance(default, InteriorPoint):
         return (
-            f"{said} Take {nearest}, or GaussSeidel() where no light body carries heavy ones, since"
-            " bodies may rest on each other here."
+            f"{problem} Take {nearest}, or GaussSeidel() where no light body carries heavy ones,"
+            " since bodies may rest on each other here."
         )
-    return f"{said} Leave out bounded=, which then is GaussSeidel(), or take {nearest}."
+    return f"{problem} Leave out contact_solver=, which then is GaussSeidel(), or take {nearest}."
 
 
-def iterations(known: Known) -> str | None:
-    """Trap 8: more iterations than bring anything."""
-    solver = innermost(known.method.solver)
-    if isinstance(solver, ConjugateGradients) and (said := _swept(known, solver.iterations)):
-        return said
-    for part, field, enough in _counted(known.method):
-        if getattr(part, field) > enough:
+def iterations(setup: Setup) -> str | None:
+    """Trap 8: more iterations than needed."""
+    solver = innermost(setup.method.solver)
+    if isinstance(solver, ConjugateGradients) and (text := _swept(setup, solver.iterations)):
+        return text
+    for part, field, count, enough in _counted(setup.method):
+        if count > enough:
             return (
-                f"{type(part).__name__}({field}={getattr(part, field)}) repeats what {enough} or"
-                " fewer usually do, in every step; a shorter step with fewer of them is better for"
-                " the same time."
+                f"{type(part).__name__}({field}={count}) is more than the {enough}"
+                " that usually suffice in every step; a shorter step with fewer of them is more"
+                " accurate in the same time."
             )
     return None
 
 
-def _swept(known: Known, rounds: int) -> str | None:
-    """Returns the warning of more conjugate gradients than bring anything, or None."""
-    n, efforts, better = known.rows.layout.size, known.choice.efforts, words(known.choice.solver)
+def _swept(setup: Setup, rounds: int) -> str | None:
+    """Returns a warning if `ConjugateGradients` makes more iterations than useful, or None.
+
+    Args:
+        setup: the scene, its state and the method.
+        rounds: number of iterations.
+    """
+    n, efforts, better = setup.rows.layout.size, setup.choice.efforts, words(setup.choice.solver)
     if 0 < 2 * n + 10 < rounds:
         return (
-            f"ConjugateGradients makes {rounds} iterations for {several(n, 'row')}, and is done"
-            f" after about as many as there are rows: take iterations={n + 5}, or {better}."
+            f"ConjugateGradients makes {rounds} iterations for {several(n, 'row')}, but"
+            f" converges in about as many iterations as rows: use iterations={n + 5}, or {better}."
         )
     if "Sparse" not in efforts or n < MANY:
         return None
@@ -295,69 +317,69 @@ def _swept(known: Known, rounds: int) -> str | None:
     )
 
 
-def bound_rows(known: Known) -> BoundRows | None:
-    """The inequality constraints of a scene by shape; None where there are none."""
-    if not known.system.bounds or not hasattr(known.system, "layout"):
+def bound_rows(setup: Setup) -> BoundRows | None:
+    """Returns the inequality rows of a scene as shapes and dtypes; None if it has none."""
+    if not setup.system.bounds or setup.system.layout is None:
         return None
-    return jax.eval_shape(linearize_at_rest, known.system, known.state.q, known.state.v)
+    return jax.eval_shape(linearize_at_rest, setup.system, setup.state.q, setup.state.v)
 
 
-def colliding(known: Known) -> tuple[str, ...]:
-    """The names of the elements that have impacts."""
-    rows = bound_rows(known)
+def colliding(setup: Setup) -> tuple[str, ...]:
+    """Returns the names of the elements that can have impacts."""
+    rows = bound_rows(setup)
     if rows is None:
         return ()
     owners = rows.layout.owners[np.flatnonzero(rows.ends)]
     return tuple(rows.layout.names[i] for i in dict.fromkeys(owners.tolist()))
 
 
-def impact(known: Known) -> str | None:
-    """Trap 9: gradients of plain steps through impacts that lack their time."""
-    method, rows = known.method, bound_rows(known)
+def impact(setup: Setup) -> str | None:
+    """Trap 9: gradients through impacts that ignore the change of the impact time."""
+    method, rows = setup.method, bound_rows(setup)
     if method.events is not None or rows is None:
         return None
-    if rows.lands:  # a robot has dozens, and one line names them
+    if rows.lands:  # a robot may have dozens, so only some are named
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
-    solver = method.resolve(known.system, known.state).bounded
-    some = isinstance(solver, Nearest) and solver.leaves_out(rows.kinds)
+    solver = method.resolve(setup.system, setup.state).contact_solver
+    leaves_out = isinstance(solver, ActiveSet) and solver.leaves_out(rows.kinds)
     shared = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
     shares = type(solver).__name__ if shared and not is_exact(solver) else None
-    said = doubt(rows, shares, some)
-    return None if said is None else said.removeprefix(PREFIX)
+    warning = doubt(rows, shares, leaves_out)
+    return None if warning is None else warning.removeprefix(PREFIX)
 
 
-def outside(known: Known) -> str | None:
-    """Trap 10: a joint that starts outside the range of a hard limit, which moves it in slowly."""
-    beyond, rates = [], []
-    for group, θ in _limited(known):
-        numbers = {field: np.asarray(x) for field, x in group.params.items()}
-        if "stiffness" in numbers:  # a spring brings it back
+def outside(setup: Setup) -> str | None:
+    """Trap 10: joints that start outside a hard limit and return at a limited speed."""
+    joints, rates = [], []
+    for group, θ in _limited(setup):
+        params = {field: np.asarray(x) for field, x in group.params.items()}
+        if "stiffness" in params:  # a soft limit: a spring moves the joint back
             continue
-        joint = known.system.constraints[group.along.group].joint
-        unit = joint.coordinates[group.along.name]
-        below, above = numbers["lower"] - θ, θ - numbers["upper"]
+        joint = setup.system.constraints[group.coordinate.group].law
+        unit = joint.coordinates[group.coordinate.name]
+        below, above = params["lower"] - θ, θ - params["upper"]
         for i in np.flatnonzero(np.maximum(below, above) > OFF):
             side = "below lower" if below[i] > above[i] else "above upper"
-            far = max(below[i], above[i])
-            beyond.append(f"{group.names[i]} ({far:.2g} {unit} {side})")
-            rates.append(f"{numbers['recovery'][i]:.2g} {unit}/s")
-    if not beyond:
+            distance = max(below[i], above[i])
+            joints.append(f"{group.names[i]} ({distance:.2g} {unit} {side})")
+            rates.append(f"{params['recovery'][i]:.2g} {unit}/s")
+    if not joints:
         return None
     return (
-        f"joints start outside their limits: {listed(beyond)}. They return at"
+        f"joints start outside their limits: {listed(joints)}. They return at"
         f" {' or '.join(dict.fromkeys(rates))} at most: start within the range, or set recovery= of"
         " the limit."
     )
 
 
-def overlapping(known: Known) -> str | None:
-    """Trap 11: hard contacts that start in overlap, which they leave slowly."""
-    rows = bound_rows(known)
-    contacts = [g for g in known.system.bounds if isinstance(g, Touches) and g.law is not Rope]
+def overlapping(setup: Setup) -> str | None:
+    """Trap 12: hard contacts that start in penetration and separate at a limited speed."""
+    rows = bound_rows(setup)
+    contacts = [g for g in setup.system.bounds if isinstance(g, Contacts) and g.law is not Rope]
     if rows is None or not contacts:
         return None
     names = {name for group in contacts for name in group.names}
-    gap = np.asarray(host.evaluate(_gaps, known.system, known.state))
+    gap = np.asarray(host.evaluate(_gaps, setup.system, setup.state))
     deepest: dict[str, float] = {}
     for row in np.flatnonzero(rows.kinds.one_sided & np.array(rows.hard) & (gap < -OFF)):
         name = rows.layout.names[rows.layout.owners[row]]
@@ -378,33 +400,33 @@ def overlapping(known: Known) -> str | None:
     )
 
 
-def _gaps(system: Any, state: Any) -> jax.Array:
-    """The gaps of the inequality constraints at a state, (n,)."""
+def _gaps(system: System, state: State) -> Array:
+    """Returns the gaps of all inequality constraints at a state, (n,)."""
     h = jnp.ones((), state.q.dtype)
+    assert system.layout is not None  # contacts exist only between bodies
     control = jnp.zeros(system.layout.n_u, state.q.dtype)
     return linearize_bounds(system, state.q, state.v, state.instant, control, h).gap
 
 
-def _limited(known: Known) -> list[tuple[Any, np.ndarray]]:
-    """The groups of joint limits, each with the coordinates (elements,) that they limit."""
-    groups = [g for g in known.system.bounds if getattr(g, "law", None) is Limit]
+def _limited(setup: Setup) -> list[tuple[Bounds, np.ndarray]]:
+    """Returns the groups of joint limits, each with its joint coordinate values (elements,)."""
+    groups = [g for g in setup.system.bounds if isinstance(g, Bounds) and g.law is Limit]
     if not groups:
         return []
-    coordinates = [group.along for group in groups]
 
-    def read(system: Any, state: Any) -> list[Any]:
+    def read(system: System, state: State) -> list[Lane]:
         snapshot = system.snapshot(state.q, state.v, state.instant)
-        return [coordinate.read(snapshot).value for coordinate in coordinates]
+        return [group.coordinate.read(snapshot).value for group in groups]
 
-    return list(zip(groups, host.evaluate(read, known.system, known.state), strict=True))
+    return list(zip(groups, host.evaluate(read, setup.system, setup.state), strict=True))
 
 
-TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
+TRAPS: dict[str, tuple[str, Callable[[Setup], str | None]]] = {
     "gains": ("gains too large for the step", gains),
     "step": ("a step too long for the motion", coarse),
     "singular": ("rows that are singular, or nearly", singular),
     "order": ("the order of rows matters", order),
-    "over-constrained": ("more rows than freedoms to take", overconstrained),
+    "over-constrained": ("redundant or contradicting rows", overconstrained),
     "start": ("inconsistent start", start),
     "nonlinear": ("one linear step is not enough", curved),
     "dense": ("dense matrices", dense),
@@ -413,44 +435,55 @@ TRAPS: dict[str, tuple[str, Callable[[Known], str | None]]] = {
     "range": ("a start outside joint limits", outside),
     "overlap": ("contacts that start in overlap", overlapping),
 }
-"""By name: the trap in words, and how it is found."""
+"""For each trap its title, and the function that returns a warning or None."""
 
 
-def _counted(method: Method) -> list[tuple[Any, str, int]]:
-    """Parts of a method that repeat something in every step, and how often is enough."""
-    swept = getattr(method.bounded, "solver", method.bounded)
-    found = [(method.solver, "rounds", 5), (swept, "sweeps", 100)]
-    found += [(p, "iterations", 5) for p in parts(method.stabilizer) if hasattr(p, "stiffness")]
-    return [(part, field, enough) for part, field, enough in found if hasattr(part, field)]
+def _counted(method: Method) -> list[tuple[object, str, int, int]]:
+    """Returns the iterative parts of a method, with their numbers of iterations.
+
+    Each entry is (part, name of the field with the number of iterations, that number, a number that
+    usually suffices).
+    """
+    counts: list[tuple[object, str, int, int]] = []
+    if isinstance(method.solver, RankSafe):
+        counts.append((method.solver, "rounds", method.solver.rounds, 5))
+    if isinstance(swept := _inner(method.contact_solver), GaussSeidel):
+        counts.append((swept, "sweeps", swept.sweeps, 100))
+    return counts + [
+        (part, "iterations", part.iterations, 5)
+        for part in parts(method.stabilizer)
+        if isinstance(part, AugmentedLagrangian)
+    ]
 
 
-def _linear(known: Known) -> bool:
-    """Returns True where the method makes one linear correction of a start that is off."""
-    stabilizer = known.method.stabilizer
+def _linear(setup: Setup) -> bool:
+    """Returns True if the method corrects an initial violation by one linear step."""
+    stabilizer = setup.method.stabilizer
     if "position" in stabilizer.corrects:
         return getattr(stabilizer, "iterations", 1) == 1
-    return asked_gains(known.method, known.dt or 0.0)[1] * (known.dt or 0.0) > SUDDEN
+    return asked_gains(setup.method, setup.dt or 0.0)[1] * (setup.dt or 0.0) > SUDDEN
 
 
-def _taken(known: Known) -> str:
-    """What the solver makes of dependent rows."""
-    solver = known.method.solver
+def _taken(setup: Setup) -> str:
+    """Returns a sentence on how the method's solver treats dependent rows."""
+    solver = setup.method.solver
     safe = isinstance(solver, ConjugateGradients | Lexicographic)
-    safe |= isinstance(solver, RankSafe) and (known.rows.layout.loops or solver.always)
-    if safe or getattr(solver, "tikhonov", None) is not None:
+    safe |= isinstance(solver, RankSafe) and (setup.rows.layout.loops or solver.always)
+    safe |= isinstance(solver, Sparse | Schur) and solver.tikhonov is not None
+    if safe:
         return f"{type(solver).__name__} takes them as they are."
-    return f"{words(solver)} refuses them as SINGULAR: take {words(known.choice.solver)}."
+    return f"{words(solver)} refuses them as SINGULAR: take {words(setup.choice.solver)}."
 
 
-def _names(known: Known, rows: list[int]) -> str:
-    """The constraints of some unit rows, each once."""
-    return ", ".join(dict.fromkeys(known.unit.owners[i][0] for i in rows))
+def _names(setup: Setup, rows: list[int]) -> str:
+    """Returns a text of the constraint names of given unit-length rows, each name once."""
+    return ", ".join(dict.fromkeys(setup.unit.owners[i][0] for i in rows))
 
 
-def _numbered(known: Known, rows: list[int]) -> str:
-    """The constraints of some unit rows, each with the numbers of these rows in it."""
+def _numbered(setup: Setup, rows: list[int]) -> str:
+    """Returns a text of the constraint names of given unit-length rows, with row indices."""
     numbers: dict[str, list[str]] = {}
     for i in rows:
-        name, row = known.unit.owners[i]
+        name, row = setup.unit.owners[i]
         numbers.setdefault(name, []).append(str(row))
     return ", ".join(f"{name}[{', '.join(rows)}]" for name, rows in numbers.items())

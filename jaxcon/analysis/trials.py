@@ -1,6 +1,7 @@
-"""One method along a horizon, compiled once for every step: h and the number of steps are traced.
+"""Simulations with one method, compiled once: step size and number of steps are traced.
 
-The horizon is cut into equal parts, at whose ends runs are compared; every step divides a part.
+The simulated time (horizon) is cut into equal parts, and every step size divides a part. Runs are
+compared at the ends of parts.
 """
 
 from __future__ import annotations
@@ -14,22 +15,30 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.analysis.quantities import energy, violation
 from jaxcon.core import checks
 from jaxcon.core.precision import cast, precision
 from jaxcon.core.status import Status, failed
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.model.state import State
-from jaxcon.simulation.initialize import init
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.step import step_quietly
+from jaxcon.core.typing import Array, DType, PyTree
+from jaxcon.execution.initialize import init
+from jaxcon.execution.step import step_quietly
+from jaxcon.methods.method import Method
+from jaxcon.protocols import System
+from jaxcon.readout.quantities import energy, violation
+from jaxcon.system.state import State
 
 PARTS = 10
-"""The number of parts of a horizon, unless its control inputs change more often."""
+"""The least number of parts of a horizon. More are used if control inputs change more often."""
 
 
 class Points(NamedTuple):
-    """Where a world is at several times: q (n, n_q), v (n, n_v), t (n,) and counted turns."""
+    """Positions, velocities, times and counted turns of a world at n instants.
+
+    Attributes:
+        q: positions, (n, n_q).
+        v: velocities, (n, n_v).
+        time: times, (n,) [s].
+        turns: counted angles of joints, as in `State.turns`, (n, …) [rad].
+    """
 
     q: Any
     v: Any
@@ -38,25 +47,29 @@ class Points(NamedTuple):
 
     @classmethod
     def of(cls, state: State) -> Points:
-        """Returns the points of one state, or of a trajectory."""
+        """Returns the points of a state or a trajectory.
+
+        Args:
+            state: one state, or states with a leading axis.
+        """
         counted = jax.tree.leaves(state.turns)
         turns = counted[0] if counted else np.zeros((*np.shape(state.time), 0))
         return cls(state.q, state.v, state.time, turns)
 
-    def begin(self, system: Any, method: Method) -> State:
-        """A state at one of them with the memory of a method."""
+    def begin(self, system: System, method: Method) -> State:
+        """Returns a state at this single point, with the initial memory of a method."""
         turns = self.turns if self.turns.size else None
         return init(system, method, self.q, self.v, self.time, turns)
 
 
 @dataclass(frozen=True)
 class Inputs:
-    """Control inputs that mean the same at every step: each value is held over a part.
+    """Control inputs that do not depend on the step size: constant over each part of the horizon.
 
     Attributes:
-        parts: of the horizon.
-        rows: one control a part, arrays with a first axis of parts; None without.
-        policy: a function of the state, read at the start of each part; None where there are rows.
+        parts: number of parts of the horizon.
+        rows: control inputs with a leading axis of parts; None without arrays of controls.
+        policy: function from state to controls, evaluated at the start of each part; or None.
     """
 
     parts: int
@@ -64,11 +77,23 @@ class Inputs:
     policy: Callable[[State], PyTree] | None = None
 
     @classmethod
-    def of(cls, system: Any, controls: Any, hold: float | None, horizon: float) -> Inputs:
-        """Returns the controls that a user gave.
+    def of(
+        cls,
+        system: System,
+        controls: PyTree | Callable[[State], PyTree],
+        hold: float | None,
+        horizon: float,
+    ) -> Inputs:
+        """Converts the user's controls to inputs by parts.
+
+        Args:
+            system: the system.
+            controls: None, an array of rows of control inputs, or a function of the state.
+            hold: time for which each value of the function is held [s].
+            horizon: simulated time [s].
 
         Raises:
-            ValueError: no array by time, or a function without the time for which it is held.
+            ValueError: `controls` has no leading axis of rows, or is a function without `hold`.
         """
         if callable(controls):
             return cls(_holds(hold, horizon), policy=controls)
@@ -79,7 +104,7 @@ class Inputs:
             )
         if controls is None:
             return cls(PARTS)
-        layout = getattr(system, "layout", None)
+        layout = system.layout
         rows = jax.tree.map(np.asarray, controls)
         if layout is not None and np.ndim(rows) == 1:
             rows = rows[None]
@@ -87,22 +112,22 @@ class Inputs:
         if len(lengths) != 1 or 0 in lengths or layout and rows.shape[1:] != (layout.n_u,):
             shapes = [np.shape(x) for x in jax.tree.leaves(controls)]
             names = [] if layout is None else [name for name, *_ in layout.controls]
-            own = "" if layout is None else f" of {layout.n_u} channels of {names}"
+            channels = "" if layout is None else f" of {layout.n_u} channels of {names}"
             raise ValueError(
-                f"tradeoff: controls must have rows{own}, each held for an equal part of the"
+                f"tradeoff: controls must have rows{channels}, each held for an equal part of the"
                 f" horizon, got shapes {shapes}; a constant control has one row, u[None]."
             )
         count = lengths.pop()
         each = -(-PARTS // count)
         return cls(count * each, jax.tree.map(lambda x: np.repeat(x, each, 0), rows))
 
-    def at(self, dtype: Any) -> Inputs:
-        """In a precision, within it."""
-        return Inputs(self.parts, cast(self.rows, dtype), self.policy)
-
 
 def _holds(hold: float | None, horizon: float) -> int:
-    """Into how many parts a horizon is cut by the time for which an input is held."""
+    """Returns the number of parts of the horizon if each input is held for `hold` seconds.
+
+    Raises:
+        ValueError: `hold` is missing or does not divide the horizon.
+    """
     if hold is None:
         raise ValueError(
             "tradeoff: controls that are a function of the state need hold=, the time in seconds"
@@ -119,9 +144,16 @@ def _holds(hold: float | None, horizon: float) -> int:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is simulated: arrays of the host, from which runs in any precision start."""
+    """The problem that all runs simulate, in any precision.
 
-    system: Any
+    Attributes:
+        system: the system.
+        start: the initial point, as float64 arrays on the host.
+        horizon: simulated time [s].
+        inputs: control inputs.
+    """
+
+    system: System
     start: Points
     horizon: float
     inputs: Inputs
@@ -132,20 +164,20 @@ class Problem:
         return self.inputs.parts
 
     def dt(self, count: int) -> float:
-        """h at so many steps a part [s]."""
+        """Returns the step size [s] for `count` steps per part of the horizon."""
         return self.horizon / (self.parts * count)
 
 
 @dataclass(frozen=True)
 class Trip:
-    """One world along the horizon.
+    """The simulation of one world over the horizon.
 
     Attributes:
-        dt: h [s].
-        points: at the ends of the parts, on the host in float64.
-        status: at the end.
-        violation: max |φ| that a step saw at its start.
-        seconds: that it took.
+        dt: step size h [s].
+        points: points at the ends of the parts, as float64 arrays on the host.
+        status: status at the end.
+        violation: the largest |φ| over the starts of all steps.
+        seconds: computing time [s].
     """
 
     dt: float
@@ -156,18 +188,18 @@ class Trip:
 
     @property
     def failed(self) -> bool:
-        """Returns True where it stopped, or is not finite."""
+        """True if a step failed, or a position or velocity is not finite."""
         finite = all(np.all(np.isfinite(x)) for x in (self.points.q, self.points.v))
         return bool(failed(jnp.asarray(int(self.status)))) or not finite
 
 
 class Lowered:
-    """A traced program in one precision, which `compile` makes ready.
+    """A traced program in one precision; `compile` compiles it.
 
     Attributes:
         lowered: the traced program.
-        program: the compiled one.
-        dtype: of its numbers.
+        program: the compiled program; None before `compile`.
+        dtype: floating-point dtype of the program.
     """
 
     lowered: Any
@@ -175,57 +207,82 @@ class Lowered:
     dtype: np.dtype
 
     def compile(self) -> None:
-        """Makes it ready; takes seconds."""
+        """Compiles the program, which takes seconds."""
         self.program = self.lowered.compile()
 
     def numbers(self, dt: float, count: int) -> tuple[Array, Array]:
-        """h and a number of steps as arguments."""
+        """Converts the step size h and the number of steps to arguments of the program."""
         return jnp.asarray(dt, self.dtype), jnp.asarray(count, jnp.int32)
 
 
 class Course(Lowered):
-    """One method in one precision on a problem; h and the number of steps are traced."""
+    """The program that simulates a problem by one method in one precision."""
 
-    def __init__(self, problem: Problem, method: Method, dtype: Any) -> None:
+    def __init__(self, problem: Problem, method: Method, dtype: str | DType) -> None:
         self.dtype, self.problem = np.dtype(dtype), problem
         with precision(dtype):
-            system, own = cast((problem.system, method), dtype)
-            inputs = problem.inputs.at(dtype)
-            start = cast(problem.start, dtype).begin(system, own)
+            system, method = cast((problem.system, method), dtype)
+            policy, parts = problem.inputs.policy, problem.parts
+            rows = cast(problem.inputs.rows, dtype)
+            start = cast(problem.start, dtype).begin(system, method)
 
-            def travel(start: State, rows: PyTree, h: Array, count: Array) -> Any:
-                return along(system, own, inputs.policy, (start, rows), (h, count), inputs.parts)
+            def travel(start: State, rows: PyTree, h: Array, count: Array) -> tuple[State, Array]:
+                return along(system, method, policy, start, rows, h, count, parts)
 
-            self.args = start, inputs.rows
+            self.args = start, rows
             self.lowered = jax.jit(travel).lower(*self.args, *self.numbers(1e-3, 1))
 
     def go(self, dt: float, count: int) -> Trip:
-        """Runs it with so many steps of this length in each part."""
+        """Simulates the whole horizon.
+
+        Args:
+            dt: step size [s].
+            count: number of steps per part.
+        """
         with precision(self.dtype):
             numbers = self.numbers(dt, count)
             begin = time.perf_counter()
             state, worst = jax.block_until_ready(self.program(*self.args, *numbers))
             spent = time.perf_counter() - begin
         points = jax.tree.map(lambda x: np.asarray(x, np.float64), Points.of(state))
+        # a failure status persists, so the last one shows whether any step failed
         code = Status(int(np.asarray(state.status)[-1]))
         return Trip(dt, points, code, float(worst), spent)
 
 
 def along(
-    system: Any, method: Method, policy: Any, given: Any, numbers: tuple[Array, Array], parts: int
+    system: System,
+    method: Method,
+    policy: Callable[[State], PyTree] | None,
+    start: State,
+    rows: PyTree,
+    h: Array,
+    count: Array,
+    parts: int,
 ) -> tuple[State, Array]:
-    """The states at the ends of the parts, and max |φ| over all steps."""
-    (start, rows), (h, count) = given, numbers
+    """Simulates all parts of a horizon. Returns the states at their ends and the largest |φ|.
 
-    def part(carry: Any, row: PyTree) -> Any:
+    Args:
+        system: the system.
+        method: the method.
+        policy: function from state to controls, evaluated at the start of each part; None with
+            rows.
+        start: the initial state.
+        rows: control inputs with a leading axis of parts; or None.
+        h: step size, () [s].
+        count: number of steps per part, ().
+        parts: number of parts.
+    """
+
+    def part(carry: tuple[State, Array], row: PyTree) -> tuple[tuple[State, Array], State]:
         control = row if policy is None else policy(carry[0])
 
-        def one(_: Any, carry: Any) -> Any:
+        def step(_: Array, carry: tuple[State, Array]) -> tuple[State, Array]:
             state, worst = carry
             state, info = step_quietly(system, method, state, control, h)
             return state, jnp.maximum(worst, info.violation.worst)
 
-        carry = jax.lax.fori_loop(0, count, one, carry)
+        carry = jax.lax.fori_loop(0, count, step, carry)
         return carry, carry[0]
 
     carry = start, jnp.zeros((), start.q.dtype)
@@ -233,8 +290,15 @@ def along(
     return states, worst
 
 
-class Seen(NamedTuple):
-    """What is read of points, (n,) each: energies [J], max |φ| and max |φ̇|."""
+class Observation(NamedTuple):
+    """Energies and constraint violations of a world at n instants.
+
+    Attributes:
+        energy: total energy, (n,) [J].
+        kinetic: kinetic energy, (n,) [J].
+        violation: max |φ|, (n,) [m, rad].
+        rate: max |φ̇|, (n,) [m/s, rad/s].
+    """
 
     energy: np.ndarray
     kinetic: np.ndarray
@@ -243,21 +307,21 @@ class Seen(NamedTuple):
 
 
 class Observer:
-    """Reads energy and violation of points in float64; compiled once for all runs."""
+    """Evaluates energies and violations at points in float64, with a program compiled once."""
 
     def __init__(self, problem: Problem) -> None:
         with precision(np.float64):
             self.system = cast(problem.system, np.float64)
 
-            def read(points: Points) -> Any:
-                healthy = jnp.zeros((), jnp.int32)
-                state = State(points.q, points.v, points.time, healthy, (), points.turns)
-                held, mechanical = violation(self.system, state), energy(self.system, state)
-                return mechanical.total, mechanical.kinetic, held.worst, held.worst_rate
+            def read(points: Points) -> tuple[Array, Array, Array, Array]:
+                ok = jnp.zeros((), jnp.int32)
+                state = State(points.q, points.v, points.time, ok, (), points.turns)
+                φ, mechanical = violation(self.system, state), energy(self.system, state)
+                return mechanical.total, mechanical.kinetic, φ.worst, φ.worst_rate
 
             self.read = jax.jit(jax.vmap(read))
 
-    def __call__(self, points: Points) -> Seen:
-        """What is read of several points."""
+    def __call__(self, points: Points) -> Observation:
+        """Returns the energies and violations at n points."""
         with precision(np.float64):
-            return Seen(*(np.asarray(x) for x in self.read(cast(points, np.float64))))
+            return Observation(*(np.asarray(x) for x in self.read(cast(points, np.float64))))

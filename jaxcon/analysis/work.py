@@ -1,8 +1,9 @@
-"""What a step of one world costs: operations counted from its trace, and time where it is asked."""
+"""Operation count of a step, from its trace; and the measured time of a step."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,29 +11,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.operations import count, instructions
 from jaxcon.core.typing import PyTree
-from jaxcon.model.state import State
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.step import check_step, step_quietly
+from jaxcon.execution.step import step_quietly
+from jaxcon.execution.validation import check_step
+from jaxcon.methods.method import Method
+from jaxcon.protocols import System
+from jaxcon.staging.operations import count, instructions
+from jaxcon.system.state import State
 
 WORLDS = 128
-"""In the batch whose step is counted: what worlds share is then shared among so many."""
+"""The batch size of the counted step. Counts are divided by it to get the count per world."""
 DT = 1e-3
-"""A step [s]; costs do not depend on it."""
+"""The step size [s]; costs do not depend on it."""
 REPEATS, LONG = 5, 0.02
-"""The number of repeats of what is timed, and how long each is at least [s]."""
+"""The number of timed runs, and the least duration of each [s]."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a step of one world takes in a batch.
+    """Number of operations of a step, per world of a batch.
 
     Attributes:
-        operations: arithmetic of floating-point numbers, loops of unknown length counted as one
-            round, and of alternatives the dearest.
-        usual: the same, of alternatives the cheapest, as where rows are independent.
-        instructions: of the program before it is compiled.
+        operations: floating-point operations if every conditional takes its costliest branch. A
+            while loop counts as one iteration.
+        usual: floating-point operations if every conditional takes its cheapest branch, for example
+            the branch for independent rows.
+        instructions: number of instructions of the traced program.
     """
 
     operations: float
@@ -44,36 +48,36 @@ class Work:
         return f"{self.usual:.0f} operations a step{most}, {self.instructions} instructions"
 
 
-def work(system: Any, method: Method, state: State, control: PyTree = None) -> Work:
-    """The operations of a step, counted from its trace; nothing is compiled.
+def work(system: System, method: Method, state: State, control: PyTree = None) -> Work:
+    """Counts the operations of a step by tracing it; nothing is compiled.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: of one world.
-        control: of one world, as of `step`, or None.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: state of one world.
+        control: control input of one world, as in `jc.step`, or None.
     """
     jaxpr = jax.make_jaxpr(_many(system, method))(*_batch(system, method, state, control, WORLDS))
-    most, least = (count(jaxpr.jaxpr, branch) / WORLDS for branch in (max, min))
-    return Work(most, least, instructions(jaxpr.jaxpr))
+    costliest, cheapest = (count(jaxpr.jaxpr, branch) / WORLDS for branch in (max, min))
+    return Work(costliest, cheapest, instructions(jaxpr.jaxpr))
 
 
 def seconds(
-    system: Any, method: Method, state: State, control: PyTree = None, batch: int = 1
+    system: System, method: Method, state: State, control: PyTree = None, batch: int = 1
 ) -> float:
-    """How long a step of a batch takes on this device, by world [s]: the median of five repeats.
+    """Measures the time of a step per world of a batch [s], the median of five runs.
 
     Args:
-        system: a `BodySystem` or `GeneralizedSystem`.
-        method: integrator, stabiliser and solver.
-        state: of one world.
-        control: of one world, as of `step`, or None.
-        batch: worlds.
+        system: the system of a built scene, or a `jc.GeneralizedSystem`.
+        method: integrator, stabilizer and solver.
+        state: state of one world.
+        control: control input of one world, as in `jc.step`, or None.
+        batch: number of worlds.
     """
     shapes = _batch(system, method, state, control, batch)
-    one = state, check_step(system, method, state, control)
+    world = state, check_step(system, method, state, control)
     args = jax.tree.map(
-        lambda x, s: jnp.broadcast_to(jnp.asarray(x, s.dtype), s.shape), one, shapes
+        lambda x, s: jnp.broadcast_to(jnp.asarray(x, s.dtype), s.shape), world, shapes
     )
     run = jax.jit(_many(system, method)).lower(*args).compile()
 
@@ -87,16 +91,16 @@ def seconds(
     return float(np.median([elapsed(times) / times for _ in range(REPEATS)])) / batch
 
 
-def _many(system: Any, method: Method) -> Any:
-    """The step of a batch, without what it saw."""
+def _many(system: System, method: Method) -> Callable[[State, PyTree], State]:
+    """Returns a function that steps a batch and discards the `StepInfo`."""
 
-    def one(state: State, control: PyTree) -> State:
+    def step(state: State, control: PyTree) -> State:
         return step_quietly(system, method, state, control, DT)[0]
 
-    return jax.vmap(one)
+    return jax.vmap(step)
 
 
-def _batch(system: Any, method: Method, state: State, control: PyTree, worlds: int) -> Any:
-    """Shapes of the states and controls of so many worlds."""
-    known = jax.tree.map(jnp.asarray, (state, check_step(system, method, state, control)))
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((worlds, *x.shape), x.dtype), known)
+def _batch(system: System, method: Method, state: State, control: PyTree, worlds: int) -> Any:
+    """Returns the states and controls of a batch, as shapes and dtypes."""
+    world = jax.tree.map(jnp.asarray, (state, check_step(system, method, state, control)))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((worlds, *x.shape), x.dtype), world)

@@ -1,1 +1,1 @@
-"""Floor 3: constraints and their rows φ, φ̇, J, γ. No solver is known here."""
+"""Equality constraints: joints, couplings, rolling, and their rows φ, φ̇, J, γ. No solvers."""

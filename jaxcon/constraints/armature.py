@@ -1,33 +1,37 @@
-"""Rotor inertia: what a geared motor adds to the inertia of a joint."""
+"""Rotor inertia that a geared motor adds to a joint coordinate."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from jaxcon.constraints.base import RowSet, gather
+from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks
+from jaxcon.core.lanes import Vector
 from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, Lane
-from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.elements import Elements, label
+from jaxcon.core.typing import Array, DType, Lane
+from jaxcon.protocols import Constraint
+from jaxcon.system.coordinates import JointCoordinate, OnJoint
+from jaxcon.system.elements import Elements, label
+
+if TYPE_CHECKING:
+    from jaxcon.system.body_system import Snapshot
 
 
 @dataclass(frozen=True)
-class Armature:
-    """The inertia I of a rotor that turns with a joint's coordinate θ: λ = −I θ̈, one row.
+class Armature(OnJoint):
+    """A rotor of inertia I that turns with a joint's coordinate θ; its one row gives λ = −I θ̈.
 
-    The row J a + λ/I = −γ holds nothing: it is the momentum balance of the rotor, whose inertia,
-    reflected by a gear g, is I = g² I_rotor about θ. So it is exact, and as stable as the mass
-    matrix to which reduced coordinates would add it. What its bearing takes up is left out, as
-    everywhere.
+    The row J a + λ/I = −γ constrains nothing: it is the momentum balance of the rotor. A rotor
+    behind a gear g has the inertia I = g² I_rotor about θ. The result is exact, as if I were added
+    to the mass matrix in reduced coordinates. Bearing reactions of the rotor are neglected.
 
     Attributes:
-        name: unique in the scene.
+        name: name of the element, unique in the scene.
         joint: name of the joint.
         inertia: I [kg m²] about an angle, [kg] along a travel.
-        coordinate: which of the joint's; not needed where it has but one.
+        coordinate: name of the joint's coordinate; needed if it has several.
     """
 
     name: str
@@ -36,33 +40,38 @@ class Armature:
     coordinate: str | None = None
     counts = False
 
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """The inertia.
+    def attach(self, dtype: DType) -> dict[str, Array]:
+        """Returns the checked inertia I by field name, () [kg m²] or [kg].
 
         Raises:
-            ValueError: it is not positive; a joint without a rotor has no armature.
+            ValueError: the inertia is not positive; a joint without a rotor needs no `Armature`.
         """
-        inertia = checks.real(label(self), "inertia", self.inertia, dtype, above=0)
-        return {"inertia": inertia}
+        return {"inertia": checks.real(label(self), "inertia", self.inertia, dtype, above=0)}
 
 
 @pytree
-class Armatures(Elements):
-    """Rotors along one coordinate of joints of one group."""
+class Armatures(Elements, Constraint):
+    """A group of rotors on the same coordinate of joints of one class.
 
-    along: JointCoordinate = static(default=None)  # type: ignore[assignment]
+    Attributes:
+        coordinate: the coordinates on which the rotors turn, one for each rotor.
+    """
 
-    def rows(self, snapshot: Any) -> RowSet:
-        """J a + λ/I = −γ; there is no φ, and no feedback."""
-        row = self.along.read(snapshot)._replace(value=0.0, rate=0.0)
-        compliance = 1 / finite_or_nan(self.params["inertia"])  # not 0, which would hold the joint
-        return gather(snapshot, self.places, [row], (compliance,))
+    is_inertia: ClassVar[bool] = True
+    closes_loops: ClassVar[bool] = False
 
-    def kinetic(self, snapshot: Any) -> Lane:
-        """½ I θ̇² [J]."""
-        return self.params["inertia"] * self.along.read(snapshot).rate ** 2 / 2
+    coordinate: JointCoordinate = static(default=None)  # type: ignore[assignment]
 
-    def anchor(self, snapshot: Any, i: int) -> Array | None:
-        """The anchor of the joint."""
-        group = snapshot.system.constraints[self.along.group]
-        return group.anchor(snapshot, self.along.joints[i])
+    def rows(self, snapshot: Snapshot) -> list[Row]:
+        """Returns the row J a + λ/I = −γ of each rotor, without a φ and without feedback."""
+        compliance = 1 / finite_or_nan(self.params["inertia"])  # NaN for I = ∞: 0 would lock it
+        row = self.coordinate.read(snapshot)
+        return [row._replace(value=0.0, rate=0.0, compliance=compliance)]
+
+    def kinetic(self, snapshot: Snapshot) -> Lane:
+        """Returns the kinetic energy ½ I θ̇² of each rotor [J]."""
+        return self.params["inertia"] * self.coordinate.read(snapshot).rate ** 2 / 2
+
+    def anchors(self, snapshot: Snapshot) -> Vector | None:
+        """Returns the anchors of the joints, world frame [m]; None without anchors."""
+        return self.coordinate.anchors(snapshot)

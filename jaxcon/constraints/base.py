@@ -1,130 +1,143 @@
-"""What a constraint answers, and joints of one class side by side."""
+"""The base class of joints, groups of joints of one class, and the blocks of their Jacobian."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol
-
-import jax.numpy as jnp
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from jaxcon.constraints.primitives import Row
-from jaxcon.core.lanes import Vector
-from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import Elements
-from jaxcon.model.layout import Place
-from jaxcon.solvers.jacobian import Columns
+from jaxcon.linear.jacobian import Block
+from jaxcon.protocols import Constraint
+from jaxcon.system.elements import BetweenBodies, Elements
+from jaxcon.system.layout import Place
+
+if TYPE_CHECKING:
+    from jaxcon.constraints.primitives import JointFrame
+    from jaxcon.system.body_system import BodySystem, Snapshot
 
 
-class RowSet(NamedTuple):
-    """The rows of equal constraints, row-major: row r of every element, then row r + 1.
+@dataclass(frozen=True)
+class Joint(BetweenBodies):
+    """The base class of joints between two bodies.
+
+    `attach` computes the numbers of a joint from the poses of its bodies at assembly. `rows`
+    computes its rows from these numbers and the motion of the bodies.
+
+    A joint whose coordinates can be read and driven also has `coordinates` and `coordinate`. If its
+    coordinates share a computation, it has `coordinate_rows` in place of `coordinate`. If joints of
+    one class differ in their rows or coordinates, the class also has `kind`.
+
+    The names of the fields that `attach` returns have a meaning. Points are called anchor, start or
+    end. Directions are called axis, first, second, normal, travel or edge. `orientation` is the
+    orientation of the second body in the first. A field whose name ends in `_b` is in the frame of
+    the second body; `in_b` lists further fields in that frame.
 
     Attributes:
-        value, rate, bias: φ, φ̇, γ by row, lanes (element,).
-        jacobian: for each body, its columns and its part of every row.
-        holonomic: by row, whether it has a φ or is one of velocities alone.
-        compliance: C by row, lanes (element,); None where it is zero.
-        swings: of the rows that are rods, see `Row.swing`.
-    """
-
-    value: tuple[Lane, ...]
-    rate: tuple[Lane, ...]
-    bias: tuple[Lane, ...]
-    jacobian: tuple[tuple[Columns, tuple[Vector, ...]], ...]
-    holonomic: tuple[bool, ...]
-    compliance: tuple[Lane, ...] | None = None
-    swings: Mapping[int, Lane] = MappingProxyType({})
-
-
-class Constraint(Protocol):
-    """A group of equal constraints in a system."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the constraints."""
-        ...
-
-    def rows(self, snapshot: Any) -> RowSet:
-        """φ, φ̇, J and γ at one instant."""
-        ...
-
-
-class Joint(Protocol):
-    """How a joint is described: two bodies, numbers at assembly, and its rows.
-
-    A joint that can be driven and read also has `coordinates`, the unit of each by its name ("rad",
-    counted over turns, "m", or "rotation" where the rate is the derivative of no coordinate), and
-    `coordinate(name, p, a, b)`, the row of one. A joint whose coordinates need a common computation
-    has `coordinate_rows(name, p, a, b)` instead, a mapping that contains that row and may contain
-    others. Joints of one class that move in different ways also have `kind`, a hashable value which
-    then stands for the class.
-
-    What `attach` keeps of a body goes along with it by its name: points are called anchor, start or
-    end, directions axis, first, second, normal, travel or edge, and the orientation of b in a is
-    `orientation`. A last word b says that it is of the second body; `in_b` names the fields that
-    are without saying so.
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the first and the second body, or `WORLD`.
     """
 
     name: str
     body_a: str
     body_b: str
 
+    coordinates: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """The unit of each coordinate by its name: "m", "rad" (with whole turns), or "rotation".
+
+    "rotation" is an angle [rad] whose rate is not the derivative of any function of positions.
+    """
+
+    x_axis = None
+    """The direction of the first coordinate normal to `axis`; None for a default direction."""
+
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The numbers of the joint in the frames of its bodies, from their poses at assembly."""
-        ...
+        """Returns the numbers of the joint by field; points and directions are in body frames.
+
+        Args:
+            a: pose of the first body at assembly, world frame.
+            b: pose of the second body at assembly, world frame.
+        """
+        raise NotImplementedError
 
     @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """The rows, from those numbers and the motion of the two bodies, by lanes."""
-        ...
+    def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+        """Returns the rows (φ, φ̇, γ and ∂φ̇/∂v) of many joints at once, as lanes (element, …).
+
+        Args:
+            p: the numbers that `attach` returned, lanes (element,) and vectors of lanes.
+            a: motion of the first body of each joint.
+            b: motion of the second body of each joint.
+        """
+        raise NotImplementedError
+
+    @staticmethod
+    def coordinate(name: str, p: dict[str, Any], a: JointFrame, b: JointFrame) -> Row:
+        """Returns a coordinate of many joints as a row: its value, zero at assembly, rate and bias.
+
+        Args:
+            name: name of the coordinate.
+            p: the numbers of the joints, by field.
+            a: motion of the first body of each joint.
+            b: motion of the second body of each joint.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def coordinate_rows(
+        cls, name: str, p: dict[str, Any], a: JointFrame, b: JointFrame
+    ) -> dict[str, Row]:
+        """Returns rows by name: that of the named coordinate, and others computed along with it.
+
+        Args:
+            name: name of the coordinate.
+            p: the numbers of the joints, by field.
+            a: motion of the first body of each joint.
+            b: motion of the second body of each joint.
+        """
+        return {name: cls.coordinate(name, p, a, b)}
 
 
 @pytree
-class Joints(Elements):
-    """Joints of one class, `joint`, between bodies of the same kinds."""
+class Joints(Elements, Constraint):
+    """A group of joints of one class, `law`, between bodies of the same kinds."""
 
-    joint: Any = static(default=None)
+    has_vectors: ClassVar[bool] = True
 
-    def rows(self, snapshot: Any) -> RowSet:
-        """φ, φ̇, J and γ at one instant."""
-        return gather(snapshot, self.places, self.joint.rows(self.params, *self.frames(snapshot)))
+    def rows(self, snapshot: Snapshot) -> list[Row]:
+        """Returns the rows of the joints at one instant: φ, φ̇, γ and J = ∂φ̇/∂v by body."""
+        return self.law.rows(self.params, *self.frames(snapshot))
 
-    def coordinate_rows(self, snapshot: Any, name: str) -> dict[str, Row]:
-        """The row of a coordinate, and of others that the same computation yields, by name.
+    def coordinate_rows(self, snapshot: Snapshot, name: str) -> dict[str, Row]:
+        """Returns the row of a coordinate by its name, and rows that share its computation.
 
-        A row has the coordinate, zero at assembly, its rate, its bias and its pulls.
+        A row has the coordinate (zero at assembly), its rate θ̇, its bias (the part of θ̈ without
+        accelerations), and its pulls (∂θ̇/∂v by body).
         """
-        frames = self.frames(snapshot)
-        if hasattr(self.joint, "coordinate_rows"):
-            return self.joint.coordinate_rows(name, self.params, *frames)
-        return {name: self.joint.coordinate(name, self.params, *frames)}
-
-    def anchor(self, snapshot: Any, i: int) -> Array | None:
-        """The anchor of one joint on its second body, world frame, (dim,); None without a point."""
-        if "anchor_b" not in self.params:
-            return None
-        one = self.select((i,))
-        point = one.frames(snapshot)[1].point(one.params["anchor_b"])
-        return jnp.stack([x.reshape(()) for x in point.position])
+        return self.law.coordinate_rows(name, self.params, *self.frames(snapshot))
 
 
-def gather(
-    snapshot: Any, places: tuple[Place, ...], rows: list[Row], compliance: Any = None
-) -> RowSet:
-    """Rows whose pulls act on these places as a set, without the columns of the world."""
-    sides = [
-        (snapshot.system.columns(place), tuple(row.pulls[side] for row in rows))
+def blocks_of(
+    system: BodySystem, places: tuple[Place, ...], rows: Sequence[Row], start: int
+) -> list[Block]:
+    """Returns the blocks of J for constraints of one type, one block for each side that can move.
+
+    The first bodies of the constraints form one side, the second bodies another. Frames fixed to
+    the world have no columns in J.
+
+    Args:
+        system: the system of bodies.
+        places: the bodies on each side.
+        rows: rows of the constraints, each with its pull (∂φ̇/∂v) on each side.
+        start: number of the first row in J. Row 0 of every constraint comes first, then row 1 of
+            every constraint, and so on.
+    """
+    return [
+        Block(tuple(row.pulls[side] for row in rows), start, system.columns(place))
         for side, place in enumerate(places)
         if place.group is not None and rows
     ]
-    return RowSet(
-        tuple(row.value for row in rows),
-        tuple(row.rate for row in rows),
-        tuple(row.bias for row in rows),
-        tuple(sides),
-        tuple(row.holonomic for row in rows),
-        compliance,
-        {r: row.swing for r, row in enumerate(rows) if row.swing is not None},
-    )

@@ -1,52 +1,62 @@
-"""Several sliders and hinges in series between two bodies, as one joint."""
+"""Several sliders and hinges in series between two bodies, as one joint.
+
+From the first body to the second, hinges about the axes n₁, n₂, n₃ turn one after the other by
+θ₁, θ₂, θ₃. The first axis is fixed in the first body and the last axis in the second body. Axes
+need not be perpendicular. With hᵢ the axes at assembly, the relative rotation is
+R = Exp(h₁ θ₁) Exp(h₂ θ₂) Exp(h₃ θ₃).
+
+References:
+    Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation (1994), section 3.3.2:
+    the subproblems of Paden and Kahan.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.constraints import gimbal, primitives
-from jaxcon.constraints.joints import (
-    anchors,
-    normals,
-    relative_orientation,
-    unit_vector,
-)
+from jaxcon.constraints import primitives
+from jaxcon.constraints.base import Joint
+from jaxcon.constraints.joints import anchors, basis, normals, relative_orientation, unit_vector
 from jaxcon.constraints.primitives import Row
-from jaxcon.core import checks
-from jaxcon.core.typing import Array
+from jaxcon.core import checks, numerics
+from jaxcon.core.lanes import Vector
+from jaxcon.core.typing import Array, Lane
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import label
+from jaxcon.system.elements import Element, label
+
+if TYPE_CHECKING:
+    from jaxcon.constraints.primitives import JointFrame
 
 DEPENDENT = 1e-6
-"""The volume that unit axes span below which they count as dependent."""
+"""The volume spanned by unit axes below which the axes count as linearly dependent."""
 
 
 @dataclass(frozen=True)
-class Freedoms:
-    """How compound joints of one group move: their rows and coordinates.
+class Freedoms(Element):
+    """The rows and coordinates of compound joints, by their numbers of slides and hinges.
 
     Attributes:
-        slides, hinges: how many of them, at most three each.
-        ball: whether every turn is free.
+        slides, hinges: the numbers of slides and of hinges, at most three each.
+        ball: True if the bodies turn freely relative to each other.
     """
 
     slides: int
     hinges: int
     ball: bool
-    in_b = gimbal.IN_B
+    in_b = ("axis_2", "first_2", "second_2")
 
     @property
     def coordinates(self) -> dict[str, str]:
-        """The units of "travel_1", …, then of "angle_1", and so on."""
+        """The unit of each coordinate by its name: "travel_1", … [m], then "angle_1", … [rad]."""
         travels = {f"travel_{i + 1}": "m" for i in range(self.slides)}
         return travels | {f"angle_{i + 1}": "rad" for i in range(self.hinges)}
 
-    def rows(self, p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """Nothing moves across the slides or turns but about the hinges."""
+    def rows(self, p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+        """Returns the rows: no travel normal to the slides, and no turn except about the hinges."""
         points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
         if not self.slides:
             rows = primitives.meet(*points)
@@ -58,56 +68,58 @@ class Freedoms:
         if not self.hinges:
             return rows + primitives.same_orientation(a, b, p["orientation"])
         if self.hinges == 2:
-            return rows + gimbal.two_rows(p, a, b)
+            row = primitives.angle_between(a.direction(p["axis_1"]), b.direction(p["axis_2"]))
+            return [*rows, row._replace(value=row.value - p["cosine"])]
         n = a.direction(p["axis_1"])
         sides = (b.direction(p["first_b"]), b.direction(p["second_b"]))
         return rows + [primitives.angle_between(n, u) for u in sides]
 
-    def coordinate_rows(self, name: str, p: dict[str, Any], a: Any, b: Any) -> dict[str, Row]:
-        """A travel since assembly [m], or an angle about a hinge [rad]; three angles at once."""
-        if self.hinges == 3 and name.startswith("angle"):
-            angles = gimbal.three_angles(p, a, b)
-            return {f"angle_{i}": row for i, row in enumerate(angles, 1)}
-        return {name: self._coordinate(name, p, a, b)}
+    def coordinate_rows(
+        self, name: str, p: dict[str, Any], a: JointFrame, b: JointFrame
+    ) -> dict[str, Row]:
+        """Returns the row of a travel since assembly [m], or of an angle about a hinge [rad].
 
-    def _coordinate(self, name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
-        """The row of one travel or angle."""
+        For three hinges the result has the rows of all three angles, since they share a
+        computation.
+        """
+        if self.hinges == 3 and name.startswith("angle"):
+            angles = three_angles(p, a, b)
+            return {f"angle_{i}": row for i, row in enumerate(angles, 1)}
         kind, _, index = name.partition("_")
         if kind == "travel":
             points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
-            return primitives.travel(a.direction(p[name]), *points)
+            return {name: primitives.travel(a.direction(p[name]), *points)}
         if self.hinges == 2:
-            return gimbal.two_angles(int(index), p, a, b)
+            return {name: two_angles(int(index), p, a, b)}
         first, second = a.direction(p["first_1"]), a.direction(p["second_1"])
-        return primitives.turn(first, second, b.direction(p["first_b"]))
+        return {name: primitives.turn(first, second, b.direction(p["first_b"]))}
 
 
 @dataclass(frozen=True)
-class Compound:
+class Compound(Joint):
     """Up to three slides, then up to three hinges through one point, in series; in space.
 
-    The point of b slides in a along the first axes, which move with a, and b turns about the hinges
-    one after the other, the first fixed in a and the last in b. Axes need not be perpendicular. No
-    massless bodies lie between: 6 rows less the freedoms remain.
+    The point of b slides along the axes of the slides, which move with a. b turns about the hinges
+    one after the other; the first is fixed in a, the last in b. Axes need not be perpendicular. No
+    massless bodies are added between a and b. The joint has 6 rows less its degrees of freedom.
 
-    Its coordinates are "travel_1", …, "angle_1", …, in the order of the axes, and springs, motors
-    and the rest act on each by name. Of three hinges the middle one stays between the two positions
-    where the axes fall into a plane (gimbal lock), ±90° where they are perpendicular: there its
-    rate is not that of any motion.
+    Its coordinates are "travel_1", …, "angle_1", …, in the order of the axes. Springs, motors and
+    other elements act on each by name. The middle one of three hinges stays between the two
+    positions at which the axes lie in one plane (gimbal lock; ±90° for perpendicular axes). At
+    these positions the rate of its angle does not belong to any motion.
 
     Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: through which all hinges go, world frame at assembly, (3,) [m]; the second body's
-            centre of mass unless given.
-        slides: axes, world frame at assembly, each (3,), any length but zero; independent.
-        hinges: axes likewise; no two in succession parallel, three not in one plane.
-        ball: every turn is free, in place of hinges; turns then have no coordinates.
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies a and b, or `WORLD`.
+        point: the common point of all hinges, world frame at assembly, (3,) [m]; the second body's
+            center of mass unless given.
+        slides: axes of the slides, world frame at assembly, each (3,), any length but zero;
+            linearly independent.
+        hinges: axes of the hinges, world frame at assembly, each (3,). Two successive axes must not
+            be parallel, and three must not lie in one plane.
+        ball: True for a ball joint in place of hinges: b turns freely, without angle coordinates.
     """
 
-    name: str
-    body_a: str
-    body_b: str
     point: Any = None
     slides: tuple[Any, ...] = ()
     hinges: tuple[Any, ...] = ()
@@ -120,49 +132,45 @@ class Compound:
 
     @property
     def kind(self) -> Freedoms:
-        """What joints that move alike share."""
+        """The numbers of slides and hinges, by which compound joints are grouped."""
         return Freedoms(len(self.slides), len(self.hinges), self.ball)
 
     @property
-    def coordinates(self) -> dict[str, str]:
-        """The unit of each by its name."""
+    def coordinates(self) -> dict[str, str]:  # type: ignore[override]
+        """The unit of each coordinate by its name."""
         return self.kind.coordinates
 
-    def rows(self, p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """Returns the rows of joints of this kind."""
-        return self.kind.rows(p, a, b)
-
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, the axes, and what reads travels and angles.
+        """Returns the point in both frames, the axes, and directions that measure the coordinates.
 
         Raises:
-            ValueError: too many axes, or dependent ones.
+            ValueError: there are more than three axes, or they are linearly dependent.
         """
-        slides = self._axes("slides", a)
-        hinges = self._axes("hinges", a)
+        slides, hinges = self._axes("slides", self.slides, a), self._axes("hinges", self.hinges, a)
         if self.ball and hinges:
             raise ValueError(f"{label(self)}: a ball joint turns freely; give hinges or ball.")
         params = anchors(self, a, b) | self._travels(slides, a)
         if len(hinges) == 3:
-            return params | gimbal.attach_three(hinges, a, b)
+            return params | attach_three(hinges, a, b)
         if len(hinges) == 2:
-            return params | gimbal.attach_two(hinges, a, b)
+            return params | attach_two(hinges, a, b)
         if len(hinges) == 1:
-            (n,) = hinges
-            u, w = normals(n)
+            n, u, w = basis(hinges[0])
             in_a = {"axis_1": n, "first_1": u, "second_1": w}
             params |= {key: a.local_direction(x) for key, x in in_a.items()}
             return params | {"first_b": b.local_direction(u), "second_b": b.local_direction(w)}
         return params if self.ball else params | {"orientation": relative_orientation(a, b)}
 
     def _travels(self, slides: list[Array], a: Pose) -> dict[str, Array]:
-        """The dual basis of the slides, d_i·s_j = δ_ij, in their span, and normals of that."""
+        """Returns directions that measure travels along the slides s_j, and normals of the slides.
+
+        The directions d_i are the dual basis of the slides in their span: d_i·s_j = δ_ij. The
+        normals are unit vectors normal to that span. All are in the frame of a.
+        """
         if not slides:
             return {}
-        across: list[Array] = []
-        if len(slides) == 1:
-            across = normals(slides[0])
-        elif len(slides) == 2:
+        across = normals(slides[0]) if len(slides) == 1 else []
+        if len(slides) == 2:
             n = jnp.cross(slides[0], slides[1])
             across = [n / jnp.sqrt(jnp.dot(n, n))]
         x, y, z = *slides, *across
@@ -171,13 +179,12 @@ class Compound:
         travels = {f"travel_{i}": a.local_direction(d / volume) for i, d in enumerate(duals, 1)}
         return travels | {f"normal_{i}": a.local_direction(n) for i, n in enumerate(across, 1)}
 
-    def _axes(self, what: str, pose: Pose) -> list[Array]:
-        """Unit vectors, checked.
+    def _axes(self, what: str, given: tuple[Any, ...], pose: Pose) -> list[Array]:
+        """Checks the axes of slides or hinges; returns them as unit vectors.
 
         Raises:
-            ValueError: there are more than three, or they are dependent.
+            ValueError: there are more than three axes, or they are linearly dependent.
         """
-        given = getattr(self, what)
         if not isinstance(given, tuple) or len(given) > 3:
             raise ValueError(
                 f"{label(self)}: {what} must be a tuple of at most 3 axes, got {given!r}."
@@ -192,3 +199,111 @@ class Compound:
                     f" {checks.numerals(few)}."
                 )
         return axes
+
+
+def attach_two(axes: list[Array], a: Pose, b: Pose) -> dict[str, Array]:
+    """Returns both hinge axes, and directions in each body that measure the hinge angles."""
+    n, m = axes
+    n_across, m_across = m - jnp.dot(n, m) * n, n - jnp.dot(n, m) * m
+    n_across, m_across = n_across / numerics.norm(n_across), m_across / numerics.norm(m_across)
+    return {
+        "axis_1": a.local_direction(n),
+        "first_1": a.local_direction(n_across),
+        "second_1": a.local_direction(jnp.cross(n, n_across)),
+        "axis_2": b.local_direction(m),
+        "first_2": b.local_direction(m_across),
+        "second_2": b.local_direction(jnp.cross(m_across, m)),
+        "cosine": jnp.dot(n, m),
+    }
+
+
+def two_angles(i: int, p: dict[str, Any], a: JointFrame, b: JointFrame) -> Row:
+    """Returns the row of θ₁, the turn of axis n₂ about n₁ in a, or of θ₂, the turn of b about n₂.
+
+    θ₂ is measured in b, where n₁ turns about n₂ by −θ₂.
+    """
+    if i == 1:
+        first, second = a.direction(p["first_1"]), a.direction(p["second_1"])
+        return primitives.turn(first, second, b.direction(p["axis_2"]))
+    first, second = b.direction(p["first_2"]), b.direction(p["second_2"])
+    row = primitives.turn(first, second, a.direction(p["axis_1"]))
+    return row._replace(pulls=row.pulls[::-1])
+
+
+def attach_three(axes: list[Array], a: Pose, b: Pose) -> dict[str, Array]:
+    """Returns the three hinge axes at assembly in the frames of both bodies."""
+    named = {f"axis_{i}": n for i, n in enumerate(axes, 1)}
+    in_a = {f"{name}_a": a.local_direction(n) for name, n in named.items()}
+    return in_a | {f"{name}_b": b.local_direction(n) for name, n in named.items()}
+
+
+def three_angles(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+    """Returns the rows of the hinge angles θ₁, θ₂, θ₃, by the dual basis of the hinge axes.
+
+    The relative angular velocity is ω_b − ω_a = n₁ θ̇₁ + n₂ θ̇₂ + n₃ θ̇₃. With the dual basis
+    d₁ = n₂ × n₃ / (n₁·(n₂ × n₃)) and so on, the rates are θ̇ᵢ = dᵢ·(ω_b − ω_a). Differentiated,
+
+        θ̈ᵢ = dᵢ·(ω̇_b − ω̇_a − ω_a × n₁ θ̇₁ − (ω_a + n₁ θ̇₁) × n₂ θ̇₂ − ω_b × n₃ θ̇₃),
+
+    since n₁ turns with a, n₃ with b, and n₂ with the link between the first two hinges. If the axes
+    lie in one plane (gimbal lock), there is no dual basis, and rates, biases and pulls are zero.
+    """
+    θ, n, spin = _angles(p, a, b)
+    n_1, n_2, n_3 = n[0].position, n[1], n[2].position
+    duals = n_2.cross(n_3), n_3.cross(n_1), n_1.cross(n_2)
+    scale = numerics.safe_divide(1.0, n_1.dot(duals[0]))
+    relative = b.spin - a.spin
+    rates = [d.dot(relative) * scale for d in duals]
+    between = (spin + n_1 * rates[0]).cross(n_2)
+    drift = n[0].velocity * rates[0] + between * rates[1] + n[2].velocity * rates[2]
+    scaled = [d * scale for d in duals]
+    return [
+        Row(angle, rate, -d.dot(drift), (a.torque(-d), b.torque(d)))
+        for angle, rate, d in zip(θ, rates, scaled, strict=True)
+    ]
+
+
+def _angles(p: dict[str, Any], a: JointFrame, b: JointFrame) -> Any:
+    """Returns the angles (θ₁, θ₂, θ₃), the current axes n₁, n₂, n₃, and the angular velocity ω_a.
+
+    Here hᵢ are the axes at assembly. n₁·n₃ = h₁·Exp(h₂ θ₂) h₃ gives θ₂. Seen from a, n₃ has then
+    turned from Exp(h₂ θ₂) h₃ by θ₁ about n₁. Seen from b, n₁ has turned from Exp(−h₂ θ₂) h₁ by −θ₃
+    about n₃.
+    """
+    h_1, h_2, h_3 = (Vector.of(p[f"axis_{i}_a"]) for i in (1, 2, 3))
+    first, last = a.direction(h_1), b.direction(p["axis_3_b"])
+    middle = _middle(h_1, h_2, h_3, first.position.dot(last.position))
+    start = a.direction(_turned(h_2, middle, h_3)).position
+    end = b.direction(_turned(Vector.of(p["axis_2_b"]), -middle, Vector.of(p["axis_1_b"]))).position
+    outer = _angle(first.position, start, last.position)
+    inner = _angle(last.position, first.position, end)
+    second = a.direction(_turned(h_1, outer, h_2)).position
+    return (outer, middle, inner), (first, second, last), a.spin
+
+
+def _middle(h_1: Vector, h_2: Vector, h_3: Vector, cosine: Lane) -> Lane:
+    """Returns the middle angle θ₂ for a given cosine n₁·n₃ between the outer axes.
+
+    θ₂ solves h₁·Exp(h₂ θ₂) h₃ = A + B cos θ₂ + C sin θ₂ = A + ρ cos(θ₂ − φ) = n₁·n₃, with the axes
+    hᵢ at assembly. Of its two solutions the function returns the one in the same interval between
+    gimbal locks as θ₂ = 0.
+    """
+    fixed = h_1.dot(h_2) * h_2.dot(h_3)
+    along, across = h_1.dot(h_3) - fixed, h_1.dot(h_2.cross(h_3))
+    z = cosine - fixed
+    lean = numerics.safe_arctan2(numerics.safe_sqrt(along * along + across * across - z * z), z)
+    return numerics.safe_arctan2(across, along) - jnp.sign(across) * lean
+
+
+def _turned(n: Vector, angle: Lane, x: Vector) -> Vector:
+    """Returns the vector x turned by θ about the unit vector n.
+
+    Rodrigues' formula is Exp(n θ) x = x cos θ + n × x sin θ + n (n·x)(1 − cos θ).
+    """
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    return x * cos + n.cross(x) * sin + n * (n.dot(x) * (1 - cos))
+
+
+def _angle(n: Vector, x: Vector, y: Vector) -> Lane:
+    """Returns the angle about n from x to y, both projected onto the plane normal to n [rad]."""
+    return numerics.safe_arctan2(n.dot(x.cross(y)), x.dot(y) - n.dot(x) * n.dot(y))

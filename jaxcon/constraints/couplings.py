@@ -1,39 +1,42 @@
 """Couplings between the coordinates of joints: gears, racks, differentials, cams, pulleys.
 
-A coupling is φ(θ₁, …, θₖ) = 0, with
+A coupling is a relation φ(θ₁, …, θₖ) = 0 between joint coordinates θᵢ. Its row is
 
     φ̇ = Σ sᵢ θ̇ᵢ,   J = Σ sᵢ Jᵢ,   γ = Σ sᵢ γᵢ + θ̇ᵀ H θ̇,   s = ∇φ, H = ∇²φ,
 
-so it needs of each joint only its coordinate with rate, bias and pulls. Coordinates are zero at
-assembly, where the couplings therefore hold, and angles count whole turns.
+so a coupling needs only the value, rate, bias and pulls (∂θ̇ᵢ/∂v by body) of each coordinate.
+Coordinates are zero at assembly, so couplings hold there. Angles count whole turns.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.constraints.base import RowSet, gather
 from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks
 from jaxcon.core.doubled import Doubled
 from jaxcon.core.lanes import total
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, Lane
-from jaxcon.model.actuators import numbers
-from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.elements import Elements, label
+from jaxcon.core.typing import Array, DType, Lane
+from jaxcon.protocols import Constraint
+from jaxcon.system.actuators import numbers
+from jaxcon.system.coordinates import JointCoordinate, OnCoordinates
+from jaxcon.system.elements import Elements, label
+
+if TYPE_CHECKING:
+    from jaxcon.system.body_system import Snapshot
 
 
 class Relation(NamedTuple):
-    """A relation between coordinates.
+    """A relation φ(θ) = 0 between joint coordinates θ, and its derivatives.
 
     Attributes:
         value: φ.
-        slopes: s = ∇φ, one for each coordinate.
+        slopes: s = ∇φ, one entry for each coordinate.
         curvature: θ̇ᵀ ∇²φ θ̇.
     """
 
@@ -42,34 +45,56 @@ class Relation(NamedTuple):
     curvature: Lane = 0.0
 
 
-class Pair:
-    """A coupling of one coordinate each of two joints."""
+class Coupling(OnCoordinates):
+    """The base class of relations between joint coordinates.
+
+    The static method `relation` returns φ and its derivatives as a `Relation`.
+    """
+
+    linear: ClassVar[bool] = True
+    """True if φ is a linear combination of the coordinates."""
+
+
+class Pair(Coupling):
+    """The base class of couplings between two joint coordinates; subclasses define the relation."""
 
     joint_a: str
     joint_b: str
     coordinate_a: str | None
     coordinate_b: str | None
-    linear = True
-    """True where φ is a sum of multiples of the coordinates."""
 
     @property
-    def along(self) -> tuple[tuple[str, str | None], ...]:
-        """The joints and coordinates that are coupled."""
+    def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
+        """The names of the coupled joints, each with the name of its coordinate."""
         return ((self.joint_a, self.coordinate_a), (self.joint_b, self.coordinate_b))
+
+    def attach(self, dtype: DType) -> dict[str, Array]:
+        """Returns the numeric fields of the element as checked arrays.
+
+        Raises:
+            ValueError: a number is zero or not finite.
+        """
+        fields = ("ratio", "radius", "radius_a", "radius_b", "parts")
+        params = numbers(self, dtype, *(f for f in fields if f in vars(self)))
+        for field, value in params.items():
+            checks.nonzero(label(self), field, value)
+        return params
 
 
 @dataclass(frozen=True)
 class Gear(Pair):
     """A pair of gears, or any fixed ratio: θ_b = r θ_a; λ is the torque on b.
 
-    Meshing outer gears turn against each other: r < 0. The angles are those of the hinges, each of
-    its second body in its first, so hinges on one moving carrier make a planetary gear.
+    Meshing outer gears turn against each other: r < 0. θ_a and θ_b are the hinge angles, each of
+    the joint's second body relative to its first. Hinges on one moving carrier therefore make a
+    planetary gear.
 
     Attributes:
-        name: unique in the scene.
-        joint_a, joint_b: names of the joints.
+        name: name of the element, unique in the scene.
+        joint_a, joint_b: names of the joints with angles θ_a and θ_b.
         ratio: r, not zero.
-        coordinate_a, coordinate_b: which of the joints'; not needed where they have but one.
+        coordinate_a, coordinate_b: names of the joints' coordinates; needed for joints with
+            several.
     """
 
     name: str
@@ -79,26 +104,25 @@ class Gear(Pair):
     coordinate_a: str | None = None
     coordinate_b: str | None = None
 
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """The ratio."""
-        return nonzero(self, dtype, "ratio")
-
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
-        """θ_b − r θ_a."""
+        """Returns the relation φ = θ_b − r θ_a, with hinge angles θ_a, θ_b and ratio r."""
         return in_ratio(p["ratio"], a, b)
 
 
 @dataclass(frozen=True)
-class RackAndPinion:
-    """A pinion that rolls along a rack: s = r θ; λ is the force on the rack [N].
+class RackAndPinion(Pair):
+    """A pinion that rolls along a rack: s = r θ, with the rack's travel s and the pinion's angle θ.
+
+    λ is the force on the rack [N].
 
     Attributes:
-        name: unique in the scene.
-        pinion: name of the joint that turns by θ.
-        rack: name of the joint that travels by s.
-        radius: r [m], not zero; negative where a positive turn drives the rack back.
-        coordinate_a, coordinate_b: which of the joints'; not needed where they have but one.
+        name: name of the element, unique in the scene.
+        pinion: name of the joint with the angle θ.
+        rack: name of the joint with the travel s.
+        radius: r [m], not zero; negative if a positive turn moves the rack backwards.
+        coordinate_a, coordinate_b: names of the coordinates of pinion and rack; needed for joints
+            with several.
     """
 
     name: str
@@ -107,32 +131,31 @@ class RackAndPinion:
     radius: Any
     coordinate_a: str | None = None
     coordinate_b: str | None = None
-    linear = True
 
     @property
-    def along(self) -> tuple[tuple[str, str | None], ...]:
-        """The joints and coordinates that are coupled."""
+    def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
+        """The names of the pinion's and the rack's joint, each with the name of its coordinate."""
         return ((self.pinion, self.coordinate_a), (self.rack, self.coordinate_b))
-
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """The radius."""
-        return nonzero(self, dtype, "radius")
 
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
-        """s − r θ."""
+        """Returns the relation φ = s − r θ, with travel s, angle θ and radius r."""
         return in_ratio(p["radius"], a, b)
 
 
 @dataclass(frozen=True)
 class Belt(Pair):
-    """A belt that does not slip round two pulleys: r_b θ_b = r_a θ_a; λ is the pull on b [N].
+    """A belt that runs round two pulleys without slip: r_b θ_b = r_a θ_a.
+
+    λ is the belt's force on pulley b, along its circumference [N].
 
     Attributes:
-        name: unique in the scene.
-        joint_a, joint_b: names of the joints on which the pulleys turn.
-        radius_a, radius_b: of the pulleys [m], not zero; of opposite signs for a crossed belt.
-        coordinate_a, coordinate_b: which of the joints'; not needed where they have but one.
+        name: name of the element, unique in the scene.
+        joint_a, joint_b: names of the joints on which the pulleys turn by θ_a and θ_b.
+        radius_a, radius_b: radii r_a, r_b of the pulleys [m], not zero; of opposite signs for a
+            crossed belt.
+        coordinate_a, coordinate_b: names of the joints' coordinates; needed for joints with
+            several.
     """
 
     name: str
@@ -143,26 +166,23 @@ class Belt(Pair):
     coordinate_a: str | None = None
     coordinate_b: str | None = None
 
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """The radii."""
-        return nonzero(self, dtype, "radius_a", "radius_b")
-
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
-        """r_b θ_b − r_a θ_a."""
+        """Returns the relation φ = r_b θ_b − r_a θ_a, with the pulleys' angles θ and radii r."""
         value = p["radius_b"] * b.value - p["radius_a"] * a.value
         return Relation(value, (-p["radius_a"], p["radius_b"]))
 
 
 @dataclass(frozen=True)
-class Pulley:
+class Pulley(Pair):
     """A rope that runs from one span over a pulley into another: l_a + n l_b is constant.
 
-    The rope is massless and taut both ways, a rod bent round the pulley; λ is minus its tension.
-    With n parts of rope in the second span it is a block and tackle.
+    l_a and l_b are the lengths of the spans. The rope is massless, and like a rod bent round the
+    pulley it carries tension and compression; λ is minus the tension [N]. With n parts of rope in
+    the second span it models a block and tackle.
 
     Attributes:
-        name: unique in the scene.
+        name: name of the element, unique in the scene.
         span_a, span_b: names of the `Span`s between pulley and load.
         parts: n, not zero.
     """
@@ -173,30 +193,31 @@ class Pulley:
     parts: Any = 1.0
 
     @property
-    def along(self) -> tuple[tuple[str, str | None], ...]:
-        """The joints and coordinates that are coupled."""
+    def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
+        """The names of the two spans; None stands for the only coordinate of a span."""
         return ((self.span_a, None), (self.span_b, None))
-
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """The number of parts."""
-        return nonzero(self, dtype, "parts")
 
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
-        """l_a + n l_b, less what it was at assembly."""
+        """Returns the relation φ = l_a + n l_b, with the spans' elongations l and n parts.
+
+        Elongations are changes of length since assembly [m].
+        """
         return Relation(a.value + p["parts"] * b.value, (1.0, p["parts"]))
 
 
 @dataclass(frozen=True)
-class Differential:
+class Differential(Coupling):
     """A differential: the carrier turns by the mean of its two shafts, θ_l + θ_r = 2 θ_c.
 
-    λ is the torque on each of the shafts, and half of that on the carrier with the opposite sign.
+    θ_l, θ_r and θ_c are the angles of left shaft, right shaft and carrier. λ is the torque on each
+    shaft; the torque on the carrier is −2 λ.
 
     Attributes:
-        name: unique in the scene.
-        left, right, carrier: names of the joints.
-        coordinates: of the three; not needed where they have but one.
+        name: name of the element, unique in the scene.
+        left, right, carrier: names of the joints of left shaft, right shaft and carrier.
+        coordinates: names of the coordinates of left, right and carrier joint; None for a joint
+            with only one.
     """
 
     name: str
@@ -204,11 +225,10 @@ class Differential:
     right: str
     carrier: str
     coordinates: tuple[str | None, str | None, str | None] = (None, None, None)
-    linear = True
 
     @property
-    def along(self) -> tuple[tuple[str, str | None], ...]:
-        """The joints and coordinates that are coupled."""
+    def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
+        """The names of the left, right and carrier joint, each with the name of its coordinate."""
         if len(self.coordinates) != 3:
             raise ValueError(
                 f"{label(self)}: coordinates must be three, of left, right and carrier, got"
@@ -216,26 +236,28 @@ class Differential:
             )
         return tuple(zip((self.left, self.right, self.carrier), self.coordinates, strict=True))
 
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """No numbers."""
+    def attach(self, dtype: DType) -> dict[str, Array]:
+        """Returns an empty dictionary: a differential has no numbers."""
         return {}
 
     @staticmethod
     def relation(p: dict[str, Any], left: Row, right: Row, carrier: Row) -> Relation:
-        """θ_l + θ_r − 2 θ_c."""
+        """Returns the relation φ = θ_l + θ_r − 2 θ_c, with angles of both shafts and carrier."""
         return Relation(left.value + right.value - 2 * carrier.value, (1.0, 1.0, -2.0))
 
 
 @dataclass(frozen=True)
 class PolynomialCoupling(Pair):
-    """One coordinate as a polynomial of another, θ_b = Σ cₖ θ_aᵏ: cams, and fits of anything else.
+    """A joint coordinate that is a polynomial of another, θ_b = Σ cₖ θ_aᵏ, such as a cam.
 
     Attributes:
-        name: unique in the scene.
-        joint_a, joint_b: names of the joints.
-        coefficients: (c₀, c₁, …), at least two. Both coordinates are zero where the scene is built,
-            so c₀ ≠ 0 is violated there; `assemble` brings the joints to where it holds.
-        coordinate_a, coordinate_b: which of the joints'; not needed where they have but one.
+        name: name of the element, unique in the scene.
+        joint_a, joint_b: names of the joints with coordinates θ_a and θ_b.
+        coefficients: (c₀, c₁, …), at least two. Both coordinates are zero at assembly, so a
+            coefficient c₀ ≠ 0 violates the coupling there. `assemble` then moves the joints to a
+            configuration that satisfies it.
+        coordinate_a, coordinate_b: names of the joints' coordinates; needed for joints with
+            several.
     """
 
     name: str
@@ -246,11 +268,11 @@ class PolynomialCoupling(Pair):
     coordinate_b: str | None = None
     linear = False
 
-    def attach(self, dtype: Any) -> dict[str, Array]:
-        """The coefficients.
+    def attach(self, dtype: DType) -> dict[str, Array]:
+        """Returns the coefficients as a checked array, (k + 1,) for degree k.
 
         Raises:
-            ValueError: there are fewer than two.
+            ValueError: there are fewer than two coefficients.
         """
         shape = np.shape(checks.check(label(self), "coefficients", self.coefficients))
         if len(shape) != 1 or shape[0] < 2:
@@ -261,7 +283,10 @@ class PolynomialCoupling(Pair):
 
     @staticmethod
     def relation(p: dict[str, Any], a: Row, b: Row) -> Relation:
-        """θ_b − P(θ_a), by Horner's rule with both derivatives: θ̇ᵀ H θ̇ = −P″ θ̇_a²."""
+        """Returns the relation φ = θ_b − P(θ_a) with the polynomial P(θ) = Σ cₖ θᵏ.
+
+        Horner's rule evaluates P and both derivatives; the curvature is θ̇ᵀ H θ̇ = −P″ θ̇_a².
+        """
         value = slope = bend = 0.0
         for c in reversed(tuple(p["coefficients"])):
             bend = bend * a.value + 2 * slope
@@ -271,63 +296,41 @@ class PolynomialCoupling(Pair):
 
 
 @pytree
-class Couplings(Elements):
-    """Couplings of one class, `law`, whose bodies coincide in the same way.
+class Couplings(Elements, Constraint):
+    """A group of couplings of one class, `law`, whose joints share bodies in the same way.
 
     Attributes:
-        along: the coordinates that are coupled.
-        sides: for each of them, the place of each body of the joint among `places`.
+        coordinates: the coupled coordinates.
+        sides: for each coordinate, the index in `places` of each body of its joint.
     """
 
-    law: Any = static(default=None)
-    along: tuple[JointCoordinate, ...] = static(default=())
+    coordinates: tuple[JointCoordinate, ...] = static(default=())
     sides: tuple[tuple[int, ...], ...] = static(default=())
 
-    def rows(self, snapshot: Any) -> RowSet:
-        """φ, φ̇, J and γ at one instant."""
-        coordinates = [along.read(snapshot) for along in self.along]
+    def rows(self, snapshot: Snapshot) -> list[Row]:
+        """Returns the row of each coupling at one instant: φ, φ̇, γ and J = ∂φ̇/∂v by body."""
+        coordinates = [each.read(snapshot) for each in self.coordinates]
         value, slopes, curvature = self.law.relation(self.params, *coordinates)
-        if getattr(self.law, "linear", False) and any(
-            row.reduced is not None for row in coordinates
-        ):
-            value = self._value(coordinates)
-        pairs = list(zip(slopes, coordinates, strict=True))
-        pulls: list[Any] = [None] * len(self.places)
-        for (slope, row), sides in zip(pairs, self.sides, strict=True):
+        if self.law.linear and any(row.reduced is not None for row in coordinates):
+            # float32 rounds large angles: evaluate φ for the angles without whole turns and for
+            # the turns, then add both results, whose sum is small
+            pairs = [row.reduced or (row.value, jnp.zeros_like(row.value)) for row in coordinates]
+            rows = list(zip(coordinates, pairs, strict=True))
+            less = [row._replace(value=value) for row, (value, _) in rows]
+            turns = [row._replace(value=Doubled.of(laps)) for row, (_, laps) in rows]
+            value, turned = (self.law.relation(self.params, *x).value for x in (less, turns))
+            value = value + 2 * jnp.pi * turned.value
+        pulls: dict[int, Any] = {}
+        for slope, row, sides in zip(slopes, coordinates, self.sides, strict=True):
             for side, pull in zip(sides, row.pulls, strict=True):
-                known = pulls[side]
-                pulls[side] = pull * slope if known is None else known + pull * slope
+                pulls[side] = pull * slope if side not in pulls else pulls[side] + pull * slope
+        pairs = list(zip(slopes, coordinates, strict=True))
         rate = total(slope * row.rate for slope, row in pairs)
         bias = total(slope * row.bias for slope, row in pairs) + curvature
-        row = Row(value, rate, bias, tuple(pulls))
-        return gather(snapshot, self.places, [row])
-
-    def _value(self, coordinates: list[Row]) -> Lane:
-        """φ of the angles less whole turns, and 2π φ of the turns, whose sum is small again."""
-        pairs = [row.reduced or (row.value, jnp.zeros_like(row.value)) for row in coordinates]
-        rows = list(zip(coordinates, pairs, strict=True))
-        less = [row._replace(value=value) for row, (value, _) in rows]
-        turns = [row._replace(value=Doubled.of(laps)) for row, (_, laps) in rows]
-        value, turned = (self.law.relation(self.params, *x).value for x in (less, turns))
-        return value + 2 * jnp.pi * turned.value
-
-    def anchor(self, snapshot: Any, i: int) -> Array | None:
-        """None: a coupling acts on several joints."""
-        return None
+        row = Row(value, rate, bias, tuple(pulls[i] for i in range(len(self.places))))
+        return [row]
 
 
 def in_ratio(ratio: Lane, a: Row, b: Row) -> Relation:
-    """b − r a."""
+    """Returns the relation φ = θ_b − r θ_a between the coordinates of two rows, with ratio r."""
     return Relation(b.value - ratio * a.value, (-ratio, 1.0))
-
-
-def nonzero(element: Any, dtype: Any, *fields: str) -> dict[str, Array]:
-    """Numbers of an element, checked.
-
-    Raises:
-        ValueError: one of them is zero or not finite.
-    """
-    params = numbers(element, dtype, *fields)
-    for field, value in params.items():
-        checks.nonzero(label(element), field, value)
-    return params

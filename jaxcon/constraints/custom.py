@@ -1,152 +1,166 @@
-"""Constraints from a user's function, on generalized coordinates or on named bodies."""
+"""Constraints from a user's function, on generalized coordinates or on named bodies.
+
+Rows follow by automatic differentiation, exact to second order. Along a motion q̇ = N(q) v,
+
+    φ̇(q, v, t) = ∂φ/∂q N(q) v + ∂φ/∂t,    J = ∂φ̇/∂v,    γ = d/dt φ̇ at constant v,
+
+where d/dt differentiates along the motion (q̇ = N v, ṫ = 1). It includes the mixed terms 2 (∂J/∂t)
+v. For velocity-level constraints, ψ(q, v, t) takes the place of φ̇.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.constraints import autodiff
-from jaxcon.constraints.base import RowSet
+from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks, functions
 from jaxcon.core.lanes import Vector
-from jaxcon.core.pytree import pytree, static
+from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.core.worlds import per_world
-from jaxcon.model.generalized import WHOLE
-from jaxcon.model.layout import Place
+from jaxcon.protocols import Constraint
+from jaxcon.staging.worlds import per_world
+from jaxcon.system.elements import Element, UserElement
+
+if TYPE_CHECKING:
+    from jaxcon.protocols import System
+    from jaxcon.system.body_system import Snapshot
 
 
 @dataclass(frozen=True)
-class Holonomic:
-    """φ(q, t) = 0 from a user's function; J and γ by automatic differentiation.
-
-    On generalized coordinates the function is `function(q, t, params)` with the system's params; on
-    bodies it is `function(*poses, t, params)` with the `Pose` of each named body. It returns φ,
-    (m,).
+class UserFunction(Element):
+    """A constraint on positions from a user's function φ(q, t).
 
     Attributes:
-        function: pure and hashable; define it once, since every new function object is a new trace.
-        bodies: names; empty for generalized coordinates.
-        name: unique in the system.
-        params: any pytree of arrays, leaves of the system; on bodies only.
+        function: the user's function.
+        bodies: names of the bodies; empty for generalized coordinates.
+        name: name of the element, unique in the system.
+        params: any pytree of arrays.
     """
 
     function: Callable[..., Array]
     bodies: tuple[str, ...] = ()
-    name: str = "holonomic"
+    name: str = ""
     params: PyTree = None
 
-    def rate(self, call: Callable[..., Array], kinematics: autodiff.Kinematics) -> Any:
-        """φ̇(q, v, t)."""
-        return autodiff.holonomic_rate(lambda q, t: call(q, None, t), kinematics)
+    def rate(self, call: Callable[..., Array], kinematics: Callable[..., Any]) -> Any:
+        """Returns the function φ̇(q, v, t), the time derivative of φ along a motion.
 
-    def value(self, call: Callable[..., Array], q: PyTree, t: Any) -> Array | None:
-        """φ(q, t)."""
+        Args:
+            call: φ as call(q, None, t).
+            kinematics: the function (q, v) → q̇.
+        """
+
+        def rate(q: PyTree, v: PyTree, t: Array) -> Array:
+            tangents = (kinematics(q, v), jnp.ones_like(t))
+            return jax.jvp(lambda q, t: call(q, None, t), (q, t), tangents)[1]
+
+        return rate
+
+    def value(self, call: Callable[..., Array], q: PyTree, t: Array) -> Array | None:
+        """Returns φ(q, t), (m,).
+
+        Args:
+            call: φ as call(q, None, t).
+            q: positions.
+            t: time, () [s].
+        """
         return call(q, None, t)
 
 
 @dataclass(frozen=True)
-class VelocityLevel:
-    """ψ(q, v, t) = 0, affine in v, from a user's function: A(q, t) v + b(q, t) = 0.
+class Holonomic(UserFunction):
+    """A constraint φ(q, t) = 0 from a user's function; J and γ follow by automatic differentiation.
 
-    On generalized coordinates the function is `function(q, v, t, params)`; on bodies it is
-    `function(*motions, t, params)` with the `Motion` of each named body. It returns ψ, (m,). Under
-    feedback ψ decays as ψ̇ = −2α ψ; it is never part of a position projection.
+    On generalized coordinates the function is `function(q, t, params)` with the system's params. On
+    bodies it is `function(*poses, t, params)` with the `Pose` of each named body. It returns φ,
+    (m,).
 
     Attributes:
-        function: pure and hashable; define it once, since every new function object is a new trace.
-        bodies: names; empty for generalized coordinates.
-        name: unique in the system.
+        function: the user's function, pure and hashable; define it once, since each new function
+            object is traced again.
+        bodies: names of the bodies; empty for generalized coordinates.
+        name: name of the element, unique in the system.
         params: any pytree of arrays, leaves of the system; on bodies only.
     """
 
-    function: Callable[..., Array]
-    bodies: tuple[str, ...] = ()
-    name: str = "velocity_level"
-    params: PyTree = None
+    name: str = "holonomic"
 
-    def rate(self, call: Callable[..., Array], kinematics: autodiff.Kinematics) -> Any:
-        """ψ(q, v, t), which takes the place of φ̇."""
+
+@dataclass(frozen=True)
+class VelocityLevel(UserFunction):
+    """A constraint ψ(q, v, t) = 0, affine in v, from a user's function: A(q, t) v + b(q, t) = 0.
+
+    On generalized coordinates the function is `function(q, v, t, params)`. On bodies it is
+    `function(*motions, t, params)` with the `Motion` of each named body. It returns ψ, (m,). Under
+    feedback ψ decays as ψ̇ = −2α ψ. A position projection does not change ψ.
+
+    Attributes:
+        function: the user's function, pure and hashable; define it once, since each new function
+            object is traced again.
+        bodies: names of the bodies; empty for generalized coordinates.
+        name: name of the element, unique in the system.
+        params: any pytree of arrays, leaves of the system; on bodies only.
+    """
+
+    name: str = "velocity_level"
+
+    def rate(self, call: Callable[..., Array], kinematics: Callable[..., Any]) -> Any:
+        """Returns the function ψ(q, v, t), which takes the place of φ̇."""
         return call
 
-    def value(self, call: Callable[..., Array], q: PyTree, t: Any) -> Array | None:
-        """None: there is no φ."""
+    def value(self, call: Callable[..., Array], q: PyTree, t: Array) -> Array | None:
+        """Returns None, since a velocity-level constraint has no φ."""
         return None
 
 
 @pytree
-class Custom:
-    """A user's constraint in a system; the subclasses say on which coordinates.
+class Custom(UserElement, Constraint):  # type: ignore[override]
+    """A user's constraint in a system: the base class for both kinds of coordinates."""
 
-    Attributes:
-        params: the user's own.
-        law: `Holonomic` or `VelocityLevel`, without its params.
-        places: of the bodies with coordinates.
-    """
-
-    params: PyTree
-    law: Any = static()
-    places: tuple[Place, ...] = static(default=(WHOLE,))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The name of the constraint, alone in a tuple."""
-        return (self.law.name,)
+    independent: ClassVar[bool] = False
 
     @property
     def owner(self) -> str:
-        """The first words of errors."""
+        """The class and name of the element, for error messages."""
         return f"{type(self.law).__name__} '{self.law.name}'"
 
-    def get(self, i: int) -> dict[str, Any]:
-        """The user's parameters."""
-        return {"params": self.params}
-
-    def set(self, changes: Any) -> Any:
-        """With other parameters."""
-        new = changes.get(self.law.name, {}).get("params", self.params)
-        return dataclasses.replace(self, params=new)
-
-    def anchor(self, snapshot: Any, i: int) -> Array | None:
-        """None: a user's constraint has no anchor but the body itself."""
-        return None
-
-    def rows(self, snapshot: Any) -> RowSet:
-        """φ, φ̇, J and γ at one instant."""
+    def rows(self, snapshot: Snapshot) -> list[Row]:
+        """Returns a row for each component of the user's function: φ, φ̇, γ and ∂φ̇/∂v by body."""
         value, rate, bias, jacobian = self.linearized(snapshot)
-        blocks = [
-            (snapshot.system.columns(place), tuple(_lanes(row) for row in block))
-            for place, block in zip(self.places, jacobian, strict=True)
-        ]
-        value, rate, bias = (tuple(_lanes(x)) for x in (value, rate, bias))
-        holonomic = (isinstance(self.law, Holonomic),) * len(rate)
-        return RowSet(value, rate, bias, tuple(blocks), holonomic)
+        pulls = zip(*([_lanes(row) for row in block] for block in jacobian), strict=True)
+        lanes = zip(*map(_lanes, (value, rate, bias)), pulls, strict=True)
+        holonomic = isinstance(self.law, Holonomic)
+        return [Row(*row, holonomic=holonomic) for row in lanes]
 
-    def linearized(self, snapshot: Any) -> tuple[Array, Array, Array, tuple[Array, ...]]:
-        """φ, φ̇, γ (m,) and ∂φ̇/∂v by bodies (m, d), batches behind."""
+    def linearized(self, snapshot: Snapshot) -> tuple[Array, Array, Array, tuple[Array, ...]]:
+        """Returns φ, φ̇ and γ, each (m,), and ∂φ̇/∂v by body, each (m, d); batch axes come last."""
         given = (snapshot.system, self, snapshot.q, snapshot.v, snapshot.t)
         return per_world(_numbers, snapshot.q.ndim - 1)(*given)
 
-    def problem(self, snapshot: Any) -> tuple[Any, Any, Any, Any]:
-        """q and v as lists, q̇ = N(q) v, and the function as call(q, v, t)."""
+    def problem(self, snapshot: Snapshot) -> tuple[Any, Any, Any, Any]:
+        """Returns (q, v, kinematics, call): the arguments and functions that define the rows.
+
+        q and v are lists of arrays, kinematics(q, v) returns q̇ = N(q) v, and call(q, v, t)
+        evaluates the user's function; v is None for φ(q, t).
+        """
         raise NotImplementedError
 
 
 @pytree
 class CustomOnCoordinates(Custom):
-    """On generalized coordinates; the parameters are the system's."""
+    """A user's constraint on generalized coordinates; its function gets the system's params."""
 
-    def problem(self, snapshot: Any) -> tuple[Any, Any, Any, Any]:
-        """q and v as lists, q̇ = v, and the function as call(q, v, t)."""
+    def problem(self, snapshot: Snapshot) -> tuple[Any, Any, Any, Any]:
+        """Returns q and v as lists of one array, q̇ = v, and the function as call(q, v, t)."""
         params = snapshot.system.params
 
-        def call(q: Any, v: Any, t: Any) -> Array:
+        def call(q: list[Array], v: list[Array] | None, t: Array) -> Array:
             args = (*q, t, params) if v is None else (*q, *v, t, params)
             return functions.call(self.owner, "function", self.law.function, *args)
 
@@ -155,19 +169,19 @@ class CustomOnCoordinates(Custom):
 
 @pytree
 class CustomOnBodies(Custom):
-    """On the poses or motions of named bodies, those fixed to the world included."""
+    """A user's constraint on the poses or motions of named bodies, which may be fixed."""
 
-    def problem(self, snapshot: Any) -> tuple[Any, Any, Any, Any]:
-        """q and v of the bodies that move, q̇ = N(q) v, and the function as call(q, v, t)."""
+    def problem(self, snapshot: Snapshot) -> tuple[Any, Any, Any, Any]:
+        """Returns q and v of each moving body, q̇ = N(q) v, and the function as call(q, v, t)."""
         layout = snapshot.system.layout
         moving = [name for name in self.law.bodies if name in layout.places]
         kinds = [layout.groups[layout.locate(name)[0]].kind for name in moving]
 
-        def kinematics(q: Any, v: Any) -> Any:
+        def kinematics(q: list[Array], v: list[Array]) -> list[Array]:
             pairs = zip(kinds, q, v, strict=True)
             return [k.kinematics(Vector.of(x), Vector.of(y)).stack() for k, x, y in pairs]
 
-        def call(q: Any, v: Any, t: Any) -> Array:
+        def call(q: list[Array], v: list[Array] | None, t: Array) -> Array:
             rates = [jnp.zeros(k.n_v, x.dtype) for k, x in zip(kinds, q, strict=True)]
             states = zip(moving, kinds, q, rates if v is None else v, strict=True)
             offsets = snapshot.system.offsets
@@ -185,23 +199,26 @@ class CustomOnBodies(Custom):
         return q, v, kinematics, call
 
 
-def _numbers(system: Any, group: Custom, q: Array, v: Array, t: Any) -> Any:
-    """φ, φ̇, γ (m,) and J by bodies (m, d), in one world."""
+def _numbers(system: System, group: Custom, q: Array, v: Array, t: Array) -> Any:
+    """Returns φ, φ̇ and γ, each (m,), and ∂φ̇/∂v by body, each (m, d), in one world."""
     q, v, kinematics, call = group.problem(system.snapshot(q, v, t))
     value = group.law.value(call, q, t)
-    rate, jacobian, bias = autodiff.rows(group.law.rate(call, kinematics), kinematics, q, v, t)
+    function = group.law.rate(call, kinematics)
+    tangents = (kinematics(q, v), jnp.ones_like(t))
+    rate, bias = jax.jvp(lambda q, t: function(q, v, t), (q, t), tangents)
+    jacobian = jax.jacfwd(function, argnums=1)(q, v, t)
     return jnp.zeros_like(rate) if value is None else value, rate, bias, jacobian
 
 
-def check_function(group: Custom, snapshot: Any) -> None:
-    """Checks what a user's function returns, and that ψ is affine in v.
+def check_function(group: Custom, snapshot: Snapshot) -> None:
+    """Checks the result of a user's function, and that ψ is affine in v.
 
-    Affinity is tested with numbers, since a program does not show it: ψ(v + w) − ψ(v) − ψ(w) + ψ(0)
-    must vanish for two random velocities. Values that are still traced are replaced by random ones,
-    because the property must hold for all.
+    The check for affinity is numerical: ψ(v + w) − ψ(v) − ψ(w) + ψ(0) must vanish for two random
+    velocities v and w. Traced values are replaced by random numbers; ψ must be affine for all
+    values.
 
     Raises:
-        ValueError: not of shape (m,), not floating, or not affine in v.
+        ValueError: the result does not have shape (m,) or the dtype of q, or ψ is not affine in v.
     """
     owner = group.owner
     q, v, _, call = group.problem(snapshot)
@@ -225,7 +242,8 @@ def check_function(group: Custom, snapshot: Any) -> None:
         )
 
 
-def _affine(group: Custom, snapshot: Any) -> bool:
+def _affine(group: Custom, snapshot: Snapshot) -> bool:
+    """Returns True if ψ is affine in v, by the test that `check_function` describes."""
     random = np.random.default_rng(0)
 
     def concrete(x: Any) -> Any:
@@ -246,5 +264,5 @@ def _affine(group: Custom, snapshot: Any) -> bool:
 
 
 def _lanes(row: Array) -> Vector:
-    """The components of one row or of a column of rows, each a lane of one element."""
+    """Returns the entries along the first axis, components or rows, as lanes of one element."""
     return Vector(*(x[None] for x in row))

@@ -2,45 +2,51 @@
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, ClassVar
 
 import jax
 import jax.numpy as jnp
 
-from jaxcon.constraints.base import RowSet, gather
+from jaxcon.constraints.primitives import Row
 from jaxcon.core import functions
 from jaxcon.core.doubled import Doubled, evaluate, rounding_operations
+from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.core.worlds import per_world
-from jaxcon.model.coordinates import JointCoordinate
-from jaxcon.model.layout import Place
+from jaxcon.core.typing import Array, DType, PyTree
+from jaxcon.protocols import Constraint
+from jaxcon.staging.worlds import per_world
+from jaxcon.system.coordinates import JointCoordinate, OnJoint
+from jaxcon.system.elements import UserElement
+
+if TYPE_CHECKING:
+    from jaxcon.system.body_system import Snapshot
 
 
 @dataclass(frozen=True)
-class Drive:
+class Drive(OnJoint):
     """A joint's coordinate follows a given motion: θ = θ*(t), one row.
 
-    θ is a coordinate of the joint, an angle [rad] or a travel [m], zero at assembly.
-    λ is the torque or force that the drive applies. In space angles are compared modulo whole
-    turns, so a crank may be driven round and round.
+    θ is a coordinate of the joint, an angle [rad] or a travel [m], zero at assembly. λ is the
+    torque or force that the drive applies. In space angles are compared modulo whole turns, so a
+    crank may turn without end.
 
-    In float32 the motion is computed from the time with its remainder, in sums of two floats where
-    it adds and multiplies, so that its phase is right after days. That holds in branches, loops and
-    called functions, too. Functions such as `jnp.sqrt` round their result: a phase of 1e5 rad is
-    off by up to 4e-3 rad after them. `build` warns of operations that see the rounded time alone,
-    such as `jnp.cumsum` and solvers of linear equations: their phase is off by ω ε t.
+    In float32 the motion is evaluated with the time and its rounding error: sums and products are
+    computed in pairs of floats, also in branches, loops and called functions. The phase is then
+    right even after days. Functions such as `jnp.sqrt` round their result: after them, a phase of
+    1e5 rad is wrong by up to 4e-3 rad. Operations such as `jnp.cumsum` and linear solvers get the
+    rounded time. The phase error is then ω ε t, with angular rate ω and machine epsilon ε; `build`
+    warns of such operations.
 
     Attributes:
-        name: unique in the scene.
+        name: name of the element, unique in the scene.
         joint: name of the driven joint.
-        motion: `motion(t, params)` → θ* (); pure and hashable, twice differentiable in t.
+        motion: the function `motion(t, params)` → θ* (); pure and hashable, twice differentiable in
+            t.
         params: any pytree of arrays.
-        coordinate: which of the joint's; not needed where it has but one.
+        coordinate: name of the joint's coordinate; needed if it has several.
     """
 
     name: str
@@ -52,43 +58,40 @@ class Drive:
 
 
 @pytree
-class Drives:
-    """One driven joint coordinate."""
+class Drives(UserElement, Constraint):  # type: ignore[override]
+    """A `Drive` in a system.
 
-    params: PyTree
-    law: Drive = static()
-    along: JointCoordinate = static()
-    places: tuple[Place, ...] = static()
+    Attributes:
+        coordinate: the driven joint coordinate.
+    """
+
+    closes_loops: ClassVar[bool] = False
+
+    coordinate: JointCoordinate = static(default=None)  # type: ignore[assignment]
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The name of the constraint, alone in a tuple."""
-        return (self.law.name,)
+    def driven(self) -> Hashable:
+        """The group, joints and name of the driven coordinate, as a key."""
+        return self.coordinate.group, self.coordinate.joints, self.coordinate.name
 
-    def get(self, i: int) -> dict[str, Any]:
-        """The parameters of the motion."""
-        return {"params": self.params}
+    def rows(self, snapshot: Snapshot) -> list[Row]:
+        """Returns the row φ = θ − θ*(t), φ̇ = θ̇ − θ̇*, γ = γ_θ − θ̈*.
 
-    def set(self, changes: Any) -> Drives:
-        """With other parameters."""
-        new = changes.get(self.law.name, {}).get("params", self.params)
-        return dataclasses.replace(self, params=new)
-
-    def rows(self, snapshot: Any) -> RowSet:
-        """φ = θ − θ*(t), φ̇ = θ̇ − θ̇*, γ = γ_θ − θ̈*, by two nested derivatives of the motion."""
-        row = self.along.read(snapshot)
+        Two nested derivatives of the motion give θ̇* and θ̈*; γ_θ is the coordinate's bias.
+        """
+        row = self.coordinate.read(snapshot)
         motion = per_world(self._motion, snapshot.q.ndim - 1)
         target, rate, bias = motion(Doubled.of(snapshot.instant), self.params)
         target, rate, bias = jax.tree.map(lambda x: x[None], (target, rate, bias))
-        error = self.along.difference(snapshot, row, target)
+        error = self.coordinate.difference(snapshot, row, target)
         row = row._replace(value=error, rate=row.rate - rate, bias=row.bias - bias)
-        return gather(snapshot, self.places, [row])
+        return [row]
 
-    def check(self, dtype: Any) -> None:
-        """Calls the motion once, abstractly; warns where its phase is lost in float32.
+    def check(self, dtype: DType) -> None:
+        """Checks the motion by tracing it once; warns if its phase loses accuracy in float32.
 
         Raises:
-            ValueError: it cannot be called, or returns no number.
+            ValueError: the motion cannot be called, or does not return a number.
         """
         start = Doubled.of(jnp.zeros((), dtype))
         try:
@@ -109,15 +112,14 @@ class Drives:
                 stacklevel=2,
             )
 
-    def anchor(self, snapshot: Any, i: int) -> Array | None:
-        """The anchor of the driven joint."""
-        (joint,) = self.along.joints
-        return snapshot.system.constraints[self.along.group].anchor(snapshot, joint)
+    def anchors(self, snapshot: Snapshot) -> Vector | None:
+        """Returns the anchor of the driven joint, world frame [m]; None without anchors."""
+        return self.coordinate.anchors(snapshot)
 
     def _motion(self, t: Doubled, params: PyTree) -> tuple[Doubled, Array, Array]:
-        """θ*, θ̇*, θ̈*."""
+        """Returns θ*, θ̇* and θ̈* at time t, each ()."""
 
-        def motion(t: Any) -> Array:
+        def motion(t: Array) -> Array:
             owner = f"Drive '{self.law.name}'"
             target = functions.call(owner, "motion", self.law.motion, t, params)
             target = functions.array(owner, "motion", target)
@@ -129,7 +131,7 @@ class Drives:
             return target
 
         def at(high: Array) -> tuple[Array, Array]:
-            # in float64 a time of days is rounded to 1e-11 s
+            # float64 needs no pairs: it resolves a time of days to 1e-11 s
             if jnp.finfo(high.dtype).bits == 64:
                 return motion(high), jnp.zeros_like(high)
             target = evaluate(motion, Doubled(high, t.low))

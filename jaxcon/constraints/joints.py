@@ -1,51 +1,54 @@
-"""Joints between two bodies, each the sum of its primitives (chapter 3.6.1, corrected).
+"""Joints between two bodies, each composed of the rows in `primitives`.
 
-Points, axes and lengths are given in the world frame at assembly and kept in the frames of the two
-bodies. To add a joint, write a class like these and one row in `tests/scenes.py`.
+The user gives points, axes and lengths in the world frame at assembly; joints keep them in the
+frames of their two bodies. To add a joint, write a class like these and one row in
+`tests/scenes.py`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
 from jaxcon.constraints import primitives
+from jaxcon.constraints.base import Joint
 from jaxcon.constraints.primitives import Row
 from jaxcon.core import checks, numerics
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, PyTree
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Pose
-from jaxcon.model.elements import label, own_point
+from jaxcon.system.elements import BetweenBodies, label, own_point
+
+if TYPE_CHECKING:
+    from jaxcon.constraints.primitives import JointFrame
+    from jaxcon.contact.contact import Rope
 
 PERPENDICULAR = 1e-6
-"""The cosine up to which two axes count as perpendicular; in float32 rounding alone is 1e-7."""
+"""The largest cosine of two axes that count as perpendicular; rounding in float32 gives 1e-7."""
 
 
 @dataclass(frozen=True)
-class Coincident:
-    """Two points stay together: 2 rows in the plane, 3 in space; particles too.
+class Coincident(Joint):
+    """Two points coincide: 2 rows in the plane, 3 in space. Bodies may be particles.
 
     Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: where, world frame at assembly, (dim,) [m].
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
+        point: the common point, world frame at assembly, (dim,) [m].
     """
 
-    name: str
-    body_a: str
-    body_b: str
     point: Any
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames."""
+        """Returns the point in the frames of both bodies."""
         return anchors(self, a, b)
 
     @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """p_b − p_a = 0."""
+    def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+        """Returns the rows p_b − p_a = 0: the joint's points on both bodies coincide."""
         return primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
 
 
@@ -54,88 +57,82 @@ class Spherical(Coincident):
     """A ball joint in space: two points stay together, every turn is free (3 rows).
 
     Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: the middle of the ball, world frame at assembly, (3,) [m].
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
+        point: the center of the ball, world frame at assembly, (3,) [m].
     """
 
     dims = (3,)
 
 
 @dataclass(frozen=True)
-class Distance:
+class Distance(Joint):
     """Two points keep their distance, φ = ‖p_b − p_a‖ − l: λ is minus the tension [N].
 
     Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
         length: l > 0 [m]; the distance at assembly unless given.
-        point_a, point_b: world points at assembly, (dim,) [m]; the centres of mass unless given.
+        point_a, point_b: world points at assembly, (dim,) [m]; the centers of mass unless given.
     """
 
-    name: str
-    body_a: str
-    body_b: str
     length: Any = None
     point_a: Any = None
     point_b: Any = None
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The two points in their frames, and the length."""
+        """Returns the points in the frames of their bodies, and the length."""
         return stretched(self, a, b)
 
     @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """‖p_b − p_a‖ − l = 0."""
+    def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+        """Returns the row φ = ‖p_b − p_a‖ − l, with the end points p_a, p_b and the length l."""
         points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
         return [primitives.distance(*points, p["length"])]
 
 
 @dataclass(frozen=True)
-class Fixed:
+class Fixed(Joint):
     """Two bodies keep their relative pose: 3 rows in the plane, 6 in space.
 
     Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: where they are joined, world frame at assembly, (dim,) [m]; the second body's
-            centre of mass unless given. The wrench is read there.
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
+        point: the point at which the bodies are joined, world frame at assembly, (dim,) [m]; the
+            second body's center of mass unless given. The wrench refers to it.
     """
 
-    name: str
-    body_a: str
-    body_b: str
     point: Any = None
     oriented = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, and the orientation of b in a."""
+        """Returns the point in the frames of both bodies, and the orientation of b in a."""
         return anchors(self, a, b) | {"orientation": relative_orientation(a, b)}
 
     @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """p_b − p_a = 0 and the orientations agree."""
+    def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+        """Returns the rows p_b − p_a = 0, and rows that keep the relative orientation.
+
+        p_a and p_b are the joint's points on both bodies.
+        """
         points = primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
         return points + primitives.same_orientation(a, b, p["orientation"])
 
 
 @dataclass(frozen=True)
-class Revolute:
+class Revolute(Joint):
     """A hinge: 2 rows in the plane, 5 in space.
 
-    Two points meet and, in space, an axis n of a stays normal to two directions of b that span the
-    plane normal to it: n·b₁ = n·b₂ = 0.
+    Two points coincide. In space, an axis n of a also stays normal to two directions b₁, b₂ of b
+    that span the plane normal to the axis: n·b₁ = n·b₂ = 0.
 
     Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        point: on the axis, world frame at assembly, (dim,) [m].
-        axis: world frame at assembly, (3,), any length but zero; only in space.
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
+        point: a point on the axis, world frame at assembly, (dim,) [m].
+        axis: the hinge axis, world frame at assembly, (3,), any length but zero; only in space.
     """
 
-    name: str
-    body_a: str
-    body_b: str
     point: Any
     axis: Any = None
     oriented = True
@@ -143,76 +140,85 @@ class Revolute:
     coordinates = MappingProxyType({"angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, the axes, and pointers that read the angle."""
+        """Returns the point in both frames, the axis, and directions that measure the angle."""
         points = anchors(self, a, b)
         if a.position.shape == (2,):
             return points | {"angle": b.orientation - a.orientation}
         return points | axes_in_both(self, a, b)
 
     @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """p_b − p_a = 0, n·b₁ = n·b₂ = 0."""
+    def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+        """Returns the rows p_b − p_a = 0 for the joint's points, and n·b₁ = n·b₂ = 0 in space.
+
+        n is the axis in a; b₁ and b₂ are directions of b normal to it.
+        """
         rows = primitives.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
         if "axis" not in p:
             return rows
         return rows + parallel(p, a, b)
 
     @staticmethod
-    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
-        """The angle of b in a about the axis, zero at assembly [rad]; over turns in the plane."""
+    def coordinate(name: str, p: dict[str, Any], a: JointFrame, b: JointFrame) -> Row:
+        """Returns the angle of b in a about the axis, zero at assembly [rad].
+
+        In the plane it includes whole turns; in space it lies in [−π, π].
+        """
         if "axis" not in p:
             return primitives.same_orientation(a, b, p["angle"])[0]
         return turn_about(p, a, b)
 
 
 @dataclass(frozen=True)
-class Prismatic:
+class Prismatic(Joint):
     """A slider: 2 rows in the plane, 5 in space; only travel along an axis of a is free.
 
-    The point of b stays on the axis through the point of a, u·(p_b − p_a) = 0 for the directions u
-    normal to the axis, and the orientations agree.
+    The point p_b of b stays on the axis through the point p_a of a: u·(p_b − p_a) = 0 for the
+    directions u normal to the axis. The relative orientation of the bodies is constant.
 
     Attributes:
-        name: unique in the scene.
-        body_a, body_b: names, or `WORLD`.
-        axis: world frame at assembly, (dim,), any length but zero.
-        point: on the axis, world frame at assembly, (dim,) [m]; the second body's centre of mass
-            unless given.
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
+        axis: the direction of travel, world frame at assembly, (dim,), any length but zero.
+        point: a point on the axis, world frame at assembly, (dim,) [m]; the second body's center of
+            mass unless given.
     """
 
-    name: str
-    body_a: str
-    body_b: str
     axis: Any
     point: Any = None
     oriented = True
     coordinates = MappingProxyType({"travel": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """The point in both frames, the axis and its normals in a, the orientation of b in a."""
-        turn = {"orientation": relative_orientation(a, b)}
-        return anchors(self, a, b) | axes_in(self, a) | turn
+        """Returns the point in both frames, axis and normals in a, and b's orientation in a."""
+        orientation = relative_orientation(a, b)
+        return anchors(self, a, b) | axes_in(self, a) | {"orientation": orientation}
 
     @staticmethod
-    def rows(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-        """u·(p_b − p_a) = 0 for u normal to the axis, and the orientations agree."""
+    def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+        """Returns the rows u·(p_b − p_a) = 0, and rows that keep the relative orientation.
+
+        p_a and p_b are the joint's points, u the directions normal to its axis.
+        """
         return on_axis(p, a, b) + primitives.same_orientation(a, b, p["orientation"])
 
     @staticmethod
-    def coordinate(name: str, p: dict[str, Any], a: Any, b: Any) -> Row:
-        """How far b has moved along the axis since assembly [m]."""
+    def coordinate(name: str, p: dict[str, Any], a: JointFrame, b: JointFrame) -> Row:
+        """Returns the travel of b along the axis since assembly [m]."""
         points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
         return primitives.travel(a.direction(p["axis"]), *points)
 
 
-def axes_in(joint: Any, a: Pose) -> dict[str, Array]:
-    """The axis of a joint and the directions normal to it, in the frame of a."""
+def axes_in(joint: Joint, a: Pose) -> dict[str, Array]:
+    """Returns the axis of a joint and the directions normal to it, in the frame of a."""
     directions = zip(("axis", "first_a", "second_a"), triad(joint, a), strict=False)
     return {side: a.local_direction(u) for side, u in directions}
 
 
-def axes_in_both(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
-    """The axis of a joint in space in the frame of a, and the directions normal to it in both."""
+def axes_in_both(joint: Joint, a: Pose, b: Pose) -> dict[str, Array]:
+    """Returns the axis of a joint in the frame of a, and its normals in the frames of a and b.
+
+    For joints in space.
+    """
     n, u, w = triad(joint, a)
     return {
         "axis": a.local_direction(n),
@@ -223,43 +229,47 @@ def axes_in_both(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
     }
 
 
-def on_axis(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-    """u·(p_b − p_a) = 0 for u normal to the axis."""
+def on_axis(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+    """Returns the rows u·(p_b − p_a) = 0, for the joint's points p and normals u of its axis."""
     points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
     normals = [p[side] for side in ("first_a", "second_a") if side in p]
     return [primitives.travel(a.direction(u), *points) for u in normals]
 
 
-def parallel(p: dict[str, Any], a: Any, b: Any) -> list[Row]:
-    """n·b₁ = n·b₂ = 0."""
+def parallel(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
+    """Returns the rows n·b₁ = n·b₂ = 0, for the axis n in a and its normals b₁, b₂ in b."""
     n = a.direction(p["axis"])
     across = (b.direction(p["first_b"]), b.direction(p["second_b"]))
     return [primitives.angle_between(n, u) for u in across]
 
 
-def turn_about(p: dict[str, Any], a: Any, b: Any) -> Row:
-    """The angle of b in a about the normal of two directions of a, zero at assembly [rad]."""
+def turn_about(p: dict[str, Any], a: JointFrame, b: JointFrame) -> Row:
+    """Returns the angle of b in a about the joint's axis, zero at assembly [rad].
+
+    The angle is measured between directions normal to the axis, and lies in [−π, π].
+    """
     first, second = a.direction(p["first_a"]), a.direction(p["second_a"])
     return primitives.turn(first, second, b.direction(p["first_b"]))
 
 
 def anchors(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
-    """The joint's point in both frames; the second body's position unless given."""
+    """Returns the joint's point in both frames; the second body's position unless given."""
     point = own_point(joint, "point", b.position if joint.point is None else joint.point, b)
     own_point(joint, "point", point, a)
     return {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
 
 
 def triad(joint: Any, pose: Pose) -> list[Array]:
-    """The unit axis of a joint and the directions normal to it, right-handed.
+    """Returns the unit axis of a joint and the directions normal to it, right-handed.
 
-    The first of them is the part of `x_axis` normal to the axis, where the joint has one.
+    If the joint has an `x_axis`, the first normal is the part of `x_axis` normal to the axis.
 
     Raises:
-        ValueError: an axis is missing, has the wrong shape or length zero, or they are parallel.
+        ValueError: an axis is missing, has the wrong shape or length zero, or `x_axis` is parallel
+            to the axis.
     """
     n = unit(joint, "axis", pose)
-    if getattr(joint, "x_axis", None) is None:
+    if joint.x_axis is None:
         return basis(n)
     given = unit(joint, "x_axis", pose)
     across = given - jnp.dot(n, given) * n
@@ -274,14 +284,15 @@ def triad(joint: Any, pose: Pose) -> list[Array]:
 
 
 def basis(n: Array) -> list[Array]:
-    """A unit vector and the directions normal to it, right-handed: two in the plane, or three."""
+    """Returns a right-handed basis: the unit vector n, (dim,), and the directions normal to it."""
     return [n, *normals(n)]
 
 
 def normals(n: Array) -> list[Array]:
-    """The directions normal to a unit vector (dim,) that make it a right-handed frame.
+    """Returns the directions normal to a unit vector n, (dim,), that complete a right-handed basis.
 
-    In space the first is n × e, e the world axis along which n is shortest, x before y before z.
+    In space the first direction is n × e, with e the world axis along which n has its smallest
+    component; x comes before y before z.
     """
     if n.shape == (2,):
         return [jnp.stack([-n[1], n[0]])]
@@ -291,11 +302,11 @@ def normals(n: Array) -> list[Array]:
     return [u, jnp.cross(n, u)]
 
 
-def unit(joint: Any, what: str, pose: Pose) -> Array:
-    """A direction of a joint at length one, world frame.
+def unit(joint: Joint, what: str, pose: Pose) -> Array:
+    """Returns a direction that is a field of a joint as a unit vector, world frame.
 
     Raises:
-        ValueError: it is missing, has the wrong shape or length zero.
+        ValueError: the direction is missing, or has the wrong shape or length zero.
     """
     given = getattr(joint, what)
     if given is None:
@@ -303,44 +314,43 @@ def unit(joint: Any, what: str, pose: Pose) -> Array:
     return unit_vector(joint, what, given, pose)
 
 
-def unit_vector(joint: Any, what: str, given: Any, pose: Pose) -> Array:
-    """A vector (dim,) that a user gave to a joint, at length one.
+def unit_vector(joint: BetweenBodies, what: str, given: PyTree, pose: Pose) -> Array:
+    """Returns a vector given by the user, (dim,), as a unit vector.
 
     Raises:
-        ValueError: it has the wrong shape or length zero.
+        ValueError: the vector has the wrong shape or length zero.
     """
     axis = checks.real(label(joint), what, given, pose.position.dtype, pose.position.shape)
     checks.nonzero(label(joint), what, axis)
     return axis / numerics.norm(axis)
 
 
-def check_perpendicular(joint: Any, u: Array, w: Array) -> None:
-    """Checks two unit axes of a joint, where they are concrete.
+def check_perpendicular(joint: Joint, u: Array, w: Array) -> None:
+    """Checks that two unit axes of a joint are perpendicular, if they are concrete.
 
     Raises:
         ValueError: the cosine of the angle between them is not zero.
     """
-    if checks.is_concrete((u, w)):
-        cosine = float(jnp.dot(u, w))
-        if abs(cosine) > PERPENDICULAR:
-            raise ValueError(
-                f"{label(joint)}: axis_a and axis_b must be perpendicular, got a cosine of"
-                f" {cosine:.6g} between them."
-            )
+    cosine = jnp.dot(u, w)
+    if checks.is_concrete(cosine) and abs(float(cosine)) > PERPENDICULAR:
+        raise ValueError(
+            f"{label(joint)}: axis_a and axis_b must be perpendicular, got a cosine of"
+            f" {float(cosine):.6g} between them."
+        )
 
 
 def relative_orientation(a: Pose, b: Pose) -> Array:
-    """θ_b − θ_a in the plane, q_a* q_b in space."""
+    """Returns b's orientation in a: θ_b − θ_a in the plane, a quaternion q_a* q_b in space."""
     if a.position.shape == (2,):
         return b.orientation - a.orientation
     return quaternion.multiply(quaternion.conjugate(a.orientation), b.orientation)
 
 
-def stretched(element: Any, a: Pose, b: Pose) -> dict[str, Array]:
-    """What a rod or a rope lies between: two points in their frames, and its length.
+def stretched(element: Distance | Rope, a: Pose, b: Pose) -> dict[str, Array]:
+    """Returns the ends of a rod or rope in the frames of its bodies, and its length.
 
     Raises:
-        ValueError: it has no length.
+        ValueError: the length is not positive.
     """
     start = own_point(element, "point_a", element.point_a, a)
     end = own_point(element, "point_b", element.point_b, b)

@@ -1,9 +1,9 @@
-"""The rows from which joints are made, in closed form.
+"""The rows of which joints are composed, in closed form.
 
-Each row is a scalar function φ of the bodies' positions with its rate φ̇, the part γ of φ̈ that holds
-no acceleration, and its gradient on each body: the generalized force of a unit multiplier. They
-follow from points p and directions u fixed in the bodies by the product rule alone, since p̈ and ü
-split into a part linear in a and a part without it:
+Each row is a scalar function φ of the bodies' positions. A row also has the rate φ̇, the part γ of
+φ̈ without accelerations, and the gradient of φ on each body: the generalized force of a unit
+multiplier. All follow by the product rule from points p and directions u fixed in the bodies, since
+p̈ and ü split into a part linear in the accelerations a and a part without them:
 
     (u · w)¨  = ü·w + 2 u̇·ẇ + u·ẅ
     (u · d)¨  = ü·d + 2 u̇·ḋ + u·d̈,   d = p_b − p_a
@@ -15,7 +15,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 
@@ -23,19 +23,58 @@ from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector, axes, minus, plus, times
 from jaxcon.core.typing import Lane
 from jaxcon.geometry import quaternion
-from jaxcon.model.frames import Direction, Point
+from jaxcon.system.frames import BodyFrame, Direction, Point
+
+
+class JointFrame(BodyFrame, Protocol):
+    """The motion of one body of each joint, as lanes (element, …), as joints use it.
+
+    `PlanarFrame` has `angle` and `laps`, `SpatialFrame` has `quaternion` and `spin`, and
+    `WorldFrame` has all four.
+    """
+
+    @property
+    def angle(self) -> Lane:
+        """The angle of the body in the plane without `laps` whole turns [rad]."""
+        ...
+
+    @property
+    def laps(self) -> Lane:
+        """The number of whole turns to add to `angle`."""
+        ...
+
+    @property
+    def quaternion(self) -> Vector:
+        """The orientation of the body in space, a unit quaternion from body to world."""
+        ...
+
+    @property
+    def omega(self) -> Any:
+        """The angular velocity ω [rad/s]: a scalar in 2-D, a vector in the body frame in 3-D."""
+        ...
+
+    @property
+    def spin(self) -> Vector:
+        """The angular velocity of the body in space, world frame [rad/s]."""
+        ...
+
+    def torque(self, n: Vector) -> Vector:
+        """Returns the generalized force of a torque n, given in the world frame [N m]; in space."""
+        ...
 
 
 class Row(NamedTuple):
-    """One scalar row of many equal constraints.
+    """One scalar row of many equal constraints, as lanes (element, …).
 
     Attributes:
-        value, rate, bias: φ, φ̇, γ, lanes (element,).
-        pulls: ∂φ̇/∂v on each body.
-        holonomic: whether there is a φ; without one the row is ψ(q, v, t) = 0, value zero, rate ψ.
-        reduced: the angle φ less whole turns, and these turns, where both are known: a large φ is
-            rounded, and differences of large angles are computed from these.
-        swing: of a rod, the square of the rate at which its direction turns [rad²/s²].
+        value, rate, bias: φ, φ̇ and γ (the part of φ̈ without accelerations), lanes (element,).
+        pulls: ∂φ̇/∂v on each body, the generalized force of a unit multiplier.
+        holonomic: True if the row has a φ. Otherwise the row is ψ(q, v, t) = 0, with the value zero
+            and the rate ψ.
+        reduced: for an angle, φ without whole turns and the number of turns; None if unknown. A
+            large φ is rounded, so differences of large angles are computed from these two.
+        swing: for a rod, the squared angular rate of its direction [rad²/s²].
+        compliance: C of J a + C λ = b, a lane (element,); None if it is zero.
     """
 
     value: Lane
@@ -45,16 +84,17 @@ class Row(NamedTuple):
     holonomic: bool = True
     reduced: tuple[Lane, Lane] | None = None
     swing: Lane | None = None
+    compliance: Lane | None = None
 
 
 def meet(p: Point, r: Point) -> list[Row]:
-    """r − p = 0 in the world frame: as many rows as the space has dimensions."""
+    """Returns the rows of r − p = 0 for two points, one row for each world axis."""
     d, ḋ, bias = r.position - p.position, r.velocity - p.velocity, r.bias - p.bias
     return [Row(d[i], ḋ[i], bias[i], (-p.pull(e), r.pull(e))) for i, e in enumerate(axes(len(d)))]
 
 
 def angle_between(u: Direction, w: Direction) -> Row:
-    """u · w, the cosine of the angle between two directions."""
+    """Returns the row of u · w, the cosine of the angle between two directions."""
     return Row(
         u.position.dot(w.position),
         plus(u.velocity.dot(w.position), u.position.dot(w.velocity)),
@@ -67,13 +107,13 @@ def angle_between(u: Direction, w: Direction) -> Row:
 
 
 def difference(x: Row, y: Row) -> Row:
-    """φ_x − φ_y."""
+    """Returns the row of φ_x − φ_y, the difference of two rows."""
     pulls = (x.pulls[0] - y.pulls[0], x.pulls[1] - y.pulls[1])
     return Row(x.value - y.value, x.rate - y.rate, x.bias - y.bias, pulls)
 
 
 def travel(u: Direction, p: Point, r: Point) -> Row:
-    """u · (r − p): how far r lies from p along a direction of p's body."""
+    """Returns the row of u · (r − p): the position of r from p along a direction u of p's body."""
     d, ḋ, bias = r.position - p.position, r.velocity - p.velocity, r.bias - p.bias
     return Row(
         u.position.dot(d),
@@ -84,29 +124,33 @@ def travel(u: Direction, p: Point, r: Point) -> Row:
 
 
 def distance(p: Point, r: Point, length: Lane) -> Row:
-    """‖r − p‖ − l; at ‖r − p‖ = 0 the row has no direction and is zero."""
+    """Returns the row of ‖r − p‖ − l, the distance of two points less a length l.
+
+    If the points coincide, the row has no direction, and its pulls are zero.
+    """
     d, ḋ = r.position - p.position, r.velocity - p.velocity
     span = numerics.norm(d)
     inverse = numerics.safe_divide(1.0, span)
     n = d * inverse
     speed = n.dot(ḋ)
     across = ḋ.dot(ḋ) - speed * speed
-    # the derivative of a quotient would multiply this by that of the span, beyond float32
+    # not across / span: the derivative of this quotient overflows in float32
     bias = n.dot(r.bias - p.bias) + across * inverse
     swing = across * inverse * inverse
     return Row(span - length, speed, bias, (-p.pull(n), r.pull(n)), swing=swing)
 
 
-def same_orientation(a: Any, b: Any, reference: Any) -> list[Row]:
-    """b keeps the orientation that it has in a at assembly: one row in the plane, three in space.
+def same_orientation(a: JointFrame, b: JointFrame, reference: Vector | Lane) -> list[Row]:
+    """Returns the rows that keep b's orientation relative to a: one in the plane, three in space.
 
-    In the plane φ = θ_b − θ_a − θ₀. In space e = q_a* q_b q₀* is the turn still left, and
-    φ = 2 vec(e), the sign of e chosen so that its scalar part is positive. From ė = ½(e ω̃ − ω_a e)
-    with ω̃ = q₀ ω_b q₀*,
+    In the plane φ = θ_b − θ_a − θ₀, with θ₀ the relative angle at assembly. In space e = q_a* q_b
+    q₀* is the rotation error, with q₀ the relative orientation at assembly. Then φ = 2 vec(e), with
+    the sign of e chosen so that its scalar part is positive. With ω̃ = q₀ ω_b q₀* and ė = ½(e ω̃ −
+    ω_a e),
 
         φ̇ = vec(e ω̃ − ω_a e) = e₀ (ω̃ − ω_a) + e⃗ × (ω̃ + ω_a),   γ = vec(ė ω̃ − ω_a ė).
 
-    Components are along a's axes, so the rows turn with the joint and prefer no frame.
+    Components are along a's axes, so the rows turn with the joint and no frame is preferred.
     """
     if not isinstance(reference, Vector):
         value = b.angle - a.angle - reference
@@ -139,23 +183,30 @@ def same_orientation(a: Any, b: Any, reference: Any) -> list[Row]:
 
 
 def _rate(e: Vector, ω_a: Vector, ω_b: Vector) -> Vector:
-    """e ω_b − ω_a e, twice the rate of the turn e."""
+    """Returns e ω_b − ω_a e, twice the rate of the rotation error e, as a quaternion."""
     right = quaternion.multiply(e, Vector(0.0, *ω_b))
     return right - quaternion.multiply(Vector(0.0, *ω_a), e)
 
 
 def turn(first: Direction, second: Direction, pointer: Direction) -> Row:
-    """The angle of a pointer of b in the plane of two directions of a, in [−π, π]."""
+    """Returns the angle of a direction of b, the pointer, in the plane of two directions of a.
+
+    The two directions of a are perpendicular; the angle from the first lies in [−π, π].
+    """
     return bearing(angle_between(first, pointer), angle_between(second, pointer))
 
 
 def bearing(c: Row, s: Row) -> Row:
-    """θ = atan2(s, c) of two rows, in [−π, π].
+    """Returns the row of the angle θ = atan2(s, c) in [−π, π], for the rows of c and s.
 
-    θ̇ = (c ṡ − s ċ)/(c² + s²), and its own rate without a is
-    (c s̈ − s c̈)/(c² + s²) − 2 θ̇ (c ċ + s ṡ)/(c² + s²). It is divided by the root of c² + s² twice:
-    the derivative of 1/(c² + s²) would overflow in float32 where the root is 1e-10.
+    The rate is θ̇ = (c ṡ − s ċ)/(c² + s²). The bias, the part of θ̈ without accelerations, is
+
+        (c s̈ − s c̈)/(c² + s²) − 2 θ̇ (c ċ + s ṡ)/(c² + s²)
+
+    with c̈ and s̈ the biases of c and s.
     """
+    # divide twice by √(c² + s²): the derivative of 1/(c² + s²) overflows in float32 if c² + s² is
+    # 1e-10
     inverse = numerics.safe_divide(1.0, numerics.norm(Vector(c.value, s.value)))
     along, across = c.value * inverse * inverse, s.value * inverse * inverse
     rate = along * s.rate - across * c.rate

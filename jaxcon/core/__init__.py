@@ -1,1 +1,1 @@
-"""Floor 0: pytrees, lanes, guards, checks and status codes."""
+"""Foundations without mechanics: pytrees, lanes, safe numerics, input checks and status codes."""

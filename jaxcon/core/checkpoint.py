@@ -1,6 +1,7 @@
-"""A search on disk: one file that is replaced as a whole, and refused by another search."""
+"""Checkpoint files of long searches, such as tuning.
 
-from __future__ import annotations
+A file is replaced atomically. Reading fails if the checkpoint belongs to a different search.
+"""
 
 import hashlib
 import json
@@ -14,18 +15,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
-from jaxcon.core.typing import PyTree
+from jaxcon.core.typing import Array, PyTree, Scalar, T
 
 PART = ".part"
-"""Ending of a file that is still being written."""
+"""The suffix of a checkpoint file that is still being written."""
 
 
 def path(file: str | Path, owner: str) -> Path:
-    """Where a checkpoint is or will be, checked before anything is done for it.
+    """Returns the path of a checkpoint, after checking that a file can be written there.
+
+    Args:
+        file: the path that the user gave.
+        owner: the function that takes it, for errors.
 
     Raises:
-        ValueError: nothing can be written there.
-        TypeError: it is no path.
+        ValueError: no file can be written there.
+        TypeError: `file` is no path.
     """
     if not isinstance(file, str | os.PathLike):
         raise TypeError(f"{owner}: checkpoint must be the path of a file, got {file!r}.")
@@ -47,7 +52,13 @@ def path(file: str | Path, owner: str) -> Path:
 
 
 def write(file: Path, about: Mapping[str, Any], contents: PyTree) -> None:
-    """Writes leaves and what they belong to; a crash leaves the old file or the new one."""
+    """Writes a checkpoint atomically: after a crash, the file is complete, either old or new.
+
+    Args:
+        file: the path of the checkpoint.
+        about: a description of the search, which `read` compares.
+        contents: the pytree whose leaves are written.
+    """
     arrays: dict[str, Any] = {
         f"leaf_{i}": numbers(x) for i, x in enumerate(jax.tree.leaves(contents))
     }
@@ -60,17 +71,25 @@ def write(file: Path, about: Mapping[str, Any], contents: PyTree) -> None:
     part.replace(file)
 
 
-def read(file: Path, like: PyTree, about: Mapping[str, Any], owner: str) -> PyTree:
-    """The leaves in the structure of `like`; arrays of numpy may have grown since.
+def read(file: Path, like: T, about: Mapping[str, Any], owner: str) -> T:
+    """Reads a checkpoint into the tree structure of `like`.
+
+    Args:
+        file: the path of the checkpoint.
+        like: a pytree with the structure and dtypes of the result; NumPy arrays in it may have
+            another length than the stored arrays.
+        about: the description of the search, which must equal the stored one.
+        owner: the function that reads, for errors.
 
     Raises:
-        ValueError: no checkpoint, or one of another search; names what is not the same.
+        ValueError: the file is no checkpoint, or the checkpoint of another search; the message
+            names the differences.
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
             written = dict(json.loads(str(stored["about"])))
             arrays = [stored[f"leaf_{i}"] for i in range(len(stored.files) - 1)]
-    except Exception as error:  # what is damaged or of another kind may raise anything
+    except Exception as error:  # a damaged file, or a file of another format, may raise anything
         raise ValueError(
             f"{owner}: {file} is no checkpoint of {owner}; give another path."
         ) from error
@@ -85,24 +104,27 @@ def read(file: Path, like: PyTree, about: Mapping[str, Any], owner: str) -> PyTr
     return jax.tree.unflatten(structure, leaves)
 
 
-def digest(*parts: Any) -> str:
-    """Returns a digest of texts and arrays, to tell whether they are equal."""
+def digest(*parts: str | Scalar) -> str:
+    """Returns a SHA-256 digest of strings and arrays, to compare the inputs of searches."""
     raw = (x.encode() if isinstance(x, str) else numbers(x).tobytes() for x in parts)
     return hashlib.sha256(b"".join(raw)).hexdigest()
 
 
-def numbers(x: Any) -> np.ndarray:
-    """A leaf as numbers; keys of random numbers are made of such."""
+def numbers(x: Scalar) -> np.ndarray:
+    """Converts a leaf to a NumPy array; a random key to its key data."""
     return np.asarray(jax.random.key_data(x) if _is_key(x) else x)
 
 
-def _restored(stored: np.ndarray, like: Any) -> Any:
+def _restored(stored: np.ndarray, like: np.ndarray | Array) -> np.ndarray | Array:
+    """Converts a stored array to a leaf of the type of `like`."""
     if isinstance(like, np.ndarray):
         return stored
     if _is_key(like):
         return jax.random.wrap_key_data(jnp.asarray(stored), impl=jax.random.key_impl(like))
-    return jnp.asarray(stored.view(like.dtype))  # numpy does not know every dtype by name
+    # NumPy stores dtypes that it does not know, such as bfloat16, as raw bytes
+    return jnp.asarray(stored.view(like.dtype))
 
 
-def _is_key(x: Any) -> bool:
+def _is_key(x: Scalar) -> bool:
+    """Returns True if x is an array of random keys."""
     return isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)

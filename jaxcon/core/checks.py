@@ -1,39 +1,39 @@
-"""Checks of what a user gave: each error names the culprit, what was got and what was expected.
+"""Checks of user input, with errors that name the argument, its value and the expected value.
 
-Shapes and dtypes are checked always; values only where they are concrete, since a tracer has none.
+Shapes and dtypes are always checked. Values are checked only if they are concrete, not traced.
 """
 
 import inspect
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any
+from typing import Any, SupportsIndex, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array, DType, PyTree, Scalar
 
 FEW = 12
-"""Numbers that a message shows whole."""
+"""The largest number of array entries that a message shows in full."""
 
 TURN = 2 * np.pi * 1.001
-"""An angle beyond a turn, and beyond what rounding to four digits makes of one [rad]."""
+"""The largest angle without a warning [rad]: one turn, plus a margin for four-digit rounding."""
 
 LONG = 80
-"""Letters of what was given that a message shows."""
+"""The largest number of characters of a value that a message shows."""
 
 _waiting_is_forbidden = ContextVar("_waiting_is_forbidden", default=False)
 _constructing = ContextVar("_constructing", default=False)
 
 
-def is_concrete(x: Any) -> bool:
-    """Returns True where every leaf has a value that can be read now: none is traced.
+def is_concrete(x: PyTree) -> bool:
+    """Returns True if no leaf of a tree is traced, so that all values can be read.
 
-    Within `without_waiting` an array of JAX has none either.
+    Within the context `without_waiting`, JAX arrays count as traced.
     """
     unknown = jax.Array if _waiting_is_forbidden.get() else Tracer
     return not any(isinstance(leaf, unknown) for leaf in jax.tree.leaves(x))
@@ -41,9 +41,9 @@ def is_concrete(x: Any) -> bool:
 
 @contextmanager
 def without_waiting() -> Iterator[None]:
-    """Leaves the values of JAX's arrays unread, since a device may still compute them.
+    """Makes checks skip the values of JAX arrays, so that they do not wait for a device.
 
-    Their shapes and dtypes are checked all the same, and what they are is judged by the status.
+    Shapes and dtypes are still checked. Invalid values appear later, in the status.
     """
     token = _waiting_is_forbidden.set(True)
     try:
@@ -52,20 +52,30 @@ def without_waiting() -> Iterator[None]:
         _waiting_is_forbidden.reset(token)
 
 
-class Checked:
-    """A part of a method that checks its numbers where it is constructed, as far as they are known.
+class NumberRange(TypedDict, total=False):
+    """The keyword arguments by which `check` limits values; see there."""
 
-    Traced numbers, and the shapes of arrays, are checked by `init`, `rollout` and `step`: a part
-    constructed with arrays may be meant for a batch of worlds. JAX rebuilds a part without this
-    check; see `pytree`.
+    above: float
+    least: float
+    most: float
+    finite: bool
+    optional: bool
+
+
+class Checked:
+    """A base class of solvers, integrators and the like, whose constructor checks its fields.
+
+    Only concrete values are checked. Shapes of arrays are checked later, by `init`, `rollout` and
+    `step`, because a field may be an array over a batch of worlds. JAX rebuilds instances without
+    these checks; see `pytree`.
     """
 
     def __post_init__(self) -> None:
-        """Checks the numbers.
+        """Calls `check`.
 
         Raises:
-            ValueError: a number is out of range.
-            TypeError: a part is of another kind.
+            ValueError: a field is out of range.
+            TypeError: a field has the wrong type.
         """
         token = _constructing.set(True)
         try:
@@ -74,49 +84,55 @@ class Checked:
             _constructing.reset(token)
 
     def check(self) -> None:
-        """Checks the numbers; nothing by default."""
+        """Checks the fields; by default, does nothing. Subclasses override it."""
 
 
-def is_floating(x: Any) -> bool:
-    """Returns True for a real number or an array of such; the name of a dtype is none."""
+def is_floating(x: PyTree) -> bool:
+    """Returns True if x is a float or a floating array, and False for any other object."""
     return isinstance(x, float) or jnp.issubdtype(getattr(x, "dtype", bool), jnp.floating)
 
 
-def chosen_dtype(*trees: Any) -> Any:
-    """The dtype of the first floating array of JAX in them, else that in use.
+def chosen_dtype(*trees: PyTree) -> np.dtype:
+    """Returns the dtype of the first floating JAX array in trees, or JAX's default dtype.
 
-    NumPy's arrays are numbers like others, and choose none.
+    NumPy arrays and Python numbers do not affect the result.
     """
-    own = (x.dtype for x in jax.tree.leaves(trees) if isinstance(x, jax.Array))
-    return next((x for x in own if jnp.issubdtype(x, jnp.floating)), jnp.result_type(float))
+    dtypes = (x.dtype for x in jax.tree.leaves(trees) if isinstance(x, jax.Array))
+    return next((x for x in dtypes if jnp.issubdtype(x, jnp.floating)), jnp.result_type(float))
 
 
-def plain_zero(x: Any) -> bool:
-    """Returns True for the plain number 0, which leaves no trace in the compiled step."""
+def plain_zero(x: PyTree) -> bool:
+    """Returns True for the Python number 0; terms with this factor are not compiled."""
     return isinstance(x, int | float) and not isinstance(x, bool) and x == 0
 
 
 def real(
-    owner: str, what: str, x: Any, dtype: Any, shape: tuple[int, ...] = (), **limits: Any
+    owner: str,
+    what: str,
+    x: PyTree,
+    dtype: DType,
+    shape: tuple[int, ...] = (),
+    **limits: Unpack[NumberRange],
 ) -> Array:
-    """Real numbers as an array of this dtype and shape.
+    """Checks a value of the user, and returns it as a real array of the scene's dtype.
 
     Args:
-        owner: whose number it is, for errors.
-        what: the number is.
-        x: as it was given.
-        dtype: of the scene.
-        shape: of the array.
-        limits: as of `check`.
+        owner: the class or function that takes the value, for errors.
+        what: the name of the argument, for errors.
+        x: the user's value.
+        dtype: the dtype of the scene.
+        shape: the required shape.
+        limits: bounds on the value; see `check`.
 
     Raises:
-        ValueError: not real numbers, another shape, another floating dtype of a JAX array, or a
-            value that is known and out of range.
+        ValueError: x is not real, has another shape, is a JAX array of another floating dtype, or
+            has a concrete value out of range.
     """
-    known = isinstance(x, jax.Array) and not x.aval.weak_type  # a Python number is no choice
-    if known and jnp.issubdtype(x.dtype, jnp.floating) and x.dtype != dtype:
+    # weakly typed arrays come from Python numbers, which choose no dtype
+    typed = x if isinstance(x, jax.Array) and not x.aval.weak_type else None
+    if typed is not None and jnp.issubdtype(typed.dtype, jnp.floating) and typed.dtype != dtype:
         raise ValueError(
-            f"{owner}: {what} is {x.dtype}, but the scene is {jnp.dtype(dtype).name};"
+            f"{owner}: {what} is {typed.dtype}, but the scene is {jnp.dtype(dtype).name};"
             " mixed dtypes are not promoted: convert it, or build the scene with dtype=."
         )
     return jnp.asarray(check(owner, what, x, shape, dtype=dtype, **limits), dtype)
@@ -125,35 +141,35 @@ def real(
 def check(
     owner: str,
     what: str,
-    x: Any,
+    x: PyTree,
     shape: tuple[int, ...] | None = None,
     *,
-    dtype: Any = None,
+    dtype: DType | None = None,
     above: float = -np.inf,
     least: float = -np.inf,
     most: float = np.inf,
     finite: bool = True,
     optional: bool = False,
 ) -> Any:
-    """Checks real numbers: their kind and shape always, and their values where these are known.
+    """Checks that x is a real number or array of a given shape and, if concrete, within bounds.
 
     Args:
-        owner: whose number it is, for errors.
-        what: the number is.
-        x: as it was given.
-        shape: that it must have; any if None.
-        dtype: in whose range it must lie.
-        above: below all that is allowed.
-        least: the smallest that is allowed.
-        most: the largest.
-        finite: whether infinity is refused; NaN always is.
-        optional: whether it may be None.
+        owner: the class or function that takes the value, for errors.
+        what: the name of the argument, for errors.
+        x: the user's value.
+        shape: the required shape; None for any shape.
+        dtype: a dtype whose range must contain the numbers; None for no such limit.
+        above: an exclusive lower bound.
+        least: an inclusive lower bound.
+        most: an inclusive upper bound.
+        finite: True to refuse infinity; NaN is always refused.
+        optional: True to allow None.
 
     Returns:
-        The numbers: an array of JAX as it is, anything else as an array; None as it is.
+        The numbers as an array; a JAX array or None unchanged.
 
     Raises:
-        ValueError: not real numbers, another shape, or a value out of range.
+        ValueError: x is not real, has another shape, or has a value out of range.
     """
     if x is None and optional:
         return None
@@ -163,8 +179,16 @@ def check(
         raise ValueError(f"{owner}: {what} must have shape {shape}, got {array.shape}.")
     if isinstance(array, jax.Array) and not is_concrete(array):
         return array
-    given = np.asarray(array, float)
-    values = given if dtype is None else _narrowed(owner, what, given, dtype)
+    given = values = np.asarray(array, float)
+    if dtype is not None:
+        with np.errstate(over="ignore"):
+            values = given.astype(dtype)
+        overflow = np.isinf(values) & ~np.isinf(given)
+        if np.any(overflow):
+            raise ValueError(
+                f"{owner}: {what} must be in the range of {jnp.dtype(dtype).name}, got"
+                f" {_shown(given, ~overflow)}."
+            )
     good = (values > above) | (above == -np.inf)
     good &= (values >= least) & (values <= most) & (np.isfinite(values) | (not finite))
     if not np.all(good):
@@ -173,27 +197,8 @@ def check(
     return array
 
 
-def _narrowed(owner: str, what: str, given: np.ndarray, dtype: Any) -> np.ndarray:
-    """The numbers in the dtype of the scene.
-
-    Raises:
-        ValueError: one is beyond its range.
-    """
-    if given.dtype == dtype:
-        return given
-    with np.errstate(over="ignore"):
-        values = given.astype(dtype)
-    overflow = np.isinf(values) & ~np.isinf(given)
-    if np.any(overflow):
-        raise ValueError(
-            f"{owner}: {what} must be in the range of {jnp.dtype(dtype).name}, got"
-            f" {_shown(given, ~overflow)}."
-        )
-    return values
-
-
 def _limits(above: float, least: float, most: float, finite: bool) -> str:
-    """The values that are allowed, in words."""
+    """Describes the allowed range of values in words, for messages."""
     ending = " and finite" if finite else ""
     if above > -np.inf and most < np.inf:
         return f"be above {above:g} and at most {most:g}"
@@ -206,17 +211,17 @@ def _limits(above: float, least: float, most: float, finite: bool) -> str:
     return "be finite" if finite else "not be NaN"
 
 
-def _numbers(owner: str, what: str, x: Any, wanted: str = "real numbers") -> Any:
-    """Real numbers as an array, of JAX where it is one or has one in it.
+def _numbers(owner: str, what: str, x: PyTree, wanted: str = "real numbers") -> Any:
+    """Converts a value of the user to a real array: a JAX array if x is or contains one.
 
     Args:
-        owner: whose they are, for errors.
-        what: they are.
-        x: as it was given.
-        wanted: what they must be, in words.
+        owner: the class or function that takes the value, for errors.
+        what: the name of the argument, for errors.
+        x: the user's value.
+        wanted: the expected kind of value in words, for errors.
 
     Raises:
-        ValueError: they are none, or not of one shape.
+        ValueError: x is not real, or is a ragged list.
     """
     if isinstance(x, jax.Array):
         array = x
@@ -224,15 +229,19 @@ def _numbers(owner: str, what: str, x: Any, wanted: str = "real numbers") -> Any
         return np.asarray(x)
     else:
         array = _from_host(owner, what, x, wanted)
-    # by kind, since NumPy counts durations among the integers; bfloat16 has one of its own
+    # tests dtype.kind, since NumPy counts timedelta64 as an integer; bfloat16 has an unusual kind
     kind = getattr(array.dtype, "kind", "?")
     if kind not in "fiu" and not jnp.issubdtype(array.dtype, jnp.floating):
         raise ValueError(f"{owner}: {what} must be {wanted}, got {shortened(x)}.")
     return array
 
 
-def _from_host(owner: str, what: str, x: Any, wanted: str) -> Any:
-    """An array of what is no array of JAX."""
+def _from_host(owner: str, what: str, x: PyTree, wanted: str) -> Any:
+    """Converts lists, NumPy arrays and Python numbers to an array; x is not a JAX array.
+
+    Raises:
+        ValueError: the input is not numeric, ragged, or out of the range of floats.
+    """
     leaves = jax.tree.leaves(x) if isinstance(x, list | tuple) else [x]
     wrong = next((y for y in leaves if isinstance(y, bool | np.bool_)), None)
     if x is None or wrong is not None:
@@ -242,11 +251,11 @@ def _from_host(owner: str, what: str, x: Any, wanted: str) -> Any:
             return jnp.asarray(x)
         if isinstance(x, np.ma.MaskedArray):
             x = np.ma.filled(x.astype(float), np.nan)
-        with warnings.catch_warnings():  # of ragged lists, by older versions of NumPy
+        with warnings.catch_warnings():  # older versions of NumPy only warn of ragged lists
             warnings.simplefilter("error")
             array = np.asarray(x)
         integers = array.dtype == object and all(type(y) is int for y in array.ravel())
-        return array.astype(float) if integers else array  # those beyond 64 bits
+        return array.astype(float) if integers else array  # Python integers beyond 64 bits
     except OverflowError as error:
         raise ValueError(
             f"{owner}: {what} is beyond the range of floating numbers, got {shortened(x)}."
@@ -258,17 +267,17 @@ def _from_host(owner: str, what: str, x: Any, wanted: str) -> Any:
 
 
 def components(owner: str, **given: tuple[Any, tuple[int, ...]]) -> list[Any]:
-    """Real numbers whose first axes enumerate components; values are not read.
+    """Converts arguments to floating arrays, checking the sizes of their first axes.
+
+    Values are not read, so traced arrays are accepted.
 
     Args:
-        owner: whose numbers they are, for errors.
-        given: by name, the numbers and the sizes of their first axes.
-
-    Returns:
-        Arrays of floating numbers.
+        owner: the function that takes the arguments, for errors.
+        given: for each argument name, the value and the required sizes of its first axes.
 
     Raises:
-        ValueError: not real numbers, other sizes, or further axes that do not broadcast.
+        ValueError: a value is not real, has other sizes, or the further axes of the arguments do
+            not broadcast against each other.
     """
     arrays = []
     for what, (x, sizes) in given.items():
@@ -291,21 +300,21 @@ def components(owner: str, **given: tuple[Any, tuple[int, ...]]) -> list[Any]:
 
 
 def shortened(x: Any) -> str:
-    """Describes a value that was given, in few words."""
+    """Returns the repr of a value, cut to `LONG` characters, for messages."""
     try:
         text = repr(x)
-    except Exception:  # an integer of too many digits, or a faulty object of the user's
+    except Exception:  # an integer with too many digits, or a user's object with a faulty repr
         return f"a value of type {type(x).__name__}"
     return clipped(text)
 
 
 def clipped(text: str) -> str:
-    """The text, cut where it is long."""
+    """Cuts a text after `LONG` characters."""
     return text if len(text) <= LONG else f"{text[:LONG]}…"
 
 
 def numerals(x: Any) -> str:
-    """Numbers as a message shows them: seven digits, without the noise of float32.
+    """Formats numbers with seven digits, for messages; this hides the rounding noise of float32.
 
     Args:
         x: an array, nested lists or a number.
@@ -317,21 +326,27 @@ def numerals(x: Any) -> str:
 
 
 def _shown(values: np.ndarray, good: np.ndarray) -> str:
-    """Numbers in words: all where they are few, else the first that is not good and its place."""
+    """Formats a whole array if it is small, otherwise its first invalid entry and the index.
+
+    Args:
+        values: the array.
+        good: a mask of the valid entries.
+    """
     if values.size <= FEW:
         return numerals(values)
     place = tuple(int(i) for i in np.argwhere(~good)[0])
     return f"{numerals(values[place])} at {list(place)} of an array {values.shape}"
 
 
-def count(owner: str, what: str, x: Any, least: int = 1, most: int = 2**31 - 1) -> None:
-    """Checks that a value is a whole number within limits.
+def count(
+    owner: str, what: str, x: PyTree | SupportsIndex, least: int = 1, most: int = 2**31 - 1
+) -> None:
+    """Checks that a value is an integer from `least` to `most`.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the value is no integer, or out of range.
     """
-    whole = isinstance(x, int | np.integer) and not isinstance(x, bool | np.timedelta64)
-    if not whole or x < least:
+    if not isinstance(x, int | np.integer) or isinstance(x, bool | np.timedelta64) or x < least:
         raise ValueError(
             f"{owner}: {what} must be a whole number from {least}, got {shortened(x)}."
         )
@@ -339,21 +354,21 @@ def count(owner: str, what: str, x: Any, least: int = 1, most: int = 2**31 - 1) 
         raise ValueError(f"{owner}: {what} must be at most {most}, got {shortened(x)}.")
 
 
-def flag(owner: str, what: str, x: Any) -> None:
+def flag(owner: str, what: str, x: PyTree) -> None:
     """Checks that a value is True or False.
 
     Raises:
-        ValueError: it is not.
+        ValueError: the value is no bool.
     """
     if not isinstance(x, bool):
         raise ValueError(f"{owner}: {what} must be True or False, got {shortened(x)}.")
 
 
-def nonzero(owner: str, what: str, x: Any) -> None:
-    """Checks that a vector has a direction.
+def nonzero(owner: str, what: str, x: PyTree) -> None:
+    """Checks that a vector is finite and not zero.
 
     Raises:
-        ValueError: it has none, or is none of numbers.
+        ValueError: the vector is zero, not finite or not numeric.
     """
     values = _numbers(owner, what, x)
     if is_concrete(values):
@@ -362,13 +377,13 @@ def nonzero(owner: str, what: str, x: Any) -> None:
             raise ValueError(f"{owner}: {what} must have a length, got {numerals(values)}.")
 
 
-def radians(owner: str, what: str, x: Any) -> None:
-    """Warns of an angle of more than a turn, which is more likely to be one in degrees.
+def radians(owner: str, what: str, x: Scalar) -> None:
+    """Warns if an angle exceeds a full turn, because it is probably given in degrees.
 
     Args:
-        owner: whose angle it is.
-        what: the angle is.
-        x: angle () [rad]; infinity is no angle.
+        owner: the class or function that takes the angle, for the message.
+        what: the name of the argument, for the message.
+        x: the angle, () [rad]; infinity gives no warning.
     """
     if is_concrete(x) and TURN < abs(float(x)) < np.inf:
         warnings.warn(
@@ -378,11 +393,11 @@ def radians(owner: str, what: str, x: Any) -> None:
         )
 
 
-def recorded(owner: str, what: str, x: Any) -> Any:
-    """Real numbers, NaN where they are masked.
+def recorded(owner: str, what: str, x: Scalar) -> Any:
+    """Checks recorded data of the user; returns it with NaN in place of masked entries.
 
     Raises:
-        ValueError: they are none.
+        ValueError: the data are not real.
     """
     kind = x.dtype if isinstance(x, jax.Array) else np.asarray(x).dtype
     if getattr(kind, "kind", "?") not in "fiu" and not jnp.issubdtype(kind, jnp.floating):
@@ -394,18 +409,20 @@ def recorded(owner: str, what: str, x: Any) -> Any:
     return np.ma.filled(x.astype(kind if kind.kind == "f" else float), np.nan)
 
 
-def takes(owner: str, what: str, function: Any, given: tuple[str, ...], why: str = "") -> None:
-    """Checks that a user's function can be called with so many arguments.
+def takes(
+    owner: str, what: str, function: Callable[..., Any], given: tuple[str, ...], why: str = ""
+) -> None:
+    """Checks that a user's function accepts as many positional arguments as a call will pass.
 
     Args:
-        owner: that calls it.
-        what: the function is.
-        function: as it was given.
-        given: what it is called with, in words.
-        why: it is called so.
+        owner: the function that takes the user's function, for errors.
+        what: the name of the argument, for errors.
+        function: the user's function.
+        given: the names of the arguments that the call passes, for errors.
+        why: the reason for these arguments, for errors.
 
     Raises:
-        TypeError: it is no function, or one of other arguments.
+        TypeError: `function` is no function, or takes other arguments.
     """
     if not callable(function):
         raise TypeError(f"{owner}: {what} must be a function of {given[0]}, got {function!r}.")
@@ -421,7 +438,7 @@ def takes(owner: str, what: str, function: Any, given: tuple[str, ...], why: str
 
 
 def described(tree: PyTree) -> str:
-    """The shapes of arrays by name."""
+    """Describes the arrays of a tree by name and shape, for messages."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     if [path for path, _ in leaves] == [()]:
         return f"an array {jnp.shape(leaves[0][1])}"
@@ -430,6 +447,6 @@ def described(tree: PyTree) -> str:
 
 
 def fits(shape: tuple[int, ...], into: tuple[int, ...]) -> bool:
-    """Returns True where an array broadcasts to a shape, and that shape to none larger."""
+    """Returns True if an array of shape `shape` can be broadcast to exactly the shape `into`."""
     pairs = zip(reversed(shape), reversed(into), strict=False)
     return len(shape) <= len(into) and all(n in (1, m) for n, m in pairs)

@@ -1,4 +1,4 @@
-"""Dependence of a function on its argument, found by tracing it."""
+"""A test whether a function depends on its argument, by tracing."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,8 +6,9 @@ from typing import Any
 import jax
 
 from jaxcon.core.jaxprs import read_arguments
+from jaxcon.core.typing import PyTree
 
 
-def depends(function: Callable[[Any], Any], x: Any) -> bool:
-    """Returns True where the result of function(x) depends on some number in x."""
+def depends(function: Callable[[Any], PyTree], x: PyTree) -> bool:
+    """Returns True if the result of function(x) depends on any leaf of x."""
     return any(read_arguments(jax.make_jaxpr(function)(x).jaxpr))

@@ -1,6 +1,4 @@
-"""Batches of worlds over the devices of a mesh."""
-
-from __future__ import annotations
+"""Distribution of batches of worlds over the devices of a mesh."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,31 +7,33 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxcon.core.typing import PyTree
+from jaxcon.core.typing import PyTree, T, Tree
 
 SHARED, APART = PartitionSpec(), PartitionSpec("worlds")
 
 
-def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
-    """Returns the batch with equal parts of its worlds, the first axis, on each device.
+def shard(batch: Tree, mesh: Mesh | None = None) -> Tree:
+    """Splits a batch along its first axis (worlds) into equal parts, one for each device.
 
-    What `jit(vmap(f))` makes of it stays there, and nothing is exchanged: loops and branches of a
-    method ask on each device of its own worlds alone. Gradients by numbers that worlds share are
-    sums over all of them; take `over_devices` for these.
+    `jit(vmap(f))` then runs without communication: results stay on their device, and loops and
+    branches of a method depend only on the worlds of the device. For gradients with respect to
+    parameters that all worlds share, which are sums over worlds, use `over_devices`.
 
-    Several processes, joined by `jax.distributed.initialize`, all give the same batch and keep
-    their parts of it. Where it is large, give keys or starts, and make the batch of them in `jit`.
+    If several processes are joined by `jax.distributed.initialize`, all must pass the same batch;
+    each process keeps its part. For a large batch, shard random keys or initial values, and compute
+    the batch from them in `jit`.
 
     Args:
         batch: a pytree of arrays (n, …).
-        mesh: of any shape; all devices of all processes unless given.
+        mesh: a mesh of any shape; None for all devices of all processes.
 
     Returns:
-        The batch, its arrays split along their first axes.
+        The batch, with arrays split along their first axes.
 
     Raises:
-        ValueError: an array has no first axis, or another n; or n does not divide.
-        TypeError: the mesh is none.
+        ValueError: an array has no first axis, the arrays differ in n, or n is not a multiple of
+            the number of devices.
+        TypeError: `mesh` is no mesh.
     """
     mesh = _line(mesh)
     _check("shard", batch, mesh.size)
@@ -41,50 +41,50 @@ def shard(batch: PyTree, mesh: Mesh | None = None) -> PyTree:
 
 
 def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Callable[..., Any]:
-    """function(shared, batch), where each device works on its own part of the batch.
+    """Maps function(shared, batch) over devices; each device evaluates its part of the batch.
 
-    No device waits for another, also where methods iterate until their worlds are done. It is good
-    to jit and to differentiate. The derivative by what is shared is summed on each device over the
-    whole motion, and over devices once, at the end: under `jit(grad(vmap(f)))` of a batch from
-    `shard` devices would meet in every step.
+    Devices do not wait for each other, even in iterative solvers. The result can be jitted and
+    differentiated. The gradient with respect to `shared` is summed on each device over the whole
+    motion, and over devices once at the end. With `jit(grad(vmap(f)))` of a batch from `shard`,
+    devices would exchange it in every step.
 
-        settled = jc.over_devices(jax.vmap(settle, in_axes=(None, 0)))
+        settled = jc.devices.over_devices(jax.vmap(settle, in_axes=(None, 0)))
         slope = jax.jit(jax.grad(lambda p, worlds: jnp.mean(settled(p, worlds))))
 
     Args:
-        function: (shared, batch) → a pytree of arrays, each with a first axis of the worlds of the
-            batch, which do not act on each other.
-        mesh: as of `shard`.
+        function: (shared, batch) → a pytree of arrays, each with the worlds along its first axis.
+            Worlds must not depend on each other.
+        mesh: see `shard`.
 
     Returns:
-        (shared, batch) → the same as the function. The batch need not lie over the devices before.
+        (shared, batch) → the result of the function. The batch need not be sharded before. A call
+        raises the ValueError of `shard`.
 
     Raises:
-        ValueError: as of `shard`, when it is called.
-        TypeError: the mesh is none.
+        TypeError: `mesh` is no mesh.
     """
     line = _line(mesh)
-    # what is shared stays so without being told apart from what is not in every operation
+    # without this check, values need no annotation of whether devices share them
     parts = {"in_specs": (SHARED, APART), "out_specs": APART, "check_vma": False}
     mapped = jax.shard_map(function, mesh=line, **parts)
 
-    def call(shared: PyTree, batch: PyTree) -> PyTree:
+    def call(shared: PyTree, batch: PyTree) -> Any:
         _check("over_devices", batch, line.size)
         return mapped(shared, batch)
 
     return call
 
 
-def gathered(tree: PyTree, mesh: Mesh) -> PyTree:
-    """Returns the tree with all of it on every device, inside `jit`."""
+def gathered(tree: T, mesh: Mesh) -> T:
+    """Replicates a tree on every device of a mesh; for use inside `jit`."""
     return jax.lax.with_sharding_constraint(tree, NamedSharding(_line(mesh), SHARED))
 
 
 def _line(mesh: Mesh | None) -> Mesh:
-    """The devices of a mesh along one axis, of worlds; where arrays lie is left to the compiler.
+    """Returns a one-dimensional mesh of the same devices, with the axis "worlds".
 
     Raises:
-        TypeError: it is no mesh.
+        TypeError: `mesh` is no mesh.
     """
     if not isinstance(mesh, Mesh | None):
         raise TypeError(
@@ -96,10 +96,10 @@ def _line(mesh: Mesh | None) -> Mesh:
 
 
 def _check(owner: str, batch: PyTree, devices: int) -> None:
-    """Checks that a batch divides over so many devices.
+    """Checks that a batch can be split into equal parts, one for each device.
 
     Raises:
-        ValueError: as of `shard`.
+        ValueError: the batch cannot be split; see `shard`.
     """
     leaves = jax.tree_util.tree_leaves_with_path(batch)
     sizes = {jax.tree_util.keystr(path) or "the array": np.shape(x)[:1] for path, x in leaves}
@@ -110,8 +110,8 @@ def _check(owner: str, batch: PyTree, devices: int) -> None:
             " would take."
         )
     if len(set(sizes.values())) > 1:
-        found = {name: size[0] for name, size in sizes.items()}
-        raise ValueError(f"{owner}: all of a batch must have as many worlds, got {found}.")
+        counts = {name: size[0] for name, size in sizes.items()}
+        raise ValueError(f"{owner}: all of a batch must have as many worlds, got {counts}.")
     for (n,) in set(sizes.values()):
         if n % devices:
             raise ValueError(

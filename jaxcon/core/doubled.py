@@ -1,10 +1,11 @@
-"""Numbers as the sum of two floats, and functions evaluated in such numbers.
+"""Double-float arithmetic: a number is stored as the unevaluated sum of two floats.
 
-A float32 of 1e5 s is a multiple of 8 ms. A time as the sum of two floats has 48 bits instead of 24,
-and so has the phase of a motion that is computed from it.
+Near 1e5 s, float32 resolves time only to 8 ms. A time stored as the sum of two float32 has 48 bits
+instead of 24, and so has the phase of a motion that is computed from it.
 
-XLA does not reassociate sums, but a CPU may contract a product and a sum into one rounding. All
-products here are therefore of halves, which are exact, so that a contraction changes nothing.
+XLA does not reassociate sums, but a CPU may contract a product and a sum into one rounding (FMA).
+Products are therefore computed from factors that are split into halves of their bits. The products
+of halves are exact, so contraction does not change them.
 
 References:
     Dekker, A floating-point technique for extending the available precision,
@@ -15,72 +16,73 @@ References:
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 
+from jaxcon.core.closures import apply_equation
 from jaxcon.core.jaxprs import called
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, DType, PyTree, Scalar
 
 TWO_PI = (6.283185307179586, 2.4492935982947064e-16, -5.989539619436679e-33)
-"""2π as a sum of three floats of 64 bits."""
+"""Three 64-bit floats whose sum is 2π."""
 
 
 @pytree
 class Doubled:
-    """high + low, where high is the float nearest to the sum.
+    """A double-float number high + low, where `high` is the float nearest to the sum.
 
-    Derivatives are those of exact arithmetic, and `high` carries them.
+    Derivatives are those of exact arithmetic; the tangent of `high` contains them.
 
     Attributes:
         high: the rounded number, any shape.
-        low: what it lacks, of the same shape.
+        low: the remainder, of the same shape.
     """
 
     high: Array
     low: Array
 
     @classmethod
-    def of(cls, x: Any) -> Doubled:
-        """The number itself, or a float without a remainder."""
-        return x if isinstance(x, Doubled) else cls(x, jnp.zeros_like(x))
+    def of(cls, x: Doubled | Scalar) -> Doubled:
+        """Converts a float to a `Doubled` with remainder zero; returns a `Doubled` unchanged."""
+        return x if isinstance(x, Doubled) else cls(x, jnp.zeros_like(x))  # type: ignore[arg-type]
 
-    def __add__(self, other: Any) -> Doubled:
-        """x + y."""
+    def __add__(self, other: Doubled | Array) -> Doubled:
+        """Returns x + y."""
         other = Doubled.of(other)
         x, y = jax.lax.stop_gradient((self, other))
         s, rest = _two_sum(x.high, y.high)
         return _carrying(s, rest + (x.low + y.low), self.value + other.value)
 
     def __neg__(self) -> Doubled:
-        """−x."""
+        """Returns −x."""
         return Doubled(-self.high, -self.low)
 
-    def __sub__(self, other: Any) -> Doubled:
-        """x − y."""
+    def __sub__(self, other: Doubled | Array) -> Doubled:
+        """Returns x − y."""
         return self + -Doubled.of(other)
 
-    def __mul__(self, other: Any) -> Doubled:
-        """x y."""
+    def __mul__(self, other: Doubled | Array) -> Doubled:
+        """Returns x y."""
         other = Doubled.of(other)
         x, y = jax.lax.stop_gradient((self, other))
         p, rest = _two_product(x.high, y.high)
         rest = rest + (x.high * y.low + x.low * y.high)
         return _carrying(p, rest, self.value * other.value)
 
-    def __rmul__(self, other: Any) -> Doubled:
-        """y x."""
+    def __rmul__(self, other: Scalar) -> Doubled:
+        """Returns y x."""
         return self * jnp.asarray(other, self.high.dtype)
 
-    def __truediv__(self, other: Any) -> Doubled:
-        """x / y."""
+    def __truediv__(self, other: Doubled | Array) -> Doubled:
+        """Returns x / y."""
         other = Doubled.of(other)
         x, y = jax.lax.stop_gradient((self, other))
         first = x.high / y.high
@@ -89,16 +91,16 @@ class Doubled:
 
     @property
     def value(self) -> Array:
-        """`high`, with the derivative by both parts."""
+        """The sum of both parts as a float: equal to `high`, but with the tangent of the sum."""
         return self.high + self.low
 
     @property
     def turns(self) -> Array:
-        """The whole turns that `reduced` leaves out."""
+        """The number of whole turns (multiples of 2π) that `reduced` removes from an angle."""
         return jnp.round(jax.lax.stop_gradient(self.high) / TWO_PI[0])
 
     def reduced(self) -> Doubled:
-        """The number less whole turns, within half a turn of zero; its derivative is 1."""
+        """Returns the angle minus whole turns, in [−π, π]; its derivative is 1."""
         x, turns = jax.lax.stop_gradient(self), self.turns
         for part in two_pi(x.high.dtype):
             x = x - Doubled(*_two_product(turns, jnp.full_like(turns, part)))
@@ -107,23 +109,27 @@ class Doubled:
 
 @dataclass(frozen=True)
 class Tangent:
-    """A float on which results depend linearly, so that its products need no remainder.
+    """A tangent, as a plain float: derivatives need no double-float precision.
 
     Attributes:
-        high: the number, any shape.
+        high: the tangent, any shape.
     """
 
     high: Array
 
 
-def rounded(x: Any) -> Any:
-    """The float nearest to a number that may have a remainder."""
+Operand: TypeAlias = Doubled | Tangent | Scalar
+"""An operand of a primitive: a float with or without a remainder, or a tangent."""
+
+
+def rounded(x: Operand) -> Any:
+    """Returns the float nearest to an operand; a plain number is returned unchanged."""
     return x.high if isinstance(x, Doubled | Tangent) else x
 
 
 @functools.cache
-def two_pi(dtype: Any) -> tuple[float, ...]:
-    """2π as a sum of three floats of a dtype."""
+def two_pi(dtype: DType) -> tuple[float, ...]:
+    """Returns three floats of a dtype whose sum is 2π."""
     left, parts = sum(map(Fraction, TWO_PI)), []
     for _ in range(3):
         parts.append(float(np.asarray(float(left), dtype)))
@@ -133,33 +139,33 @@ def two_pi(dtype: Any) -> tuple[float, ...]:
 
 @jax.custom_jvp
 def _carry(x: Array, like: Array) -> Array:
-    """x, with the derivative of `like`."""
+    """Returns x, with the derivative of `like` in place of its own."""
     return x
 
 
 @_carry.defjvp
-def _(primals: Any, tangents: Any) -> tuple[Array, Array]:
+def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
     return _carry(*primals), tangents[1]
 
 
 def _carrying(large: Array, small: Array, like: Array) -> Doubled:
-    """The sum of a number and a small one (Dekker), with the derivative of a plain sum."""
+    """Adds a large and a small float exactly (Dekker); the derivative is that of `like`."""
     high = large + small
     return Doubled(_carry(high, like), small - (high - large))
 
 
 def _two_sum(x: Array, y: Array) -> tuple[Array, Array]:
-    """x + y rounded, and what rounding took (Knuth)."""
+    """Returns the rounded sum x + y and its exact rounding error (Knuth)."""
     s = x + y
     other = s - x
     return s, (x - (s - other)) + (y - other)
 
 
 def _halves(x: Array) -> tuple[Array, Array]:
-    """x as a sum of two floats of half the bits: their products are exact.
+    """Splits x into a sum of two floats with half the bits each, so that their products are exact.
 
-    The upper half is cut from the bits. The usual C x − (C x − x) fails where the product and the
-    difference are contracted.
+    The upper half is x with its lower bits masked. The usual formula C x − (C x − x) fails if a
+    CPU contracts the product and the difference.
     """
     bits = {32: (jnp.int32, -1 << 12), 64: (jnp.int64, -1 << 27)}
     integer, mask = bits[jnp.finfo(x.dtype).bits]
@@ -169,26 +175,26 @@ def _halves(x: Array) -> tuple[Array, Array]:
 
 
 def _two_product(x: Array, y: Array) -> tuple[Array, Array]:
-    """x y, rounded to its last bit but one, and what rounding took."""
+    """Returns the product x y, accurate to the last bit but one, and its rounding error."""
     (a, b), (c, d) = _halves(x), _halves(y)
     middle, rest = _two_sum(a * d, b * c)
-    p, more = _two_sum(a * c, middle)
-    return p, more + (rest + b * d)
+    p, error = _two_sum(a * c, middle)
+    return p, error + (rest + b * d)
 
 
-def evaluate(function: Callable[..., Array], x: Doubled, *args: Any) -> Doubled:
-    """function(x, *args), computed in sums of two floats where it adds and multiplies.
+def evaluate(function: Callable[..., Array], x: Doubled, *args: PyTree) -> Doubled:
+    """Evaluates function(x, *args) with sums and products in double-float arithmetic.
 
-    That holds within branches, loops and called functions, too, and for complex numbers. Sines,
-    cosines and complex exponentials get their argument within half a turn of zero. Remainders, and
-    the whole numbers of floor, ceil and round, are those of the sum. Every other operation f is
-    linearized, f(high) + f′(high) low; conditions see the rounded number. Where two floats
-    overflow, which is before one does, the result is that of the rounded number.
+    Branches, loops, called functions and complex numbers are supported. Arguments of sines, cosines
+    and complex exponentials are first reduced to [−π, π]. `rem`, `floor`, `ceil` and `round` apply
+    to the sum of both floats. Every other operation f is linearized: f(high) + f′(high) low.
+    Conditions use the rounded number. Double-float results can overflow earlier than floats; the
+    function is then evaluated at the rounded number.
 
     Args:
-        function: pure; returns an array.
-        x: its first argument.
-        args: pytrees of arrays.
+        function: a pure function that returns an array.
+        x: the first argument, in double-float precision.
+        args: pytrees of arrays, the other arguments.
     """
     closed, leaves = jax.make_jaxpr(function)(x.high, *args), jax.tree.leaves(args)
     (result,) = map(Doubled.of, Evaluation().run(closed.jaxpr, closed.consts, [x, *leaves]))
@@ -197,53 +203,55 @@ def evaluate(function: Callable[..., Array], x: Doubled, *args: Any) -> Doubled:
     return Doubled(jnp.where(finite, result.high, plain), jnp.where(finite, result.low, 0))
 
 
-def rounding_operations(function: Callable[..., Array], x: Doubled, *args: Any) -> list[str]:
-    """The names of the operations on x in which `evaluate` sees the rounded number alone.
+def rounding_operations(function: Callable[..., Array], x: Doubled, *args: PyTree) -> list[str]:
+    """Returns the names of primitives for which `evaluate` loses the double-float precision.
+
+    These are primitives, such as `cumsum`, that contain large sums or products, but are linearized
+    as a whole.
 
     Args:
-        function: pure; returns an array.
-        x: its first argument.
-        args: pytrees of arrays.
+        function: a pure function that returns an array.
+        x: the first argument, in double-float precision.
+        args: pytrees of arrays, the other arguments.
     """
-    evaluation = Evaluation()
-
-    def run(x: Doubled, leaves: Any) -> list[Any]:
-        return evaluation.run(closed.jaxpr, closed.consts, [x, *leaves])
-
-    closed = jax.make_jaxpr(function)(x.high, *args)
-    jax.eval_shape(run, x, jax.tree.leaves(args))
+    evaluation, closed = Evaluation(), jax.make_jaxpr(function)(x.high, *args)
+    jax.eval_shape(
+        lambda x, *leaves: evaluation.run(closed.jaxpr, closed.consts, [x, *leaves]),
+        x,
+        *jax.tree.leaves(args),
+    )
     return sorted(evaluation.rounding)
 
 
 class Evaluation:
-    """The evaluation of a jaxpr in sums of two floats.
+    """The evaluation of a jaxpr in double-float arithmetic.
 
     Attributes:
-        rounding: names of the operations that were linearized as a whole, though sums and products
-            within them may be large.
+        rounding: the names of the evaluated primitives that were linearized as a whole, although
+            they contain large sums or products.
     """
 
     def __init__(self) -> None:
-        """Has met no operation yet."""
+        """Creates an evaluation in which no primitive has been evaluated."""
         self.rounding: set[str] = set()
 
-    def run(self, jaxpr: Any, consts: Any, inputs: Any) -> list[Any]:
-        """The results of a jaxpr, of which some inputs have remainders."""
-        known = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
+    def run(self, jaxpr: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+        """Evaluates an open jaxpr; inputs and results are plain arrays or `Doubled`."""
+        values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *inputs), strict=True))
 
-        def read(x: Any) -> Any:
-            return x.val if isinstance(x, Literal) else known[x]
+        def read(x: Var | Literal) -> Any:
+            return x.val if isinstance(x, Literal) else values[x]
 
         for equation in jaxpr.eqns:
             results = self._apply(jaxpr, equation, [read(x) for x in equation.invars])
-            known.update(zip(equation.outvars, results, strict=True))
+            values.update(zip(equation.outvars, results, strict=True))
         return [read(x) for x in jaxpr.outvars]
 
-    def _apply(self, jaxpr: Any, equation: Any, inputs: list[Any]) -> list[Any]:
-        """The results of one equation of a jaxpr."""
+    def _apply(self, jaxpr: Jaxpr, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
+        """Evaluates one equation of a jaxpr, with plain arrays, `Doubled` or tangents as inputs."""
         name, params = equation.primitive.name, equation.params
         if not any(isinstance(x, Doubled | Tangent) for x in inputs):
-            return _bound(jaxpr, equation, inputs)
+            return apply_equation(jaxpr, equation, inputs)
         linear = any(isinstance(x, Tangent) for x in inputs)
         if name in FLOW and not linear:
             return FLOW[name](self, params, inputs)
@@ -252,7 +260,7 @@ class Evaluation:
         if name != "custom_vjp_call" and (inner := called(equation)) is not None:
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), inputs)
         if linear:
-            return list(map(Tangent, _bound(jaxpr, equation, list(map(rounded, inputs)))))
+            return list(map(Tangent, apply_equation(jaxpr, equation, list(map(rounded, inputs)))))
         if name in RULES:
             return [RULES[name](*map(_doubled, inputs))]
         if name == "round":
@@ -272,17 +280,17 @@ class Evaluation:
             self.rounding.add(name)
         return _linearized(jaxpr, equation, inputs)
 
-    def _closed(self, closed: Any, inputs: Any) -> list[Any]:
-        """The results of a closed jaxpr, all but integers and truth values with remainders."""
+    def _closed(self, closed: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
+        """Evaluates a closed jaxpr; results are `Doubled`, except integers and booleans."""
         return list(map(_doubled, self.run(closed.jaxpr, closed.consts, inputs)))
 
-    def _cond(self, params: Any, inputs: list[Any]) -> list[Any]:
-        """`lax.cond` and `lax.switch`, by the index of the rounded number."""
+    def _cond(self, params: Mapping[str, Any], inputs: list[Any]) -> list[Any]:
+        """Evaluates `lax.cond` and `lax.switch`; the branch index comes from rounded numbers."""
         branches = [functools.partial(self._closed, branch) for branch in params["branches"]]
         return jax.lax.switch(inputs[0], branches, inputs[1:])
 
-    def _scan(self, params: Any, inputs: list[Any]) -> list[Any]:
-        """`lax.scan`, and `lax.fori_loop` between known bounds."""
+    def _scan(self, params: Mapping[str, Any], inputs: list[Any]) -> list[Any]:
+        """Evaluates `lax.scan`, and `lax.fori_loop` with concrete bounds."""
         first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
 
         def body(carry: list[Any], x: list[Any]) -> tuple[list[Any], list[Any]]:
@@ -294,8 +302,8 @@ class Evaluation:
         carry, stacked = jax.lax.scan(body, start, inputs[last:], **options)
         return [*carry, *stacked]
 
-    def _while(self, params: Any, inputs: list[Any]) -> list[Any]:
-        """`lax.while_loop`, by the condition of the rounded number."""
+    def _while(self, params: Mapping[str, Any], inputs: list[Any]) -> list[Any]:
+        """Evaluates `lax.while_loop`; the condition uses rounded numbers."""
         first, last = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
 
         def goes_on(carry: list[Any]) -> Any:
@@ -306,8 +314,10 @@ class Evaluation:
 
         return jax.lax.while_loop(goes_on, body, list(map(_doubled, inputs[last:])))
 
-    def _with_own_derivative(self, jaxpr: Any, equation: Any, inputs: list[Any]) -> list[Any]:
-        """A `jax.custom_jvp` function, whose rule is evaluated in sums of two floats, too."""
+    def _with_own_derivative(
+        self, jaxpr: Jaxpr, equation: JaxprEqn, inputs: list[Any]
+    ) -> list[Any]:
+        """Evaluates a `jax.custom_jvp` function and its derivative rule in double floats."""
         inner = equation.params["call_jaxpr"]
 
         @jax.custom_jvp
@@ -315,16 +325,18 @@ class Evaluation:
             return self._closed(inner, inputs)
 
         @function.defjvp
-        def _(primals: Any, tangents: Any) -> Any:
+        def _(primals: tuple[list[Any]], tangents: tuple[list[Any]]) -> Any:
             (inputs,), (moved,) = primals, tangents
             values = [rounded(x) for x in inputs]
             slopes = [x.value if isinstance(x, Doubled) else x for x in moved]
             free = [i for i, x in enumerate(slopes) if x.dtype != jax.dtypes.float0]
 
             def slope(values: list[Any], slopes: list[Any]) -> Any:
-                def bound(*some: Any) -> list[Any]:
+                def bound(*some: Array) -> list[Any]:
                     given = dict(zip(free, some, strict=True))
-                    return _bound(jaxpr, equation, [given.get(i, x) for i, x in enumerate(values)])
+                    return apply_equation(
+                        jaxpr, equation, [given.get(i, x) for i, x in enumerate(values)]
+                    )
 
                 return jax.jvp(bound, [values[i] for i in free], slopes)[1]
 
@@ -337,104 +349,93 @@ class Evaluation:
         return function(inputs)
 
 
-FLOW: dict[str, Callable[[Evaluation, Any, list[Any]], list[Any]]] = {
+FLOW: dict[str, Callable[[Evaluation, Mapping[str, Any], list[Any]], list[Any]]] = {
     "cond": Evaluation._cond,
     "scan": Evaluation._scan,
     "while": Evaluation._while,
 }
-"""Branches and loops."""
+"""The evaluation of each primitive for branches and loops."""
 
 ROUNDING = frozenset({"cumsum", "cumprod", "reduce_prod", "conv_general_dilated", "fft"})
-"""Primitives that add and multiply, and yet are linearized as a whole."""
+"""Primitives with large sums or products that are linearized as a whole, and lose precision."""
 
 
-def _is_jaxpr(x: Any) -> bool:
-    """Returns True for a parameter of an equation that is a function."""
+def _is_jaxpr(x: PyTree | Jaxpr | ClosedJaxpr) -> bool:
+    """Returns True if a parameter of an equation is a jaxpr, open or closed."""
     return hasattr(x, "eqns") or hasattr(x, "jaxpr")
 
 
-def _is_complex(x: Any) -> bool:
-    """Returns True for complex numbers."""
+def _is_complex(x: Operand) -> bool:
+    """Returns True if an operand is complex."""
     return jnp.issubdtype(rounded(x).dtype, jnp.complexfloating)
 
 
-def _doubled(x: Any) -> Any:
-    """A number with a remainder; an integer or truth value as it is."""
+def _doubled(x: Operand) -> Any:
+    """Converts a float to a `Doubled` with remainder zero; integers and booleans stay plain."""
     if isinstance(x, Doubled):
         return x
     x = jnp.asarray(x)
     return Doubled.of(x) if jnp.issubdtype(x.dtype, jnp.inexact) else x
 
 
-def _tangent(x: Any, change: Any) -> Any:
-    """The tangent of a result, of which `high` carries the derivative."""
+def _tangent(x: Doubled | Array, change: Operand) -> Any:
+    """Returns the tangent of a result x in the form that `jax.custom_jvp` needs.
+
+    The derivative is in the tangent of `high`; the tangent of `low` is zero.
+    """
     if not isinstance(x, Doubled):
         return np.zeros(jnp.shape(x), jax.dtypes.float0)
-    change = rounded(change)
-    return Doubled(change, jnp.zeros_like(change))
+    slope = rounded(change)
+    return Doubled(slope, jnp.zeros_like(slope))
 
 
-def _bound(jaxpr: Any, equation: Any, inputs: list[Any]) -> list[Any]:
-    """The results of an equation for inputs without remainders, by a jaxpr of it alone."""
-    pairs = zip(equation.invars, inputs, strict=True)
-    given = {x: value for x, value in pairs if not isinstance(x, Literal)}
-    outputs, effects = list(equation.outvars), equation.effects
-    alone = jaxpr.replace(
-        constvars=[], invars=[*given], outvars=outputs, eqns=[equation], effects=effects
-    )
-    return jaxpr_as_fun(ClosedJaxpr(alone, ()))(*given.values())
-
-
-def _linearized(jaxpr: Any, equation: Any, inputs: list[Any]) -> list[Any]:
-    """f(high) + f′(high) low."""
+def _linearized(jaxpr: Jaxpr, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
+    """Evaluates an equation with operation f by linearization: f(high) + f′(high) low."""
     where = [i for i, x in enumerate(inputs) if isinstance(x, Doubled)]
 
     def function(*highs: Array) -> list[Any]:
         given = dict(zip(where, highs, strict=True))
-        return _bound(jaxpr, equation, [given.get(i, x) for i, x in enumerate(inputs)])
+        return apply_equation(jaxpr, equation, [given.get(i, x) for i, x in enumerate(inputs)])
 
     parts = [inputs[i] for i in where]
     values, changes = jax.jvp(function, [x.high for x in parts], [x.low for x in parts])
     return [
-        _summed(y, low) if jnp.issubdtype(y.dtype, jnp.inexact) else y
+        _carrying(*jax.lax.stop_gradient((y, low)), y + low)
+        if jnp.issubdtype(y.dtype, jnp.inexact)
+        else y
         for y, low in zip(values, changes, strict=True)
     ]
 
 
-def _summed(y: Array, low: Array) -> Doubled:
-    """The sum of a number and a small one."""
-    return _carrying(*jax.lax.stop_gradient((y, low)), y + low)
-
-
-def _sum(x: Doubled, axes: Any) -> Doubled:
-    """The sum over axes, by halves."""
+def _sum(x: Doubled, axes: Sequence[int]) -> Doubled:
+    """Sums an array over axes, by pairwise summation."""
     for axis in sorted(axes, reverse=True):
         x = jax.tree.map(lambda part, axis=axis: jnp.moveaxis(part, axis, 0), x)
         while x.high.shape[0] > 1:
-            x = jax.tree.map(_even, x)
+            # a row of zeros makes the number of rows even
+            x = jax.tree.map(
+                lambda part: jnp.concatenate([part, jnp.zeros_like(part[: len(part) % 2])]), x
+            )
             first, second = (jax.tree.map(lambda part, i=i: part[i::2], x) for i in (0, 1))
             x = first + second
         x = jax.tree.map(lambda part: jnp.sum(part, axis=0), x)
     return x
 
 
-def _even(x: Array) -> Array:
-    """The rows of an array, and one of zeros where their number is odd."""
-    return jnp.concatenate([x, jnp.zeros_like(x[: x.shape[0] % 2])])
-
-
-def _dot(x: Doubled, y: Doubled, contracted: Any, batched: Any) -> Doubled:
-    """`lax.dot_general`: the products, and their sum."""
+def _dot(
+    x: Doubled, y: Doubled, contracted: Sequence[Sequence[int]], batched: Sequence[Sequence[int]]
+) -> Doubled:
+    """Evaluates `lax.dot_general` as an elementwise product and a sum."""
     batch, last = len(batched[0]), len(contracted[0])
     free = [z.high.ndim - batch - last for z in (x, y)]
     missing = [batch + free[0] + i for i in range(free[1])], [batch + i for i in range(free[0])]
 
     def arranged(side: int, part: Array) -> Array:
-        """(batch, free of x, free of y, contracted)."""
+        """Transposes one operand to axes (batch, free of x, free of y, contracted)."""
         fixed = (*batched[side], *contracted[side])
-        own = [i for i in range(part.ndim) if i not in fixed]
+        free_axes = [i for i in range(part.ndim) if i not in fixed]
         return jnp.expand_dims(
-            jnp.transpose(part, (*batched[side], *own, *contracted[side])), missing[side]
+            jnp.transpose(part, (*batched[side], *free_axes, *contracted[side])), missing[side]
         )
 
     x, y = (jax.tree.map(functools.partial(arranged, side), z) for side, z in enumerate((x, y)))
@@ -443,17 +444,17 @@ def _dot(x: Doubled, y: Doubled, contracted: Any, batched: Any) -> Doubled:
 
 
 def _parts(x: Doubled) -> tuple[Doubled, Doubled]:
-    """The real and the imaginary part."""
+    """Returns the real and the imaginary part of a complex number."""
     return jax.tree.map(jnp.real, x), jax.tree.map(jnp.imag, x)
 
 
 def _joined(real: Doubled, imaginary: Doubled) -> Doubled:
-    """The complex number of two parts."""
+    """Returns the complex number with the given real and imaginary part."""
     return jax.tree.map(jax.lax.complex, real, imaginary)
 
 
 def _product(x: Doubled, y: Doubled) -> Doubled:
-    """x y, of complex numbers by their parts."""
+    """Returns the product x y of real or complex numbers."""
     if not _is_complex(x):
         return x * y
     (a, b), (c, d) = _parts(x), _parts(y)
@@ -461,7 +462,7 @@ def _product(x: Doubled, y: Doubled) -> Doubled:
 
 
 def _quotient(x: Doubled, y: Doubled) -> Doubled:
-    """x / y, of complex numbers by their parts."""
+    """Returns the quotient x / y of real or complex numbers."""
     if not _is_complex(x):
         return x / y
     a, b = _parts(y)
@@ -470,7 +471,7 @@ def _quotient(x: Doubled, y: Doubled) -> Doubled:
 
 
 def _power(x: Doubled, exponent: int) -> Doubled:
-    """xⁿ by repeated squares."""
+    """Returns xⁿ for an integer exponent n, by repeated squaring."""
     if exponent < 0:
         return _quotient(Doubled.of(jnp.ones_like(x.high)), _power(x, -exponent))
     result = Doubled.of(jnp.ones_like(x.high))
@@ -481,13 +482,13 @@ def _power(x: Doubled, exponent: int) -> Doubled:
 
 
 def _remainder(x: Doubled, y: Doubled) -> Doubled:
-    """`jax.lax.rem`: x less whole multiples of y, of the sign of x and smaller than y."""
+    """Evaluates `jax.lax.rem`: x minus a multiple of y, with the sign of x and less than |y|."""
     derivative = jax.lax.rem(x.value, y.value)
     x, y = jax.lax.stop_gradient((x, y))
     rest = jax.lax.rem(x.high, y.high)
     multiple = jnp.round((x.high - rest) / y.high)
     size = Doubled.of(rest) + jax.lax.rem(x.low, y.high) - multiple * y.low
-    # |x| less multiples of |y| lies between −|y| and 2|y|
+    # |x| minus multiples of |y| lies between −|y| and 2|y|
     side, period = jnp.where(x.high < 0, -1, 1).astype(rest.dtype), y * jnp.sign(y.high)
     size = size * side
     size = _select((size - period).high >= 0, size - period, size)
@@ -496,20 +497,20 @@ def _remainder(x: Doubled, y: Doubled) -> Doubled:
 
 
 def _select(where: Array, x: Doubled, y: Doubled) -> Doubled:
-    """x where a mask is True, and y elsewhere."""
+    """Returns x where a mask is True, and y elsewhere."""
     return jax.tree.map(functools.partial(jnp.where, where), x, y)
 
 
 def _floor(x: Doubled) -> Doubled:
-    """The largest whole number that is not above x."""
+    """Returns the largest integer that is not above x."""
     x = jax.lax.stop_gradient(x)
     whole = jnp.floor(x.high)
     # |low| is at most half a spacing of `high`: it decides only where `high` is whole
     return _carrying(whole, jnp.where(whole == x.high, jnp.floor(x.low), 0), whole)
 
 
-def _rounded_to_whole(x: Doubled, ties: Any) -> Doubled:
-    """The whole number nearest to x; `ties` decide where two are."""
+def _rounded_to_whole(x: Doubled, ties: jax.lax.RoundingMethod) -> Doubled:
+    """Rounds x to the nearest integer; `ties` is the rule for numbers halfway between integers."""
     x = jax.lax.stop_gradient(x)
     whole, below = jax.lax.round(x.high, ties), jnp.floor(x.high)
     halfway = (x.high - below == 0.5) & (x.low != 0)
@@ -529,4 +530,4 @@ RULES: dict[str, Callable[..., Doubled]] = {
     "floor": _floor,
     "ceil": lambda x: -_floor(-x),
 }
-"""The primitives that are computed in sums of two floats."""
+"""The double-float function of each primitive that is evaluated without linearization."""

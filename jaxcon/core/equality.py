@@ -1,11 +1,9 @@
-"""Equality and hashes of pytrees, for those that are static arguments or keys.
+"""Equality and hashes of pytrees, for use as static arguments or keys.
 
-Two trees are equal where a function that is traced with the one as a constant is the same program
-as with the other: one structure, and leaves of one type with the same bits. So 5 and 5.0 differ,
-and NaN equals NaN.
+Two trees are equal if their structures are equal and their leaves have equal types and bits. Thus 5
+and 5.0 differ, and NaN equals NaN. A function that is traced with equal trees as constants gives
+the same program.
 """
-
-from __future__ import annotations
 
 from typing import Any
 
@@ -14,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxcon.core.typing import PyTree
 
-def equal(a: Any, b: Any) -> bool:
-    """Returns True for equal trees. Values of arrays are read only where all else agrees."""
+
+def equal(a: PyTree, b: PyTree) -> bool:
+    """Returns True if two trees are equal; reads array values only if everything else agrees."""
     if a is b:
         return True
     (leaves_a, structure_a), (leaves_b, structure_b) = jax.tree.flatten(a), jax.tree.flatten(b)
@@ -26,8 +26,8 @@ def equal(a: Any, b: Any) -> bool:
     return all(_kind(x) == _kind(y) for x, y in pairs) and all(_same_bits(x, y) for x, y in pairs)
 
 
-def hashed(tree: Any) -> int:
-    """A hash that agrees with `equal` and waits for no device: of arrays it takes the types alone.
+def hashed(tree: PyTree) -> int:
+    """Returns a hash consistent with `equal`, without reading array values from a device.
 
     Raises:
         TypeError: a leaf or static field cannot be hashed.
@@ -36,8 +36,11 @@ def hashed(tree: Any) -> int:
     return hash((structure, *map(_kind, leaves)))
 
 
-def _kind(x: Any) -> Any:
-    """All of a leaf that is known without a device; a traced value is itself alone."""
+def _kind(x: PyTree) -> Any:
+    """Returns the type and properties of a leaf, without reading array values from a device.
+
+    Host numbers are represented by their value, and a tracer by its identity.
+    """
     if isinstance(x, Tracer):
         return Tracer, id(x)
     if isinstance(x, jax.Array):
@@ -45,17 +48,17 @@ def _kind(x: Any) -> Any:
     if isinstance(x, np.ndarray):
         return np.ndarray, x.shape, x.dtype
     if isinstance(x, bool | int | float | complex | np.generic):
-        return type(x), repr(x)  # tells −0.0 from 0.0, and not NaN from NaN
+        return type(x), repr(x)  # repr distinguishes −0.0 from 0.0, and makes NaN equal NaN
     return x
 
 
-def _same_bits(x: Any, y: Any) -> bool:
-    """Returns True where two leaves of one kind have the same value."""
+def _same_bits(x: PyTree, y: PyTree) -> bool:
+    """Returns True if two leaves of equal kind have equal bits."""
     if not isinstance(x, np.ndarray | jax.Array):
-        return True  # the kind says it all
-    if isinstance(x, jax.Array):
+        return True  # the kind contains the value
+    if isinstance(x, jax.Array) and isinstance(y, jax.Array):
         if jnp.issubdtype(x.dtype, jax.dtypes.extended):
             x, y = jax.random.key_data(x), jax.random.key_data(y)
         if not (x.is_fully_addressable and y.is_fully_addressable):
-            return False  # a part of them is known to another process alone
+            return False  # a part is on devices of another process
     return np.asarray(x).tobytes() == np.asarray(y).tobytes()

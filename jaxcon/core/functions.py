@@ -1,6 +1,4 @@
-"""Functions of the user's: errors of theirs say which function it is, and what it should do."""
-
-from __future__ import annotations
+"""Calls of user functions, with errors that name the function and the expected result."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,20 +15,20 @@ from jaxcon.core.checks import shortened
 from jaxcon.core.typing import Array, PyTree
 
 UNKNOWN = (ConcretizationTypeError, TracerArrayConversionError, TracerIntegerConversionError)
-"""The errors that JAX raises where a program asks for the value of a traced number."""
+"""The errors that JAX raises when code needs the concrete value of a tracer."""
 
 
-def call(owner: str, what: str, function: Callable[..., Any], *args: Any) -> Any:
-    """function(*args), which is traced.
+def call(owner: str, what: str, function: Callable[..., Any], *args: PyTree) -> Any:
+    """Calls a user's function, function(*args), and explains errors about traced values.
 
     Args:
-        owner: that calls it, for errors.
-        what: the function is.
-        function: the user's.
-        args: its arguments.
+        owner: the caller, for errors.
+        what: the role of the function, for errors.
+        function: the user's function.
+        args: the arguments of the function.
 
     Raises:
-        TypeError: the function needs the value of a number that is traced.
+        TypeError: the function reads the value of a tracer.
     """
     try:
         return function(*args)
@@ -42,18 +40,18 @@ def call(owner: str, what: str, function: Callable[..., Any], *args: Any) -> Any
         ) from error
 
 
-def title(function: Any) -> str:
-    """A function's name, and where it is written."""
+def title(function: Callable[..., Any]) -> str:
+    """Returns the name of a function with its file and line, for messages."""
     name = getattr(function, "__qualname__", type(function).__name__)
     code = getattr(function, "__code__", None)
     return f"'{name}'" + (f" ({code.co_filename}:{code.co_firstlineno})" if code else "")
 
 
-def array(owner: str, what: str, x: Any) -> Array:
-    """The result of a function, as an array of real numbers.
+def array(owner: str, what: str, x: PyTree) -> Array:
+    """Converts the result of a user's function to an array of real numbers.
 
     Raises:
-        TypeError: it is none.
+        TypeError: the result is no array of real numbers.
     """
     try:
         result = None if x is None or isinstance(x, str | bool) else jnp.asarray(x)
@@ -68,10 +66,10 @@ def array(owner: str, what: str, x: Any) -> Array:
 
 
 def tree(owner: str, what: str, x: PyTree) -> PyTree:
-    """The result of a function, a pytree of arrays as it is.
+    """Checks that the result of a user's function is a pytree of arrays; returns it unchanged.
 
     Raises:
-        TypeError: a leaf of it is something else.
+        TypeError: a leaf is not an array or a number.
     """
     for path, leaf in jax.tree_util.tree_leaves_with_path(x):
         if not hasattr(leaf, "dtype") and not isinstance(leaf, bool | int | float | complex):

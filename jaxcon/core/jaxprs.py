@@ -1,12 +1,13 @@
-"""Traced functions as JAX writes them down; what its versions write differently is read here."""
-
-from __future__ import annotations
+"""Functions on jaxprs that hide differences between versions of JAX."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+from jax.extend.core import Jaxpr, JaxprEqn
 from jax.interpreters import partial_eval
+
+from jaxcon.core.typing import PyTree
 
 CALLS = {
     "jit": "jaxpr",
@@ -19,46 +20,46 @@ CALLS = {
     "checkpoint": "jaxpr",
     "remat2": "jaxpr",
 }
-"""Primitives that only call a function, and the parameter that holds it."""
+"""Primitives that only call a function, with the parameter that contains its jaxpr."""
 
 
-def called(equation: Any) -> Any:
-    """The jaxpr that an equation only calls, or None where it does anything else.
+def called(equation: JaxprEqn) -> Any:
+    """Returns the jaxpr that an equation calls; None if the equation is not a plain call.
 
-    From JAX 0.11 on, `lax.custom_root` is a primitive with derivatives of its own, a `HiPrim`: its
-    `expand` is the function, which is traced here.
+    From JAX 0.11 on, `lax.custom_root` is a `HiPrim`, a primitive with its own derivative rule. The
+    method `expand` of a `HiPrim` is the called function, which is traced to a jaxpr.
     """
     name, params = equation.primitive.name, equation.params
     if name in CALLS:
         return params[CALLS[name]]
-    primitive = params.get("_prim")
+    primitive: Any = params.get("_prim")
     if hasattr(primitive, "expand"):
         return jax.make_jaxpr(primitive.expand)(*primitive.in_avals)
     return None
 
 
-def each(function: Callable[[Any], Any], xs: Any) -> Any:
-    """`jax.vmap(function)(xs)`, of functions that contain a `lax.custom_root`.
+def each(function: Callable[[Any], Any], xs: PyTree) -> Any:
+    """Returns `jax.vmap(function)(xs)`, also for functions that contain a `lax.custom_root`.
 
-    JAX 0.11 maps it to a primitive without a derivative in the branches of `lax.cond`; there the
-    function runs once for each x.
+    In branches of `lax.cond`, JAX 0.11 vectorizes `custom_root` to a primitive without a
+    derivative. With that version, `jax.lax.map` is used instead.
     """
     if jax.__version_info__[:2] == (0, 11):
         return jax.lax.map(function, xs)
     return jax.vmap(function)(xs)
 
 
-def without_unused(jaxpr: Any, wanted: Sequence[bool] | None = None) -> Any:
-    """An open jaxpr with the wanted results alone, and without what none of them needs.
+def without_unused(jaxpr: Jaxpr, wanted: Sequence[bool] | None = None) -> Any:
+    """Removes unwanted results and unused equations from an open jaxpr.
 
     Args:
-        jaxpr: open; it keeps all its arguments.
-        wanted: whether each result is; all of them unless given.
+        jaxpr: the open jaxpr; the result has all its arguments.
+        wanted: True for each result to keep; None for all.
     """
     chosen = [True] * len(jaxpr.outvars) if wanted is None else list(wanted)
     return partial_eval.dce_jaxpr(jaxpr, chosen, instantiate=True)[0]
 
 
-def read_arguments(jaxpr: Any) -> list[bool]:
-    """Returns, for each argument of an open jaxpr, True where some result is computed from it."""
+def read_arguments(jaxpr: Jaxpr) -> list[bool]:
+    """Returns a flag for each argument of an open jaxpr: True if any result depends on it."""
     return partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))[1]

@@ -1,32 +1,33 @@
-"""Small vectors and matrices by components, each component a lane.
+"""Small vectors and matrices whose components are lanes.
 
-A lane is an array whose axes all enumerate bodies or worlds, never components. Every operation is
-then one elementwise instruction over long contiguous memory, which XLA vectorises, where a small
-`einsum` would be a loop of short ones. A component that is known when tracing (the 0s and 1s of a
-coordinate axis) stays a Python number, and products with it are never emitted.
+A lane is an array whose axes enumerate bodies or worlds, never components. Every operation is then
+one elementwise instruction over long contiguous memory, which XLA vectorizes. A small `einsum`
+would be a loop of short instructions. Components known at trace time (the 0s and 1s of a coordinate
+axis) stay Python numbers, and products with them are left out of the program.
 """
 
 from __future__ import annotations
 
 import functools
 import itertools
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.pytree import exportable
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.typing import Array, Lane, Scalar, T
 
 
 def _is(x: Lane, number: int) -> bool:
+    """Returns True if x is a Python number with this value, not an array."""
     return isinstance(x, int | float) and x == number
 
 
 def times(x: Lane, y: Lane) -> Lane:
-    """x y, without an instruction where a factor is the Python number 0, 1 or −1."""
+    """Returns x y; no operation is traced if a factor is the Python number 0, 1 or −1."""
     for a, b in ((x, y), (y, x)):
         if _is(a, 0):
             return 0.0
@@ -38,37 +39,45 @@ def times(x: Lane, y: Lane) -> Lane:
 
 
 def plus(x: Lane, y: Lane) -> Lane:
-    """x + y, without an instruction where a term is the Python number 0."""
+    """Returns x + y; no operation is traced if a term is the Python number 0."""
     if _is(x, 0):
         return y
     return x if _is(y, 0) else x + y
 
 
 def minus(x: Lane, y: Lane) -> Lane:
-    """x − y, without an instruction for the Python number 0."""
+    """Returns x − y; no operation is traced if a term is the Python number 0."""
     if _is(x, 0):
         return times(-1, y)
     return x if _is(y, 0) else x - y
 
 
-def total(terms: Any) -> Lane:
-    """The sum of lanes."""
+@overload
+def total(terms: Iterable[Array]) -> Array: ...
+
+
+@overload
+def total(terms: Iterable[Lane]) -> Lane: ...
+
+
+def total(terms: Iterable[Lane]) -> Lane:
+    """Returns the sum of lanes; 0.0 if there are none."""
     return functools.reduce(plus, terms, 0.0)
 
 
 @exportable
 @jax.tree_util.register_pytree_node_class
 class Vector:
-    """A vector whose components are lanes; `Vector(x, y, z)`."""
+    """A vector whose components are lanes (see this module), such as `Vector(x, y, z)`."""
 
     __slots__ = ("components",)
 
-    def __init__(self, *components: Any) -> None:
-        self.components = components
+    def __init__(self, *components: Lane | Vector) -> None:
+        self.components: tuple[Any, ...] = components
 
     @classmethod
-    def of(cls, x: Any) -> Vector:
-        """From an array whose first axis enumerates components, from a sequence, or as it is."""
+    def of(cls, x: Vector | Array | Sequence[Lane]) -> Vector:
+        """Converts an array (component, …) or a sequence of components to a vector."""
         if isinstance(x, Vector):
             return x
         if isinstance(x, jax.Array):
@@ -77,29 +86,31 @@ class Vector:
 
     @classmethod
     def of_rows(cls, x: Array, start: int, components: int, elements: int) -> Vector:
-        """From rows of an array: those of all elements for each component, from `start` on.
+        """Splits consecutive rows of an array into the components of a vector, (element, …) each.
 
-        They are split at once, since the transpose of that is one concatenation, and that of slices
-        as many padded arrays and their sum.
+        The rows of the first component start at row `start`; those of each next component follow.
         """
+        # one split, since its transpose is one concatenation; slices give a sum of padded arrays
         rest = len(x) - start - components * elements
         return cls(*jax.lax.split(x, (start, *(elements,) * components, rest))[1:-1])
 
     def stack(self) -> Array:
-        """The array with the components along the first axis."""
+        """Returns an array with the components along the first axis."""
+        dtypes = [c.dtype for c in self if isinstance(c, jax.Array)] or [jnp.result_type(float)]
         shape = jnp.broadcast_shapes(*(jnp.shape(c) for c in self))
-        return jnp.stack([jnp.broadcast_to(c, shape) for c in _common(self.components)])
+        arrays = (c if isinstance(c, jax.Array) else jnp.asarray(c, dtypes[0]) for c in self)
+        return jnp.stack([jnp.broadcast_to(c, shape) for c in arrays])
 
-    def map(self, function: Callable[[Lane], Lane]) -> Vector:
-        """The function of each component."""
+    def map(self, function: Callable[[Any], Any]) -> Vector:
+        """Applies a function to each component; returns the vector of the results."""
         return Vector(*map(function, self))
 
     def dot(self, other: Vector) -> Lane:
-        """Σ xᵢ yᵢ."""
+        """Returns the scalar product Σ xᵢ yᵢ."""
         return total(times(x, y) for x, y in zip(self, other, strict=True))
 
     def cross(self, other: Vector) -> Any:
-        """x × y: a vector in space, and in the plane its one component along the normal."""
+        """Returns the cross product x × y: a Vector in space, its normal component in the plane."""
         if len(self) == 2:
             (a, b), (c, d) = self, other
             return minus(times(a, d), times(b, c))
@@ -111,21 +122,21 @@ class Vector:
         )
 
     def tree_flatten(self) -> tuple[tuple[Any, ...], None]:
-        """Components are children."""
+        """Returns the components as children."""
         return self.components, None
 
     @classmethod
-    def tree_unflatten(cls, _: None, children: Any) -> Vector:
-        """From children."""
+    def tree_unflatten(cls, _: None, children: Iterable[Any]) -> Vector:
+        """Rebuilds the vector from its children."""
         return cls(*children)
 
-    def __iter__(self) -> Iterator[Lane]:
+    def __iter__(self) -> Iterator[Any]:  # lanes; rows of a Matrix
         return iter(self.components)
 
     def __len__(self) -> int:
         return len(self.components)
 
-    def __getitem__(self, index: Any) -> Any:
+    def __getitem__(self, index: int | slice) -> Any:
         return self.components[index]
 
     def __add__(self, other: Vector) -> Vector:
@@ -147,7 +158,7 @@ class Vector:
 
 
 class Matrix(Vector):
-    """A matrix of lanes as a vector of row vectors."""
+    """A matrix of lanes: a vector of row vectors."""
 
     __slots__ = ()
 
@@ -155,12 +166,12 @@ class Matrix(Vector):
         return Vector(*(row.dot(x) for row in self))
 
     def stack(self) -> Array:
-        """The array with rows along the first axis and columns along the second."""
+        """Returns an array with rows along the first axis and columns along the second."""
         return jnp.stack([row.stack() for row in self])
 
     @property
     def T(self) -> Matrix:
-        """The transpose."""
+        """The transposed matrix."""
         return Matrix(*(Vector(*column) for column in zip(*self, strict=True)))
 
 
@@ -168,28 +179,28 @@ exportable(jax.tree_util.register_pytree_node_class(Matrix))
 
 
 def zeros(n: int) -> Vector:
-    """The zero vector of n components, known when tracing."""
+    """Returns the zero vector with n components, as Python numbers."""
     return Vector(*(0.0,) * n)
 
 
 def axes(n: int) -> tuple[Vector, ...]:
-    """The n coordinate axes, known when tracing."""
+    """Returns the n coordinate axes, as vectors of Python numbers."""
     return tuple(Vector(*(1.0 if i == j else 0.0 for j in range(n))) for i in range(n))
 
 
 def perpendicular(x: Vector) -> Vector:
-    """x turned by +90° in the plane."""
+    """Returns the planar vector x rotated by +90°."""
     return Vector(times(-1, x[1]), x[0])
 
 
 GATHERED = 16
-"""Rows from which picking them is one gather instead of as many copies."""
+"""The smallest number of indices for which `take` uses one gather instead of single slices."""
 
 
 def take(x: Lane, indices: tuple[int, ...]) -> Lane:
-    """x[indices] along the first axis: nothing, a slice, copies or a gather, as needed.
+    """Returns x[indices] along the first axis; a Python number unchanged.
 
-    A number is the same for every index.
+    The cheapest operation is used: x itself, a strided slice, a few slices, or a gather.
     """
     if not isinstance(x, jax.Array) or not x.ndim:
         return x
@@ -207,8 +218,13 @@ def take(x: Lane, indices: tuple[int, ...]) -> Lane:
     return x[np.asarray(indices)]
 
 
-def side_by_side(rows: list[tuple[Lane, int]]) -> Lane:
-    """Rows of lanes (element, …) as one lane; a row of a number is that number."""
+def side_by_side(rows: Sequence[tuple[Lane, int]]) -> Lane:
+    """Concatenates single rows of lanes (element, …) into one lane.
+
+    Args:
+        rows: for each row of the result, the lane and the index of the row in it. A Python number
+            in place of the lane gives a row of equal entries.
+    """
     parts: list[tuple[Lane, int]] = []
     for _, members in itertools.groupby(rows, key=lambda row: id(row[0])):
         lanes, places = zip(*members, strict=True)
@@ -217,7 +233,7 @@ def side_by_side(rows: list[tuple[Lane, int]]) -> Lane:
         return parts[0][0]
     arrays = [x for x, _ in parts if isinstance(x, jax.Array)]
     if not arrays:
-        (number,) = {x for x, _ in parts}
+        (number,) = {x for x, _ in parts if not isinstance(x, jax.Array)}
         return number
     shape = jnp.broadcast_shapes(*(x.shape[1:] for x in arrays))
     whole = [jnp.broadcast_to(jnp.asarray(x, arrays[0].dtype), (n, *shape)) for x, n in parts]
@@ -225,64 +241,58 @@ def side_by_side(rows: list[tuple[Lane, int]]) -> Lane:
 
 
 PIECES = 8
-"""Runs of bodies from which a sum over bodies gathers its terms instead of slicing them."""
+"""The largest number of runs of bodies for which `collect` uses slices instead of gathers."""
 
 
-def collect(terms: list[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
-    """Σ of lanes (element, …) over the bodies on which their elements act, as a lane (body, …).
+def collect(terms: Sequence[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
+    """Sums contributions of elements, such as joints, to the bodies on which they act.
 
     Args:
-        terms: the body of each element, and the lane.
-        bodies: how many bodies there are.
+        terms: pairs (number of the body of each element, contributions (element, …)).
+        bodies: the number of bodies.
+
+    Returns:
+        The sums, a lane (body, …).
     """
-    arrays = [(indices, x) for indices, x in terms if not _is(x, 0)]
+    arrays: list[tuple[tuple[int, ...], Any]] = [(i, x) for i, x in terms if not _is(x, 0)]
     if not arrays:
         return 0.0
     if all(indices == tuple(range(bodies)) for indices, _ in arrays):
         return total(x for _, x in arrays)
     shape = jnp.broadcast_shapes(*(x.shape[1:] for _, x in arrays))
-    own: list[list[tuple[int, int]]] = [[] for _ in range(bodies)]
+    sources: list[list[tuple[int, int]]] = [[] for _ in range(bodies)]
     for t, (indices, _) in enumerate(arrays):
         for element, body in enumerate(indices):
-            own[body].append((t, element))
-    starts = [i for i in range(bodies) if not i or own[i] != [(t, e + 1) for t, e in own[i - 1]]]
+            sources[body].append((t, element))
+    starts = [
+        i for i in range(bodies) if not i or sources[i] != [(t, e + 1) for t, e in sources[i - 1]]
+    ]
     if len(starts) > PIECES:
-        return _gathered([x for _, x in arrays], own, shape)
+        # one gather for each term of the sums, from one array of all terms, padded by zeros
+        rows = [jnp.broadcast_to(x, (x.shape[0], *shape)) for _, x in arrays]
+        every = jnp.concatenate([*rows, jnp.zeros((1, *shape), rows[0].dtype)])
+        first = np.cumsum([0, *(len(x) for x in rows)])
+        places = np.full((max(map(len, sources)), len(sources)), first[-1])
+        for body, members in enumerate(sources):
+            for k, (t, element) in enumerate(members):
+                places[k, body] = first[t] + element
+        return total(every[index] for index in places)
     pieces = []
     for first, end in zip(starts, [*starts[1:], bodies], strict=True):
-        rows = (jax.lax.slice_in_dim(arrays[t][1], e, e + end - first) for t, e in own[first])
-        piece = total(rows) if own[first] else jnp.zeros((), arrays[0][1].dtype)
+        rows = (jax.lax.slice_in_dim(arrays[t][1], e, e + end - first) for t, e in sources[first])
+        piece = total(rows) if sources[first] else jnp.zeros((), arrays[0][1].dtype)
         pieces.append(jnp.broadcast_to(piece, (end - first, *shape)))
     return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
-
-
-def _gathered(lanes: list[Array], own: list[list[tuple[int, int]]], shape: Any) -> Array:
-    """Sums lanes by as many gathers as needed from one array of all terms and a row of zeros."""
-    rows = [jnp.broadcast_to(x, (x.shape[0], *shape)) for x in lanes]
-    every = jnp.concatenate([*rows, jnp.zeros((1, *shape), rows[0].dtype)])
-    first = np.cumsum([0, *(len(x) for x in rows)])
-    places = np.full((max(map(len, own)), len(own)), first[-1])
-    for body, terms in enumerate(own):
-        for k, (t, element) in enumerate(terms):
-            places[k, body] = first[t] + element
-    return total(every[index] for index in places)
-
-
-def _common(components: tuple[Any, ...]) -> list[Any]:
-    """Components of one dtype: that of the arrays among them, the default where there are none."""
-    dtypes = [c.dtype for c in components if isinstance(c, jax.Array)]
-    dtype = dtypes[0] if dtypes else jnp.result_type(float)
-    return [c if isinstance(c, jax.Array) else jnp.asarray(c, dtype) for c in components]
 
 
 def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
     """Lets a function of vectors also take arrays whose first axis enumerates components.
 
-    The result is an array where every vector argument was one, and a Vector otherwise.
+    If all arguments are arrays, the result is an array; otherwise it is a Vector.
     """
 
     @functools.wraps(function)
-    def wrapped(*args: Any) -> Any:
+    def wrapped(*args: Vector | Scalar) -> Any:
         if any(isinstance(x, Vector) for x in args):
             return function(*args)
         arrays = [jnp.asarray(x) for x in args]
@@ -292,15 +302,15 @@ def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def widened(tree: Any, worlds: int) -> Any:
-    """Lanes with an axis of size 1 before those of worlds, for many right sides at once.
+def add_rhs_axis(tree: T, worlds: int) -> T:
+    """Inserts an axis of size 1 before the batch axes, so that lanes broadcast over many vectors.
+
+    The new axis enumerates right-hand sides.
 
     Args:
-        tree: lanes, and numbers of each world.
-        worlds: how many trailing axes enumerate worlds.
+        tree: a tree of arrays with trailing batch axes; scalars are unchanged.
+        worlds: the number of trailing batch axes.
     """
-
-    def one(x: Any) -> Any:
-        return jnp.expand_dims(x, jnp.ndim(x) - worlds) if jnp.ndim(x) else x
-
-    return jax.tree.map(one, tree)
+    return jax.tree.map(
+        lambda x: jnp.expand_dims(x, jnp.ndim(x) - worlds) if jnp.ndim(x) else x, tree
+    )

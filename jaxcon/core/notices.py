@@ -1,11 +1,12 @@
-"""Warnings of wrong derivatives, each once in a process, and observations of what causes them."""
+"""Warnings about inexact derivatives, each given once in a process, and recorded observations.
 
-from __future__ import annotations
+An observation is a set of values that a running program reports to the host.
+"""
 
 import contextlib
 import functools
 import warnings
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from contextvars import ContextVar
 from typing import Any
 
@@ -24,22 +25,22 @@ _observations: list[Any] = []
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def when_differentiated(x: Array, message: str) -> Array:
-    """Returns x, and warns with the message where a derivative through x is traced."""
+    """Returns x, and gives a warning with the message when a derivative through x is traced."""
     return x
 
 
 @when_differentiated.defjvp
-def _(message: str, primals: Any, tangents: Any) -> tuple[Array, Array]:
+def _(message: str, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
     tell(message)
     return primals[0], tangents[0]
 
 
 def tell(message: str) -> None:
-    """Warns with a message that has not been given yet, or adds it to what is `collected`."""
-    found = _collected.get()
-    if found is not None:
-        if message not in found:
-            found.append(message)
+    """Gives a warning once per process; within the context `collected`, only records it."""
+    messages = _collected.get()
+    if messages is not None:
+        if message not in messages:
+            messages.append(message)
     elif message not in _given:
         _given.add(message)
         warnings.warn(message, stacklevel=2)
@@ -47,26 +48,26 @@ def tell(message: str) -> None:
 
 @contextlib.contextmanager
 def collected() -> Iterator[list[str]]:
-    """Collects the messages of derivatives that are traced within, in place of warnings."""
-    found: list[str] = []
-    token = _collected.set(found)
+    """Collects the messages of `tell` within this context in a list, instead of warning."""
+    messages: list[str] = []
+    token = _collected.set(messages)
     try:
-        yield found
+        yield messages
     finally:
         _collected.reset(token)
 
 
 def is_observing() -> bool:
-    """Returns True while programs are traced that report what they meet."""
+    """Returns True within the context `observed`, where traced programs report observations."""
     return _observing.get()
 
 
 @contextlib.contextmanager
 def observed() -> Iterator[list[Any]]:
-    """Collects what the programs that are traced and run within `observe`.
+    """Collects the observations of programs that are traced and run within this context.
 
-    What was traced before is traced again, and apart from it, since metadata of XLA is among the
-    settings by which JAX tells traces apart.
+    XLA metadata is part of the key of JAX's trace cache. Cached programs are therefore traced again
+    in this context, and stay in the cache unchanged.
     """
     _observations.clear()
     token = _observing.set(True)
@@ -77,21 +78,22 @@ def observed() -> Iterator[list[Any]]:
         _observing.reset(token)
 
 
-def observe(x: Array, kind: Any, happens: Array, *values: Array) -> Array:
-    """Returns x; where any of it happens, adds (kind, happens, *values) to what is `observed`.
+def observe(x: Array, kind: Hashable, happens: Array, *values: Array) -> Array:
+    """Returns x, and reports the values to the host if `happens` is True anywhere.
 
-    Nothing is traced for it outside `observed`.
+    The observation is the tuple (kind, happens, *values). Outside of the context `observed`,
+    nothing is added to the traced program.
 
     Args:
-        x: with an axis before those of the worlds.
-        kind: says what the values are.
-        happens: booleans with the trailing axes of x.
-        values: arrays likewise.
+        x: an array with one axis before the batch axes.
+        kind: a label of the observation.
+        happens: a mask with the trailing axes of x.
+        values: arrays with the trailing axes of x.
     """
     if not _observing.get():
         return x
 
-    def add(happens: Any, *values: Any) -> Any:
+    def add(happens: np.ndarray, *values: np.ndarray) -> np.ndarray:
         if np.any(happens):
             _observations.append((kind, *map(np.asarray, (happens, *values))))
         return np.zeros(x.shape[1:], x.dtype)

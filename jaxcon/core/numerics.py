@@ -1,11 +1,10 @@
-"""Guards: every function with a singular point, finite and with a finite gradient there.
+"""Functions with finite values and gradients at singular points, such as √x at x = 0.
 
-Each takes the safe branch of the input before the singular operation (the "double where"), since a
-`where` after it would still multiply an infinite derivative by zero.
+Each function replaces a singular input before the operation (the "double where"). A single `where`
+after the operation would multiply an infinite derivative by zero in reverse mode, which gives NaN.
 """
 
 import math
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,61 +14,70 @@ from jaxcon.core.typing import Array, Lane, PyTree
 
 
 def safe_sqrt(x: Lane) -> Array:
-    """√x, and 0 with zero gradient where x ≤ 0; NaN stays NaN."""
+    """Returns √x for x > 0, 0 with zero gradient for x ≤ 0, and NaN for NaN."""
     low = x <= 0
     return jnp.where(low, 0, jnp.sqrt(jnp.where(low, 1, x)))
 
 
 def safe_divide(numerator: Lane, denominator: Lane) -> Array:
-    """n / d where d ≠ 0, and 0 with zero gradient elsewhere."""
+    """Returns numerator / denominator; 0 with zero gradient where the denominator is 0."""
     nonzero = denominator != 0
     return jnp.where(nonzero, numerator / jnp.where(nonzero, denominator, 1), 0)
 
 
 def finite_or_nan(x: Lane) -> Array:
-    """A number, and NaN for an infinite one, which a quotient or a comparison would hide."""
+    """Returns x for finite x, and NaN otherwise.
+
+    NaN makes an error visible: a quotient such as 1/∞ = 0 or a comparison would hide infinity.
+    """
     return jnp.where(jnp.isfinite(x), x, jnp.nan)
 
 
-def norm(x: Any) -> Array:
-    """‖x‖ over the first axis (or a Vector's components), with zero gradient at x = 0."""
+def norm(x: Vector | Array) -> Array:
+    """Returns ‖x‖ over the first axis (or a Vector's components), with zero gradient at x = 0."""
     x = Vector.of(x)
     return safe_sqrt(x.dot(x))
 
 
 def unit(x: Vector) -> Vector:
-    """x / ‖x‖, and 0 with zero gradient at x = 0."""
+    """Returns the unit vector x / ‖x‖; 0 with zero gradient at x = 0."""
     return x * safe_divide(1.0, norm(x))
 
 
 def safe_arctan2(y: Lane, x: Lane) -> Array:
-    """The angle of (x, y), and 0 with zero gradient at the origin."""
+    """Returns the polar angle of the point (x, y); 0 with zero gradient at the origin."""
     origin = (x == 0) & (y == 0)
     return jnp.arctan2(jnp.where(origin, 0, y), jnp.where(origin, 1, x))
 
 
 def negligible(x: Array) -> Array:
-    """ε^⅔ (1 + max |x|) by world: what an iteration may leave open at x (n, …), a constant."""
+    """Returns the tolerance ε^⅔ (1 + max |x|) of an iteration for x (n, …), one for each world.
+
+    ε is the machine precision.
+    """
     size = 1 + jnp.max(jnp.abs(x), axis=0, initial=0)
     return jax.lax.stop_gradient(float(jnp.finfo(x.dtype).eps) ** (2 / 3) * size)
 
 
 def wrap(angle: Lane) -> Array:
-    """The angle brought to [−π, π] by whole turns; its derivative is 1."""
+    """Wraps an angle to [−π, π] by subtracting whole turns; its derivative is 1."""
     turn = 2 * jnp.pi
     return angle - turn * jnp.round(angle / turn)
 
 
 TERMS = {32: 6, 64: 11}
-"""The number of terms of the series of cos r and sin r / r in r², by the bits of a float: the next
-term is below half of the last place for r up to π/2."""
+"""The number of terms of the power series of cos r and sin r / r in r², for 32- and 64-bit floats.
+
+The first omitted term is below half a unit in the last place for r up to π/2.
+"""
 
 
 def cos_sinc(square: Lane) -> tuple[Array, Array]:
-    """cos √s and sin √s / √s as smooth functions of s ≥ 0, at s = 0 too.
+    """Returns cos √s and sin √s / √s for s = `square`, smooth for all s ≥ 0.
 
-    With n the whole half turns in √s and r = √s − n π, cos √s = (−1)ⁿ cos r and
-    sin √s = (−1)ⁿ sin r, and both are series in r²; near s = 0 that is s itself.
+    The argument is reduced by n half turns: r = √s − n π. Then cos √s = (−1)ⁿ cos r and
+    sin √s = (−1)ⁿ sin r, and both are evaluated as power series in r². Near s = 0, r² is s itself,
+    so no square root is differentiated there.
     """
     near = square < (jnp.pi / 2) ** 2
     root = jnp.sqrt(jnp.where(near, 1, square))
@@ -82,7 +90,13 @@ def cos_sinc(square: Lane) -> tuple[Array, Array]:
 
 
 def alternating(s: Array, odd: int, terms: int | None = None) -> Array:
-    """1 − s/(2 + odd)! + s²/(4 + odd)! − …: cos √s, or with odd = 1 sin √s / √s."""
+    """Evaluates a power series in s: cos √s for odd = 0, or sin √s / √s for odd = 1.
+
+    Args:
+        s: the square of the angle.
+        odd: 0 or 1.
+        terms: the number of terms after the first; None for full precision up to √s = π/2.
+    """
     terms = TERMS[jnp.finfo(s.dtype).bits] if terms is None else terms
     total = jnp.full_like(s, (-1) ** terms / math.factorial(2 * terms + odd))
     for k in range(terms - 1, -1, -1):
@@ -91,13 +105,17 @@ def alternating(s: Array, odd: int, terms: int | None = None) -> Array:
 
 
 BERNOULLI = (1 / 6, 1 / 30, 1 / 42, 1 / 30, 5 / 66, 691 / 2730, 7 / 6, 3617 / 510, 43867 / 798)
-"""|B₂|, |B₄|, … of (x/2) cot(x/2) = 1 − Σ |B₂ₙ| x²ⁿ / (2n)!; exact to the last place for x < 1."""
+"""The Bernoulli numbers |B₂|, |B₄|, … of the series (x/2) cot(x/2) = 1 − Σ |B₂ₙ| x²ⁿ / (2n)!.
+
+The series is used for x < 1.
+"""
 
 
 def inverse_exponential(square: Lane) -> Array:
-    """c(s) = (1 − (√s/2) cot(√s/2)) / s as a smooth function of 0 ≤ s < (2π)², 1/12 at s = 0.
+    """Returns c(s) = (1 − (√s/2) cot(√s/2)) / s, smooth for 0 ≤ s < (2π)², with c(0) = 1/12.
 
-    The coefficient of dexp⁻¹_φ = 1 − ½ φ× + c(φ·φ) φ×φ× of the rotation group.
+    c is a coefficient of the inverse derivative of the exponential map of rotation vectors φ:
+    dexp⁻¹_φ = 1 − ½ φ× + c(φ·φ) φ×φ×.
     """
     near = square < 1
     s = jnp.where(near, square, 1)
@@ -110,7 +128,7 @@ def inverse_exponential(square: Lane) -> Array:
 
 
 def all_finite(tree: PyTree) -> Array:
-    """Returns True where every number of a tree is finite, ()."""
+    """Returns True if every number in a tree of arrays is finite, ()."""
     good = jnp.ones((), bool)
     for x in jax.tree.leaves(tree):
         good &= jnp.all(jnp.isfinite(x))

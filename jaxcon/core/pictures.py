@@ -1,6 +1,4 @@
-"""Where matplotlib comes from: imported when it is first needed, so that simulating needs none."""
-
-from __future__ import annotations
+"""The delayed import of matplotlib, which only pictures need."""
 
 from typing import Any
 
@@ -8,10 +6,10 @@ MISSING = "Pictures need matplotlib: pip install 'jaxcon[plot]'."
 
 
 def pyplot() -> Any:
-    """matplotlib's pyplot.
+    """Imports and returns `matplotlib.pyplot`.
 
     Raises:
-        ImportError: it is not installed; names the extra that brings it.
+        ImportError: matplotlib is missing; the message names the extra to install.
     """
     try:
         import matplotlib.pyplot as plt

@@ -1,6 +1,4 @@
-"""Numbers of a chosen precision, whatever the configuration of JAX says."""
-
-from __future__ import annotations
+"""Computation in a chosen floating precision, whatever the configuration of JAX."""
 
 from contextlib import AbstractContextManager
 from typing import Any
@@ -8,23 +6,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 
-from jaxcon.core.typing import PyTree
+from jaxcon.core.typing import T
 
 
-def precision(dtype: Any) -> AbstractContextManager[Any]:
-    """Within it float64 is there where `dtype` is that, and float32 is the default elsewhere."""
+def precision(dtype: DTypeLike) -> AbstractContextManager[Any]:
+    """Returns a context that enables float64 if `dtype` is float64, and disables it otherwise."""
     return jax.enable_x64(np.dtype(dtype) == np.float64)
 
 
-def cast(tree: PyTree, dtype: Any) -> PyTree:
-    """A tree with its arrays of real numbers in another precision, within `precision(dtype)`."""
-
-    def one(x: Any) -> Any:
-        if isinstance(x, jax.Array | np.ndarray | np.generic) and jnp.issubdtype(
-            x.dtype, jnp.floating
-        ):
-            return jnp.asarray(np.asarray(x), dtype)
-        return x
-
-    return jax.tree.map(one, tree)
+def cast(tree: T, dtype: DTypeLike) -> T:
+    """Casts the floating arrays of a tree to a dtype; call it within `precision(dtype)`."""
+    return jax.tree.map(
+        lambda x: (
+            jnp.asarray(np.asarray(x), dtype)
+            if isinstance(x, jax.Array | np.ndarray | np.generic)
+            and jnp.issubdtype(x.dtype, jnp.floating)
+            else x
+        ),
+        tree,
+    )

@@ -1,14 +1,11 @@
-"""Conditions on the worlds of a batch, asked on each device of its own worlds alone.
+"""Conditions on a batch of worlds that each device evaluates for its own worlds only.
 
-A loop or branch that goes on while one world needs it would otherwise make all devices meet in
-every step, to learn of the worlds of the others. What each of them then does of its own contains
-no exchange: worlds do not read each other.
+A loop or branch runs if any world needs it. Worlds are independent, so a device needs only the
+flags of its own worlds. A plain `jnp.any` would exchange flags between devices in each step.
 """
 
-from __future__ import annotations
-
 import functools
-from typing import Any
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,53 +20,55 @@ from jaxcon.core.typing import Array
 
 
 def somewhere(flags: Array) -> Array:
-    """Returns True where a flag (…) is set in some world that the device holds, ().
+    """Returns True if a flag is set in any world on this device, ().
 
-    It has no derivative. Under `jax.vmap` it is asked for each of the mapped arrays.
+    The result has no derivative. Under `jax.vmap`, each mapped array of flags has its own result.
+
+    Args:
+        flags: one flag for each world, (…).
     """
     return somewhere_p.bind(jnp.asarray(flags, bool), asks=asking())
 
 
 def everywhere(flags: Array) -> Array:
-    """Returns True where a flag (…) is set in all worlds that the device holds, ()."""
+    """Returns True if the flags are set in all worlds on this device, ()."""
     return ~somewhere(~flags)
 
 
 def _any(flags: Array) -> Array:
-    """Returns True where a flag is set."""
+    """Returns True if any flag is set, ()."""
     return jnp.any(flags)
-
-
-def _partition(mesh: Any, args: Any, result: Any) -> Any:
-    """The function and shardings on several devices: each reads its own flags alone."""
-    return mesh, _any, NamedSharding(mesh, PartitionSpec()), (args[0].sharding,)
-
-
-def _axes(mesh: Any, args: Any, results: Any) -> str:
-    """All axes of the flags go, in the notation of Einstein's sums."""
-    return " ".join(f"i{k}" for k in range(len(args[0].shape))) + " -> "
 
 
 _by_device = custom_partitioning(_any)
 _by_device.def_partition(
-    _partition,
+    # each device reads its own flags alone
+    lambda mesh, args, result: (
+        mesh,
+        _any,
+        NamedSharding(mesh, PartitionSpec()),
+        (args[0].sharding,),
+    ),
     infer_sharding_from_operands=lambda mesh, args, result: NamedSharding(mesh, PartitionSpec()),
-    sharding_rule=_axes,
+    # all axes of the flags are reduced, in Einstein notation
+    sharding_rule=lambda mesh, args, results: (
+        " ".join(f"i{k}" for k in range(len(args[0].shape))) + " -> "
+    ),
 )
 
 
 @functools.cache
 def asking() -> ClosedJaxpr:
-    """A traced question, for the parameters of primitives whose lowering asks some.
+    """Returns a jaxpr of such a condition, as a parameter for primitives that lower to conditions.
 
-    JAX looks for such questions in what is lowered, parameters included, to know that it needs the
-    devices.
+    A program with a custom partitioning must know its devices when it is lowered. JAX detects this
+    by searching the jaxpr and its parameters, and would not find the condition otherwise.
     """
     return jax.make_jaxpr(_by_device)(np.zeros(1, bool))
 
 
-def _batched(args: Any, axes: Any, *, asks: Any) -> Any:
-    """One answer for each of the mapped arrays, for which devices may have to meet."""
+def _batched(args: Sequence[Array], axes: Sequence[int], *, asks: ClosedJaxpr) -> tuple[Array, int]:
+    """Implements `jax.vmap`: returns one flag for each mapped array, reduced over all devices."""
     (flags,), (axis,) = args, axes
     return jnp.any(jnp.moveaxis(flags, axis, 0), axis=tuple(range(1, flags.ndim))), 0
 

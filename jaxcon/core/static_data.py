@@ -1,10 +1,8 @@
-"""Static data of pytrees as JSON: what `jax.export` writes of them into a file.
+"""Conversion of the static data of pytrees to JSON and back, for files of `jax.export`.
 
-Only names and numbers are written. Reading makes instances of dataclasses by their fields and looks
-classes and functions up by their names; it runs no code from the file.
+Files contain names and numbers only. Reading a file builds dataclasses from their fields, and looks
+up classes and functions by name. It runs no code from the file.
 """
-
-from __future__ import annotations
 
 import dataclasses
 import importlib
@@ -15,25 +13,25 @@ from typing import Any
 
 
 def encoded(data: Any) -> bytes:
-    """Static data as JSON.
+    """Converts the static data of a pytree to JSON text.
 
     Raises:
-        TypeError: it has what cannot be found again by a name, such as a lambda.
+        TypeError: the data contain an object without an importable name, such as a lambda.
     """
     return json.dumps(_written(data)).encode()
 
 
 def decoded(text: bytes) -> Any:
-    """The static data that `encoded` wrote.
+    """Converts the JSON text of `encoded` back to static data.
 
     Raises:
-        ValueError: it names a class or function that is not there.
+        ValueError: a class or function in the data does not exist.
     """
     return _read(json.loads(text.decode()))
 
 
 def _written(x: Any) -> Any:
-    """In terms of JSON: a number or text as it is, all else as {kind: …}."""
+    """Converts static data to JSON values: numbers and strings unchanged, others as {kind: …}."""
     if x is None or type(x) in (bool, int, float, str):
         return x
     if isinstance(x, Enum):
@@ -51,6 +49,7 @@ def _written(x: Any) -> Any:
 
 
 def _read(x: Any) -> Any:
+    """Converts JSON values back to static data; inverts `_written`."""
     if not isinstance(x, dict):
         return x
     if "enum" in x:
@@ -71,17 +70,17 @@ def _read(x: Any) -> Any:
 
 
 def _name(x: Any) -> str:
-    """module:name of a class or function.
+    """Returns the name "module:name" of a class or function.
 
     Raises:
-        TypeError: it is none, or has no name under which it can be found again.
+        TypeError: the object is no class or function, or cannot be looked up by this name.
     """
     name = f"{getattr(x, '__module__', None)}:{getattr(x, '__qualname__', None)}"
     try:
-        found = _found(name)
+        target = _found(name)
     except ValueError:
-        found = None
-    if found is not x:
+        target = None
+    if target is not x:
         raise TypeError(
             f"{x!r} is part of the structure of a system or method and cannot be written to a file:"
             " it must be a class or function at the top of a module. Define it there, or export a"
@@ -91,23 +90,24 @@ def _name(x: Any) -> str:
 
 
 def _found(name: str) -> Any:
-    """The class or function of this name.
+    """Looks up a class or function by its name "module:name".
 
-    Modules of the library are imported; others must be there, since importing one runs its code.
+    Modules of the library are imported if needed. Any other module must already be imported,
+    because importing a module runs its code.
 
     Raises:
-        ValueError: there is none.
+        ValueError: no class or function has this name.
     """
     module, _, path = name.partition(":")
     try:
         if module.partition(".")[0] == "jaxcon":
             importlib.import_module(module)
-        found = sys.modules[module]
+        target = sys.modules[module]
         for part in path.split("."):
-            found = getattr(found, part)
+            target = getattr(target, part)
     except (ImportError, KeyError, AttributeError) as error:
         raise ValueError(
             f"there is no {name}, which the file needs; import its module {module!r} first, in the"
             " version with which it was written."
         ) from error
-    return found
+    return target

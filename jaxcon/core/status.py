@@ -1,28 +1,31 @@
-"""What became of a world: codes that survive jit and vmap, and their meaning in words."""
+"""Status codes, one for each world, that work under jit and vmap, and their meanings."""
 
 from enum import IntEnum
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, PyTree
 
 
 class Status(IntEnum):
-    """0 is healthy; below `CONFLICT` a world has failed and stops, from there on it goes on.
+    """The status codes of a world.
+
+    Codes from 1 to below `CONFLICT` are failures: the world stops. Codes from `CONFLICT` on are
+    notes: the world continues.
 
     Attributes:
-        OK: nothing to say.
+        OK: no failure and no note.
         NON_FINITE: a state, force or parameter is NaN or infinite.
-        SINGULAR: rows depend on each other, or the mass matrix is not positive definite.
+        SINGULAR: constraint rows are dependent, or the mass matrix is not positive definite.
         NOT_CONVERGED: an iteration did not reach its tolerance.
-        VIOLATED: constraints stayed off by more than the limit of a `Recovery`.
-        LOST_TURNS: a joint turned further in a step than its count of whole turns can tell.
-        LOST_IMPACTS: a joint rebounds through the whole of its range within a step.
-        CONFLICT: constraints contradict each other; least squares go on.
-        ROLLED_BACK: a `Recovery` went back to the state before the step.
-        PROJECTED: it went to the valid configuration nearest to the state before.
-        RELAXED: it took the step with weaker feedback.
+        VIOLATED: constraint errors stayed above the limit of a `Recovery`.
+        LOST_TURNS: a joint turned too far in a step to count its whole turns.
+        LOST_IMPACTS: a joint rebounds through its whole range within a step.
+        CONFLICT: constraints contradict each other; the least-squares solution was used.
+        ROLLED_BACK: a `Recovery` restored the state before the step.
+        PROJECTED: a `Recovery` projected the state before the step onto the constraints.
+        RELAXED: a `Recovery` took the step with weaker feedback.
     """
 
     OK = 0
@@ -39,10 +42,10 @@ class Status(IntEnum):
 
 
 _CONFLICT, _RELAXED = int(Status.CONFLICT), int(Status.RELAXED)
-"""A member is no Python number to JAX where jit is disabled, and would make an int64 of a code."""
+"""Codes as plain integers, because JAX without jit promotes an array and a `Status` to int64."""
 
 REPAIRS = (Status.ROLLED_BACK, Status.PROJECTED, Status.RELAXED)
-"""Notes of a `Recovery`: what acted."""
+"""The codes of steps that a `Recovery` repaired."""
 
 
 MEANING = {
@@ -77,39 +80,42 @@ MEANING = {
 
 
 class SimulationError(RuntimeError):
-    """A world failed; the message names which and why."""
+    """The error of a failed simulation; the message names the world and the reason."""
 
 
 def failed(code: Array) -> Array:
-    """Returns True where a world has failed, by its code: it keeps its last finite state.
+    """Returns True for each failed world; failed worlds keep their last finite state.
 
-    So has a world with a code that no `Status` has.
+    Unknown status codes count as failures.
     """
     return (code != 0) & ((code < _CONFLICT) | (code > _RELAXED))
 
 
 def failures(code: Array) -> Array:
-    """The code where it is a failure, OK where it is a note."""
+    """Returns the status codes of failed worlds, and OK for all other worlds."""
     return jnp.where(failed(code), code, Status.OK).astype(code.dtype)
 
 
 def first(earlier: Array, later: Array) -> Array:
-    """The graver code, a failure before a conflict before a repair; of equals the earlier."""
+    """Returns the more severe of two status codes; of equally severe codes, the earlier one.
+
+    A failure is more severe than a conflict, and a conflict more severe than a repair.
+    """
     conflict = (later == _CONFLICT) & (earlier > _CONFLICT)
     graver = failed(later) & ~failed(earlier) | conflict
     return jnp.where((earlier == 0) | graver, later, earlier)
 
 
-def raise_for_status(result: object) -> None:
-    """Raises where a world failed or has contradicting constraints. For use outside jit.
+def raise_for_status(result: PyTree) -> None:
+    """Raises an error if any world failed or has contradictory constraints; call it outside jit.
 
     Args:
         result: a State, StepInfo or Solution, of one world or a batch.
 
     Raises:
-        TypeError: it has no status.
-        SimulationError: some `status` is neither OK nor that of a repair; the message names world,
-            code and likely causes.
+        TypeError: the result has no status.
+        SimulationError: a status is neither OK nor a repair; the message names world, code and
+            likely causes.
     """
     try:
         status = np.asarray(getattr(result, "status", result))
@@ -123,9 +129,9 @@ def raise_for_status(result: object) -> None:
     bad = np.argwhere(~np.isin(np.atleast_1d(status), (Status.OK, *REPAIRS)))
     if bad.size:
         number = int(np.atleast_1d(status)[tuple(bad[0])])
-        known = number in Status.__members__.values()
-        name = Status(number).name if known else f"status {number}"
-        meaning = MEANING[Status(number)] if known else "no Status has this code"
+        named = number in Status.__members__.values()
+        name = Status(number).name if named else f"status {number}"
+        meaning = MEANING[Status(number)] if named else "no Status has this code"
         where = "" if status.ndim == 0 else f" in {len(bad)} of {status.size} worlds"
         index = "" if status.ndim == 0 else f", first in world {tuple(map(int, bad[0]))}"
         times = getattr(result, "time", None)

@@ -1,11 +1,11 @@
-"""Environments for reinforcement learning: pure functions, and Gymnasium's interfaces to them.
+"""Environments for reinforcement learning: pure functions, and interfaces to Gymnasium and Brax.
 
     environment = jc.environments.make("CartPole")
     episode = environment.reset(key)
     episode, outcome = environment.step(episode, action)
 
-With Gymnasium installed (`pip install 'jaxcon[rl]'`), importing this registers the tasks, so that
-`gymnasium.make("jaxcon/CartPole-v0")` and `gymnasium.make_vec` know them.
+If Gymnasium is installed (`pip install 'jaxcon[rl]'`), importing this module registers the tasks
+for `gymnasium.make("jaxcon/CartPole-v0")` and `gymnasium.make_vec`.
 """
 
 from importlib import import_module
@@ -66,19 +66,19 @@ __all__ = [
     "with_stiffness",
 ]
 
-OF_OTHERS = {
+ADAPTERS = {
     "BraxEnv": "brax",
     "FunctionalEnv": "functional",
     "GymnasiumEnv": "gym",
     "GymnasiumVectorEnv": "vector",
 }
-"""Classes that derive from those of Gymnasium or Brax, and so need it, by module."""
+"""Classes that need Gymnasium or Brax, with their modules."""
 
 
 def __getattr__(name: str) -> Any:
-    """A class that needs Gymnasium or Brax, imported when it is first asked for."""
-    if name in OF_OTHERS:
-        return getattr(import_module(f"jaxcon.environments.{OF_OTHERS[name]}"), name)
+    """Imports a class that needs Gymnasium or Brax at its first use."""
+    if name in ADAPTERS:
+        return getattr(import_module(f"jaxcon.environments.{ADAPTERS[name]}"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

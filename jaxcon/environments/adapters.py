@@ -1,4 +1,4 @@
-"""What Gymnasium's interfaces to an environment have in common."""
+"""Helpers that the Gymnasium interfaces of an environment share."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxcon.core import checks
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, PyTree
 from jaxcon.environments.environment import Environment
 
 try:
@@ -21,58 +21,58 @@ except ImportError as error:
     raise ImportError("Gymnasium's interfaces need gymnasium: pip install 'jaxcon[rl]'.") from error
 
 __all__ = ["AutoresetMode", "FuncEnv", "VectorEnv", "batch_space", "gymnasium"]
-"""The names of Gymnasium, whose absence only this module explains."""
+"""Gymnasium names. Other modules import them from here, where a missing Gymnasium is reported."""
 
-PICTURES = "rgb_array"
+RGB_ARRAY = "rgb_array"
 
 
 def observation_space(environment: Environment) -> spaces.Box:
-    """The bounds of its channels."""
-    least, most = (
-        np.array([getattr(channel, side) for channel in environment.observed], environment.dtype)
-        for side in ("least", "most")
-    )
+    """Returns the Gymnasium space of observations, bounded by the observation channels."""
+    least = np.array([channel.least for channel in environment.observed], environment.dtype)
+    most = np.array([channel.most for channel in environment.observed], environment.dtype)
     return spaces.Box(least, most, dtype=environment.dtype.type)
 
 
 def action_space(environment: Environment) -> spaces.Box:
-    """From −1 to 1 for each number of an action."""
+    """Returns the Gymnasium space of actions: −1 to 1 for each component."""
     return spaces.Box(-1.0, 1.0, (len(environment.actions),), environment.dtype.type)
 
 
 def describe(environment: Environment) -> dict[str, Any]:
-    """Gymnasium's metadata: the pictures, and how many of them make a second."""
+    """Returns Gymnasium's metadata: render modes and frames per second."""
     rate = max(round(1 / (float(environment.dt) * environment.skip)), 1)
-    return {"render_modes": [PICTURES], "render_fps": rate}
+    return {"render_modes": [RGB_ARRAY], "render_fps": rate}
 
 
 def check_render_mode(mode: str | None) -> str | None:
-    """The mode.
+    """Returns the render mode if it is supported.
 
     Raises:
-        ValueError: it is another one.
+        ValueError: the mode is not supported.
     """
-    if mode not in (None, PICTURES):
-        raise ValueError(f"render_mode must be None or '{PICTURES}', got {mode!r}.")
+    if mode not in (None, RGB_ARRAY):
+        raise ValueError(f"render_mode must be None or '{RGB_ARRAY}', got {mode!r}.")
     return mode
 
 
 def check_options(options: dict[str, Any] | None, known: tuple[str, ...]) -> None:
-    """Checks the options of a reset.
+    """Checks that all options of a reset are known.
 
     Raises:
-        ValueError: some are unknown.
+        ValueError: an option is unknown.
     """
     if unknown := sorted(set(options or {}) - set(known)):
-        there = f"known are {list(known)}" if known else "there are none"
-        raise ValueError(f"reset: unknown options {unknown}; {there}.")
+        hint = f"known are {list(known)}" if known else "there are none"
+        raise ValueError(f"reset: unknown options {unknown}; {hint}.")
 
 
 def check_no_horizon(options: dict[str, Any]) -> None:
-    """Checks that a time limit comes as Gymnasium's, whose own would go before it unseen.
+    """Refuses the option `horizon`.
+
+    Gymnasium's own `max_episode_steps` would silently override it.
 
     Raises:
-        ValueError: it is an option of the task.
+        ValueError: `horizon` is among the options.
     """
     if "horizon" in options:
         raise ValueError(
@@ -81,51 +81,53 @@ def check_no_horizon(options: dict[str, Any]) -> None:
         )
 
 
-def time_limit(steps: int | None, own: int | None) -> int | None:
-    """The horizon of `max_episode_steps`, which is None for that of the task and −1 for none.
+def time_limit(steps: int | None, default: int | None) -> int | None:
+    """Returns the horizon of an environment for Gymnasium's `max_episode_steps`.
+
+    None gives the default of the task, and −1 gives None, which means no limit.
 
     Raises:
-        ValueError: it is another number, and no count.
+        ValueError: `steps` is not a whole number from 1.
     """
     if steps is None:
-        return own
+        return default
     if steps == -1:
         return None
     checks.count("VectorEnv", "max_episode_steps", steps)
     return steps
 
 
-def check_saved(saved: Any, like: Any) -> None:
-    """Checks that what is to be restored has the arrays that are expected.
+def check_saved(saved: PyTree, like: PyTree) -> None:
+    """Checks that a saved pytree has the expected shapes and dtypes.
 
     Args:
         saved: a pytree of arrays.
-        like: the shapes and dtypes of such a tree.
+        like: a pytree of the expected shapes and dtypes.
 
     Raises:
-        ValueError: it has others.
+        ValueError: the leaves, shapes or dtypes differ.
     """
 
-    def arrays(tree: Any) -> dict[str, str]:
+    def arrays(tree: PyTree) -> dict[str, str]:
         leaves = jax.tree_util.tree_leaves_with_path(tree)
         return {jax.tree_util.keystr(path): f"{x.dtype}{x.shape}" for path, x in leaves}
 
-    found, wanted = arrays(saved), arrays(like)
-    for name in [*wanted, *found]:
-        if found.get(name) != wanted.get(name):
+    given, expected = arrays(saved), arrays(like)
+    for name in [*expected, *given]:
+        if given.get(name) != expected.get(name):
             raise ValueError(
-                "restore: what was saved is of another task, precision or number of copies: it has"
-                f" {name} as {found.get(name)}, and {wanted.get(name)} is expected."
+                "restore: the save is from another task, precision or number of copies: it has"
+                f" {name} as {given.get(name)}, and {expected.get(name)} is expected."
             )
 
 
 def key_from(random: np.random.Generator) -> Array:
-    """A key of JAX drawn from Gymnasium's generator, as an array that can be saved."""
+    """Draws a JAX key from Gymnasium's generator, as an array that can be saved."""
     return jax.random.PRNGKey(random.integers(2**32, dtype=np.uint32))
 
 
 def warn_of_no_mode() -> None:
-    """As Gymnasium warns of pictures that nobody asked for."""
+    """Warns, as Gymnasium does, that `render` was called without a render mode."""
     gymnasium.logger.warn(
-        f"render was called without a mode; make the environment with render_mode='{PICTURES}'."
+        f"render was called without a mode; make the environment with render_mode='{RGB_ARRAY}'."
     )

@@ -1,4 +1,4 @@
-"""Brax's interface to an environment, so that what trains on Brax's environments trains on ours."""
+"""Brax's interface to an environment, for training code written for Brax."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ except ImportError as error:
 
 
 class BraxEnv(Env):
-    """An environment as Brax's training knows them.
+    """An environment with Brax's interface.
 
         train(environment=BraxEnv("CartPole"), episode_length=500, num_timesteps=2_000_000, …)
 
-    Brax counts the actions of an episode and resets copies by its own wrappers, which bring each
-    copy back to the start that it first drew; give it the horizon of the task as `episode_length`.
-    A copy that diverges is done. `sys` is the environment itself, a pytree: a `randomization_fn`
-    gets it, and gives a batch of them with the axes to map over.
+    Brax's wrappers count actions and reset each copy to its first initial state. Pass the horizon
+    of the task as `episode_length`. An environment that diverges is done. `sys` is the
+    `Environment`, a pytree. A `randomization_fn` receives it and returns a batch of environments
+    with the axes to map over.
 
     Args:
         task: the name of a task, or an environment.
-        options: of the task's `build`.
+        options: options of the task's `build`.
 
     References:
         Freeman et al., Brax: a differentiable physics engine for large scale rigid body simulation
@@ -40,43 +40,43 @@ class BraxEnv(Env):
         self.sys = dataclasses.replace(make(task, **options), horizon=None)
 
     def reset(self, rng: Array) -> State:
-        """The start of an episode, all of whose randomness comes from the key."""
-        episode: Any = self.sys.reset(rng)
+        """Starts an episode. All its random numbers derive from the key."""
+        episode = self.sys.reset(rng)
         zero = jnp.zeros((), self.sys.dtype)
         metrics = {"violation": zero, "diverged": zero}
         return State(episode, self.sys.observe(episode), zero, zero, metrics)
 
-    def step(self, state: Any, action: Array) -> State:
-        """One action, clipped to −1 to 1."""
+    def step(self, state: State, action: Array) -> State:
+        """Takes one action, clipped to −1 to 1."""
         before: Episode = state.pipeline_state
         episode, outcome = self.sys.step(before, action)
         done, diverged = outcome.terminated | outcome.truncated, outcome.info["diverged"]
-        seen = {"violation": outcome.info["violation"], "diverged": diverged}
+        metrics = {"violation": outcome.info["violation"], "diverged": diverged}
         dtype = self.sys.dtype
         return state.replace(
             pipeline_state=episode,
             obs=outcome.observation,
             reward=outcome.reward,
             done=done.astype(dtype),
-            metrics=state.metrics | {name: x.astype(dtype) for name, x in seen.items()},
+            metrics=state.metrics | {name: x.astype(dtype) for name, x in metrics.items()},
         )
 
     @property
     def observation_size(self) -> int:
-        """Numbers of an observation."""
+        """The number of components of an observation."""
         return len(self.sys.observed)
 
     @property
     def action_size(self) -> int:
-        """Numbers of an action."""
+        """The number of components of an action."""
         return len(self.sys.actions)
 
     @property
     def backend(self) -> str:
-        """What simulates."""
+        """The name of the physics engine."""
         return "jaxcon"
 
     @property
     def dt(self) -> Array:
-        """The time of an action [s]."""
+        """The duration of an action [s]."""
         return self.sys.dt * self.sys.skip

@@ -1,54 +1,57 @@
-"""Many copies of an environment in one program, each reset with a fresh key when it is done."""
+"""A batch of copies of an environment in one program; each copy resets when its episode ends."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Environment, Episode, Outcome
 
+T = TypeVar("T")
+
 Randomize = Callable[[Environment, Array], Environment]
-"""(environment, key) → the same with other numbers: the world of one copy, for one episode."""
+"""(environment, key) → an environment of equal structure, for one copy and one episode."""
 
 MODES = ("NextStep", "SameStep", "Disabled")
-"""When a copy that is done is reset, by the names that Gymnasium gives them."""
+"""The modes that set when a finished copy is reset, by Gymnasium's names."""
 
-PARTS, LEAST_PART = (16, 4, 1), 64
-"""By which parts of all copies they are started, and how many at least."""
+RESTART_SHARES, LEAST_RESTARTS = (16, 4, 1), 64
+"""Initial states are computed for 1/16, 1/4 or all of the copies, but for at least 64."""
 
 
 @pytree
 class Copies:
-    """Where all copies stand; every array has a first axis of their number n.
+    """The state of n copies of an environment. All arrays have a leading axis of length n.
 
     Attributes:
-        episode: of each.
-        done: which are done, (n,).
-        world: the environment of each where these differ; () where all share one.
+        episode: the episode of each copy.
+        done: True for copies whose episode has ended, (n,).
+        world: the environment of each copy if copies are randomized; otherwise (), as all copies
+            share one environment.
     """
 
     episode: Episode
     done: Array
-    world: PyTree = ()
+    world: Any = ()
 
 
 def begin(
     environment: Environment, key: Array, count: int, randomize: Randomize | None = None
 ) -> tuple[Copies, Array]:
-    """All copies at the start of an episode, and what they see.
+    """Starts an episode in every copy.
 
     Args:
-        environment: of all of them.
-        key: each copy gets one of its own, which does not depend on how many there are.
-        count: n.
-        randomize: draws the world of each copy, afresh for each episode.
+        environment: the environment to copy.
+        key: a JAX key. The key of each copy is derived from it and does not depend on n.
+        count: n, the number of copies.
+        randomize: draws the environment of a copy, again for each episode; None for equal copies.
 
     Returns:
         The copies and their observations (n, …).
@@ -66,27 +69,33 @@ def advance(
     mode: str = "NextStep",
     randomize: Randomize | None = None,
 ) -> tuple[Copies, Outcome]:
-    """One action of every copy; pure, and good to scan.
+    """Takes one action in every copy. The function is pure and can be scanned.
 
     Args:
-        environment: of all of them.
-        copies: where they stand.
+        environment: the environment given to `begin`.
+        copies: the copies before the actions.
         actions: (n, number of actions).
-        mode: "NextStep": a copy that was done is reset instead of acting, with reward 0;
-            "SameStep": it is reset after the action that ends it, whose observation and info are
-            `final_obs` and `final_info` of the info; "Disabled": it goes on.
-        randomize: as of `begin`.
+        mode: "NextStep": a finished copy ignores its action, is reset and gets reward 0.
+            "SameStep": a copy is reset right after its last action, whose observation and info are
+            `final_obs` and `final_info` of the info. "Disabled": copies are never reset.
+        randomize: as for `begin`.
 
     Returns:
         The copies, and the outcome of each, (n, …).
 
     Raises:
-        ValueError: an unknown mode.
+        ValueError: the mode is unknown.
     """
     if mode not in MODES:
         raise ValueError(f"advance: mode must be one of {', '.join(MODES)}, got {mode!r}.")
     after = simulate(environment, copies, actions)
-    reward, terminated, truncated = over(environment, copies, "judge", actions, after)
+    reward, terminated, truncated = over(
+        environment,
+        copies,
+        lambda world, *judged: world.judge(*judged),
+        actions,
+        after,
+    )
     stepped = dataclasses.replace(copies, episode=after, done=terminated | truncated)
     if mode == "NextStep":
         waiting = copies.done
@@ -96,109 +105,121 @@ def advance(
         stepped = restart(environment, stepped, waiting, randomize)
     final: dict[str, Any] = {}
     if mode == "SameStep":
-        seen, info = look(environment, stepped)
-        final = {"final_obs": seen, "_final_obs": stepped.done}
+        observation, info = look(environment, stepped)
+        final = {"final_obs": observation, "_final_obs": stepped.done}
         final |= {"final_info": info, "_final_info": stepped.done}
         stepped = restart(environment, stepped, stepped.done, randomize)
-    seen, info = look(environment, stepped)
-    return stepped, Outcome(seen, reward, terminated, truncated, info | final)
+    observation, info = look(environment, stepped)
+    return stepped, Outcome(observation, reward, terminated, truncated, info | final)
 
 
 def restart(
     environment: Environment, copies: Copies, chosen: Array, randomize: Randomize | None = None
 ) -> Copies:
-    """The copies with those that are chosen, (n,), at the start of a new episode.
+    """Starts a new episode in the chosen copies.
 
-    Few starts are computed where few are chosen: none, or as many as the smallest of `PARTS` of
-    all copies that holds them. There is no loop, so that both modes of differentiation go through.
+    Shapes are static, so initial states are computed for a fixed number of copies. That number is
+    zero if no copy is chosen. Otherwise, it is the smallest share of `RESTART_SHARES` that is large
+    enough.
 
     Args:
-        environment: of all of them.
-        copies: where they stand.
-        chosen: which, (n,) of bools.
-        randomize: as of `begin`.
+        environment: the environment given to `begin`.
+        copies: the current copies.
+        chosen: a mask of the copies to restart, (n,).
+        randomize: as for `begin`.
     """
     count = chosen.shape[0]
-    sizes = sorted({min(count, max(LEAST_PART, -(-count // part))) for part in PARTS})
+    sizes = sorted(
+        {min(count, max(LEAST_RESTARTS, -(-count // share))) for share in RESTART_SHARES}
+    )
     old = copies.episode, copies.world
 
-    def started(size: int) -> tuple[Episode, PyTree]:
-        so_far, which = jnp.cumsum(chosen), jnp.arange(1, size + 1)
-        index = jnp.searchsorted(so_far, which, method="scan_unrolled")  # n beyond the last
+    def restarted(size: int) -> tuple[Episode, Any]:
+        # index[i] is the copy that is the i-th to restart, and n if there are fewer than i
+        index = jnp.searchsorted(
+            jnp.cumsum(chosen), jnp.arange(1, size + 1), method="scan_unrolled"
+        )
         fresh = _start(environment, old[0].key.at[index].get(mode="clip"), randomize)
         return jax.tree.map(lambda x, y: x.at[index].set(y, mode="drop"), old, fresh)
 
-    cases = [lambda: old, *(functools.partial(started, size) for size in sizes)]
-    case = jnp.sum(jnp.sum(chosen) > jnp.asarray([0, *sizes[:-1]]))
-    episode, world = jax.lax.switch(case, cases)
+    # a switch over a few static sizes: unlike a loop, both modes of differentiation support it
+    branches = [lambda: old, *(functools.partial(restarted, size) for size in sizes)]
+    branch = jnp.sum(jnp.sum(chosen) > jnp.asarray([0, *sizes[:-1]]))
+    episode, world = jax.lax.switch(branch, branches)
     return Copies(episode, copies.done, world)
 
 
 def _start(
     environment: Environment, keys: Array, randomize: Randomize | None
-) -> tuple[Episode, PyTree]:
-    """An episode for each key, and its world where worlds differ."""
+) -> tuple[Episode, Any]:
+    """Returns a new episode for each key, and its environment if copies are randomized."""
 
-    def one(key: Array) -> tuple[Episode, PyTree]:
+    def start(key: Array) -> tuple[Episode, Any]:
         if randomize is None:
             return environment.reset(key), ()
-        own, key = jax.random.split(key)
-        world = randomize(environment, own)
+        world_key, key = jax.random.split(key)
+        world = randomize(environment, world_key)
         return world.reset(key), world
 
-    return jax.vmap(one)(keys)
+    return jax.vmap(start)(keys)
 
 
 def simulate(environment: Environment, copies: Copies, actions: Array) -> Episode:
-    """The episodes of all copies after an action.
+    """Returns the episodes of all copies after one action each.
 
-    On a CPU one lot of copies follows the other: many leave its cache in each of the operations
-    that a step consists of, and are then 1.3 to 7 times slower.
+    On a CPU, large batches run in chunks of at most `at_once` copies. Larger chunks exceed the
+    cache in each operation of a step, which is then 1.3 to 7 times slower.
 
     Args:
-        environment: of all of them.
-        copies: where they stand.
+        environment: the environment given to `begin`.
+        copies: the copies before the actions.
         actions: (n, number of actions).
     """
-    size = size_of_lot(len(copies.done), environment.at_once)
+
+    def transition(chunk: tuple[Copies, Array]) -> Episode:
+        return over(environment, chunk[0], lambda world, *given: world.transition(*given), chunk[1])
+
+    size = chunk_size(len(copies.done), environment.at_once)
     if size is None or jax.default_backend() != "cpu":
-        return over(environment, copies, "transition", actions)
-
-    def apart(x: Array) -> Array:
-        return x.reshape(-1, size, *x.shape[1:])
-
-    lots = jax.tree.map(apart, (copies, actions))
-    after = jax.lax.map(lambda own: over(environment, own[0], "transition", own[1]), lots)
+        return transition((copies, actions))
+    chunks = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), (copies, actions))
+    after = jax.lax.map(transition, chunks)
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), after)
 
 
-def size_of_lot(count: int, most: int) -> int | None:
-    """How many of so many copies are simulated at once; None for all.
+def chunk_size(count: int, most: int) -> int | None:
+    """Returns the largest divisor of `count` in (most/4, most].
 
-    The most that divide them, since a last lot of its own would be compiled for itself.
+    None means that all copies run in one batch.
     """
     if count <= most:
         return None
+    # only divisors: a smaller last chunk would be compiled separately
     sizes = range(most, most // 4, -1)
     return next((size for size in sizes if count % size == 0), None)
 
 
 def look(environment: Environment, copies: Copies) -> tuple[Array, dict[str, Array]]:
-    """What all copies see, and their info."""
-    return over(environment, copies, "look")
+    """Returns the observations and the info of all copies."""
+    return over(environment, copies, lambda world, episode: world.look(episode))
 
 
-def over(environment: Environment, copies: Copies, verb: str, *args: Any) -> Any:
-    """A method of the environment for all copies, each in its world.
+def over(
+    environment: Environment,
+    copies: Copies,
+    function: Callable[..., T],
+    *args: Array | Episode,
+) -> T:
+    """Maps a function over all copies, each with its environment.
 
     Args:
-        environment: of all of them.
-        copies: whose episodes come first among the arguments.
-        verb: the name of the method.
-        args: what else it takes, with a first axis of n.
+        environment: the environment that copies share unless they are randomized.
+        copies: the copies.
+        function: (environment, episode, *args) → a pytree.
+        args: further arguments, with a leading axis of length n.
     """
 
-    def one(world: PyTree, *own: Any) -> Any:
-        return getattr(environment if isinstance(world, tuple) else world, verb)(*own)
+    def call(world: Environment | tuple[()], *given: Array | Episode) -> T:
+        return function(environment if isinstance(world, tuple) else world, *given)
 
-    return jax.vmap(one)(copies.world, copies.episode, *args)
+    return jax.vmap(call)(copies.world, copies.episode, *args)

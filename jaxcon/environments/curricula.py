@@ -1,38 +1,37 @@
-"""Curricula: numbers as functions of training, and environments with these numbers.
+"""Curricula: schedules over training, and environments with scheduled or randomized parameters.
 
-Schedules are pure; what they return goes into leaves, so that no number makes a new trace. They
-take arrays and may be traced.
+Schedules are pure functions of arrays, traced or not. Their results become leaves of the
+environment, so new values do not recompile.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
-from jaxcon.core.typing import Array
-from jaxcon.environments.environment import Environment
-from jaxcon.stabilization.penalty import Penalty
+from jaxcon.core.typing import Array, Scalar
+from jaxcon.environments.environment import Environment, Number
+from jaxcon.methods.penalty import Penalty
 
 OWNER = "vary and jitter"
-"""The first words of their errors."""
+"""The prefix of error messages."""
 
 
-def decay(t: Any, initial: Any, time: Any) -> Array:
-    """σ(t) = σ₀ exp(−t/τ): noise that fades.
+def decay(t: Scalar, initial: Number, time: Number) -> Array:
+    """Returns exponentially decaying noise, σ(t) = σ₀ exp(−t/τ).
 
     Args:
-        t: how far training has come, in any unit, (…).
-        initial: σ₀.
-        time: τ, in the unit of t.
+        t: training progress in any unit, (…).
+        initial: σ₀, the initial noise.
+        time: τ, the decay time, in the unit of t.
 
     Raises:
-        ValueError: a number is none, or τ is not positive.
+        ValueError: an argument is not a number, or τ is not positive.
     """
     for what, x in (("t", t), ("initial", initial)):
         checks.check("decay", what, x)
@@ -40,40 +39,46 @@ def decay(t: Any, initial: Any, time: Any) -> Array:
     return initial * jnp.exp(-jnp.asarray(t) / time)
 
 
-def warm_up(episode: Any, begin: Any, end: Any, least: Any = 0.1) -> Array:
-    """The strength of a constraint by episode: `least` up to `begin`, a ramp, 1 from `end` on.
+def warm_up(episode: Scalar, begin: Number, end: Number, least: Number = 0.1) -> Array:
+    """Returns the strength of a constraint by episode: `least`, then a ramp to 1.
 
     Args:
-        episode: how many have been, (…).
-        begin: where the ramp begins.
-        end: where it ends; beyond `begin`.
-        least: the strength before.
+        episode: the number of finished episodes, (…).
+        begin: the episode at which the ramp begins.
+        end: the episode at which the ramp reaches 1; greater than `begin`.
+        least: the strength before the ramp.
 
     Raises:
-        ValueError: a number is none, or `end` is not beyond `begin`.
+        ValueError: an argument is not a number, or `end` is not greater than `begin`.
     """
     for what, x in (("episode", episode), ("begin", begin), ("end", end), ("least", least)):
         checks.check("warm_up", what, x)
     if checks.is_concrete((begin, end)) and not np.all(np.less(begin, end)):
         raise ValueError(f"warm_up: end must lie beyond begin, got {end} and {begin}.")
-    done = (jnp.asarray(episode, jnp.result_type(float)) - begin) / (end - begin)
-    return least + (1 - least) * jnp.clip(done, 0, 1)
+    progress = (jnp.asarray(episode, jnp.result_type(float)) - begin) / (end - begin)
+    return least + (1 - least) * jnp.clip(progress, 0, 1)
 
 
 def by_performance(
-    performance: Any, least: Any, most: Any, middle: Any = 0.0, width: Any = 1.0
+    performance: Scalar,
+    least: Number,
+    most: Number,
+    middle: Number = 0.0,
+    width: Number = 1.0,
 ) -> Array:
-    """k = k_min + (k_max − k_min) sigmoid((p − p₀)/w): the better, the stiffer.
+    """Returns a stiffness k that grows with performance p.
+
+    It is k = k_min + (k_max − k_min) sigmoid((p − p₀)/w).
 
     Args:
-        performance: p, such as the mean reward of the last episodes, (…).
-        least: k_min.
-        most: k_max.
-        middle: p₀, where k is halfway.
-        width: w > 0; from 0.27 to 0.73 of the way within one of it either side.
+        performance: p, such as the mean reward of recent episodes, (…).
+        least: k_min, the lowest stiffness.
+        most: k_max, the highest stiffness.
+        middle: p₀, the performance at which k is halfway.
+        width: w > 0, the width of the transition; at p₀ ± w, the sigmoid is 0.27 and 0.73.
 
     Raises:
-        ValueError: a number is none, or w is not positive.
+        ValueError: an argument is not a number, or w is not positive.
     """
     given = {"performance": performance, "least": least, "most": most, "middle": middle}
     for what, x in given.items():
@@ -82,13 +87,19 @@ def by_performance(
     return least + (most - least) * jax.nn.sigmoid((jnp.asarray(performance) - middle) / width)
 
 
-def with_stiffness(environment: Environment, stiffness: Any, damping: Any) -> Environment:
-    """The environment with springs instead of its constraints; stiff ones hold nearly as well.
+def with_stiffness(
+    environment: Environment,
+    stiffness: Scalar | Mapping[str, Scalar],
+    damping: Scalar | Mapping[str, Scalar],
+) -> Environment:
+    """Returns the environment with `Penalty` springs in place of its constraints.
 
     Args:
-        environment: whose method is taken but for its stabiliser.
-        stiffness: of `Penalty`, by constraint or of all.
-        damping: of `Penalty`.
+        environment: the environment; only the stabilizer of its method is replaced.
+        stiffness: the stiffness of `jc.stabilizers.Penalty`: one value for all constraints, or
+            values by constraint name.
+        damping: the damping of `jc.stabilizers.Penalty`: one value for all constraints, or values
+            by constraint name.
     """
     dtype = environment.dtype
     k, d = jax.tree.map(lambda x: jnp.asarray(x, dtype), (stiffness, damping))
@@ -97,86 +108,77 @@ def with_stiffness(environment: Environment, stiffness: Any, damping: Any) -> En
 
 
 def vary(
-    environment: Environment, key: Array, shares: Mapping[str, Mapping[str, float]]
+    environment: Environment, key: Array, shares: Mapping[str, Mapping[str, Number]]
 ) -> Environment:
-    """The environment with some of its numbers times 1 + u, u uniform within ± a share.
+    """Randomizes parameters: multiplies each by 1 + u, with u uniform within ± a share.
 
     Args:
-        environment: `environment.system.params` lists its numbers.
-        key: of the draw.
+        environment: the environment; `environment.system.params` lists its parameters.
+        key: a JAX key.
         shares: {body or element: {field: share}}; each component of a field gets its own u.
 
     Raises:
-        ValueError: an unknown name or field.
+        ValueError: a name or field is unknown.
     """
 
-    def scaled(key: Array, x: Array, share: float) -> Array:
+    def scaled(key: Array, x: Array, share: Number) -> Array:
         return x * (1 + jax.random.uniform(key, x.shape, x.dtype, -share, share))
 
-    return _changed(environment, key, shares, scaled)
+    return _perturbed(environment, key, shares, scaled)
 
 
 def jitter(
-    environment: Environment, key: Array, sizes: Mapping[str, Mapping[str, Any]]
+    environment: Environment, key: Array, sizes: Mapping[str, Mapping[str, Number]]
 ) -> Environment:
-    """The environment with noise of N(0, σ²) added to some of its numbers: C + N(0, σ²).
+    """Adds normally distributed noise, N(0, σ²), to parameters.
 
-    Noise on anchors, lengths or centres of mass moves what the constraints ask for by as much, and
-    an episode begins as far off them: the default feedback takes that back within a step, at a
-    speed of σ/h.
+    Noise on anchors, lengths or centers of mass shifts the constraints. An episode then starts with
+    a violation of about σ. The default feedback removes it within one step of size h, with a
+    velocity of about σ/h.
 
     Args:
-        environment: `environment.system.params` lists its numbers.
-        key: of the draw.
-        sizes: {constraint: {field: σ}}, in the unit of the field; may be traced.
+        environment: the environment; `environment.system.params` lists its parameters.
+        key: a JAX key.
+        sizes: {constraint: {field: σ}}, in the unit of the field; σ may be traced.
 
     Raises:
-        ValueError: an unknown name or field.
+        ValueError: a name or field is unknown.
     """
 
-    def moved(key: Array, x: Array, size: Any) -> Array:
+    def moved(key: Array, x: Array, size: Number) -> Array:
         return x + jnp.asarray(size, x.dtype) * jax.random.normal(key, x.shape, x.dtype)
 
-    return _changed(environment, key, sizes, moved)
+    return _perturbed(environment, key, sizes, moved)
 
 
-def _changed(environment: Environment, key: Array, which: Any, change: Any) -> Environment:
-    """With change(key, number, how) in place of each number that is named."""
-    _check_sizes(which)
-    known = environment.system.params
-    wanted = [(name, field) for name, fields in which.items() for field in fields]
-    _check_names(wanted, known)
-    changes: dict[str, dict[str, Array]] = {name: {} for name in which}
-    for own, (name, field) in zip(jax.random.split(key, len(wanted)), wanted, strict=True):
-        changes[name][field] = change(own, known[name][field], which[name][field])
-    return dataclasses.replace(environment, system=environment.system.with_params(changes))
-
-
-def _check_sizes(which: Any) -> None:
-    """Checks that there is a number, zero or more, for each field by name.
+def _perturbed(
+    environment: Environment,
+    key: Array,
+    sizes: Mapping[str, Mapping[str, Number]],
+    change: Callable[[Array, Array, Number], Array],
+) -> Environment:
+    """Returns the environment with each named parameter replaced by change(key, parameter, size).
 
     Raises:
-        ValueError: there is not.
+        ValueError: a size is negative or not a number, or a name or field is unknown.
     """
-    for name, fields in which.items() if isinstance(which, Mapping) else [("", which)]:
+    for name, fields in sizes.items() if isinstance(sizes, Mapping) else [("", sizes)]:
         if not isinstance(fields, Mapping):
             raise ValueError(
                 f"{OWNER}: give numbers by name and field, {{'arm': {{'mass': 0.1}}}}, got"
-                f" {checks.shortened(which)}."
+                f" {checks.shortened(sizes)}."
             )
         for field, x in fields.items():
             checks.check(OWNER, f"{field} of '{name}'", x, least=0)
-
-
-def _check_names(wanted: Sequence[tuple[str, str]], known: Mapping[str, Any]) -> None:
-    """Checks that every number is one of the system's.
-
-    Raises:
-        ValueError: one is not.
-    """
-    for name, field in wanted:
-        if not isinstance(known.get(name), Mapping):
-            named = sorted(x for x, fields in known.items() if isinstance(fields, Mapping))
-            raise ValueError(f"'{name}' has no numbers; those that have are {named}.")
-        if field not in known[name]:
-            raise ValueError(f"'{name}' has no {field!r}, it has {sorted(known[name])}.")
+    params = environment.system.params
+    chosen = [(name, field) for name, fields in sizes.items() for field in fields]
+    for name, field in chosen:
+        if not isinstance(params.get(name), Mapping):
+            names = sorted(x for x, fields in params.items() if isinstance(fields, Mapping))
+            raise ValueError(f"'{name}' has no numbers; those that have are {names}.")
+        if field not in params[name]:
+            raise ValueError(f"'{name}' has no {field!r}, it has {sorted(params[name])}.")
+    changes: dict[str, dict[str, Array]] = {name: {} for name in sizes}
+    for field_key, (name, field) in zip(jax.random.split(key, len(chosen)), chosen, strict=True):
+        changes[name][field] = change(field_key, params[name][field], sizes[name][field])
+    return dataclasses.replace(environment, system=environment.system.with_params(changes))

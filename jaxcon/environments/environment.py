@@ -1,34 +1,46 @@
-"""An environment as pure functions of pytrees: reset, step, observe, reward.
+"""Environments as pure functions of pytrees: reset, step, observe, reward.
 
-An environment is a value. Its physical numbers are leaves, so that `jax.vmap` over environments
-gives every copy a world of its own, and `jax.grad` reaches them; names, counts and choices are
-static. What a task adds to its mechanism is four functions: where an episode starts, what an
-action does, what is seen and what it is worth.
+An `Environment` is a frozen dataclass. Its physical parameters are leaves, so `jax.vmap` over
+environments randomizes them, and `jax.grad` differentiates with respect to them. Names, counts and
+choices are static. A task adds four functions to its mechanism: the initial state, the control
+inputs of an action, the observation and the reward.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import failed
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.model.state import State
-from jaxcon.simulation.method import Method
-from jaxcon.simulation.rollout import rollout
+from jaxcon.core.typing import Array, DType, Scalar
+from jaxcon.execution.rollout import rollout
+from jaxcon.methods.method import Method
+from jaxcon.system.body_system import BodySystem
+from jaxcon.system.state import State
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Number: TypeAlias = Array | float
+"""A number or array for arithmetic with arrays, which may be traced."""
+
+Option: TypeAlias = Scalar | Sequence[Scalar] | Method | DType | None
+"""An option of a task's `build`: a number, a sequence of numbers, a method or a dtype."""
 
 
 class Channel(NamedTuple):
-    """One number of an observation, with the bounds to which it is clipped.
+    """The description of one component of an observation, and the bounds to which it is clipped.
 
     Attributes:
-        name: what it is.
-        unit: as "m" or "rad/s"; "1" where there is none.
+        name: a description, such as "rate of crank".
+        unit: such as "m" or "rad/s"; "1" for a dimensionless number.
         least, most: the bounds.
     """
 
@@ -40,18 +52,18 @@ class Channel(NamedTuple):
 
 @pytree
 class Episode:
-    """Where an episode stands; saved and restored as it is, it goes on with the very same numbers.
+    """The state of an episode. A saved episode continues bit for bit when it is restored.
 
     Attributes:
-        state: of the mechanism.
-        goal: what the task drew for this episode.
-        steps: actions taken, ().
-        key: for what this copy draws next.
-        violation: the largest |φ| that the last action's steps began with, ().
+        state: the state of the mechanism.
+        goal: the target that the task drew for this episode; () for none.
+        steps: the number of actions taken, ().
+        key: the JAX key for the next draws of this episode.
+        violation: the largest |φ| at the start of a step of the last action, ().
     """
 
     state: State
-    goal: PyTree
+    goal: Any
     steps: Array
     key: Array
     violation: Array
@@ -59,14 +71,14 @@ class Episode:
 
 @pytree
 class Outcome:
-    """What an action led to.
+    """The result of one action.
 
     Attributes:
-        observation: (n,), by `Environment.observed`.
-        reward: (); 0 where the world diverged.
-        terminated: whether the task is over, ().
-        truncated: whether the episode ends for another reason: its time is over, or it diverged.
-        info: `diverged`, the `status` code of the world, and `violation`.
+        observation: (n,); `Environment.observed` describes its components.
+        reward: (); 0 if the simulation diverged.
+        terminated: True if the task ended, ().
+        truncated: True if the episode reached its horizon or diverged, ().
+        info: `diverged`, the `status` code of the simulation, and `violation`.
     """
 
     observation: Array
@@ -78,130 +90,132 @@ class Outcome:
 
 @pytree
 class Environment:
-    """A mechanism with a task; what the tasks of `jaxcon.environments.tasks` derive from.
+    """A mechanism with a task: the base class of all tasks.
 
     Attributes:
         system: the mechanism.
-        method: how it is simulated.
-        dt: h of a step of the simulation, () [s].
-        skip: how many of these an action is held for.
-        horizon: actions until an episode is truncated; None, and it is not.
+        method: integrator, stabilizer and solvers.
+        dt: the step size h of the simulation, () [s].
+        skip: the number of steps for which an action is held.
+        horizon: the number of actions after which an episode is truncated; None for no limit.
     """
 
-    system: Any
+    system: BodySystem
     method: Method
     dt: Array
     skip: int = static()
     horizon: int | None = static()
     at_once: ClassVar[int] = 128
-    """The largest number of copies simulated at once on a CPU; more run one chunk after another."""
+    """The largest number of copies simulated at once on a CPU. Larger batches run in chunks."""
 
     @property
-    def dtype(self) -> Any:
-        """The dtype of every number."""
+    def dtype(self) -> np.dtype:
+        """The floating dtype of the system."""
         return self.system.gravity.dtype
 
     @property
     def observed(self) -> tuple[Channel, ...]:
-        """What an observation consists of."""
+        """The channels of an observation, one per component."""
         raise NotImplementedError
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """What an action consists of: names with the unit of an action's −1 to 1."""
+        """The components of an action: names, with the unit to which −1 to 1 refers."""
         raise NotImplementedError
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """What a picture shows at the start: (left, right) and (low, high) [m]."""
+        """The view of a rendered image at the start: (left, right) and (bottom, top) [m]."""
         raise NotImplementedError
 
     def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The part of the world in a picture, as large as `frame`, which it is unless overridden.
+        """Returns the view of a rendered image, with the size of `frame`; by default `frame`.
 
         Args:
-            episode: where it stands.
+            episode: the episode that is drawn.
         """
         return self.frame
 
-    def start(self, key: Array) -> tuple[State, PyTree]:
-        """A state of the mechanism in which an episode begins, and its goal.
+    def start(self, key: Array) -> tuple[State, Any]:
+        """Draws the initial state of an episode and its goal.
 
         Args:
-            key: of JAX.
+            key: a JAX key.
         """
         raise NotImplementedError
 
     def control(self, episode: Episode, action: Array) -> Array:
-        """The control inputs (n_u,) for an action within −1 to 1; the action unless overridden.
+        """Returns the control inputs (n_u,) for an action within −1 to 1.
+
+        By default, these are the action itself.
 
         Args:
-            episode: where it stands.
+            episode: the episode before the action.
             action: (number of actions,).
         """
         return action
 
     def observation(self, episode: Episode) -> Array:
-        """What is seen, before it is clipped, (n,).
+        """Returns the observation before clipping, (n,).
 
         Args:
-            episode: where it stands.
+            episode: the current episode.
         """
         raise NotImplementedError
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """What an action within −1 to 1 was worth, ().
+        """Returns the reward of an action within −1 to 1, ().
 
-        From 0 to 1 in the tasks here but `HalfCheetah`, which has Gymnasium's reward.
+        Rewards lie between 0 and 1, except for `HalfCheetah`, which has Gymnasium's reward.
 
         Args:
             before: the episode before the action.
             action: (number of actions,).
-            after: the episode after it.
+            after: the episode after the action.
         """
         raise NotImplementedError
 
     def terminal(self, episode: Episode) -> Array:
-        """Returns True where the task is over, ().
+        """Returns True if the task has ended, (). By default it never ends.
 
         Args:
-            episode: where it stands.
+            episode: the current episode.
         """
         return jnp.zeros((), bool)
 
-    def marks(self, axes: Any, episode: Episode) -> None:
-        """Draws into a picture what bodies do not show, such as the goal.
+    def marks(self, axes: Axes, episode: Episode) -> None:
+        """Draws the parts of an image that are not bodies, such as the goal; nothing by default.
 
         Args:
-            axes: of matplotlib.
-            episode: where it stands.
+            axes: Matplotlib axes.
+            episode: the current episode.
         """
 
     def reset(self, key: Array) -> Episode:
-        """The start of an episode, all of whose randomness comes from the key.
+        """Starts an episode. All its random numbers derive from the key.
 
         Args:
-            key: of JAX.
+            key: a JAX key.
         """
-        own, key = jax.random.split(key)
-        state, goal = self.start(own)
+        start_key, key = jax.random.split(key)
+        state, goal = self.start(start_key)
         zero = jnp.zeros((), jnp.int32)
         return Episode(state, goal, zero, key, jnp.zeros((), self.dtype))
 
-    def transition(self, episode: Episode, action: Any) -> Episode:
-        """The episode after one action, held for `skip` steps.
+    def transition(self, episode: Episode, action: Scalar) -> Episode:
+        """Returns the episode after one action, which is held for `skip` steps.
 
         Args:
-            episode: where it stands.
-            action: (number of actions,); what lies outside of −1 to 1 is clipped.
+            episode: the episode before the action.
+            action: (number of actions,); components are clipped to −1 to 1.
 
         Raises:
-            ValueError: the action has another shape (at trace time).
+            ValueError: the action has the wrong shape (at trace time).
         """
         return self.act(episode, self.allowed(action))
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """The episode after an action, which is not clipped."""
+        """Returns the episode after one action, which is not clipped."""
         control = self.control(episode, action)
         controls = jnp.broadcast_to(control, (self.skip, *control.shape))
         state, worst = rollout(
@@ -217,11 +231,11 @@ class Environment:
             episode, state=state, steps=episode.steps + 1, violation=jnp.max(worst)
         )
 
-    def allowed(self, action: Any) -> Array:
-        """The action, clipped to −1 to 1 and checked.
+    def allowed(self, action: Scalar) -> Array:
+        """Returns the action as an array, clipped to −1 to 1.
 
         Raises:
-            ValueError: it has another shape than `actions` says.
+            ValueError: its shape does not match `actions`.
         """
         action = jnp.asarray(action).astype(self.dtype)
         if action.shape != (len(self.actions),):
@@ -232,42 +246,45 @@ class Environment:
         return jnp.clip(action, -1, 1)
 
     def observe(self, episode: Episode) -> Array:
-        """The observation, clipped to the bounds of its channels, (n,)."""
-        least, most = (
-            jnp.asarray([getattr(c, side) for c in self.observed], self.dtype)
-            for side in ("least", "most")
-        )
+        """Returns the observation, clipped to the bounds of its channels, (n,)."""
+        least = jnp.asarray([channel.least for channel in self.observed], self.dtype)
+        most = jnp.asarray([channel.most for channel in self.observed], self.dtype)
         return jnp.clip(self.observation(episode), least, most)
 
-    def judge(self, before: Episode, action: Any, after: Episode) -> tuple[Array, Array, Array]:
-        """Reward, terminated and truncated, () each; a world that diverged earns nothing."""
+    def judge(self, before: Episode, action: Scalar, after: Episode) -> tuple[Array, Array, Array]:
+        """Returns reward, terminated and truncated, () each.
+
+        The reward is 0 if the simulation diverged.
+        """
         diverged = failed(after.state.status)
+        # where the reward is masked, a NaN in the action would still make its gradient NaN
         action = jnp.nan_to_num(self.allowed(action))
         reward = jnp.where(diverged, 0, self.reward(before, action, after))
         late = jnp.zeros((), bool) if self.horizon is None else after.steps >= self.horizon
         return reward, self.terminal(after) & ~diverged, late | diverged
 
     def info(self, episode: Episode) -> dict[str, Array]:
-        """Returns whether the world diverged, why, and how far it was off its constraints."""
+        """Returns `diverged`, the status code and the constraint violation of the last action."""
         status = episode.state.status
         return {"diverged": failed(status), "status": status, "violation": episode.violation}
 
     def look(self, episode: Episode) -> tuple[Array, dict[str, Array]]:
-        """Observation and info."""
+        """Returns the observation and the info of an episode."""
         return self.observe(episode), self.info(episode)
 
-    def step(self, episode: Episode, action: Any) -> tuple[Episode, Outcome]:
-        """One action: the episode after it, and what it led to; never resets.
+    def step(self, episode: Episode, action: Scalar) -> tuple[Episode, Outcome]:
+        """Takes one action. An episode that has ended is not reset.
 
         Args:
-            episode: from `reset` or `step`.
-            action: (number of actions,), clipped to −1 to 1. NaN makes the world diverge.
+            episode: the result of `reset` or of an earlier `step`.
+            action: (number of actions,), clipped to −1 to 1. NaN makes the simulation diverge.
 
         Returns:
-            The episode, in a world that diverged where it last was finite, and the outcome.
+            The episode and the outcome. If the simulation diverged, the episode is at its last
+            finite state.
 
         Raises:
-            ValueError: the action has another shape (at trace time).
+            ValueError: the action has the wrong shape (at trace time).
         """
         after = self.transition(episode, action)
         reward, terminated, truncated = self.judge(episode, action, after)
@@ -275,25 +292,25 @@ class Environment:
         return after, Outcome(observation, reward, terminated, truncated, info)
 
 
-def near(x: Any, scale: float) -> Array:
-    """1 / (1 + (x/s)²): 1 at x = 0, ½ at x = ±s, with a slope everywhere else.
+def near(x: Array, scale: float) -> Array:
+    """Returns the reward term 1 / (1 + (x/s)²) of an error x with scale s.
+
+    It is 1 at x = 0 and ½ at x = ±s. Its slope is nonzero except at x = 0.
 
     Args:
-        x: of any shape.
+        x: an error, of any shape.
         scale: s, in the unit of x.
     """
     return 1 / (1 + (x / scale) ** 2)
 
 
-def spread(key: Array, size: float, shape: tuple[int, ...], dtype: Any) -> Array:
-    """Uniform numbers from −size to size.
-
-    Drawn in a row: of many copies, XLA draws two rows of two at a third of the pace of one of four.
-    """
+def spread(key: Array, size: float, shape: tuple[int, ...], dtype: DType) -> Array:
+    """Draws an array of uniform random numbers between −size and size."""
+    # drawn flat and reshaped: under vmap, XLA draws two rows of two at a third of the speed of four
     return jax.random.uniform(key, (math.prod(shape),), dtype, -size, size).reshape(shape)
 
 
 def angle_channels(name: str, most: float) -> tuple[Channel, ...]:
-    """Cosine, sine and rate of an angle."""
-    turn = [Channel(f"{f} of {name}", "1", -1.0, 1.0) for f in ("cosine", "sine")]
-    return (*turn, Channel(f"rate of {name}", "rad/s", -most, most))
+    """Returns the channels of an angle: cosine, sine and rate, which is within ± `most`."""
+    direction = [Channel(f"{f} of {name}", "1", -1.0, 1.0) for f in ("cosine", "sine")]
+    return (*direction, Channel(f"rate of {name}", "rad/s", -most, most))

@@ -1,27 +1,28 @@
-"""Exploring where constraints allow it: the nearest action that keeps limits.
+"""Exploration within limits: the nearest action that satisfies linearized inequalities.
 
-a = argmin ½ ‖a − (a_raw + ε)‖²   so that   −1 ≤ a ≤ 1   and   c(after a) ≤ 0 to first order.
+The action is a = argmin ½ ‖a − (a_raw + ε)‖² subject to −1 ≤ a ≤ 1 and c(after a) ≤ 0. Here a_raw
+is the desired action, ε the noise and c the limits, linearized at the desired action.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, Scalar
 from jaxcon.environments.environment import Environment, Episode
 
 ITERATIONS = 30
-"""The iterations of Newton's method; each leaves at most a fifth of μ."""
+"""The number of Newton iterations. Each reduces the barrier parameter μ at most fivefold."""
 INWARD = 0.95
-"""How far an iteration goes of the way to the nearest bound."""
+"""The fraction of the distance to the nearest bound that one iteration may cover."""
 
 
-class Point(NamedTuple):
-    """A guess: the point a (k,), the multipliers λ (m,) and the slacks s (m,), both positive."""
+class ExploredPoint(NamedTuple):
+    """A primal–dual iterate: action a (k,), multipliers λ (m,) > 0 and slacks s (m,) > 0."""
 
     a: Array
     λ: Array
@@ -31,51 +32,53 @@ class Point(NamedTuple):
 def feasible_action(
     environment: Environment,
     episode: Episode,
-    action: Any,
+    action: Scalar,
     limits: Callable[[Episode], Array],
-    noise: Any = 0.0,
+    noise: Array | float = 0.0,
 ) -> Array:
-    """The action nearest to a wanted one, plus noise, after which the limits are kept.
+    """Returns the action nearest to the desired action plus noise that satisfies the limits.
 
-    The limits are linearized along the wanted action. Where no action keeps them all, they are
-    missed by least squares, each in the unit of |c| + |∇c|; two that are opposite make an equality.
-    It is differentiable in the action, the noise and the environment.
+    The limits c apply to the episode after the action, and are linearized at the desired action. If
+    no action satisfies all of them, their violations are minimized by least squares, each scaled by
+    the sum |c| + |∇c|. Two opposite limits act as an equality. The result is differentiable with
+    respect to the action, the noise and the environment.
 
     Args:
-        environment: which acts.
-        episode: where it stands.
-        action: a_raw, (k,).
-        limits: c, from an episode to numbers (m,) that are to be ≤ 0.
+        environment: the environment.
+        episode: the episode before the action.
+        action: a_raw, the desired action, (k,).
+        limits: c, a function from an episode to numbers (m,) that must be ≤ 0.
         noise: ε, (k,) or ().
 
     Returns:
         The action, (k,), within −1 to 1.
 
     Raises:
-        ValueError: the action has another shape than the environment's (at trace time).
+        ValueError: the action has the wrong shape for the environment (at trace time).
     """
-    wanted = jnp.asarray(action, environment.dtype) + noise
-    at = environment.allowed(wanted)
+    desired = jnp.asarray(action, environment.dtype) + noise
+    at = environment.allowed(desired)
 
     def after(a: Array) -> Array:
-        return limits(environment.act(episode, a))  # unclipped: a clip has no slope
+        return limits(environment.act(episode, a))  # not clipped: a clip has zero slope
 
     # forward mode: there are few actions
     value, slope = scaled(after(at), jax.jacfwd(after)(at))
     eye = jnp.eye(len(at), dtype=at.dtype)
     rows = jnp.concatenate([slope, eye, -eye])
     bounds = jnp.concatenate([slope @ at - value, jnp.ones(2 * len(at), at.dtype)])
-    return jnp.clip(project(wanted, rows, bounds), -1, 1)
+    return jnp.clip(project(desired, rows, bounds), -1, 1)
 
 
 def scaled(value: Array, slope: Array) -> tuple[Array, Array]:
-    """Limits and their slopes in units of their own, in which a row is |∇c| + |c| = 1.
+    """Scales each limit and its slope such that |∇c| + |c| = 1.
 
-    A millimetre for a whole action would else be given up before a thousandth of the action is.
+    Without the scaling, a limit that varies little over the range of an action would be violated
+    rather than satisfied.
 
     Args:
-        value: c, (m,).
-        slope: ∇c, (m, k).
+        value: c, the limits, (m,).
+        slope: ∇c, their slopes by the action, (m, k).
     """
     size = jax.lax.stop_gradient(jnp.sum(jnp.abs(slope), axis=1) + jnp.abs(value))
     size = jnp.where(size > 0, size, 1)
@@ -83,57 +86,64 @@ def scaled(value: Array, slope: Array) -> tuple[Array, Array]:
 
 
 def project(x: Array, rows: Array, bounds: Array) -> Array:
-    """The point a nearest to x with G a ≤ h, by an interior-point method of fixed length.
+    """Returns the point a nearest to x with G a ≤ h, by a fixed number of interior-point steps.
 
-    It solves a − x + Gᵀλ = 0, s = h − G a + δ λ, λ s = μ for small μ; δ lets rows that contradict
-    each other be missed by least squares. The derivative is that of this solution.
+    Solves a − x + Gᵀλ = 0, s = h − G a + δ λ, λ s = μ for small μ and δ. λ are multipliers and s
+    are slacks. Through δ, contradictory rows are violated in the least-squares sense. The
+    derivative is that of this solution.
 
     Args:
-        x: (k,).
+        x: the desired point, (k,).
         rows: G, (m, k); k and m of a few tens at most.
         bounds: h, (m,).
 
     Returns:
-        a, (k,).
+        The point a, (k,).
     """
     eps = float(jnp.finfo(x.dtype).eps)
-    soft = last = eps**0.6  # smaller, and rounding would show in the derivative
+    soft = last = eps**0.6  # with smaller values, rounding errors dominate the derivative
     size = 1 + jnp.max(jnp.abs(bounds - rows @ x), initial=0)
     ones = jnp.ones_like(bounds)
-    start = jax.lax.stop_gradient(Point(x, size * ones, size * ones))
+    start = jax.lax.stop_gradient(ExploredPoint(x, size * ones, size * ones))
     fixed = jax.lax.stop_gradient((x, rows, bounds))
 
-    def iterate(point: Point, _: Any) -> tuple[Point, None]:
-        aim = jnp.maximum(0.2 * jnp.mean(point.λ * point.s), last)
-        change = newton(point, residual(point, *fixed, soft, aim), fixed[1], soft)
-        both = jnp.concatenate([point.λ, point.s]), jnp.concatenate([change.λ, change.s])
-        shrinks = both[1] < 0
-        far = jnp.where(shrinks, -both[0] / jnp.where(shrinks, both[1], -1), jnp.inf)
-        length = jnp.minimum(INWARD * jnp.min(far, initial=jnp.inf), 1)
+    def iterate(point: ExploredPoint, _: None) -> tuple[ExploredPoint, None]:
+        μ = jnp.maximum(0.2 * jnp.mean(point.λ * point.s), last)
+        change = newton(point, residual(point, *fixed, soft, μ), fixed[1], soft)
+        positive, delta = (jnp.concatenate([p.λ, p.s]) for p in (point, change))
+        shrinks = delta < 0
+        to_bound = jnp.where(shrinks, -positive / jnp.where(shrinks, delta, -1), jnp.inf)
+        length = jnp.minimum(INWARD * jnp.min(to_bound, initial=jnp.inf), 1)
         return jax.tree.map(lambda p, c: p + length * c, point, change), None
 
-    found = jax.lax.stop_gradient(jax.lax.scan(iterate, start, None, ITERATIONS)[0])
-    # one step of Newton's method from the solution has its derivative, by the implicit function
-    # theorem, where the matrix is held constant
-    left = residual(found, x, rows, bounds, soft, last)
-    return found.a + newton(found, left, fixed[1], soft).a
+    solution = jax.lax.stop_gradient(jax.lax.scan(iterate, start, None, ITERATIONS)[0])
+    # implicit differentiation: one Newton step from the solution, with its matrix held constant,
+    # has the derivative of the solution
+    r = residual(solution, x, rows, bounds, soft, last)
+    return solution.a + newton(solution, r, fixed[1], soft).a
 
 
-def residual(point: Point, x: Array, rows: Array, bounds: Array, soft: float, aim: Any) -> Point:
-    """What is left of the three conditions: of the point, of the complementarity, of the rows."""
+def residual(
+    point: ExploredPoint, x: Array, rows: Array, bounds: Array, soft: float, μ: float | Array
+) -> ExploredPoint:
+    """Returns the residuals of the optimality conditions as an `ExploredPoint`.
+
+    They are stationarity, complementarity λ s = μ, and the rows s = h − G a + δ λ, with `soft` = δ.
+    """
     a, λ, s = point
-    return Point(a - x + rows.T @ λ, λ * s - aim, s - bounds + rows @ a - soft * λ)
+    return ExploredPoint(a - x + rows.T @ λ, λ * s - μ, s - bounds + rows @ a - soft * λ)
 
 
-def newton(point: Point, left: Point, rows: Array, soft: float) -> Point:
-    """The step that takes away what is left, to first order; the slacks and multipliers eliminated.
+def newton(point: ExploredPoint, r: ExploredPoint, rows: Array, soft: float) -> ExploredPoint:
+    """Returns the Newton step for the residual r, with slacks and multipliers eliminated.
 
-    Δs = −r_s − G Δa + δ Δλ and λ Δs + s Δλ = −r_λ give Δλ = (G Δa + r_s − r_λ/λ)/(s/λ + δ).
+    Δs = −r_s − G Δa + δ Δλ and λ Δs + s Δλ = −r_λ give Δλ = (G Δa + r_s − r_λ/λ)/(s/λ + δ). Here G
+    is `rows` and δ is `soft`.
     """
     _, λ, s = point
     weight = 1 / (s / λ + soft)
-    open_ = left.s - left.λ / λ
+    reduced = r.s - r.λ / λ
     matrix = jnp.eye(rows.shape[1], dtype=rows.dtype) + (rows.T * weight[None]) @ rows
-    a = jnp.linalg.solve(matrix, -left.a - rows.T @ (weight * open_))
-    λ_step = weight * (rows @ a + open_)
-    return Point(a, λ_step, -left.s - rows @ a + soft * λ_step)
+    a = jnp.linalg.solve(matrix, -r.a - rows.T @ (weight * reduced))
+    λ_step = weight * (rows @ a + reduced)
+    return ExploredPoint(a, λ_step, -r.s - rows @ a + soft * λ_step)

@@ -2,83 +2,96 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, Scalar
 from jaxcon.environments import adapters, render
 from jaxcon.environments.adapters import FuncEnv
-from jaxcon.environments.environment import Environment, Episode
+from jaxcon.environments.environment import Environment, Episode, Option
 from jaxcon.environments.registry import make
+
+if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 
 class FunctionalEnv(FuncEnv):
-    """Gymnasium's functional interface; its `params` are the environment itself.
+    """Gymnasium's functional interface. Its `params` are an `Environment`.
 
-    `params` of the same structure with other numbers make another world: a batch of them under
-    `jax.vmap` gives each copy its own.
+    To change parameters, pass an environment of equal structure with other numbers as `params`.
+    Under `jax.vmap`, a batch of environments gives each copy its own.
 
     Args:
         task: the name of a task, or an environment.
-        options: of the task's `build`.
+        options: options of the task's `build`.
     """
 
-    def __init__(self, task: str | Environment, **options: Any) -> None:
+    def __init__(self, task: str | Environment, **options: Option) -> None:
         self.environment = make(task, **options)
         self.observation_space = adapters.observation_space(self.environment)
         self.action_space = adapters.action_space(self.environment)
         super().__init__()
 
-    def get_default_params(self, **kwargs: Any) -> Environment:
-        """The environment."""
+    def get_default_params(self, **kwargs: Option) -> Environment:
+        """Returns the environment with which this interface was created."""
         return self.environment
 
-    def initial(self, rng: Array, params: Any = None) -> Episode:
-        """The start of an episode."""
-        return self._of(params).reset(rng)
+    def initial(self, rng: Array, params: Environment | None = None) -> Episode:
+        """Starts an episode."""
+        return self._chosen(params).reset(rng)
 
-    def transition(self, state: Episode, action: Any, rng: Any, params: Any = None) -> Episode:
-        """The episode after an action; the draws of a copy come from its own key."""
-        return self._of(params).transition(state, action)
+    def transition(
+        self, state: Episode, action: Scalar, rng: Array, params: Environment | None = None
+    ) -> Episode:
+        """Returns the episode after one action. `rng` is not used: an episode has its own key."""
+        return self._chosen(params).transition(state, action)
 
-    def observation(self, state: Episode, rng: Any, params: Any = None) -> Array:
-        """What is seen."""
-        return self._of(params).observe(state)
+    def observation(self, state: Episode, rng: Array, params: Environment | None = None) -> Array:
+        """Returns the observation of an episode."""
+        return self._chosen(params).observe(state)
 
     def reward(
-        self, state: Episode, action: Any, next_state: Episode, rng: Any, params: Any = None
+        self,
+        state: Episode,
+        action: Scalar,
+        next_state: Episode,
+        rng: Array,
+        params: Environment | None = None,
     ) -> Array:
-        """What the action was worth."""
-        return self._of(params).judge(state, action, next_state)[0]
+        """Returns the reward of an action."""
+        return self._chosen(params).judge(state, action, next_state)[0]
 
-    def terminal(self, state: Episode, rng: Any, params: Any = None) -> Array:
-        """Returns True where the task is over, or the world diverged."""
-        environment = self._of(params)
+    def terminal(self, state: Episode, rng: Array, params: Environment | None = None) -> Array:
+        """Returns True if the task has ended or the simulation diverged."""
+        environment = self._chosen(params)
         return environment.terminal(state) | environment.info(state)["diverged"]
 
-    def state_info(self, state: Episode, params: Any = None) -> dict[str, Array]:
-        """Returns whether the world diverged, why, and the violation."""
-        return self._of(params).info(state)
+    def state_info(self, state: Episode, params: Environment | None = None) -> dict[str, Array]:
+        """Returns `diverged`, the status code and the constraint violation."""
+        return self._chosen(params).info(state)
 
     def transition_info(
-        self, state: Episode, action: Any, next_state: Episode, params: Any = None
+        self, state: Episode, action: Scalar, next_state: Episode, params: Environment | None = None
     ) -> dict[str, Array]:
-        """Returns `state_info` of the state after an action."""
-        return self._of(params).info(next_state)
+        """Returns `diverged`, the status code and the constraint violation after an action."""
+        return self._chosen(params).info(next_state)
 
-    def render_init(self, params: Any = None, **kwargs: Any) -> Any:
-        """A canvas."""
-        return render.canvas(self._of(params))
+    def render_init(self, params: Environment | None = None, **kwargs: Option) -> FigureCanvasAgg:
+        """Creates a canvas for images."""
+        return render.canvas(self._chosen(params))
 
     def render_image(
-        self, state: Episode, render_state: Any, params: Any = None
-    ) -> tuple[Any, np.ndarray]:
-        """The canvas, and the picture, (height, width, 3), of bytes."""
-        return render_state, render.image(self._of(params), state, render_state)
+        self, state: Episode, render_state: FigureCanvasAgg, params: Environment | None = None
+    ) -> tuple[FigureCanvasAgg, np.ndarray]:
+        """Returns the canvas and the image, (height, width, 3), of bytes."""
+        return render_state, render.image(self._chosen(params), state, render_state)
 
-    def render_close(self, render_state: Any, params: Any = None) -> None:
-        """Nothing is left to close."""
+    def render_close(
+        self, render_state: FigureCanvasAgg, params: Environment | None = None
+    ) -> None:
+        """Does nothing: a canvas holds no resources that must be released."""
 
-    def _of(self, params: Any) -> Environment:
+    def _chosen(self, params: Environment | None) -> Environment:
+        """Returns the given environment, or the default environment for None."""
         return self.environment if params is None else params

@@ -1,29 +1,33 @@
-"""Gymnasium's interface to one copy of an environment, and its registry."""
+"""Gymnasium's interface to one copy of an environment, and the registration of tasks."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
 from jaxcon.environments import adapters, render
-from jaxcon.environments.adapters import PICTURES, gymnasium
-from jaxcon.environments.environment import Environment, Episode
+from jaxcon.environments.adapters import RGB_ARRAY, gymnasium
+from jaxcon.environments.environment import Environment, Episode, Option
 from jaxcon.environments.registry import TASKS, horizon, make
 
-# the environment is an argument, so that all of one structure share what was compiled
+if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+# the environment is an argument, so that environments of equal structure share a compiled program
 _reset = jax.jit(lambda environment, key: environment.reset(key))
 _look = jax.jit(lambda environment, episode: environment.look(episode))
 _step = jax.jit(lambda environment, episode, action: environment.step(episode, action))
 
 
 def register() -> None:
-    """Tells Gymnasium of every task, as "jaxcon/CartPole-v0"."""
+    """Registers every task with Gymnasium, as "jaxcon/CartPole-v0"."""
     for task in TASKS:
         name = f"jaxcon/{task}-v0"
         if name not in gymnasium.registry:
@@ -37,25 +41,25 @@ def register() -> None:
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One copy, with arrays of numpy.
+    """One copy of an environment, with NumPy arrays.
 
-    Out-of-range actions are clipped, as those of Gymnasium's pendulum. The info of a step says
-    whether the simulation `diverged`, in which case the episode is truncated, its `status` in a
-    word, and the largest `violation` of a constraint. Time limits are those of `gymnasium.make`.
+    Actions out of range are clipped, as in Gymnasium's pendulum. The info of a step has `diverged`,
+    the name of the `status`, and the largest constraint `violation`. An episode that diverges is
+    truncated. `gymnasium.make` sets time limits.
 
     Args:
         task: the name of a task, or an environment.
         render_mode: None or "rgb_array".
-        options: of the task's `build`.
+        options: options of the task's `build`.
 
     Raises:
-        ValueError: a horizon, which `gymnasium.make` takes as `max_episode_steps`.
+        ValueError: `horizon` is given; pass `max_episode_steps` to `gymnasium.make`.
     """
 
-    metadata: dict[str, Any] = {"render_modes": [PICTURES], "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": [RGB_ARRAY], "render_fps": 50}
 
     def __init__(
-        self, task: str | Environment, render_mode: str | None = None, **options: Any
+        self, task: str | Environment, render_mode: str | None = None, **options: Option
     ) -> None:
         adapters.check_no_horizon(options)
         environment = make(task, **options)
@@ -65,19 +69,19 @@ class GymnasiumEnv(gymnasium.Env):
         self.observation_space = adapters.observation_space(environment)
         self.action_space = adapters.action_space(environment)
         self.episode: Episode | None = None
-        self._canvas: Any = None
+        self._canvas: FigureCanvasAgg | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Starts an episode; those after a seed are the same whenever the seed is.
+        """Starts an episode. After a seed, the sequence of episodes is reproducible.
 
         Args:
-            seed: of all that is drawn from now on; None goes on drawing.
-            options: none.
+            seed: seeds the random generator; None continues with it.
+            options: None or empty; there are no options.
 
         Raises:
-            ValueError: options, of which there are none.
+            ValueError: options are given.
         """
         adapters.check_options(options, ())
         super().reset(seed=seed)
@@ -85,14 +89,14 @@ class GymnasiumEnv(gymnasium.Env):
         observation, info = _look(self.environment, self.episode)
         return np.array(observation), in_words(info)
 
-    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One action, (number of actions,), clipped to −1 to 1.
+    def step(self, action: ArrayLike) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Takes one action, clipped to −1 to 1.
 
         Args:
             action: (number of actions,).
 
         Raises:
-            ValueError: the action has another shape, or is not a number.
+            ValueError: the action has the wrong shape or contains NaN.
         """
         episode = self._running()
         action, names = np.asarray(action, self.environment.dtype), self.environment.actions
@@ -106,9 +110,10 @@ class GymnasiumEnv(gymnasium.Env):
         return np.array(outcome.observation), float(outcome.reward), *ends, in_words(outcome.info)
 
     def save(self) -> dict[str, Any]:
-        """Where the episode stands and what will be drawn next, as arrays of numpy to keep.
+        """Returns the episode and the state of the random generator, as NumPy arrays.
 
-        Actions are counted by `gymnasium.make`'s wrapper for its time limit, which this is not of.
+        The action count of `gymnasium.make`'s time limit is not included: it is in Gymnasium's
+        wrapper.
         """
         return {
             "episode": jax.tree.map(np.array, self._running()),
@@ -116,13 +121,13 @@ class GymnasiumEnv(gymnasium.Env):
         }
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Goes on from what `save` gave, with the very same numbers.
+        """Restores an episode from the result of `save`. It continues bit for bit.
 
         Args:
-            saved: from `save`.
+            saved: the result of `save`.
 
         Raises:
-            ValueError: it is of another task or precision.
+            ValueError: the save is from another task or precision.
         """
         key = jax.ShapeDtypeStruct((2,), np.uint32)
         adapters.check_saved(saved["episode"], _reset.eval_shape(self.environment, key))
@@ -130,7 +135,7 @@ class GymnasiumEnv(gymnasium.Env):
         self.np_random.bit_generator.state = saved["random"]
 
     def render(self) -> np.ndarray | None:
-        """The picture, (height, width, 3), of bytes.
+        """Returns the image, (height, width, 3), of bytes; None without a render mode.
 
         Raises:
             ImportError: matplotlib is not installed.
@@ -143,14 +148,14 @@ class GymnasiumEnv(gymnasium.Env):
         return render.image(self.environment, self._running(), self._canvas)
 
     def close(self) -> None:
-        """Lets go of the canvas."""
+        """Releases the canvas."""
         self._canvas = None
 
     def _running(self) -> Episode:
-        """The episode.
+        """Returns the current episode.
 
         Raises:
-            gymnasium.error.ResetNeeded: there is none yet.
+            gymnasium.error.ResetNeeded: `reset` has not been called.
         """
         if self.episode is None:
             raise gymnasium.error.ResetNeeded("call reset before step, save or render.")
@@ -158,7 +163,7 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 def in_words(info: dict[str, Array]) -> dict[str, Any]:
-    """An info of one copy in Python's types."""
+    """Converts the info of one copy to Python types, and its status code to the name."""
     return {
         "diverged": bool(info["diverged"]),
         "status": Status(int(info["status"])).name,

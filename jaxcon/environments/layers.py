@@ -1,37 +1,40 @@
-"""Layered control: a slow policy sets targets, a fast controller follows them."""
+"""Hierarchical control: a slow policy sets targets, and a fast controller tracks them."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Channel, Environment, Episode
-from jaxcon.model.state import State
+from jaxcon.system.state import State
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Controller = Callable[[Environment, Episode, Array], Array]
-"""(environment, episode, target within −1 to 1) → the action of the environment."""
+"""(environment, episode, target within −1 to 1) → an action of the low-level task."""
 
 
 @pytree
 class Layered(Environment):
-    """A task whose actions are targets, each held for several actions of a controller below.
+    """A task whose actions are targets. A controller tracks them in a low-level task.
 
-    The controller is asked before every action of the task below; it may be constrained, as by
-    `feasible_action`. Observation, start and end are those of the task below, and the reward is
-    that of the task where a target ends, or the task is over.
+    The controller is called before every action of the low-level task. It may be constrained, for
+    example by `feasible_action`. Observation, initial state and termination are those of the
+    low-level task. The reward of a target is the low-level reward at its end.
 
     Attributes:
-        task: the one below; its system, method and dt are those of this environment.
-        controller: pure; define it once.
-        targets: what a target consists of: names with the unit of its −1 to 1.
-        hold: actions below for each target.
+        task: the low-level task. Its system, method and dt are fields of this environment.
+        controller: a pure function; define it once, since every new function object recompiles.
+        targets: the components of a target: names, with the unit to which −1 to 1 refers.
+        hold: the number of low-level actions for which a target is held.
     """
 
     task: Environment
@@ -43,75 +46,89 @@ class Layered(Environment):
     def build(
         cls, task: Environment, controller: Controller, targets: tuple[str, ...], hold: int
     ) -> Layered:
-        """The task under a controller; its horizon counts targets.
+        """Builds the environment. Its horizon counts targets.
 
         Args:
-            task: the one below.
+            task: the low-level task.
             controller: (environment, episode, target within −1 to 1) → action of the task.
-            targets: names with the unit of a target's −1 to 1.
-            hold: actions below for each target.
+            targets: the components of a target: names, with the unit to which −1 to 1 refers.
+            hold: the number of low-level actions for which a target is held.
 
         Raises:
-            ValueError: `hold` is no whole number from 1.
+            ValueError: `hold` is not a whole number from 1.
         """
         checks.count("Layered", "hold", hold)
         horizon = None if task.horizon is None else -(-task.horizon // hold)
-        own = task.system, task.method, task.dt, task.skip * hold, horizon
-        return cls(*own, task, controller, tuple(targets), hold)
+        skip = task.skip * hold
+        return cls(
+            task.system,
+            task.method,
+            task.dt,
+            skip,
+            horizon,
+            task,
+            controller,
+            tuple(targets),
+            hold,
+        )
 
     @property
     def below(self) -> Environment:
-        """The task with the numbers of this environment."""
+        """The low-level task with the system, method and step size of this environment."""
         return dataclasses.replace(self.task, system=self.system, method=self.method, dt=self.dt)
 
     @property
     def observed(self) -> tuple[Channel, ...]:
-        """As below."""
+        """The observation channels of the low-level task."""
         return self.task.observed
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The targets."""
+        """The components of an action, which are those of a target."""
         return self.targets
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """As below."""
+        """The view of the low-level task in images."""
         return self.task.frame
 
     def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
-        """As below."""
+        """Returns the current view of the low-level task."""
         return self.below.window(episode)
 
-    def start(self, key: Array) -> tuple[State, PyTree]:
-        """As below."""
+    def start(self, key: Array) -> tuple[State, Any]:
+        """Draws the initial state and goal of the low-level task."""
         return self.below.start(key)
 
     def observation(self, episode: Episode) -> Array:
-        """As below."""
+        """Returns the observation of the low-level task."""
         return self.below.observation(episode)
 
     def terminal(self, episode: Episode) -> Array:
-        """As below."""
+        """Returns True if the low-level task has ended."""
         return self.below.terminal(episode)
 
-    def marks(self, axes: Any, episode: Episode) -> None:
-        """As below."""
+    def marks(self, axes: Axes, episode: Episode) -> None:
+        """Draws the marks of the low-level task."""
         self.below.marks(axes, episode)
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """The controller follows a target for `hold` actions, or until the task is over."""
+        """Lets the controller track a target for `hold` actions, or until the task ends."""
         below = self.below
 
-        def follow(now: Episode, _: Any) -> tuple[Episode, Array]:
-            after, over = below.transition(now, self.controller(below, now, action)), below.terminal
-            after = jax.tree.map(lambda a, b: jnp.where(over(now), a, b), now, after)
+        def follow(now: Episode, _: None) -> tuple[Episode, Array]:
+            after = below.transition(now, self.controller(below, now, action))
+            over = below.terminal(now)
+            after = jax.tree.map(lambda a, b: jnp.where(over, a, b), now, after)
             return after, after.violation
 
         last, worst = jax.lax.scan(follow, episode, None, self.hold)
         return dataclasses.replace(last, steps=episode.steps + 1, violation=jnp.max(worst))
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """As below over the time of a target, for what the controller does where it has come to."""
-        own = self.below.allowed(self.controller(self.below, after, action))
-        return dataclasses.replace(self.below, skip=self.skip).reward(before, own, after)
+        """Returns the reward of the low-level task over the time of a target.
+
+        Its action is the one that the controller chooses at the state where the target ends.
+        """
+        low_level = self.below.allowed(self.controller(self.below, after, action))
+        return dataclasses.replace(self.below, skip=self.skip).reward(before, low_level, after)

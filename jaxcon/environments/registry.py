@@ -1,13 +1,13 @@
-"""The tasks by name."""
+"""The registry of tasks by name."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 from jaxcon.core import checks
-from jaxcon.environments.environment import Environment
+from jaxcon.environments.environment import Environment, Option
 from jaxcon.environments.tasks.cart_pole import CartPole, double_cart_pole
 from jaxcon.environments.tasks.cat import CatRighting
 from jaxcon.environments.tasks.cheetah import HalfCheetah
@@ -28,20 +28,20 @@ TASKS: dict[str, Callable[..., Environment]] = {
     "RopeSwing": RopeSwing.build,
     "StewartBalancing": StewartBalancing.build,
 }
-"""What builds each; Gymnasium knows them as "jaxcon/CartPole-v0" and so on."""
+"""The builder of each task by name. In Gymnasium, tasks have names like "jaxcon/CartPole-v0"."""
 
 
-def make(task: str | Environment, **options: Any) -> Environment:
-    """The environment of a task, as pure functions.
+def make(task: str | Environment, **options: Option) -> Environment:
+    """Builds the environment of a task.
 
     Args:
-        task: its name, or an environment, which is taken as it is.
-        options: numbers and choices of the task's `build`.
+        task: the name of a task, or an environment, which is returned unchanged.
+        options: options of the task's `build`.
 
     Raises:
-        ValueError: an unknown task, options for an environment that is already built, or a skip or
-            a horizon that is no whole number from 1.
-        TypeError: an option that the task does not have.
+        ValueError: the task is unknown, the environment is already built but options are given, a
+            number is negative, or `skip` or `horizon` is not a whole number from 1.
+        TypeError: an option is not among those of the task.
     """
     if isinstance(task, Environment):
         if options:
@@ -52,12 +52,21 @@ def make(task: str | Environment, **options: Any) -> Environment:
         return task
     if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"task {task!r} is unknown; known are {', '.join(TASKS)}.")
+    signature = inspect.signature(TASKS[task])
     try:
-        inspect.signature(TASKS[task]).bind(**options)
+        signature.bind(**options)
     except TypeError as error:
-        known = list(inspect.signature(TASKS[task]).parameters)
-        raise TypeError(f"task {task}: {error}; its options are {', '.join(known)}.") from error
-    _check_numbers(task, options)
+        names = ", ".join(signature.parameters)
+        raise TypeError(f"task {task}: {error}; its options are {names}.") from error
+    # only sizes, masses, forces and steps have numbers as defaults; a task checks the others
+    values: dict[str, Any] = options
+    for name, x in values.items():
+        default = signature.parameters[name].default if name in signature.parameters else None
+        if isinstance(default, float | tuple):
+            limit: dict[str, Any] = {"above": 0} if name == "dt" else {"least": 0}
+            checks.check(task, name, x, **limit)
+        elif type(default) is int:
+            checks.count(task, name, x)
     built = TASKS[task](**options)
     checks.count(task, "skip", built.skip)
     if built.horizon is not None:
@@ -65,22 +74,6 @@ def make(task: str | Environment, **options: Any) -> Environment:
     return built
 
 
-def _check_numbers(task: str, options: Mapping[str, Any]) -> None:
-    """Checks the options whose usual values are numbers: sizes, masses, forces and the step.
-
-    Raises:
-        ValueError: one is negative or no number, or a choice that is no value of its kind.
-    """
-    known = inspect.signature(TASKS[task]).parameters
-    for name, x in options.items():
-        usual = known[name].default if name in known else None
-        if isinstance(usual, float | tuple):
-            limit: dict[str, Any] = {"above": 0} if name == "dt" else {"least": 0}
-            checks.check(task, name, x, **limit)
-        elif type(usual) is int:
-            checks.count(task, name, x)
-
-
 def horizon(task: str) -> int:
-    """Actions until an episode of a task is truncated, unless told otherwise."""
+    """Returns the default horizon of a task: the number of actions that truncates an episode."""
     return inspect.signature(TASKS[task]).parameters["horizon"].default

@@ -1,35 +1,38 @@
-"""Pictures of an episode as arrays, drawn without a window."""
+"""Images of an episode as arrays, rendered off screen."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jaxcon import view
 from jaxcon.environments.environment import Environment, Episode
 
+if TYPE_CHECKING:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
 WIDTH, DPI = 4.8, 100
-"""The size of a picture [inch], and its dots per inch."""
+"""The width of an image [inch], and its dots per inch."""
 
 
-def canvas(environment: Environment) -> Any:
-    """A canvas in the shape of what the environment shows.
+def canvas(environment: Environment) -> FigureCanvasAgg:
+    """Creates a canvas with the aspect ratio of the environment's view.
 
     Raises:
-        ImportError: matplotlib is not installed; names the extra that brings it.
+        ImportError: matplotlib is not installed; the message names the extra to install.
     """
     (left, right), (low, high) = environment.frame
     return view.canvas(WIDTH, WIDTH * (high - low) / (right - left), DPI)
 
 
-def image(environment: Environment, episode: Episode, onto: Any) -> np.ndarray:
-    """The picture of an episode, (height, width, 3), of bytes.
+def image(environment: Environment, episode: Episode, onto: FigureCanvasAgg) -> np.ndarray:
+    """Renders an episode to an image, (height, width, 3), of bytes.
 
     Args:
-        environment: whose bodies and marks are drawn.
-        episode: where it stands.
-        onto: from `canvas`; what was drawn on it before is wiped.
+        environment: the environment, whose bodies and marks are drawn.
+        episode: the episode to draw.
+        onto: a canvas from `canvas`; its previous content is erased.
     """
     figure = onto.figure
     figure.clear()

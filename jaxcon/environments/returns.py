@@ -1,9 +1,8 @@
-"""What a policy earns."""
+"""Returns of a policy: sums of rewards over whole episodes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,17 +19,19 @@ def returns(
     count: int,
     actions: int | None = None,
 ) -> Array:
-    """Σ rewards of whole episodes under a policy: each ends where it terminates or is truncated.
+    """Returns the sum of rewards of whole episodes under a policy.
+
+    An episode ends when it terminates or is truncated.
 
     Args:
-        environment: of all episodes.
-        policy: from an observation to an action.
-        key: each episode gets one of its own, which does not depend on how many there are.
-        count: n episodes, side by side.
-        actions: of an episode at most; the horizon unless given.
+        environment: the environment.
+        policy: a function from an observation to an action.
+        key: a JAX key. The key of each episode is derived from it and does not depend on n.
+        count: n, the number of episodes, which run as a batch.
+        actions: the largest number of actions in an episode; None for the horizon.
 
     Returns:
-        The sums, (n,).
+        The sums of rewards, (n,).
 
     Raises:
         ValueError: neither `actions` nor a horizon bounds an episode.
@@ -38,18 +39,18 @@ def returns(
     checks.count("returns", "count", count)
     if actions is not None:
         checks.count("returns", "actions", actions)
-    most = environment.horizon if actions is None else actions
-    if most is None:
+    limit = environment.horizon if actions is None else actions
+    if limit is None:
         raise ValueError("returns: the environment has no horizon; say how many actions to take.")
 
-    def act(now: tuple[Episode, Array], _: Any) -> tuple[tuple[Episode, Array], Array]:
-        episode, going = now
+    def act(carry: tuple[Episode, Array], _: None) -> tuple[tuple[Episode, Array], Array]:
+        episode, running = carry
         episode, outcome = environment.step(episode, policy(environment.observe(episode)))
         ended = outcome.terminated | outcome.truncated
-        return (episode, going & ~ended), jnp.where(going, outcome.reward, 0)
+        return (episode, running & ~ended), jnp.where(running, outcome.reward, 0)
 
-    def earned(number: Array) -> Array:
+    def episode_return(number: Array) -> Array:
         start = environment.reset(jax.random.fold_in(key, number)), jnp.ones((), bool)
-        return jnp.sum(jax.lax.scan(act, start, None, most)[1])
+        return jnp.sum(jax.lax.scan(act, start, None, limit)[1])
 
-    return jax.vmap(earned)(jnp.arange(count))
+    return jax.vmap(episode_return)(jnp.arange(count))

@@ -1,1 +1,1 @@
-"""Floor 1: rotations, poses and inertia."""
+"""Rotations, poses, inertia of solids, and height fields."""

@@ -1,13 +1,14 @@
-"""A surface z = h(x, y) between heights on a grid, by lanes; in the plane a line z = h(x).
+"""Interpolated height fields z = h(x, y), or z = h(x) in the plane, vectorized over lanes.
 
-Along an axis, with u in steps of the grid and t = u − i the way into cell i,
+The interpolation is cubic convolution. Along an axis, let u be the coordinate in grid steps, and
+t = u − i the position in cell i. With the weights w of the four surrounding heights,
 
-    h = Σ w_k(t) h_{i−1+k},   w = ½ (−t + 2t² − t³, 2 − 5t² + 3t³, t + 4t² − 3t³, −t² + t³),
+    h = Σ w_k(t) h_{i−1+k},   w = ½ (−t + 2t² − t³, 2 − 5t² + 3t³, t + 4t² − 3t³, −t² + t³).
 
-and over two axes the product of both. h goes through the heights given, its slope is continuous,
-and polynomials of second degree are met exactly, other surfaces to third order in the steps. At an
-edge the height that is missing lies on the parabola of the last three; beyond it h goes on straight
-with the slope that it has there, so that the surface has no end.
+Over two axes, the weights are multiplied. h passes through the given heights and has a continuous
+slope. It is exact for polynomials of second degree; for other surfaces the error is of third order
+in the grid step. At an edge, the missing height is extrapolated by a parabola through the last
+three heights. Beyond the edge, h is linear, with the slope at the edge.
 
 References:
     Keys, Cubic convolution interpolation for digital image processing, IEEE Trans. Acoust., Speech,
@@ -16,8 +17,9 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,17 +27,23 @@ import numpy as np
 
 from jaxcon.core.lanes import Matrix, Vector, total
 from jaxcon.core.typing import Array
-from jaxcon.core.worlds import lift, per_world
+from jaxcon.staging.worlds import expand_like, per_world
 
 LEAST = 4
-"""Heights along each axis."""
+"""The number of grid heights along each axis that determine h at one place."""
 
 NEWTON = 12
-"""Steps in which the nearest point is found; four are usual, rough ground takes more."""
+"""The number of Newton steps for the nearest point; on smooth ground, four usually suffice."""
 
 
 class Shape(NamedTuple):
-    """A surface at a place: its height, slope ∂h/∂x and bend ∂²h/∂x²."""
+    """The local shape of a surface at a place x.
+
+    Attributes:
+        height: h [m].
+        slope: the gradient ∂h/∂x.
+        bend: the second derivatives ∂²h/∂x² [1/m].
+    """
 
     height: Array
     slope: Vector
@@ -43,7 +51,14 @@ class Shape(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """Where a search for the nearest point is: its place, next step, how much of it, distance²."""
+    """The state of the Newton search for the surface point nearest to a given point.
+
+    Attributes:
+        place: the current iterate x [m].
+        step: the full Newton step at the iterate [m].
+        share: the damping factor of the step.
+        square: the squared distance between the surface at x and the given point [m²].
+    """
 
     place: Vector
     step: Vector
@@ -53,12 +68,14 @@ class _Search(NamedTuple):
 
 @dataclass(frozen=True)
 class Surface:
-    """Surfaces over rectangles, and which of them each lane is about.
+    """Height fields over rectangles, one for each entry of a lane.
+
+    Several entries, such as contacts with the same ground, may share one height field.
 
     Attributes:
-        heights: (surface, n_x, n_y), in the plane (surface, n_x) [m].
-        owner: of each lane, its surface.
-        size: edges of the rectangle, lanes [m]; its middle is the origin.
+        heights: the grid heights, (surface, n_x, n_y) in space and (surface, n_x) in the plane [m].
+        owner: the index of the surface for each lane entry.
+        size: the edges of the rectangle, lanes [m]; its center is the origin.
     """
 
     heights: Array
@@ -67,7 +84,7 @@ class Surface:
 
     @property
     def steps(self) -> Vector:
-        """The steps of the grid, along each axis [m]."""
+        """The distance between grid points along each axis [m]."""
         return Vector(*(x * (1 / (n - 1)) for x, n in zip(self.size, self._counts, strict=True)))
 
     @property
@@ -75,7 +92,7 @@ class Surface:
         return self.heights.shape[1 : 1 + len(self.size)]
 
     def at(self, place: Vector) -> Shape:
-        """Height, slope and bend."""
+        """Returns the height, slope and second derivatives of the surface at a place x [m]."""
         counts, steps = self._counts, self.steps
         triples = zip(place, self.size, steps, strict=True)
         along = [
@@ -88,7 +105,7 @@ class Surface:
             x = values
             for axis, (_, orders) in enumerate(along):
                 w = orders[axes.count(axis)]
-                x = total(lift(w[k], x[k]) * x[k] for k in range(LEAST))
+                x = total(expand_like(w[k], x[k]) * x[k] for k in range(LEAST))
             for axis in axes:
                 x = x / steps[axis]
             return x
@@ -98,28 +115,30 @@ class Surface:
         return Shape(derivative(), Vector(*(derivative(i) for i in every)), Matrix(*bend))
 
     def nearest(self, point: Vector) -> Vector:
-        """The place below the point of the surface that is nearest to a point (x, …, z).
+        """Finds the surface point nearest to a given point; returns its horizontal place x [m].
 
-        By Newton's method from the place below the point itself. A step that does not come nearer
-        is taken back and tried again by a quarter, which rough ground needs: there the search ends
-        in the first hollow that it finds, which need not be the nearest. Differentiated at its end
-        as the solution that it is, to first order.
+        The given point is (x, z) in the plane or (x, y, z) in space. Newton's method starts
+        vertically below it. A step that increases the distance is undone and repeated with a
+        quarter of its length. On rough ground, the result may be a local minimum of the distance.
+        First derivatives are exact (implicit differentiation). The result is NaN if the search
+        reaches a height that is not finite.
         """
-        known = jax.lax.stop_gradient((self.heights, self.size, point))
-        fixed, point_now = Surface(known[0], self.owner, known[1]), known[2]
+        constants = jax.lax.stop_gradient((self.heights, self.size, point))
+        fixed, point_now = Surface(constants[0], self.owner, constants[1]), constants[2]
 
-        def once(_: Any, search: _Search) -> _Search:
+        def once(_: Array, search: _Search) -> _Search:
             place = search.place - search.step * search.share
             shape = fixed.at(place)
-            found = _Search(
+            tried = _Search(
                 place,
                 _newton(shape, place, point_now),
                 jnp.minimum(2 * search.share, 1),
                 _square(shape, place, point_now),
             )
             failed = search._replace(share=0.25 * search.share)
-            nearer = found.square <= search.square
-            return jax.tree.map(lambda x, y: jnp.where(nearer, x, y), found, failed)
+            # steps to a NaN or infinite distance are accepted, so that the result becomes NaN
+            farther = (tried.square > search.square) & (tried.square < jnp.inf)
+            return jax.tree.map(lambda x, y: jnp.where(farther, x, y), failed, tried)
 
         below = Vector(*point_now[:-1])
         shape = fixed.at(below)
@@ -129,15 +148,19 @@ class Surface:
             jnp.ones_like(shape.height),
             _square(shape, below, point_now),
         )
-        found = jax.lax.fori_loop(0, NEWTON, once, start).place
-        rest = _newton(self.at(found), found, point, fixed.at(found))
-        return found - (rest - jax.lax.stop_gradient(rest))
+        end = jax.lax.fori_loop(0, NEWTON, once, start).place
+        rest = _newton(self.at(end), end, point, fixed.at(end))
+        return end - (rest - jax.lax.stop_gradient(rest))
 
     def _window(self, starts: list[Array]) -> Array:
-        """The four heights along each axis around each lane, (4, …, lane)."""
+        """Returns the four heights along each axis that surround each lane entry, (4, …, lane).
+
+        Args:
+            starts: the index of the first of the four heights along each axis, lanes.
+        """
         axes = len(starts)
 
-        def one(heights: Array, *starts: Array) -> Array:
+        def window(heights: Array, *starts: Array) -> Array:
             index = [jnp.asarray(self.owner, jnp.int32).reshape(*(1,) * axes, -1)]
             for axis, start in enumerate(starts):
                 four = [1] * (axes + 1)
@@ -146,11 +169,20 @@ class Surface:
                 index.append(start.reshape(*(1,) * axes, -1) + steps)
             return heights.at[tuple(index)].get(mode="clip")
 
-        return per_world(one, starts[0].ndim - 1)(self.heights, *starts)
+        return per_world(window, starts[0].ndim - 1)(self.heights, *starts)
 
 
 def _weights(u: Array, count: int) -> tuple[Array, tuple[Vector, Vector, Vector]]:
-    """The first of four heights, and the weights of these with two derivatives by u."""
+    """Returns the interpolation weights along one axis.
+
+    Args:
+        u: the coordinate in grid steps.
+        count: the number of grid heights along the axis.
+
+    Returns:
+        The index of the first of the four heights, and the weights (w, w′, w″): w and its first and
+        second derivative with respect to u.
+    """
     inside = jnp.clip(u, 0, count - 1)
     cell = jax.lax.stop_gradient(jnp.clip(jnp.floor(inside), 0, count - 2))
     t, beyond = inside - cell, u - inside
@@ -162,7 +194,10 @@ def _weights(u: Array, count: int) -> tuple[Array, tuple[Vector, Vector, Vector]
 
 
 def _cubics(t: Array) -> tuple[Vector, Vector, Vector]:
-    """w, w′ and w″ of the heights at −1, 0, 1 and 2."""
+    """Returns the interior weights w and their derivatives w′ and w″ at the cell position t.
+
+    The four weights belong to the heights at positions −1, 0, 1 and 2 in grid steps.
+    """
     square = t * t
     value = (
         (2 - t) * square - t,
@@ -176,30 +211,39 @@ def _cubics(t: Array) -> tuple[Vector, Vector, Vector]:
 
 
 def _at_edges(w: Vector, first: Array, last: Array) -> Vector:
-    """Weights of four heights that are there: before the first, h = 3h₀ − 3h₁ + h₂."""
+    """Returns the four weights, with the missing height at an edge replaced by extrapolation.
+
+    The missing height is 3h₀ − 3h₁ + h₂, from the three heights nearest to the edge.
+
+    Args:
+        w: the interior weights.
+        first: True in the first cell of the axis.
+        last: True in the last cell of the axis.
+    """
     a, b, c, d = w
     left = b + 3 * a, c - 3 * a, d + a, 0 * a
     right = 0 * a, a + d, b - 3 * d, c + 3 * d
-    known = zip(left, right, w, strict=True)
-    return Vector(*(jnp.where(first, x, jnp.where(last, y, z)) for x, y, z in known))
+    weights = zip(left, right, w, strict=True)
+    return Vector(*(jnp.where(first, x, jnp.where(last, y, z)) for x, y, z in weights))
 
 
 def _square(shape: Shape, place: Vector, point: Vector) -> Array:
-    """Returns the square of the distance, ‖x − X‖² + (h − Z)²."""
+    """Returns the squared distance ‖x − X‖² + (h − Z)² of a surface point from a point (X, Z)."""
     aside, off = place - Vector(*point[:-1]), shape.height - point[-1]
     return total(x * x for x in aside) + off * off
 
 
 def _newton(shape: Shape, place: Vector, point: Vector, at: Shape | None = None) -> Vector:
-    """H⁻¹ g of the half square of the distance, g = x − X + (h − Z) ∇h.
+    """Returns the Newton step H⁻¹ g that minimizes half the squared distance to a point (X, Z).
 
-    H = 1 + ∇h ∇hᵀ + (h − Z) ∇²h, without the last term where it would not be positive.
+    The gradient is g = x − X + (h − Z) ∇h, and the Hessian is H = 1 + ∇h ∇hᵀ + (h − Z) ∇²h. If H is
+    not positive definite, its last term is left out.
 
     Args:
-        shape: of the surface at the place, for g.
+        shape: the surface at x, for g.
         place: x.
         point: (X, Z).
-        at: for H, where it is to be without derivatives.
+        at: the surface at x for H, if H must be constant under differentiation; None for `shape`.
     """
     off = shape.height - point[-1]
     right = place - Vector(*point[:-1]) + shape.slope * off
@@ -212,11 +256,11 @@ def _newton(shape: Shape, place: Vector, point: Vector, at: Shape | None = None)
     return _solve([[jnp.where(convex, full[i][j], plain[i][j]) for j in rank] for i in rank], right)
 
 
-def _determinant(h: Any) -> Array:
+def _determinant(h: Sequence[Sequence[Array]]) -> Array:
     return h[0][0] if len(h) == 1 else h[0][0] * h[1][1] - h[0][1] * h[1][0]
 
 
-def _solve(h: Any, y: Vector) -> Vector:
+def _solve(h: Sequence[Sequence[Array]], y: Vector) -> Vector:
     if len(h) == 1:
         return y * (1 / h[0][0])
     x = Vector(h[1][1] * y[0] - h[0][1] * y[1], h[0][0] * y[1] - h[1][0] * y[0])

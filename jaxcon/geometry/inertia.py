@@ -1,16 +1,15 @@
-"""Mass, centre of mass and principal moments of common solids and of any tensor.
+"""Inertia of common solids and of arbitrary tensors: mass, center of mass and principal moments.
 
-Each constructor returns an `Inertia` in the solid's own frame, whose origin lies at its geometric
-centre. `Scene.add_body(inertia=…)` takes it: the simulated frame then lies at the centre of mass
-along the principal axes, which makes the mass matrix constant and diagonal, while positions given
-and read stay in the solid's frame.
+Each constructor returns an `Inertia` for `Scene.add_body(inertia=…)`, in the solid's own frame,
+whose origin is its geometric center. Users give and read positions in this frame. Internally, the
+simulation uses the principal frame at the center of mass, where the mass matrix is constant and
+diagonal.
 
 References:
     Goldstein, Classical Mechanics (3rd ed.), section 5.3.
 """
 
-from __future__ import annotations
-
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -19,26 +18,48 @@ import numpy as np
 
 from jaxcon.core import checks, numerics
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, PyTree, Scalar
 from jaxcon.geometry import quaternion
 
-APART = 0.45
-"""Exponent of ε by which moments are apart where axes are differentiated.
+__all__ = [
+    "Inertia",
+    "sphere",
+    "box",
+    "cylinder",
+    "rod",
+    "capsule",
+    "from_tensor",
+    "from_log_cholesky",
+    "log_cholesky",
+    "principal_axes",
+    "check_triangle",
+]
 
-What is off by that is then 1e-7 in float64 and 8e-4 in float32; less would make the turn of the
-axes so fast that its rounding, 1/ε^0.45 times that of the motion, is more.
+
+def __dir__() -> list[str]:
+    """Returns the public names."""
+    return [*__all__]
+
+
+APART = 0.45
+"""The exponent p of the smallest relative distance ε^p between principal moments.
+
+Derivatives of the principal axes use moments that are at least so far apart; ε is the machine
+precision. The resulting error is 1e-7 in float64 and 8e-4 in float32. A smaller distance would
+amplify rounding errors by more than 1/ε^0.45.
 """
 
 
 @pytree
 class Inertia:
-    """Mass properties of a rigid body in its own frame.
+    """The mass properties of a rigid body in its own frame.
 
     Attributes:
         mass: () [kg].
-        moments: principal moments about the centre of mass, (3,) [kg m²].
-        center: centre of mass, (3,) [m].
-        axes: principal axes, unit quaternion (4,) principal to own frame; None where they coincide.
+        moments: the principal moments about the center of mass, (3,) [kg m²].
+        center: the center of mass, (3,) [m]; None for the origin.
+        axes: the rotation from the principal frame to the body's own frame, a unit quaternion (4,);
+            None if both frames have the same axes.
     """
 
     mass: Any
@@ -47,8 +68,8 @@ class Inertia:
     axes: Array | None = None
 
 
-def sphere(mass: Any, radius: Any) -> Inertia:
-    """Homogeneous ball: I = 2/5 m r².
+def sphere(mass: Scalar, radius: Scalar) -> Inertia:
+    """The inertia of a homogeneous ball: I = 2/5 m r².
 
     Args:
         mass: () [kg].
@@ -59,8 +80,8 @@ def sphere(mass: Any, radius: Any) -> Inertia:
     return Inertia(mass, (moment, moment, moment))
 
 
-def box(mass: Any, size: Any) -> Inertia:
-    """Homogeneous box with edges size (3,): I_x = m (b² + c²) / 12, and so on.
+def box(mass: Scalar, size: Array | np.ndarray | Sequence[Scalar]) -> Inertia:
+    """The inertia of a homogeneous box with edges (a, b, c): I_x = m (b² + c²) / 12, and so on.
 
     Args:
         mass: () [kg].
@@ -71,31 +92,29 @@ def box(mass: Any, size: Any) -> Inertia:
     return Inertia(mass, (mass * (y + z) / 12, mass * (z + x) / 12, mass * (x + y) / 12))
 
 
-def cylinder(mass: Any, radius: Any, length: Any) -> Inertia:
-    """Homogeneous cylinder along z: I_z = m r² / 2, I_x = I_y = m (3 r² + l²) / 12.
+def cylinder(mass: Scalar, radius: Scalar, length: Scalar) -> Inertia:
+    """The inertia of a homogeneous cylinder along z: I_z = m r²/2, I_x = I_y = m (3 r² + l²)/12.
 
     Args:
         mass: () [kg].
         radius: () [m].
-        length: along z, () [m].
+        length: the length along z, () [m].
     """
     _check("cylinder", mass=mass, radius=radius, length=length)
     across = mass * (3 * radius**2 + length**2) / 12
     return Inertia(mass, (across, across, mass * radius**2 / 2))
 
 
-def rod(mass: Any, *, length: Any, radius: Any) -> Inertia:
-    """Rod along x of circular section: I_x = m r² / 2, I_y = I_z = m (3 r² + l²) / 12.
+def rod(mass: Scalar, *, length: Scalar, radius: Scalar) -> Inertia:
+    """The inertia of a homogeneous round rod along x: I_x = m r²/2, I_y = I_z = m (3 r² + l²)/12.
 
-    Its sizes go by name: `cylinder` and `capsule`, which are thick and lie along z, have the radius
-    first.
-
-    A rod without thickness cannot be turned about itself in space; in the plane use
-    `inertia=mass * length**2 / 12`.
+    Length and radius are keyword arguments, because `cylinder` and `capsule`, which lie along z,
+    take the radius first. The radius must be positive: a rod without thickness has no moment about
+    its own axis. In the plane, use `inertia=mass * length**2 / 12`.
 
     Args:
         mass: () [kg].
-        length: along x, () [m].
+        length: the length along x, () [m].
         radius: () [m].
     """
     _check("rod", mass=mass, length=length, radius=radius)
@@ -103,16 +122,16 @@ def rod(mass: Any, *, length: Any, radius: Any) -> Inertia:
     return Inertia(mass, (mass * radius**2 / 2, across, across))
 
 
-def capsule(mass: Any, radius: Any, length: Any) -> Inertia:
-    """Homogeneous capsule along z: a cylinder of this length between two half balls.
+def capsule(mass: Scalar, radius: Scalar, length: Scalar) -> Inertia:
+    """The inertia of a homogeneous capsule along z: a cylinder between two half balls.
 
-    A half ball of mass m_h has its centre of mass 3r/8 from its flat face, and m_h r² · 83/320
-    about it across.
+    The center of mass of a half ball of mass m_h lies 3r/8 from its flat face. Its moment of
+    inertia about a transverse axis through its center of mass is 83/320 m_h r².
 
     Args:
         mass: () [kg].
         radius: () [m].
-        length: of the cylinder, without the half balls, () [m].
+        length: the length of the cylinder, without the half balls, () [m].
     """
     _check("capsule", mass=mass, radius=radius, length=length)
     share = 3 * length / (3 * length + 4 * radius)  # the cylinder's share of the volume
@@ -123,46 +142,61 @@ def capsule(mass: Any, radius: Any, length: Any) -> Inertia:
     return Inertia(mass, (across, across, along))
 
 
-def from_tensor(mass: Any, tensor: Any, center: Any = None, owner: str = "inertia") -> Inertia:
-    """From a full tensor (3, 3) about the centre of mass, by its principal axes.
+def from_tensor(
+    mass: PyTree,
+    tensor: PyTree,
+    center: Scalar | Sequence[Scalar] | None = None,
+    owner: str = "inertia",
+) -> Inertia:
+    """The inertia given by a full inertia tensor about the center of mass.
 
-    It is differentiable also where principal moments coincide (`principal_axes`): to 1e-6 in
-    float64, to some percent by products of inertia in float32.
+    The tensor is diagonalized. Derivatives exist also if principal moments coincide (see
+    `principal_axes`). Their relative error is then 1e-6 in float64. In float32, derivatives with
+    respect to products of inertia have an error of a few percent.
 
     Args:
         mass: () [kg].
-        tensor: symmetric, (3, 3) [kg m²].
-        center: centre of mass in the same frame, (3,) [m]; the origin unless given.
-        owner: what messages begin with.
+        tensor: the symmetric inertia tensor, (3, 3) [kg m²].
+        center: the center of mass in the same frame, (3,) [m]; None for the origin.
+        owner: the first words of error messages.
 
     Raises:
-        ValueError: not 3×3, not symmetric, not positive definite, or against the triangle
-            inequality, which no distribution of mass can violate.
+        ValueError: the tensor is not 3×3, not symmetric or not positive definite, or it violates
+            the triangle inequality.
     """
     tensor = jnp.asarray(checks.check(owner, "the tensor", tensor))
     if tensor.shape != (3, 3):
         raise ValueError(f"{owner}: the tensor must have shape (3, 3), got {tensor.shape}.")
     moments, axes = principal_axes(tensor)
     if checks.is_concrete(tensor):
-        _check_tensor(owner, tensor, moments)
+        values = np.asarray(tensor)
+        if np.max(np.abs(values - values.T)) > 1e-6 * np.max(np.abs(values)):
+            raise ValueError(
+                f"{owner}: the tensor must be symmetric, got {checks.numerals(values)}."
+            )
+        checks.check(owner, "the principal moments", moments, above=0)
+        check_triangle(owner, moments)
     return Inertia(mass, moments, center, quaternion.from_matrix(axes))
 
 
-def from_log_cholesky(theta: Any) -> Inertia:
-    """The body of ten free numbers, every choice of which is one that can exist.
+def from_log_cholesky(theta: Scalar | Sequence[Scalar]) -> Inertia:
+    """The inertia of a body from ten unconstrained parameters.
 
-    With θ = (α, d₁, d₂, d₃, s₁₂, s₂₃, s₁₃, t₁, t₂, t₃), mass m = e^{2α}, centre of mass t and
+    The inertia is physically consistent for all values of the parameters, which are
+    θ = (α, d₁, d₂, d₃, s₁₂, s₂₃, s₁₃, t₁, t₂, t₃). The mass is m = e^{2α}, and the center of mass
+    is t = (t₁, t₂, t₃). The matrix Σ of second moments of mass about the center and the inertia
+    tensor I about the center are
 
-        Σ = m V Vᵀ,   V = [[e^{d₁}, s₁₂, s₁₃], [0, e^{d₂}, s₂₃], [0, 0, e^{d₃}]],   I = tr(Σ) 1 − Σ,
+        Σ = m V Vᵀ,   V = [[e^{d₁}, s₁₂, s₁₃], [0, e^{d₂}, s₂₃], [0, 0, e^{d₃}]],   I = tr(Σ) 1 − Σ.
 
-    Σ being the second moments of mass about the centre and I the tensor there: m, every moment and
-    the triangle inequality are positive whatever θ, which is what a fit by gradient wants.
+    For every θ, m and all moments are positive, and the triangle inequality holds. Gradient-based
+    fits of θ therefore need no constraints.
 
     Args:
-        theta: (10,).
+        theta: θ, (10,).
 
     Raises:
-        ValueError: another shape.
+        ValueError: `theta` has another shape.
 
     References:
         Rucker, Wensing, Smooth Parameterization of Rigid-Body Inertia, IEEE Robotics and Automation
@@ -182,10 +216,10 @@ def from_log_cholesky(theta: Any) -> Inertia:
 
 
 def log_cholesky(body: Inertia) -> Array:
-    """The ten numbers (10,) of a body in space, as `from_log_cholesky` takes them.
+    """Returns the parameters θ (10,) of a body in space; inverts `from_log_cholesky`.
 
     Args:
-        body: whose moments satisfy the triangle inequality strictly: it is not flat.
+        body: an inertia that satisfies the triangle inequality strictly, so that it is not flat.
     """
     moments = jnp.asarray(body.moments, jnp.result_type(float, *body.moments))
     axes = jnp.eye(4, dtype=moments.dtype)[0] if body.axes is None else body.axes
@@ -200,64 +234,58 @@ def log_cholesky(body: Inertia) -> Array:
 
 @jax.custom_jvp
 def principal_axes(tensor: Array) -> tuple[Array, Array]:
-    """I = A diag(moments) Aᵀ with A a rotation.
+    """Diagonalizes an inertia tensor I: I = A diag(moments) Aᵀ with a rotation A.
 
     Args:
-        tensor: symmetric, (3, 3) [kg m²].
+        tensor: the symmetric tensor I, (3, 3) [kg m²].
 
     Returns:
-        moments (3,), ascending, and A (3, 3). Tangents of the axes follow
-        dA = A Ω, Ω_ij = dI_ij / (I_j − I_i). Where moments coincide any axes of their plane are
-        principal, and there is no such Ω, while the motion of the body does have a derivative. What
-        is differentiated is therefore the body whose moments are apart by ε^0.45 of the largest,
-        1e-7 in float64: its derivatives, and the moments returned beside them, are off by about as
-        much, by products of inertia ten times as much. Second derivatives want moments apart.
+        The principal moments (3,) in ascending order, and A (3, 3), whose columns are the principal
+        axes. The tangent of A is dA = A Ω with Ω_ij = dI_ij / (I_j − I_i), where dI is expressed in
+        the principal axes.
+
+        If moments coincide, Ω does not exist, although the motion of the body has a derivative.
+        Under differentiation, moments are therefore separated by at least ε^0.45 of the largest
+        moment: 1e-7 in float64. This is also the relative error of the derivatives, and of moments
+        computed together with derivatives. For derivatives with respect to products of inertia, the
+        error is ten times as large. Second derivatives need distinct moments.
     """
     moments, axes = jnp.linalg.eigh((tensor + tensor.T) / 2)
     return moments, axes.at[:, 2].multiply(jnp.linalg.det(axes))
 
 
 @principal_axes.defjvp
-def _principal_axes_jvp(primals: Any, tangents: Any) -> Any:
+def _principal_axes_jvp(
+    primals: tuple[Array], tangents: tuple[Array]
+) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     moments, axes = principal_axes(*primals)
-    moments = _apart(moments)
     (d_tensor,) = tangents
+    # moves the ascending moments apart, by at least ε^0.45 of the largest moment
+    least = float(jnp.finfo(moments.dtype).eps) ** APART * jnp.max(jnp.abs(moments))
+    first, second, third = moments
+    second = jnp.maximum(second, first + least)
+    moved = jnp.stack([first, second, jnp.maximum(third, second + least)])
+    moments = moments + jax.lax.stop_gradient(moved - moments)
     inside = axes.T @ ((d_tensor + d_tensor.T) / 2) @ axes
     turn = numerics.safe_divide(inside, moments[None, :] - moments[:, None])
     return (moments, axes), (jnp.diagonal(inside), axes @ turn)
 
 
-def _apart(moments: Array) -> Array:
-    """Ascending moments, none nearer to the one before than ε^0.45 of the largest."""
-    least = float(jnp.finfo(moments.dtype).eps) ** APART * jnp.max(jnp.abs(moments))
-    first, second, third = moments
-    second = jnp.maximum(second, first + least)
-    moved = jnp.stack([first, second, jnp.maximum(third, second + least)])
-    return moments + jax.lax.stop_gradient(moved - moments)
-
-
-def _check(solid: str, **values: Any) -> None:
+def _check(solid: str, **values: PyTree) -> None:
+    """Checks that the mass and the lengths of a solid are positive."""
     for what, value in values.items():
         checks.check(solid, what, value, (3,) if what == "size" else (), above=0)
 
 
-def _check_tensor(owner: str, tensor: Array, moments: Array) -> None:
-    known = np.asarray(tensor)
-    if np.max(np.abs(known - known.T)) > 1e-6 * np.max(np.abs(known)):
-        raise ValueError(f"{owner}: the tensor must be symmetric, got {checks.numerals(known)}.")
-    checks.check(owner, "the principal moments", moments, above=0)
-    check_triangle(owner, moments)
-
-
-def check_triangle(owner: str, moments: Any) -> None:
-    """Checks I₁ + I₂ ≥ I₃, which every real body satisfies.
+def check_triangle(owner: str, moments: Scalar | Sequence[Scalar]) -> None:
+    """Checks the triangle inequality I₁ + I₂ ≥ I₃, which every distribution of mass satisfies.
 
     Args:
-        owner: what the message begins with.
+        owner: the first words of the error message.
         moments: principal moments, (3,) [kg m²].
 
     Raises:
-        ValueError: one moment exceeds the sum of the others by more than round-off.
+        ValueError: one moment exceeds the sum of the other two by more than rounding.
     """
     if checks.is_concrete(moments):
         values = np.sort(np.asarray(moments)).tolist()

@@ -1,6 +1,6 @@
-"""Where a body is and how it moves, as arrays for user functions and accessors.
+"""Poses and motions of single bodies as arrays, for accessors and users' functions.
 
-The hot path works on lanes instead (`model.bodies`); these classes are the readable face.
+The step functions use lanes over many bodies instead; see `system.frames`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from jaxcon.geometry import quaternion
 
 @pytree
 class Pose:
-    """Position and orientation of a frame in the world.
+    """The position and orientation of a frame in the world.
 
     Attributes:
-        position: (2,) or (3,) [m].
-        orientation: angle () [rad] in the plane, unit quaternion (4,) in space; None for a
+        position: the origin of the frame, (2,) or (3,) [m].
+        orientation: an angle () [rad] in the plane; a unit quaternion (4,) in space; None for a
             particle.
     """
 
@@ -29,7 +29,10 @@ class Pose:
 
     @property
     def rotation(self) -> Array:
-        """R, body to world: (2, 2) or (3, 3); the identity for a particle."""
+        """The rotation matrix R from the frame to the world, (2, 2) or (3, 3).
+
+        For a particle, R is the identity.
+        """
         if self.orientation is None:
             return jnp.eye(self.position.shape[0], dtype=self.position.dtype)
         if self.position.shape[0] == 3:
@@ -38,42 +41,43 @@ class Pose:
         return jnp.stack([jnp.stack([c, -s]), jnp.stack([s, c])])
 
     def point(self, local: Array) -> Array:
-        """x + R s: a point of the body in the world frame.
+        """Converts a point from the body frame to the world frame: x + R s.
 
         Args:
-            local: s, in the body frame, (dim,) [m].
+            local: the point s in the body frame, (dim,) [m].
         """
         return self.position + self.direction(local)
 
     def direction(self, local: Array) -> Array:
-        """R u: a direction of the body in the world frame.
+        """Converts a direction from the body frame to the world frame: R u.
 
         Args:
-            local: u, in the body frame, (dim,).
+            local: the direction u in the body frame, (dim,).
         """
         return local if self.orientation is None else self.rotation @ local
 
     def local_point(self, world: Array) -> Array:
-        """Rᵀ (p − x): a world point in the body frame.
+        """Converts a point from the world frame to the body frame: Rᵀ (p − x).
 
         Args:
-            world: p, (dim,) [m].
+            world: the point p in the world frame, (dim,) [m].
         """
         return self.local_direction(world - self.position)
 
     def local_direction(self, world: Array) -> Array:
-        """Rᵀ n: a world direction in the body frame.
+        """Converts a direction from the world frame to the body frame: Rᵀ n.
 
         Args:
-            world: n, (dim,).
+            world: the direction n in the world frame, (dim,).
         """
         return world if self.orientation is None else self.rotation.T @ world
 
     def then(self, other: Pose) -> Pose:
-        """In the world, a frame that is given in this one.
+        """Composes this pose with a pose relative to this frame; returns the resulting world pose.
 
         Args:
-            other: of that frame in this one; without an orientation it is not turned.
+            other: the pose of another frame in this frame. An orientation of None means no
+                rotation.
         """
         position, turn = self.point(other.position), self.orientation
         if turn is None or other.orientation is None:
@@ -84,7 +88,7 @@ class Pose:
 
     @property
     def inverse(self) -> Pose:
-        """The world as seen from this frame."""
+        """The inverse pose: the position and orientation of the world frame in this frame."""
         position = -self.local_direction(self.position)
         if self.orientation is None or self.position.shape[0] == 2:
             return Pose(position, None if self.orientation is None else -self.orientation)
@@ -93,25 +97,25 @@ class Pose:
 
 @pytree
 class WorldPose(Pose):
-    """A frame fixed to the world: its own points and directions are those of the world."""
+    """The pose of a frame fixed to the world, whose local points are given in the world frame."""
 
     def local_point(self, world: Array) -> Array:
-        """The point itself."""
+        """Returns the world point unchanged."""
         return world
 
     def local_direction(self, world: Array) -> Array:
-        """The direction itself."""
+        """Returns the world direction unchanged."""
         return world
 
 
 @pytree
 class Motion(Pose):
-    """A pose and its rate of change.
+    """The pose and the velocity of a frame.
 
     Attributes:
-        position, orientation: as of `Pose`.
-        velocity: of the frame's origin, world frame, (2,) or (3,) [m/s].
-        angular_velocity: () in the plane, (3,) in the body frame in space [rad/s]; None for a
+        position, orientation: see `Pose`.
+        velocity: the velocity of the origin in the world frame, (2,) or (3,) [m/s].
+        angular_velocity: () in the plane; (3,) in space, in the body frame [rad/s]. None for a
             particle.
     """
 
@@ -120,14 +124,14 @@ class Motion(Pose):
 
     @property
     def pose(self) -> Pose:
-        """The pose alone."""
+        """The position and orientation as a `Pose`."""
         return Pose(self.position, self.orientation)
 
     def seen_from(self, offset: Pose | None) -> Motion:
-        """The motion of a frame fixed in this body at the pose `offset` in it.
+        """Returns the motion of another frame fixed to the same body.
 
         Args:
-            offset: of the frame in the body; None for the body's own.
+            offset: the pose of the other frame in the body frame; None for the body frame itself.
         """
         if offset is None:
             return self
@@ -139,15 +143,14 @@ class Motion(Pose):
         return Motion(position, turned, velocity, omega)
 
     def point_velocity(self, local: Array) -> Array:
-        """ẋ + R (ω × s): the velocity of a point of the body, world frame [m/s].
+        """Returns the velocity ẋ + R (ω × s) of a point of the body, world frame, (dim,) [m/s].
 
         Args:
-            local: s, in the body frame, (dim,) [m].
+            local: the point s in the body frame, (dim,) [m].
         """
         if self.angular_velocity is None:
             return self.velocity
         if self.position.shape[0] == 3:
             return self.velocity + self.rotation @ jnp.cross(self.angular_velocity, local)
-        lever = self.rotation @ local
-        turned = jnp.stack([-lever[1], lever[0]])
-        return self.velocity + self.angular_velocity * turned
+        x, y = self.rotation @ local
+        return self.velocity + self.angular_velocity * jnp.stack([-y, x])

@@ -1,10 +1,10 @@
-"""Unit quaternions `wxyz`, body to world.
+"""Unit quaternions (w, x, y, z) that rotate from the body frame to the world frame.
 
 Every function takes arrays whose first axis enumerates components, or Vectors of lanes; trailing
-axes are batches. Angular velocities are in the body frame, so that q̇ = ½ q ⊗ (0, ω).
+axes are batches. Angular velocities ω are in the body frame, so that q̇ = ½ q ⊗ (0, ω).
 
-A ValueError names what is not of real numbers, or of another shape. Values are not read: NaN in an
-argument becomes NaN in the result.
+An argument with a wrong shape, or without real numbers, raises a ValueError that names it. Values
+are not checked: NaN in an argument becomes NaN in the result.
 
 References:
     Solà, Quaternion kinematics for the error-state Kalman filter (2017), sections 1-4.
@@ -12,37 +12,62 @@ References:
 
 import functools
 import inspect
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Matrix, Vector, componentwise, minus, plus, times
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.typing import Array, Lane, Scalar
+
+__all__ = [
+    "multiply",
+    "conjugate",
+    "rotate",
+    "matrix",
+    "rotation",
+    "derivative",
+    "exp",
+    "log",
+    "normalize",
+    "from_axis_angle",
+    "from_matrix",
+    "split",
+]
+
+
+def __dir__() -> list[str]:
+    """Returns the public names."""
+    return [*__all__]
+
+
+Components: TypeAlias = Array | Vector
+"""The components of a quaternion or vector: an array (component, …), or a Vector of lanes."""
 
 IDENTITY = Vector(1.0, 0.0, 0.0, 0.0)
 
 
 def _of_components(*sizes: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Lets a function of Vectors of these sizes also take arrays, which it checks.
+    """A decorator by which a function of Vectors also accepts arrays, whose shapes it checks.
 
-    Raises:
-        ValueError: by the function, of arrays that are not real numbers or of other shapes.
+    The decorated function raises a ValueError for arrays of other shapes or without real numbers.
+
+    Args:
+        sizes: the number of components of each argument.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         owner, lanes = f"quaternion.{function.__name__}", componentwise(function)
-        names = tuple(inspect.signature(function).parameters)
         signature = inspect.signature(function)
 
         @functools.wraps(function)
-        def wrapped(*args: Any, **named: Any) -> Any:
+        def wrapped(*args: Components, **named: Components) -> Any:
             values = signature.bind(*args, **named).args
             if any(isinstance(x, Vector) for x in values):
                 return function(*values)
-            given = zip(values, ((n,) for n in sizes), strict=True)
-            return lanes(*checks.components(owner, **dict(zip(names, given, strict=True))))
+            given = zip(signature.parameters, values, sizes, strict=True)
+            return lanes(*checks.components(owner, **{name: (x, (n,)) for name, x, n in given}))
 
         return wrapped
 
@@ -50,8 +75,8 @@ def _of_components(*sizes: int) -> Callable[[Callable[..., Any]], Callable[..., 
 
 
 @_of_components(4, 4)
-def multiply(p: Any, q: Any) -> Any:
-    """p ⊗ q: first turn by q, then by p.
+def multiply(p: Components, q: Components) -> Any:
+    """Returns the product p ⊗ q: the rotation by q followed by the rotation by p.
 
     Args:
         p: (4, …).
@@ -67,8 +92,8 @@ def multiply(p: Any, q: Any) -> Any:
 
 
 @_of_components(4)
-def conjugate(q: Any) -> Any:
-    """q*: the inverse of a unit quaternion (4, …).
+def conjugate(q: Components) -> Any:
+    """Returns the conjugate q*, (4, …), which is the inverse of a unit quaternion.
 
     Args:
         q: (4, …).
@@ -77,21 +102,21 @@ def conjugate(q: Any) -> Any:
 
 
 @_of_components(4, 3)
-def rotate(q: Any, x: Any) -> Any:
-    """q x q*: a vector of the body (3, …) in the world frame.
+def rotate(q: Components, x: Components) -> Any:
+    """Rotates a vector x from the body frame to the world frame: returns q x q*, (3, …).
 
     Args:
         q: (4, …).
-        x: in the body frame, (3, …).
+        x: the vector in the body frame, (3, …).
     """
-    scalar, vector = split(q)
+    (scalar, vector), x = split(q), Vector.of(x)
     twice = vector.cross(x) * 2.0
     return x + twice * scalar + vector.cross(twice)
 
 
 @_of_components(4)
-def matrix(q: Any) -> Any:
-    """The rotation matrix R (3, 3, …) with R x = q x q*.
+def matrix(q: Components) -> Any:
+    """Returns the rotation matrix R, (3, 3, …), with R x = q x q*.
 
     Args:
         q: (4, …).
@@ -99,8 +124,8 @@ def matrix(q: Any) -> Any:
     return rotation(q)
 
 
-def rotation(q: Vector) -> Matrix:
-    """The rotation matrix of lanes, R x = q x q*.
+def rotation(q: Components) -> Matrix:
+    """Returns the rotation matrix R as a `Matrix` of lanes, with R x = q x q*.
 
     Args:
         q: a `Vector` of 4 lanes.
@@ -124,62 +149,69 @@ def rotation(q: Vector) -> Matrix:
 
 
 @_of_components(4, 3)
-def derivative(q: Any, omega: Any) -> Any:
-    """q̇ = ½ q ⊗ (0, ω), ω (3, …) in the body frame [rad/s].
+def derivative(q: Components, omega: Components) -> Any:
+    """Returns the time derivative q̇ = ½ q ⊗ (0, ω), (4, …) [1/s].
 
     Args:
         q: (4, …).
-        omega: ω, (3, …) [rad/s].
+        omega: the angular velocity ω in the body frame, (3, …) [rad/s].
     """
     return multiply(q, Vector(0.0, *omega)) * 0.5
 
 
 @_of_components(3)
-def exp(phi: Any) -> Any:
-    """The turn by ‖φ‖ about φ (3, …) [rad]: (cos ½‖φ‖, φ sin ½‖φ‖ / ‖φ‖), smooth at φ = 0.
+def exp(phi: Components) -> Any:
+    """Returns the quaternion (4, …) of a rotation vector φ: the rotation by ‖φ‖ about φ.
+
+    It is (cos ½‖φ‖, φ sin ½‖φ‖ / ‖φ‖), evaluated smoothly at φ = 0.
 
     Args:
-        phi: φ, (3, …) [rad].
+        phi: the rotation vector φ, (3, …) [rad].
     """
-    cos, sinc = numerics.cos_sinc(phi.dot(phi) * 0.25)
-    return Vector(cos, *(phi * (sinc * 0.5)))
+    φ = Vector.of(phi)
+    cos, sinc = numerics.cos_sinc(φ.dot(φ) * 0.25)
+    return Vector(cos, *(φ * (sinc * 0.5)))
 
 
 @_of_components(4)
-def log(q: Any) -> Any:
-    """The rotation vector φ (3, …) [rad] of the shorter turn: exp(φ) = ± q, smooth at identity.
+def log(q: Components) -> Any:
+    """Returns the shortest rotation vector φ of a quaternion, (3, …) [rad].
+
+    It solves exp(φ) = ±q, and is smooth at the identity.
 
     Args:
         q: (4, …).
     """
     scalar, vector = split(q)
     sine = numerics.norm(vector)
-    half = jnp.arctan2(sine, jnp.abs(scalar))
     series = 2 * (1 + sine * sine * (1 / 6 + sine * sine * (3 / 40)))
     small = sine < 1e-3
-    scale = jnp.where(small, series, 2 * half / jnp.where(small, 1, sine))
+    # the branch that is not taken must have a finite derivative, also where q = 0
+    safe = jnp.where(small, 1, sine)
+    half = jnp.arctan2(safe, jnp.abs(scalar))
+    scale = jnp.where(small, series, 2 * half / safe)
     return vector * jnp.where(scalar < 0, -scale, scale)
 
 
 @_of_components(4)
-def normalize(q: Any) -> Any:
-    """q / ‖q‖ (4, …).
+def normalize(q: Components) -> Any:
+    """Returns the unit quaternion q / ‖q‖, (4, …).
 
     Args:
-        q: (4, …), not zero.
+        q: a nonzero quaternion, (4, …).
     """
-    return numerics.unit(q)
+    return numerics.unit(Vector.of(q))
 
 
-def from_axis_angle(axis: Any, angle: Any) -> Array:
-    """The turn by an angle () [rad] about an axis (3,) of any length but zero.
+def from_axis_angle(axis: Scalar | Sequence[Scalar], angle: Scalar) -> Array:
+    """Returns the unit quaternion (4,) of a rotation by an angle about an axis.
 
     Args:
-        axis: (3,), of any length but zero.
-        angle: () [rad].
+        axis: the rotation axis, (3,), of any nonzero length.
+        angle: the rotation angle, () [rad].
 
     Raises:
-        ValueError: not real numbers, or another shape.
+        ValueError: an argument has no real numbers, or another shape.
     """
     with checks.without_waiting():
         checks.check("quaternion.from_axis_angle", "axis", axis, (3,))
@@ -191,15 +223,16 @@ def from_axis_angle(axis: Any, angle: Any) -> Array:
 
 
 def from_matrix(r: Array) -> Array:
-    """The unit quaternion (4,) of a rotation matrix (3, 3), differentiable at every rotation.
+    """Returns the unit quaternion (4,) of a rotation matrix, differentiable at every rotation.
 
-    The column of 4 q qᵀ with the largest diagonal entry, which is never near zero.
+    The result is the normalized column of 4 q qᵀ with the largest diagonal entry; that column is
+    never near zero.
 
     Args:
         r: R, (3, 3).
 
     Raises:
-        ValueError: not real numbers, or another shape.
+        ValueError: `r` has no real numbers, or another shape.
 
     References:
         Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978).
@@ -222,8 +255,8 @@ def from_matrix(r: Array) -> Array:
     return largest / jnp.sqrt(jnp.sum(largest * largest))
 
 
-def split(q: Vector) -> tuple[Lane, Vector]:
-    """The scalar and the vector part.
+def split(q: Components) -> tuple[Lane, Vector]:
+    """Returns the scalar part and the vector part of a quaternion.
 
     Args:
         q: a `Vector` of 4 lanes.

@@ -1,29 +1,34 @@
-"""The inertia of a body, in whatever form a user gave it."""
+"""Conversion of the mass and inertia arguments of users to an `Inertia`."""
 
-from __future__ import annotations
-
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
 from jaxcon.core import checks
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, DType, PyTree, Scalar
 from jaxcon.geometry.inertia import Inertia, check_triangle, from_tensor
 
 
-def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> Inertia:
-    """Mass and moments as arrays, whatever form a user gave.
+def resolve_inertia(
+    owner: str,
+    mass: PyTree,
+    given: Inertia | Scalar | Sequence[Scalar] | None,
+    dim: int,
+    dtype: DType,
+) -> Inertia:
+    """Converts the mass and inertia arguments of a body to an `Inertia` of arrays.
 
     Args:
-        owner: what errors begin with, as "body 'rod'".
-        mass: () [kg]; None beside an `Inertia`, which brings it.
-        given: a moment () in the plane; in space principal moments (3,) or a tensor (3, 3); or an
-            `Inertia`.
-        dim: 2 or 3.
-        dtype: of the scene.
+        owner: the first words of errors, such as "body 'rod'".
+        mass: () [kg]; None if `given` is an `Inertia`, which contains the mass.
+        given: an `Inertia`; or a moment of inertia () in the plane; or principal moments (3,) or a
+            tensor (3, 3) in space [kg m²].
+        dim: the dimension of space, 2 or 3.
+        dtype: the dtype of the scene.
 
     Raises:
-        ValueError: a wrong shape or dtype, a value that no body has, or mass twice or not at all.
+        ValueError: a shape or dtype is wrong, a value is out of range, or the mass is given twice
+            or not at all.
     """
     if isinstance(given, Inertia):
         if mass is not None:
@@ -36,10 +41,11 @@ def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> 
         tensor = checks.real(owner, "inertia", given, dtype, (3, 3))
         given = from_tensor(mass, tensor, owner=owner)
     else:
-        if dim == 2 and np.ndim(checks.check(owner, "inertia", given, finite=False)):
+        shape = np.shape(checks.check(owner, "inertia", given, finite=False))
+        if dim == 2 and shape:
             raise ValueError(
                 f"{owner}: inertia must have shape () in the plane, about the normal through the"
-                f" centre of mass, got {np.shape(given)}; of principal moments give the third."
+                f" center of mass, got {shape}; of principal moments give the third."
             )
         given = Inertia(mass, given)
     moments = given.moments
@@ -51,11 +57,11 @@ def resolve_inertia(owner: str, mass: Any, given: Any, dim: int, dtype: Any) -> 
     return Inertia(resolve_mass(owner, given.mass, dtype), moments, given.center, given.axes)
 
 
-def resolve_mass(owner: str, mass: Any, dtype: Any) -> Array:
-    """A mass () [kg] as an array.
+def resolve_mass(owner: str, mass: PyTree, dtype: DType) -> Array:
+    """Converts the mass argument of a body to an array, () [kg].
 
     Raises:
-        ValueError: there is none, or it is not positive.
+        ValueError: the mass is None or not positive.
     """
     if mass is None:
         raise ValueError(

@@ -1,27 +1,30 @@
-"""Actuators of MuJoCo's on joints, each one control channel, in the order of its controls."""
+"""Import of MuJoCo's joint actuators; each is a control channel, in the order of MuJoCo's ctrl."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from jaxcon.constraints.compound import Compound
+from jaxcon.constraints.pairs import Twist
 from jaxcon.core import checks
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
 from jaxcon.io.links import Link, LinkJoint
-from jaxcon.model.actuators import AffineActuator, Motor
+from jaxcon.system.actuators import AffineActuator, Motor
 
 
 class Transmission(NamedTuple):
-    """How an actuator acts on a coordinate θ = qpos − reference.
+    """The transmission of an actuator: the joint coordinate on which it acts, and its gear ratio.
 
     Attributes:
-        at: the coordinate.
-        gear: g.
-        reference: qpos at assembly.
-        measured: whether the length g qpos counts; that of a free joint is zero.
+        at: the joint coordinate θ = qpos − reference.
+        gear: the gear ratio g.
+        reference: the value of qpos at assembly.
+        measured: True if the actuator length is g qpos; False for free joints, whose actuator
+            length is zero.
     """
 
     at: Coordinate
@@ -36,7 +39,13 @@ LAWS = (
     ("gaintype", "mjtGain", ("fixed", "affine")),
     ("biastype", "mjtBias", ("none", "affine")),
 )
-"""What is supported of transmission, dynamics, gain and bias."""
+"""The supported types of transmission, dynamics, gain and bias.
+
+Each entry has MuJoCo's field, its enumeration, and the names of the supported values.
+"""
+
+Element: TypeAlias = Motor | AffineActuator | Compound | Twist
+"""A scene element: an actuator, or a joint without constraint rows that defines its coordinate."""
 
 
 def actuators(
@@ -44,11 +53,17 @@ def actuators(
     links: tuple[Link, ...],
     coordinates: dict[int, Coordinate],
     names: Names,
-) -> Iterator[Any]:
-    """The elements of all actuators.
+) -> Iterator[Element]:
+    """Yields the scene elements of all actuators of a model.
+
+    Args:
+        compiled: the model.
+        links: the links of the model.
+        coordinates: the scene coordinate of each hinge and slide, by MuJoCo's joint id.
+        names: the names in the scene.
 
     Raises:
-        NotImplementedError: one of them is of a kind that is not supported.
+        NotImplementedError: an actuator is not supported.
     """
     m = compiled.model
     joints = {joint.id: (link, joint) for link in links for joint in link.joints}
@@ -66,23 +81,30 @@ def actuators(
 
 
 def _check(compiled: Compiled, i: int) -> None:
-    """Checks that an actuator is of a supported kind.
+    """Checks that an actuator has supported types of transmission, dynamics, gain and bias.
 
     Raises:
-        NotImplementedError: it is not.
+        NotImplementedError: a type is not supported.
     """
     m = compiled.model
-    for field, enum, known in LAWS:
-        found = compiled.choice(enum, getattr(m, f"actuator_{field}")[i])
-        if found not in known:
+    for field, enum, supported in LAWS:
+        kind = compiled.choice(enum, getattr(m, f"actuator_{field}")[i])
+        if kind not in supported:
             raise NotImplementedError(
-                f"from_mjcf: actuator '{compiled.name('actuator', i)}' has the {field} '{found}';"
-                f" supported are {list(known)}."
+                f"from_mjcf: actuator '{compiled.name('actuator', i)}' has the {field} '{kind}';"
+                f" supported are {list(supported)}."
             )
 
 
-def _law(compiled: Compiled, i: int, name: str, transmission: Transmission) -> Any:
-    """(g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇ with the length l = g θ + g reference."""
+def _law(
+    compiled: Compiled, i: int, name: str, transmission: Transmission
+) -> Motor | AffineActuator:
+    """Builds actuator i with MuJoCo's force law (g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇.
+
+    u is the control, l = g (θ + reference) the actuator length with the gear ratio g, g_i the gain
+    parameters and b_i the bias parameters. The result is a `Motor` if the force is proportional to
+    u and has no limits.
+    """
     at, gear, reference, measured = transmission
     m = compiled.model
     gain, bias = m.actuator_gainprm[i, :3].copy(), m.actuator_biasprm[i, :3].copy()
@@ -91,8 +113,8 @@ def _law(compiled: Compiled, i: int, name: str, transmission: Transmission) -> A
     for law in (gain, bias):
         law[0] += law[1] * gear * reference
         law[1] *= measured
-    obeyed = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl")
-    control = m.actuator_ctrlrange[i] if obeyed else None
+    clamped = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl")
+    control = m.actuator_ctrlrange[i] if clamped else None
     force = _force_range(compiled, i, gear)
     if not gain[1:].any() and not bias.any() and force is None:
         return Motor(name, at.joint, gear * gain[0], control, at.name)
@@ -100,45 +122,47 @@ def _law(compiled: Compiled, i: int, name: str, transmission: Transmission) -> A
 
 
 def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
-    """Returns the force that passes both the actuator's range and its joint's, before gear.
+    """Returns the force range of an actuator before its gear, (2,); None if there are no limits.
+
+    The range respects the limits of the actuator and of its joint.
 
     Raises:
         NotImplementedError: the joint limits the sum of several actuators.
     """
     m, joint = compiled.model, int(compiled.model.actuator_trnid[i, 0])
-    own = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
+    of_actuator = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
     if not m.jnt_actfrclimited[joint] or not gear:
-        return own
-    at_joint = [_acts_on(compiled, k, joint) for k in range(m.nu)]
-    if sum(at_joint) > 1:
+        return of_actuator
+    kinds = [compiled.choice("mjtTrn", kind) for kind in m.actuator_trntype]
+    on_joint = np.isin(kinds, ("joint", "jointinparent")) & (m.actuator_trnid[:, 0] == joint)
+    if sum(on_joint) > 1:
         raise NotImplementedError(
             f"from_mjcf: joint '{compiled.name('joint', joint)}' has an actuatorfrcrange and"
-            f" {sum(at_joint)} actuators, whose sum it limits; give each a forcerange instead."
+            f" {sum(on_joint)} actuators, whose sum it limits; give each a forcerange instead."
         )
-    joints = np.sort(m.jnt_actfrcrange[joint] / gear)
-    return joints if own is None else np.clip(own, *joints)
-
-
-def _acts_on(compiled: Compiled, i: int, joint: int) -> bool:
-    """Returns True where an actuator acts on a joint."""
-    m = compiled.model
-    kind = compiled.choice("mjtTrn", m.actuator_trntype[i])
-    return kind in ("joint", "jointinparent") and int(m.actuator_trnid[i, 0]) == joint
+    of_joint = np.sort(m.jnt_actfrcrange[joint] / gear)
+    return of_joint if of_actuator is None else np.clip(of_actuator, *of_joint)
 
 
 def _vector(
     compiled: Compiled, i: int, link: Link, joint: LinkJoint, names: Names
-) -> tuple[Any, Transmission]:
-    """A joint without rows along the gear of a ball or free joint, and ‖gear‖ along it.
+) -> tuple[Compound | Twist, Transmission]:
+    """Builds the transmission of an actuator on a ball or free joint.
+
+    The actuator acts along its gear vector, with the gear ratio ‖gear‖.
+
+    Returns:
+        A joint without constraint rows, whose coordinate lies along the gear vector, and the
+        transmission on this coordinate.
 
     Raises:
         NotImplementedError: the gear has both a force and a torque.
     """
-    own, gear = compiled.name("actuator", i), compiled.model.actuator_gear[i]
+    label, gear = compiled.name("actuator", i), compiled.model.actuator_gear[i]
     force, torque = (gear[:3], gear[3:]) if joint.kind == "free" else (np.zeros(3), gear[:3])
     if force.any() and torque.any():
         raise NotImplementedError(
-            f"from_mjcf: actuator '{own}' has a gear with a force and a"
+            f"from_mjcf: actuator '{label}' has a gear with a force and a"
             f" torque, {checks.numerals(gear)}; give each an actuator of its own."
         )
     axis = force if force.any() else torque
@@ -147,11 +171,11 @@ def _vector(
     if force.any():
         axes = np.linalg.svd(axis[None])[2]
         axes[0] = axis
-        push = pushing(compiled, link, axes, names.take(f"{own} push", "push"))
+        push = pushing(compiled, link, axes, names.take(f"{label} push", "push"))
         return push, Transmission(Coordinate(push.name, "travel_1"), size, measured=False)
     in_parent = compiled.choice("mjtTrn", compiled.model.actuator_trntype[i]) == "jointinparent"
     frame = compiled.data.xmat[link.body].reshape(3, 3)
     world = axis if in_parent and joint.kind == "free" else frame @ axis
-    twist = turning(link, world, names.take(f"{own} twist", "twist"), backward=in_parent)
+    twist = turning(link, world, names.take(f"{label} twist", "twist"), backward=in_parent)
     at, sign = Coordinate(twist.name, "twist"), -1 if in_parent else 1
     return twist, Transmission(at, sign * size, measured=joint.kind == "ball")

@@ -1,39 +1,60 @@
-"""A model that MuJoCo has compiled, and where everything lies in its reference pose."""
+"""A model compiled by MuJoCo, with the frames of its bodies in the reference pose qpos0."""
 
 from __future__ import annotations
 
 import os
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from jaxcon.core.checks import shortened
 
 
+class MjModel(Protocol):
+    """The type of `mujoco.MjModel`, for annotations, because MuJoCo has no type stubs."""
+
+    nq: int
+    """The number of entries of qpos."""
+    nv: int
+    """The number of entries of qvel."""
+
+
+Source: TypeAlias = str | os.PathLike[str] | MjModel
+"""The path of an MJCF or URDF file, the text of such a file, or a `mujoco.MjModel`."""
+
+
 class Compiled:
-    """MuJoCo's model, with its data at the reference pose `qpos0`.
+    """A compiled MuJoCo model, with its `MjData` in the reference pose `qpos0`.
 
     Args:
-        source: path of an MJCF or URDF file, its text, or an `mujoco.MjModel`.
-        ignored: what the user leaves out.
+        source: the path of an MJCF or URDF file, its text, or a `mujoco.MjModel`.
+        ignored: the features that the user chose to ignore; see `jc.io.from_mjcf`.
 
     Raises:
         ImportError: MuJoCo is not installed.
-        FileNotFoundError: there is no such file.
-        ValueError: MuJoCo cannot compile it, or a number of it is NaN.
-        TypeError: it is none of these.
+        FileNotFoundError: the file does not exist.
+        ValueError: MuJoCo cannot compile the model, or a number in it is NaN.
+        TypeError: the source has another type.
     """
 
-    def __init__(self, source: Any, ignored: frozenset[str] = frozenset()) -> None:
-        self.mujoco, self.ignored = _mujoco(), ignored
+    def __init__(self, source: Source, ignored: frozenset[str] = frozenset()) -> None:
+        try:
+            import mujoco
+        except ImportError as error:
+            raise ImportError(
+                "from_mjcf needs MuJoCo's compiler: pip install 'jaxcon[mujoco]'."
+            ) from error
+        self.mujoco: Any = mujoco
+        self.ignored = ignored
         self.model = self._compile(source)
         self._refuse_nan_numbers()
         self.data = self.mujoco.MjData(self.model)
         self.mujoco.mj_kinematics(self.model, self.data)
 
-    def _compile(self, source: Any) -> Any:
+    def _compile(self, source: Source) -> Any:
+        """Compiles the source to an `MjModel`; raises the errors that the class lists."""
         model = self.mujoco.MjModel
         if isinstance(source, model):
             return source
@@ -56,77 +77,64 @@ class Compiled:
             raise ValueError(f"from_mjcf: MuJoCo cannot compile {what}: {error}") from error
 
     def _refuse_nan_numbers(self) -> None:
-        """Checks the model's arrays.
+        """Checks all numbers of the model for NaN.
 
         Raises:
-            ValueError: one has NaN in it.
+            ValueError: an array or option contains NaN.
         """
         for holder in (self.model, self.model.opt):
             for field in dir(holder):
                 x = None if field.startswith("_") else getattr(holder, field)
-                if isinstance(x, float | np.ndarray) and np.any(np.isnan(_floats(x))):
+                if not isinstance(x, float | np.ndarray):
+                    continue
+                x = np.asarray(x)
+                if x.dtype.kind == "f" and np.any(np.isnan(x)):
                     raise ValueError(f"from_mjcf: the model's {field} must be numbers, got NaN.")
 
     def name(self, kind: str, i: int) -> str:
-        """Returns the name of a "body", "joint", …; kind and number where it has none."""
+        """Returns the name of object i of a kind such as "joint"; "joint 3" if it has no name."""
         code = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         return self.mujoco.mj_id2name(self.model, code, i) or f"{kind} {i}"
 
-    def choice(self, enum: str, value: Any) -> str:
-        """The name of a value of one of MuJoCo's enumerations: "hinge" of mjtJoint 3."""
+    def choice(self, enum: str, value: int | np.integer) -> str:
+        """Returns the name of a value of a MuJoCo enumeration, such as "hinge" for mjtJoint 3."""
         return getattr(self.mujoco, enum)(int(value)).name.split("_", 1)[1].lower()
 
     def disabled(self, *features: str) -> bool:
-        """Returns True where a flag of the options, or the user, disables one of these features."""
+        """Returns True if `ignored` or a flag of the model disables any of these features."""
         if self.ignored.intersection(features):
             return True
-        known = self.mujoco.mjtDisableBit.__members__
-        bits = [known[f"mjDSBL_{f.upper()}"] for f in features if f"mjDSBL_{f.upper()}" in known]
+        flags = self.mujoco.mjtDisableBit.__members__
+        bits = [flags[f"mjDSBL_{f.upper()}"] for f in features if f"mjDSBL_{f.upper()}" in flags]
         return any(self.model.opt.disableflags & int(bit) for bit in bits)
 
 
 class Names:
-    """Names that are unique in a scene, where MuJoCo's need be so only among their kind."""
+    """The names used in a scene, which must be unique.
+
+    In MuJoCo, objects of different kinds may have equal names.
+    """
 
     def __init__(self) -> None:
         self.taken = {"world", "gravity"}
 
     def take(self, name: str, kind: str) -> str:
-        """The name itself if it is free, or with its kind after it, and a number if need be."""
-        wanted = [name, f"{name} {kind}"]
-        free = next((x for x in wanted if x not in self.taken), None)
-        n = 2
-        while free is None:
-            numbered = f"{name} {kind} {n}"
-            free, n = (None if numbered in self.taken else numbered), n + 1
+        """Reserves and returns a unique name: if it is taken, appends the kind, then a number."""
+        free, n = name, 1
+        while free in self.taken:
+            free, n = f"{name} {kind}" + f" {n}" * (n > 1), n + 1
         self.taken.add(free)
         return free
 
 
-def _floats(x: Any) -> np.ndarray:
-    """Floating numbers as they are, and none of anything else."""
-    x = np.asarray(x)
-    return x if x.dtype.kind == "f" else np.zeros(0)
-
-
 def _refuse_nan(text: str) -> None:
-    """Checks the attributes of a model's text: MuJoCo takes NaN for what is left out.
+    """Checks the XML attributes of a model for NaN, which MuJoCo would replace by defaults.
 
     Raises:
-        ValueError: one is NaN.
+        ValueError: an attribute is NaN.
     """
     attributes = re.findall(r"""([\w:]+)\s*=\s*["']([^"']*)["']""", text)
     names = {value for key, value in attributes if key == "name"}
     for key, value in attributes:
         if key != "name" and value not in names and "nan" in value.lower().split():
             raise ValueError(f'from_mjcf: {key}="{value}" must be numbers, got NaN.')
-
-
-def _mujoco() -> Any:
-    try:
-        import mujoco
-    except ImportError as error:
-        raise ImportError(
-            "from_mjcf needs MuJoCo's compiler: pip install 'jaxcon[mujoco]'."
-        ) from error
-    return mujoco

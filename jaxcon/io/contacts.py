@@ -1,22 +1,23 @@
-"""Contacts of planes, spheres, capsules and boxes."""
+"""Import of contacts between the planes, spheres, capsules and boxes of a MuJoCo model."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 
-from jaxcon.constraints.contact import CapsuleContact, PlaneContact
+from jaxcon.contact.contact import CapsuleContact, PlaneContact
 from jaxcon.io import pairs
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.links import Link, scene_body
-from jaxcon.io.pairs import Pair
+from jaxcon.io.pairs import GeomPair
 
 
-def contacts(compiled: Compiled, links: tuple[Link, ...], names: Names) -> Iterator[Any]:
-    """The elements of all pairs that are supported."""
+def contacts(
+    compiled: Compiled, links: tuple[Link, ...], names: Names
+) -> Iterator[PlaneContact | CapsuleContact]:
+    """Yields the contacts of all supported pairs of geoms."""
     for pair in pairs.pairs(compiled):
         if not pairs.supported(compiled, pair):
             continue
@@ -27,15 +28,15 @@ def contacts(compiled: Compiled, links: tuple[Link, ...], names: Names) -> Itera
 
 
 def _on_plane(
-    compiled: Compiled, pair: Pair, ends: list[str], names: Names
+    compiled: Compiled, pair: GeomPair, ends: list[str], names: Names
 ) -> Iterator[PlaneContact]:
-    """The balls of a shape on a plane: its own, those at the ends of its axis, or its corners."""
-    data, own = compiled.data, pairs.label(compiled, pair)
+    """Yields the contacts of a shape with a plane: one per sphere, capsule end or box corner."""
+    data, label = compiled.data, pairs.label(compiled, pair)
     normal = data.geom_xmat[pair.first].reshape(3, 3)[:, 2]
     centers, radius = _balls(compiled, pair.second)
     for i, center in enumerate(centers, 1):
         yield PlaneContact(
-            names.take(own if len(centers) == 1 else f"{own} {i}", "contact"),
+            names.take(label if len(centers) == 1 else f"{label} {i}", "contact"),
             *ends,
             radius=radius + pair.margin,
             center=center,
@@ -46,7 +47,12 @@ def _on_plane(
 
 
 def _balls(compiled: Compiled, geom: int) -> tuple[np.ndarray, float]:
-    """Centres in the world, (balls, 3), and the radius that they share."""
+    """Returns the spheres by which a geom touches a plane: a sphere, capsule ends, box corners.
+
+    Returns:
+        The centers of the spheres in the world frame, (n, 3) [m], and their common radius [m]; 0
+        for the corners of a box.
+    """
     kind = compiled.choice("mjtGeom", compiled.model.geom_type[geom])
     size = compiled.model.geom_size[geom]
     if kind != "box":
@@ -57,7 +63,10 @@ def _balls(compiled: Compiled, geom: int) -> tuple[np.ndarray, float]:
 
 
 def _axis(compiled: Compiled, geom: int) -> np.ndarray:
-    """Both ends of the axis of a capsule in the world, (2, 3); of a sphere its centre, twice."""
+    """Returns both ends of a capsule's axis in the world frame, (2, 3) [m].
+
+    For a sphere, both ends are its center.
+    """
     m, data = compiled.model, compiled.data
     long = compiled.choice("mjtGeom", m.geom_type[geom]) == "capsule"
     half = m.geom_size[geom, 1] * long * data.geom_xmat[geom].reshape(3, 3)[:, 2]
@@ -65,9 +74,9 @@ def _axis(compiled: Compiled, geom: int) -> np.ndarray:
 
 
 def _round(
-    compiled: Compiled, pair: Pair, ends: list[str], names: Names
+    compiled: Compiled, pair: GeomPair, ends: list[str], names: Names
 ) -> Iterator[CapsuleContact]:
-    """Two spheres or capsules, each with half of the margin."""
+    """Yields the contact of two spheres or capsules, each enlarged by half the margin."""
     radii = compiled.model.geom_size[list(pair[:2]), 0] + pair.margin / 2
     yield CapsuleContact(
         names.take(pairs.label(compiled, pair), "contact"),

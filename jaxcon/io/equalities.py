@@ -1,13 +1,13 @@
-"""Equality constraints of MuJoCo's: points that meet, bodies that are welded, coupled joints.
+"""Import of MuJoCo's equality constraints: connect, weld and joint couplings.
 
-MuJoCo pulls them together softly, by `solref` and `solimp`; here they hold as joints do.
+MuJoCo's constraints are soft, with `solref` and `solimp`. Here they are rigid, like joints.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from types import ModuleType
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,41 +15,50 @@ import numpy as np
 from jaxcon.constraints.couplings import PolynomialCoupling
 from jaxcon.constraints.drive import Drive
 from jaxcon.constraints.joints import Coincident, Fixed, anchors, relative_orientation
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, Scalar
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Pose
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate
 from jaxcon.io.links import Link, scene_body
-from jaxcon.model.elements import own_point
+from jaxcon.system.elements import own_point
 
 
 @dataclass(frozen=True)
 class Connected(Coincident):
-    """Two points meet that need not do so at assembly; `point` is that of the first body."""
+    """A constraint that makes two body points coincide (connect), even if apart at assembly.
 
-    point_b: Any = None
+    The inherited `point` is the point of the first body.
+
+    Attributes:
+        point_b: the point of the second body in the world frame at assembly, (3,) [m].
+    """
+
+    point_b: Scalar | None = None
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Each point in its own frame."""
+        """Returns both points, each in the frame of its body, for the assembly poses a and b."""
         end = own_point(self, "point_b", self.point_b, b)
         return anchors(self, a, b) | {"anchor_b": b.local_point(end)}
 
 
 @dataclass(frozen=True)
 class Welded(Fixed):
-    """Two frames meet that need not do so at assembly; `point` is that of the first body.
+    """A constraint that makes two body frames coincide (weld), even if apart at assembly.
+
+    The inherited `point` is the point of the first body.
 
     Attributes:
-        point_b: of the second body, world frame at assembly [m].
-        turn: by which the second body must turn in the world to be as it is to be, (4,).
+        point_b: the point of the second body in the world frame at assembly, (3,) [m].
+        turn: the rotation from the assembly orientation of the second body to its constrained
+            orientation: a quaternion (4,) in the world frame.
     """
 
-    point_b: Any = None
-    turn: Any = None
+    point_b: Scalar | None = None
+    turn: Scalar | None = None
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Each point in its own frame, and the orientation of b in a that is to be."""
+        """Returns both points in their body frames, and the required orientation of b in a."""
         end = own_point(self, "point_b", self.point_b, b)
         turn = jnp.asarray(self.turn, b.position.dtype)
         turned = Pose(b.position, quaternion.multiply(turn, b.orientation))
@@ -62,11 +71,17 @@ def equalities(
     links: tuple[Link, ...],
     coordinates: dict[int, Coordinate],
     names: Names,
-) -> Iterator[Any]:
-    """The elements of all equality constraints that are active.
+) -> Iterator[Connected | Welded | Drive | PolynomialCoupling]:
+    """Yields the scene elements of all active equality constraints of a model.
+
+    Args:
+        compiled: the model.
+        links: the links of the model.
+        coordinates: the scene coordinate of each hinge and slide, by MuJoCo's joint id.
+        names: the names in the scene.
 
     Raises:
-        NotImplementedError: one of them is of a kind that is not supported.
+        NotImplementedError: a constraint is not supported.
     """
     m = compiled.model
     if compiled.disabled("equality", "constraint"):
@@ -74,22 +89,27 @@ def equalities(
     for i in range(m.neq):
         if not m.eq_active0[i]:
             continue
-        own = compiled.name("equality", i)
+        label = compiled.name("equality", i)
         kind = compiled.choice("mjtEq", m.eq_type[i])
         if kind not in ("connect", "weld", "joint"):
             raise NotImplementedError(
-                f"from_mjcf: equality '{own}' is of type '{kind}'; supported are connect, weld and"
-                " joint."
+                f"from_mjcf: equality '{label}' is of type '{kind}'; supported are connect, weld"
+                " and joint."
             )
-        name = names.take(own, "equality")
+        name = names.take(label, "equality")
         if kind == "joint":
             yield _coupling(compiled, i, name, coordinates)
         else:
             yield _closure(compiled, i, kind, name, links)
 
 
-def _coupling(compiled: Compiled, i: int, name: str, coordinates: dict[int, Coordinate]) -> Any:
-    """y − y₀ = Σ cₖ (x − x₀)ᵏ, and y − y₀ = c₀ where there is no x."""
+def _coupling(
+    compiled: Compiled, i: int, name: str, coordinates: dict[int, Coordinate]
+) -> Drive | PolynomialCoupling:
+    """Builds the coupling y − y₀ = Σ cₖ (x − x₀)ᵏ of two joint coordinates x and y.
+
+    If the constraint names only one joint, y is held at y₀ + c₀.
+    """
     m = compiled.model
     first, second, coefficients = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i, :5]
     y = coordinates[first]
@@ -99,15 +119,19 @@ def _coupling(compiled: Compiled, i: int, name: str, coordinates: dict[int, Coor
     return PolynomialCoupling(name, x.joint, y.joint, coefficients, x.name, y.name)
 
 
-def held(t: Any, params: Any) -> Any:
-    """A motion that stands still."""
+def held(t: Array, params: dict[str, Array]) -> Array:
+    """Returns the constant `params["value"]` for all times t, as a prescribed motion of `Drive`."""
     return params["value"] + 0.0 * t
 
 
 def _closure(
     compiled: Compiled, i: int, kind: str, name: str, links: tuple[Link, ...]
 ) -> Connected | Welded:
-    """Two bodies that share a point or a frame, which are those of two sites, or of the bodies."""
+    """Builds a connect or weld constraint between two sites, or between two bodies.
+
+    Raises:
+        NotImplementedError: both sites or bodies belong to the same link.
+    """
     m, data, mujoco = compiled.model, compiled.data, compiled.mujoco
     objects = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
     by_site = m.eq_objtype[i] == int(mujoco.mjtObj.mjOBJ_SITE)
@@ -135,13 +159,15 @@ def _closure(
     return Welded(name, *bodies, point=points[0], point_b=points[1], turn=turn)
 
 
-def _product(mujoco: Any, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+def _product(mujoco: ModuleType, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Returns the quaternion product p ⊗ q, (4,)."""
     result = np.zeros(4)
     mujoco.mju_mulQuat(result, p, q)
     return result
 
 
-def _quaternion(mujoco: Any, matrix: np.ndarray) -> np.ndarray:
+def _quaternion(mujoco: ModuleType, matrix: np.ndarray) -> np.ndarray:
+    """Returns the quaternion (4,) of a rotation matrix, given as a flat array (9,)."""
     result = np.zeros(4)
     mujoco.mju_mat2Quat(result, matrix)
     return result

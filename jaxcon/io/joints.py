@@ -1,52 +1,60 @@
-"""The joints of a link."""
+"""Import of the joints of a MuJoCo model: one joint between each link and its parent."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from jaxcon.constraints.compound import DEPENDENT, Compound
 from jaxcon.constraints.joints import Prismatic, Revolute, Spherical
-from jaxcon.constraints.twist import Twist
+from jaxcon.constraints.pairs import Twist
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.links import Link, LinkJoint
-from jaxcon.model.layout import WORLD
+from jaxcon.system.layout import WORLD
 
 MEETING = 1e-9
-"""How far apart, in parts of a metre, axes may pass that are to meet in one point."""
+"""The largest distance [m] between hinge axes that count as intersecting in one point."""
+
+Joint: TypeAlias = Revolute | Prismatic | Spherical | Compound
+"""The types of joints that may connect a link to its parent."""
 
 
 class Coordinate(NamedTuple):
-    """Where a coordinate of MuJoCo's is found in the scene: that of a joint, by name."""
+    """The scene coordinate of one of MuJoCo's hinges or slides.
+
+    Attributes:
+        joint: the name of the joint in the scene.
+        name: the name of the coordinate of this joint, such as "angle".
+    """
 
     joint: str
     name: str
 
 
 class Joined(NamedTuple):
-    """What joins a link to its parent.
+    """The joint between a link and its parent, as scene elements.
 
     Attributes:
-        elements: of the scene.
-        coordinates: by the id of each hinge and slide in MuJoCo's model.
+        elements: a list with the joint; empty for a free link.
+        coordinates: the scene coordinate of each hinge and slide, by MuJoCo's joint id.
     """
 
-    elements: list[Any]
+    elements: list[Joint]
     coordinates: dict[int, Coordinate]
 
 
 def join(compiled: Compiled, link: Link, names: Names) -> Joined:
-    """The joint between a link and its parent.
+    """Builds the joint between a link and its parent.
 
     Raises:
-        NotImplementedError: the freedoms of the link are none that one joint has.
+        NotImplementedError: no single joint has the degrees of freedom of the link.
     """
-    joint, *more = link.joints
+    joint = link.joints[0]
     if joint.kind == "free":
         return Joined([], {})
     ends = (link.above, link.name)
-    if more:
+    if len(link.joints) > 1:
         return _compound(compiled, link, ends, names)
     name = names.take(compiled.name("joint", joint.id), "joint")
     point, axis = compiled.data.xanchor[joint.id], compiled.data.xaxis[joint.id]
@@ -60,7 +68,19 @@ def join(compiled: Compiled, link: Link, names: Names) -> Joined:
 
 
 def _compound(compiled: Compiled, link: Link, ends: tuple[str, str], names: Names) -> Joined:
-    """Slides, then hinges or a ball; hinges, then slides, is the same seen from the other body."""
+    """Builds a `Compound` from several joints of one body: slides, followed by hinges or a ball.
+
+    If hinges are followed by slides, the `Compound` is built with the two bodies exchanged.
+
+    Args:
+        compiled: the model.
+        link: the link with the joints.
+        ends: the names of the parent link and of the link.
+        names: the names in the scene.
+
+    Raises:
+        NotImplementedError: the joints have another order, or more than one ball.
+    """
     kinds = [j.kind for j in link.joints]
     turns = [j for j in link.joints if j.kind != "slide"]
     slides = [j for j in link.joints if j.kind == "slide"]
@@ -82,16 +102,18 @@ def _compound(compiled: Compiled, link: Link, ends: tuple[str, str], names: Name
         hinges=() if balls else hinge_axes,
         ball=bool(balls),
     )
-    found = [(s, f"travel_{i}") for i, s in enumerate(slides, 1)]
-    found += [(h, f"angle_{i}") for i, h in enumerate(turns, 1) if not balls]
-    return Joined([joint], {j.id: Coordinate(joint.name, name) for j, name in found})
+    labels = [(s, f"travel_{i}") for i, s in enumerate(slides, 1)]
+    labels += [(h, f"angle_{i}") for i, h in enumerate(turns, 1) if not balls]
+    return Joined([joint], {j.id: Coordinate(joint.name, name) for j, name in labels})
 
 
-def _axes(compiled: Compiled, link: Link, joints: list[LinkJoint], sign: int) -> tuple[Any, ...]:
-    """Their axes, as seen by the body that comes first.
+def _axes(
+    compiled: Compiled, link: Link, joints: list[LinkJoint], sign: int
+) -> tuple[np.ndarray, ...]:
+    """Returns the axes of slides or hinges in the world frame, (3,) each, multiplied by `sign`.
 
     Raises:
-        NotImplementedError: there are more than three, or they are dependent.
+        NotImplementedError: there are more than three axes, or they are linearly dependent.
     """
     axes = [sign * compiled.data.xaxis[j.id] for j in joints]
     gram = np.reshape(axes, (-1, 3)) @ np.reshape(axes, (-1, 3)).T
@@ -105,12 +127,13 @@ def _axes(compiled: Compiled, link: Link, joints: list[LinkJoint], sign: int) ->
 
 
 def _meeting_point(compiled: Compiled, link: Link, joints: list[LinkJoint]) -> np.ndarray:
-    """The point through which the axes go; that of the body where there are none.
+    """Returns the intersection point of the hinge axes of a link, world frame, (3,) [m].
 
-    Σ (1 − n nᵀ)(x − p) = 0 is nearest to the lines with the points p and directions n.
+    The point x solves Σ (1 − n nᵀ)(x − p) = 0, for axes through points p with unit directions n.
+    Without hinges, it is the origin of the body.
 
     Raises:
-        NotImplementedError: they do not meet.
+        NotImplementedError: the axes do not intersect in one point.
     """
     if not joints:
         return compiled.data.xpos[link.body]
@@ -130,13 +153,28 @@ def _meeting_point(compiled: Compiled, link: Link, joints: list[LinkJoint]) -> n
     return nearest
 
 
-def turning(link: Link, axis: Any, name: str, backward: bool = False) -> Twist:
-    """The turning of a link about an axis of its own, or about one of its parent the other way."""
+def turning(link: Link, axis: np.ndarray, name: str, backward: bool = False) -> Twist:
+    """Returns a joint without constraint rows that measures the rotation of a link about an axis.
+
+    Args:
+        link: the link.
+        axis: the axis in the world frame at assembly, (3,); fixed in the link.
+        name: the name of the joint.
+        backward: True to fix the axis in the parent instead; the sign of the angle is then
+            reversed.
+    """
     ends = (link.above, link.name)
     return Twist(name, *(ends[::-1] if backward else ends), axis=axis)
 
 
-def pushing(compiled: Compiled, link: Link, axes: Any, name: str) -> Compound:
-    """The travel of a free link's frame along three axes of the world, which holds nothing."""
+def pushing(compiled: Compiled, link: Link, axes: np.ndarray, name: str) -> Compound:
+    """Returns a joint without constraint rows that measures the travel of a free link.
+
+    Args:
+        compiled: the model.
+        link: the free link.
+        axes: the directions of travel in the world frame, one per row, (3, 3).
+        name: the name of the joint.
+    """
     origin = compiled.data.xpos[link.body]
     return Compound(name, WORLD, link.name, origin, slides=(*axes,), ball=True)

@@ -1,16 +1,16 @@
-"""Bodies of a model of MuJoCo: those welded to each other are one link, joined to its parent."""
+"""The links of a MuJoCo model. A body without a joint is merged into its parent's link."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core.typing import DType
 from jaxcon.geometry import inertia
 from jaxcon.io.compiled import Compiled, Names
-from jaxcon.model.layout import WORLD
+from jaxcon.system.layout import WORLD
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,10 @@ class LinkJoint:
     """One of MuJoCo's joints.
 
     Attributes:
-        id: in the model.
+        id: the index of the joint in the model.
         kind: "free", "ball", "slide" or "hinge".
-        q, v: where its coordinates begin in qpos and qvel.
+        q: the first index of the joint in qpos.
+        v: the first index of the joint in qvel.
     """
 
     id: int
@@ -31,15 +32,15 @@ class LinkJoint:
 
 @dataclass(frozen=True)
 class Link:
-    """Bodies without joints between them.
+    """A link: a group of MuJoCo bodies that are rigidly connected to each other.
 
     Attributes:
-        name: in the scene; that of the first body.
-        body: id of the first body, which carries the joints.
-        members: ids of all bodies.
-        parent: index among the links; −1 for the world.
-        above: name of the parent in the scene.
-        joints: between it and its parent, in order.
+        name: the name of the link in the scene, which is the name of its first body.
+        body: MuJoCo's id of the first body, which has the joints.
+        members: MuJoCo's ids of all bodies of the link.
+        parent: the index of the parent link; −1 for the world.
+        above: the name of the parent link in the scene.
+        joints: the joints between the link and its parent, in order.
     """
 
     name: str
@@ -51,7 +52,7 @@ class Link:
 
 
 def find_links(compiled: Compiled, names: Names) -> tuple[Link, ...]:
-    """The links that move, each after its parent."""
+    """Returns all moving links of a model, parents before children."""
     m = compiled.model
     links: list[Link] = []
     index = {0: -1}
@@ -78,14 +79,15 @@ def find_links(compiled: Compiled, names: Names) -> tuple[Link, ...]:
 
 
 def scene_body(compiled: Compiled, links: tuple[Link, ...], body: int) -> str:
-    """The name in the scene of the link that a body of MuJoCo belongs to."""
+    """Returns the scene name of the link that contains a body; `jc.WORLD` for fixed bodies."""
     return next((link.name for link in links if body in link.members), WORLD)
 
 
-def solid(compiled: Compiled, link: Link, dtype: Any) -> inertia.Inertia:
-    """Mass, centre and principal axes of a link in the frame of its first body.
+def solid(compiled: Compiled, link: Link, dtype: DType) -> inertia.Inertia:
+    """Returns the inertia of a link in the frame of its first body.
 
-    Σ mᵢ, Σ mᵢ cᵢ / m, and the parallel axis theorem: Σ Iᵢ + mᵢ (‖d‖² − d dᵀ) with d = cᵢ − c.
+    The masses mᵢ, centers cᵢ and tensors Iᵢ of its bodies are combined by the parallel axis
+    theorem: m = Σ mᵢ, c = Σ mᵢ cᵢ / m, and I = Σ Iᵢ + mᵢ (‖d‖² − d dᵀ) with d = cᵢ − c.
     """
     m, data, ids = compiled.model, compiled.data, list(link.members)
     if len(ids) == 1:
@@ -95,8 +97,8 @@ def solid(compiled: Compiled, link: Link, dtype: Any) -> inertia.Inertia:
     masses, centers = m.body_mass[ids], data.xipos[ids]
     center = masses @ centers / masses.sum()
     tensor = np.zeros((3, 3))
-    for b, mass, place in zip(ids, masses, centers, strict=True):
-        axes, d = data.ximat[b].reshape(3, 3), place - center
+    for b, mass, at in zip(ids, masses, centers, strict=True):
+        axes, d = data.ximat[b].reshape(3, 3), at - center
         tensor += axes @ np.diag(m.body_inertia[b]) @ axes.T
         tensor += mass * (d @ d * np.eye(3) - np.outer(d, d))
     frame = data.xmat[link.body].reshape(3, 3)
@@ -108,14 +110,18 @@ def solid(compiled: Compiled, link: Link, dtype: Any) -> inertia.Inertia:
 def offset(
     compiled: Compiled, links: tuple[Link, ...], link: Link
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) and orientation (4,) of a link before its joints, in its parent's frame."""
+    """Returns the pose of a link in the frame of its parent link, with all joints at zero.
+
+    Returns:
+        The position, (3,) [m], and the orientation, a quaternion (4,).
+    """
     m = compiled.model
     top = 0 if link.parent < 0 else links[link.parent].body
     position, turn = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
     body = link.body
     while body != top:
         moved, turned = np.zeros(3), np.zeros(4)
-        own = m.body_pos[body], m.body_quat[body]
-        compiled.mujoco.mju_mulPose(moved, turned, *own, position, turn)
+        local = m.body_pos[body], m.body_quat[body]
+        compiled.mujoco.mju_mulPose(moved, turned, *local, position, turn)
         position, turn, body = moved, turned, int(m.body_parentid[body])
     return position, turn

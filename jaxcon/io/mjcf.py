@@ -1,41 +1,43 @@
-"""Models that are already written down: MJCF and URDF, read by MuJoCo's own compiler."""
+"""Import of MJCF and URDF models, which are read by MuJoCo's own compiler."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.builders.scene import Scene
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array
-from jaxcon.dynamics.scene import Scene
+from jaxcon.core.summary import listed, span, table
+from jaxcon.core.typing import Array, DType, Scalar
+from jaxcon.io import maps
 from jaxcon.io.actuators import actuators
-from jaxcon.io.compiled import Compiled, Names
+from jaxcon.io.compiled import Compiled, Names, Source
 from jaxcon.io.contacts import contacts
 from jaxcon.io.equalities import equalities
 from jaxcon.io.joints import Coordinate, join
 from jaxcon.io.links import Link, find_links, offset, solid
-from jaxcon.io.maps import Node, Scalar, Tree
+from jaxcon.io.maps import Node, Tree
 from jaxcon.io.passive import passive
 from jaxcon.io.refusals import left_out, refuse
-from jaxcon.model.coordinates import TurnCounter
-from jaxcon.model.inertial import restate
-from jaxcon.model.state import State
-from jaxcon.model.system import BodySystem
-from jaxcon.simulation.method import Method
+from jaxcon.methods.method import Method
+from jaxcon.system.body_system import BodySystem
+from jaxcon.system.coordinates import TurnCounter
+from jaxcon.system.inertial import restate
+from jaxcon.system.state import State
 
 
 @pytree
 class Keyframe:
-    """A state that a model names, and the controls that go with it.
+    """A keyframe of a model: a state and controls.
 
     Attributes:
-        state: the state, as `MujocoModel.state` makes it.
+        state: the state of the system.
         control: MuJoCo's ctrl, (nu,).
     """
 
@@ -45,20 +47,20 @@ class Keyframe:
 
 @pytree
 class MujocoModel:
-    """A model of MuJoCo as a system, with maps to and from MuJoCo's coordinates.
+    """An imported MuJoCo model: a system, and conversions to and from MuJoCo's coordinates.
 
-    `system, state = model` unpacks what a `Scene` builds, and `model.method()` is the `Method` that
-    suits it. The control array is MuJoCo's ctrl.
+    `system, state = model` unpacks the system and its initial state, as `jc.Scene.build` returns
+    them. `model.method()` is a suitable `jc.Method`. The control array is MuJoCo's ctrl.
 
     Attributes:
-        system: its links are named as the bodies, its joints and actuators as MuJoCo's, with their
-            kind after the name where a body or joint has it already.
-        start: the state at MuJoCo's reference pose, at rest.
-        timestep: of the model's options, () [s].
-        tree: the links and their joints.
+        system: the system. Links, joints and actuators have MuJoCo's names. If an object of another
+            kind already has the name, the kind is appended.
+        start: the state in MuJoCo's reference pose, at rest.
+        timestep: the step size in the model's options, () [s].
+        tree: the kinematic tree in MuJoCo's coordinates.
         keys: time, qpos, qvel and ctrl of each keyframe.
-        joints: by MuJoCo's name of each hinge and slide, the joint and coordinate of the system.
-        keyframes: names of the keyframes; "key 0" and so on where they have none.
+        joints: for each hinge and slide, its name in MuJoCo, and its coordinate in the system.
+        keyframes: the names of the keyframes; "key 0" and so on for keyframes without a name.
     """
 
     system: BodySystem
@@ -69,34 +71,49 @@ class MujocoModel:
     joints: tuple[tuple[str, Coordinate], ...] = static()
     keyframes: tuple[str, ...] = static()
 
+    def __repr__(self) -> str:
+        """Describes the step size, the keyframes and the system."""
+        rows = [
+            ("timestep", span(self.timestep, "s")),
+            ("keyframes", listed(self.keyframes)),
+        ]
+        return f"{table('MujocoModel', rows)}\n{self.system!r}"
+
     def __iter__(self) -> Iterator[Any]:
         return iter((self.system, self.start))
 
     def with_params(self, changes: Mapping[str, Any]) -> MujocoModel:
-        """Returns the model with other numbers of its system, and its start restated.
+        """Returns the model with changed parameters; the poses of all links at `start` are kept.
 
         Args:
-            changes: as of `BodySystem.with_params`; links lie as MuJoCo's bodies do.
+            changes: new values by name; see `with_params` of the system. They refer to the frames
+                of MuJoCo's bodies.
 
         Raises:
-            ValueError: an unknown name or field, a wrong shape, or a value out of range.
+            ValueError: a name or field is unknown, a shape is wrong, or a value is out of range.
         """
         system = self.system.with_params(changes)
         start = restate(self.start, self.system, system)
         return dataclasses.replace(self, system=system, start=start)
 
-    def state(self, qpos: Any, qvel: Any = None, time: Any = 0.0) -> State:
-        """The state at MuJoCo's coordinates; pure: jit, vmap and differentiate it.
+    def state(
+        self,
+        qpos: Scalar | Sequence[float],
+        qvel: Scalar | Sequence[float] | None = None,
+        time: Scalar = 0.0,
+    ) -> State:
+        """Converts MuJoCo's coordinates to a state; works under jit, vmap and grad.
 
         Args:
-            qpos: (nq,), quaternions of any length but zero; angles may hold whole turns. Of three
-                hinges of one body the middle one must stay between gimbal locks; where qpos is
-                traced, that is not checked, and other angles of the same pose are read back.
-            qvel: (nv,); zero unless given.
-            time: () [s].
+            qpos: MuJoCo's positions, (nq,). Quaternions may have any nonzero length, and angles may
+                include whole turns. If a body has three hinges, the angle of the middle hinge must
+                stay short of gimbal lock. Traced values are not checked for this; beyond gimbal
+                lock, the method `qpos` returns other angles of the same pose.
+            qvel: MuJoCo's velocities, (nv,); zero by default.
+            time: the time, () [s].
 
         Raises:
-            ValueError: a wrong shape or dtype, or a middle hinge beyond gimbal lock.
+            ValueError: a shape or dtype is wrong, or a middle hinge is beyond gimbal lock.
         """
         dtype = self.start.q.dtype
         qpos = checks.real("state", "qpos", qpos, dtype, self.tree.reference.shape)
@@ -109,59 +126,61 @@ class MujocoModel:
         return dataclasses.replace(self.start, q=q, v=v, time=time, turns=turns)
 
     def method(self, **parts: Any) -> Method:
-        """Returns the method that suits the model by its structure: `Method.auto` at the start.
+        """Returns a suitable method for the model, by `jc.Method.auto` at `start`.
 
-        `Method.auto` chooses the solver of the joints. That of stops, friction and contacts is left
-        to `Method`, which takes sweeps where they have many rows. The start of a method with other
-        parts is `jc.init(system, method, state.q, state.v)`.
+        `jc.Method.auto` chooses the linear solver. The contact solver is the default of
+        `jc.Method`: Gauss–Seidel sweeps for systems with many inequality rows. If you pass other
+        parts, initialize the state with `jc.init(system, method, state.q, state.v)`.
 
         Args:
-            parts: other parts, such as `integrator=jc.RK4()`, and the arguments `batch` and
-                `platform` of `Method.auto`.
+            parts: parts of the method that replace the defaults, such as `integrator=jc.RK4()`, and
+                the arguments `batch` and `platform` of `jc.Method.auto`.
         """
         return Method.auto(self.system, self.start, **parts)
 
     def qpos(self, state: State) -> Array:
-        """MuJoCo's positions of a state, (nq,).
+        """Returns MuJoCo's positions qpos of a state, (nq,).
 
-        An angle lies within half a turn of its reference unless whole turns are counted: by a
-        spring, servo or coupling, or everywhere by `from_mjcf(…, count_turns=True)`.
+        Angles lie within half a turn of the reference pose, unless whole turns are counted. Turns
+        are counted for joints with a spring, servo or coupling, and for all hinges after
+        `from_mjcf(…, count_turns=True)`.
 
         Args:
-            state: of one world.
+            state: the state of one world.
         """
         return self.tree.read(self.system, state)[0]
 
     def qvel(self, state: State) -> Array:
-        """MuJoCo's velocities of a state, (nv,).
+        """Returns MuJoCo's velocities qvel of a state, (nv,).
 
         Args:
-            state: of one world.
+            state: the state of one world.
         """
         return self.tree.read(self.system, state)[1]
 
     def qacc(self, state: State, acceleration: Array) -> Array:
-        """MuJoCo's accelerations, (nv,): the rate of qvel where the bodies have this a (n_v,).
+        """Returns MuJoCo's accelerations, (nv,): the rate of qvel for given body accelerations.
 
         Args:
-            state: of one world.
-            acceleration: a, (n_v,).
+            state: the state of one world.
+            acceleration: the accelerations a of the system, (n_v,).
         """
 
         def qvel(q: Array, v: Array) -> Array:
+            """Returns MuJoCo's qvel at positions q and velocities v of the system."""
             return self.qvel(dataclasses.replace(state, q=q, v=v))
 
         slopes = self.system.kinematics(state.q, state.v), acceleration
         return jax.jvp(qvel, (state.q, state.v), slopes)[1]
 
     def keyframe(self, name: str) -> Keyframe:
-        """A keyframe by name.
+        """Returns the state and controls of a keyframe.
 
         Args:
-            name: as the model has it.
+            name: one of the names in `keyframes`.
 
         Raises:
-            ValueError: there is none of this name.
+            ValueError: the name is unknown.
         """
         if name not in self.keyframes:
             raise ValueError(f"keyframe '{name}' is unknown; known are {list(self.keyframes)}.")
@@ -170,63 +189,80 @@ class MujocoModel:
 
 
 def from_mjcf(
-    source: Any, ignore: tuple[str, ...] = (), count_turns: bool = False, dtype: Any = None
+    source: Source,
+    ignore: tuple[str, ...] = (),
+    count_turns: bool = False,
+    dtype: DType | None = None,
 ) -> MujocoModel:
-    """A system from an MJCF or URDF model, compiled by MuJoCo: `pip install 'jaxcon[mujoco]'`.
+    """Imports an MJCF or URDF model. Needs MuJoCo: `pip install 'jaxcon[mujoco]'`.
 
-    Bodies without a joint become part of their parent. Several joints of one body become one
-    `Compound`. Springs, dampers, rotors (armature), actuators and keyframes are those of the model;
-    equality constraints hold as joints do, not softly by `solref` and `solimp`. Integrator and
-    step are the user's, `timestep` is the model's. What has no effect on the motion (sites,
-    cameras, sensors) is left out; what has one and is not supported is refused by name.
+    Bodies without a joint are merged into their parent. Several joints of one body become one
+    `jc.joints.Compound`. Springs, dampers, armature, actuators and keyframes are imported. Equality
+    constraints are rigid, like joints; `solref` and `solimp` are not used. The integrator and the
+    step size are not imported; `timestep` is the step size in the model.
 
-    Ranges of hinges and slides are `Limit`s, frictionloss is `JointFriction`, and pairs of geoms
-    that may touch are contacts: spheres, capsules by the balls at their ends, and boxes by their
-    corners on planes, and spheres and capsules on each other. Stops and contacts are hard and
-    without rebound, not soft by `solref` and `solimp`; they act where MuJoCo's soft ones begin to,
-    at `margin` from the stop or surface. Friction is Coulomb's, by the sliding coefficient alone.
-    `info.reactions["knee limit"]`, `["knee friction"]` and `["floor and foot"]`, numbered where a
-    shape touches at several points, read what they do.
+    Features without effect on the motion (sites, cameras, sensors) are dropped. Unsupported
+    features with an effect raise an error that names them.
 
-    Every pair is rows in every step, whether it touches or not. Where a model lets its own limbs
-    touch, many pairs are between them; `ignore=("self_contact",)` keeps the ground alone.
+    Ranges of hinges and slides become `jc.contacts.Limit`. The attribute frictionloss becomes
+    `jc.contacts.JointFriction`. Pairs of geoms become contacts: spheres, capsules and boxes on
+    planes, and spheres and capsules with each other. A capsule touches a plane at its ends, and a
+    box at its corners.
+
+    Limits and contacts are hard and inelastic; `solref` and `solimp` are not used. They act at the
+    distance `margin`, where MuJoCo's soft limits and contacts begin to act. Friction is Coulomb
+    friction with the sliding coefficient. Read reactions as `info.reactions["knee limit"]`,
+    `["knee friction"]` or `["floor and foot"]`. If a pair has several contact points, their names
+    are numbered.
+
+    Every pair of geoms adds rows to every step, whether it touches or not. In many models, most
+    pairs are between the robot's own limbs; `ignore=("self_contact",)` keeps only contacts with the
+    ground.
 
     Args:
-        source: path of a file, its text, or a `mujoco.MjModel`.
-        ignore: what to leave out although it has an effect, out of
+        source: the path of a file, its text, or a `mujoco.MjModel`.
+        ignore: names of features to leave out although they affect the motion:
             "contact": all contacts,
-            "self_contact": those between two bodies that move,
-            "shape": those of shapes for which there is none here,
-            "torsion": torsional and rolling friction, by condim 4 or 6,
-            "limit": all limits of joints,
-            "ball_limit": those of ball joints,
+            "self_contact": contacts between two moving bodies,
+            "shape": contacts between unsupported shapes,
+            "torsion": torsional and rolling friction (condim 4 or 6),
+            "limit": all joint limits,
+            "ball_limit": limits of ball joints,
             "friction": dry friction of joints,
-            "tendon": tendons with all that they do, "fluid", and "gravcomp".
-        count_turns: whether every hinge counts its whole turns, so that `qpos` gives them.
-        dtype: of every number; JAX's default float unless given.
+            "tendon": tendons,
+            "fluid": density and viscosity,
+            "gravcomp": gravity compensation.
+        count_turns: True to count the whole turns of every hinge, so that `qpos` includes them.
+        dtype: the floating dtype of the model; by default JAX's default float.
 
     Returns:
-        The model; `system, state = jc.from_mjcf(path)` is enough to simulate it.
+        The model. `system, state = jc.from_mjcf(path)` is enough to simulate it.
 
     Raises:
         ImportError: MuJoCo is not installed.
-        FileNotFoundError: there is no such file.
-        ValueError: MuJoCo cannot compile it, or nothing in it moves.
-        NotImplementedError: it has what is not supported; the message names it.
+        FileNotFoundError: the file does not exist.
+        ValueError: MuJoCo cannot compile the model, or nothing in it moves.
+        NotImplementedError: the model has an unsupported feature, which the message names.
     """
     checks.flag("from_mjcf", "count_turns", count_turns)
     compiled = Compiled(source, left_out(ignore))
     refuse(compiled)
     names = Names()
     links = find_links(compiled, names)
-    scene = Scene(gravity=_gravity(compiled), dtype=dtype)
+    gravity = compiled.model.opt.gravity * (not compiled.disabled("gravity"))
+    scene = Scene(gravity=gravity, dtype=dtype)
     for link in links:
         frame = compiled.data.xpos[link.body], compiled.data.xquat[link.body]
         body = solid(compiled, link, scene.dtype)
         scene.add_body(link.name, inertia=body, position=frame[0], quaternion=frame[1])
-    found = _add_elements(scene, compiled, links, names, count_turns)
+    coordinates = _add_elements(scene, compiled, links, names, count_turns)
     system, state = scene.build()
-    m, cast = compiled.model, lambda x: jnp.asarray(x, scene.dtype)
+    m = compiled.model
+
+    def cast(x: np.ndarray) -> Array:
+        """Converts numbers of the model to a JAX array in the dtype of the scene."""
+        return jnp.asarray(x, scene.dtype)
+
     keys = [
         {"time": m.key_time[i], "qpos": m.key_qpos[i], "qvel": m.key_qvel[i], "ctrl": m.key_ctrl[i]}
         for i in range(m.nkey)
@@ -235,53 +271,55 @@ def from_mjcf(
         system,
         state,
         cast(m.opt.timestep),
-        _tree(compiled, links, found, cast),
+        _tree(compiled, links, coordinates, cast),
         jax.tree.map(cast, tuple(keys)),
-        tuple((compiled.name("joint", i), at) for i, at in sorted(found.items())),
+        tuple((compiled.name("joint", i), at) for i, at in sorted(coordinates.items())),
         tuple(compiled.name("key", i) for i in range(m.nkey)),
     )
-
-
-def _gravity(compiled: Compiled) -> np.ndarray:
-    """Returns the gravity of the options [m/s²]."""
-    return compiled.model.opt.gravity * (not compiled.disabled("gravity"))
 
 
 def _add_elements(
     scene: Scene, compiled: Compiled, links: tuple[Link, ...], names: Names, count: bool
 ) -> dict[int, Coordinate]:
-    """Adds everything between the links; returns the coordinate of each hinge and slide."""
-    found: dict[int, Coordinate] = {}
+    """Adds joints, equality constraints, actuators, passive elements and contacts to a scene.
+
+    Returns:
+        The scene coordinate of each hinge and slide, by MuJoCo's joint id.
+    """
+    coordinates: dict[int, Coordinate] = {}
     for link in links:
         joined = join(compiled, link, names)
-        found |= joined.coordinates
+        coordinates |= joined.coordinates
         for element in joined.elements:
             scene.add(element)
-    for element in equalities(compiled, links, found, names):
+    for element in equalities(compiled, links, coordinates, names):
         scene.add(element)
-    for element in actuators(compiled, links, found, names):
+    for element in actuators(compiled, links, coordinates, names):
         scene.add(element)
     for link in links:
         for joint in link.joints:
-            at = found.get(joint.id)
+            at = coordinates.get(joint.id)
             for element in passive(compiled, link, joint, at, names):
                 scene.add(element)
             if count and at is not None and joint.kind == "hinge":
-                own = compiled.name("joint", joint.id)
-                scene.add(TurnCounter(names.take(f"{own} turns", "turns"), *at))
+                label = compiled.name("joint", joint.id)
+                scene.add(TurnCounter(names.take(f"{label} turns", "turns"), *at))
     for element in contacts(compiled, links, names):
         scene.add(element)
-    return found
+    return coordinates
 
 
 def _tree(
-    compiled: Compiled, links: tuple[Link, ...], found: dict[int, Coordinate], cast: Any
+    compiled: Compiled,
+    links: tuple[Link, ...],
+    coordinates: dict[int, Coordinate],
+    cast: Callable[[np.ndarray], Array],
 ) -> Tree:
-    """The links and joints as what maps coordinates."""
+    """Returns the kinematic tree of the links; `cast` converts NumPy arrays to JAX arrays."""
     m = compiled.model
     offsets = [offset(compiled, links, link) for link in links]
     joints = {joint.id: joint for link in links for joint in link.joints}
-    scalars = [Scalar(joints[i].q, joints[i].v, at) for i, at in sorted(found.items())]
+    scalars = [maps.Scalar(joints[i].q, joints[i].v, at) for i, at in sorted(coordinates.items())]
     return Tree(
         cast(np.array([x for x, _ in offsets])),
         cast(np.array([turn for _, turn in offsets])),

@@ -1,9 +1,9 @@
-"""Pairs of geoms that may touch, as MuJoCo finds them, and what their contact is like."""
+"""Pairs of geoms that may touch according to MuJoCo's filters, with their contact parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,17 +12,19 @@ from jaxcon.io.compiled import Compiled
 ROUND = ("sphere", "capsule")
 ON_PLANE = (*ROUND, "box")
 FLAT = ("plane", "hfield")
-"""Two of these never touch in MuJoCo."""
+"""Shapes without contacts between each other in MuJoCo."""
 
 
-class Pair(NamedTuple):
+class GeomPair(NamedTuple):
     """Two geoms that may touch.
 
     Attributes:
-        first, second: ids; a plane comes first.
-        condim: 1 without friction, 3 with sliding friction, 4 and 6 with torsional and rolling.
-        friction: μ along both tangents, (2,).
-        margin: the distance at which they touch [m].
+        first: MuJoCo's id of the first geom; a plane always comes first.
+        second: MuJoCo's id of the second geom.
+        condim: MuJoCo's dimension of the contact: 1 without friction, 3 with sliding friction, 4
+            also with torsional friction, 6 also with rolling friction.
+        friction: the friction coefficients μ along both tangents, (2,).
+        margin: the distance at which contact begins [m].
     """
 
     first: int
@@ -32,53 +34,57 @@ class Pair(NamedTuple):
     margin: float
 
 
-def pairs(compiled: Compiled) -> list[Pair]:
-    """Returns the pairs that the model lists, and then those that its filters let through."""
+def pairs(compiled: Compiled) -> list[GeomPair]:
+    """Returns the explicitly listed pairs, then the pairs that pass the collision filters."""
     if compiled.disabled("contact", "constraint"):
         return []
     margins = Margins(compiled)
     listed = list(_listed(compiled, margins))
-    known = {p[:2] for p in listed}
-    found = [p for p in _filtered(compiled, margins) if p[:2] not in known]
-    return [p for p in (*listed, *found) if _acts(compiled, p)]
+    ids = {p[:2] for p in listed}
+    filtered = [p for p in _filtered(compiled, margins) if p[:2] not in ids]
+    return [p for p in (*listed, *filtered) if _acts(compiled, p)]
 
 
-def _acts(compiled: Compiled, pair: Pair) -> bool:
-    """Returns True where the geoms can move in each other and touch, and the user wants it."""
-    first, second = _welded(compiled, pair)
+def _acts(compiled: Compiled, pair: GeomPair) -> bool:
+    """Returns True if a pair can touch, its bodies move relatively, and the user keeps it."""
+    weld, body = compiled.model.body_weldid, compiled.model.geom_bodyid
+    first, second = (int(weld[body[g]]) for g in pair[:2])  # the moving body; 0 for the world
     flat = all(kind in FLAT for kind in shapes(compiled, pair))
     left_out = first and second and "self_contact" in compiled.ignored
     return first != second and not flat and not left_out
 
 
-def label(compiled: Compiled, pair: Pair) -> str:
-    """The names of both geoms."""
+def label(compiled: Compiled, pair: GeomPair) -> str:
+    """Returns the names of both geoms, joined by "and", for element names and messages."""
     return " and ".join(compiled.name("geom", g) for g in (pair.first, pair.second))
 
 
-def shapes(compiled: Compiled, pair: Pair) -> tuple[str, str]:
-    """The kinds of both geoms."""
+def shapes(compiled: Compiled, pair: GeomPair) -> tuple[str, str]:
+    """Returns the shapes of both geoms, such as "plane" and "sphere"."""
     first, second = (compiled.choice("mjtGeom", compiled.model.geom_type[g]) for g in pair[:2])
     return first, second
 
 
-def supported(compiled: Compiled, pair: Pair) -> bool:
-    """Returns True where there is a contact for these shapes."""
+def supported(compiled: Compiled, pair: GeomPair) -> bool:
+    """Returns True if jaxcon has a contact for the shapes of both geoms."""
     first, second = shapes(compiled, pair)
     return second in ON_PLANE if first == "plane" else {first, second} <= set(ROUND)
 
 
-def _listed(compiled: Compiled, margins: Margins) -> Iterator[Pair]:
-    """The model's own `<pair>`s."""
+def _listed(compiled: Compiled, margins: Margins) -> Iterator[GeomPair]:
+    """Yields the pairs that the model lists explicitly as `<pair>`."""
     m = compiled.model
     for i in range(m.npair):
         ends = _ordered(compiled, int(m.pair_geom1[i]), int(m.pair_geom2[i]))
-        own = margins.of_pair(m.pair_margin[i], m.pair_gap[i])
-        yield Pair(*ends, int(m.pair_dim[i]), m.pair_friction[i, :2], own)
+        margin = margins.of_pair(m.pair_margin[i], m.pair_gap[i])
+        yield GeomPair(*ends, int(m.pair_dim[i]), m.pair_friction[i, :2], margin)
 
 
-def _filtered(compiled: Compiled, margins: Margins) -> Iterator[Pair]:
-    """Geoms whose masks match, on bodies that are not excluded and no parent and child."""
+def _filtered(compiled: Compiled, margins: Margins) -> Iterator[GeomPair]:
+    """Yields the pairs that pass MuJoCo's filters.
+
+    The filters are collision masks, excluded pairs of bodies, and parent and child bodies.
+    """
     m = compiled.model
     weld, parent = m.body_weldid, m.body_weldid[m.body_parentid]
     excluded = {int(x) for x in m.exclude_signature}
@@ -94,21 +100,26 @@ def _filtered(compiled: Compiled, margins: Margins) -> Iterator[Pair]:
                 yield _combined(compiled, _ordered(compiled, g, h), margins)
 
 
-def _combined(compiled: Compiled, ends: tuple[int, int], margins: Margins) -> Pair:
-    """The material of the geom of higher priority, or the larger numbers of both."""
-    m, own = compiled.model, list(ends)
-    most = m.geom_priority[own].max()
-    rule = [g for g in own if m.geom_priority[g] == most]
+def _combined(compiled: Compiled, ends: tuple[int, int], margins: Margins) -> GeomPair:
+    """Returns the pair with its combined contact parameters.
+
+    Condim and friction come from the geom of higher priority. At equal priority, the larger values
+    of both geoms are used.
+    """
+    m, geoms = compiled.model, list(ends)
+    highest = m.geom_priority[geoms].max()
+    rule = [g for g in geoms if m.geom_priority[g] == highest]
     friction = m.geom_friction[rule, 0].max()
-    margin = margins.of_geoms(m.geom_margin[own], m.geom_gap[own])
-    return Pair(*ends, int(m.geom_condim[rule].max()), np.full(2, friction), margin)
+    margin = margins.of_geoms(m.geom_margin[geoms], m.geom_gap[geoms])
+    return GeomPair(*ends, int(m.geom_condim[rule].max()), np.full(2, friction), margin)
 
 
 class Margins:
-    """The distance at which geoms touch, by margin and gap, which has changed with versions.
+    """The rule for the distance at which contact begins, from the margins and gaps of two geoms.
 
-    Two spheres with margins of 1 and 2 and a gap of 1/4 tell which rule it is: the sum or the
-    larger one, with the gap taken off or not.
+    The rule differs between versions of MuJoCo: the sum or the maximum of both margins, with or
+    without the gap subtracted. The installed version is probed by a model with margins of 1 and 2
+    and a gap of 1/4.
     """
 
     PROBE = (
@@ -121,26 +132,25 @@ class Margins:
         model = mujoco.MjModel.from_xml_string(self.PROBE)
         data = mujoco.MjData(model)
         mujoco.mj_forward(model, data)
-        seen = float(data.contact.includemargin[0])
-        self.together = np.sum if seen > 2 else np.max
-        self.by_gap = float(seen % 1 != 0)
+        distance = float(data.contact.includemargin[0])
+        self.together = np.sum if distance > 2 else np.max
+        self.by_gap = float(distance % 1 != 0)
 
     def of_geoms(self, margin: np.ndarray, gap: np.ndarray) -> float:
-        """Returns the distance at which contact of two geoms begins, from numbers of each, (2,)."""
+        """Returns the distance [m] at which contact of two geoms begins.
+
+        Args:
+            margin: the margins of both geoms, (2,) [m].
+            gap: the gaps of both geoms, (2,) [m].
+        """
         return float(self.together(margin) - self.by_gap * self.together(gap))
 
     def of_pair(self, margin: float, gap: float) -> float:
-        """Returns the distance at which contact of a listed pair begins."""
+        """Returns the distance [m] at which contact of an explicitly listed pair begins."""
         return float(margin - self.by_gap * gap)
 
 
 def _ordered(compiled: Compiled, g: int, h: int) -> tuple[int, int]:
-    """By kind, as MuJoCo orders them: a plane first."""
+    """Orders two geoms by shape, as MuJoCo does: a plane comes first."""
     first, second = sorted((g, h), key=lambda i: (compiled.model.geom_type[i], i))
     return first, second
-
-
-def _welded(compiled: Compiled, pair: Pair) -> list[Any]:
-    """Returns the body that each geom moves with; 0 where it does not move."""
-    m = compiled.model
-    return [int(m.body_weldid[m.geom_bodyid[g]]) for g in pair[:2]]

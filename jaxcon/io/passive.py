@@ -1,26 +1,40 @@
-"""What acts along MuJoCo's joints: springs, dampers, rotors, dry friction and limits."""
+"""Import of springs, dampers, rotor inertia, dry friction and limits of MuJoCo's joints."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
 from jaxcon.constraints.armature import Armature
-from jaxcon.constraints.limits import JointFriction, Limit
+from jaxcon.constraints.compound import Compound
+from jaxcon.constraints.pairs import Twist
+from jaxcon.contact.limits import JointFriction, Limit
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
 from jaxcon.io.links import Link, LinkJoint
-from jaxcon.model.actuators import JointDamper, JointSpring
+from jaxcon.system.actuators import JointDamper, JointSpring
+
+Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Compound | Twist
+"""A scene element: a passive element, or a joint without constraint rows for its coordinate."""
 
 
 def passive(
     compiled: Compiled, link: Link, joint: LinkJoint, at: Coordinate | None, names: Names
-) -> Iterator[Any]:
-    """What acts along one of MuJoCo's joints, along its coordinate or freedoms."""
+) -> Iterator[Element]:
+    """Yields the passive elements of one of MuJoCo's joints.
+
+    Args:
+        compiled: the model.
+        link: the link with the joint.
+        joint: the joint.
+        at: the scene coordinate of a hinge or slide. None for a ball or free joint, which gets
+            elements along each degree of freedom.
+        names: the names in the scene.
+    """
     m = compiled.model
-    own = compiled.name("joint", joint.id)
+    label = compiled.name("joint", joint.id)
     rubs = not compiled.disabled("friction", "frictionloss", "constraint")
     numbers = {
         "stiffness": 0.0 if compiled.disabled("spring", "passive") else m.jnt_stiffness[joint.id],
@@ -30,33 +44,46 @@ def passive(
     }
     if at is not None:
         rest = m.qpos_spring[joint.q] - m.qpos0[joint.q]
-        yield from _along(own, at, numbers, rest, names)
+        yield from _along(label, at, numbers, rest, names)
         yield from _limit(compiled, joint, at, names)
     elif any(numbers.values()):
         elements, coordinates = _freedoms(compiled, link, joint, names)
         yield from elements
         for freedom in coordinates:
-            yield from _along(f"{own} {freedom.name}", freedom, numbers, 0.0, names)
+            yield from _along(f"{label} {freedom.name}", freedom, numbers, 0.0, names)
 
 
 def _along(
-    own: str, at: Coordinate, numbers: dict[str, float], rest: float, names: Names
-) -> Iterator[Any]:
-    """A spring with damping, or a damper, a rotor, and dry friction."""
+    label: str, at: Coordinate, numbers: dict[str, float], rest: float, names: Names
+) -> Iterator[Element]:
+    """Yields the spring, damper, rotor and dry friction of one coordinate that are not zero.
+
+    Args:
+        label: the name of the joint, for the names of the elements.
+        at: the coordinate.
+        numbers: stiffness, damping, armature and friction, in this order.
+        rest: the coordinate at which the spring is relaxed.
+        names: the names in the scene.
+    """
     stiffness, damping, armature, friction = numbers.values()
     if stiffness:
-        name = names.take(f"{own} spring", "spring")
+        name = names.take(f"{label} spring", "spring")
         yield JointSpring(name, at.joint, stiffness, damping, rest, at.name)
     elif damping:
-        yield JointDamper(names.take(f"{own} damper", "damper"), at.joint, damping, at.name)
+        yield JointDamper(names.take(f"{label} damper", "damper"), at.joint, damping, at.name)
     if armature:
-        yield Armature(names.take(f"{own} rotor", "rotor"), at.joint, armature, at.name)
+        yield Armature(names.take(f"{label} rotor", "rotor"), at.joint, armature, at.name)
     if friction:
-        yield JointFriction(names.take(f"{own} friction", "friction"), at.joint, friction, at.name)
+        yield JointFriction(
+            names.take(f"{label} friction", "friction"), at.joint, friction, at.name
+        )
 
 
 def _limit(compiled: Compiled, joint: LinkJoint, at: Coordinate, names: Names) -> Iterator[Limit]:
-    """The range of a hinge or slide, less its margin, within which MuJoCo's stop pushes."""
+    """Yields the limit of a hinge or slide, if it has one.
+
+    The hard limit of the scene acts at the margin, where MuJoCo's soft limit begins to push.
+    """
     m = compiled.model
     if compiled.disabled("limit", "constraint") or not m.jnt_limited[joint.id]:
         return
@@ -66,14 +93,20 @@ def _limit(compiled: Compiled, joint: LinkJoint, at: Coordinate, names: Names) -
     yield Limit(name, at.joint, lower, upper, at.name)
 
 
-def _freedoms(compiled: Compiled, link: Link, joint: LinkJoint, names: Names) -> Any:
-    """Joints without rows along the freedoms of a ball or free joint, and their coordinates."""
-    own = compiled.name("joint", joint.id)
+def _freedoms(
+    compiled: Compiled, link: Link, joint: LinkJoint, names: Names
+) -> tuple[list[Compound | Twist], list[Coordinate]]:
+    """Builds coordinates for the degrees of freedom of a ball or free joint.
+
+    Returns:
+        Joints without constraint rows that define the coordinates, and the coordinates.
+    """
+    label = compiled.name("joint", joint.id)
     frame = compiled.data.xmat[link.body].reshape(3, 3)
-    elements = [turning(link, axis, names.take(f"{own} twist", "twist")) for axis in frame.T]
-    coordinates = [Coordinate(twist.name, "twist") for twist in elements]
-    if joint.kind == "free":
-        push = pushing(compiled, link, np.eye(3), names.take(f"{own} push", "push"))
-        elements = [push, *elements]
-        coordinates = [Coordinate(push.name, f"travel_{i}") for i in (1, 2, 3)] + coordinates
-    return elements, coordinates
+    twists = [turning(link, axis, names.take(f"{label} twist", "twist")) for axis in frame.T]
+    angles = [Coordinate(twist.name, "twist") for twist in twists]
+    if joint.kind != "free":
+        return [*twists], angles
+    push = pushing(compiled, link, np.eye(3), names.take(f"{label} push", "push"))
+    travels = [Coordinate(push.name, f"travel_{i}") for i in (1, 2, 3)]
+    return [push, *twists], travels + angles

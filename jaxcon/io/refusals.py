@@ -1,15 +1,15 @@
-"""What a model of MuJoCo may have that jaxcon does not simulate: named, never dropped silently."""
+"""Checks for MuJoCo features that jaxcon does not support, with errors that name the feature."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
 
 import numpy as np
 
+from jaxcon.core.summary import listed
 from jaxcon.io import pairs
 from jaxcon.io.compiled import Compiled
-from jaxcon.io.pairs import Pair
+from jaxcon.io.pairs import GeomPair
 
 ZERO = (
     ("joint", "jnt_stiffnesspoly", "polynomial stiffness"),
@@ -19,23 +19,23 @@ ZERO = (
     ("actuator", "actuator_armature", "armature"),
     ("actuator", "actuator_delay", "a delay"),
 )
-"""Arrays of MuJoCo's model that must be zero: of what, which, and what they mean."""
+"""The arrays of MuJoCo's model that must be zero: the kind of object, the field and its meaning."""
 
 
 def shapes(compiled: Compiled) -> list[str]:
-    """Pairs of geoms for whose shapes there is no contact."""
+    """Returns the names of all pairs of geoms whose shapes have no contact in jaxcon."""
     unknown = [p for p in pairs.pairs(compiled) if not pairs.supported(compiled, p)]
     return [_described(compiled, p) for p in unknown]
 
 
 def torsion(compiled: Compiled) -> list[str]:
-    """Pairs of geoms with more than sliding friction."""
-    found = [p for p in pairs.pairs(compiled) if p.condim > 3 and pairs.supported(compiled, p)]
-    return [pairs.label(compiled, p) for p in found]
+    """Returns the names of all pairs of geoms with torsional or rolling friction."""
+    listed = [p for p in pairs.pairs(compiled) if p.condim > 3 and pairs.supported(compiled, p)]
+    return [pairs.label(compiled, p) for p in listed]
 
 
 def ball_limits(compiled: Compiled) -> list[str]:
-    """Ball joints that have a range."""
+    """Returns the names of all ball joints with limits."""
     m = compiled.model
     if compiled.disabled("limit", "constraint"):
         return []
@@ -44,7 +44,7 @@ def ball_limits(compiled: Compiled) -> list[str]:
 
 
 def tendons(compiled: Compiled) -> list[str]:
-    """Tendons that pull, resist or end; those which are only measured have no effect."""
+    """Returns the names of all tendons with forces or limits; other tendons are only sensors."""
     m = compiled.model
     fields = ["stiffness", "damping", "armature"]
     fields += [] if compiled.disabled("limit", "constraint") else ["limited"]
@@ -55,13 +55,13 @@ def tendons(compiled: Compiled) -> list[str]:
 
 
 def fluid(compiled: Compiled) -> list[str]:
-    """The medium, where it has a density or viscosity."""
+    """Returns the names of the nonzero fluid options, "density" and "viscosity"."""
     options = compiled.model.opt
     return [f for f in ("density", "viscosity") if getattr(options, f)]
 
 
 def gravity_compensation(compiled: Compiled) -> list[str]:
-    """Bodies whose weight is taken up."""
+    """Returns the names of all bodies with gravity compensation."""
     return _named(compiled, "body", compiled.model.body_gravcomp)
 
 
@@ -73,12 +73,15 @@ REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "fluid": ("the option", fluid),
     "gravcomp": ("the gravcomp of", gravity_compensation),
 }
-"""What must be left out where the model has it: what it is, and what has it."""
+"""The unsupported features that `ignore` may leave out.
+
+Each entry has a description and a function that returns the names of the objects with the feature.
+"""
 IGNORABLE = ("contact", "self_contact", "limit", "friction", *REFUSED)
 
 
 def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
-    """What the user gives up.
+    """Checks the `ignore` argument of `from_mjcf`; returns it as a set.
 
     Raises:
         ValueError: `ignore` has an unknown entry.
@@ -92,13 +95,13 @@ def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
 
 
 def refuse(compiled: Compiled) -> None:
-    """Checks that everything that has an effect is simulated, but for what the user gives up.
+    """Checks that all features of a model that affect its motion are supported or ignored.
 
     Raises:
-        NotImplementedError: the model has what is not supported.
+        NotImplementedError: the model has an unsupported feature.
     """
-    for key, (what, found) in REFUSED.items():
-        if key not in compiled.ignored and (names := found(compiled)):
+    for key, (what, search) in REFUSED.items():
+        if key not in compiled.ignored and (names := search(compiled)):
             raise NotImplementedError(
                 f"from_mjcf: {what} {_listed(names)} are not supported; to simulate the model"
                 f" without them, say so by ignore=('{key}',)."
@@ -108,7 +111,7 @@ def refuse(compiled: Compiled) -> None:
 
 
 def _unsupported(compiled: Compiled) -> Iterable[str]:
-    """What cannot be left out either."""
+    """Yields descriptions of the unsupported features that `ignore` cannot leave out."""
     m = compiled.model
     for count, what in (("nflex", "flex"), ("nmocap", "mocap body"), ("nplugin", "plugin")):
         if getattr(m, count):
@@ -126,36 +129,41 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
 
 
 def _unsupported_contacts(compiled: Compiled) -> Iterable[str]:
-    """What a contact may have beside its shapes and condim."""
-    m, found = compiled.model, pairs.pairs(compiled)
-    if found and m.opt.enableflags & int(compiled.mujoco.mjtEnableBit.mjENBL_OVERRIDE):
+    """Yields descriptions of the unsupported contact features, except shapes and condim."""
+    m, contacts = compiled.model, pairs.pairs(compiled)
+    if contacts and m.opt.enableflags & int(compiled.mujoco.mjtEnableBit.mjENBL_OVERRIDE):
         yield "the flag override='enable' of a model with contacts"
-    touching = sorted({g for pair in found for g in pair[:2]})
+    touching = sorted({g for pair in contacts for g in pair[:2]})
     for field, what in (("surfacevel", "surfacevel"), ("adhesion", "adhesion")):
         values = np.asarray(getattr(m, f"geom_{field}", np.zeros(m.ngeom)))
         for g in touching:
             if values[g].any():
                 yield f"{what} of geom '{compiled.name('geom', g)}'"
-    if found and np.any(getattr(m, "pair_adhesion", 0.0)):
+    if contacts and np.any(getattr(m, "pair_adhesion", 0.0)):
         yield "adhesion of a pair"
-    for pair in found:
+    for pair in contacts:
         if pair.condim > 1 and pair.friction[0] != pair.friction[1]:
             yield f"friction that depends on the direction, of {_described(compiled, pair)},"
 
 
-def _described(compiled: Compiled, pair: Pair) -> str:
-    """The geoms and their shapes."""
+def _described(compiled: Compiled, pair: GeomPair) -> str:
+    """Returns the names of both geoms with their shapes, for messages."""
     return f"{pairs.label(compiled, pair)} ({' and '.join(pairs.shapes(compiled, pair))})"
 
 
-def _named(compiled: Compiled, kind: str, flags: Any) -> list[str]:
-    """The names of those elements of a kind for which there is something."""
+def _named(compiled: Compiled, kind: str, flags: np.ndarray | tuple[()]) -> list[str]:
+    """Returns the names of the objects of a kind that have a nonzero flag.
+
+    Args:
+        compiled: the model.
+        kind: the kind of object, such as "joint".
+        flags: one row for each object of the kind, (n, …); empty if there are no flags.
+    """
     rows = np.asarray(flags)
     rows = rows.reshape(len(rows), -1).any(axis=1) if len(rows) else rows
     return [compiled.name(kind, int(i)) for i in np.flatnonzero(rows)]
 
 
 def _listed(names: list[str], most: int = 4) -> str:
-    """Some of the names, and how many more there are."""
-    shown = ", ".join(f"'{name}'" for name in names[:most])
-    return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
+    """Joins quoted names by commas; a long list is cut to the first names and "and n more"."""
+    return listed([f"'{name}'" for name in names], most)

@@ -1,4 +1,4 @@
-"""Starts of an identification on their way, side by side, and what a checkpoint holds of them."""
+"""Runs the starts of an identification in one batch, with checkpoints."""
 
 from __future__ import annotations
 
@@ -7,72 +7,77 @@ import functools
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from jaxcon.core import checkpoint as files
-from jaxcon.core.ends import ENDS, bar, words
+from jaxcon.core.interrupts import STOP_EXCEPTIONS, describe_error, progress_bar
 from jaxcon.core.typing import PyTree
 from jaxcon.learning.information import noise_left
-from jaxcon.learning.least_squares import Fit, Progress, least_squares, side_by_side
-from jaxcon.learning.stretches import FARTHEST, Stretches
+from jaxcon.learning.least_squares import Fit, FitProgress, Values, least_squares, side_by_side
+from jaxcon.learning.stretches import FARTHEST, Point, Stretches
 
 HORIZONS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Parts of a recording that are fitted one after another where the fit of the whole is poor."""
+"""Shares of a recording that are fitted one after another if the direct fit is poor."""
 EXCESS = 2.0
-"""Ratio of residuals to their noise above which the noise does not explain them."""
+"""The ratio of residuals to noise above which noise does not explain the residuals."""
 DOUBT = 1.2
-"""Ratio above which parts of the recording are tried; that costs time and spoils nothing."""
+"""The ratio of residuals to noise above which fits of parts of the recording are tried.
+
+It is smaller than `EXCESS`: such fits cost time, but never worsen the result.
+"""
 PROGRAM = "the simulation, another option, or the version of jax"
-"""Causes of a different compiled program, for the error message."""
+"""Possible causes of a changed program, for the error message of a checkpoint."""
 
 
 class End(NamedTuple):
-    """The fit that a start led to, and the noise by which its residuals were divided."""
+    """The final fit from one start, and its noise factor: residuals are divided by `noise`."""
 
     fit: Fit
     noise: float
 
     @property
     def cost(self) -> float:
-        """½ ‖r‖² in the units of residuals that were not divided."""
+        """The cost ½ ‖r‖² of the residuals r in their original units, without the noise factor."""
         return float(self.noise**2 * self.fit.costs[-1])
 
     @property
     def broken(self) -> bool:
-        """True if the search was ended from outside."""
+        """True if an interrupt or a machine error stopped the search."""
         return self.fit.broken
 
     def broken_by(self, reason: str) -> End:
-        """A copy marked as ended from outside for this reason."""
+        """Returns a copy that is marked as stopped by an interrupt or error, with this reason."""
         return End(dataclasses.replace(self.fit, stopped=reason, broken=True), self.noise)
 
 
 @dataclass
 class Attempt:
-    """One start of an identification.
+    """The search from one start of an identification.
 
-    Ends of stretches come closer to the nodes by decades. Noise that nobody gave is estimated again
-    after each decade, since how well ends should meet nodes depends on it. Without nodes there is
-    one decade, and nothing depends on it.
+    With nodes, the recording is cut into segments (stretches), and a sequence of fits closes the
+    gaps between them. Each fit, called a decade, allows gaps a tenth as large as the fit before. If
+    the user gave no noise, it is estimated again after each decade, since the weight of the gaps
+    depends on it. Without nodes there is one decade.
 
-    The longer an oscillation is recorded, the more local minima the fit has. If the residuals of a
-    fit without nodes exceed their noise, a second one goes from the start through longer and longer
-    parts of the recording. The better of the two counts.
+    The longer the recording of an oscillation, the more local minima the fit has. If the residuals
+    of a fit without nodes exceed their noise, a second fit begins at `begin`. It covers longer and
+    longer parts of the recording. The better of both fits is the result.
 
     Attributes:
-        problem: the recording.
-        begin: its parameters by their scale, (p,).
-        continuity: standard deviation of the gaps between ends and nodes in the last decade.
-        steps: the limit for each decade and each part of the recording.
-        widths: standard deviation of the gaps by decade; empty before the start was evaluated.
-        noise: factor on the noise of the data.
-        decade: index of the present decade.
-        known: progress of the present fit.
-        direct: the finished fit of the whole recording, once parts of it are fitted; else None.
-        horizon: index of the part that is fitted, in `HORIZONS`.
+        problem: the least-squares problem of the recording.
+        begin: initial parameters, divided by their scales, (p,).
+        continuity: allowed standard deviation of the gaps in the last decade.
+        steps: maximum number of steps of each fit.
+        widths: allowed standard deviation of the gaps in each decade; empty before the start is
+            evaluated.
+        noise: factor by which the standard deviation of the data is multiplied.
+        decade: index of the current decade.
+        progress: state of the current fit.
+        direct: the finished fit of the whole recording, while parts are fitted; otherwise None.
+        horizon: index into `HORIZONS` of the part that is being fitted.
     """
 
     problem: Stretches
@@ -82,103 +87,111 @@ class Attempt:
     widths: tuple[float, ...] = ()
     noise: float = 1.0
     decade: int = 0
-    known: Progress | None = None
-    direct: Progress | None = None
+    progress: FitProgress | None = None
+    direct: FitProgress | None = None
     horizon: int = 0
 
-    def run(self) -> Generator[Any, Any, End]:
-        """Yields (unknowns, continuity, noise) and is sent (r, J) there; returns where it ended.
+    def run(self) -> Generator[Point, Values, End]:
+        """Runs the search as a generator: yields points, and is sent residuals r and Jacobians J.
 
         Raises:
-            ValueError: the residuals or their derivatives are not finite at the start.
+            ValueError: r or J is not finite at the start.
         """
         if not self.widths:
-            yield from self._look()
-        if self.direct is not None and self.direct.goes_on(self.steps):  # more were asked for
-            self.known, self.direct, self.horizon = self.direct, None, 0
+            yield from self._evaluate_start()
+        # after a resume with more steps, the fit of the whole recording continues
+        if self.direct is not None and self.direct.goes_on(self.steps):
+            self.progress, self.direct, self.horizon = self.direct, None, 0
         if self.direct is not None:
             end = End((yield from self._fitted(self.direct)), self.noise)
         else:
             end = yield from self._by_decades()
             if end.broken or self.problem.gaps or not unexplained(self.problem, end, DOUBT):
                 return end
-            self.direct, self.known = self.known, Progress(self.begin)
+            self.direct, self.progress = self.progress, FitProgress(self.begin)
         return (yield from self._by_horizons(end))
 
-    def _by_decades(self) -> Generator[Any, Any, End]:
-        """Fits the whole recording, with narrower gaps from decade to decade."""
+    def _by_decades(self) -> Generator[Point, Values, End]:
+        """Fits the whole recording repeatedly; each fit allows smaller gaps between segments."""
         end = None
         while True:
             try:
-                end = End((yield from self._fitted(self.known)), self.noise)
-            except ENDS as error:
+                end = End((yield from self._fitted(self.progress)), self.noise)
+            except STOP_EXCEPTIONS as error:
                 if end is None:
-                    raise  # there is nothing to be lost
-                return end.broken_by(words(error))
+                    raise  # no earlier result would be lost
+                return end.broken_by(describe_error(error))
             if end.broken or self.decade + 1 == len(self.widths):
                 return end
             self._narrow(end.fit)
 
-    def _by_horizons(self, direct: End) -> Generator[Any, Any, End]:
-        """Fits longer and longer parts of the recording; returns the better of this and `direct`.
+    def _by_horizons(self, direct: End) -> Generator[Point, Values, End]:
+        """Fits longer and longer parts of the recording.
 
-        Parts with no more numbers than parameters are skipped.
+        Parts with no more data than parameters are skipped.
+
+        Args:
+            direct: the fit of the whole recording from the start.
+
+        Returns:
+            The better of the resulting fit and `direct`.
         """
         fit, scatter = direct.fit, self.problem.scatter(direct.fit.residual)
         while True:
             share = HORIZONS[self.horizon]
             if self.problem.observed_until(share) > self.begin.size:
-                # without a prior, parameters that a short part hardly tells would follow its noise
+                # without a prior, parameters that a short part does not determine would fit noise
                 tie = scatter / FARTHEST if share < 1 else 0.0
                 try:
-                    fit = yield from self._fitted(self.known, share, tie)
-                except ENDS as error:
-                    return direct.broken_by(words(error))
+                    fit = yield from self._fitted(self.progress, share, tie)
+                except STOP_EXCEPTIONS as error:
+                    return direct.broken_by(describe_error(error))
                 if fit.broken:
                     return direct.broken_by(fit.stopped)
-                self.known = Progress(fit.z) if share < 1 else self.known
+                self.progress = FitProgress(fit.z) if share < 1 else self.progress
             if share == HORIZONS[-1]:
                 return min(direct, End(fit, self.noise), key=lambda end: end.cost)
             self.horizon += 1
 
     def _fitted(
-        self, known: Progress | None, horizon: float = 1.0, tie: float = 0.0
-    ) -> Generator[Any, Any, Fit]:
-        """Fits a part of the recording.
+        self, progress: FitProgress | None, horizon: float = 1.0, tie: float = 0.0
+    ) -> Generator[Point, Values, Fit]:
+        """Fits the first part of the recording.
 
         Args:
-            known: where the fit begins.
-            horizon: end of the part, as a share of the time.
-            tie: weight of the rows tie · (z − begin), a prior on the parameters.
+            progress: the state of the fit from which it starts or resumes.
+            horizon: length of the part, as a share of the recording's duration.
+            tie: weight of a prior on the parameters z: adds the residuals tie · (z − begin).
         """
-        assert known is not None
+        assert progress is not None
         problem, width, noise = self.problem, self.widths[self.decade], self.noise
         precision = problem.precision(width, noise)
-        fit = least_squares(known, problem.limits, self.steps, precision, self.note, problem.reach)
-        found: Any = ()
-        how: Callable[..., Any] = functools.partial(next, fit)
+        fit = least_squares(
+            progress, problem.limits, self.steps, precision, self.note, problem.reach
+        )
+        resume: Callable[[], np.ndarray] = functools.partial(next, fit)
         while True:
             try:
-                z = how(*found)
+                z = resume()
             except StopIteration as end:
                 return end.value
             try:
                 r, J = yield z, width, noise
-            except ENDS as error:
-                found, how = (error,), fit.throw
+            except STOP_EXCEPTIONS as error:
+                resume = functools.partial(fit.throw, error)
                 continue
             r, J = problem.until(horizon, r, J)
             if tie:
                 r = np.append(r, tie * (z - self.begin))
                 J = np.concatenate([J, tie * np.eye(z.size)])
-            found, how = ((r, J),), fit.send
+            resume = functools.partial(fit.send, (r, J))
 
-    def note(self, known: Progress) -> None:
-        """Records the progress of the present fit."""
-        self.known = known
+    def note(self, progress: FitProgress) -> None:
+        """Stores the progress of the current fit."""
+        self.progress = progress
 
-    def _look(self) -> Any:
-        """Evaluates the start, and derives the decades from its gaps."""
+    def _evaluate_start(self) -> Generator[Point, Values, None]:
+        """Evaluates the residuals at the start, and derives the gaps that each fit allows."""
         problem, start = self.problem, np.append(self.begin, self.problem.nodes)
         residual, slopes = yield start, 1.0, 1.0
         if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slopes))):
@@ -186,65 +199,79 @@ class Attempt:
                 "identify: the residuals or their derivatives are not finite at the start; simulate"
                 " and its gradient must be finite there."
             )
-        self.known, widths = Progress(start), problem.widths(residual, self.continuity)
-        if self._estimated:  # what is missed at the start is the least that is known of it
+        self.progress, widths = FitProgress(start), problem.widths(residual, self.continuity)
+        if self._estimated:  # the residuals at the start give the first estimate
             self.noise = problem.typical(residual)
             widths = [*widths, self.continuity]
         self.widths = tuple(widths)
 
     def _narrow(self, fit: Fit) -> None:
-        """Goes on to the next decade, with the noise estimated again."""
+        """Starts the next fit, with smaller gaps. Estimates the noise if the user gave none."""
         if self._estimated:
             problem, width = self.problem, self.widths[self.decade]
             left = remaining(problem, fit, problem.condensed(fit.jacobian, width), self.noise)
-            again = problem.typical(fit.residual * self.noise)
-            own = again if np.isnan(left) else self.noise * left
-            self.noise = max(own, problem.least)
-        self.decade, self.known = self.decade + 1, Progress(fit.z)
+            typical = problem.typical(fit.residual * self.noise)
+            noise = typical if np.isnan(left) else self.noise * left
+            self.noise = max(noise, problem.least)
+        self.decade, self.progress = self.decade + 1, FitProgress(fit.z)
 
     @property
     def _estimated(self) -> bool:
+        """True if the noise is estimated again after each fit of the whole recording."""
         return self.problem.noise is None and self.problem.gaps > 0
 
     @property
     def contents(self) -> dict[str, np.ndarray]:
-        """Arrays for a checkpoint; z is empty before the start was evaluated."""
+        """The state of the search as arrays for a checkpoint.
+
+        z is empty before the start is evaluated.
+        """
         fields = {name: getattr(self, name) for name in ("widths", "noise", "decade", "horizon")}
-        fields |= _contents(self.known)
+        fields |= _contents(self.progress)
         fields |= {f"direct_{name}": x for name, x in _contents(self.direct).items()}
         return {name: np.asarray(x) for name, x in fields.items()}
 
     def restore(self, contents: dict[str, np.ndarray]) -> None:
-        """Goes on from a checkpoint."""
+        """Sets the state of the search from the contents of a checkpoint."""
         self.widths = tuple(contents["widths"].tolist())
         self.noise = float(contents["noise"])
         self.decade, self.horizon = int(contents["decade"]), int(contents["horizon"])
-        self.known, self.direct = _restored(contents), _restored(contents, "direct_")
+        self.progress, self.direct = _restored(contents), _restored(contents, "direct_")
 
 
-def _contents(known: Progress | None) -> dict[str, Any]:
-    """Fields of a `Progress` for a checkpoint; z is empty for None."""
-    return dataclasses.asdict(known or Progress(np.zeros(0)))
+def _contents(progress: FitProgress | None) -> dict[str, np.ndarray | float | tuple | str]:
+    """Returns the fields of a `FitProgress` for a checkpoint; for None, an empty z."""
+    return dataclasses.asdict(progress or FitProgress(np.zeros(0)))
 
 
-def _restored(contents: dict[str, np.ndarray], prefix: str = "") -> Progress | None:
-    """The `Progress` in a checkpoint, None if z is empty."""
+def _restored(contents: dict[str, np.ndarray], prefix: str = "") -> FitProgress | None:
+    """Returns the `FitProgress` stored in a checkpoint; None if its z is empty."""
     z, damping, costs, stopped = (
-        contents[prefix + field.name] for field in dataclasses.fields(Progress)
+        contents[prefix + field.name] for field in dataclasses.fields(FitProgress)
     )
     if not z.size:
         return None
-    return Progress(z, float(damping), tuple(costs.tolist()), str(stopped))
+    return FitProgress(z, float(damping), tuple(costs.tolist()), str(stopped))
 
 
 def remaining(problem: Stretches, fit: Fit, J: np.ndarray, noise: float) -> float:
-    """The ratio of the noise left by a fit to the noise it began with; J is condensed."""
-    rows, told = fit.residual.size - problem.gaps, problem.told(noise)
-    return noise_left(dataclasses.replace(fit, jacobian=J), rows, problem.observed, told)
+    """Estimates the noise from the residuals of a fit, relative to its noise factor.
+
+    Args:
+        problem: the least-squares problem of the recording.
+        fit: a fit of all unknowns.
+        J: the Jacobian of the fit, transformed by `Stretches.condensed`.
+        noise: the factor by which the residuals are divided.
+    """
+    rows, precision = fit.residual.size - problem.gaps, problem.data_precision(noise)
+    return noise_left(dataclasses.replace(fit, jacobian=J), rows, problem.observed, precision)
 
 
 def unexplained(problem: Stretches, end: End, excess: float = EXCESS) -> bool:
-    """True if residuals exceed noise and rounding by this ratio; False if that is not known."""
+    """Returns True if residuals exceed both `excess` times the noise and the rounding errors.
+
+    If the noise is unknown, returns False.
+    """
     residual = end.fit.residual
     return problem.share(residual, end.noise) > 0 and problem.excess(residual) > excess
 
@@ -252,42 +279,51 @@ def unexplained(problem: Stretches, end: End, excess: float = EXCESS) -> bool:
 def searched(
     problem: Stretches, attempts: list[Attempt], save: Callable[[], None], progress: bool | None
 ) -> list[End | None]:
-    """Runs all starts in one batch; returns their ends, None for a start that is not finite.
+    """Runs the searches from all starts in one batch.
+
+    Returns:
+        The final fit from each start; None for a start at which residuals are not finite.
 
     Raises:
-        ValueError: no start is finite.
+        ValueError: the residuals are finite at no start.
     """
 
-    def evaluate(asked: dict[int, Any]) -> dict[int, Any]:
-        some = next(iter(asked.values()))  # in the place of those that have ended
-        found = problem.evaluate([asked.get(i, some) for i in range(len(attempts))])
-        return {i: found[i] for i in asked}
+    def evaluate(points: dict[int, Point]) -> dict[int, Values]:
+        """Returns (r, J) at the points of all running searches."""
+        filler = next(iter(points.values()))  # keeps the batch size when searches end
+        values = problem.evaluate([points.get(i, filler) for i in range(len(attempts))])
+        return {i: values[i] for i in points}
 
-    with bar(progress, desc="identifying") as seen:
+    with progress_bar(progress, desc="identifying") as shown:
 
         def after() -> None:
-            seen.update()
+            """Updates the progress bar and writes the checkpoint."""
+            shown.update()
             save()
 
-        found = side_by_side([attempt.run() for attempt in attempts], evaluate, after)
-    return [x if isinstance(x, End) else None for x in found]
+        ends = side_by_side([attempt.run() for attempt in attempts], evaluate, after)
+    return [x if isinstance(x, End) else None for x in ends]
 
 
 def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Callable[[], None]:
-    """Restores attempts from a file, if it exists; returns a function that writes them to it.
+    """Restores searches from a checkpoint file, if it exists.
+
+    Returns:
+        A function that writes the searches to the file.
 
     Raises:
-        ValueError: the file holds something else.
+        ValueError: the file is not a checkpoint of this search.
     """
     about = _about(problem, attempts)
     if file.exists():
         like = [attempt.contents for attempt in attempts]
         for attempt, x in zip(attempts, files.read(file, like, about, "identify"), strict=True):
             attempt.restore(x)
-    written: list[Any] = []
+    written: list[int] = []
 
     def save() -> None:
-        state = [id(attempt.known) for attempt in attempts]
+        """Writes the checkpoint, if any search has made progress."""
+        state = [id(attempt.progress) for attempt in attempts]
         if state != written:
             files.write(file, about, [attempt.contents for attempt in attempts])
             written[:] = state
@@ -295,8 +331,8 @@ def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Calla
     return save
 
 
-def _about(problem: Stretches, attempts: list[Attempt]) -> dict[str, Any]:
-    """The properties of a search that must match those in a checkpoint, by their description."""
+def _about(problem: Stretches, attempts: list[Attempt]) -> dict[str, object]:
+    """Returns the settings of a search that must match those of a checkpoint, by description."""
     first, space = attempts[0], problem.space
     limits: PyTree = [*space.low, *space.high]
     numbers = [np.asarray(x) for x in jax.tree.leaves(problem.seen)]

@@ -1,4 +1,4 @@
-"""Curvature of a loss from the gradients along a search: limited-memory BFGS."""
+"""Estimates the curvature of a loss from gradients during a search, by limited-memory BFGS."""
 
 from __future__ import annotations
 
@@ -9,16 +9,18 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 
 PAIRS = 10
-"""The number of secant pairs that are kept."""
+"""The number of secant pairs that L-BFGS stores."""
 
 
 @pytree
 class Secants:
-    """Pairs (s, y) with H s = y for a mean Hessian H of the loss, the newest last.
+    """Secant pairs (s, y) of steps and gradient changes, for limited-memory BFGS; newest last.
+
+    They satisfy H s = y, with the Hessian H of the loss averaged over the step.
 
     Attributes:
-        steps: s = x₁ − x₀ between two points of the search, (m, n); 0 where there is none yet.
-        changes: y = g₁ − g₀ of the gradient between them, (m, n).
+        steps: steps s = x₁ − x₀ between points of the search, (m, n); zero for unused pairs.
+        changes: changes y = g₁ − g₀ of the gradient over these steps, (m, n).
     """
 
     steps: Array
@@ -26,38 +28,41 @@ class Secants:
 
     @classmethod
     def none(cls, x: Array) -> Secants:
-        """No pairs, for coordinates x (n,)."""
+        """Returns an empty set of pairs, for search coordinates x (n,)."""
         empty = jnp.zeros((PAIRS, *x.shape), x.dtype)
         return cls(empty, empty)
 
     def add(self, step: Array, change: Array, slope: Array) -> Secants:
-        """The pairs with one more, if the loss is convex along it and the change is no rounding.
+        """Adds a pair, if the loss is convex along s and y exceeds rounding errors.
 
         Args:
-            step: s (n,).
-            change: y (n,).
-            slope: gradient g₁ at the end of the step, (n,).
+            step: the step s, (n,).
+            change: the change y of the gradient over the step, (n,).
+            slope: the gradient g₁ at the end of the step, (n,).
         """
         eps = jnp.finfo(step.dtype).eps
         sizes = jnp.max(jnp.abs(step), initial=0), jnp.max(jnp.abs(change), initial=0)
-        told = sizes[1] > eps**0.5 * jnp.max(jnp.abs(slope), initial=0)
-        # s and y of like size: their squares then neither overflow nor vanish in float32
-        scale = jnp.where(told & (sizes[0] > 0), jnp.sqrt(sizes[0]) * jnp.sqrt(sizes[1]), 1)
+        valid = sizes[1] > eps**0.5 * jnp.max(jnp.abs(slope), initial=0)
+        # scales s and y to equal size, so that their squares do not over- or underflow in float32
+        scale = jnp.where(valid & (sizes[0] > 0), jnp.sqrt(sizes[0]) * jnp.sqrt(sizes[1]), 1)
         s, y = step / scale, change / scale
-        told &= s @ y > eps * jnp.sqrt((s @ s) * (y @ y))
+        valid &= s @ y > eps * jnp.sqrt((s @ s) * (y @ y))
         pairs = ((self.steps, s), (self.changes, y))
-        added = (jnp.where(told, jnp.append(old[1:], x[None], 0), old) for old, x in pairs)
+        added = (jnp.where(valid, jnp.append(old[1:], x[None], 0), old) for old, x in pairs)
         return Secants(*added)
 
     def newton_step(self, slope: Array, free: Array) -> Array:
-        """−H⁻¹ g within the free coordinates, by the two-loop recursion, (n,); NaN without pairs.
+        """Returns the quasi-Newton step −H⁻¹ g in the free coordinates, (n,); NaN without pairs.
 
-        The recursion begins from a diagonal, Σ |s y| / Σ y² by coordinate. Unlike a multiple of
-        the identity it does not depend on the units of the coordinates.
+        H is the Hessian of the loss, approximated by secant pairs, and g its gradient.
+
+        Uses the two-loop recursion of L-BFGS. The initial inverse Hessian is diagonal, with entries
+        Σ |s y| / Σ y² over all pairs. Unlike a multiple of the identity, it adapts to the units of
+        each coordinate.
 
         Args:
-            slope: g (n,).
-            free: whether a coordinate may move, (n,).
+            slope: the gradient g, (n,).
+            free: mask of the coordinates that may move, (n,).
 
         References:
             Nocedal, Wright, Numerical Optimization (2006), algorithm 7.4.
@@ -69,15 +74,21 @@ class Secants:
         pairs = (s, y, rho)
 
         def backward(d: Array, pair: tuple[Array, ...]) -> tuple[Array, Array]:
+            """First loop of the L-BFGS recursion: removes a multiple of y from d.
+
+            Returns:
+                The new d, and the weight ρ sᵀd.
+            """
             s, y, rho = pair
             weight = rho * (s @ d)
             return d - weight * y, weight
 
         def forward(d: Array, pair: tuple[Array, ...]) -> tuple[Array, None]:
+            """Second loop of the L-BFGS recursion: adds a multiple of s to d."""
             s, y, rho, weight = pair
             return d + (weight - rho * (y @ d)) * s, None
 
-        # loops, not unrolled: they compile in a tenth of a second
+        # scans instead of unrolled loops, since they compile fast
         d, weights = jax.lax.scan(backward, jnp.where(free, slope, 0), pairs, reverse=True)
         d = self._diagonal(s, y, valid) * d
         d, _ = jax.lax.scan(forward, d, (*pairs, weights))
@@ -85,10 +96,13 @@ class Secants:
 
     @staticmethod
     def _diagonal(s: Array, y: Array, valid: Array) -> Array:
-        """An inverse Hessian by coordinate, (n,); the mean one where nothing is known."""
+        """Returns the initial diagonal of the inverse Hessian H⁻¹, (n,).
+
+        Coordinates whose gradient did not change get the mean over all coordinates.
+        """
         s, y = (jnp.where(valid[:, None], x, 0) for x in (s, y))
         products, squares = jnp.abs(s * y), y * y
         top, bottom = jnp.sum(products), jnp.sum(squares)
         mean = top / jnp.where(bottom > 0, bottom, 1)
-        own = jnp.sum(squares, axis=0)
-        return jnp.where(own > 0, jnp.sum(products, axis=0) / jnp.where(own > 0, own, 1), mean)
+        sums = jnp.sum(squares, axis=0)
+        return jnp.where(sums > 0, jnp.sum(products, axis=0) / jnp.where(sums > 0, sums, 1), mean)

@@ -1,4 +1,4 @@
-"""Steps of an optimizer that survive losses which are not finite: pure, for one jitted scan."""
+"""Optimizer steps that recover from non-finite losses. Pure functions, for a jitted scan."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,22 +19,25 @@ from jaxcon.core.devices import over_devices
 from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.core.worlds import keep
 from jaxcon.learning.curvature import Secants
 from jaxcon.learning.leaves import Space, flat
-from jaxcon.learning.optimizer import SearchAware
-from jaxcon.simulation.recovery import contain
+from jaxcon.learning.optimizer import OptimizerMemory, SearchAware
+from jaxcon.staging.failure import mask_failed_gradients
+from jaxcon.staging.worlds import where_tree
 
 RETRIES = 20
-"""Steps from one point, each half as long as the one before, after which a start is given up."""
+"""The number of rejected steps in a row that ends a search. Each is half as long as the last."""
 RECOVERY = 1.2
-"""Factor by which the share of the optimizer's step grows with every good step, up to 1."""
+"""The factor by which the step fraction grows after each accepted step, up to 1."""
 WORSE = 1000.0
-"""Factor by which a step must multiply the loss to be taken back."""
+"""A step is rejected if it multiplies a nonnegative loss by more than this factor."""
+
+Value: TypeAlias = tuple[Array, tuple[PyTree, Array]]
+"""The loss, (), with its auxiliary output and the number of non-finite samples."""
 
 
 class Stop(IntEnum):
-    """The reason why a start takes no more steps."""
+    """The reason why the search from one start ended."""
 
     RUNNING = 0
     STALLED = 1
@@ -44,17 +47,18 @@ class Stop(IntEnum):
 
 @pytree
 class Best:
-    """The point of the least loss so far.
+    """The point with the smallest loss so far.
 
-    A point at which more samples are not finite is never better: those may be the worst ones.
+    A point with more non-finite samples never counts as better, since these samples may have the
+    largest losses.
 
     Attributes:
-        y: the point.
-        slope: gradient of the loss there; zero where the loss takes samples.
-        loss: there.
-        aux: what the loss returned beside it.
-        lost: how many samples were not finite.
-        step: how many steps led there.
+        y: search coordinates of the point.
+        slope: gradient of the loss at y; zero if the loss is averaged over samples.
+        loss: loss at y, ().
+        aux: auxiliary output of the loss at y.
+        lost: number of non-finite samples at y, ().
+        step: number of steps taken before y, ().
     """
 
     y: tuple[Array, ...]
@@ -66,47 +70,48 @@ class Best:
 
 
 @pytree
-class Origin:
-    """The last accepted point, from which a step that fails is tried again.
+class AcceptedPoint:
+    """The last accepted point, from which a rejected step is repeated with a smaller fraction.
 
     Attributes:
-        y: the point.
-        slope: gradient of the loss there.
-        loss: there.
-        update: step of the optimizer from there.
-        memory: of the optimizer after that step.
+        y: search coordinates of the point.
+        slope: gradient of the loss at y.
+        loss: loss at y, ().
+        update: the optimizer's full step from y.
+        memory: state of the optimizer after that step.
     """
 
     y: tuple[Array, ...]
     slope: tuple[Array, ...]
     loss: Array
-    update: PyTree
-    memory: PyTree
+    update: tuple[Array, ...]
+    memory: optax.OptState | OptimizerMemory
 
 
 @pytree
 class Search:
-    """One start on its way.
+    """The state of the search from one start.
 
     Attributes:
-        y: the point that is looked at next.
-        origin: the accepted point from which a step led there.
-        best: so far.
-        first: the loss at the first accepted point, NaN before.
+        y: the next point to evaluate.
+        origin: the accepted point from which the step to y was taken.
+        best: the best point so far.
+        first: loss at the first accepted point; NaN before there is one.
         highest: the largest loss of an accepted point.
-        mark: the loss that must be undercut by the tolerance.
-        since: the step of the mark.
-        share: of the optimizer's step that is taken; halved where a step is taken back.
-        tries: steps in a row that were taken back.
-        step: how many were taken.
-        refused: how many of these were taken back.
-        stop: a `Stop`.
-        secants: pairs of steps and changes of the gradient; None where the loss takes samples.
-        ahead: the quasi-Newton step from the best point, (n,); NaN where nothing tells it.
+        mark: the loss to beat: a loss that is lower by more than the tolerance counts as progress.
+        since: the step at which `mark` was set.
+        share: step fraction, the fraction of the optimizer's step that is taken; halved after a
+            rejection.
+        tries: number of rejected steps in a row.
+        step: number of steps taken.
+        refused: number of rejected steps.
+        stop: the reason why the search ended, a `Stop`.
+        secants: secant pairs for quasi-Newton steps; None if the loss is averaged over samples.
+        ahead: the quasi-Newton step from the best point, (n,); NaN if unknown.
     """
 
     y: tuple[Array, ...]
-    origin: Origin
+    origin: AcceptedPoint
     best: Best
     first: Array
     highest: Array
@@ -122,23 +127,23 @@ class Search:
 
     @property
     def accepted(self) -> Array:
-        """True where some point was accepted."""
+        """True once the search has accepted a point."""
         return ~jnp.isnan(self.first)
 
 
 @dataclass(frozen=True)
 class Descent:
-    """The descent of a loss: what is fixed during a search.
+    """The minimization problem, with all settings that are constant during a search.
 
     Attributes:
-        loss: params → loss or (loss, aux); (params, key) → the same where there are samples.
-        space: of the parameters.
-        optimizer: of optax, or the default one.
-        samples: over how many keys the loss is averaged; 0 for a loss that takes none.
-        patience: steps without progress after which a start stops.
-        tolerance: a fall of the loss that counts as progress.
-        forward: whether gradients are taken in forward mode, number by number.
-        mesh: over whose devices the samples lie; None for one.
+        loss: function from params, or (params, key) with samples, to a loss or (loss, aux).
+        space: map between parameters and search coordinates.
+        optimizer: a transformation of optax, or the default optimizer.
+        samples: number of keys over which the loss is averaged; 0 for a loss without key.
+        patience: number of steps without progress after which a search ends.
+        tolerance: the decrease of the loss that counts as progress.
+        forward: True for gradients in forward mode, one pass per parameter.
+        mesh: devices among which the samples are divided; None for a single device.
     """
 
     loss: Callable[..., Any]
@@ -150,8 +155,8 @@ class Descent:
     forward: bool = False
     mesh: Mesh | None = None
 
-    def start(self, y: tuple[Array, ...], key: Any) -> Search:
-        """A search that begins at y."""
+    def start(self, y: tuple[Array, ...], key: Array | None) -> Search:
+        """Returns the initial state of a search that begins at y."""
         value, (aux, lost) = jax.eval_shape(self.evaluate, y, key)
         none, zeros = jnp.zeros((), jnp.int32), jax.tree.map(jnp.zeros_like, y)
         infinite = jnp.full((), jnp.inf, value.dtype)
@@ -160,7 +165,7 @@ class Descent:
         x = flat(y)[0]
         return Search(
             y=y,
-            origin=Origin(y, zeros, infinite, zeros, self.optimizer.init(y)),
+            origin=AcceptedPoint(y, zeros, infinite, zeros, self.optimizer.init(y)),
             best=Best(y, zeros, infinite, nothing, all_lost, none),
             first=jnp.full_like(infinite, jnp.nan),
             highest=-infinite,
@@ -175,71 +180,96 @@ class Descent:
             ahead=jnp.full_like(x, jnp.nan),
         )
 
-    def _loss(self, *args: Any) -> tuple[Array, PyTree]:
-        """(loss, aux) of the user's function."""
+    def _loss(self, *args: PyTree) -> tuple[Array, PyTree]:
+        """Calls the user's loss. Returns (loss, aux)."""
         return split(functions.call("tune", "loss", self.loss, *args))
 
-    def evaluate(self, y: Any, key: Any) -> tuple[Array, PyTree]:
-        """Loss at y, aux there, and how many samples are not finite.
+    def evaluate(self, y: tuple[Array, ...], key: Array | None) -> Value:
+        """Returns (loss, (auxiliary output, number of non-finite samples)) at y.
 
-        Where there are samples the loss is the mean over those that are finite, if most are. The
-        others have no gradient.
+        With samples, the loss is the mean over the finite samples. It is NaN unless more than half
+        of the samples are finite. Non-finite samples have zero gradient.
         """
         if not self.samples:
             value, aux = self._loss(self.space.decode(y))
             return value, (aux, jnp.zeros((), jnp.int32))
 
-        def one(y: Any, key: Any) -> Any:
+        def sample(y: tuple[Array, ...], key: Array) -> tuple[tuple[Array, PyTree], Array]:
+            """Returns (loss, aux) of one sample, and its status."""
             value, aux = self._loss(self.space.decode(y), key)
             good = jnp.isfinite(value)
             return (value, aux), jnp.where(good, Status.OK, Status.NON_FINITE).astype(jnp.int32)
 
+        assert key is not None
         keys = jax.random.split(key, self.samples)
-        every = jax.vmap(lambda y, k: contain(one, (y, k)), in_axes=(None, 0))
-        every = every if self.mesh is None else over_devices(every, self.mesh)
-        (values, aux), status = every(y, keys)
+        batch = jax.vmap(lambda y, k: mask_failed_gradients(sample, (y, k)), in_axes=(None, 0))
+        batch = batch if self.mesh is None else over_devices(batch, self.mesh)
+        (values, aux), status = batch(y, keys)
         lost = jnp.sum(failed(status), dtype=jnp.int32)
         count = jnp.maximum(self.samples - lost, 1).astype(values.dtype)
         mean = jnp.sum(jnp.where(failed(status), 0, values)) / count
         return jnp.where(2 * lost < self.samples, mean, jnp.nan), (aux, lost)
 
-    def run(self, search: Search, limit: Array, key: Any, length: int) -> tuple[Search, Array]:
-        """So many steps, or as many as are left up to the limit, and their losses, (length,)."""
+    def run(
+        self, search: Search, limit: Array, key: Array | None, length: int
+    ) -> tuple[Search, Array]:
+        """Takes a number of steps, called a chunk.
 
-        def one(search: Search, _: None) -> tuple[Search, Array]:
+        Args:
+            search: the state before the chunk.
+            limit: maximum number of steps of the whole search, ().
+            key: random key for the samples; None without samples.
+            length: number of steps of the chunk.
+
+        Returns:
+            The state after the chunk, and the losses by step, (length,). NaN for steps not taken.
+        """
+
+        def advance(search: Search, _: None) -> tuple[Search, Array]:
+            """Takes one step; does nothing if the search has ended."""
             active = (search.stop == Stop.RUNNING) & (search.step < limit)
-            own = jax.random.fold_in(key, search.step + 1) if self.samples else None
-            new, loss = self.step(search, own)
-            return keep(active, new, search), jnp.where(active, loss, jnp.nan)
+            fresh = None
+            if self.samples and key is not None:
+                fresh = jax.random.fold_in(key, search.step + 1)
+            new, loss = self.step(search, fresh)
+            return where_tree(active, new, search), jnp.where(active, loss, jnp.nan)
 
-        new, losses = jax.lax.scan(one, search, None, length)
+        new, losses = jax.lax.scan(advance, search, None, length)
         if new.secants is None:
-            return keep(new.step > search.step, self.compare(search, new, key), new), losses
+            return where_tree(new.step > search.step, self.compare(search, new, key), new), losses
         best = new.best
         ahead = new.secants.newton_step(flat(best.slope)[0], self.space.free(best.y, best.slope))
         return dataclasses.replace(new, ahead=ahead), losses
 
-    def compare(self, before: Search, after: Search, key: Any) -> Search:
-        """The search after both ends of a chunk were judged by the same keys: no lucky draw wins.
+    def compare(self, before: Search, after: Search, key: Array | None) -> Search:
+        """Compares the points before and after a chunk by the same keys, to exclude lucky samples.
 
-        An end that is not finite, or has run away, is taken back to the beginning of the chunk.
+        If the loss after the chunk is not finite or far too large, the search returns to the point
+        before the chunk.
         """
+        assert key is not None
         fixed = jax.random.fold_in(key, 0)
         y = jax.tree.map(lambda *x: jnp.stack(x), before.y, after.y)
-        losses, seen = jax.vmap(lambda y: self.evaluate(y, fixed))(y)
-        seen = [jax.tree.map(lambda x, i=i: x[i], seen) for i in range(2)]
+        losses, extras = jax.vmap(lambda y: self.evaluate(y, fixed))(y)
         search, failed = after, jnp.asarray(False)
-        for i, at in enumerate((before, after)):
-            aux, lost = seen[i]
-            point = Best(at.y, search.best.slope, losses[i], aux, lost, at.step)
+        for i, end in enumerate((before, after)):
+            aux, lost = jax.tree.map(lambda x, i=i: x[i], extras)
+            point = Best(end.y, search.best.slope, losses[i], aux, lost, end.step)
             failed = ~jnp.isfinite(losses[i]) | self.runs_away(search, losses[i], losses[0])
             search = self.judge(self.accept(search, losses[i], ~failed), point)
         half = after.share / 2
         back = dataclasses.replace(search, y=before.y, origin=before.origin, share=half)
-        return keep(failed & jnp.isfinite(losses[0]), back, search)
+        return where_tree(failed & jnp.isfinite(losses[0]), back, search)
 
-    def step(self, search: Search, key: Any) -> tuple[Search, Array]:
-        """One step, and the loss before it; where that fails, a shorter one from the origin."""
+    def step(self, search: Search, key: Array | None) -> tuple[Search, Array]:
+        """Evaluates the current point and takes one step from it.
+
+        If the loss at the current point is unacceptable, the step to that point is repeated with
+        half its length.
+
+        Returns:
+            The new state, and the loss at the current point.
+        """
         (loss, (aux, lost)), slope = self.slope(search.y, key)
         good = jnp.isfinite(loss) & numerics.all_finite(slope)
         point = Best(search.y, slope, loss, aux, lost, search.step)
@@ -247,22 +277,22 @@ class Descent:
         if search.secants is not None:
             good &= ~self.runs_away(search, loss, search.origin.loss)
             learned = self.learned(search, search.secants, slope)
-            secants = keep(good & search.accepted, learned, search.secants)
+            secants = where_tree(good & search.accepted, learned, search.secants)
             search = dataclasses.replace(search, secants=secants)
             search = self.judge(self.accept(search, loss, good), point)
-        origin = keep(good, self.leave(search, loss, slope, key), search.origin)
+        origin = where_tree(good, self.leave(search, loss, slope, key), search.origin)
         share = jnp.where(good, jnp.minimum(1, RECOVERY * search.share), search.share / 2)
         ahead = jax.tree.map(
             lambda y, u: y + share.astype(y.dtype) * u.astype(y.dtype), origin.y, origin.update
         )
         moved = self.space.clip(ahead)
-        led = numerics.all_finite(moved)
+        finite = numerics.all_finite(moved)
         tries = jnp.where(good, 0, search.tries + 1)
         stop = jnp.where(tries > RETRIES, Stop.NO_STEP, search.stop)
-        stop = jnp.where(good & ~led, Stop.LED_NOWHERE, stop)
+        stop = jnp.where(good & ~finite, Stop.LED_NOWHERE, stop)
         new = dataclasses.replace(
             search,
-            y=keep(led, moved, origin.y),
+            y=where_tree(finite, moved, origin.y),
             origin=origin,
             share=share,
             tries=tries,
@@ -271,15 +301,22 @@ class Descent:
         )
         return new, loss
 
-    def leave(self, search: Search, loss: Array, slope: tuple[Array, ...], key: Any) -> Origin:
-        """The point from which the optimizer steps after it saw this one, and its step."""
-        memory = search.origin.memory
-        # optax counts on promotion, whatever the rest of a program is held to
+    def leave(
+        self, search: Search, loss: Array, slope: tuple[Array, ...], key: Array | None
+    ) -> AcceptedPoint:
+        """Calls the optimizer. Returns the point from which it steps, with its step.
+
+        An optimizer of optax steps from the current point. The default optimizer may step from the
+        best point.
+        """
+        update: Any  # optax has its own types
+        memory: Any = search.origin.memory
+        # optax relies on dtype and rank promotion, which the user may have forbidden
         with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
             if isinstance(self.optimizer, SearchAware):
                 moved, memory = self.optimizer.update(slope, memory, search.y, loss, search)
                 point, update = moved
-                return Origin(point.y, point.slope, point.loss, update, memory)
+                return AcceptedPoint(point.y, point.slope, point.loss, update, memory)
             update, memory = self.optimizer.update(
                 slope,
                 memory,
@@ -288,15 +325,21 @@ class Descent:
                 grad=slope,
                 value_fn=lambda y: self.evaluate(self.space.clip(y), key)[0],
             )
-        return Origin(search.y, slope, loss, update, memory)
+        return AcceptedPoint(search.y, slope, loss, update, memory)
 
     def runs_away(self, search: Search, loss: Array, before: Array) -> Array:
-        """Returns True where a step makes the loss so much worse that it is taken back.
+        """Returns True if a step increases the loss so much that it must be rejected.
 
-        It is a thousand times that before the step; or above all accepted ones by ten times their
-        range, or by the range and the size of the first one. The latter holds for losses of any
-        sign, logarithms too. A rise by a hundredth of the first one is never judged, nor is
-        rounding around a loss of zero.
+        If all accepted losses are nonnegative, a step may multiply the loss by at most 1000.
+
+        Any loss, such as a logarithm, may exceed the highest accepted loss by at most min(max(|f|,
+        d), max(|f| / 100, 10 d)). Here f is the first loss and d the range of accepted losses.
+        Rounding errors near a loss of zero are ignored.
+
+        Args:
+            search: the state of the search.
+            loss: the loss after the step, ().
+            before: the loss before the step, ().
         """
         size, span = jnp.abs(search.first), search.highest - search.best.loss
         rounding = jnp.finfo(loss.dtype).eps * size
@@ -306,37 +349,44 @@ class Descent:
 
     @staticmethod
     def accept(search: Search, loss: Array, good: Array) -> Search:
-        """The search after a loss was found good, or not."""
+        """Updates the first and the highest accepted loss with this loss, if `good` is True."""
         first = jnp.where(good & ~search.accepted, loss, search.first)
         highest = jnp.where(good, jnp.maximum(loss, search.highest), search.highest)
         return dataclasses.replace(search, first=first, highest=highest)
 
     @staticmethod
     def learned(search: Search, secants: Secants, slope: tuple[Array, ...]) -> Secants:
-        """The secant pairs with that of the step from the origin to a point of this slope."""
+        """Adds the secant pair of the step from the origin to the current point.
+
+        Args:
+            search: the state of the search, with the origin and the current point y.
+            secants: the secant pairs so far.
+            slope: gradient of the loss at the current point.
+        """
         origin, g = search.origin, flat(slope)[0]
         step = flat(search.y)[0] - flat(origin.y)[0]
         return secants.add(step, g - flat(origin.slope)[0], g)
 
-    def slope(self, y: Any, key: Any) -> Any:
-        """(loss, (aux, lost)) and the gradient."""
+    def slope(self, y: tuple[Array, ...], key: Array | None) -> tuple[Value, tuple[Array, ...]]:
+        """Returns (loss, extras) as `evaluate` does, and the gradient of the loss at y."""
         if not self.forward:
             return jax.value_and_grad(self.evaluate, has_aux=True)(y, key)
         x, back = flat(y)
 
-        def push(tangent: Array) -> Any:
+        def push(tangent: Array) -> tuple[Array, Array, tuple[PyTree, Array]]:
+            """Returns the loss, its derivative along a tangent, and the extras."""
             return jax.jvp(lambda y: self.evaluate(back(y), key), (x,), (tangent,), has_aux=True)
 
-        value, slope, seen = jax.vmap(push, out_axes=(None, 0, None))(
+        value, slope, extras = jax.vmap(push, out_axes=(None, 0, None))(
             jnp.eye(x.size, dtype=x.dtype)
         )
-        return (value, seen), back(slope)
+        return (value, extras), back(slope)
 
     def judge(self, search: Search, point: Best) -> Search:
-        """The search after a point was looked at."""
+        """Updates the best point and the mark with a new point. Stops a search without progress."""
         fewer = point.lost < search.best.lost
         less = (point.lost == search.best.lost) & (point.loss < search.best.loss)
-        best = keep(jnp.isfinite(point.loss) & (fewer | less), point, search.best)
+        best = where_tree(jnp.isfinite(point.loss) & (fewer | less), point, search.best)
         progress = (best.lost < search.best.lost) | (best.loss < search.mark - self.tolerance)
         since = jnp.where(progress, search.step, search.since)
         stalled = (search.stop == Stop.RUNNING) & (search.step - since >= self.patience)
@@ -345,13 +395,12 @@ class Descent:
         return dataclasses.replace(search, best=best, mark=mark, since=since, stop=stop)
 
 
-def split(result: Any) -> tuple[Array, PyTree]:
-    """(loss, aux) of what a user's loss returned.
+def split(result: PyTree) -> tuple[Array, PyTree]:
+    """Splits the return value of a user's loss into (loss, aux); without aux, it is ().
 
     Raises:
-        TypeError: the loss is no floating scalar.
+        TypeError: the loss is not a floating scalar.
     """
-    value: Any
     value, aux = result if isinstance(result, tuple) and len(result) == 2 else (result, ())
     number = isinstance(value, float | np.ndarray | np.generic | jax.Array)
     if not number or jnp.shape(value) or not jnp.issubdtype(jnp.result_type(value), jnp.floating):

@@ -1,9 +1,9 @@
-"""Numbers of a model from recordings of its motion, and what the recordings do not tell."""
+"""Identification: estimates the parameters of a model, with uncertainty, from recorded motion."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxcon.core import checkpoint as files
 from jaxcon.core import checks
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array, PyTree, Scalar
 from jaxcon.learning.attempts import (
     Attempt,
     End,
@@ -23,54 +23,61 @@ from jaxcon.learning.attempts import (
     searched,
     unexplained,
 )
-from jaxcon.learning.information import deviations, told
+from jaxcon.learning.information import deviations, singular_directions
 from jaxcon.learning.least_squares import CONVERGED
-from jaxcon.learning.leaves import Space, is_searched, space_of
+from jaxcon.learning.leaves import Bounds, Space, is_searched, space_of
 from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.stretches import Stretches
 
 VAGUE = 1.0
-"""Standard deviation of a relative change above which it is not identified: a factor of e."""
+"""The standard deviation of a direction's relative change above which it counts as undetermined."""
 
 ALIKE = 1e-2
-"""Relative difference of costs below which two starts ended alike."""
+"""The relative difference of costs below which two starts count as equally good."""
 
 
 @dataclass(frozen=True)
 class Identified:
-    """Parameters with what is known of them; `print` it.
+    """The parameters estimated by `identify`, with their uncertainty; `print` it for a summary.
 
-    A direction is a combination of relative changes: of log x for positive parameters, of others by
-    their size, found or at the start, whichever is larger. A start within √ε of 0 counts as 0, and
-    what starts at 0 has the size 1 at least. Singular values are those of the residuals by noise,
-    σ = 1, along them, so that 1/s is the standard deviation of the estimate there (Cramér and Rao's
-    bound).
+    A direction is a combination of relative changes of parameters. The relative change of a
+    positive parameter x is the change of log x. For another parameter, the change is divided by its
+    initial or final magnitude, whichever is larger. This divisor is at least 1 for a parameter that
+    starts within √ε of 0.
+
+    Singular values s are those of the Jacobian of the residuals, divided by their noise. Hence 1/s
+    is the standard deviation of the estimate along the direction (the Cramér–Rao bound).
 
     Attributes:
-        params: like those given.
-        errors: their standard deviations, in the same structure and units; infinite where the data
-            tell nothing; NaN where a leaf was not searched, where a parameter lies on its bound,
-            and where nothing tells the noise. Those of others hold if it belongs on its bound.
-        nodes: the states at the nodes, as they were given; None without.
-        noise: what remains, its root mean square by degree of freedom: in units of the noise that
-            was given, so that 1 is as expected, or in those of the data where none was. NaN where
-            no degree of freedom is left.
-        observed: how many numbers were seen.
-        names: of the parameters, one by one.
-        bounded: the names of those that lie on their bounds.
-        singular_values: largest first, (n,), n parameters being off their bounds.
-        directions: of unit length by all parameters, a row for each singular value.
-        costs: ½ ‖r‖² by step; of the last search, with all data and the continuity asked for.
-        ends: ½ ‖r‖² where each start ended, in units of the noise that was given, or of the data;
-            infinite where it could not begin, (restarts,).
-        stopped: why it went no further, in words. "converged" is a minimum whose residuals are at
-            most twice the noise, the one given or else the one seen between neighbors. Any other
-            minimum is called local. A residual that is less than √ε of the data counts as noise.
+        params: the parameters, in the structure of the start.
+        errors: standard deviations of the parameters, in the same structure and units. Infinite for
+            parameters that the data do not determine. NaN for constant leaves, for parameters on a
+            bound, and if the noise is unknown. The values of parameters on a bound are taken as
+            exact.
+        nodes: the estimated initial states of the segments, in the structure of `nodes=`; None
+            without nodes.
+        noise: root mean square residual per degree of freedom. It is relative to the given noise,
+            so that 1 is expected. If no noise was given, it is in units of the data. NaN without
+            degrees of freedom.
+        observed: number of data that are not NaN.
+        names: names of the n estimated numbers, such as "mass[2]".
+        bounded: names of the numbers on a bound.
+        singular_values: singular values, largest first, (k,), for the k numbers that are not on a
+            bound.
+        directions: the unit vectors of the singular values, as rows, (k, n).
+        costs: ½ ‖r‖² at the start and after each step of the last fit, which uses all data and the
+            final continuity.
+        ends: final ½ ‖r‖² from each start, (restarts,). Residuals r are divided by the given noise,
+            or in units of the data. Infinite for starts with non-finite residuals.
+        stopped: the reason why the search ended, as text. "converged" means a minimum whose
+            residuals are at most twice the noise. The noise is the given one, or is estimated from
+            differences between neighboring data. Other minima are called local. Residuals below √ε
+            of the data count as noise.
     """
 
-    params: PyTree
-    errors: PyTree
-    nodes: PyTree
+    params: Any
+    errors: Any
+    nodes: Any
     noise: float
     observed: int
     names: tuple[str, ...]
@@ -83,28 +90,28 @@ class Identified:
 
     @property
     def table(self) -> dict[str, tuple[float, float]]:
-        """Each number that was searched with its standard deviation, by name."""
+        """Each estimated number with its standard deviation, by name."""
         leaves = zip(jax.tree.leaves(self.params), jax.tree.leaves(self.errors), strict=True)
-        found = [(np.ravel(x), np.ravel(e)) for x, e in leaves if is_searched(x)]
-        values, errors = (np.concatenate(x) for x in zip(*found, strict=True))
-        pairs = zip(values, errors, strict=True)
-        return {name: (float(x), float(e)) for name, (x, e) in zip(self.names, pairs, strict=True)}
+        searched = [(np.ravel(x), np.ravel(e)) for x, e in leaves if is_searched(x)]
+        values, errors = (np.concatenate(x) for x in zip(*searched, strict=True))
+        rows = zip(self.names, values, errors, strict=True)
+        return {name: (float(x), float(e)) for name, x, e in rows}
 
     @property
     def converged(self) -> bool:
-        """True at a minimum whose residuals are no larger than noise, if that can be judged."""
+        """True if the search ended at a minimum and noise explains the residuals; see `stopped`."""
         return self.stopped == CONVERGED
 
     @property
     def condition(self) -> float:
-        """cond(JᵀJ) = (s₁/sₙ)²; NaN where every parameter lies on a bound."""
+        """The condition number of JᵀJ, (s₁/sₖ)²; NaN if every parameter is on a bound."""
         s = self.singular_values
         with np.errstate(divide="ignore", invalid="ignore"):
             return float((s[0] / s[-1]) ** 2) if s.size else np.nan
 
     @property
     def untold(self) -> list[dict[str, float]]:
-        """Directions that the data do not tell, each by the share of each parameter."""
+        """The directions that the data do not determine: their components by parameter name."""
         rows = self.directions[self.singular_values <= 1 / VAGUE]
         return [
             {name: float(x) for name, x in zip(self.names, row, strict=True) if abs(x) > 0.05}
@@ -135,74 +142,79 @@ class Identified:
 
 
 def identify(
-    simulate: Callable[..., Any],
+    simulate: Callable[..., PyTree],
     params: PyTree,
     data: PyTree,
     *,
     noise: PyTree = None,
-    positive: Any = (),
-    bounds: Any = None,
+    positive: PyTree = (),
+    bounds: Bounds = None,
     nodes: PyTree = None,
     continuity: float = 1e-3,
     steps: int = 50,
     restarts: int = 1,
-    spread: Any = 0.0,
-    key: Any = None,
+    spread: Scalar | Mapping[str, Scalar] = 0.0,
+    key: Array | None = None,
     checkpoint: str | Path | None = None,
     progress: bool | None = None,
 ) -> Identified:
-    """The parameters whose simulation is nearest to a recording, by damped Gauss–Newton steps.
+    """Fits the parameters of a simulation to recorded data, by damped Gauss–Newton steps.
 
-    argmin Σ ((simulate(params) − data) / noise)², with derivatives in forward mode: for up to some
-    tens of parameters. For more, `tune` a loss by `losses.tracking`.
+    Minimizes Σ ((simulate(params) − data) / noise)², with derivatives by forward mode. It is
+    suitable for up to some tens of parameters. For more, use `jc.tune` with
+    `jc.learning.losses.tracking`.
 
-    A fit of a long oscillation has local minima. If the residuals exceed their noise, a second fit
-    goes from the start through longer and longer parts of the recording. The better one counts.
-    Time is taken to be the longest axis of each leaf of the data.
+    The fit of a long oscillation has local minima. If the residuals exceed the noise, a second fit
+    begins at the same start and covers longer and longer parts of the recording. The better fit is
+    returned. The longest axis of each leaf of the data is taken as time.
 
-    Recordings longer than the motion can be foreseen, or so long that the least of the sum is hard
-    to reach, are cut into stretches (multiple shooting). Their first states, the nodes, are unknown
-    too, and the end of each stretch must meet the next node.
+    For long or chaotic recordings, use multiple shooting: cut the recording into segments, called
+    stretches. The initial state of each stretch, called its node, is estimated too. The end of each
+    stretch must match the next node.
+
+    A keyboard interrupt or a machine error stops the search, and the best result so far is
+    returned.
 
     Args:
-        simulate: params → predictions; with nodes (params, node) → predictions of one stretch and
-            its end, in the structure of a node. Trouble on the way should show as NaN
-            (`losses.unless_failed`).
-        params: the start; leaves as of `tune`.
-        data: what was recorded, in the structure of the predictions, NaN or masked where nothing
-            was seen; with nodes an axis of stretches comes first.
-        noise: standard deviation of the data, a number or a pytree whose leaves broadcast to those
-            of the data; estimated from what remains unless given.
-        positive: as of `tune`.
-        bounds: as of `tune`.
-        nodes: first guesses of the states at the nodes, with a first axis of stretches. Minimal
-            coordinates, such as angles and rates, so that every value is a state.
-        continuity: standard deviation by which an end may miss the next node, in its units.
-        steps: at most so many for each fit; with nodes there is one for each decade by which ends
-            come closer to them, and without one for each part of the recording.
-        restarts: how many starts are searched in one batch; the first is the one given, and all
-            have the same nodes.
-        spread: as of `tune`, of the parameters of other starts.
-        key: of random numbers for them.
-        checkpoint: a file that is written after each step. Where it exists the search goes on from
-            it, with the very numbers of a search that was not interrupted. Without nodes more steps
-            may be asked of it.
-        progress: whether a bar is shown; None is in terminals and notebooks.
-
-    An interrupt from the keyboard, or an error of the machine, ends the search with what was found.
+        simulate: function from params to predictions of the data. With nodes, a function from
+            (params, node) to the predictions for one stretch and its end state, in the structure of
+            a node. Predictions should be NaN after a failure; see
+            `jc.learning.losses.unless_failed`.
+        params: the initial parameters; leaves as in `jc.tune`.
+        data: the recorded data, in the structure of the predictions; NaN or masked where missing.
+            With nodes, all leaves have a first axis of stretches.
+        noise: standard deviation of the data: a number, or a pytree whose leaves broadcast to those
+            of the data. By default it is estimated from the residuals.
+        positive: parameters that must stay positive; see `jc.tune`.
+        bounds: bounds of the parameters; see `jc.tune`.
+        nodes: initial guesses of the nodes, with a first axis of stretches. Use minimal coordinates
+            such as angles and rates, so that any values are a valid state.
+        continuity: allowed standard deviation between the end of a stretch and the next node, in
+            units of the node.
+        steps: maximum number of steps of each fit. With nodes, there is one fit for each factor of
+            ten by which the gaps between stretches shrink. Without nodes, there is one fit for each
+            part of the recording.
+        restarts: number of starts, run in one batch. The first start is `params`. All starts have
+            the same nodes.
+        spread: standard deviation of the random starts around `params`; see `jc.tune`.
+        key: random key for the random starts.
+        checkpoint: path of a file that is written after each step. If it exists, the search resumes
+            from it and gives the same numbers as an uninterrupted search. Without nodes, `steps`
+            may be increased.
+        progress: True shows a progress bar, False none; None shows one in terminals and notebooks.
 
     Returns:
-        An `Identified`, of the start that led to the least.
+        An `Identified`, from the start with the smallest sum of squares.
 
     Raises:
-        ValueError: predictions, data and noise do not fit, unknown names, a start out of its
-            bounds, residuals that are finite at no start, or a checkpoint of another search, or
-            where none can be written.
-        TypeError: `simulate` is no function, or one of other arguments.
+        ValueError: predictions, data and noise do not fit each other; a name is unknown; the
+            initial parameters are out of bounds; the residuals are finite at no start; or the
+            checkpoint belongs to another search or cannot be written.
+        TypeError: `simulate` is not a function, or has a wrong signature.
 
     References:
-        Bock, Recent advances in parameter identification techniques for ODE (1983).
-        Nocedal, Wright, Numerical Optimization (2006), section 10.3.
+        Bock, Recent advances in parameter identification techniques for ODE (1983). Nocedal,
+        Wright, Numerical Optimization (2006), section 10.3.
     """
     checks.count("identify", "steps", steps)
     checks.count("identify", "restarts", restarts)
@@ -220,26 +232,26 @@ def identify(
         raise ValueError(f"identify: data hold no array, got {data!r}.")
     data = jax.tree.map(lambda x: checks.recorded("identify", "data", x), data)
     space = space_of(params, positive, bounds, "identify")
-    own = space.encode(params)
-    batch = scattered(space, own, restarts, spread, key, "identify")
-    problem = Stretches(simulate, space, _scale(space, space.flatten(own)), data, noise, nodes)
+    start = space.encode(params)
+    batch = scattered(space, start, restarts, spread, key, "identify")
+    problem = Stretches(simulate, space, _scale(space, space.flatten(start)), data, noise, nodes)
     if not problem.observed:
         raise ValueError("identify: the data are NaN throughout: no number was seen.")
     starts = np.asarray(jax.vmap(space.flatten)(batch) / problem.scale[None])
     searches = [Attempt(problem, x, continuity, steps) for x in starts]
-    save = remembered(problem, searches, file) if file is not None else _ignore
-    found = searched(problem, searches, save, progress)
-    ends = np.array([np.inf if end is None else end.cost for end in found])
-    best = found[int(np.argmin(ends))]
+    save = remembered(problem, searches, file) if file is not None else lambda: None
+    ends = searched(problem, searches, save, progress)
+    costs = np.array([np.inf if end is None else end.cost for end in ends])
+    best = ends[int(np.argmin(costs))]
     assert best is not None
-    return _report(problem, best, continuity, ends)
+    return _report(problem, best, continuity, costs)
 
 
 def _check_nodes(nodes: PyTree) -> None:
-    """Checks that there is one first guess for each stretch.
+    """Checks the initial guesses of the nodes.
 
     Raises:
-        ValueError: they are no arrays of real and finite numbers with one first axis.
+        ValueError: the nodes are not arrays of finite real numbers with a common first axis.
     """
     leaves = [jnp.asarray(checks.check("identify", "nodes", x)) for x in jax.tree.leaves(nodes)]
     if nodes is not None and not leaves:
@@ -253,34 +265,31 @@ def _check_nodes(nodes: PyTree) -> None:
         )
 
 
-def _ignore() -> None:
-    """Does nothing: no checkpoint was asked for."""
-
-
 def _scale(space: Space, y: Array) -> Array:
-    """Divisors of coordinates: 1 for logarithms and for starts near 0, else |y|."""
-    none = jnp.abs(y) <= float(jnp.finfo(y.dtype).eps) ** 0.5
-    return jnp.where(space.logarithms | none, 1, jnp.abs(y))
+    """Returns the divisors of search coordinates y: 1 for logarithms and near 0, otherwise |y|."""
+    near_zero = jnp.abs(y) <= float(jnp.finfo(y.dtype).eps) ** 0.5
+    return jnp.where(space.logarithms | near_zero, 1, jnp.abs(y))
 
 
 def _report(problem: Stretches, end: End, continuity: float, ends: np.ndarray) -> Identified:
-    """The result of the best fit, with errors of parameters for free nodes.
+    """Converts the best fit to an `Identified`. Nodes count as unknown in the errors of parameters.
 
     Args:
-        problem: the recording.
-        end: of the best start.
-        continuity: as of `identify`.
-        ends: as of `Identified`.
+        problem: the least-squares problem of the recording.
+        end: the final fit of the best start.
+        continuity: allowed standard deviation of the gaps, as in `identify`.
+        ends: final costs of all starts, as in `Identified`.
     """
-    fit, own = end
+    fit, noise = end
     space, scale, p = problem.space, np.asarray(problem.scale), problem.scale.size
-    precision, free = problem.told(own), fit.free[:p]
+    precision, free = problem.data_precision(noise), fit.free[:p]
     J = problem.condensed(fit.jacobian, continuity)
-    left = remaining(problem, fit, J, own)
+    left = remaining(problem, fit, J, noise)
     unit = np.where(space.logarithms, 1, np.maximum(np.abs(fit.z[:p]), 1))
-    s, V = told(J[:, :p][:, free], J[:, p:], unit[free], precision)
+    s, V = singular_directions(J[:, :p][:, free], J[:, p:], unit[free], precision)
     if problem.noise is None:
-        left = float(np.maximum(left, problem.rounding / own))  # of data that are met exactly, too
+        # even data that are fitted exactly have rounding errors
+        left = float(np.maximum(left, problem.rounding / noise))
         with np.errstate(divide="ignore"):
             s = np.where(s > 0, s / left, 0)
     y = space.split(jnp.asarray(fit.z[:p] * scale, problem.scale.dtype))
@@ -292,7 +301,7 @@ def _report(problem: Stretches, end: End, continuity: float, ends: np.ndarray) -
         params=space.decode(y),
         errors=_errors(space, y, deviation),
         nodes=problem.restore(fit.z[p:]),
-        noise=left * (own if problem.noise is None else 1.0),
+        noise=left * (noise if problem.noise is None else 1.0),
         observed=problem.observed,
         names=names,
         bounded=tuple(name for name, off in zip(names, free, strict=True) if not off),
@@ -305,7 +314,7 @@ def _report(problem: Stretches, end: End, continuity: float, ends: np.ndarray) -
 
 
 def _stopped(problem: Stretches, end: End) -> str:
-    """The reason for the end, and a warning if noise does not explain the residuals."""
+    """Returns why the search ended, with a warning if noise cannot explain the residuals."""
     fit, noise = end
     if fit.broken or not unexplained(problem, end):
         return fit.stopped
@@ -320,16 +329,24 @@ def _stopped(problem: Stretches, end: End) -> str:
 
 
 def _errors(space: Space, y: tuple[Array, ...], deviations: np.ndarray) -> PyTree:
-    """Standard deviations like the parameters; d x = x d log x for positive ones."""
-    own = space.split(jnp.asarray(deviations, y[0].dtype))
+    """Returns standard deviations in the structure of the parameters.
+
+    For a positive parameter x, they are converted by dx = x d(log x).
+
+    Args:
+        space: map between parameters and search coordinates.
+        y: the final search coordinates.
+        deviations: standard deviations of y, (n,).
+    """
+    leaves = space.split(jnp.asarray(deviations, y[0].dtype))
     factors = [jnp.exp(z) if p else 1.0 for z, p in zip(y, space.positive, strict=True)]
-    nothing = [None if x is None else np.full(np.shape(x), np.nan) for x in space.fixed]
-    errors = [jnp.where(jnp.isinf(d), d, d * f) for d, f in zip(own, factors, strict=True)]
-    return dataclasses.replace(space, fixed=tuple(nothing)).fill(errors)
+    unknown = [None if x is None else np.full(np.shape(x), np.nan) for x in space.fixed]
+    errors = [jnp.where(jnp.isinf(d), d, d * f) for d, f in zip(leaves, factors, strict=True)]
+    return dataclasses.replace(space, fixed=tuple(unknown)).fill(errors)
 
 
 def _scalars(space: Space) -> tuple[str, ...]:
-    """A name for each number."""
+    """Returns the name of each searched number, such as "mass[2]"."""
     names = []
     for name, low in zip(space.names, space.low, strict=True):
         for index in np.ndindex(low.shape):

@@ -1,4 +1,4 @@
-"""Identifiability of some unknowns with others free, and the noise of residuals. Host code."""
+"""Identifiability of parameters while other unknowns are free, and noise estimates. Host code."""
 
 from __future__ import annotations
 
@@ -8,57 +8,72 @@ from jaxcon.learning.least_squares import Fit, Precision
 
 
 def noise_left(fit: Fit, rows: int, observed: int, precision: Precision) -> float:
-    """The root mean square of residuals by degree of freedom; NaN where none is left.
+    """Returns the root mean square residual per degree of freedom; NaN if there is none.
 
-    What the unknowns take from the numbers that were seen is the trace of the projection onto the
-    columns of J, as far as these are independent and off their bounds.
+    The number of degrees of freedom is the number of data minus those that the unknowns absorb. The
+    unknowns absorb the trace of the projection onto the columns of J, restricted to data rows.
+    Unknowns on a bound absorb none.
 
     Args:
-        fit: with its residuals; only the first ones count, others are conditions.
-        rows: how many count.
-        observed: how many of these were seen.
-        precision: of residuals.
+        fit: a fit whose residuals are data rows, followed by continuity rows.
+        rows: the number of data rows.
+        observed: the number of data rows that are not NaN.
+        precision: floating-point precision of the residuals.
     """
     U, *_ = precision.reached(fit.jacobian[:, fit.free])
     freedom = observed - np.sum(U[:rows] ** 2)
     return float(np.linalg.norm(fit.residual[:rows]) / freedom**0.5) if freedom > 0.5 else np.nan
 
 
-def told(
-    own: np.ndarray, others: np.ndarray, unit: np.ndarray, precision: Precision
+def singular_directions(
+    J: np.ndarray, others: np.ndarray, unit: np.ndarray, precision: Precision
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Singular values and directions of what residuals say of some unknowns whatever the others.
+    """Returns singular values and directions of ∂r/∂x, while other unknowns y are free.
 
-    Rank is judged on columns of equal length, since a unit says nothing of what can be told.
+    r are residuals, and x the unknowns of interest.
+
+    The columns of ∂r/∂y are projected out of ∂r/∂x.
 
     Args:
-        own: ∂r/∂x, (m, n).
-        others: by the other unknowns.
-        unit: of x, (n,).
-        precision: of r.
+        J: the Jacobian ∂r/∂x, (m, n).
+        others: the Jacobian ∂r/∂y, (m, k).
+        unit: the unit of each x, (n,).
+        precision: floating-point precision of r.
 
     Returns:
-        Singular values by units, 0 where nothing is told, (n,), and directions of length 1, (n, n).
+        Singular values of J · unit, (n,), 0 for directions that r does not determine; and unit
+        directions as rows, (n, n).
     """
-    n, D = own.shape[1], precision.scale(own)
+    n, D = J.shape[1], precision.scale(J)
     U, *_ = precision.reached(others)
-    alike = own / D
-    _, s, V = np.linalg.svd(_padded(alike - U @ (U.T @ alike)), full_matrices=False)
-    k = int(np.sum(s > precision.tolerance))
-    null, _ = np.linalg.qr((V[k:] / np.where(np.isinf(D), 1, D) / unit).T)
-    own = np.where(np.isinf(D), 0, own - U @ (U.T @ own)) * unit
-    _, s, V = np.linalg.svd(_padded(own - (own @ null) @ null.T), full_matrices=False)
+    # columns of equal length: the rank then does not depend on the units
+    scaled = J / D
+    _, s, V = np.linalg.svd(_padded(scaled - U @ (U.T @ scaled)), full_matrices=False)
+    rank = int(np.sum(s > precision.tolerance))
+    null, _ = np.linalg.qr((V[rank:] / np.where(np.isinf(D), 1, D) / unit).T)
+    J = np.where(np.isinf(D), 0, J - U @ (U.T @ J)) * unit
+    _, s, V = np.linalg.svd(_padded(J - (J @ null) @ null.T), full_matrices=False)
     signs = [np.sign(row[np.abs(row).argmax()]) for row in V]
-    return np.where(np.arange(n) < k, s, 0), V * np.reshape(signs, (n, 1))
+    return np.where(np.arange(n) < rank, s, 0), V * np.reshape(signs, (n, 1))
 
 
 def _padded(J: np.ndarray) -> np.ndarray:
-    """With n rows of zeros, so that there are never fewer rows than columns."""
+    """Appends n rows of zeros, so that J (m, n) has at least as many rows as columns."""
     return np.concatenate([J, np.zeros((J.shape[1], J.shape[1]))])
 
 
 def deviations(s: np.ndarray, V: np.ndarray, tolerance: float) -> np.ndarray:
-    """(Σ (v / s)²)^½ of each unknown; infinite where it has a share in what is not told."""
+    """Returns the standard deviation (Σ (v / s)²)^½ of each unknown, (n,).
+
+    The sum is over directions v with singular values s.
+
+    It is infinite if the unknown takes part in a direction with s = 0.
+
+    Args:
+        s: singular values, (k,).
+        V: directions v as rows, (k, n).
+        tolerance: an unknown takes part in a direction if its component |v| is larger.
+    """
     shares = (s[:, None] != 0) | (np.abs(V) > tolerance)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.sqrt(np.sum(np.where(shares, V / s[:, None], 0) ** 2, axis=0))

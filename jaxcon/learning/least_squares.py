@@ -1,36 +1,53 @@
-"""Levenberg–Marquardt on the host: few unknowns, residuals and Jacobian from a jitted call."""
+"""Levenberg–Marquardt on the host, for few unknowns. A caller evaluates residuals and Jacobians."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
-from jaxcon.core.ends import ENDS, words
+from jaxcon.core.interrupts import STOP_EXCEPTIONS, describe_error
+
+Values: TypeAlias = tuple[np.ndarray, np.ndarray]
+"""The residual r, (m,), and the Jacobian J = ∂r/∂z, (m, n), at one point."""
+
+
+class FitOutcome(Protocol):
+    """The result of a search run by `side_by_side`."""
+
+    @property
+    def broken(self) -> bool:
+        """True if an interrupt or a machine error stopped the search."""
+        ...
+
+
+P = TypeVar("P")
+V = TypeVar("V")
+R = TypeVar("R", bound=FitOutcome)
 
 CONVERGED = "converged"
 EVERY_STEP = "every step was taken before it converged"
 START = 1e-3
-"""μ at the start."""
+"""The initial Levenberg–Marquardt damping μ."""
 FAINT = 8
-"""Columns of J shorter than this many roundings of the predictions count as zero."""
+"""The number of rounding errors of the data below which a column of the Jacobian counts as zero."""
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A minimum of ½ ‖r‖², or the point where the search for it ended.
+    """A minimum of ½ ‖r‖², or the last point of the search for it.
 
     Attributes:
         z: unknowns, (n,).
-        residual: r there, (m,).
-        jacobian: ∂r/∂z there, (m, n).
-        free: which unknowns do not press against a bound, (n,).
+        residual: the residual r at z, (m,).
+        jacobian: ∂r/∂z at z, (m, n).
+        free: mask of the unknowns that do not press against a bound, (n,).
         costs: ½ ‖r‖² at the start and after each step.
-        stopped: why it went no further, in words.
-        broken: True if it was ended from outside.
+        stopped: the reason why the search ended, as text.
+        broken: True if an interrupt or a machine error stopped the search.
     """
 
     z: np.ndarray
@@ -44,11 +61,11 @@ class Fit:
 
 @dataclass(frozen=True)
 class Precision:
-    """The precision of residuals.
+    """The floating-point precision of residuals.
 
     Attributes:
-        tolerance: √ε.
-        size: the norm of what they are the differences of.
+        tolerance: √ε, with the machine epsilon ε.
+        size: the norm of the data. Residuals are differences from data, rounded by ε · size.
     """
 
     tolerance: float
@@ -56,33 +73,37 @@ class Precision:
 
     @property
     def rounding(self) -> float:
-        """ε by the size."""
+        """The rounding error of a residual: machine epsilon ε times the norm of the data."""
         return self.tolerance**2 * self.size
 
     def scale(self, J: np.ndarray) -> np.ndarray:
-        """D, the norms of the columns; infinite where they are rounding alone, (n,)."""
+        """Returns the norms D of the columns of J, (n,). Infinite for mere rounding errors."""
         norms = np.sqrt(np.sum(J * J, axis=0))
         return np.where(norms > FAINT * self.rounding, norms, np.inf)
 
     def reached(self, J: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """J D⁻¹ = U s V as far as its directions are told: (m, k), (k,), (k, n).
+        """Returns the singular value decomposition of J D⁻¹, truncated to its numerical rank k.
 
-        Units do not matter, for they say nothing of what can be told.
+        D are the norms of the columns of J.
+
+        Returns:
+            U (m, k), s (k,) and V (k, n) with J D⁻¹ ≈ U diag(s) V.
         """
+        # columns of equal norm, so that the rank does not depend on the units of the unknowns
         U, s, V = np.linalg.svd(J / self.scale(J), full_matrices=False)
         k = int(np.sum(s > self.tolerance * np.max(s, initial=0)))
         return U[:, :k], s[:k], V[:k]
 
 
 @dataclass(frozen=True)
-class Progress:
-    """The state of a fit: enough to resume it with identical numbers.
+class FitProgress:
+    """The state of a fit. A fit resumed from it gives identical numbers.
 
     Attributes:
         z: unknowns, (n,).
-        damping: μ.
-        costs: ½ ‖r‖² at the start and after each step; empty before the start was looked at.
-        stopped: why it goes no further, in words; empty while it does.
+        damping: the damping μ.
+        costs: ½ ‖r‖² at the start and after each step; empty before the start is evaluated.
+        stopped: the reason why the fit ended, as text; empty while it runs.
     """
 
     z: np.ndarray
@@ -91,142 +112,164 @@ class Progress:
     stopped: str = ""
 
     def goes_on(self, steps: int) -> bool:
-        """True if the fit is not finished and fewer than so many steps were taken."""
+        """Returns True if the fit has neither ended nor taken `steps` steps."""
         return not self.stopped and len(self.costs) <= steps
 
 
 def least_squares(
-    known: Progress,
+    progress: FitProgress,
     limits: tuple[np.ndarray, np.ndarray],
     steps: int,
     precision: Precision,
-    note: Callable[[Progress], None] = lambda known: None,
-    reach: Any = np.inf,
-) -> Generator[np.ndarray, tuple[np.ndarray, np.ndarray], Fit]:
-    """argmin ½ ‖r(z)‖² within limits, by steps −D⁻¹(ĴᵀĴ + μ s₁²)⁻¹ Ĵᵀr, Ĵ = J D⁻¹.
+    note: Callable[[FitProgress], None] = lambda progress: None,
+    reach: np.ndarray | float = np.inf,
+) -> Generator[np.ndarray, Values, Fit]:
+    """Minimizes ½ ‖r(z)‖² over unknowns z within limits, by the Levenberg–Marquardt method.
 
-    It yields points and is sent (r, J) there, so that several can be looked at in one batch; it
-    returns a `Fit`. What ends a search from outside may be thrown into it.
+    This is a generator. It yields a point z, is sent (r, J) at z, and finally returns a `Fit`. The
+    points of several fits can thus be evaluated in one batch. Interrupts and machine errors may be
+    thrown into it.
 
-    D are the norms of the columns. Directions whose singular value is below √ε of the largest are
-    not moved along: the data say nothing of them. Unknowns that press against a bound stay there
-    for a step.
+    A step is −D⁻¹(ĴᵀĴ + μ s₁²)⁻¹ Ĵᵀr. Here D are the norms of the columns of J, and Ĵ = J D⁻¹. s₁
+    is the largest singular value of Ĵ, and μ is the damping. Directions with singular values below
+    √ε s₁ are kept fixed, since the data do not determine them. Unknowns on a bound, which a step
+    would push beyond it, are kept fixed for that step.
 
     Args:
-        known: the start, or how far it came before.
-        limits: (low, high), each (n,).
-        steps: at most so many since the start.
-        precision: of r.
-        note: is told of each step.
-        reach: by how much each unknown may change in one, (n,): a first step by a logarithm leads
-            out of all floating numbers otherwise, where no residual tells the way back.
+        progress: the start, or the state of an interrupted fit.
+        limits: lower and upper bounds of z, (n,) each.
+        steps: maximum number of steps since the start.
+        precision: floating-point precision of r.
+        note: callback that receives the progress after each step.
+        reach: the largest change of each unknown in one step, (n,). It keeps the first step of a
+            logarithm from overflowing, after which the fit could not recover.
 
     References:
         Moré, The Levenberg–Marquardt algorithm: implementation and theory (1978).
     """
-    r, J = yield known.z
-    if not known.costs:
+    r, J = yield progress.z
+    if not progress.costs:
         cost = _cost(r, J)
         stopped = "" if np.isfinite(cost) else _stuck(r, J)
-        known = dataclasses.replace(known, costs=(cost,), stopped=stopped)
-    here, broken = (known, r, J), ""
+        progress = dataclasses.replace(progress, costs=(cost,), stopped=stopped)
+    broken = ""
     try:
-        while here[0].goes_on(steps):
-            here = yield from _step(*here, limits, reach, precision)
-            note(here[0])
-    except ENDS as error:
-        broken = words(error)
-    known, r, J = here
-    stopped = known.stopped or broken or EVERY_STEP
-    return Fit(
-        known.z, r, J, _free(known.z, r, J, limits), np.array(known.costs), stopped, bool(broken)
-    )
+        while progress.goes_on(steps):
+            progress, r, J = yield from _step(progress, r, J, limits, reach, precision)
+            note(progress)
+    except STOP_EXCEPTIONS as error:
+        broken = describe_error(error)
+    z, stopped = progress.z, progress.stopped or broken or EVERY_STEP
+    costs = np.array(progress.costs)
+    return Fit(z, r, J, _free(z, r, J, limits), costs, stopped, bool(broken))
 
 
 def _step(
-    known: Progress, r: np.ndarray, J: np.ndarray, limits: Any, reach: Any, precision: Precision
-) -> Any:
-    """The progress, r and J after a step, which is damped more until it helps."""
-    z, damping = known.z, known.damping
+    progress: FitProgress,
+    r: np.ndarray,
+    J: np.ndarray,
+    limits: tuple[np.ndarray, np.ndarray],
+    reach: np.ndarray | float,
+    precision: Precision,
+) -> Generator[np.ndarray, Values, tuple[FitProgress, np.ndarray, np.ndarray]]:
+    """Takes a step, with more and more damping until it lowers ½ ‖r‖². Returns (progress, r, J)."""
+    z, damping = progress.z, progress.damping
     within = np.maximum(limits[0], z - reach), np.minimum(limits[1], z + reach)
     move = _steps(z, r, J, _free(z, r, J, limits), precision)
     last = _negligible(move(0.0), z, r, J, precision)
     while True:
         ahead = np.clip(z + move(0.0 if last else damping), *within)
-        found = yield ahead
-        cost = _cost(*found)
-        better = cost < known.costs[-1]
+        values = yield ahead
+        cost = _cost(*values)
+        better = cost < progress.costs[-1]
         if better or last or _negligible(ahead - z, z, r, J, precision):
             break
         damping *= 10
-    stopped = CONVERGED if last else "" if better else _stuck(*found)
+    stopped = CONVERGED if last else "" if better else _stuck(*values)
     if not better:
-        return dataclasses.replace(known, stopped=stopped), r, J
+        return dataclasses.replace(progress, stopped=stopped), r, J
     damping = max(damping / 10, precision.tolerance**2)
-    return Progress(ahead, damping, (*known.costs, cost), stopped), *found
+    return FitProgress(ahead, damping, (*progress.costs, cost), stopped), *values
 
 
 def side_by_side(
-    searches: Sequence[Generator[Any, Any, Any]],
-    evaluate: Callable[[dict[int, Any]], dict[int, Any]],
+    searches: Sequence[Generator[P, V, R]],
+    evaluate: Callable[[dict[int, P]], dict[int, V]],
     after: Callable[[], None] = lambda: None,
-) -> list[Any]:
-    """Runs generators in rounds: each yields a point and is sent its evaluation; returns results.
+) -> list[R | BaseException]:
+    """Runs search generators in rounds; the points of a round are evaluated in one batch.
+
+    An interrupt or a machine error in one search stops all searches.
 
     Args:
-        searches: generators; those that were ended from outside return something `broken`.
-        evaluate: points by search → what is found there.
-        after: is called after each round.
+        searches: generators that yield a point and are sent the values at that point.
+        evaluate: function from points to the values at them, both by index of the search.
+        after: callback after each round.
 
     Returns:
-        Results, or the error that a search ended by, unless all did: then it is raised.
-    """
-    results: list[Any] = [None] * len(searches)
-    asked: dict[int, Any] = {}
+        For each search its result, or the exception that ended it.
 
-    def proceed(i: int, how: Callable[..., Any], *given: Any) -> None:
+    Raises:
+        BaseException: the exception of the first search, if every search ended with an exception.
+    """
+    results: dict[int, R | BaseException] = {}
+    points: dict[int, P] = {}
+
+    def proceed(i: int, resume: Callable[[], P]) -> None:
         try:
-            asked[i] = how(*given)
+            points[i] = resume()
             return
         except StopIteration as end:
             results[i] = end.value
-        except (ValueError, *ENDS) as error:
+        except (ValueError, *STOP_EXCEPTIONS) as error:
             results[i] = error
-        asked.pop(i, None)
+        points.pop(i, None)
 
     for i, search in enumerate(searches):
-        proceed(i, next, search)
-    while asked:
+        proceed(i, lambda search=search: next(search))
+    while points:
         try:
-            for i, found in evaluate(asked).items():
-                proceed(i, searches[i].send, found)
+            for i, values in evaluate(points).items():
+                proceed(i, lambda i=i, values=values: searches[i].send(values))
             after()
-            ended = [x for x in results if getattr(x, "broken", False) or isinstance(x, ENDS)]
-        except ENDS as error:
-            ended = [error]
-        if ended:
-            error = ended[0] if isinstance(ended[0], BaseException) else KeyboardInterrupt()
-            for i in list(asked):
-                proceed(i, searches[i].throw, error)
-    if all(isinstance(x, BaseException) for x in results):
-        raise results[0]
-    return results
+            ended = [results[i] for i in sorted(results)]
+            causes = [x for x in ended if _broke(x)]
+        except STOP_EXCEPTIONS as error:
+            causes = [error]
+        if causes:
+            cause = causes[0] if isinstance(causes[0], BaseException) else KeyboardInterrupt()
+            for i in list(points):
+                proceed(i, lambda i=i, cause=cause: searches[i].throw(cause))
+    ordered = [results[i] for i in range(len(searches))]
+    errors = [x for x in ordered if isinstance(x, BaseException)]
+    if len(errors) == len(ordered):
+        raise errors[0]
+    return ordered
+
+
+def _broke(result: FitOutcome | BaseException) -> bool:
+    """Returns True if an interrupt or a machine error stopped the search."""
+    return (
+        isinstance(result, STOP_EXCEPTIONS) if isinstance(result, BaseException) else result.broken
+    )
 
 
 def _cost(r: np.ndarray, J: np.ndarray) -> float:
-    """½ ‖r‖², infinite where it or its derivative is not finite."""
+    """Returns the cost ½ ‖r‖²; infinite if r or J is not finite."""
     return float(r @ r / 2) if np.all(np.isfinite(r)) and np.all(np.isfinite(J)) else np.inf
 
 
 def _stuck(r: np.ndarray, J: np.ndarray) -> str:
-    """The reason why no step helps, from the evaluation at the end of a short one."""
+    """Returns the reason why no step lowers the cost, given r and J after a short step."""
     if np.isfinite(_cost(r, J)):
         return "no step, however short, lowers the sum of squares"
     return "the residuals or their derivatives are not finite around the last point"
 
 
-def _free(z: np.ndarray, r: np.ndarray, J: np.ndarray, limits: Any) -> np.ndarray:
-    """A mask of unknowns that do not press against a bound, (n,)."""
+def _free(
+    z: np.ndarray, r: np.ndarray, J: np.ndarray, limits: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """Returns the mask of unknowns that a descent step does not push beyond a bound, (n,)."""
     (low, high), slope = limits, J.T @ r
     return ~((z <= low) & (slope > 0) | (z >= high) & (slope < 0))
 
@@ -234,7 +277,7 @@ def _free(z: np.ndarray, r: np.ndarray, J: np.ndarray, limits: Any) -> np.ndarra
 def _negligible(
     step: np.ndarray, z: np.ndarray, r: np.ndarray, J: np.ndarray, precision: Precision
 ) -> bool:
-    """True if a step changes r negligibly, or both the unknowns and the predictions."""
+    """Returns True if a step changes r, or both the unknowns and the predictions, negligibly."""
     effect, tolerance = float(np.linalg.norm(J @ step)), precision.tolerance
     short = bool(np.all(np.abs(step) <= tolerance * (1 + np.abs(z))))
     unseen = effect <= max(tolerance * float(np.linalg.norm(r)), precision.rounding)
@@ -244,13 +287,14 @@ def _negligible(
 def _steps(
     z: np.ndarray, r: np.ndarray, J: np.ndarray, free: np.ndarray, precision: Precision
 ) -> Callable[[float], np.ndarray]:
-    """The Levenberg–Marquardt step (n,) as a function of the damping."""
+    """Returns a function from the damping μ to the Levenberg–Marquardt step, (n,)."""
     (U, s, V), D = precision.reached(J[:, free]), precision.scale(J[:, free])
-    along = U.T @ r
+    components = U.T @ r
 
     def step(damping: float) -> np.ndarray:
+        """Returns the step for a damping, (n,); zero for unknowns that are kept fixed."""
         move = np.zeros_like(z)
-        move[free] = -(along * s / (s * s + damping * np.max(s, initial=0) ** 2)) @ V / D
+        move[free] = -(components * s / (s * s + damping * np.max(s, initial=0) ** 2)) @ V / D
         return move
 
     return step

@@ -1,11 +1,11 @@
-"""Leaves of a pytree by name, and the coordinates in which they are searched."""
+"""Named leaves of a pytree, and the search coordinates of parameters."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from fnmatch import fnmatchcase
-from typing import Any
+from typing import Any, TypeAlias, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,25 +14,33 @@ from jax.flatten_util import ravel_pytree
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array, PyTree, Scalar
+
+T = TypeVar("T")
+
+Pair: TypeAlias = tuple[Scalar | None, Scalar | None]
+"""The bounds (low, high) of a leaf; None stands for no bound."""
+Bounds: TypeAlias = Pair | Mapping[str, Pair] | None
+"""The bounds of all leaves, or a mapping from names to bounds; None for no bounds."""
 
 
 @pytree
 class Space:
-    """y ↔ parameters x: y = log x of positive leaves and y = x of others, low ≤ x ≤ high.
+    """The map between parameters x and search coordinates y, with bounds on x.
 
-    Leaves that are no floating numbers are kept as they are.
+    y = log x for positive leaves, and y = x for the others. Leaves without floating-point numbers
+    are constant.
 
     Attributes:
-        fixed: leaves that are not searched, None for those that are.
-        low: of each leaf that is searched, in its shape.
-        high: the same.
-        structure: of the parameters.
-        names: of the leaves that are searched.
-        positive: whether each of them is.
+        fixed: for each leaf its value if it is constant, or None if it is searched.
+        low: lower bounds of the searched leaves, in their shapes.
+        high: upper bounds of the searched leaves, in their shapes.
+        structure: tree structure of the parameters.
+        names: names of the searched leaves.
+        positive: for each searched leaf, True if it must stay positive.
     """
 
-    fixed: tuple[Any, ...]
+    fixed: tuple[Scalar | None, ...]
     low: tuple[Array, ...]
     high: tuple[Array, ...]
     structure: Any = static()
@@ -40,39 +48,39 @@ class Space:
     positive: tuple[bool, ...] = static()
 
     def encode(self, params: PyTree) -> tuple[Array, ...]:
-        """y of parameters."""
-        leaves = jax.tree.leaves(params)
-        found = [x for x, f in zip(leaves, self.fixed, strict=True) if f is None]
-        free = [jnp.asarray(x, jnp.result_type(x)) for x in found]  # of no weak type
+        """Converts parameters to search coordinates y."""
+        leaves = zip(jax.tree.leaves(params), self.fixed, strict=True)
+        # an explicit dtype, so that the arrays are not weakly typed
+        free = [jnp.asarray(x, jnp.result_type(x)) for x, f in leaves if f is None]
         return tuple(jnp.log(x) if p else x for x, p in zip(free, self.positive, strict=True))
 
-    def decode(self, y: tuple[Array, ...]) -> PyTree:
-        """Parameters of y, which lies within the bounds: what exp rounds beyond one is put back."""
+    def decode(self, y: tuple[Array, ...]) -> Any:
+        """Converts y to parameters, clipped to their bounds since exp may round beyond a bound."""
         x = [jnp.exp(z) if p else z for z, p in zip(y, self.positive, strict=True)]
         inside = map(jnp.clip, x, self.low, self.high)
-        # a clip has no derivative at the bound itself, where a search must be able to turn back
+        # straight-through estimator: at a bound, the derivative of clip would be zero
         pairs = zip(x, inside, strict=True)
         return self.fill(
             jnp.where(jnp.isinf(z), c, z + jax.lax.stop_gradient(c - z)) for z, c in pairs
         )
 
-    def fill(self, leaves: Iterable[Any]) -> PyTree:
-        """These in the place of the leaves that are searched."""
+    def fill(self, leaves: Iterable[Array]) -> Any:
+        """Returns the parameters with given values of the searched leaves."""
         free = iter(leaves)
         whole = [next(free) if f is None else f for f in self.fixed]
         return jax.tree.unflatten(self.structure, whole)
 
     def flatten(self, y: Iterable[Array]) -> Array:
-        """All numbers of y in one array."""
+        """Concatenates all numbers of y to one array, (n,)."""
         return jnp.concatenate([jnp.ravel(z) for z in y])
 
     @property
     def logarithms(self) -> np.ndarray:
-        """Which of all numbers of y are logarithms."""
+        """The mask of the numbers in y that are logarithms, (n,)."""
         return np.repeat(self.positive, [x.size for x in self.low])
 
     def split(self, flat: Array) -> tuple[Array, ...]:
-        """y of all its numbers."""
+        """Splits an array of all numbers (n,) into y; inverse of `flatten`."""
         ends = np.cumsum([x.size for x in self.low])[:-1]
         return tuple(
             z.reshape(x.shape).astype(x.dtype)
@@ -80,12 +88,17 @@ class Space:
         )
 
     def clip(self, y: tuple[Array, ...]) -> tuple[Array, ...]:
-        """The nearest y within the bounds."""
+        """Clips search coordinates y to their bounds."""
         limits = zip(y, *self.limits, strict=True)
         return tuple(jnp.clip(z, low, high) for z, low, high in limits)
 
     def free(self, y: tuple[Array, ...], slope: tuple[Array, ...]) -> Array:
-        """A mask of the numbers of y that may follow −slope: on a bound, only back inside, (n,)."""
+        """Returns the mask of numbers in y that a descent step does not push out of bounds, (n,).
+
+        Args:
+            y: search coordinates.
+            slope: gradient of the loss by y; the step is along −slope.
+        """
         sides = zip(y, slope, *self.limits, strict=True)
         return jnp.concatenate(
             [jnp.ravel(jnp.where(g > 0, z > low, z < high) | (g == 0)) for z, g, low, high in sides]
@@ -93,36 +106,36 @@ class Space:
 
     @property
     def limits(self) -> tuple[list[Array], list[Array]]:
-        """The bounds of y."""
-        log = [jnp.log if p else jnp.asarray for p in self.positive]
-        ends = (self.low, self.high)
-        low, high = ([f(x) for f, x in zip(log, end, strict=True)] for end in ends)
-        return low, high
+        """The lower and the upper bounds of y."""
+        maps = [jnp.log if p else jnp.asarray for p in self.positive]
+        low = [f(x) for f, x in zip(maps, self.low, strict=True)]
+        return low, [f(x) for f, x in zip(maps, self.high, strict=True)]
 
 
-def flat(y: PyTree) -> tuple[Array, Any]:
-    """All numbers of a tree in one array of the widest dtype, and what restores the tree."""
+def flat(y: T) -> tuple[Array, Callable[[Array], T]]:
+    """Concatenates a tree to one array in the widest dtype. Also returns the inverse map."""
     with jax.numpy_dtype_promotion("standard"):  # leaves may have several precisions
         return ravel_pytree(y)
 
 
-def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
-    """The coordinates of parameters, checked at the start.
+def space_of(params: PyTree, positive: PyTree, bounds: Bounds, owner: str) -> Space:
+    """Checks initial parameters, and returns the map to their search coordinates.
 
     Args:
-        params: the start.
-        positive: True, a name or names of leaves, or a pytree of bools like the parameters.
-        bounds: None, a pair (low, high), or a mapping from names to pairs.
-        owner: for errors.
+        params: the initial parameters.
+        positive: leaves that must stay positive: True for all, one or several names, or a pytree of
+            bools.
+        bounds: None, a pair (low, high) for all leaves, or a mapping from names to pairs.
+        owner: name of the caller, for error messages.
 
     Raises:
-        ValueError: an unknown name, nothing to search, or a start that is not positive, not finite
-            or out of its bounds.
-        TypeError: they are traced.
+        ValueError: a name is unknown, no leaf can be searched, or a parameter is not finite, not
+            positive or out of bounds.
+        TypeError: the parameters are traced.
     """
-    found, structure = jax.tree_util.tree_flatten_with_path(params)
-    names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in found]
-    leaves = [x for _, x in found]
+    paths, structure = jax.tree_util.tree_flatten_with_path(params)
+    names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in paths]
+    leaves = [x for _, x in paths]
     for name, times in Counter(names).items():
         if times > 1:
             raise ValueError(f"{owner}: {times} leaves of the parameters are named '{name}'.")
@@ -142,17 +155,18 @@ def space_of(params: PyTree, positive: Any, bounds: Any, owner: str) -> Space:
     ends = [_limits(names[i], limits[i], leaves[i], logs[i], owner) for i in searched]
     fixed = tuple(None if f else x for f, x in zip(free, leaves, strict=True))
     low, high = zip(*ends, strict=True)
-    own = tuple(names[i] for i in searched)
-    return Space(fixed, low, high, structure, own, tuple(logs[i] for i in searched))
+    names = [names[i] for i in searched]
+    return Space(fixed, low, high, structure, tuple(names), tuple(logs[i] for i in searched))
 
 
-def _check_numbers(names: list[str], leaves: list[Any], owner: str) -> None:
-    """Checks that there are numbers, and no whole one was written where a real one is meant.
+def _check_numbers(names: list[str], leaves: list[PyTree], owner: str) -> None:
+    """Checks that all leaves are numbers, and no Python or NumPy integers.
 
-    Those that JAX holds, such as the status of a state, are parts of trees that nobody wrote.
+    A user who writes an integer probably means a float. Integer arrays of JAX are allowed, since
+    larger trees contain them, such as the status of a state.
 
     Raises:
-        ValueError: there is something else.
+        ValueError: a leaf is not a number, or is a Python or NumPy integer.
     """
     for name, x in zip(names, leaves, strict=True):
         what = f"'{name}'" if name else "the parameter"
@@ -169,19 +183,25 @@ def _check_numbers(names: list[str], leaves: list[Any], owner: str) -> None:
             )
 
 
-def is_searched(leaf: Any) -> bool:
-    """True if a leaf has floating numbers."""
+def is_searched(leaf: PyTree) -> bool:
+    """Returns True if a leaf has floating-point numbers."""
     return checks.is_floating(leaf)
 
 
-def by_name(values: Mapping[str, Any], names: Iterable[str], default: Any, owner: str) -> list[Any]:
-    """For each name the value of the key that stands for it.
+def by_name(values: Mapping[str, T], names: Iterable[str], default: T, owner: str) -> list[T]:
+    """Looks up a value for each leaf by its name.
 
-    A key is a name, such as "stabilizer/alpha"; the first part of names, "stabilizer"; or a shell
-    pattern, "*/mass". A name itself outranks the others.
+    A key matches a name if it is the name itself ("stabilizer/alpha"), the first part of the name
+    ("stabilizer"), or a shell pattern ("*/mass"). The name itself takes precedence.
+
+    Args:
+        values: values by key.
+        names: names of leaves.
+        default: value for leaves without a matching key.
+        owner: name of the caller, for error messages.
 
     Raises:
-        ValueError: a key stands for nothing, or two for one name.
+        ValueError: a key matches no name, or several keys match one name.
     """
     names = list(names)
     for key in values:
@@ -197,11 +217,16 @@ def by_name(values: Mapping[str, Any], names: Iterable[str], default: Any, owner
 
 
 def _stands_for(key: str, name: str) -> bool:
+    """Returns True if a key matches the name of a leaf; see `by_name`."""
     return key == name or name.startswith(key + "/") or fnmatchcase(name, key)
 
 
-def _flags(positive: Any, params: PyTree, names: list[str], owner: str) -> list[bool]:
-    """The flag of each leaf: True if it is positive."""
+def _flags(positive: PyTree, params: PyTree, names: list[str], owner: str) -> list[bool]:
+    """Returns for each leaf True if it must stay positive.
+
+    Raises:
+        ValueError: `positive` has other values than bools and names, or another structure.
+    """
     chosen = jax.tree.leaves(positive)
     if all(isinstance(x, str) for x in chosen):
         return by_name(dict.fromkeys(chosen, True), names, False, f"{owner}: positive")
@@ -216,14 +241,21 @@ def _flags(positive: Any, params: PyTree, names: list[str], owner: str) -> list[
         ) from error
 
 
-def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Array, Array]:
-    """The bounds of a leaf in its shape.
+def _limits(name: str, pair: Pair, leaf: Scalar, log: bool, owner: str) -> tuple[Array, Array]:
+    """Checks the bounds of a leaf, and returns them in the leaf's shape.
+
+    Args:
+        name: name of the leaf.
+        pair: the user's bounds (low, high).
+        leaf: the initial value of the leaf.
+        log: True if the leaf must stay positive, so that its logarithm is searched.
+        owner: name of the caller, for error messages.
 
     Raises:
-        ValueError: no pair of numbers, or a start beyond them.
+        ValueError: the bounds are not a pair of numbers, or the initial value is not within them.
     """
     what = f"{owner}: '{name}'" if name else f"{owner}: the parameter"
-    start = jnp.asarray(start)
+    start = jnp.asarray(leaf)
     if not np.all(np.isfinite(start)):
         raise ValueError(f"{what} must be finite at the start, got {checks.numerals(start)}.")
     if log and not np.all(np.asarray(start) >= jnp.finfo(start.dtype).tiny):
@@ -238,10 +270,10 @@ def _limits(name: str, pair: Any, start: Any, log: bool, owner: str) -> tuple[Ar
         raise ValueError(
             f"{what} needs bounds (low, high), numbers or arrays {start.shape}, got {pair!r}."
         ) from error
-    if log:  # beyond these exp may round to zero, or to infinity
-        known = jnp.finfo(start.dtype)
-        low = jnp.maximum(low, known.tiny)
-        high = jnp.minimum(high, jnp.maximum(start, known.max / 2))
+    if log:  # beyond these bounds exp may round to zero or to infinity
+        limits = jnp.finfo(start.dtype)
+        low = jnp.maximum(low, limits.tiny)
+        high = jnp.minimum(high, jnp.maximum(start, limits.max / 2))
     if not np.all(np.asarray(low) <= np.asarray(high)):
         raise ValueError(f"{what} needs bounds (low, high) with low ≤ high, got {pair!r}.")
     if not np.all((np.asarray(low) <= start) & (start <= np.asarray(high))):

@@ -1,4 +1,4 @@
-"""What may be made small: functions of what a rollout recorded, to be added as they are.
+"""Loss terms: functions of the quantities that a rollout records. Their sum is a loss.
 
     def record(s, i):
         return jc.position(system, s, "foot"), i.violation, jc.energy(system, s)
@@ -6,13 +6,13 @@
     final, (foot, off, energy) = jc.rollout(system, method, state, None, dt, steps, record=record)
     loss = losses.tracking(foot, wanted) + 0.1 * losses.energy_drift(energy)
 
-`tracking` and `mean_violation` are means, over worlds too where a batch was recorded.
+`tracking` and `mean_violation` are means. For a batch they also average over worlds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -21,26 +21,43 @@ import numpy as np
 from jaxcon.constraints.rows import Violation
 from jaxcon.core import checks, numerics
 from jaxcon.core.status import failed
-from jaxcon.core.typing import Array, PyTree
-from jaxcon.model.state import Energy, State
+from jaxcon.core.typing import Array, PyTree, Scalar
+from jaxcon.system.state import Energy, State
+
+_T = TypeVar("_T")
+
+__all__ = [
+    "tracking",
+    "misfit",
+    "violation",
+    "mean_violation",
+    "energy_drift",
+    "weighted",
+    "unless_failed",
+]
+
+
+def __dir__() -> list[str]:
+    """Lists the public names of this namespace."""
+    return [*__all__]
 
 
 def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
-    """The mean over quantities of ((x − x_ref) / scale)², averaged over time, ().
+    """Returns the mean square tracking error (x − x_ref) / scale over quantities and times, ().
 
     Args:
-        path: arrays of chosen quantities.
-        reference: the same as they should be; NaN or masked where nobody knows.
-        scale: of each quantity: a number, or numbers in the structure of the path, or of its first
-            levels, that broadcast with it.
+        path: the recorded quantities x, a pytree of arrays.
+        reference: the target values x_ref, in the same structure; NaN or masked where unknown.
+        scale: divisor of each quantity: a number, or a pytree whose structure is that of `path` or
+            a prefix of it. Its leaves must broadcast to those of `path`.
 
     Raises:
-        ValueError: path and reference differ in structure or shape, the scale has more numbers, or
-            the reference is NaN throughout or of no real numbers.
+        ValueError: path and reference differ in structure or shape, the scale does not broadcast,
+            or the reference is all NaN or not real.
     """
     reference = _known(reference)
-    known = [x for x in jax.tree.leaves(reference) if jnp.size(x)]
-    if known and checks.is_concrete(known) and all(np.all(np.isnan(x)) for x in known):
+    targets = [x for x in jax.tree.leaves(reference) if jnp.size(x)]
+    if targets and checks.is_concrete(targets) and all(np.all(np.isnan(x)) for x in targets):
         raise ValueError("tracking: the reference is NaN throughout: there is nothing to track.")
     off = jax.tree.leaves(misfit(path, reference, scale))
     means = [
@@ -51,16 +68,16 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
 
 
 def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
-    """(x − x_ref) / scale, and 0 where the reference is NaN.
+    """Returns the scaled errors (x − x_ref) / scale by quantity and time; 0 where x_ref is NaN.
 
     Args:
-        path: arrays of chosen quantities.
-        reference: the same as they should be; NaN or masked where nobody knows.
-        scale: of each quantity, as of `tracking`.
+        path: the recorded quantities x, a pytree of arrays.
+        reference: the target values x_ref, in the same structure; NaN or masked where unknown.
+        scale: divisor of each quantity; see `tracking`.
 
     Raises:
-        ValueError: path and reference differ in structure or shape, the scale has more numbers, or
-            the reference is of no real numbers.
+        ValueError: path and reference differ in structure or shape, the scale does not broadcast,
+            or the reference is not real.
     """
     reference = _known(reference)
     shapes = [jnp.shape(x) for x in jax.tree.leaves(path)]
@@ -78,54 +95,57 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
             f" its first levels, got {checks.described(scale)}."
         ) from error
 
-    def off(x: Any, wanted: Any, width: Any) -> Array:
-        shape, own = jnp.shape(x), jnp.shape(width)
-        if not checks.fits(own, shape):
+    def leaf_misfit(x: Array, target: Scalar, width: Scalar) -> Array:
+        """Returns (x − target) / width of one leaf; 0 where the target is NaN."""
+        shape, given = jnp.shape(x), jnp.shape(width)
+        if not checks.fits(given, shape):
             raise ValueError(
-                f"a scale of shape {own} does not broadcast to what it scales, {shape}."
+                f"a scale of shape {given} does not broadcast to what it scales, {shape}."
             )
-        wanted = jnp.asarray(wanted, x.dtype)
+        target = jnp.asarray(target, x.dtype)
         width = jnp.broadcast_to(jnp.asarray(width, x.dtype), shape)
-        seen = ~jnp.isnan(wanted)
-        return jnp.where(seen, (x - jnp.where(seen, wanted, 0)) / width, 0)
+        known = ~jnp.isnan(target)
+        return jnp.where(known, (x - jnp.where(known, target, 0)) / width, 0)
 
-    return jax.tree.map(off, path, reference, widths)
+    return jax.tree.map(leaf_misfit, path, reference, widths)
 
 
 def _known(reference: PyTree) -> PyTree:
-    """A reference of real numbers, NaN where it is masked."""
+    """Checks that a reference has real numbers, and replaces masked values by NaN."""
     return jax.tree.map(lambda x: checks.recorded("losses", "a reference", x), reference)
 
 
-def violation(off: Violation, dt: Any) -> Array:
-    """log₁₀ of the root mean square of (φ, h φ̇) over rows and time, () [m].
+def violation(off: Violation, dt: Scalar) -> Array:
+    """Returns log₁₀ of the root mean square constraint violation (φ, h φ̇), ().
 
-    For what should be as small as can be: no weight makes it matter less as it falls. Beside a
-    task, `mean_violation` does.
+    The mean is over rows and time; φ is in m, φ̇ in m/s.
+
+    Use it as the only term of a loss: the logarithm weights small and large violations equally. As
+    one of several terms, use `jc.learning.losses.mean_violation`.
 
     Args:
-        off: `info.violation` of each step.
-        dt: h, () [s].
+        off: the recorded `info.violation` of all steps.
+        dt: step size h, () [s].
 
     Raises:
-        ValueError: the scene has no rows.
+        ValueError: the scene has no constraints.
     """
     square = mean_violation(off, dt)
     return jnp.log10(jnp.maximum(square, jnp.finfo(square.dtype).tiny)) / 2
 
 
-def mean_violation(off: Violation, dt: Any) -> Array:
-    """The mean square of (φ, h φ̇) over rows and time, () [m²].
+def mean_violation(off: Violation, dt: Scalar) -> Array:
+    """Returns the mean square of φ plus the mean square of h φ̇, over rows and time, () [m²].
 
-    φ is the error now, h φ̇ the one that it is about to grow by.
+    φ is the current violation, and h φ̇ its predicted change in the next step.
 
     Args:
-        off: `info.violation` of each step.
-        dt: h, () [s].
+        off: the recorded `info.violation` of all steps.
+        dt: step size h, () [s].
 
     Raises:
-        ValueError: the scene has no rows.
-        TypeError: it is no `Violation`.
+        ValueError: the scene has no constraints.
+        TypeError: `off` is not a `Violation`.
     """
     _check("mean_violation", "off", off, Violation, "info.violation of the recorded steps")
     if not off.position.size:
@@ -134,15 +154,18 @@ def mean_violation(off: Violation, dt: Any) -> Array:
     return jnp.mean(off.position**2) + jnp.mean((h * off.velocity) ** 2)
 
 
-def energy_drift(energy: Energy, scale: Any = None) -> Array:
-    """The root mean square over time of (E − E₀) / scale, ().
+def energy_drift(energy: Energy, scale: Scalar | None = None) -> Array:
+    """Returns the root mean square energy change (E − E₀) / scale over time, ().
+
+    E is the total energy, and E₀ its first recorded value.
 
     Args:
-        energy: of each recorded state, its first axis time.
-        scale: [J]; the largest kinetic energy unless given: give one where nothing may move.
+        energy: `jc.energy` of the recorded states; its first axis is time.
+        scale: energy scale [J]; by default the largest kinetic energy. Pass a scale if the system
+            may be at rest.
 
     Raises:
-        TypeError: it is no `Energy`.
+        TypeError: `energy` is not an `Energy`.
     """
     _check("energy_drift", "energy", energy, Energy, "jc.energy(system, state) of recorded states")
     checks.check("energy_drift", "scale", scale, above=0, optional=True)
@@ -151,16 +174,18 @@ def energy_drift(energy: Energy, scale: Any = None) -> Array:
     return numerics.safe_sqrt(jnp.mean(change**2))
 
 
-def weighted(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Σ weight · term, and the terms themselves, as `tune` takes a loss and what goes beside it.
+def weighted(
+    terms: Mapping[str, Array], weights: Mapping[str, Array | float]
+) -> tuple[Array, dict[str, Array]]:
+    """Returns the weighted sum of loss terms, and the terms: the (loss, aux) that `tune` expects.
 
     Args:
-        terms: numbers by name, () each.
-        weights: numbers by the same names.
+        terms: loss terms by name, () each.
+        weights: weights by the same names.
 
     Raises:
-        ValueError: terms and weights have other names, or a term is no single number.
-        TypeError: they have none.
+        ValueError: terms and weights have different names, or a term is not a single number.
+        TypeError: `terms` or `weights` is not a mapping.
     """
     if not (isinstance(terms, Mapping) and isinstance(weights, Mapping)):
         raise TypeError(
@@ -175,40 +200,48 @@ def weighted(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> tuple[An
                 f"weighted: term '{name}' must be one number, got shape {jnp.shape(x)}; take a mean"
                 " or a sum of it."
             )
-    return sum((weights[name] * x for name, x in terms.items()), start=0.0), dict(terms)
+    total: Any = sum((weights[name] * x for name, x in terms.items()), start=0.0)
+    return total, dict(terms)
 
 
-def unless_failed(x: PyTree, state: Any) -> PyTree:
-    """x, and NaN in its place where a world has failed, so that no search goes there.
+def unless_failed(x: _T, state: State) -> _T:
+    """Replaces a loss by NaN in failed worlds, so that a search avoids these parameters.
 
-    A world that failed keeps its last finite state, and what follows from that looks like any
-    number.
+    A failed world keeps its last finite state. A loss computed from that state would look valid.
 
     Args:
-        x: a loss, or predictions. Of a batch, what has its axes first is NaN for the worlds that
-            failed; what does not, such as a mean over worlds, is NaN if one of them has.
-        state: the final one, of a world or a batch.
+        x: a loss, or predictions. For a batch, leaves that begin with the batch axes become NaN for
+            the failed worlds. Other leaves, such as a mean, become NaN if any world has failed.
+        state: the final state of a world or a batch.
 
     Raises:
-        TypeError: it is no `State`.
+        TypeError: `state` is not a `State`.
     """
     _check("unless_failed", "state", state, State, "the state in which a rollout ended")
     bad = failed(state.status)
 
-    def one(y: Any) -> Array:
-        own = jnp.shape(y)[: bad.ndim] == bad.shape
+    def masked(y: Array) -> Array:
+        """Replaces a leaf by NaN in failed worlds."""
+        by_world = jnp.shape(y)[: bad.ndim] == bad.shape
         axes = (*bad.shape, *(1,) * (jnp.ndim(y) - bad.ndim))
-        lost = jnp.reshape(bad, axes) if own else jnp.any(bad)
-        return jnp.where(lost, jnp.nan, y)
+        mask = jnp.reshape(bad, axes) if by_world else jnp.any(bad)
+        return jnp.where(mask, jnp.nan, y)
 
-    return jax.tree.map(one, x)
+    return jax.tree.map(masked, x)
 
 
-def _check(owner: str, what: str, x: Any, kind: type, meant: str) -> None:
-    """Checks that an argument is what a rollout gave.
+def _check(owner: str, what: str, x: Violation | Energy | State, kind: type, expected: str) -> None:
+    """Checks that an argument has the right type.
+
+    Args:
+        owner: name of the function, for the error message.
+        what: name of the argument.
+        x: its value.
+        kind: the right type.
+        expected: description of the right value.
 
     Raises:
-        TypeError: it is of another type.
+        TypeError: the argument has another type.
     """
     if not isinstance(x, kind):
-        raise TypeError(f"losses.{owner}: {what} must be {meant}, got {type(x).__name__}.")
+        raise TypeError(f"losses.{owner}: {what} must be {expected}, got {type(x).__name__}.")

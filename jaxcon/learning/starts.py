@@ -1,35 +1,40 @@
-"""Starts of searches: the one given, and random ones around it."""
+"""Starts of a search: the user's initial parameters, and random ones around them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, Scalar
 from jaxcon.learning.leaves import Space, by_name
 
 
 def scattered(
-    space: Space, y: tuple[Array, ...], restarts: int, spread: Any, key: Any, owner: str
+    space: Space,
+    y: tuple[Array, ...],
+    restarts: int,
+    spread: Scalar | Mapping[str, Scalar],
+    key: Array | None,
+    owner: str,
 ) -> tuple[Array, ...]:
-    """The start and others around it, with a first axis of starts.
+    """Returns a start and random starts around it, with a first axis of starts.
 
     Args:
-        space: of the parameters.
-        y: the start.
-        restarts: how many, the one given included.
-        spread: standard deviation of y, a number or a mapping from names; or arrays that broadcast
-            to the shape of a leaf.
-        key: of random numbers.
-        owner: for errors.
+        space: search coordinates of the parameters, with their bounds.
+        y: search coordinates of the user's start.
+        restarts: number of starts, including the user's start.
+        spread: standard deviation of the random starts in y: a number, an array that broadcasts to
+            each leaf, or a mapping from names to numbers or arrays.
+        key: random key.
+        owner: name of the caller, for error messages.
 
     Raises:
-        ValueError: a deviation that is none or of another shape, or several starts at one place.
+        ValueError: the spread is invalid, has a wrong shape, or is zero although there are several
+            starts.
     """
     values = spread if isinstance(spread, Mapping) else {"*": spread}
     widths = by_name(values, space.names, 0.0, f"{owner}: spread")
@@ -47,6 +52,7 @@ def scattered(
         raise ValueError(
             f"{owner}: restarts from one place find one thing: give spread=, such as 0.5."
         )
+    assert key is not None
     keys = jax.random.split(key, len(batch))
     noise = [
         jax.random.normal(k, x.shape, x.dtype).at[0].set(0)
@@ -56,12 +62,12 @@ def scattered(
     return jax.vmap(space.clip)(tuple(map(jnp.add, batch, noise)))
 
 
-def check_key(key: Any, needed: bool, owner: str) -> None:
-    """Checks that there is a key of random numbers where they are drawn.
+def check_key(key: Array | None, needed: bool, owner: str) -> None:
+    """Checks a random key.
 
     Raises:
-        ValueError: there is none.
-        TypeError: it is something else.
+        ValueError: a key is needed, but none is given.
+        TypeError: `key` is not a key, or is an array of keys.
     """
     if key is None and needed:
         raise ValueError(

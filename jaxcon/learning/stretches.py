@@ -1,4 +1,4 @@
-"""A recording in one stretch or in several: residuals, gaps and their derivatives."""
+"""Residuals of a recording in one or several segments (stretches), and their derivatives."""
 
 from __future__ import annotations
 
@@ -6,38 +6,52 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.stages import Wrapped
 
 from jaxcon.core import checks, functions
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.learning.least_squares import Precision
+from jaxcon.learning.least_squares import Precision, Values
 from jaxcon.learning.leaves import Space
 from jaxcon.learning.losses import misfit
 
 FARTHEST = float(np.log(10.0))
-"""Largest change of a logarithm in a step."""
+"""The largest change of a logarithm in one step of the fit."""
 NEIGHBORS = 16
-"""Least number of differences of neighbors from which their noise is estimated."""
+"""The least number of differences between neighboring data from which noise is estimated."""
+
+Pair: TypeAlias = tuple[Array, Array]
+"""The data residuals and the end state of a segment of the recording, or their derivatives."""
+Point: TypeAlias = tuple[np.ndarray, float, float]
+"""The unknowns, the standard deviation of the gaps, and the factor on the noise of the data."""
 
 
 @dataclass(frozen=True)
 class Stretches:
-    """A recording in one stretch, or in several that begin at nodes.
+    """The least-squares problem of a recording; with nodes, for multiple shooting.
+
+    The recording is cut into segments, called stretches. Each stretch begins at a node, an unknown
+    initial state. The difference between the end of a stretch and the next node, called gap, is a
+    residual. Without nodes there is one stretch and no gap.
+
+    The unknowns are the search coordinates of the parameters, divided by `scale`, followed by all
+    nodes.
 
     Attributes:
-        simulate: as of `identify`.
-        space: of the parameters.
-        scale: of their coordinates, (p,).
-        data, noise: as of `identify`.
-        given: the first guesses of the nodes, None without.
+        simulate: the user's simulation; see `identify`.
+        space: map between parameters and search coordinates.
+        scale: divisors of the search coordinates, (p,).
+        data: the recorded data; see `identify`.
+        noise: standard deviation of the data, or None if it was not given; see `identify`.
+        given: initial guesses of the nodes, with a first axis of stretches; None without nodes.
     """
 
-    simulate: Callable[..., Any]
+    simulate: Callable[..., PyTree]
     space: Space
     scale: Array
     data: PyTree
@@ -46,13 +60,13 @@ class Stretches:
 
     @property
     def nodes(self) -> np.ndarray:
-        """The first guesses, (stretches, n); (1, 0) without nodes."""
+        """Guesses of the segments' initial states, (segments, n); (1, 0) without nodes."""
         if self.given is None:
             return np.zeros((1, 0))
         return np.asarray(jax.vmap(lambda x: ravel_pytree(x)[0])(self.given))
 
     def restore(self, nodes: np.ndarray) -> PyTree:
-        """Numbers of nodes in the structure in which they were given."""
+        """Converts nodes (segments · n,) to the user's structure; None without nodes."""
         if self.given is None:
             return None
         back = ravel_pytree(jax.tree.map(lambda x: x[0], self.given))[1]
@@ -60,11 +74,11 @@ class Stretches:
 
     @cached_property
     def seen(self) -> tuple[PyTree, PyTree]:
-        """Data and the noise of each number, with a first axis of stretches.
+        """The data and the standard deviation of each datum, with a first axis of segments.
 
         Raises:
-            ValueError: the data do not have that axis or are infinite, or the noise does not
-                broadcast with them.
+            ValueError: the data lack this axis or are infinite, or the noise does not broadcast
+                with them.
         """
         data = jax.tree.map(np.asarray, self.data)
         if any(np.any(np.isinf(x)) for x in jax.tree.leaves(data)):
@@ -92,135 +106,154 @@ class Stretches:
 
     @cached_property
     def size(self) -> float:
-        """‖data / noise‖ of what was seen."""
+        """The norm ‖data / noise‖ over all data that are not NaN."""
         pairs = zip(*map(jax.tree.leaves, self.seen), strict=True)
         parts = [np.where(np.isfinite(x), x / w, 0).astype(float) for x, w in pairs]
         return float(np.sqrt(sum(np.sum(x * x) for x in parts)))
 
     @property
     def observed(self) -> int:
-        """The count of numbers in the data that are not NaN."""
+        """The number of data that are not missing (NaN)."""
         return sum(int(np.sum(np.isfinite(x))) for x in jax.tree.leaves(self.data))
 
     @property
     def gaps(self) -> int:
-        """The count of gaps between stretches; they are the last residuals."""
+        """The number of gap residuals: differences between a segment's end and the next start.
+
+        They follow the data residuals.
+        """
         stretches, n = self.nodes.shape
         return (stretches - 1) * n
 
     @property
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """(low, high) of the unknowns; nodes have none."""
+        """Lower and upper bounds of the unknowns; infinite for initial states of segments."""
         low, high = (np.asarray(self.space.flatten(x) / self.scale) for x in self.space.limits)
         none = np.full(self.nodes.size, np.inf)
         return np.append(low, -none), np.append(high, none)
 
     @property
     def reach(self) -> np.ndarray:
-        """The largest change of each unknown in a step."""
+        """The largest allowed change of each unknown in one step of the fit."""
         none = np.full(self.nodes.size, np.inf)
         return np.append(np.where(self.space.logarithms, FARTHEST, np.inf), none)
 
     @property
     def rounding(self) -> float:
-        """The typical rounding error of a number in the data."""
+        """The typical rounding error of one datum."""
         spacing = float(jnp.finfo(self.scale.dtype).eps)
         return spacing * self.size / max(self.observed, 1) ** 0.5
 
     @property
     def least(self) -> float:
-        """The rounding error of the data, or 1 if all data are 0."""
+        """The typical rounding error of one datum; 1 if all data are 0."""
         return self.rounding or 1.0
 
     def typical(self, residual: np.ndarray) -> float:
-        """The root mean square of residuals of the data, no less than rounding makes them."""
-        own = residual[: residual.size - self.gaps]
-        return max(float(np.linalg.norm(own)) / max(self.observed, 1) ** 0.5, self.least)
+        """Returns the root mean square data residual, but at least the rounding error `least`."""
+        r = residual[: residual.size - self.gaps]
+        return max(float(np.linalg.norm(r)) / max(self.observed, 1) ** 0.5, self.least)
 
     @cached_property
     def times(self) -> np.ndarray:
-        """The time of each residual of the data as a share of its stretch, (m,).
+        """The time of each data residual, as a share of the duration of its segment, (m,).
 
-        Time is the longest axis of a leaf: the data have no other mark of it.
+        The longest axis of a leaf is taken as time, since the data do not mark the time axis.
         """
         shares = []
         for x in jax.tree.leaves(self.seen[0]):
             shape = x.shape[1:] or (1,)
             axis = int(np.argmax(shape))
             share = np.arange(1, shape[axis] + 1) / max(shape[axis], 1)
-            along = np.expand_dims(share, [i for i in range(len(shape)) if i != axis])
-            shares.append(np.broadcast_to(along, shape).ravel())
+            share = np.expand_dims(share, [i for i in range(len(shape)) if i != axis])
+            shares.append(np.broadcast_to(share, shape).ravel())
         return np.tile(np.concatenate(shares), len(self.nodes))
 
     def observed_until(self, horizon: float) -> int:
-        """The count of numbers seen up to a horizon, a share of the time."""
+        """Returns the number of data up to a time, given as a share of each segment's duration."""
         data = jax.tree.map(lambda x: np.reshape(x, (len(self.nodes), -1)), self.seen[0])
         flat = np.concatenate(jax.tree.leaves(data), axis=1).ravel()
         return int(np.sum(np.isfinite(flat) & (self.times <= horizon)))
 
     def until(self, horizon: float, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals and Jacobian with zero rows for data after a horizon, a share of the time."""
+        """Returns r and J with zero rows for data after a time, a share of the duration."""
         later = np.append(self.times > horizon, np.zeros(self.gaps, bool))
         return np.where(later, 0, r), np.where(later[:, None], 0, J)
 
     def share(self, residual: np.ndarray, noise: float) -> float:
-        """‖residuals‖ / ‖data‖ of the data; 0 if it is below √ε.
+        """Returns ‖data residuals‖ / ‖data‖; 0 if this ratio is below √ε.
 
         Args:
-            residual: r.
-            noise: by which r was divided.
+            residual: all residuals r.
+            noise: the factor by which r is divided.
         """
-        own = noise * float(np.linalg.norm(residual[: residual.size - self.gaps]))
-        return own / self.size if own > self.precision(np.inf).tolerance * self.size else 0.0
+        size = noise * float(np.linalg.norm(residual[: residual.size - self.gaps]))
+        return size / self.size if size > self.precision(np.inf).tolerance * self.size else 0.0
 
     def excess(self, residual: np.ndarray) -> float:
-        """The ratio of the root mean square of residuals to their `scatter`; NaN with that."""
-        own = residual[: residual.size - self.gaps]
-        return float(np.linalg.norm(own)) / max(self.observed, 1) ** 0.5 / self.scatter(residual)
+        """Returns the ratio of the root mean square data residual to its noise, `scatter`.
+
+        It is NaN if the noise is unknown.
+        """
+        r = residual[: residual.size - self.gaps]
+        return float(np.linalg.norm(r)) / max(self.observed, 1) ** 0.5 / self.scatter(residual)
 
     def scatter(self, residual: np.ndarray) -> float:
-        """The standard deviation of the noise in residuals of the data.
+        """Returns the standard deviation of the noise in the data residuals.
 
-        It is 1 if the noise was given. Else it is the root mean square of differences of neighbors
-        over √2: residuals of a wrong motion are smooth, and noise is not. NaN if there are too few.
+        It is 1 if the noise was given. Otherwise it is the root mean square difference between
+        neighboring residuals, divided by √2. This separates noise, which is rough, from errors of
+        the motion, which are smooth. NaN if there are too few neighbors.
 
         References:
             Durbin, Watson, Testing for serial correlation in least squares regression (1950).
         """
         if self.noise is not None:
             return 1.0
-        own = residual[: residual.size - self.gaps].reshape(len(self.nodes), -1)
+        rows = residual[: residual.size - self.gaps].reshape(len(self.nodes), -1)
         data = [np.asarray(x) for x in jax.tree.leaves(self.seen[0])]
         ends = np.cumsum([x[0].size for x in data])[:-1]
-        leaves = zip(np.split(own, ends, axis=1), data, strict=True)
+        leaves = zip(np.split(rows, ends, axis=1), data, strict=True)
         seen = [np.where(np.isfinite(x), r.reshape(x.shape), np.nan) for r, x in leaves]
         return min(_scatters(seen), default=np.nan)
 
     def precision(self, continuity: float, noise: float = 1.0) -> Precision:
-        """The precision of residuals in the dtype in which they are computed."""
+        """Returns the floating-point precision of all residuals, in the dtype of the computation.
+
+        Args:
+            continuity: standard deviation of the gaps.
+            noise: factor by which the noise of the data is multiplied.
+        """
         ends = float(np.linalg.norm(self.nodes)) / continuity
         tolerance = float(jnp.finfo(self.scale.dtype).eps) ** 0.5
         return Precision(tolerance, float(np.hypot(self.size / noise, ends)))
 
-    def told(self, noise: float) -> Precision:
-        """The precision of residuals of the data alone, with gaps as unknowns."""
+    def data_precision(self, noise: float) -> Precision:
+        """Returns the precision of the data residuals alone, for a `condensed` Jacobian."""
         return dataclasses.replace(self.precision(np.inf), size=self.size / noise)
 
     def condensed(self, J: np.ndarray, continuity: float) -> np.ndarray:
-        """J by the parameters, the first node and the gaps g, in place of the other nodes.
+        """Transforms the Jacobian so that gaps g are unknowns, in place of all nodes but the first.
 
-        Node k + 1 is put as e_k(p, x_k) − g_k. The columns of p and x₀ are then those of one motion
-        without gaps, whose weight would hide from a rank what is told of them: of nodes that move
-        along together, gaps leave rounding alone. J stays as it is where one motion cannot be
-        foreseen to √ε.
+        A node is the initial state of a segment. A gap is the difference between a segment's end
+        and the next node.
+
+        Substitutes x_{k+1} = e_k(p, x_k) − g_k for node k + 1, with the end e_k of stretch k. The
+        columns of the parameters p and the first node x₀ then describe one motion without gaps. In
+        the original J, this information is lost in rounding errors, since gaps have large weights.
+        If the motion is too unstable to be predicted to √ε, J is returned unchanged.
+
+        Args:
+            J: Jacobian of all residuals by parameters and nodes, (m, p + stretches · n).
+            continuity: standard deviation by which the gaps in J are divided.
         """
         p, (stretches, n) = self.scale.size, self.nodes.shape
         data, gaps = np.split(J, [len(J) - self.gaps])
         rows = continuity * gaps.reshape(stretches - 1, n, J.shape[1])
         T = np.eye(J.shape[1])
         for k in range(stretches - 1):
-            own, after = (slice(p + i * n, p + (i + 1) * n) for i in (k, k + 1))
-            T[after] = rows[k][:, :p] @ T[:p] + rows[k][:, own] @ T[own] + T[after]
+            node, after = (slice(p + i * n, p + (i + 1) * n) for i in (k, k + 1))
+            T[after] = rows[k][:, :p] @ T[:p] + rows[k][:, node] @ T[node] + T[after]
         if not np.max(np.abs(T), initial=1) * self.precision(np.inf).tolerance < 1:
             return J
         alone = np.zeros_like(gaps)
@@ -228,71 +261,75 @@ class Stretches:
         return np.concatenate([data @ T, alone])
 
     def widths(self, residual: np.ndarray, continuity: float) -> list[float]:
-        """Standard deviations of the gaps by decade, from their size at the start downwards.
+        """Returns standard deviations of the gaps by decade, from their initial size downward.
 
-        A search that had to keep them together from the start would creep along a narrow valley.
+        Each is a tenth of the previous one. If small gaps were required from the start, the search
+        would creep along a narrow valley.
+
+        Args:
+            residual: all residuals r at the start, with gaps that are not scaled.
+            continuity: the final standard deviation.
         """
         gaps = residual[residual.size - self.gaps :]
         missed = np.sqrt(np.sum(gaps**2) / max(self.gaps, 1))
         decades = np.ceil(np.log10(max(missed / continuity, 1)))
         return [continuity * 10.0**k for k in np.arange(decades, -1, -1)]
 
-    def evaluate(
-        self, points: Sequence[tuple[np.ndarray, float, float]]
-    ) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Residuals with the gaps between stretches, and their Jacobian, at several points.
-
-        Args:
-            points: unknowns, the deviation of gaps, and by what the noise of data is multiplied.
-        """
-        x = np.stack([self._begins(z) for z, *_ in points])
-        found = self._derivatives(jnp.asarray(x, self.scale.dtype), *self.seen)
-        host = jax.tree.map(lambda y: np.asarray(y, float), found)
-        each = (jax.tree.map(lambda y, i=i: y[i], host) for i in range(len(points)))
-        return [self._rows(x, own, *p[1:]) for x, own, p in zip(x, each, points, strict=True)]
+    def evaluate(self, points: Sequence[Point]) -> list[Values]:
+        """Returns residuals r (data, then gaps) and their Jacobian J at each of several points."""
+        p, n = self.scale.size, self.nodes.shape[1]
+        starts = np.stack([self._begins(z) for z, *_ in points])
+        batch = self._derivatives(jnp.asarray(starts, self.scale.dtype), *self.seen)
+        (r, end), (by_r, by_end) = jax.tree.map(lambda y: np.asarray(y, float), batch)
+        values = []
+        for i, (_, continuity, noise) in enumerate(points):
+            gap = (end[i, :-1] - starts[i, 1:, p:]) / continuity
+            J = _placed(by_r[i] / noise, by_end[i, :-1] / continuity, p)
+            J[r[i].size :, p + n :] -= np.eye(gap.size) / continuity
+            values.append((np.append(r[i] / noise, gap), J))
+        return values
 
     def program(self, starts: int) -> str:
-        """The lowered program that evaluates this many points, as text."""
+        """Returns the text of the lowered program that evaluates `starts` points."""
         x = jnp.zeros((starts, *self._begins(self.start).shape), self.scale.dtype)
         return self._derivatives.lower(x, *self.seen).as_text()
 
     @property
     def start(self) -> np.ndarray:
-        """Unknowns with zeros for the parameters."""
+        """The unknowns, with zeros for parameters and the given initial states of segments."""
         return np.append(np.zeros(self.scale.size), self.nodes)
 
     def _begins(self, z: np.ndarray) -> np.ndarray:
-        """Parameters and own node of each stretch, (stretches, p + n)."""
+        """Returns the parameters and the initial state of each segment, (segments, p + n).
+
+        Args:
+            z: unknowns, (p + segments · n,).
+        """
         p, (stretches, n) = self.scale.size, self.nodes.shape
         return np.concatenate([np.tile(z[:p], (stretches, 1)), z[p:].reshape(stretches, n)], 1)
 
-    def _rows(self, x: np.ndarray, found: Any, continuity: float, noise: float) -> Any:
-        """Residuals and Jacobian of one point from what its stretches gave."""
-        p, n = self.scale.size, self.nodes.shape[1]
-        (r, end), (by_r, by_end) = found
-        gap = (end[:-1] - x[1:, p:]) / continuity
-        J = _placed(by_r / noise, by_end[:-1] / continuity, p)
-        J[r.size :, p + n :] -= np.eye(gap.size) / continuity
-        return np.append(r / noise, gap), J
-
     @cached_property
-    def _derivatives(self) -> Any:
-        """(residuals, end) of every point and stretch, and both by (parameters, node).
+    def _derivatives(self) -> Wrapped:
+        """The jitted function (x, data, noise) → ((r, end), their Jacobians), by forward mode.
 
-        In forward mode. One program for each recording: what a simulation reads from elsewhere may
-        change between two of them.
+        x are the parameters and the node of each stretch, (points, stretches, p + n). r are its
+        data residuals, and end is its end state.
         """
 
-        def along(x: Array, data: PyTree, noise: PyTree) -> Any:
-            def push(tangent: Array) -> Any:
+        # compiled for each problem, since variables that `simulate` closes over may have changed
+        def linearize(x: Array, data: PyTree, noise: PyTree) -> tuple[Pair, Pair]:
+            """Returns (data residuals, end state) of one segment, and their Jacobians by x."""
+
+            def push(tangent: Array) -> tuple[Pair, Pair]:
+                """Returns data residuals and end state, and their derivatives along a tangent."""
                 return jax.jvp(lambda x: self._stretch(x, data, noise), (x,), (tangent,))
 
             return jax.vmap(push, out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype))
 
-        return jax.jit(jax.vmap(jax.vmap(along), (0, None, None)))
+        return jax.jit(jax.vmap(jax.vmap(linearize), (0, None, None)))
 
-    def _stretch(self, x: Array, data: PyTree, noise: PyTree) -> tuple[Array, Array]:
-        """Residuals and the end of one stretch."""
+    def _stretch(self, x: Array, data: PyTree, noise: PyTree) -> Pair:
+        """Simulates one segment. Returns its data residuals and its end state, as arrays."""
         p = self.scale.size
         params, end = self.space.decode(self.space.split(x[:p] * self.scale)), ()
         if self.given is None:
@@ -301,30 +338,30 @@ class Stretches:
             predicted, end = self._onward(params, x[p:])
         return ravel_pytree(misfit(predicted, data, noise))[0], ravel_pytree(end)[0]
 
-    def _simulated(self, *args: Any) -> Any:
-        """Calls the user's function.
+    def _simulated(self, *args: PyTree) -> Any:
+        """Calls the user's `simulate`.
 
         Raises:
-            TypeError: it returns no arrays, or needs the value of a traced number.
+            TypeError: the function returns no arrays, or needs the value of a traced number.
         """
-        found = functions.call("identify", "simulate", self.simulate, *args)
-        if not jax.tree.leaves(functions.tree("identify", "simulate", found)):
+        result = functions.call("identify", "simulate", self.simulate, *args)
+        if not jax.tree.leaves(functions.tree("identify", "simulate", result)):
             raise TypeError(
                 "identify: simulate must return predictions of the data,"
-                f" {checks.described(self.data)}, got {found!r}; is a return missing?"
+                f" {checks.described(self.data)}, got {result!r}; is a return missing?"
             )
-        return found
+        return result
 
     def _onward(self, params: PyTree, node: Array) -> tuple[PyTree, PyTree]:
-        """Predictions from a node on, and the end.
+        """Simulates one segment from its initial state. Returns the predictions and the end state.
 
         Raises:
-            ValueError: there is no end like a node.
+            ValueError: the function does not return an end in the structure of a node.
         """
         first = jax.tree.map(lambda x: x[0], self.given)
-        found = self._simulated(params, ravel_pytree(first)[1](node))
-        both = isinstance(found, tuple | list) and len(found) == 2
-        predicted, end = found if both else (found, ())
+        result = self._simulated(params, ravel_pytree(first)[1](node))
+        both = isinstance(result, tuple | list) and len(result) == 2
+        predicted, end = result if both else (result, ())
         wanted, got = checks.described(first), checks.described(end)
         if got != wanted:
             raise ValueError(
@@ -335,9 +372,15 @@ class Stretches:
 
 
 def _scatters(residuals: list[np.ndarray]) -> list[float]:
-    """The noise estimated along each axis but the first (stretches), over all leaves.
+    """Estimates noise from differences between neighbors along each axis but the first.
 
-    Axes with fewer than `NEIGHBORS` differences are left out. NaN marks unseen residuals.
+    Axes with fewer than `NEIGHBORS` differences are left out.
+
+    Args:
+        residuals: residuals by leaf of the data, with a first axis of stretches; NaN where missing.
+
+    Returns:
+        One standard deviation per axis.
     """
     scatters = []
     for axis in range(1, max((r.ndim for r in residuals), default=1)):
@@ -350,11 +393,11 @@ def _scatters(residuals: list[np.ndarray]) -> list[float]:
 
 
 def _placed(by_r: np.ndarray, by_end: np.ndarray, p: int) -> np.ndarray:
-    """The Jacobian of all residuals, then all gaps, by parameters and nodes.
+    """Assembles the Jacobian of all data residuals, then all ends, by parameters and nodes.
 
     Args:
-        by_r: residuals of each stretch by (parameters, own node), (stretches, m, p + n).
-        by_end: gaps likewise, (stretches − 1, n, p + n), without the node that they end at.
+        by_r: ∂r/∂(parameters, node) of each stretch, (stretches, m, p + n).
+        by_end: ∂end/∂(parameters, node) of each stretch but the last, (stretches − 1, n, p + n).
         p: number of parameters.
     """
     blocks = []
@@ -363,7 +406,7 @@ def _placed(by_r: np.ndarray, by_end: np.ndarray, p: int) -> np.ndarray:
         block = np.zeros((count, height, p + len(by_r) * (width - p)))
         block[:, :, :p] = rows[:, :, :p]
         for k in range(count):
-            own = p + k * (width - p)
-            block[k, :, own : own + width - p] = rows[k, :, p:]
+            node = p + k * (width - p)
+            block[k, :, node : node + width - p] = rows[k, :, p:]
         blocks.append(block.reshape(count * height, block.shape[2]))
     return np.concatenate(blocks)

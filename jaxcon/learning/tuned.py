@@ -1,13 +1,14 @@
-"""The result of a search by gradients."""
+"""The result of `tune`, and its verdict on convergence."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import numpy as np
 
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array
 from jaxcon.learning.descent import Search, Stop
 from jaxcon.learning.leaves import Space
 
@@ -21,39 +22,41 @@ REASONS = {
 }
 
 CLOSE = 1e-3
-"""Estimated relative distance of every parameter from a minimum below which it converged."""
+"""The relative distance of every parameter to a minimum below which a search has converged."""
 LATE = 0.01
-"""Share of the whole fall of a loss that its second half of steps may have if they were enough."""
+"""The share of the total decrease of the loss below which the second half of the steps is idle."""
 RECENT = 0.1
-"""Share of the steps over which the present progress is measured."""
+"""The share of steps, at the end, over which the current rate of progress is measured."""
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """The best parameters that were found; `print` it.
+    """The best parameters found by `tune`; `print` it for a summary.
 
     Attributes:
-        params: like those given.
-        loss: there; the mean over keys that were held fixed where the loss takes keys.
-        aux: what the loss returned beside it there, with a first axis of keys where it takes some.
-        lost: at how many of those keys the loss is not finite; it is the mean over the others.
-        history: losses by step of the start that led there, (steps,).
-        histories: of every start, (restarts, steps), NaN after its end.
-        steps: how many that start took.
-        best_step: how many steps led to `params`; 0 is the start. Where the loss takes no keys,
-            `history[best_step]` is its loss.
-        refused: how many steps were taken back, since the loss or its gradient was not finite, or
-            the loss far worse than before.
-        converged: whether every parameter is within 0.1 % of a minimum, by the curvature along the
-            last steps: of its size, found or at the start. The minimum may be a local one. False
-            where nothing tells it.
-        stopped: why it took no more, in words.
-        bounded: the names of leaves that lie on a bound, with one of their numbers at least.
+        params: the best parameters, in the structure of the start.
+        loss: the loss at `params`. With samples, it is the mean over a fixed set of keys.
+        aux: auxiliary output of the loss at `params`. With samples, it has a first axis of keys.
+        lost: number of keys at which the loss is not finite. The mean excludes them.
+        history: loss at each step of the search from the best start, (steps,).
+        histories: loss at each step of all searches, (restarts, steps). NaN after a search has
+            ended.
+        steps: number of steps of the search from the best start.
+        best_step: number of steps taken before `params`; 0 is the start. Without samples,
+            `history[best_step]` is `loss`.
+        refused: number of rejected steps, after which the loss or its gradient was not finite, or
+            the loss much larger than before.
+        converged: True if every parameter is within 0.1 % of a minimum, which may be local. The
+            distance is estimated from the curvature of the loss along the last steps. It is
+            relative to the parameter's initial or final magnitude, whichever is larger. False if no
+            estimate is possible.
+        stopped: the reason why the search ended, as text.
+        bounded: names of the leaves with at least one number on a bound.
     """
 
-    params: PyTree
+    params: Any
     loss: float
-    aux: PyTree
+    aux: Any
     lost: int
     history: np.ndarray
     histories: np.ndarray
@@ -66,7 +69,7 @@ class Tuned:
 
     @property
     def table(self) -> dict[str, str]:
-        """The parameters as text, by name of leaf; long arrays by their shape."""
+        """The parameters as text, by name of leaf; long arrays as their shapes."""
         leaves = jax.tree_util.tree_leaves_with_path(self.params)
         named = (
             (jax.tree_util.keystr(k, simple=True, separator="/"), np.asarray(x)) for k, x in leaves
@@ -81,9 +84,9 @@ class Tuned:
         first = f", from {finite[0]:.4g}" if finite.size else ""
         best = f" at step {self.best_step} of {self.steps}"
         lines = [f"loss {self.loss:.4g}{first},{best}: {self.stopped}"]
-        own = {name or "the parameter" for name in self.bounded}
-        ends = {name: ", on its bound" if name in own else "" for name in self.table}
-        lines += [f"  {name} = {x}{ends[name]}" for name, x in self.table.items()]
+        bounded = {name or "the parameter" for name in self.bounded}
+        for name, x in self.table.items():
+            lines.append(f"  {name} = {x}" + ", on its bound" * (name in bounded))
         if len(self.histories) > 1:
             lines.append(f"the best of {len(self.histories)} starts")
         if self.lost:
@@ -100,17 +103,17 @@ class Tuned:
 def result(
     space: Space, starts: tuple[Array, ...], search: Search, losses: np.ndarray, broken: str
 ) -> Tuned:
-    """The result of the best start.
+    """Converts the search from the best start to a `Tuned`.
 
     Args:
-        space: of the parameters.
-        starts: where each search began.
-        search: of all starts.
-        losses: (starts, steps).
-        broken: what ended it from outside, in words.
+        space: map between parameters and search coordinates.
+        starts: initial points, with a first axis of starts.
+        search: final states of all searches, with a first axis of starts.
+        losses: losses by start and step, (starts, steps).
+        broken: description of the interrupt or machine error that stopped the search; or empty.
 
     Raises:
-        ValueError: nothing was found.
+        ValueError: no search has found a finite loss.
     """
     best = search.best
     if not np.any(np.isfinite(best.loss)):
@@ -119,44 +122,39 @@ def result(
             " or try several starts by restarts= and spread=."
         )
     index = int(np.lexsort((best.loss, best.lost))[0])
-    one, start = jax.tree.map(lambda x: x[index], (search, starts))
-    taken, stop = int(one.step), Stop(int(one.stop))
+    search, start = jax.tree.map(lambda x: x[index], (search, starts))
+    best, taken, stop = search.best, int(search.step), Stop(int(search.stop))
     history = losses[index, :taken]
-    outlook = Outlook.of(space, start, one, history)
+    outlook = Outlook.of(space, start, search, history)
     reason = REASONS[stop] + (outlook.words if stop in (Stop.RUNNING, Stop.STALLED) else "")
+    ends = zip(space.names, best.y, *space.limits, strict=True)
     return Tuned(
-        params=space.decode(one.best.y),
-        loss=float(one.best.loss),
-        aux=one.best.aux,
-        lost=int(one.best.lost),
+        params=space.decode(best.y),
+        loss=float(best.loss),
+        aux=best.aux,
+        lost=int(best.lost),
         history=history,
         histories=losses,
         steps=taken,
-        best_step=int(one.best.step),
-        refused=int(one.refused),
+        best_step=int(best.step),
+        refused=int(search.refused),
         converged=outlook.converged,
         stopped=broken if broken and stop == Stop.RUNNING else reason,
-        bounded=_bounded(space, one.best.y),
+        bounded=tuple(name for name, y, low, high in ends if np.any((y <= low) | (y >= high))),
     )
-
-
-def _bounded(space: Space, y: tuple[Array, ...]) -> tuple[str, ...]:
-    """The names of leaves that lie on a bound."""
-    ends = zip(space.names, y, *space.limits, strict=True)
-    return tuple(name for name, z, low, high in ends if np.any((z <= low) | (z >= high)))
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """An estimate of the remaining distance at the end of a search.
+    """An estimate of how far the end of a search is from a minimum.
 
     Attributes:
-        distance: largest relative change of a parameter that is left to a minimum; NaN where the
-            curvature is not known.
-        leaf: name of that parameter.
-        pace: by which the loss fell in each of the last steps.
-        late: share of the fall of the loss in the second half of the steps; NaN where there are
-            too few to tell.
+        distance: estimated relative distance to a minimum, the largest of all parameters; NaN if
+            the curvature is unknown.
+        leaf: name of the parameter with this distance.
+        pace: average decrease of the loss per step over the last steps.
+        late: share of the total decrease of the loss that the second half of the steps achieved;
+            NaN for too few steps.
     """
 
     distance: float
@@ -168,10 +166,10 @@ class Outlook:
     def of(
         cls, space: Space, start: tuple[Array, ...], search: Search, history: np.ndarray
     ) -> Outlook:
-        """The outlook of a search, by the quasi-Newton step from its best point.
+        """Estimates the distance to a minimum by the quasi-Newton step −H⁻¹ g at the best point.
 
-        A slow slide through a valley has a small gradient and hardly lowers the loss; the step
-        −H⁻¹ g is long there none the less, since the curvature is as small.
+        This step reveals slow progress through a narrow valley. There the gradient g is small and
+        the loss hardly decreases. But the curvature is small too, so the step is long.
         """
         steps = space.split(search.ahead)
         leaves = zip(steps, search.best.y, start, space.positive, strict=True)
@@ -183,12 +181,12 @@ class Outlook:
 
     @property
     def converged(self) -> bool:
-        """True where every parameter is close to the minimum; False where that is unknown."""
+        """True if every parameter is close to a minimum; False if the distance is unknown."""
         return self.distance <= CLOSE
 
     @property
     def words(self) -> str:
-        """The estimate in words."""
+        """A description of the estimate, as the end of a sentence."""
         if self.converged:
             return (
                 f", and it converged: within {self.distance:.1e} (relative) of a minimum, possibly"
@@ -217,9 +215,9 @@ class Outlook:
 
 
 def _size(y: Array, start: Array, log: bool) -> np.ndarray | float:
-    """The size to which a change of y is related: 1 for logarithms, else the larger of y and start.
+    """Returns the divisor of a relative change of y: 1 for logarithms, else max(|y|, |start|).
 
-    A start at 0 says nothing of the size, and counts as 1.
+    A start near 0 counts as 1.
     """
     if log:
         return 1.0
@@ -229,7 +227,13 @@ def _size(y: Array, start: Array, log: bool) -> np.ndarray | float:
 
 
 def _pace(history: np.ndarray) -> tuple[float, float]:
-    """The fall of the least loss by step, recently, and its share in the second half of steps."""
+    """Returns `pace` and `late` of an `Outlook`: how fast the lowest loss decreased at the end.
+
+    Both are NaN for fewer than four finite losses.
+
+    Args:
+        history: losses by step.
+    """
     finite = history[np.isfinite(history)]
     if finite.size < 4:
         return np.nan, np.nan

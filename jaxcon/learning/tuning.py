@@ -1,26 +1,27 @@
-"""The least of a loss over any pytree, by gradients. Host code around one jitted scan."""
+"""`tune` minimizes a loss over a pytree by gradients. Host code around a jitted scan."""
 
 from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsIndex, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jax.sharding import Mesh
+from jax.stages import Wrapped
 
 from jaxcon.core import checkpoint as files
 from jaxcon.core import checks
 from jaxcon.core.devices import gathered, over_devices
-from jaxcon.core.ends import ENDS, bar, words
-from jaxcon.core.typing import PyTree
+from jaxcon.core.interrupts import STOP_EXCEPTIONS, describe_error, progress_bar
+from jaxcon.core.typing import Array, PyTree, Scalar
 from jaxcon.learning.descent import Descent, Search, Stop
-from jaxcon.learning.leaves import Space, space_of
+from jaxcon.learning.leaves import Bounds, Space, space_of
 from jaxcon.learning.optimizer import adam, adam_then_newton
 from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.tuned import Tuned, result
@@ -28,7 +29,10 @@ from jaxcon.learning.tuned import Tuned, result
 NEVER = np.iinfo(np.int32).max
 SCHEDULE = "the number of steps, along which the rate of the default optimizer falls"
 PROGRAM = "the loss, its data, the bounds, the optimizer, another option, or the version of jax"
-"""Causes of a different compiled program, for the error message."""
+"""Possible causes of a changed program, for the error message of a checkpoint."""
+
+Course: TypeAlias = tuple[Search, np.ndarray]
+"""The states of all searches, and their losses by step, (restarts, steps)."""
 
 
 def tune(
@@ -37,12 +41,12 @@ def tune(
     *,
     steps: int = 200,
     optimizer: optax.GradientTransformation | None = None,
-    positive: Any = (),
-    bounds: Any = None,
+    positive: PyTree = (),
+    bounds: Bounds = None,
     samples: int = 0,
     restarts: int = 1,
-    spread: Any = 0.0,
-    key: Any = None,
+    spread: Scalar | Mapping[str, Scalar] = 0.0,
+    key: Array | None = None,
     patience: int | None = None,
     tolerance: float = 0.0,
     checkpoint: str | Path | None = None,
@@ -51,63 +55,72 @@ def tune(
     mesh: Mesh | None = None,
     progress: bool | None = None,
 ) -> Tuned:
-    """argmin of a loss over a pytree, or of its expectation E[loss(params, key)].
+    """Minimizes loss(params), or the mean of loss(params, key) over keys, by gradients.
 
-    Leaves are named by their path, "stabilizer/alpha"; the first part of a path names all below it,
-    and patterns such as "*/mass" work. Positive leaves are searched by their logarithm. Bounds are
-    kept by putting each step back to the nearest point within them, so that a loss never sees
-    parameters beyond them and an optimum may lie on one.
+    Leaves of params are named by their path, such as "stabilizer/alpha". The first part of a path
+    stands for all leaves below it, and patterns such as "*/mass" work. For positive leaves, the
+    logarithm is the search coordinate. Steps are clipped to the bounds: the loss is never evaluated
+    out of bounds, and the optimum may lie on a bound.
 
-    The best parameters seen come back, never worse ones than the start. A step is taken back, and
-    tried again with half its length, where the loss or its gradient is not finite, where the loss
-    is a thousand times that before it, or where it rises far above all losses so far. With samples
-    the last two are judged at the ends of chunks. A start is given up after 20 such tries in a row.
-    An interrupt from the keyboard ends the search with what was found. So does an error of the
-    machine after the first chunk.
+    The result is the best evaluated point, never worse than the start. A step is rejected and
+    repeated with half its length if the loss or its gradient is not finite after it. The same
+    happens if the loss grows a thousandfold, or far above all losses so far. With samples, this is
+    checked at the end of each chunk. After 20 rejections in a row a search ends.
 
-    The result says "converged" only where the curvature of the loss along the last steps puts the
-    least within 0.1 % of every parameter. A slow slide through a valley is not taken for it.
+    A keyboard interrupt, or a machine error after the first chunk, stops the search. The best
+    result so far is returned.
+
+    The search has converged only if every parameter is within 0.1 % of a minimum. The distance is
+    estimated from the curvature of the loss along the last steps. Slow progress through a narrow
+    valley therefore does not count as convergence.
 
     Args:
-        loss: params → a scalar, or a scalar and anything else; (params, key) → the same where
-            `samples` is given.
-        params: the start. Bools and whole numbers that JAX holds are kept; those of Python and
-            numpy are refused. What else shall stay is closed over by the loss.
-        steps: at most so many for each start. Each looks at the loss before it moves, so that the
-            first judges the start, and where the last one leads is not seen.
-        optimizer: a transformation of optax, line searches included. By default Adam for the first
-            half of the steps, its rate falling from 0.2 along a cosine: it moves a leaf by n / 20
-            at most, a positive one by the factor exp(n / 20). Then limited-memory quasi-Newton
-            steps within a trust region, which follow narrow valleys. With samples, Adam alone.
-        positive: True, names of leaves, or a pytree of bools like the parameters.
-        bounds: (low, high) for all leaves, or a mapping from names to such pairs; None is no bound.
-        samples: over how many fresh keys each step takes the mean of the loss; the best is then
-            judged at the start and the ends of chunks, by keys that stay the same. Where the loss
-            is finite at most keys, the mean is that over these; but a point at which more are lost
-            is never better. 0 where the loss takes none.
-        restarts: how many starts are searched in one batch; the first is the one given.
-        spread: standard deviation of the others from it, relative for positive leaves; a number, or
-            a mapping from names.
-        key: for samples and starts.
-        patience: a start stops where so many steps brought no progress.
-        tolerance: by how much the loss must fall to make progress.
-        checkpoint: a file that is written after each chunk. Where it exists the search goes on from
-            it, with the very numbers of a search that was not interrupted. More steps may be asked
-            of it with an optimizer of one's own; the rate of the default depends on their number.
-        chunk: steps between two looks at the search: one call of a compiled scan.
-        forward: takes gradients in forward mode, number by number: for few numbers, long rollouts
-            and loops without a reverse mode. A line search still takes its own in reverse.
-        mesh: over whose devices the samples lie in equal parts, or the starts where there are no
-            samples. A loss that takes `jc.over_devices` itself needs none.
-        progress: whether a bar is shown; None is in terminals and notebooks.
+        loss: function from params to a scalar loss, or to (loss, auxiliary output). With `samples`,
+            a function of (params, key).
+        params: the initial parameters. Bools and integer arrays of JAX stay constant; Python and
+            NumPy integers are refused. Let the loss close over other constants.
+        steps: maximum number of steps of each search. A step first evaluates the loss, then moves.
+            Hence the first step evaluates the start, and the point after the last step is not
+            evaluated.
+        optimizer: a transformation of optax; line searches work too. By default, the first half of
+            the steps uses Adam, with a rate that decays from 0.2 along a cosine. In a search of n
+            steps, Adam changes a leaf by at most n / 20. It changes a positive leaf by at most the
+            factor exp(n / 20). The second half uses limited-memory quasi-Newton steps within a
+            trust region, which follow narrow valleys. With samples, the default is Adam alone.
+        positive: leaves that must stay positive: True for all, names of leaves, or a pytree of
+            bools.
+        bounds: a pair (low, high) for all leaves, or a mapping from names to pairs. None in place
+            of `low` or `high` means no bound.
+        samples: number of random keys per step over which the loss is averaged; 0 for a loss
+            without key. Each step uses new keys. The best point is chosen among the start and the
+            ends of chunks, with the same keys for all. Keys with a non-finite loss are excluded
+            from the mean if they are fewer than half. A point with more such keys never counts as
+            better.
+        restarts: number of starts, run in one batch. The first start is `params`.
+        spread: standard deviation of the other starts around `params`: a number, or a mapping from
+            names to numbers. It is relative for positive leaves.
+        key: random key for samples and random starts.
+        patience: number of steps without progress after which a search ends; None never ends it.
+        tolerance: the decrease of the loss that counts as progress.
+        checkpoint: path of a file that is written after each chunk. If it exists, the search
+            resumes from it and gives the same numbers as an uninterrupted search. `steps` may be
+            increased if `optimizer` is given. The rate of the default optimizer depends on `steps`.
+        chunk: number of steps per call of the compiled scan. After each chunk progress is checked.
+        forward: True computes gradients by forward mode, with one pass per parameter. Use it for
+            few parameters, long rollouts, or loops without reverse mode. Line searches still use
+            reverse mode.
+        mesh: devices among which the samples, or without samples the starts, are divided equally.
+            Not needed if the loss itself uses `jc.devices.over_devices`.
+        progress: True shows a progress bar, False none; None shows one in terminals and notebooks.
 
     Returns:
         A `Tuned`.
 
     Raises:
-        ValueError: unknown names, a start out of its bounds, a loss that is finite at no start, or
-            a checkpoint of another search, or where none can be written.
-        TypeError: the loss is no floating scalar, or the optimizer none of optax.
+        ValueError: a name is unknown; the initial parameters are out of bounds; the loss is finite
+            at no start; or the checkpoint belongs to another search or cannot be written.
+        TypeError: the loss is not a floating-point scalar, or the optimizer is not a transformation
+            of optax.
     """
     counts = _counts(steps=steps, samples=samples, restarts=restarts, chunk=chunk)
     steps, samples, restarts, chunk = counts
@@ -122,98 +135,122 @@ def tune(
     _check(loss, optimizer, key, samples, restarts)
     _check_mesh(mesh, samples, restarts)
     file = None if checkpoint is None else files.path(checkpoint, "tune")
-    if checkpoint is None:  # whose chunk stays when it is resumed with more steps
+    if checkpoint is None:  # a checkpoint may be resumed with more steps, but needs the same chunk
         chunk = min(chunk, steps)
     space = space_of(params, positive, bounds, "tune")
     default = optimizer is None
     if default and not samples:
-        own = adam_then_newton(space, steps)
+        stepper = adam_then_newton(space, steps)
     else:
-        own = optax.with_extra_args_support(adam(steps) if optimizer is None else optimizer)
-    descent = Descent(loss, space, own, samples, patience, float(tolerance), forward, mesh)
+        stepper = optax.with_extra_args_support(adam(steps) if optimizer is None else optimizer)
+    descent = Descent(loss, space, stepper, samples, patience, float(tolerance), forward, mesh)
     for_starts, for_samples = (None, None) if key is None else jax.random.split(key)
     starts = scattered(space, space.encode(params), restarts, spread, for_starts, "tune")
     search = jax.vmap(lambda y: descent.start(y, for_samples))(starts)
 
     limit = jnp.asarray(steps, jnp.int32)
     lowered = _scan(descent, chunk).lower(search, limit, for_samples)
-    found = search, np.zeros((restarts, 0), search.mark.dtype)
-    save = _ignore
+    course: Course = search, np.zeros((restarts, 0), search.mark.dtype)
+    save = None
     if file is not None:
         about = _about(space, starts, key, chunk, steps if default else None)
         about[PROGRAM] = files.digest(lowered.as_text())
-        found = files.read(file, found, about, "tune") if file.exists() else found
+        course = files.read(file, course, about, "tune") if file.exists() else course
         save = functools.partial(files.write, file, about)
     compiled = lowered.compile()
 
-    def advance(search: Search) -> Any:
-        # chunks, at whose ends samples are judged, end where they would have without a break
+    def advance(search: Search) -> tuple[Search, Array]:
+        """Runs one chunk of steps, or the rest of an interrupted chunk."""
+        # a resumed search must end its chunks at the same steps as an uninterrupted one
         ahead = (int(jnp.max(search.step)) // chunk + 1) * chunk
         return compiled(search, jnp.asarray(min(ahead, steps), jnp.int32), for_samples)
 
-    found, broken = _loop(advance, found, steps, save, progress, bool(samples))
-    return result(space, starts, found[0], found[1], broken)
+    course, broken = _loop(advance, course, steps, save, progress, bool(samples))
+    return result(space, starts, *course, broken)
 
 
-def _scan(descent: Descent, chunk: int) -> Any:
-    """A chunk of steps of every start, jitted: (search, limit, key) → (search, losses)."""
+def _scan(descent: Descent, chunk: int) -> Wrapped:
+    """Returns a jitted function (search, limit, key) → (search, losses) that runs a chunk."""
     mesh = descent.mesh
 
-    def each(shared: Any, search: Search) -> Any:
+    def run_starts(shared: tuple[Array, Array | None], search: Search) -> tuple[Search, Array]:
+        """Runs a chunk of the searches of one device."""
         limit, key = shared
         return jax.vmap(lambda s: descent.run(s, limit, key, chunk))(search)
 
     @jax.jit
-    def run(search: Search, limit: Any, key: Any) -> Any:
+    def run(search: Search, limit: Array, key: Array | None) -> tuple[Search, Array]:
+        """Runs a chunk of all searches, on the devices of the mesh if there is one."""
         if mesh is None:
-            return each((limit, key), search)
-        apart = each if descent.samples else over_devices(each, mesh)
-        return gathered(apart((limit, key), gathered(search, mesh)), mesh)
+            return run_starts((limit, key), search)
+        divided = run_starts if descent.samples else over_devices(run_starts, mesh)
+        return gathered(divided((limit, key), gathered(search, mesh)), mesh)
 
     return run
 
 
 def _loop(
-    advance: Callable[..., Any],
-    found: Any,
+    advance: Callable[[Search], tuple[Search, Array]],
+    course: Course,
     steps: int,
-    save: Callable[..., None],
+    save: Callable[[Course], None] | None,
     progress: bool | None,
     fresh: bool,
-) -> Any:
-    """Chunks until no start runs: (search, losses), and what ended it before, in words.
+) -> tuple[Course, str]:
+    """Runs chunks until all searches have ended.
 
-    With samples every step has fresh keys, so that one after a step taken back may go on.
+    Args:
+        advance: function that runs one chunk.
+        course: states and losses from which to start or resume.
+        steps: maximum number of steps.
+        save: function that writes a checkpoint; None for no checkpoint.
+        progress: see `tune`.
+        fresh: True if every step draws new samples, so that a repeated step may succeed.
+
+    Returns:
+        The final states and losses; and a description of the interrupt or machine error that
+        stopped the search, or an empty text.
     """
-    done = found[1].shape[1]
+    done = course[1].shape[1]
     try:
-        with bar(progress, total=steps, initial=done, desc="tuning") as seen:
-            while np.any(_running(found[0], steps)):
-                search, losses = jax.block_until_ready(advance(found[0]))
-                taken = int(jnp.max(search.step)) - found[1].shape[1]
-                losses = np.append(found[1], np.asarray(losses)[:, :taken], axis=1)
-                found = search, losses  # at once: an interrupt finds both or neither
-                save(found)
-                seen.update(taken)
-                seen.set_postfix(best=f"{float(jnp.min(search.best.loss)):.4g}", refresh=False)
-                if not (fresh or np.any(np.isfinite(losses))):
-                    break  # each goes back to where it was, which is no better
-    except ENDS as error:
-        if not found[1].size:
-            raise  # there is nothing to be lost
-        return found, words(error)
-    return found, ""
+        with progress_bar(progress, total=steps, initial=done, desc="tuning") as shown:
+            while np.any(_running(course[0], steps)):
+                search, losses = jax.block_until_ready(advance(course[0]))
+                taken = int(jnp.max(search.step)) - course[1].shape[1]
+                history = np.append(course[1], np.asarray(losses)[:, :taken], axis=1)
+                course = search, history  # one assignment: an interrupt sees both or neither
+                if save is not None:
+                    save(course)
+                shown.update(taken)
+                shown.set_postfix(best=f"{float(jnp.min(search.best.loss)):.4g}", refresh=False)
+                if not (fresh or np.any(np.isfinite(history))):
+                    break  # no start is finite, and repeating a step from it changes nothing
+    except STOP_EXCEPTIONS as error:
+        if not course[1].size:
+            raise  # no earlier result would be lost
+        return course, describe_error(error)
+    return course, ""
 
 
 def _running(search: Search, steps: int) -> np.ndarray:
-    """Which starts still take steps."""
+    """Returns the mask of searches that have not ended, (restarts,)."""
     return (np.asarray(search.stop) == Stop.RUNNING) & (np.asarray(search.step) < steps)
 
 
-def _about(space: Space, starts: Any, key: Any, chunk: int, rate: int | None) -> dict[str, Any]:
-    """The properties of a search that must match those in a checkpoint, beside the program.
+def _about(
+    space: Space, starts: tuple[Array, ...], key: Array | None, chunk: int, rate: int | None
+) -> dict[str, object]:
+    """Returns the settings of a search that must match those of a checkpoint, by description.
 
-    `rate` is the length of the default schedule of rates, None for an optimizer of the user.
+    The compiled program is not included.
+
+    Args:
+        space: map between parameters and search coordinates.
+        starts: search coordinates of all starts, with a first axis of starts.
+        key: random key.
+        chunk: number of steps of a chunk.
+        rate: number of steps over which the default optimizer's rate decays; None if the user gave
+            an optimizer.
     """
     shapes = [list(x.shape[1:]) for x in starts]
     return {
@@ -225,27 +262,30 @@ def _about(space: Space, starts: Any, key: Any, chunk: int, rate: int | None) ->
     }
 
 
-def _ignore(found: Any) -> None:
-    """A search that nobody wants on disk."""
-
-
-def _counts(**given: Any) -> list[int]:
-    """Whole numbers of Python.
+def _counts(**given: SupportsIndex) -> list[int]:
+    """Checks counts, and converts them to Python integers.
 
     Raises:
-        ValueError: one is none, or out of range.
+        ValueError: a count is not an integer, or is out of range.
     """
     for what, x in given.items():
         checks.count("tune", what, x, 0 if what == "samples" else 1)
     return [operator.index(x) for x in given.values()]
 
 
-def _check(loss: Any, optimizer: Any, key: Any, samples: int, restarts: int) -> None:
-    """Checks what can be checked before anything is traced.
+def _check(
+    loss: Callable[..., Any],
+    optimizer: optax.GradientTransformation | None,
+    key: Array | None,
+    samples: int,
+    restarts: int,
+) -> None:
+    """Checks the loss, the optimizer and the key before anything is traced.
 
     Raises:
-        ValueError: no key where one is needed.
-        TypeError: no key of random numbers, no optimizer, or a loss of other arguments.
+        ValueError: a key is needed, but none is given.
+        TypeError: the key is not a random key, the optimizer is not a transformation of optax, or
+            the loss has a wrong signature.
     """
     called = hasattr(optimizer, "init") and hasattr(optimizer, "update")
     if optimizer is not None and not called:
@@ -259,11 +299,11 @@ def _check(loss: Any, optimizer: Any, key: Any, samples: int, restarts: int) -> 
 
 
 def _check_mesh(mesh: Mesh | None, samples: int, restarts: int) -> None:
-    """Checks that the devices of a mesh get equal parts.
+    """Checks that samples or starts can be divided equally among the devices of a mesh.
 
     Raises:
-        ValueError: they do not.
-        TypeError: it is no mesh.
+        ValueError: the number of samples or starts is not a multiple of the number of devices.
+        TypeError: `mesh` is not a mesh.
     """
     if mesh is not None and not isinstance(mesh, Mesh):
         raise TypeError(f"tune: mesh must be one of jax.sharding.Mesh, got {mesh!r}.")

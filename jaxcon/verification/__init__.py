@@ -1,7 +1,7 @@
-"""The library held against reference numbers of others: benchmarks, papers and closed forms.
+"""Verification against published reference values: benchmarks, papers and closed-form solutions.
 
 Each case builds a scene through the public interface, simulates it in float64 and compares it with
-numbers from `data/`, which say where they come from. `CASES` names them all and `run` runs them.
+values from `data/`. Each file there names its source. `CASES` lists all cases and `run` runs them.
 """
 
 from __future__ import annotations
@@ -83,20 +83,20 @@ CASES: dict[str, Callable[[], list[Check]]] = {
         gradients.pendulum_gradients,
     )
 }
-"""Every case by name; each returns its checks."""
+"""All cases by name; each returns its checks."""
 
 
 def run(names: Iterable[str] | None = None) -> Iterator[list[Check]]:
     """Runs cases one after the other.
 
     Args:
-        names: of cases; all unless given.
+        names: the names of the cases to run; None runs all cases.
 
     Yields:
-        The checks of each case. A case whose simulation fails has one check, of value NaN.
+        The checks of each case. A case whose simulation fails has one check, with value NaN.
 
     Raises:
-        ValueError: a name is unknown, or JAX is not in double precision.
+        ValueError: a name is unknown, or JAX does not use float64.
     """
     chosen = list(CASES if names is None else names)
     unknown = sorted(set(chosen) - set(CASES))

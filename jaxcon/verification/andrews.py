@@ -1,4 +1,4 @@
-"""Andrews' squeezing mechanism: seven angles, six loop conditions, motion within milliseconds."""
+"""Andrews' squeezing mechanism: seven angles, three closed loops, and a motion of 0.03 s."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.generalized import GeneralizedCoordinates
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, relative, scaled
 from jaxcon.verification.references import column
@@ -16,7 +17,7 @@ from jaxcon.verification.sampling import RK4, sample, solve
 
 
 def mass(q: jax.Array, p: dict[str, Any]) -> jax.Array:
-    """M(q), (7, 7) [kg m²], for q = (β, Θ, γ, Φ, δ, Ω, ε)."""
+    """Returns the mass matrix M(q), (7, 7) [kg m²], at the angles q = (β, Θ, γ, Φ, δ, Ω, ε)."""
     cos, sin = jnp.cos(q), jnp.sin(q)
     e, f = p["e"] - p["ea"], p["zf"] - p["fa"]
     m45 = p["m4"] * (e**2 + p["zt"] * e * sin[3]) + p["i4"]
@@ -40,8 +41,11 @@ def mass(q: jax.Array, p: dict[str, Any]) -> jax.Array:
     return m
 
 
-def force(q: jax.Array, v: jax.Array, t: Any, control: Any, p: dict[str, Any]) -> jax.Array:
-    """f(q, q̇), (7,) [N m]: the driving torque, the spring, and the terms quadratic in q̇."""
+def force(q: jax.Array, v: jax.Array, t: jax.Array, control: None, p: dict[str, Any]) -> jax.Array:
+    """Returns the generalized force f(q, q̇), (7,) [N m].
+
+    It is the sum of the drive torque, the spring force and the terms quadratic in q̇.
+    """
     cos, sin = jnp.cos(q), jnp.sin(q)
     pull, g = spring(q, p), 2
     on_knee = p["m4"] * p["zt"] * (p["e"] - p["ea"]) * cos[3]
@@ -62,7 +66,10 @@ def force(q: jax.Array, v: jax.Array, t: Any, control: Any, p: dict[str, Any]) -
 
 
 def spring(q: jax.Array, p: dict[str, Any]) -> jax.Array:
-    """−c₀ (L − l₀) d/L: the force of the spring on the triangle, whose angle is γ, (2,) [N]."""
+    """Returns the spring force −c₀ (L − l₀) d/L on the triangle with angle γ, (2,) [N].
+
+    Here d is the vector along the spring, L its length, l₀ the rest length and c₀ the stiffness.
+    """
     cos, sin = jnp.cos(q[2]), jnp.sin(q[2])
     d = jnp.stack(
         [
@@ -74,8 +81,11 @@ def spring(q: jax.Array, p: dict[str, Any]) -> jax.Array:
     return -p["c0"] * (length - p["l0"]) / length * d
 
 
-def loops(q: jax.Array, t: Any, p: dict[str, Any]) -> jax.Array:
-    """Three loops close at the common joint of crank and triangle arms, (6,) [m]."""
+def loops(q: jax.Array, t: jax.Array, p: dict[str, Any]) -> jax.Array:
+    """Returns the residuals of three loop closures, (6,) [m].
+
+    All three loops close at the common joint of the crank and the triangle arms.
+    """
     beta, theta, gamma, phi, delta, omega, epsilon = q
     x = p["rr"] * jnp.cos(beta) - p["d"] * jnp.cos(beta + theta)
     y = p["rr"] * jnp.sin(beta) - p["d"] * jnp.sin(beta + theta)
@@ -92,33 +102,34 @@ def loops(q: jax.Array, t: Any, p: dict[str, Any]) -> jax.Array:
     )
 
 
-def andrews(method: jc.Method = RK4) -> tuple[Any, jc.State]:
-    """The mechanism at rest, with SI parameters as leaves of the system.
+def andrews(method: jc.Method = RK4) -> tuple[GeneralizedCoordinates, jc.State]:
+    """Builds the mechanism at rest. Its parameters are leaves of the system, in SI units.
 
     Args:
-        method: with which it will be simulated.
+        method: the method that will simulate the system.
 
     Returns:
-        The system and its first state.
+        The system and its initial state.
 
     References:
         Mazzia, Magherini, Test Set for Initial Value Problem Solvers (2008), problem Andrews.
     """
     data = references.load("ivp_andrews")
     params = {name: jnp.asarray(value) for name, value in data["parameters"].items()}
-    closed = jc.Holonomic(loops, name="loops")
+    closed = jc.joints.Holonomic(loops, name="loops")
     system = jc.GeneralizedSystem(mass=mass, force=force, constraints=(closed,), params=params)
     q, v = (jnp.array(data["initial"][key], float) for key in ("q", "v"))
     return system, jc.init(system, method, q, v)
 
 
 def andrews_squeezer() -> list[Check]:
-    """M(q) a = f(q, q̇) + Jᵀλ to t = 0.03 s; the reference's multipliers have the other sign.
+    """Checks the mechanism to t = 0.03 s: M(q) a = f(q, q̇) + Jᵀλ.
 
-    q is held to the eleven digits that the reference asks for. At 0.03 s some rates are thousands
-    of times smaller than that of the crank, whose error they inherit through the loops; a and λ
-    follow from q and q̇ alone. So these are held to nine digits, and on the way relative to the
-    largest component of each row. The published end state is itself good to 9.6 digits in q.
+    The multipliers of the reference have the opposite sign. The bound on q is eleven digits, as the
+    reference demands. At 0.03 s, some rates are thousands of times smaller than the rate of the
+    crank, and inherit its error through the loops. a and λ depend only on q and q̇. The bounds on
+    q̇, a and λ are therefore nine digits. At earlier times, errors are relative to the largest
+    component of each row. The published final state has 9.6 correct digits in q.
     """
     case, data = "andrews_squeezer", references.load("ivp_andrews")
     rows, published = data["corrected_reference"]["rows"], data["published_reference_t0p03"]
@@ -126,10 +137,10 @@ def andrews_squeezer() -> list[Check]:
     states = sample(system, state, [r["t"] for r in rows], 1.25e-6)
     solutions = solve(system, states)
     a, multipliers = np.asarray(solutions.acceleration), -np.asarray(solutions.multipliers)
-    first = jc.forward_dynamics(system, state, None, RK4, 1e-6)
+    start = jc.forward_dynamics(system, state, None, RK4, 1e-6)
     initial, end = data["initial"], published["values"]
     q, v, n = states.q, states.v, len(rows) - 1
-    vdot12, lam12 = first.acceleration[:2], -first.multipliers[:2]
+    vdot12, lam12 = start.acceleration[:2], -start.multipliers[:2]
     return [
         Check(case, "q at 0.03 s, relative", relative(q[n], rows[n]["q"]), 1e-11),
         Check(case, "q̇ at 0.03 s, relative", relative(v[n], rows[n]["v"]), 1e-9),

@@ -1,28 +1,30 @@
-"""The linearized bicycle, by derivatives of the nonlinear one."""
+"""The linearized bicycle model, obtained by differentiating the nonlinear model."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.polynomial import Polynomial
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.scenes import BICYCLE, bicycle
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error, relative
 
-IDEAL = jc.Method(stabilizer=jc.Unstabilized(), solver=jc.Dense())
+IDEAL = jc.Method(stabilizer=jc.stabilizers.Unstabilized(), solver=jc.solvers.Dense())
 
 
-def rates(system: Any, q: jax.Array, v: jax.Array) -> jax.Array:
-    """(lean rate, steer rate, spin of the rear wheel): linear in v, its coefficients constant.
+def rates(system: BodySystem, q: jax.Array, v: jax.Array) -> jax.Array:
+    """Returns lean rate, steer rate and spin of the rear wheel, (3,) [rad/s], at velocities v.
 
-    The lean rate is that of the frame about its own x axis: the pitch that it leaves out is of
-    second order. The steering axis has the same components in frame and fork.
+    All three are linear in v with constant coefficients. The lean rate is the angular velocity of
+    the frame about its own x axis. This neglects the pitch, which is of second order. The steering
+    axis has the same components in the axes of the frame and of the fork.
     """
     frame, fork, wheel = (
         system.motion(name, q, v).angular_velocity for name in ("frame", "fork", "rear_wheel")
@@ -32,19 +34,24 @@ def rates(system: Any, q: jax.Array, v: jax.Array) -> jax.Array:
     return jnp.stack([frame[0], axis @ (fork - frame), wheel[1]])
 
 
-def velocities(system: Any, q: jax.Array, u: jax.Array) -> jax.Array:
-    """The v that the rows allow and whose rates are u: J v = 0, S v = u."""
-    none = jnp.zeros(system.n_v, q.dtype)
-    jacobian = linearize(system, q, none, jnp.zeros((), q.dtype)).jacobian.dense()
-    select = jax.jacfwd(lambda v: rates(system, q, v))(none)
+def velocities(system: BodySystem, q: jax.Array, u: jax.Array) -> jax.Array:
+    """Returns the velocities v that satisfy the constraints and have the given rates.
+
+    Solves J v = 0 and S v = u. J is the constraint Jacobian, S the matrix of `rates`, and u holds
+    lean rate, steer rate and wheel spin.
+    """
+    zero = jnp.zeros(system.n_v, q.dtype)
+    jacobian = linearize(system, q, zero, jnp.zeros((), q.dtype)).jacobian.dense()
+    select = jax.jacfwd(lambda v: rates(system, q, v))(zero)
     right = jnp.concatenate([jnp.zeros(len(jacobian), q.dtype), u])
     return jnp.linalg.solve(jnp.vstack([jacobian, select]), right)
 
 
-def tangents(system: Any, state: jc.State) -> np.ndarray:
-    """Displacements (n_v, 2) by a unit of lean and of steer that keep the joints and the contacts.
+def tangents(system: BodySystem, state: jc.State) -> np.ndarray:
+    """Returns displacements (n_v, 2) for unit lean and unit steer.
 
-    Where the bicycle stands, how it heads and how its wheels are turned does not matter.
+    They preserve the holonomic constraints. Position, heading and wheel angles of the bicycle are
+    arbitrary.
     """
     rows = linearize(system, state.q, state.v, state.instant)
     held = np.asarray(rows.jacobian.dense())[rows.layout.holonomic]
@@ -54,12 +61,15 @@ def tangents(system: Any, state: jc.State) -> np.ndarray:
 
 
 @jax.jit
-def linearized(system: Any, state: jc.State, along: jax.Array, speed: jax.Array) -> Any:
-    """M, and the derivatives of (lean, steer)¨ by lean and steer and by their rates, at a speed.
+def linearized(
+    system: BodySystem, state: jc.State, along: jax.Array, speed: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns the mass matrix M and the derivatives of the accelerations of lean and steer.
 
-    M = BᵀM B, B the velocities of unit rates of lean and steer. The nonlinear bicycle is put at
-    q(y), y lean and steer, with the velocities that its rows allow there, and its accelerations are
-    differentiated.
+    The derivatives are with respect to y = (lean, steer) and to ẏ, (2, 2) each. M = BᵀM B, where
+    the columns of B are the velocities for unit rates of lean and steer. The function places the
+    nonlinear bicycle at q(y). Its velocities there satisfy the constraints and have a given forward
+    speed. The function then differentiates the accelerations.
     """
 
     def accelerations(y: jax.Array, ẏ: jax.Array) -> jax.Array:
@@ -69,14 +79,17 @@ def linearized(system: Any, state: jc.State, along: jax.Array, speed: jax.Array)
         a = jc.forward_dynamics(system, moved, None, IDEAL, 1e-3).acceleration
         return rates(system, q, a)[:2]
 
-    none = jnp.zeros(2)
+    zero = jnp.zeros(2)
     basis = jax.vmap(lambda u: velocities(system, state.q, u))(jnp.eye(3)[:2])
     mass = basis @ jax.vmap(system.mass(state.q).apply)(basis).T
-    return mass, *jax.jacfwd(accelerations, (0, 1))(none, none)
+    return mass, *jax.jacfwd(accelerations, (0, 1))(zero, zero)
 
 
 def bicycle_linear() -> list[Check]:
-    """M q¨ + v C₁ q̇ + (g K₀ + v² K₂) q = 0 for the lean and steer q of a bicycle.
+    """Checks M q̈ + v C₁ q̇ + (g K₀ + v² K₂) q = 0 for q = (lean, steer) of a bicycle.
+
+    Here v is the forward speed and g the gravitational acceleration. M, C₁, K₀ and K₂ are the
+    matrices of mass, damping and stiffness.
 
     References:
         Meijaard, Papadopoulos, Ruina, Schwab, Linearized dynamics equations for the balance and
@@ -87,56 +100,64 @@ def bicycle_linear() -> list[Check]:
     system, state = bicycle(gravity=g)
     along = jnp.asarray(tangents(system, state))
     speeds = [row["v"] for row in data["eigenvalues"]]
-    found = [linearized(system, state, along, jnp.asarray(float(v))) for v in speeds]
-    mass = np.asarray(found[0][0])
-    stiffness, damping = ([-mass @ np.asarray(f[i]) for f in found] for i in (1, 2))
+    results = [linearized(system, state, along, jnp.asarray(float(v))) for v in speeds]
+    mass = np.asarray(results[0][0])
+    stiffness, damping = ([-mass @ np.asarray(f[i]) for f in results] for i in (1, 2))
     weight = stiffness[0] / g
     matrices = {"M": mass, "C1": damping[1], "K0": weight, "K2": stiffness[1] - stiffness[0]}
     checks = [
-        Check(case, f"{name}, relative to its largest entry", _scaled(got, data[name]), 1e-8)
-        for name, got in matrices.items()
+        Check(
+            case,
+            f"{name}, relative to its largest entry",
+            error(matrix, data[name]) / float(np.max(np.abs(data[name]))),
+            1e-8,
+        )
+        for name, matrix in matrices.items()
     ]
     worst = 0.0
-    for (_, by_place, by_rate), row in zip(found, data["eigenvalues"], strict=True):
+    for (_, by_place, by_rate), row in zip(results, data["eigenvalues"], strict=True):
         matrix = np.block([[np.zeros((2, 2)), np.eye(2)], [by_place, by_rate]])
-        got = np.sort_complex(np.linalg.eigvals(matrix))
+        eigenvalues = np.sort_complex(np.linalg.eigvals(matrix))
         expected = np.sort_complex(np.array(row["eig"]) @ [1, 1j])
-        worst = max(worst, float(np.max(np.abs(got - expected) / np.abs(expected))))
+        worst = max(worst, float(np.max(np.abs(eigenvalues - expected) / np.abs(expected))))
     checks.append(Check(case, "eigenvalues from 0 to 10 m/s, relative", worst, 1e-8))
-    got = stability_speeds(matrices, g)
+    speeds = stability_speeds(matrices, g)
     expected = [data["weave_speed"], data["capsize_speed"]]
     return [
         *checks,
-        Check(case, "weave and capsize speed, relative", relative(got, expected), 1e-8),
+        Check(case, "weave and capsize speed, relative", relative(speeds, expected), 1e-8),
     ]
 
 
-def _scaled(got: np.ndarray, expected: Any) -> float:
-    return error(got, expected) / float(np.max(np.abs(expected)))
-
-
 def stability_speeds(p: dict[str, np.ndarray], g: float) -> list[float]:
-    """Between which speeds all eigenvalues have negative real parts [m/s].
+    """Returns the weave and capsize speeds [m/s].
 
-    The characteristic polynomial a₄ s⁴ + a₃ s³ + a₂ s² + a₁ s + a₀ has coefficients that are
-    polynomials of v. Weave: b a₁ = a₀ a₃² with b = a₂ a₃ − a₄ a₁ (Hurwitz); capsize: a₀ = 0.
+    Between these forward speeds v, all eigenvalues have negative real parts. The characteristic
+    polynomial a₄ s⁴ + a₃ s³ + a₂ s² + a₁ s + a₀ has coefficients that are polynomials in v. Weave
+    starts where b a₁ = a₀ a₃² with b = a₂ a₃ − a₄ a₁ (Hurwitz). Capsize starts where a₀ = 0.
     """
-    v = np.polynomial.Polynomial([0, 1])
+    v = Polynomial([0, 1])
 
-    def entry(i: int, j: int) -> list[Any]:
-        """M s² + v C₁ s + g K₀ + v² K₂, by powers of s."""
-        return [g * p["K0"][i, j] + v**2 * p["K2"][i, j], v * p["C1"][i, j], p["M"][i, j]]
+    def entry(i: int, j: int) -> list[Polynomial]:
+        """Returns the coefficients of s⁰, s¹, s² in an entry of M s² + v C₁ s + g K₀ + v² K₂."""
+        constant = Polynomial([p["M"][i, j]])
+        return [g * p["K0"][i, j] + v**2 * p["K2"][i, j], v * p["C1"][i, j], constant]
 
-    def product(x: list[Any], y: list[Any]) -> list[Any]:
-        return [sum(x[k] * y[n - k] for k in range(3) if 0 <= n - k < 3) for n in range(5)]
+    def product(x: list[Polynomial], y: list[Polynomial]) -> list[Polynomial]:
+        """Returns the coefficients of the product of two quadratic polynomials in s."""
+        terms = ([x[k] * y[n - k] for k in range(3) if 0 <= n - k < 3] for n in range(5))
+        return [sum(products, Polynomial([0])) for products in terms]
 
     diagonal, across = product(entry(0, 0), entry(1, 1)), product(entry(0, 1), entry(1, 0))
     a0, a1, a2, a3, a4 = (x - y for x, y in zip(diagonal, across, strict=True))
     weave = (a2 * a3 - a4 * a1) * a1 - a0 * a3**2
-    return [max(_real(weave)[_real(weave) < max(_real(a0))]), max(_real(a0))]
+    capsize = max(_positive_roots(a0))
+    candidates = _positive_roots(weave)
+    return [max(candidates[candidates < capsize]), capsize]
 
 
-def _real(polynomial: Any) -> np.ndarray:
-    """The positive real roots; a highest coefficient that is rounding would make one far away."""
+def _positive_roots(polynomial: Polynomial) -> np.ndarray:
+    """Returns the positive real roots of a polynomial."""
+    # a leading coefficient of rounding size would add a spurious large root
     roots = polynomial.trim(1e-12 * np.max(np.abs(polynomial.coef))).roots()
     return roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 1e-6)].real

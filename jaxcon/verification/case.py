@@ -1,22 +1,22 @@
-"""One comparison with a reference, and the measures of error used in it."""
+"""`Check`, which compares a computed value with its bound, and measures of error."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
 class Check:
-    """A number of the library held against a bound.
+    """A computed value and the bound that it must not exceed.
 
     Attributes:
-        case: name of the case, as in `CASES`.
-        figure: what is compared, in words.
-        value: what came out, an error unless the figure says otherwise.
-        bound: the largest value that passes; infinite where the figure is only reported.
+        case: the name of the case, as in `CASES`.
+        figure: a description of the value.
+        value: the computed value: an error, unless `figure` says otherwise.
+        bound: the largest value that passes; infinite if the value is only reported.
     """
 
     case: str
@@ -26,41 +26,53 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """value ≤ bound; NaN never passes."""
+        """True if value ≤ bound; NaN never passes."""
         return self.value <= self.bound
 
 
-def error(got: Any, expected: Any) -> float:
-    """max |x − x*|."""
-    return float(np.max(np.abs(_same_shape(got, expected))))
+def error(actual: ArrayLike, expected: ArrayLike) -> float:
+    """Returns the largest absolute error, max |x − x*|, for references x*."""
+    return float(np.max(np.abs(_difference(actual, expected))))
 
 
-def relative(got: Any, expected: Any) -> float:
-    """max |x − x*| / |x*|, component by component."""
-    return float(np.max(np.abs(_same_shape(got, expected) / np.asarray(expected))))
+def relative(actual: ArrayLike, expected: ArrayLike) -> float:
+    """Returns the largest componentwise relative error, max |x − x*| / |x*|, for references x*."""
+    return float(np.max(np.abs(_difference(actual, expected) / np.asarray(expected))))
 
 
-def scaled(got: Any, expected: Any) -> float:
-    """max |x − x*| / max |x*| within each row: for vectors some of whose components vanish."""
+def scaled(actual: ArrayLike, expected: ArrayLike) -> float:
+    """Returns the largest error relative to the largest component of its row.
+
+    For a row x and its reference x*, this is max |x − x*| / max |x*|. Use it for vectors with
+    components that vanish.
+    """
     size = np.max(np.abs(np.asarray(expected)), axis=-1, keepdims=True)
-    return float(np.max(np.abs(_same_shape(got, expected)) / size))
+    return float(np.max(np.abs(_difference(actual, expected)) / size))
 
 
-def up_to_sign(got: Any, expected: Any) -> float:
-    """max min(|q − q*|, |q + q*|) over rows of quaternions: both signs are one orientation."""
-    q, reference = np.asarray(got), np.asarray(expected)
-    both = [np.max(np.abs(_same_shape(s * q, reference)), axis=-1) for s in (1, -1)]
+def up_to_sign(actual: ArrayLike, expected: ArrayLike) -> float:
+    """Returns the largest error over rows of quaternions q, max min(|q − q*|, |q + q*|).
+
+    A quaternion and its negative are the same orientation. q* is the reference.
+    """
+    q, reference = np.asarray(actual), np.asarray(expected)
+    both = [np.max(np.abs(_difference(s * q, reference)), axis=-1) for s in (1, -1)]
     return float(np.max(np.minimum(*both)))
 
 
-def turned(got: Any, expected: Any) -> float:
-    """max |θ − θ*| modulo whole turns [rad]."""
-    difference = _same_shape(got, expected)
+def turned(actual: ArrayLike, expected: ArrayLike) -> float:
+    """Returns the largest error of angles modulo 2π, max |θ − θ*| [rad], for references θ*."""
+    difference = _difference(actual, expected)
     return float(np.max(np.abs(np.angle(np.exp(1j * difference)))))
 
 
-def _same_shape(got: Any, expected: Any) -> np.ndarray:
-    x, reference = np.asarray(got, float), np.asarray(expected, float)
+def _difference(actual: ArrayLike, expected: ArrayLike) -> np.ndarray:
+    """Returns x − x*, the values minus their reference.
+
+    Raises:
+        ValueError: the shapes differ.
+    """
+    x, reference = np.asarray(actual, float), np.asarray(expected, float)
     if x.shape != reference.shape:
         raise ValueError(f"compared with a reference of {reference.shape}, got {x.shape}.")
     return x - reference

@@ -1,6 +1,6 @@
-"""Textbook mechanisms whose accelerations and forces are one line of algebra.
+"""Textbook mechanisms whose accelerations and forces have a one-line closed form.
 
-The rope that goes taut needs an impact law; it is left to the cases with unilateral constraints.
+Ropes stay taut here. A rope that becomes taut needs an impact law, and is an inequality constraint.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, relative
 from jaxcon.verification.nonholonomic import rolling_ball
@@ -23,32 +24,44 @@ forward = jax.jit(jc.forward_dynamics)
 
 
 def constants(name: str) -> dict[str, Any]:
-    """The numbers of one of the mechanisms."""
+    """Returns the reference values of a mechanism by its name."""
     cases = references.load("an_small_closed_forms")["cases"]
     return next(case for case in cases if case["id"] == name)
 
 
-def rope(left: jc.Pose, right: jc.Pose, t: Any, params: Any) -> jax.Array:
-    """y₁ + y₂ = 0: λ is the tension of a rope over a massless pulley."""
+def rope(left: jc.extend.Pose, right: jc.extend.Pose, t: jax.Array, params: None) -> jax.Array:
+    """Returns y₁ + y₂, the residual of a rope over a massless pulley, (1,) [m].
+
+    y₁ and y₂ are the heights of its two weights. The multiplier λ is the tension.
+    """
     return (left.position[1] + right.position[1])[None]
 
 
-def wound(weight: jc.Pose, pulley: jc.Pose, t: Any, lever: Any) -> jax.Array:
-    """y + l θ = 0: a weight on a rope that leaves a pulley on the side of its lever l."""
+def wound(
+    weight: jc.extend.Pose, pulley: jc.extend.Pose, t: jax.Array, lever: jax.Array
+) -> jax.Array:
+    """Returns y + l θ, the residual of a rope that winds onto a pulley, (1,) [m].
+
+    y is the height of the weight on the rope, θ the angle of the pulley and l its lever arm.
+    """
     return (weight.position[1] + lever * pulley.orientation)[None]
 
 
 def atwood() -> list[Check]:
-    """a = (m₁ − m₂) g / (m₁ + m₂ + I/r²) for two weights on a rope over a pulley."""
+    """Checks Atwood's machine: two weights on a rope over a pulley.
+
+    The acceleration is a = (m₁ − m₂) g / (m₁ + m₂ + I/r²). m₁ and m₂ are the masses of the weights,
+    I the inertia of the pulley and r its radius.
+    """
     light, heavy = constants("atwood"), constants("atwood_pulley_inertia")
     scene = two_weights()
-    scene.add(jc.Holonomic(rope, bodies=("left", "right")))
+    scene.add(jc.joints.Holonomic(rope, bodies=("left", "right")))
     fall, tension = solve_one(*scene.build())
     scene, r = two_weights(), 0.2
     scene.add_body("pulley", mass=1.0, inertia=r**2 / 2)
     scene.add(jc.Revolute("axle", jc.WORLD, "pulley", point=(0.0, 0.0)))
-    scene.add(jc.Holonomic(wound, ("left", "pulley"), "left rope", jnp.array(r)))
-    scene.add(jc.Holonomic(wound, ("right", "pulley"), "right rope", jnp.array(-r)))
+    scene.add(jc.joints.Holonomic(wound, ("left", "pulley"), "left rope", jnp.array(r)))
+    scene.add(jc.joints.Holonomic(wound, ("right", "pulley"), "right rope", jnp.array(-r)))
     system, state = scene.build()
     slower = solve_one(system, state)[0]
     left = system.layout.v("left")[1]
@@ -60,7 +73,7 @@ def atwood() -> list[Check]:
 
 
 def two_weights() -> jc.Scene:
-    """3 kg and 2 kg in the plane, at rest at y = 0."""
+    """Returns a planar scene with weights of 3 kg and 2 kg, at rest at y = 0."""
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     scene.add_particle("left", mass=3.0)
     scene.add_particle("right", mass=2.0)
@@ -68,7 +81,10 @@ def two_weights() -> jc.Scene:
 
 
 def incline() -> list[Check]:
-    """a = (5/7) g sin α for a ball that rolls down an incline; friction (2/7) m g sin α."""
+    """Checks a ball that rolls down an incline of angle α.
+
+    Its acceleration is a = (5/7) g sin α. The friction is (2/7) m g sin α.
+    """
     data, alpha, mass = constants("rolling_ball_incline"), np.radians(25.0), 1.3
     gravity = (G * np.sin(alpha), 0.0, -G * np.cos(alpha))
     system, state = rolling_ball(mass, 0.2, 0.0, gravity, position=(0.0, 0.0, 0.2))
@@ -84,7 +100,10 @@ def incline() -> list[Check]:
 
 
 def conical_pendulum() -> list[Check]:
-    """Ω² = g / (l cos θ): the bob goes round at constant height, with tension m Ω² l."""
+    """Checks a conical pendulum, whose bob circles at constant height.
+
+    Its rate Ω satisfies Ω² = g / (l cos θ), with length l and tilt θ. The tension is m Ω² l.
+    """
     data, length, tilt, mass = constants("conical_pendulum"), 1.2, 0.4, 2.0
     radius, height = length * np.sin(tilt), -length * np.cos(tilt)
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -G))
@@ -104,9 +123,10 @@ def conical_pendulum() -> list[Check]:
 
 
 def physical_pendulum() -> list[Check]:
-    """θ̈ = 3g/(2l) and pin force m g/4 at the horizontal; ω² = 3g/l and 5/2 m g at the bottom.
+    """Checks a rod of length l that swings about its end from the horizontal to the bottom.
 
-    The quarter period is K(sin 45°)/√(3g/(2l)), K by the arithmetic-geometric mean.
+    At the horizontal, θ̈ = 3g/(2l) and the pin force is m g/4. At the bottom, ω² = 3g/l and the pin
+    force is 5/2 m g. A quarter period takes K(sin 45°)/√(3g/(2l)), with the elliptic integral K.
     """
     data, length = constants("physical_pendulum_pin_force"), 1.0
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
@@ -117,9 +137,9 @@ def physical_pendulum() -> list[Check]:
     quarter = quarter_turn() / np.sqrt(1.5 * G / length)
     bottom = jax.tree.map(lambda x: x[1], run(system, RK4, state, quarter / steps, steps, 1))
     at_rest, moving = (forward(system, s, None, RK4, 1e-3) for s in (state, bottom))
-    up = jc.wrench(system, state, at_rest, "pin")[1]
-    up_below = jc.wrench(system, bottom, moving, "pin")[1]
-    found = {
+    up = jc.wrench(at_rest, "pin", system=system)[1]
+    up_below = jc.wrench(moving, "pin", system=system)[1]
+    results = {
         "initial_angular_acceleration": -at_rest.acceleration[2],
         "initial_pin_force_up": up,
         "bottom_angular_speed": -bottom.v[2],
@@ -127,19 +147,22 @@ def physical_pendulum() -> list[Check]:
     }
     return [
         Check("physical_pendulum", key.replace("_", " "), relative(x, data[key]), BOUND)
-        for key, x in found.items()
+        for key, x in results.items()
     ]
 
 
 def quarter_turn() -> float:
-    """K(k) for k² = ½: π / (2 agm(1, √½))."""
+    """Returns the elliptic integral K(k) for k² = ½ as π / (2 agm(1, √½)).
+
+    agm is the arithmetic-geometric mean.
+    """
     a, b = 1.0, np.sqrt(0.5)
     for _ in range(6):
         a, b = (a + b) / 2, np.sqrt(a * b)
     return np.pi / (2 * a)
 
 
-def solve_one(system: Any, state: jc.State) -> tuple[np.ndarray, np.ndarray]:
-    """Acceleration and multipliers at one state."""
+def solve_one(system: BodySystem, state: jc.State) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the accelerations (n_v,) and the multipliers (rows,) at one state."""
     solution = forward(system, state, None, RK4, 1e-3)
     return np.asarray(solution.acceleration), np.asarray(solution.multipliers)

@@ -1,34 +1,40 @@
-"""Bodies that leave what they slide on: the moment at which a force of contact vanishes."""
+"""Bodies that leave a surface: the time at which the contact force vanishes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification.case import Check, relative
 from jaxcon.verification.closed_forms import BOUND, G, constants
 from jaxcon.verification.sampling import RK4, run, solve
 
 
-def wall_and_floor(rod: jc.Pose, t: Any, half: Any) -> jax.Array:
-    """x of the upper end and y of the lower end of a rod vanish; λ are the forces there."""
+def wall_and_floor(rod: jc.extend.Pose, t: jax.Array, half: jax.Array) -> jax.Array:
+    """Returns x of the upper end and y of the lower end of a rod, in the world frame, (2,) [m].
+
+    Both are zero while the rod touches wall and floor. The multipliers λ are the contact forces.
+    """
     end = rod.direction(half)
     return jnp.stack([rod.position[0] - end[0], rod.position[1] + end[1]])
 
 
 def ladder() -> list[Check]:
-    """A ladder slides down a smooth wall until the wall's force vanishes: sin θ = ⅔ sin θ₀."""
+    """Checks where a ladder that slides down a smooth wall leaves it: at sin θ = ⅔ sin θ₀.
+
+    θ is the angle of the ladder from the floor, and θ₀ its initial value.
+    """
     data, half, tilt = constants("ladder"), 1.0, np.pi / 3
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
-    # the rod's axis points from the middle to the lower end, away from the wall
+    # the axis of the rod points from its middle to its lower end, away from the wall
     start = {"position": (half * np.cos(tilt), half * np.sin(tilt)), "angle": -tilt}
     scene.add_body("rod", mass=1.0, inertia=half**2 / 3, **start)
-    constraint = jc.Holonomic(wall_and_floor, ("rod",), "ends", jnp.array([half, 0.0]))
+    constraint = jc.joints.Holonomic(wall_and_floor, ("rod",), "ends", jnp.array([half, 0.0]))
     scene.add(constraint)
     state = leave(*scene.build(), (0.1, 1.0))
     sine = data["leaves_wall_sin_theta"]
@@ -39,9 +45,10 @@ def ladder() -> list[Check]:
 
 
 def sphere_departure() -> list[Check]:
-    """A point mass sliding from the top of a smooth sphere leaves it where cos θ = ⅔.
+    """Checks where a point mass that slides down a smooth sphere leaves it: at cos θ = ⅔.
 
-    Since the top is an equilibrium, the motion starts a little below, with the speed gained there.
+    θ is the angle from the top, which is an equilibrium. The motion therefore starts at 0.3 rad,
+    with the velocity gained on the way there.
     """
     data, angle, radius = constants("sphere_departure"), 0.3, 0.8
     speed = np.sqrt(2 * G * radius * (1 - np.cos(angle)))
@@ -56,8 +63,14 @@ def sphere_departure() -> list[Check]:
     return [Check("sphere_departure", "cos θ", relative(cosine, expected), BOUND)]
 
 
-def leave(system: Any, state: jc.State, bracket: tuple[float, float]) -> jc.State:
-    """The state at the time in the bracket [s] at which the first multiplier changes sign."""
+def leave(system: BodySystem, state: jc.State, bracket: tuple[float, float]) -> jc.State:
+    """Returns the state at which the first multiplier changes sign.
+
+    Args:
+        system: the mechanism.
+        state: the initial state.
+        bracket: a time before and a time after the change of sign [s].
+    """
     steps = 2000
 
     def after(t: float) -> jc.State:
@@ -70,10 +83,10 @@ def leave(system: Any, state: jc.State, bracket: tuple[float, float]) -> jc.Stat
 
 
 def crossing(function: Callable[[float], float], low: float, high: float) -> float:
-    """The zero of a function that is positive at `low` and negative at `high`.
+    """Returns the zero of a decreasing function between `low` and `high`, by bisection.
 
     Raises:
-        ValueError: the signs are others.
+        ValueError: the function is not positive at `low`, or not negative at `high`.
     """
     if not function(low) > 0 > function(high):
         raise ValueError("crossing: the function must fall from positive to negative.")

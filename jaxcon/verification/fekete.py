@@ -1,8 +1,6 @@
-"""Fekete's points: twenty particles that repel each other on a sphere come to rest."""
+"""Fekete points: twenty particles on a sphere repel each other and come to rest."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,21 +13,29 @@ from jaxcon.verification.case import Check, error, relative
 COUNT = 20
 
 
-def repulsion(q: jax.Array, v: jax.Array, t: Any, control: Any, damping: Any) -> jax.Array:
-    """Σⱼ (pᵢ − pⱼ)/‖pᵢ − pⱼ‖² − α ṗᵢ, (60,)."""
+def repulsion(
+    q: jax.Array, v: jax.Array, t: jax.Array, control: None, damping: jax.Array
+) -> jax.Array:
+    """Returns the force on each particle, Σⱼ (pᵢ − pⱼ)/‖pᵢ − pⱼ‖² − α ṗᵢ, (60,).
+
+    pᵢ are the positions of the particles and α is the damping.
+    """
     points = q.reshape(COUNT, 3)
     apart = points[:, None] - points[None]
     square = jnp.sum(apart * apart, axis=-1) + jnp.eye(COUNT, dtype=q.dtype)
     return jnp.sum(apart / square[..., None], axis=1).ravel() - damping * v
 
 
-def on_sphere(q: jax.Array, t: Any, damping: Any) -> jax.Array:
-    """‖pᵢ‖² − 1, (20,)."""
+def on_sphere(q: jax.Array, t: jax.Array, damping: jax.Array) -> jax.Array:
+    """Returns the residuals ‖pᵢ‖² − 1 of particles at positions pᵢ on the unit sphere, (20,)."""
     return jnp.sum(q.reshape(COUNT, 3) ** 2, axis=1) - 1
 
 
 def fekete(dt: float = 0.025) -> list[Check]:
-    """p̈ = f(p, ṗ) + 2 λ p to t = 1000 by RK4 and projection, positions to eight digits.
+    """Checks p̈ = f(p, ṗ) + 2 λ p to t = 1000, with RK4 and projection.
+
+    p are positions, f the repulsion with damping, and λ the multipliers of the sphere. Positions
+    must agree to eight digits.
 
     References:
         Mazzia, Magherini, Test Set for Initial Value Problem Solvers (2008), problem Fekete.
@@ -38,14 +44,14 @@ def fekete(dt: float = 0.025) -> list[Check]:
     system = jc.GeneralizedSystem(
         mass=lambda q, p: jnp.ones_like(q),
         force=repulsion,
-        constraints=(jc.Holonomic(on_sphere, name="sphere"),),
+        constraints=(jc.joints.Holonomic(on_sphere, name="sphere"),),
         params=jnp.asarray(0.5),
     )
-    method = jc.Method(jc.RK4(), jc.Projection(iterations=4), jc.Schur())
+    method = jc.Method(jc.RK4(), jc.Projection(iterations=4), jc.solvers.Schur())
     start = np.ravel(data["initial"]["p"])
     state = jc.init(system, method, start, np.zeros_like(start))
 
-    def step(_: Any, state: jc.State) -> jc.State:
+    def step(_: int, state: jc.State) -> jc.State:
         return jc.step(system, method, state, None, dt)[0]
 
     end = jax.jit(lambda s: jax.lax.fori_loop(0, round(1000 / dt), step, s))(state)

@@ -1,14 +1,13 @@
-"""Exact derivatives of a simulated pendulum by parameters from which its scene is built."""
+"""Exact derivatives of a simulated pendulum with respect to parameters of its scene."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.core.typing import Scalar
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, relative
 from jaxcon.verification.references import column
@@ -17,11 +16,11 @@ from jaxcon.verification.sampling import RK4, run
 EVERY, COUNT = 500, 10
 
 
-def swing(parameters: jax.Array, step: Any) -> jax.Array:
-    """(θ, θ̇) every 500 steps, (2, 10), of a pendulum from rest at θ₀, with length l, under g.
+def swing(parameters: jax.Array, dt: Scalar) -> jax.Array:
+    """Returns the angle θ and rate θ̇ of a pendulum every 500 steps, (2, 10) [rad], [rad/s].
 
-    The scene is built from the parameters: the bob starts at l (sin θ₀, −cos θ₀), which moves with
-    l, and l is also in the constraint.
+    The scene is built from the parameters: initial angle θ₀, length l and gravity g. The length
+    enters both the initial position l (sin θ₀, −cos θ₀) and the constraint.
     """
     angle, length, g = parameters
     start = length * jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
@@ -29,34 +28,41 @@ def swing(parameters: jax.Array, step: Any) -> jax.Array:
     scene.add_particle("bob", mass=1.0, position=start)
     scene.add(jc.Distance("rod", jc.WORLD, "bob", length=length))
     system, state = scene.build()
-    states = run(system, RK4, state, step, EVERY, COUNT)
+    states = run(system, RK4, state, dt, EVERY, COUNT)
     (x, y), (vx, vy) = states.q[1:].T, states.v[1:].T
     return jnp.stack([jnp.arctan2(x, -y), (x * vy - y * vx) / (x * x + y * y)])
 
 
 @jax.jit
-def by_grad(parameters: jax.Array, step: Any) -> jax.Array:
-    """∂(θ, θ̇)/∂(θ₀, l, g) at every tenth of the time, (2, 10, 3), by `jax.grad` of each number."""
+def by_grad(parameters: jax.Array, dt: Scalar) -> jax.Array:
+    """Returns ∂(θ, θ̇)/∂(θ₀, l, g) of `swing` at ten times, (2, 10, 3).
+
+    `jax.grad` differentiates each component.
+    """
     weights = jnp.eye(2 * COUNT).reshape(-1, 2, COUNT)
-    slope = jax.grad(lambda p, w: jnp.sum(w * swing(p, step)))
+    slope = jax.grad(lambda p, w: jnp.sum(w * swing(p, dt)))
     return jax.vmap(slope, (None, 0))(parameters, weights).reshape(2, COUNT, 3)
 
 
 @jax.jit
-def by_jvp(parameters: jax.Array, step: Any) -> tuple[jax.Array, jax.Array]:
-    """(θ, θ̇), and its derivatives as `by_grad`, by `jax.jvp` along each parameter."""
+def by_jvp(parameters: jax.Array, dt: Scalar) -> tuple[jax.Array, jax.Array]:
+    """Returns (θ, θ̇) of `swing`, (2, 10), and their derivatives ∂(θ, θ̇)/∂(θ₀, l, g), (2, 10, 3).
+
+    `jax.jvp` differentiates along each parameter.
+    """
 
     def along(direction: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.jvp(lambda p: swing(p, step), (parameters,), (direction,))
+        return jax.jvp(lambda p: swing(p, dt), (parameters,), (direction,))
 
     values, slopes = jax.vmap(along)(jnp.eye(3))
     return values[0], jnp.moveaxis(slopes, 0, -1)
 
 
 def pendulum_gradients() -> list[Check]:
-    """Derivatives by initial angle, length and gravity, through 5000 steps.
+    """Checks derivatives of a pendulum's motion through 5000 steps.
 
-    The derivative of the period T, at which θ̇ = 0 again, is −(∂θ̇/∂p)/θ̈ there.
+    They are with respect to the initial angle, the length and gravity. At the end of a period T,
+    θ̇ = 0. The derivative of T with respect to a parameter p is therefore −(∂θ̇/∂p)/θ̈ there.
 
     References:
         Jacobi's elliptic functions and their derivatives, in 40 digits.

@@ -1,8 +1,9 @@
-"""Constraints on velocities that are no derivative of a position: A(q, t) v + b(q, t) = 0."""
+"""Nonholonomic constraints A(q, t) v + b(q, t) = 0, which no equation in positions can express."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,21 +11,25 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error
 from jaxcon.verification.references import column
 from jaxcon.verification.sampling import RK4, multipliers, run, sample
 
 
-def blade(body: jc.Motion, t: Any, offset: Any) -> jax.Array:
-    """The sideways velocity of a blade at (−offset, 0) of the body: n · ẋ_blade = 0."""
+def blade(body: jc.extend.Motion, t: jax.Array, offset: jax.Array) -> jax.Array:
+    """Returns the sideways velocity n · ẋ of a blade, which is zero, (1,) [m/s].
+
+    The blade is at (−offset, 0) of the body, and n is its normal.
+    """
     behind = jnp.stack([-offset, jnp.zeros_like(offset)])
     sideways = body.direction(jnp.array([0.0, 1.0], behind.dtype))
     return jnp.dot(sideways, body.point_velocity(behind))[None]
 
 
-def sleigh(p: dict[str, Any]) -> tuple[Any, jc.State]:
-    """A body in the plane on a blade at a distance a behind its centre of mass."""
+def sleigh(p: dict[str, Any]) -> tuple[BodySystem, jc.State]:
+    """Builds a planar body on a blade at a distance a behind its center of mass."""
     a, along = p["a"], np.array([np.cos(p["theta0"]), np.sin(p["theta0"])])
     across = np.array([-along[1], along[0]])
     scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
@@ -37,12 +42,14 @@ def sleigh(p: dict[str, Any]) -> tuple[Any, jc.State]:
         velocity=p["u0"] * along + a * p["omega0"] * across,
         angular_velocity=p["omega0"],
     )
-    scene.add(jc.VelocityLevel(blade, bodies=("sleigh",), name="blade", params=jnp.array(a)))
+    scene.add(jc.joints.VelocityLevel(blade, bodies=("sleigh",), name="blade", params=jnp.array(a)))
     return scene.build()
 
 
 def chaplygin_sleigh() -> list[Check]:
-    """u̇ = a ω², (I + m a²) ω̇ = −m a u ω for a blade behind the centre of mass.
+    """Checks a sleigh on a blade at a distance a behind its center of mass.
+
+    Its forward speed u and angular velocity ω satisfy u̇ = a ω² and (I + m a²) ω̇ = −m a u ω.
 
     References:
         Bloch, Nonholonomic Mechanics and Control (2003).
@@ -55,7 +62,7 @@ def chaplygin_sleigh() -> list[Check]:
     along = np.stack([np.cos(q[:, 2]), np.sin(q[:, 2])], -1)
     energy = v**2 @ [p["m"], p["m"], p["I_com"]] / 2
     force = multipliers(system, states, "blade")[:, 0]
-    found = {
+    results = {
         "centre of mass to 5 s [m]": (q[:, :2], "com"),
         "blade [m]": (q[:, :2] - p["a"] * along, "blade"),
         "θ [rad]": (q[:, 2], "theta"),
@@ -63,13 +70,16 @@ def chaplygin_sleigh() -> list[Check]:
         "ω [rad/s]": (v[:, 2], "omega"),
         "sideways force on the blade [N]": (force, "lateral_force_on_body"),
     }
-    checks = [Check(case, k, error(x, column(rows, key)), 1e-8) for k, (x, key) in found.items()]
-    kept = [data["constants"]["energy"]] * len(rows)
-    return [*checks, Check(case, "energy [J]", error(energy, kept), 1e-8)]
+    checks = [Check(case, k, error(x, column(rows, key)), 1e-8) for k, (x, key) in results.items()]
+    conserved = [data["constants"]["energy"]] * len(rows)
+    return [*checks, Check(case, "energy [J]", error(energy, conserved), 1e-8)]
 
 
-def rolling(ball: jc.Motion, t: Any, params: Any) -> jax.Array:
-    """No slip of a ball on a plane z = 0 that turns at Ω: ẋ − r ω_y = −Ω y, ẏ + r ω_x = Ω x."""
+def rolling(ball: jc.extend.Motion, t: jax.Array, params: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """Returns the slip of a ball on the plane z = 0, which rotates at a rate Ω, (2,) [m/s].
+
+    Without slip, ẋ − r ω_y = −Ω y and ẏ + r ω_x = Ω x, with radius r and angular velocity ω.
+    """
     radius, rate = params
     omega = jc.quaternion.rotate(ball.orientation, ball.angular_velocity)
     x, v = ball.position, ball.velocity
@@ -77,23 +87,31 @@ def rolling(ball: jc.Motion, t: Any, params: Any) -> jax.Array:
     return jnp.stack(slip)
 
 
-def height(ball: jc.Pose, t: Any, radius: Any) -> jax.Array:
-    """z − r = 0."""
+def height(ball: jc.extend.Pose, t: jax.Array, radius: jax.Array) -> jax.Array:
+    """Returns z − r, the height of a ball of radius r above its plane, which is zero, (1,) [m]."""
     return (ball.position[2] - radius)[None]
 
 
-def rolling_ball(mass: float, radius: float, rate: float, gravity: Any, **motion: Any) -> Any:
-    """A homogeneous ball on the plane z = 0, which turns about z at a rate [rad/s]."""
+def rolling_ball(
+    mass: float,
+    radius: float,
+    rate: float,
+    gravity: Sequence[float],
+    **motion: Any,
+) -> tuple[BodySystem, jc.State]:
+    """Builds a homogeneous ball on the plane z = 0, which rotates about z at a rate [rad/s]."""
     scene = jc.Scene(dim=3, gravity=gravity)
     scene.add_body("ball", inertia=jc.inertia.sphere(mass, radius), **motion)
     params = (jnp.array(radius), jnp.array(rate))
-    scene.add(jc.Holonomic(height, ("ball",), "height", params[0]))
-    scene.add(jc.VelocityLevel(rolling, ("ball",), "rolling", params))
+    scene.add(jc.joints.Holonomic(height, ("ball",), "height", params[0]))
+    scene.add(jc.joints.VelocityLevel(rolling, ("ball",), "rolling", params))
     return scene.build()
 
 
 def ball_on_turntable() -> list[Check]:
-    """v̇ = (2/7) Ω z × v: a ball on a turntable goes round in circles.
+    """Checks a ball that rolls on a turntable and moves in circles: v̇ = (2/7) Ω z × v.
+
+    v is the velocity of the ball and Ω the rate of the turntable about z.
 
     References:
         Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972).
@@ -118,13 +136,15 @@ def ball_on_turntable() -> list[Check]:
     ]
 
 
-def skate(particle: jc.Motion, t: Any, params: Any) -> jax.Array:
-    """ż − y ẋ = 0."""
+def skate(particle: jc.extend.Motion, t: jax.Array, params: None) -> jax.Array:
+    """Returns the residual ż − y ẋ of a nonholonomic constraint on a particle, (1,)."""
     return (particle.velocity[2] - particle.position[1] * particle.velocity[0])[None]
 
 
 def nonholonomic_particle() -> list[Check]:
-    """ż = y ẋ without force, its multiplier ẍ = −y λ, z̈ = λ, and exact derivatives of the flow.
+    """Checks a particle without forces under the constraint ż = y ẋ.
+
+    Its motion obeys ẍ = −y λ and z̈ = λ. Derivatives of the flow are checked too.
 
     References:
         Rosenberg, Analytical Dynamics of Discrete Systems (1977).
@@ -133,7 +153,7 @@ def nonholonomic_particle() -> list[Check]:
     p, rows = data["parameters"], data["rows"]
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
     scene.add_particle("particle", mass=p["mass"])
-    scene.add(jc.VelocityLevel(skate, bodies=("particle",), name="skate"))
+    scene.add(jc.joints.VelocityLevel(skate, bodies=("particle",), name="skate"))
     system, start = scene.build()
 
     def release(free: jax.Array) -> jc.State:

@@ -1,13 +1,13 @@
-"""Pendulums of point masses: distance constraints in Cartesian coordinates."""
+"""Pendulums of point masses, with distance constraints in Cartesian coordinates."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error
 from jaxcon.verification.references import column
@@ -15,9 +15,16 @@ from jaxcon.verification.sampling import sample, solve
 
 
 def hanging_chain(
-    masses: Sequence[float], lengths: Sequence[float], angles: Sequence[float], rates: Any, g: float
-) -> tuple[Any, jc.State]:
-    """Point masses in the plane, each on a rod from the one above; angles from downward [rad]."""
+    masses: Sequence[float],
+    lengths: Sequence[float],
+    angles: Sequence[float],
+    rates: Sequence[float],
+    g: float,
+) -> tuple[BodySystem, jc.State]:
+    """Builds a planar chain of point masses, each on a rod from the one above.
+
+    Angles are from downward [rad].
+    """
     scene = jc.Scene(dim=2, gravity=(0.0, -g))
     above, position, velocity = jc.WORLD, np.zeros(2), np.zeros(2)
     for i, (m, length, angle, rate) in enumerate(zip(masses, lengths, angles, rates, strict=True)):
@@ -30,21 +37,25 @@ def hanging_chain(
 
 
 def chain_positions(states: jc.State, bobs: int) -> np.ndarray:
-    """(times, bobs, 2) [m]; q is component-major in a group of bodies."""
+    """Returns the positions of the point masses, (times, bobs, 2) [m]."""
     return np.swapaxes(np.asarray(states.q).reshape(-1, 2, bobs), 1, 2)
 
 
 def chain_rates(states: jc.State, bobs: int) -> np.ndarray:
-    """ω = r × ṙ / |r|² of each rod, (times, bobs) [rad/s]."""
+    """Returns the angular velocity of each rod, (times, bobs) [rad/s].
+
+    It is ω = r × ṙ / |r|², where r is the vector along the rod.
+    """
     x, v = (np.asarray(y).reshape(-1, 2, bobs) for y in (states.q, states.v))
     r, rate = (np.diff(y, axis=2, prepend=0) for y in (x, v))
     return (r[:, 0] * rate[:, 1] - r[:, 1] * rate[:, 0]) / np.sum(r * r, axis=1)
 
 
 def simple_pendulum() -> list[Check]:
-    """θ̈ = −(g/L) sin θ from the horizontal, and the tension T = m(L θ̇² + g cos θ) = −λ.
+    """Checks a pendulum released from the horizontal: θ̈ = −(g/L) sin θ.
 
-    The rows at 1000 s and 2000 s are left out: they take millions of steps.
+    The tension is T = m(L θ̇² + g cos θ) = −λ. Reference rows at 1000 s and 2000 s are omitted:
+    they would take millions of steps.
 
     References:
         IFToMM benchmark library, problem A01; solution in Jacobi's elliptic functions.
@@ -57,14 +68,14 @@ def simple_pendulum() -> list[Check]:
     tension = np.sum(v * v, -1) - g * x[:, 1]
     period = data["period_s"]
     swing = sample(system, state, (period / 4, period), period / 8000)
-    found = -solve(system, states).multipliers[:, 0]
+    tensions = -solve(system, states).multipliers[:, 0]
     quarter = -solve(system, swing).multipliers[0, 0]
     return [
         Check(case, "position to 10 s [m]", error(states.q[:-1], x[:-1]), 1e-8),
         Check(case, "velocity to 10 s [m/s]", error(states.v[:-1], v[:-1]), 1e-8),
         Check(case, "position at 100 s [m]", error(states.q[-1], x[-1]), 1e-8),
         Check(case, "velocity at 100 s [m/s]", error(states.v[-1], v[-1]), 1e-8),
-        Check(case, "tension T = −λ at all times [N]", error(found, tension), 1e-8),
+        Check(case, "tension T = −λ at all times [N]", error(tensions, tension), 1e-8),
         Check(case, "back after one period [m]", error(swing.q[1], state.q), 1e-8),
         Check(case, "largest speed", error(-swing.v[0, 0], data["max_speed"]), 1e-8),
         Check(case, "largest tension", error(quarter, data["max_multiplier_tension_N"]), 1e-8),
@@ -72,10 +83,10 @@ def simple_pendulum() -> list[Check]:
 
 
 def double_pendulum() -> list[Check]:
-    """Two point masses released from the horizontal; the energy stays zero.
+    """Checks two point masses released from the horizontal, with zero total energy.
 
     References:
-        Extrapolation in 80-bit arithmetic; each row says how far it can be trusted.
+        Extrapolation in 80-bit arithmetic; each row states its accuracy.
     """
     case, data = "double_pendulum", references.load("an_double_pendulum")
     system, state = hanging_chain([1, 1], [1, 1], [np.pi / 2] * 2, [0, 0], data["parameters"]["g"])
@@ -95,7 +106,7 @@ def double_pendulum() -> list[Check]:
 
 
 def chain_pendulum() -> list[Check]:
-    """Chains of two and of five point masses.
+    """Checks chains of two and of five point masses.
 
     References:
         Finzi, Wang, Wilson, Simplifying Hamiltonian and Lagrangian neural networks via explicit
@@ -107,19 +118,21 @@ def chain_pendulum() -> list[Check]:
         masses, lengths = data["masses_top_to_bottom"], data["lengths_top_to_bottom"]
         system, state = hanging_chain(masses, lengths, data["theta0"], data["omega0"], 9.81)
         states = sample(system, state, [r["t"] for r in rows], 5e-4)
-        found = {
+        errors = {
             "positions to 3 s [m]": error(chain_positions(states, n), column(rows, "xy")),
             "rates to 3 s [rad/s]": error(chain_rates(states, n), column(rows, "omega")),
         }
-        checks += [Check("chain_pendulum", f"{n} links: {k}", e, 1e-8) for k, e in found.items()]
+        checks += [Check("chain_pendulum", f"{n} links: {k}", e, 1e-8) for k, e in errors.items()]
     return checks
 
 
 def spherical_pendulum() -> list[Check]:
-    """One distance constraint in space; the bob moves between two heights.
+    """Checks a spherical pendulum, whose bob oscillates between two heights.
+
+    It has one distance constraint. Energy and the vertical angular momentum L_z are conserved.
 
     References:
-        Extrapolation in 80-bit arithmetic; conserved L_z and energy.
+        Extrapolation in 80-bit arithmetic.
     """
     case, data = "spherical_pendulum", references.load("an_spherical_pendulum")
     p = data["parameters"]

@@ -1,23 +1,23 @@
-"""Reference numbers, packaged as JSON; each file names its source and how to compare."""
+"""Loads reference values from JSON files. Each file names its source and how to compare."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from importlib import resources
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 
 def load(name: str) -> dict[str, Any]:
-    """A reference by the name of its file; numbers printed as text become floats.
+    """Loads a file of reference values. Numbers written as text become floats.
 
     Args:
-        name: of the file in `jaxcon/verification/data`, without its ending.
+        name: the name of a file in `jaxcon/verification/data`, without its extension.
 
     Returns:
-        The contents. Text that is no number, such as a formula, stays text.
+        The contents of the file. Text that is not a number, such as a formula, stays text.
     """
     text = (
         resources.files("jaxcon.verification").joinpath("data", f"{name}.json").read_text("utf-8")
@@ -26,11 +26,15 @@ def load(name: str) -> dict[str, Any]:
 
 
 def column(rows: Sequence[dict[str, Any]], key: str) -> np.ndarray:
-    """One quantity of every row, (rows, …)."""
+    """Returns one quantity of all rows as an array, (rows, …)."""
     return np.array([row[key] for row in rows], float)
 
 
-def _numbers(x: Any) -> Any:
+JSON: TypeAlias = "dict[str, JSON] | list[JSON] | str | float | bool | None"
+
+
+def _numbers(x: JSON) -> Any:
+    """Returns the tree with numbers written as text converted to floats."""
     if isinstance(x, dict):
         return {key: _numbers(value) for key, value in x.items()}
     if isinstance(x, list):

@@ -1,29 +1,34 @@
-"""Discs that roll without slip, and a skate under the physical and the variational equations."""
+"""Discs that roll without slip, and a skate under physical and variational equations."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 import jaxcon as jc
 from jaxcon.analysis.reference import butcher
+from jaxcon.protocols import System
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error
 from jaxcon.verification.references import column
 from jaxcon.verification.sampling import multipliers, sample, solve
 
 
-def disc(p: dict[str, Any], turn: Any, axis: Any, omega: Any) -> tuple[Any, jc.State]:
-    """A disc with its axis along y of its frame that touches the plane z = 0 at the origin.
+def disc(
+    p: dict[str, Any], turn: ArrayLike, axis: np.ndarray, omega: np.ndarray
+) -> tuple[BodySystem, jc.State]:
+    """Builds a disc that touches the plane z = 0 at the origin. Its axis is y of its body frame.
 
     Args:
-        p: m, r, I_axial, I_transverse, g.
-        turn: quaternion, body to world.
-        axis: of the disc, world frame, (3,), a unit vector.
-        omega: angular velocity, world frame, (3,) [rad/s]; the contact does not move.
+        p: mass m, radius r, inertias I_axial and I_transverse, and gravity g.
+        turn: the orientation, a quaternion from body to world, (4,).
+        axis: the axis of the disc in the world frame, a unit vector (3,).
+        omega: the angular velocity in the world frame, (3,) [rad/s]. The contact point is at rest.
     """
     up = np.array([0.0, 0.0, 1.0])
     arm = up - axis[2] * axis
@@ -39,12 +44,16 @@ def disc(p: dict[str, Any], turn: Any, axis: Any, omega: Any) -> tuple[Any, jc.S
         velocity=np.cross(omega, center),
         angular_velocity=matrix.T @ omega,
     )
-    scene.add(jc.RollingDisc("roll", jc.WORLD, "disc", radius=p["r"], axis=axis))
+    scene.add(jc.joints.RollingDisc("roll", jc.WORLD, "disc", radius=p["r"], axis=axis))
     return scene.build()
 
 
 def rolling_disc() -> list[Check]:
-    """(I_a + m r²) w_a Ω cos φ − I_t Ω² sin φ cos φ = −m g r sin φ: a disc in a steady turn.
+    """Checks a disc that rolls in a steady turn.
+
+    Its turning rate Ω satisfies (I_a + m r²) w_a Ω cos φ − I_t Ω² sin φ cos φ = −m g r sin φ. φ is
+    the roll angle, and w_a the angular velocity about the axis of the disc. I_a and I_t are the
+    axial and the transverse inertia.
 
     References:
         Neimark, Fufaev, Dynamics of Nonholonomic Systems (1972).
@@ -54,8 +63,8 @@ def rolling_disc() -> list[Check]:
     roll, times = steady["roll"], np.array([0.25, 0.5, 1.0])
     axis, turn = np.array([0.0, np.cos(roll), np.sin(roll)]), (np.cos(roll / 2), np.sin(roll / 2))
     checks = []
-    for found, name in zip(steady["solutions"], ("fast", "slow"), strict=True):
-        rate = found["Omega"]
+    for reference, name in zip(steady["solutions"], ("fast", "slow"), strict=True):
+        rate = reference["Omega"]
         omega = np.array([0.0, 0.0, rate]) + steady["spin"] * axis
         system, state = disc(p, (*turn, 0.0, 0.0), axis, omega)
         states = sample(system, state, times.tolist(), 2.5e-4)
@@ -65,11 +74,11 @@ def rolling_disc() -> list[Check]:
         arm = (start - middle)[0] + 1j * (start - middle)[1]
         around = arm * np.exp(1j * angle)
         circle = np.stack([around.real, around.imag, np.full(3, start[2])], -1) + middle * [1, 1, 0]
-        radius = abs(np.hypot(*(start - middle)[:2]) - found["centre_path_radius"])
+        radius = abs(np.hypot(*(start - middle)[:2]) - reference["centre_path_radius"])
         solution = jc.forward_dynamics(system, state, None, jc.Method(jc.RK4()), 1e-3)
-        force = found["contact_force_on_disc"]
+        force = reference["contact_force_on_disc"]
         expected = [force[key] for key in ("along_heading", "lateral", "vertical")]
-        contact = jc.wrench(system, state, solution, "roll")[:3]
+        contact = jc.wrench(solution, "roll", system=system)[:3]
         checks += [
             Check(case, f"{name} turn: centre to 1 s [m]", error(states.q[:, :3], circle), 1e-8),
             Check(case, f"{name} turn: radius of the path [m]", float(radius), 1e-12),
@@ -79,17 +88,17 @@ def rolling_disc() -> list[Check]:
 
 
 def rolling_coin() -> list[Check]:
-    """A coin that spins at 5 turns a second, one degree off the vertical.
+    """Checks a coin that spins at 5 turns per second, one degree off the vertical.
 
     References:
         Rill, Schaeffer, Grundlagen und Methodik der Mehrkörpersimulation (2010), p. 59; EXUDYN,
-        rollingCoinTest, whose own step error in x is 8.5e-7 m.
+        rollingCoinTest, whose step error in x is 8.5e-7 m.
     """
     case, data = "rolling_coin", references.load("exudyn_rolling_coin")
     p, rows = data["parameters"], data["corrected_reference"]
     tilt = np.deg2rad(p["tilt0_deg"])
     axis = np.array([np.cos(tilt), 0.0, -np.sin(tilt)])
-    # the turn that takes y to the axis: first by −90° about z, then by the tilt about y
+    # the rotation of y into the axis: first by −90° about z, then by the tilt about y
     quarter = jc.quaternion.from_axis_angle((0.0, 0.0, 1.0), -np.pi / 2)
     lean = jc.quaternion.from_axis_angle((0.0, 1.0, 0.0), tilt)
     system, state = disc(p, jc.quaternion.multiply(lean, quarter), axis, np.array(p["omega0"]))
@@ -98,24 +107,26 @@ def rolling_coin() -> list[Check]:
     arm = np.array([0.0, 0.0, 1.0]) - axes[:, 2:] * axes
     center = np.asarray(states.q[:, :3])
     contact = center - p["r"] * arm / np.linalg.norm(arm, axis=1, keepdims=True)
-    off = abs(contact[-1, 0] - data["exudyn_value"]["contact_x_at_0p5"])
+    deviation = abs(contact[-1, 0] - data["exudyn_value"]["contact_x_at_0p5"])
     return [
         Check(case, "centre to 0.5 s [m]", error(center, column(rows, "centre")), 1e-8),
         Check(case, "contact [m]", error(contact[:, :2], column(rows, "contact_xy")), 1e-8),
-        Check(case, "contact x at 0.5 s against EXUDYN [m]", float(off), 1e-6),
+        Check(case, "contact x at 0.5 s against EXUDYN [m]", float(deviation), 1e-6),
     ]
 
 
-def skate(p: dict[str, Any]) -> tuple[Any, jc.State]:
-    """A blade at the centre of mass on an incline, x downhill, spinning, otherwise at rest."""
+def skate(p: dict[str, Any]) -> tuple[BodySystem, jc.State]:
+    """Builds a spinning body on an incline. Its blade is at the center of mass; x is downhill."""
     scene = jc.Scene(dim=2, gravity=(p["g"] * np.sin(np.pi / 6), 0.0))
     scene.add_body("skate", mass=p["m"], inertia=p["J"], angular_velocity=p["omega"])
-    scene.add(jc.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
     return scene.build()
 
 
 def knife_edge_incline() -> list[Check]:
-    """x = c sin² ωt, y = c (ωt − ½ sin 2ωt), c = g sin α/(2ω²): a skate that does not slide down.
+    """Checks a spinning skate on an incline, which does not slide down.
+
+    Its path is x = c sin² ωt, y = c (ωt − ½ sin 2ωt), with c = g sin α/(2ω²), spin ω and slope α.
 
     References:
         Bloch, Nonholonomic Mechanics and Control (2003), section 1.6.
@@ -127,42 +138,44 @@ def knife_edge_incline() -> list[Check]:
     x, y, angle = np.asarray(states.q).T
     speed = np.hypot(*np.asarray(states.v[:, :2]).T)
     force = np.abs(multipliers(system, states, "blade")[:, 0])
-    found = {
+    results = {
         "x to 5 s [m]": (x, "x"),
         "y [m]": (y, "y"),
         "φ [rad]": (angle, "phi"),
         "speed [m/s]": (speed, "speed"),
         "side force [N]": (force, "side_force"),
     }
-    return [Check(case, k, error(got, column(rows, key)), 1e-8) for k, (got, key) in found.items()]
+    return [Check(case, k, error(x, column(rows, key)), 1e-8) for k, (x, key) in results.items()]
 
 
 def vakonomic_knife_edge() -> list[Check]:
-    """Checks a skate by variation with μ = 0.1 at the start: it slides down; what it conserves.
+    """Checks conserved quantities of a skate under the variational equations, from μ = 0.1.
 
-    With ψ = ẋ sin φ − ẏ cos φ, m ẏ − μ cos φ, m ẋ + μ sin φ − m g t sin α, the spin's own momentum
-    rate J φ̈ = μ (ẋ cos φ + ẏ sin φ), and the energy. `KnifeEdge` has the opposite ψ, so −μ.
+    μ is the multiplier of the blade. The skate slides down. With ψ = ẋ sin φ − ẏ cos φ, these are
+    constant: m ẏ − μ cos φ, m ẋ + μ sin φ − m g t sin α, and the energy. The spin obeys
+    J φ̈ = μ (ẋ cos φ + ẏ sin φ). `KnifeEdge` has the opposite sign of ψ, so the code has −μ.
 
     References:
         Bloch, Baillieul, Crouch, Marsden, Nonholonomic Mechanics and Control (2003), section 1.6.
     """
     case, data = "vakonomic_knife_edge", references.load("an_knife_edge_incline")
     p, pull = data["parameters"], data["parameters"]["g"] * np.sin(np.pi / 6)
-    system, state = jc.vakonomic(*skate(p), {"blade": -0.1})
-    method = jc.Method(butcher())  # of order six: its spin passes 18 rad/s
+    variational, state = jc.systems.vakonomic(*skate(p), {"blade": -0.1})
+    system = cast(System, variational)  # it delegates most methods to the system of the skate
+    method = jc.Method(butcher())  # order six, because the spin exceeds 18 rad/s
     states = sample(system, state, [0.5, 1.0, 2.0, 5.0], 2e-4, method)
     t, (x, _, angle) = np.asarray(states.time), np.asarray(states.q).T
     vx, vy, spin, μ = np.asarray(states.v).T * [[1], [1], [1], [-1]]
     sine, cosine = np.sin(angle), np.cos(angle)
     energy = p["m"] * (vx**2 + vy**2) / 2 + p["J"] * spin**2 / 2 - p["m"] * pull * x
     torque = p["J"] * np.asarray(solve(system, states).acceleration)[:, 2]
-    none = np.zeros(4)
+    zero = np.zeros(4)
     across, along = p["m"] * vy - μ * cosine, p["m"] * (vx - pull * t) + μ * sine
     checks = {
-        "m ẏ − μ cos φ to 5 s": error(across, none - 0.1),
-        "m ẋ + μ sin φ − m g t sin α": error(along, none),
-        "energy [J]": error(energy, none + p["J"] * p["omega"] ** 2 / 2),
+        "m ẏ − μ cos φ to 5 s": error(across, zero - 0.1),
+        "m ẋ + μ sin φ − m g t sin α": error(along, zero),
+        "energy [J]": error(energy, zero + p["J"] * p["omega"] ** 2 / 2),
         "J φ̈ − μ (ẋ cos φ + ẏ sin φ)": error(torque, μ * (vx * cosine + vy * sine)),
-        "slip ψ [m/s]": error(vx * sine - vy * cosine, none),
+        "slip ψ [m/s]": error(vx * sine - vy * cosine, zero),
     }
     return [Check(case, name, value, 1e-9) for name, value in checks.items()]

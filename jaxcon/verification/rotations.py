@@ -1,4 +1,4 @@
-"""Bodies that turn in space: free, and about a fixed point."""
+"""Rotating bodies in space: free bodies, and bodies that rotate about a fixed point."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error, up_to_sign
 from jaxcon.verification.references import column
@@ -15,9 +16,9 @@ from jaxcon.verification.sampling import multipliers, sample
 
 
 def tumbling_body() -> list[Check]:
-    """I ω̇ = −ω × Iω, started near the intermediate axis: it turns over again and again.
+    """Checks a free body that spins near its intermediate axis and flips over repeatedly.
 
-    The quaternions of the reference are printed to 12 digits.
+    It obeys I ω̇ = −ω × Iω. The quaternions of the reference have 12 digits.
 
     References:
         Landau, Lifshitz, Mechanics, section 37: ω in Jacobi's elliptic functions.
@@ -44,7 +45,7 @@ def tumbling_body() -> list[Check]:
 
 
 def symmetric_body() -> list[Check]:
-    """A free axisymmetric body in flight: two uniform rotations, one after the other.
+    """Checks a free axisymmetric body: its rotation is a product of two uniform rotations.
 
     References:
         Kane, Likins, Levinson, Spacecraft Dynamics (1983), section 1.13.
@@ -70,8 +71,8 @@ def symmetric_body() -> list[Check]:
     ]
 
 
-def top(p: dict[str, Any], center: Any, **motion: Any) -> tuple[Any, jc.State]:
-    """A body on a ball joint at the origin, its centre of mass at `center` [m]."""
+def top(p: dict[str, Any], center: np.ndarray, **motion: Any) -> tuple[BodySystem, jc.State]:
+    """Builds a body on a ball joint at the origin, with its center of mass at `center` [m]."""
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -9.81))
     scene.add_body("top", mass=p["m"], position=center, **motion)
     scene.add(jc.Spherical("pivot", jc.WORLD, "top", point=(0.0, 0.0, 0.0)))
@@ -79,7 +80,10 @@ def top(p: dict[str, Any], center: Any, **motion: Any) -> tuple[Any, jc.State]:
 
 
 def steady_top() -> list[Check]:
-    """I₁ cos θ Ω² − I₃ ω₃ Ω + m g l = 0: both rates at which a top precesses without nodding.
+    """Checks the two rates at which a symmetric top precesses without nutation.
+
+    The rate Ω satisfies I₁ cos θ Ω² − I₃ ω₃ Ω + m g l = 0. θ is the tilt, and ω₃ the angular
+    velocity about the symmetry axis. I₁ and I₃ are the transverse and the axial inertia.
 
     References:
         Goldstein, Classical Mechanics (3rd ed.), section 5.7.
@@ -107,13 +111,13 @@ def steady_top() -> list[Check]:
         states = sample(system, state, times.tolist(), 1e-4)
         circle = [np.sin(tilt) * f(rate * times) for f in (np.cos, np.sin)]
         expected = p["l"] * np.stack([*circle, np.full(4, np.cos(tilt))], -1)
-        found = error(states.q[:, :3], expected)
-        checks.append(Check("steady_top", f"{name}: centre of mass to 1 s [m]", found, 1e-8))
+        deviation = error(states.q[:, :3], expected)
+        checks.append(Check("steady_top", f"{name}: centre of mass to 1 s [m]", deviation, 1e-8))
     return checks
 
 
 def heavy_top() -> list[Check]:
-    """A fast top, a benchmark of integrators on Lie groups: 150 rad/s about its axis.
+    """Checks a fast top, 150 rad/s about its axis: a benchmark for integrators on Lie groups.
 
     References:
         Brüls, Cardona, On the use of Lie group time integrators in multibody dynamics (2010);

@@ -1,4 +1,4 @@
-"""Linkages through positions in which their constraints depend on each other."""
+"""Linkages that pass through singular configurations, where their constraint rows are dependent."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ import jax
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error
 from jaxcon.verification.references import column
 from jaxcon.verification.sampling import sample
 
 G = 9.81
-METHOD = jc.Method(jc.RK4(), jc.Baumgarte.critical(20.0), jc.RankSafe())
+METHOD = jc.Method(jc.RK4(), jc.Baumgarte.critical(20.0), jc.solvers.RankSafe())
 
 
-def bars(loops: int) -> tuple[Any, jc.State]:
-    """N parallelograms side by side: N + 1 rods on the ground, N couplers, one freedom.
+def bars(loops: int) -> tuple[BodySystem, jc.State]:
+    """Builds a row of N = `loops` parallelograms: N + 1 rods on the ground and N couplers.
 
-    Where all rods lie in one line, twice a turn, the rows of each loop depend on each other, and
-    the linkage could leave the branch on which it is.
+    The linkage has one degree of freedom. Twice per turn, all rods are in one line. The rows of
+    each loop are then dependent, and the linkage could switch to another branch of its motion.
     """
     scene = jc.Scene(dim=2, gravity=(0.0, -G))
     solid: dict[str, Any] = {"mass": 1.0, "inertia": 1 / 12}
@@ -43,14 +44,14 @@ def bars(loops: int) -> tuple[Any, jc.State]:
     return scene.build()
 
 
-def first_joint(system: Any, state: jc.State) -> Any:
-    """Position [m] and velocity [m/s] of the top of the first rod."""
+def first_joint(system: BodySystem, state: jc.State) -> tuple[jax.Array, jax.Array]:
+    """Returns position [m] and velocity [m/s] of the top of the first rod."""
     top = (0.5, 0.0)
     return jc.position(system, state, "rod0", top), jc.velocity(system, state, "rod0", top)
 
 
 def n_four_bar(loops: int, step: float, bound: float) -> list[Check]:
-    """The top of the first rod, which stays on the branch of parallelograms.
+    """Checks that the linkage stays on the branch of parallelograms, by the top of its first rod.
 
     References:
         IFToMM library of computational benchmark problems, A02; by elliptic functions.
@@ -68,10 +69,10 @@ def n_four_bar(loops: int, step: float, bound: float) -> list[Check]:
 
 
 def n_four_bar_2() -> list[Check]:
-    """Two loops for ten seconds, the rods in line fourteen times."""
+    """Checks two loops for ten seconds; the rods are in one line fourteen times."""
     return n_four_bar(2, 5e-4, 1e-5)
 
 
 def n_four_bar_40() -> list[Check]:
-    """Forty loops for twenty seconds."""
+    """Checks forty loops for twenty seconds."""
     return n_four_bar(40, 1e-3, 1e-3)

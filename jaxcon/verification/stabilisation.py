@@ -1,23 +1,24 @@
-"""Baumgarte's feedback: how a constraint error decays, exactly, and up to which gains."""
+"""Baumgarte feedback: the exact decay of constraint errors, and the largest stable gains."""
 
 from __future__ import annotations
 
 import dataclasses
 import warnings
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.protocols import Integrator
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error, relative
 from jaxcon.verification.references import column
 from jaxcon.verification.sampling import run
 
 INTEGRATORS = {
-    "explicit_euler": jc.ExplicitEuler,
+    "explicit_euler": jc.integrators.ExplicitEuler,
     "semi_implicit_euler": jc.SemiImplicitEuler,
     "rk4": jc.RK4,
 }
@@ -26,7 +27,9 @@ STEP = 0.01
 
 
 def feedback_in_time() -> list[Check]:
-    """φ̈ + 2α φ̇ + β² φ = 0 holds for every constraint: a pendulum that starts off its circle.
+    """Checks that constraint errors φ decay by φ̈ + 2α φ̇ + β² φ = 0.
+
+    α and β are the gains. The scene is a pendulum that starts off its circle.
 
     References:
         Baumgarte, Stabilization of constraints and integrals of motion in dynamical systems (1972).
@@ -38,11 +41,11 @@ def feedback_in_time() -> list[Check]:
     scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
     system, state = scene.build()
 
-    def decay(alpha: Any, beta: Any) -> tuple[jax.Array, jax.Array]:
+    def decay(alpha: jax.Array, beta: jax.Array) -> tuple[jax.Array, jax.Array]:
         method = jc.Method(integrator=jc.RK4(), stabilizer=jc.Baumgarte(alpha, beta))
         states = run(system, method, state, 5e-4, 200, 10)
-        off = jax.vmap(lambda s: jc.violation(system, s))(states)
-        return off.position[:, 0], off.velocity[:, 0]
+        violation = jax.vmap(lambda s: jc.violation(system, s))(states)
+        return violation.position[:, 0], violation.velocity[:, 0]
 
     rows = data["continuous"]
     gains = (jnp.asarray(column(rows, key)) for key in ("alpha", "beta"))
@@ -54,58 +57,68 @@ def feedback_in_time() -> list[Check]:
     ]
 
 
-def plane(particle: jc.Pose, t: Any, normal: Any) -> jax.Array:
-    """n · x = 0, linear in the position."""
+def plane(particle: jc.extend.Pose, t: jax.Array, normal: jax.Array) -> jax.Array:
+    """Returns n · x, the distance of a particle at x from a plane with normal n, (1,) [m]."""
     return jnp.dot(normal, particle.position)[None]
 
 
-def particle_off_plane() -> tuple[Any, jc.State]:
-    """A particle under gravity, to be held on a plane."""
+def particle_off_plane() -> tuple[BodySystem, jc.State]:
+    """Builds a particle under gravity and a constraint that holds it on an inclined plane."""
     scene = jc.Scene(dim=3, gravity=(0.0, 0.0, -9.81))
     scene.add_particle("particle", mass=1.7)
-    scene.add(jc.Holonomic(plane, ("particle",), "plane", jnp.asarray(NORMAL)))
+    scene.add(jc.joints.Holonomic(plane, ("particle",), "plane", jnp.asarray(NORMAL)))
     return scene.build()
 
 
 class Decay:
-    """(φ, φ̇) of the particle after some steps of one integrator, as a function of its start."""
+    """Steps a particle that starts off its plane, and returns its constraint error (φ, φ̇)."""
 
-    def __init__(self, integrator: Any) -> None:
+    def __init__(self, integrator: Integrator) -> None:
         self.integrator = integrator
         self.system, self.start = particle_off_plane()
         self.many = jax.jit(jax.vmap(self.after, (None, 0, 0, 0, None)))
 
-    def after(self, off: Any, alpha: Any, beta: Any, h: Any, steps: Any) -> jax.Array:
-        """(φ, φ̇) after a number of steps, traced."""
-        return jax.lax.fori_loop(0, steps, lambda _, x: self.once(x, alpha, beta, h), off)
+    def after(
+        self,
+        start: jax.Array,
+        alpha: jax.Array,
+        beta: jax.Array,
+        h: jax.Array,
+        steps: int | jax.Array,
+    ) -> jax.Array:
+        """Returns (φ, φ̇) after a number of steps, which may be traced."""
+        return jax.lax.fori_loop(0, steps, lambda _, x: self.once(x, alpha, beta, h), start)
 
-    def once(self, off: jax.Array, alpha: Any, beta: Any, h: Any) -> jax.Array:
-        """(φ, φ̇) after one step; the particle also moves across the normal."""
+    def once(self, start: jax.Array, alpha: jax.Array, beta: jax.Array, h: jax.Array) -> jax.Array:
+        """Returns (φ, φ̇) after one step. The particle also moves within the plane."""
         method = jc.Method(self.integrator, jc.Baumgarte(alpha, beta))
         across = jnp.array([0.5, 1.0, 0.0])
-        state = dataclasses.replace(self.start, q=off[0] * NORMAL, v=off[1] * NORMAL + across)
+        state = dataclasses.replace(self.start, q=start[0] * NORMAL, v=start[1] * NORMAL + across)
         state, _ = jc.step(self.system, method, state, None, h)
         return jnp.stack([jnp.dot(NORMAL, state.q), jnp.dot(NORMAL, state.v)])
 
-    def matrices(self, *gains: Any) -> np.ndarray:
-        """The linear maps of one step on (φ, φ̇), (gains, 2, 2), from what it makes of a basis."""
-        columns = [np.asarray(self.many(off, *gains, 1)) for off in jnp.eye(2)]
+    def matrices(self, *gains: jax.Array) -> np.ndarray:
+        """Returns the matrices that one step multiplies (φ, φ̇) by, (gains, 2, 2).
+
+        `gains` are α, β and the step size h, (gains,) each.
+        """
+        columns = [np.asarray(self.many(start, *gains, 1)) for start in jnp.eye(2)]
         return np.stack(columns, axis=-1)
 
 
 def feedback_in_steps() -> list[Check]:
-    """On a linear constraint a step multiplies (φ, φ̇) by a constant matrix.
+    """Checks that a step multiplies (φ, φ̇) of a linear constraint by a constant matrix.
 
-    Its spectral radius is by how much an error shrinks at every step.
+    The spectral radius of the matrix is the contraction of the error per step.
     """
     case, data = "feedback_in_steps", references.load("an_baumgarte_decay")
-    off = jnp.array([data["initial"]["C"], data["initial"]["Cdot"]])
+    start = jnp.array([data["initial"]["C"], data["initial"]["Cdot"]])
     checks = []
     for name, integrator in INTEGRATORS.items():
         rows = [row for row in data["discrete"] if row["method"] == name]
         gains = [jnp.asarray(column(rows, key)) for key in ("alpha", "beta", "h")]
         decay = Decay(integrator())
-        ends = decay.many(off, *gains, rows[0]["n_steps"])
+        ends = decay.many(start, *gains, rows[0]["n_steps"])
         expected = np.stack([column(rows, "C"), column(rows, "Cdot")], -1)
         radii = [spectral_radius(m) for m in decay.matrices(*gains)]
         shrink = relative(radii, column(rows, "spectral_radius"))
@@ -117,10 +130,10 @@ def feedback_in_steps() -> list[Check]:
 
 
 def spectral_radius(m: np.ndarray) -> float:
-    """max |μ| over μ² − (tr m) μ + det m = 0.
+    """Returns the spectral radius of a (2, 2) matrix m: max |μ| with μ² − (tr m) μ + det m = 0.
 
-    At critical damping the roots meet, and round-off ε in the coefficients would part them by √ε;
-    so a discriminant of the size of round-off counts as zero.
+    At critical damping the roots coincide. A rounding error ε in the coefficients would separate
+    them by √ε, so a discriminant of the size of rounding errors counts as zero.
     """
     half, product = np.trace(m) / 2, np.linalg.det(m)
     apart = half**2 - product
@@ -130,7 +143,7 @@ def spectral_radius(m: np.ndarray) -> float:
 
 
 def critical_limit() -> float:
-    """The largest x with |R(−x)| ≤ 1 for the polynomial R of the classical Runge-Kutta method.
+    """Returns the largest x with |R(−x)| ≤ 1 for the stability polynomial R of `jc.RK4`.
 
     R(−x) = 1 − x + x²/2 − x³/6 + x⁴/24 = 1 at the real root of 1 = x/2 − x²/6 + x³/24.
     """
@@ -139,15 +152,16 @@ def critical_limit() -> float:
 
 
 def feedback_limits() -> list[Check]:
-    """Critical damping is stable up to h·rate = 2, 2√2 − 2 and 2.7853 of the three integrators.
+    """Checks the largest stable rate of critically damped feedback for three integrators.
 
-    Just below a limit errors fall, just above they grow, and there the warning starts.
+    For a step size h, the limits of h·rate are 2, 2√2 − 2 and 2.7853. Errors decay just below a
+    limit and grow just above it. The library must warn just above a limit and not just below it.
     """
     case, checks = "feedback_limits", []
     limits = (2.0, 2 * np.sqrt(2) - 2, critical_limit())
     for (name, integrator), limit in zip(INTEGRATORS.items(), limits, strict=True):
-        found = jc.largest_stable_rate(integrator(), STEP) * STEP
-        checks.append(Check(case, f"{name}: limit of h·rate", abs(found - limit), 1e-9))
+        rate = jc.stabilizers.largest_stable_rate(integrator(), STEP) * STEP
+        checks.append(Check(case, f"{name}: limit of h·rate", abs(rate - limit), 1e-9))
         rates = jnp.array([0.999, 1.001]) * (limit / STEP)
         start, step = jnp.array([1e-3, 0.0]), jnp.full(2, STEP)
         below, above = Decay(integrator()).many(start, rates, rates, step, 10000)
@@ -160,12 +174,12 @@ def feedback_limits() -> list[Check]:
         missed = [warns(integrator(), limit * x / STEP) - (x > 1) for x in (1 - 1e-6, 1 + 1e-6)]
         figure = f"{name}: wrong warnings a millionth to each side"
         checks.append(Check(case, figure, float(np.sum(np.abs(missed))), 0.0))
-    printed = abs(jc.largest_stable_rate(jc.RK4(), STEP) * STEP - 2.785)
+    printed = abs(jc.stabilizers.largest_stable_rate(jc.RK4(), STEP) * STEP - 2.785)
     return [*checks, Check(case, "rk4: limit as printed, 2.785", printed, 5e-4)]
 
 
-def warns(integrator: Any, rate: float) -> bool:
-    """Returns True where a step with critical damping at this rate warns of instability."""
+def warns(integrator: Integrator, rate: float) -> bool:
+    """Returns True if a step with critical damping at this rate warns of instability."""
     system, state = particle_off_plane()
     method = jc.Method(integrator, jc.Baumgarte.critical(rate))
     with warnings.catch_warnings(record=True) as caught:

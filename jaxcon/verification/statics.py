@@ -1,16 +1,16 @@
-"""Forces of constraints: wrenches at rest, tension, power and balance."""
+"""Constraint forces: wrenches at rest, tension, power, and balance of action and reaction."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.system.body_system import BodySystem
 from jaxcon.verification import references
 from jaxcon.verification.case import Check, error
 from jaxcon.verification.sampling import RK4
@@ -18,15 +18,15 @@ from jaxcon.verification.sampling import RK4
 forward = jax.jit(jc.forward_dynamics)
 
 
-def hold(t: Any, params: Any) -> jax.Array:
-    """θ* = 0: the joint stays where it is."""
+def hold(t: jax.Array, params: None) -> jax.Array:
+    """Returns the prescribed angle 0: a drive keeps the joint at its initial angle."""
     return jnp.zeros_like(t)
 
 
-def two_links() -> tuple[Any, jc.State]:
-    """Two links lying along world y, the first on a hinge about x that a drive holds.
+def two_links() -> tuple[BodySystem, jc.State]:
+    """Builds two links along world y. A drive holds the hinge of the first link, whose axis is x.
 
-    In the rest posture the links' z axes point along world y and their y axes down.
+    In this pose, z of the links points along world y, and y of the links points down.
     """
     p = references.load("static_reactions_gazebo")["parameters"]
     turned = (np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0)  # −π/2 about x
@@ -37,15 +37,15 @@ def two_links() -> tuple[Any, jc.State]:
     x, y = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     scene.add(jc.Revolute("joint1", jc.WORLD, "link1", point=(0.0, 0.0, 0.5), axis=x))
     scene.add(jc.Revolute("joint2", "link1", "link2", point=(0.0, 1.0, 0.5), axis=y))
-    scene.add(jc.Drive("stop", "joint1", hold))
+    scene.add(jc.joints.Drive("stop", "joint1", hold))
     return scene.build()
 
 
 def static_reactions() -> list[Check]:
-    """Wrenches of two joints at rest, on each side and in the axes of that side, 24 numbers.
+    """Checks the wrenches of two joints at rest on both bodies, each in the axes of its body.
 
-    The torque of the stop is that of a drive that holds the first joint; the reference counts it
-    into the joint's reaction.
+    In the reference, the reaction of the first joint includes the torque of the drive that holds
+    it.
 
     References:
         Simbody, tests/GazeboReactionForce.cpp, after a test of Gazebo.
@@ -55,10 +55,10 @@ def static_reactions() -> list[Check]:
     solution = forward(system, state, None, RK4, 1e-3)
     reaction = {}
     for body in (jc.WORLD, "link1"):
-        parts = (jc.wrench(system, state, solution, name, body) for name in ("joint1", "stop"))
+        parts = (jc.wrench(solution, name, body, system=system) for name in ("joint1", "stop"))
         reaction[f"reaction1_on_{'parent' if body == jc.WORLD else 'child'}"] = sum(parts), body
     for body, side in (("link1", "parent"), ("link2", "child")):
-        reaction[f"reaction2_on_{side}"] = jc.wrench(system, state, solution, "joint2", body), body
+        reaction[f"reaction2_on_{side}"] = jc.wrench(solution, "joint2", body, system=system), body
     rest = error(solution.acceleration, np.zeros(12))
     checks = [Check("static_reactions", "acceleration at rest", rest, 1e-9)]
     for name, (wrench, body) in reaction.items():
@@ -67,14 +67,17 @@ def static_reactions() -> list[Check]:
         inward = jnp.array([1.0, 0.0, 0.0, 0.0])
         if body != jc.WORLD:
             inward = jc.quaternion.conjugate(jc.orientation(system, state, body))
-        found = [jc.quaternion.rotate(inward, x) for x in (wrench[3:], wrench[:3])]
+        actual = [jc.quaternion.rotate(inward, x) for x in (wrench[3:], wrench[:3])]
         figure = f"{name.replace('_', ' ')} [N m, N]"
-        checks.append(Check("static_reactions", figure, error(found, expected), 1e-6))
+        checks.append(Check("static_reactions", figure, error(actual, expected), 1e-6))
     return checks
 
 
 def tension() -> list[Check]:
-    """λ of `Distance` is minus the tension: T = m(l θ̇² + g cos θ), at many angles and rates."""
+    """Checks the tension of a pendulum rod, which is minus the λ of `Distance`.
+
+    T = m(l θ̇² + g cos θ) at many angles θ and rates θ̇.
+    """
     length, mass, g = 1.3, 0.7, 9.81
     random = np.random.default_rng(3)
     scene = jc.Scene(dim=2, gravity=(0.0, -g))
@@ -89,14 +92,14 @@ def tension() -> list[Check]:
         moved = dataclasses.replace(state, q=q, v=v)
         return jc.forward_dynamics(system, moved, None, RK4, 1e-3).multipliers[0]
 
-    found = -np.asarray(jax.jit(jax.vmap(multiplier))(q, v))
+    actual = -np.asarray(jax.jit(jax.vmap(multiplier))(q, v))
     expected = mass * (length * rate**2 + g * np.cos(angle))
-    return [Check("tension", "T = −λ [N]", error(found, expected), 1e-11)]
+    return [Check("tension", "T = −λ [N]", error(actual, expected), 1e-11)]
 
 
 @functools.cache
-def mixed_scene() -> tuple[Any, jc.State]:
-    """Bodies and a particle in space, held by joints of every kind, at rest."""
+def mixed_scene() -> tuple[BodySystem, jc.State]:
+    """Builds bodies and a particle at rest in space, with joints of every kind."""
     scene = jc.Scene(dim=3, gravity=(0.3, -0.2, -9.81))
     for i, name in enumerate("abcd"):
         half = 0.2 * i
@@ -115,9 +118,10 @@ def mixed_scene() -> tuple[Any, jc.State]:
 
 
 def power() -> list[Check]:
-    """vᵀ(M a − f) = λᵀ(J v), for any v: a constraint's power is that of its multipliers.
+    """Checks the power of constraint forces: vᵀ(M a − f) = λᵀ(J v) for any velocities v.
 
-    J v is φ̇, since no constraint here depends on time. The difference is relative to Σ|terms|.
+    J v = φ̇, because no constraint here depends on time. The difference is relative to the sum of
+    the absolute values of all terms.
     """
     system, state = mixed_scene()
 
@@ -137,13 +141,13 @@ def power() -> list[Check]:
 
 
 def balance() -> list[Check]:
-    """A joint's wrenches on its two bodies are opposite, about the same anchor."""
+    """Checks that a joint's wrenches on its two bodies, about the same anchor, are opposite."""
     system, state = mixed_scene()
     solution = forward(system, state, None, RK4, 1e-3)
     sides = {"ball": ("a", "b"), "slider": ("b", "c"), "weld": ("c", "d")}
     checks = []
     for name, bodies in sides.items():
-        on_a, on_b = (jc.wrench(system, state, solution, name, body) for body in bodies)
+        on_a, on_b = (jc.wrench(solution, name, body, system=system) for body in bodies)
         gap = error(on_a, -on_b) / float(jnp.max(jnp.abs(on_b)))
         checks.append(Check("balance", f"{name}: wrenches opposite, relative", gap, 1e-12))
     return checks

@@ -1,4 +1,4 @@
-"""Chains that hang between two points: where they come to rest, and their tension."""
+"""Chains that hang between two points: equilibrium shape and tension."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from jaxcon.verification.sampling import RK4
 
 CASE = "hanging_chain"
 FINE = 2000
-"""Links of a chain that stands for a catenary; its sag is off by about 1/links²."""
+"""The number of links of a chain that approximates a catenary; its sag has an error of 1/links²."""
 
 
 def hanging_chain() -> list[Check]:
-    """Equal links with equal masses at their joints: shape [m], rest [m/s²] and tension [N].
+    """Checks chains of equal links with equal masses at their joints.
+
+    Shape [m], acceleration [m/s²] and tension [N] in equilibrium are compared.
 
     References:
-        Statics: the horizontal part of the tension is the same in all links.
+        Statics: the horizontal component of the tension is equal in all links.
     """
     data = references.load("an_hanging_chain")
     checks = []
     for case in data["cases"]:
         n, ends = case["N_links"], ((0.0, 0.0), (case["span"], 0.0))
         table = np.column_stack([case["x"], case["y"]])
-        shape = jc.hanging(*ends, n * case["link"], n)
+        shape = jc.chains.hanging(*ends, n * case["link"], n)
         scene = jc.Scene(dim=2, gravity=(0.0, -case["g"]))
-        jc.rope(scene, "chain", table, n * case["mass_per_joint"], end=jc.WORLD)
+        jc.chains.rope(scene, "chain", table, n * case["mass_per_joint"], end=jc.WORLD)
         system, state = scene.build()
         info = jax.jit(lambda s, system=system: jc.forward_dynamics(system, s, None, RK4, 1e-3))(
             state
@@ -40,6 +42,6 @@ def hanging_chain() -> list[Check]:
             Check(CASE, f"{n} links: T = −λ", error(-info.multipliers, tension), 1e-8),
         ]
     limit = data["continuous_limit"]
-    fine = jc.hanging((0.0, 0.0), (limit["span"], 0.0), limit["length"], FINE)
+    fine = jc.chains.hanging((0.0, 0.0), (limit["span"], 0.0), limit["length"], FINE)
     checks.append(Check(CASE, "sag of a catenary", error(-fine[:, 1].min(), limit["sag"]), 1e-6))
     return checks

@@ -1,1 +1,1 @@
-"""One file a task."""
+"""Tasks for reinforcement learning, one per file."""

@@ -1,8 +1,8 @@
-"""A cat that falls on its back turns itself over, with no angular momentum to turn by."""
+"""A task in which a falling cat turns over with zero angular momentum."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,55 +10,65 @@ import numpy as np
 import jaxcon as jc
 from jaxcon.core.numerics import safe_sqrt
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array
-from jaxcon.environments.environment import Channel, Environment, Episode, near, spread
+from jaxcon.core.typing import Array, DType
+from jaxcon.environments.environment import Channel, Environment, Episode, Number, near, spread
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 LENGTH, RADIUS, LEGS = 0.25, 0.07, 0.15
-"""Sizes of each half of the cat, a cylinder, and of the legs [m]."""
+"""Length and radius of each half of the cat, a cylinder, and the length of the legs [m]."""
 SIDES = (("front", 1.0), ("rear", -1.0))
 
 
-def spine(front: jc.Motion, rear: jc.Motion, t: Array, u: Array, params: Any) -> tuple:
-    """The torque of the back on the rear half, and its opposite on the front one, (6,) each.
+def spine(
+    front: jc.extend.Motion, rear: jc.extend.Motion, t: Array, u: Array, params: dict[str, Array]
+) -> tuple[Array, Array]:
+    """Returns the wrenches of the spine on the front and the rear half of the cat, (6,) each.
 
-    In the frame of the front half its muscles give τ u about y and z, its elasticity −2 k s with
-    s = n tan β/2 for the bend β about n: k β while that is small. Its damping −c (s·ω) s takes out
-    what muscles that work in time with the bend bring in, so that no torques fold the back double,
-    and leaves a bend that runs round the spine alone.
+    In the frame of the front half, muscles give the torque τ u about y and z. τ is the largest
+    torque and u the control. The elastic torque is −2 k s with stiffness k, where s = n tan β/2 for
+    a bend β about the axis n. For small β its size is k β. The damping torque is −c (s·ω) s, with
+    the bending rate ω. Without damping, muscles that act in phase with the bend would fold the
+    spine double. A bend of constant size that travels around the spine is not damped.
     """
     relative = turn_between(front.orientation, rear.orientation)
     bending = jc.quaternion.rotate(relative, rear.angular_velocity) - front.angular_velocity
     muscles = jnp.append(jnp.zeros((), u.dtype), params["torque"] * u)
     s = relative[1:] / relative[0]
-    own = muscles - (2 * params["stiffness"] + params["damping"] * jnp.dot(s, bending)) * s
-    torque = front.rotation @ own
+    gain = 2 * params["stiffness"] + params["damping"] * jnp.dot(s, bending)
+    torque = front.rotation @ (muscles - gain * s)
     zero = jnp.zeros_like(torque)
     return jnp.concatenate([zero, -torque]), jnp.concatenate([zero, torque])
 
 
 @pytree
 class CatRighting(Environment):
-    """Two halves on a joint that bends any way and does not twist, dropped feet up.
+    """A cat of two halves is dropped feet up and must land on its feet.
 
-    Nothing but the back's own torques acts besides gravity, so that angular momentum stays zero:
-    the cat turns over by bending, letting the bend run round the spine, and stretching again.
+    The joint between the halves bends in any direction but does not twist. Apart from gravity, only
+    the torques of the spine act, so angular momentum stays zero. The cat turns over in three
+    phases: it bends, lets the bend travel around the spine, and straightens.
 
-    Action: the torques of the back about the axes y (to the left) and z (out of the back) of the
-    front half, −1 to 1 of the largest (`torque` among the parameters of "spine"). Observation: the
-    upward direction in the frame of the front half (3,), the bend as the vector of the turn from
-    the front half to the rear one along y and z (2,) [rad], the angular velocity of the front half
-    in its frame (3,) [rad/s], that of the rear one relative to it along y and z (2,) [rad/s], and
-    height [m] and velocity [m/s] of the centre of mass.
+    Action: the torques of the spine about y (left) and z (out of the back) of the front half. ±1 is
+    the largest torque (`torque` among the parameters of "spine").
 
-    Reward, 0 to 1: (1 + u)/2 · (1 + near(β, 0.8 rad))/2 · (4 + near(action, 1))/5 with the mean u
-    over both halves of how far the back points up, −1 to 1, the bend β, and near(x, s) =
-    1/(1 + (x/s)²), of the root of the mean square where there are several. An episode starts at
-    rest, the back pointing down but for 0.3 rad of roll and 0.2 rad of pitch, any heading, and the
-    spine bent by up to 0.1 rad about y and z; it is over when the centre of mass has come down to
-    the length of the legs, 0.15 m, which takes 0.54 s from the stock height.
+    Observation, in the frame of the front half unless noted: the world's upward direction (3,). The
+    bend: the rotation vector from the front to the rear half, along y and z (2,) [rad]. The angular
+    velocity of the front half (3,), and that of the rear half relative to it, along y and z (2,)
+    [rad/s]. Height [m] and vertical velocity [m/s] of the center of mass.
+
+    Reward, 0 to 1: (1 + u)/2 · (1 + near(β, 0.8 rad))/2 · (4 + near(action, 1))/5, with near(x, s)
+    = 1/(1 + (x/s)²). Here u, −1 to 1, is the upward component of the back direction, averaged over
+    both halves, and β is the bend. For several actions, x is their root mean square.
+
+    An episode starts at rest with the back down, within 0.3 rad of roll and 0.2 rad of pitch, with
+    any heading. The spine is bent by up to 0.1 rad about y and z. The episode terminates when the
+    center of mass is 0.15 m above the ground, the length of the legs. From the default height this
+    takes 0.54 s.
 
     Attributes:
-        height: of the centre of mass at the start, () [m].
+        height: the height of the center of mass at the start, () [m].
 
     References:
         Kane and Scher, A dynamical explanation of the falling cat phenomenon, Int. J. Solids
@@ -70,32 +80,33 @@ class CatRighting(Environment):
     @classmethod
     def build(
         cls,
-        mass: Any = 2.0,
-        torque: Any = 8.0,
-        stiffness: Any = 6.0,
-        height: Any = 1.6,
+        mass: Number = 2.0,
+        torque: Number = 8.0,
+        stiffness: Number = 6.0,
+        height: Number = 1.6,
         *,
-        damping: Any = 0.2,
-        dt: Any = 2e-3,
+        damping: Number = 0.2,
+        dt: Number = 2e-3,
         skip: int = 5,
         horizon: int | None = 100,
         method: jc.Method | None = None,
-        dtype: Any = None,
+        dtype: DType | None = None,
     ) -> CatRighting:
-        """The environment; its numbers may be traced.
+        """Builds the environment. Its numeric options may be traced.
 
         Args:
-            mass: of each half [kg].
-            torque: the largest of the back about each axis [N m].
-            stiffness: k of the back [N m/rad].
-            height: of the centre of mass at the start [m].
-            damping: c of the back, of its bend, none while it is straight [N m s/rad].
-            dt: h [s].
-            skip: steps of h an action is held for.
-            horizon: actions until an episode is truncated, or None.
-            method: of the simulation; RATTLE unless given, which keeps angular momentum to
-                rounding.
-            dtype: of every number.
+            mass: the mass of each half [kg].
+            torque: the largest torque of the spine about each axis [N m].
+            stiffness: the stiffness k of the spine [N m/rad].
+            height: the height of the center of mass at the start [m].
+            damping: the damping c of the spine, which has no effect while it is straight [N m
+                s/rad].
+            dt: the step size h [s].
+            skip: the number of steps for which an action is held.
+            horizon: the number of actions after which an episode is truncated; None for no limit.
+            method: integrator, stabilizer and solvers; by default `jc.integrators.RATTLE()`, which
+                conserves angular momentum to rounding.
+            dtype: the floating dtype of the scene.
         """
         scene = jc.Scene(dtype=dtype)
         along, across = RADIUS**2 / 2, (3 * RADIUS**2 + LENGTH**2) / 12
@@ -104,18 +115,22 @@ class CatRighting(Environment):
             middle = (side * LENGTH / 2, 0.0, 0.0)
             scene.add_body(name, mass=mass, inertia=moments, position=middle)
         axis = (1.0, 0.0, 0.0)
-        scene.add(jc.ConstantVelocity("waist", "front", "rear", np.zeros(3), axis))
+        scene.add(jc.joints.ConstantVelocity("waist", "front", "rear", np.zeros(3), axis))
         numbers = {"torque": torque, "stiffness": stiffness, "damping": damping}
         params = {name: jnp.asarray(x, scene.dtype) for name, x in numbers.items()}
-        scene.add(jc.CustomForce("spine", ("front", "rear"), spine, params, controls=2))
+        scene.add(jc.forces.CustomForce("spine", ("front", "rear"), spine, params, controls=2))
         system, _ = scene.build()
-        method = jc.Method(jc.RATTLE(), solver=jc.Sparse()) if method is None else method
+        method = (
+            jc.Method(jc.integrators.RATTLE(), solver=jc.solvers.Sparse())
+            if method is None
+            else method
+        )
         dt, height = (jnp.asarray(x, scene.dtype) for x in (dt, height))
         return cls(system, method, dt, skip, horizon, height)
 
     @property
     def observed(self) -> tuple[Channel, ...]:
-        """Front half, back, fall."""
+        """The observation channels of the front half, the spine and the fall."""
         up = [Channel(f"upwards along {axis}", "1", -1.0, 1.0) for axis in "xyz"]
         bend = [Channel(f"bend about {axis}", "rad", -3.2, 3.2) for axis in "yz"]
         spin = [Channel(f"rate about {axis}", "rad/s", -100.0, 100.0) for axis in "xyz"]
@@ -125,16 +140,16 @@ class CatRighting(Environment):
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Two torques."""
+        """The components of an action: the two torques of the spine."""
         return "torque about y, of the largest", "torque about z, of the largest"
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The fall from its stock height."""
+        """The view of the whole fall from the default height."""
         return (-0.7, 0.7), (0.0, 1.9)
 
-    def start(self, key: Array) -> tuple[jc.State, Any]:
-        """Feet up, at rest."""
+    def start(self, key: Array) -> tuple[jc.State, tuple[()]]:
+        """Draws a state with the feet up, at rest."""
         size = jnp.asarray((0.3, 0.2, jnp.pi, 0.1, 0.1), self.dtype)
         roll, pitch, heading, *bend = spread(key, 1.0, (5,), self.dtype) * size
         zero = jnp.zeros_like(roll)
@@ -146,11 +161,11 @@ class CatRighting(Environment):
         return jc.init(self.system, self.method, q, still), ()
 
     def place(self, front: Array, bend: Array) -> Array:
-        """Positions (n_q,) at the height of the start.
+        """Returns positions (n_q,) with the center of mass at the initial height.
 
         Args:
-            front: orientation of the front half, (4,).
-            bend: vector of the turn to the rear half along y and z, (2,) [rad].
+            front: the orientation of the front half, a quaternion (4,).
+            bend: the rotation vector from the front to the rear half, along y and z, (2,) [rad].
         """
         zero = jnp.zeros((), self.dtype)
         rear = jc.quaternion.exp(jnp.append(zero, bend))
@@ -165,28 +180,34 @@ class CatRighting(Environment):
         return q
 
     def upright(self, episode: Episode) -> Array:
-        """How far the backs of both halves point up, −1 to 1 in the mean, ()."""
+        """Returns how far the backs point up, averaged over both halves, () in −1 to 1.
+
+        For each half, this is the upward component of the direction out of its back.
+        """
         return jnp.mean(jnp.stack([self.upwards(episode, name)[2] for name, _ in SIDES]))
 
     def upwards(self, episode: Episode, name: str) -> Array:
-        """The upward direction in the frame of a half, (3,)."""
+        """Returns the world's upward direction in the frame of a half, (3,)."""
         turn = jc.orientation(self.system, episode.state, name)
         up = jnp.asarray((0.0, 0.0, 1.0), self.dtype)
         return jc.quaternion.rotate(jc.quaternion.conjugate(turn), up)
 
     def bend(self, episode: Episode) -> tuple[Array, Array]:
-        """The turn from front to rear, its vector (3,) [rad], and the relative rate (3,) [rad/s].
+        """Returns the bend of the spine and its rate, in the frame of the front half.
 
-        Both in the frame of the front half.
+        Returns:
+            The rotation vector from the front to the rear half, (3,) [rad], and the angular
+            velocity of the rear half relative to the front half, (3,) [rad/s].
         """
-        given = self.system, episode.state
-        front, rear = (jc.orientation(*given, name) for name, _ in SIDES)
+        world = self.system, episode.state
+        front, rear = (jc.orientation(*world, name) for name, _ in SIDES)
         relative = turn_between(front, rear)
-        spin, other = (jc.angular_velocity(*given, name) for name, _ in SIDES)
-        return jc.quaternion.log(relative), jc.quaternion.rotate(relative, other) - spin
+        front_spin, rear_spin = (jc.angular_velocity(*world, name) for name, _ in SIDES)
+        rate = jc.quaternion.rotate(relative, rear_spin) - front_spin
+        return jc.quaternion.log(relative), rate
 
     def observation(self, episode: Episode) -> Array:
-        """Front half, back, fall."""
+        """Returns the states of the front half, the spine and the fall as one vector."""
         bend, bending = self.bend(episode)
         spin = jc.angular_velocity(self.system, episode.state, "front")
         fall = jnp.stack([x[2] for x in jc.center_of_mass(self.system, episode.state)])
@@ -194,18 +215,18 @@ class CatRighting(Environment):
         return jnp.concatenate([up, bend[1:], spin, bending[1:], fall])
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """For feet that point down and a straight back, with little effort."""
+        """Rewards feet that point down and a straight back, with little torque."""
         bend, _ = self.bend(after)
         straight = (1 + near(safe_sqrt(bend @ bend), 0.8)) / 2
         effort = (4 + near(safe_sqrt(jnp.mean(action**2)), 1.0)) / 5
         return (1 + self.upright(after)) / 2 * straight * effort
 
     def terminal(self, episode: Episode) -> Array:
-        """Returns True where it has landed."""
+        """Returns True if the cat has landed."""
         return jc.center_of_mass(self.system, episode.state)[0][2] < LEGS
 
-    def marks(self, axes: Any, episode: Episode) -> None:
-        """The ground, the halves in full length, and a leg of each."""
+    def marks(self, axes: Axes, episode: Episode) -> None:
+        """Draws the ground, both halves at their full length, and one leg of each half."""
         axes.axhline(0.0, color="k", lw=1)
         for i, (name, side) in enumerate(SIDES):
             points = np.array([(-side, 0.0, 0.0), (side, 0.0, 0.0), (side * 0.8, 0.0, 0.0)])
@@ -217,5 +238,5 @@ class CatRighting(Environment):
 
 
 def turn_between(front: Array, rear: Array) -> Array:
-    """The quaternion (4,) that turns the frame of the front half into that of the rear one."""
+    """Returns the rotation from the front half to the rear half, a quaternion (4,)."""
     return jc.quaternion.multiply(jc.quaternion.conjugate(front), rear)

@@ -1,8 +1,8 @@
-"""A Stewart platform keeps a rolling ball in the middle of its plate."""
+"""A task in which a Stewart platform balances a rolling ball on its plate."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +11,19 @@ import numpy as np
 import jaxcon as jc
 from jaxcon.core.numerics import safe_sqrt
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array
-from jaxcon.environments.environment import Channel, Environment, Episode, near, spread
+from jaxcon.core.typing import Array, DType
+from jaxcon.environments.environment import Channel, Environment, Episode, Number, near, spread
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 HEIGHT, PLATE, THICK = 1.0, 0.4, 0.02
-"""The height of the platform at home, its radius, and its surface above its centre [m]."""
+"""The height of the platform at home, its radius, and the height of its surface [m]."""
 LEGS = range(6)
 
 
 def ring(radius: float, apart: float) -> np.ndarray:
-    """Six points in three pairs on a circle, (6, 3) [m]."""
+    """Returns six points on a circle, in three pairs at angles ± `apart` [rad], (6, 3) [m]."""
     pair, side = np.arange(6) // 2, np.arange(6) % 2 * 2 - 1
     angle = pair * 2 * np.pi / 3 + side * apart
     return radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
@@ -32,28 +35,30 @@ HEADS = ring(PLATE, np.pi / 3 - 0.25) + np.array([0.0, 0.0, HEIGHT])
 
 @pytree
 class StewartBalancing(Environment):
-    """Six servos lengthen and shorten the legs of a platform on which a ball rolls.
+    """Six servos change the lengths of the legs of a platform on which a ball rolls.
 
-    Fifteen bodies and their six freedoms: each leg is a cylinder on a cross joint, a piston that
-    slides in it, and a ball joint under the platform; five independent loops, and a ball that rolls
-    without slip on the plate and stays on it.
+    The scene has fourteen bodies. Each leg is a cylinder on a universal joint, a piston that slides
+    in it, and a ball joint under the platform. The legs form five independent loops. The ball rolls
+    without slip and does not lose contact with the plate.
 
-    Action: what each leg is to be longer than at home, −1 to 1 of `stroke` [m]; a servo follows.
-    Observation: place and velocity of the ball in the frame of the plate, (2,) [m] and (2,) [m/s],
-    then of the platform its place from home (3,) [m], its turn as a vector (3,) [rad], its velocity
-    (3,) [m/s] and angular velocity (3,) [rad/s], and of the legs what they are longer than at home,
-    (6,) [m].
+    Action: the extension of each leg relative to home, which a servo tracks. ±1 is `stroke` [m].
 
-    Reward, 0 to 1: near(d, 0.1 m) · (1 + near(v, 0.4 m/s))/2 · (4 + near(action, 1))/5 with the
-    ball's distance d from the middle and its speed v over the plate, and near(x, s) =
-    1/(1 + (x/s)²), of the root of the mean square where there are several. An episode starts with
-    the platform at home and at rest and the ball within 0.15 m of the middle along x and y, rolling
-    at up to 0.2 m/s along each; it is over when the ball leaves the plate, 0.4 m from the middle.
+    Observation: position (2,) [m] and velocity (2,) [m/s] of the ball in the frame of the plate.
+    For the platform: displacement from home (3,) [m], rotation vector (3,) [rad], velocity (3,)
+    [m/s] and angular velocity (3,) [rad/s]. The extension of each leg relative to home, (6,) [m].
+
+    Reward, 0 to 1: near(d, 0.1 m) · (1 + near(v, 0.4 m/s))/2 · (4 + near(action, 1))/5, with
+    near(x, s) = 1/(1 + (x/s)²). Here d is the distance of the ball from the center of the plate,
+    and v its speed relative to the plate. For several actions, x is their root mean square.
+
+    An episode starts with the platform at home and at rest. The ball is within 0.15 m of the center
+    along x and y, and rolls at up to 0.2 m/s along each. The episode terminates when the ball is
+    0.4 m from the center, at the edge of the plate.
 
     Attributes:
-        stroke: how far a leg goes either way [m].
-        radius: of the ball [m].
-        home: positions as assembled, the ball in the middle, (n_q,).
+        stroke: the largest extension of a leg, longer or shorter [m].
+        radius: the radius of the ball [m].
+        home: the positions as assembled, with the ball at the center, (n_q,).
     """
 
     stroke: Array
@@ -63,33 +68,33 @@ class StewartBalancing(Environment):
     @classmethod
     def build(
         cls,
-        ball: Any = 0.2,
-        radius: Any = 0.04,
-        platform: Any = 20.0,
-        stroke: Any = 0.1,
-        stiffness: Any = 2e4,
-        damping: Any = 1e3,
+        ball: Number = 0.2,
+        radius: Number = 0.04,
+        platform: Number = 20.0,
+        stroke: Number = 0.1,
+        stiffness: Number = 2e4,
+        damping: Number = 1e3,
         *,
-        dt: Any = 4e-3,
+        dt: Number = 4e-3,
         skip: int = 5,
         horizon: int | None = 500,
         method: jc.Method | None = None,
-        dtype: Any = None,
+        dtype: DType | None = None,
     ) -> StewartBalancing:
-        """The environment; its numbers may be traced.
+        """Builds the environment. Its numeric options may be traced.
 
         Args:
-            ball: its mass [kg].
-            radius: of the ball [m].
-            platform: its mass [kg].
-            stroke: how far a leg goes either way [m].
-            stiffness: of the servos [N/m].
-            damping: of the servos [N s/m].
-            dt: h [s].
-            skip: steps of h an action is held for.
-            horizon: actions until an episode is truncated, or None.
-            method: of the simulation.
-            dtype: of every number.
+            ball: the mass of the ball [kg].
+            radius: the radius of the ball [m].
+            platform: the mass of the platform [kg].
+            stroke: the largest extension of a leg, longer or shorter [m].
+            stiffness: the stiffness of the servos [N/m].
+            damping: the damping of the servos [N s/m].
+            dt: the step size h [s].
+            skip: the number of steps for which an action is held.
+            horizon: the number of actions after which an episode is truncated; None for no limit.
+            method: integrator, stabilizer and solvers; by default with `jc.solvers.Sparse()`.
+            dtype: the floating dtype of the scene.
         """
         scene = jc.Scene(dtype=dtype)
         moments = platform * np.array([0.04, 0.04, 0.08])
@@ -100,15 +105,15 @@ class StewartBalancing(Environment):
         up = np.array([0.0, 0.0, 1.0])
         middle = (HEIGHT + THICK + radius) * up
         scene.add_body("ball", mass=ball, inertia=moment, position=middle)
-        scene.add(jc.RollingSphere("rolling", "platform", "ball", radius))
+        scene.add(jc.joints.RollingSphere("rolling", "platform", "ball", radius))
         system, state = scene.build()
-        method = jc.Method(solver=jc.Sparse()) if method is None else method
+        method = jc.Method(solver=jc.solvers.Sparse()) if method is None else method
         dt, stroke, radius = (jnp.asarray(x, scene.dtype) for x in (dt, stroke, radius))
         return cls(system, method, dt, skip, horizon, stroke, radius, state.q)
 
     @property
     def observed(self) -> tuple[Channel, ...]:
-        """Ball, platform, legs."""
+        """The observation channels of ball, platform and legs."""
         vectors = [
             ("ball", "m", 1.0, "xy"),
             ("velocity of ball", "m/s", 10.0, "xy"),
@@ -126,16 +131,19 @@ class StewartBalancing(Environment):
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """Six lengths."""
+        """The components of an action: the extensions of the six legs."""
         return tuple(f"leg {i + 1}, of the stroke" for i in LEGS)
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Seen along y."""
+        """The view of the platform along y."""
         return (-1.0, 1.0), (-0.1, 1.4)
 
-    def start(self, key: Array) -> tuple[jc.State, Any]:
-        """The platform at home, the ball rolling: ω = n × v/r."""
+    def start(self, key: Array) -> tuple[jc.State, tuple[()]]:
+        """Draws a ball that rolls on the platform at home.
+
+        For a velocity v, radius r and normal n, it rolls with the angular velocity ω = n × v/r.
+        """
         place, velocity = jax.random.split(key)
         x, y = spread(place, 0.15, (2,), self.dtype)
         u, w = spread(velocity, 0.2, (2,), self.dtype)
@@ -146,66 +154,67 @@ class StewartBalancing(Environment):
         return jc.init(self.system, self.method, q, v), ()
 
     def control(self, episode: Episode, action: Array) -> Array:
-        """The lengths that the servos are to follow [m]."""
+        """Returns the desired extensions of the legs, (6,) [m]."""
         return self.stroke * action
 
     def ball(self, episode: Episode) -> tuple[Array, Array]:
-        """Its place and velocity over the plate, in the frame of the plate, (2,) [m], [m/s]."""
+        """Returns position [m] and velocity [m/s] of the ball in the plate frame, (2,) each."""
         system, state = self.system, episode.state
         center, velocity = (f(system, state, "ball") for f in (jc.position, jc.velocity))
         origin, turn = (f(system, state, "platform") for f in (jc.position, jc.orientation))
-        back = jc.quaternion.conjugate(turn)
-        place = jc.quaternion.rotate(back, center - origin)
+        to_plate = jc.quaternion.conjugate(turn)
+        place = jc.quaternion.rotate(to_plate, center - origin)
         spin = jc.angular_velocity(system, state, "platform")
-        moved = jc.quaternion.rotate(back, velocity - jc.velocity(system, state, "platform"))
-        return place[:2], (moved - jnp.cross(spin, place))[:2]
+        relative = velocity - jc.velocity(system, state, "platform")
+        relative = jc.quaternion.rotate(to_plate, relative)
+        return place[:2], (relative - jnp.cross(spin, place))[:2]
 
     def observation(self, episode: Episode) -> Array:
-        """Ball, platform, legs."""
-        given = self.system, episode.state
+        """Returns the states of ball, platform and legs as one vector."""
+        world = self.system, episode.state
         up = jnp.asarray((0.0, 0.0, HEIGHT), self.dtype)
         platform = (
-            jc.position(*given, "platform") - up,
-            jc.quaternion.log(jc.orientation(*given, "platform")),
-            jc.velocity(*given, "platform"),
-            jc.angular_velocity(*given, "platform"),
+            jc.position(*world, "platform") - up,
+            jc.quaternion.log(jc.orientation(*world, "platform")),
+            jc.velocity(*world, "platform"),
+            jc.angular_velocity(*world, "platform"),
         )
-        legs = jnp.stack([jc.coordinate(*given, f"leg{i + 1}") for i in LEGS])
+        legs = jnp.stack([jc.coordinate(*world, f"leg{i + 1}") for i in LEGS])
         return jnp.concatenate([*self.ball(episode), *platform, legs])
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """For the ball in the middle and at rest, with little motion of the legs."""
-        away, fast = (safe_sqrt(x @ x) for x in self.ball(after))
+        """Returns a reward for a ball at rest at the center, with little extension of the legs."""
+        distance, speed = (safe_sqrt(x @ x) for x in self.ball(after))
         effort = (4 + near(safe_sqrt(jnp.mean(action**2)), 1.0)) / 5
-        return near(away, 0.1) * (1 + near(fast, 0.4)) / 2 * effort
+        return near(distance, 0.1) * (1 + near(speed, 0.4)) / 2 * effort
 
     def terminal(self, episode: Episode) -> Array:
-        """Returns True where the ball has left the plate."""
+        """Returns True if the ball has left the plate."""
         place, _ = self.ball(episode)
         return place @ place > PLATE**2
 
-    def marks(self, axes: Any, episode: Episode) -> None:
-        """The ball as a disc."""
+    def marks(self, axes: Axes, episode: Episode) -> None:
+        """Draws the ball as a disc."""
         from matplotlib.patches import Circle
 
         x, _, z = jc.position(self.system, episode.state, "ball")
         axes.add_patch(Circle((float(x), float(z)), float(self.radius), color="k"))
 
 
-def add_leg(scene: jc.Scene, i: int, stiffness: Any, damping: Any) -> None:
-    """A cylinder at a foot, a piston at a head, and the servo between them."""
+def add_leg(scene: jc.Scene, i: int, stiffness: Number, damping: Number) -> None:
+    """Adds a leg to the scene: cylinder, piston, joints and servo."""
     foot, head, name = FEET[i], HEADS[i], f"{i + 1}"
     along = (head - foot) / np.linalg.norm(head - foot)
-    first = np.cross(along, [0.0, 0.0, 1.0])  # also the axis of the turn that takes z to the leg
+    first = np.cross(along, [0.0, 0.0, 1.0])  # −first is the rotation axis from z to the leg
     lean = np.arctan2(np.linalg.norm(first), along[2])
     turn = np.asarray(jc.quaternion.from_axis_angle(-first, lean))
-    part = jc.inertia.cylinder(2.0, 0.03, 0.5)
+    inertia = jc.inertia.cylinder(2.0, 0.03, 0.5)
     ends = (f"cylinder{name}", foot + 0.3 * along), (f"piston{name}", head - 0.3 * along)
     for body, middle in ends:
-        scene.add_body(body, inertia=part, position=middle, quaternion=turn)
+        scene.add_body(body, inertia=inertia, position=middle, quaternion=turn)
     (cylinder, _), (piston, _) = ends
     crossed = {"axis_a": first, "axis_b": np.cross(along, first)}
-    scene.add(jc.Universal(f"foot{name}", jc.WORLD, cylinder, foot, **crossed))
+    scene.add(jc.joints.Universal(f"foot{name}", jc.WORLD, cylinder, foot, **crossed))
     scene.add(jc.Prismatic(f"leg{name}", cylinder, piston, axis=along))
     scene.add(jc.Spherical(f"head{name}", piston, "platform", head))
-    scene.add(jc.PositionServo(f"servo{name}", f"leg{name}", stiffness, damping))
+    scene.add(jc.forces.PositionServo(f"servo{name}", f"leg{name}", stiffness, damping))

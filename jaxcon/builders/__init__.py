@@ -1,0 +1,1 @@
+"""Builders of systems: scenes, chains, assembly."""

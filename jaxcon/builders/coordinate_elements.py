@@ -1,0 +1,189 @@
+"""Groups elements that act on joint coordinates, by the groups of these joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any
+
+from jaxcon.constraints.armature import Armature, Armatures
+from jaxcon.constraints.base import Joints
+from jaxcon.constraints.couplings import Coupling, Couplings
+from jaxcon.constraints.drive import Drive, Drives
+from jaxcon.contact.limits import Bounds
+from jaxcon.core import checks
+from jaxcon.core.typing import DType, PyTree
+from jaxcon.system.actuators import JointForce, JointForces
+from jaxcon.system.coordinates import (
+    End,
+    JointCoordinate,
+    OnCoordinates,
+    OnJoint,
+    TurnCounter,
+    at,
+    directory,
+    find,
+    numbered,
+    turns_over,
+)
+from jaxcon.system.elements import Element, label, stack
+from jaxcon.system.layout import Layout, Place
+
+
+class CoordinateElements:
+    """The elements that act on joint coordinates, and the coordinates with counted turns.
+
+    Args:
+        joints: groups of joints, which come first among the constraints of the system.
+        elements: all elements of the scene.
+        layout: names and indices.
+        dtype: dtype of every number.
+    """
+
+    def __init__(
+        self, joints: list[Joints], elements: Iterable[Element], layout: Layout, dtype: DType
+    ) -> None:
+        self.joints, self.layout, self.dtype = joints, layout, dtype
+        self.elements = [e for e in elements if isinstance(e, OnCoordinates)]
+        where = directory(joints)
+        self.ends = {e.name: self._ends(e, where) for e in self.elements}
+        counting: dict[tuple[int, str], set[int]] = {}
+        for element in self.elements:
+            for group, index, name in self.ends[element.name]:
+                turns = turns_over(joints[group].law, name, layout.dim)
+                if isinstance(element, TurnCounter) and not turns and layout.dim == 3:
+                    raise ValueError(
+                        f"{label(element)}: the {name} of '{element.joint}' makes no turns."
+                    )
+                if turns and element.counts:
+                    counting.setdefault((group, name), set()).add(index)
+        counted, self.turns = [], 0  # the number of counted angles
+        for (group, name), indices in counting.items():
+            counters = tuple(range(self.turns, self.turns + len(indices)))
+            counted.append(JointCoordinate(group, tuple(sorted(indices)), name, counters))
+            self.turns += len(indices)
+        self.counted = tuple(counted)
+        self.counters = numbered(self.counted)
+
+    def forces(self) -> list[JointForces]:
+        """Returns the groups of springs, dampers, motors and servos."""
+        acting = [e for e in self.elements if isinstance(e, JointForce)]
+        groups = self._gather(acting)
+        return [
+            JointForces(*group, coordinate=coordinate, starts=starts)
+            for group, (coordinate,), _, starts in groups
+        ]
+
+    def armatures(self) -> list[Armatures]:
+        """Returns the groups of rotors."""
+        groups = self._gather([e for e in self.elements if isinstance(e, Armature)])
+        return [Armatures(*group, coordinate=coordinate) for group, (coordinate,), *_ in groups]
+
+    def bounds(self) -> list[Bounds]:
+        """Returns the groups of limits, dry friction, rate limits and rate motors."""
+        bounded = [e for e in self.elements if isinstance(e, OnJoint) and e.law is not None]
+        groups = self._gather(bounded)
+        return [
+            Bounds(*group, coordinate=coordinate, starts=starts)
+            for group, (coordinate,), _, starts in groups
+        ]
+
+    def couplings(self) -> list[Couplings]:
+        """Returns the groups of gears, racks, belts, pulleys, differentials and cams."""
+        groups = self._gather([e for e in self.elements if isinstance(e, Coupling)])
+        return [
+            Couplings(*group, coordinates=coordinates, sides=sides)
+            for group, coordinates, sides, _ in groups
+        ]
+
+    def drives(
+        self, drives: list[Drive], params: Callable[[Any], PyTree], bare: Callable[[Any], Any]
+    ) -> list[Drives]:
+        """Returns the prescribed motions, each as a group of one.
+
+        Args:
+            drives: the drives of the scene.
+            params: a function that returns the user's parameters of an element.
+            bare: a function that returns an element without its parameters.
+        """
+        result = []
+        for drive in drives:
+            ends = self.ends[drive.name]
+            places, _ = self._places((ends,))
+            result.append(Drives(params(drive), bare(drive), places, at(self.counters, ends)))
+            result[-1].check(self.dtype)
+        return result
+
+    def _gather(self, elements: list[Any]) -> Iterator[tuple[Any, Any, Any, Any]]:
+        """Groups elements of one class whose coordinates belong to the same groups of joints.
+
+        Yields:
+            The fields of `Elements`; the coordinates; for each coordinate, the indices in `places`
+            of the bodies of its joint; and the starts of the control channels.
+        """
+        groups: dict[Any, list[Any]] = {}
+        for element in elements:
+            ends, params = self.ends[element.name], element.attach(self.dtype)
+            group, _, name = ends[0]
+            if self.joints[group].law.coordinates[name] == "rad":
+                for field in element.angles:
+                    checks.radians(label(element), field, params[field])
+            # the bodies of the joints; bodies fixed to the world count as one
+            bodies = [
+                (place.group, -1 if place.group is None else place.indices[index])
+                for group, index, _ in ends
+                for place in self.joints[group].places
+            ]
+            key = (
+                type(element),
+                tuple((field, x.shape) for field, x in params.items()),
+                tuple((group, name) for group, _, name in ends),
+                tuple(bodies.index(body) for body in bodies),
+                tuple(len(at(self.counters, [end]).counters) for end in ends),
+            )
+            groups.setdefault(key, []).append((element, ends, params))
+        for (cls, *_), members in groups.items():
+            names = tuple(element.name for element, *_ in members)
+            columns = tuple(zip(*(ends for _, ends, _ in members), strict=True))
+            places, sides = self._places(columns)
+            starts = tuple(self.layout.control(n).start for n in names) if cls.controls else ()
+            coordinates = tuple(at(self.counters, column) for column in columns)
+            yield (stack([p for *_, p in members]), names, places, cls), coordinates, sides, starts
+
+    def _places(
+        self, columns: tuple[Iterable[End], ...]
+    ) -> tuple[tuple[Place, ...], tuple[tuple[int, ...], ...]]:
+        """Returns the places of all bodies without repetition, and their indices by coordinate.
+
+        The indices of a coordinate name the places of its joint's bodies.
+        """
+        places: list[Place] = []
+        sides = []
+        for column in columns:
+            group, joints, _ = zip(*column, strict=True)
+            of_joint = self.joints[group[0]].select(joints).places
+            places += [p for p in of_joint if p not in places]
+            sides.append(tuple(places.index(p) for p in of_joint))
+        return tuple(places), tuple(sides)
+
+    def _ends(self, element: OnCoordinates, where: dict[str, tuple[int, int]]) -> tuple[End, ...]:
+        """Returns the coordinates on which an element acts.
+
+        Raises:
+            ValueError: a coordinate is unknown or coupled with itself, or a prescribed or coupled
+                coordinate is not the integral of its rate.
+        """
+        ends = tuple(
+            find(self.joints, where, label(element), *end) for end in element.joint_coordinates
+        )
+        if len(set(ends)) < len(ends):
+            raise ValueError(
+                f"{label(element)}: it couples a coordinate with itself:"
+                f" {element.joint_coordinates}."
+            )
+        for group, index, name in ends if isinstance(element, Coupling | Drive) else ():
+            if self.joints[group].law.coordinates[name] == "rotation":
+                raise ValueError(
+                    f"{label(element)}: the {name} of '{self.joints[group].names[index]}' is not"
+                    " the integral of its rate; couple or drive the angle of a hinge."
+                )
+        return ends

@@ -1,0 +1,331 @@
+"""The variational (vakonomic) equations of motion for velocity-level rows."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Self
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.rows import RowLayout, Rows, layout_of, linearize
+from jaxcon.core import checks
+from jaxcon.core.doubled import Doubled, rounded
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, DType, PyTree, Scalar
+from jaxcon.geometry.pose import Motion
+from jaxcon.linear.saddle import Diagonal, Full, Mass, Solution
+from jaxcon.protocols import System
+from jaxcon.system.body_system import Snapshot
+from jaxcon.system.coordinates import JointCoordinate
+from jaxcon.system.state import Energy, State, checked_system
+
+
+@pytree
+class Vakonomic:
+    """A system under the variational equations; `vakonomic` makes one.
+
+    In the physical (d'Alembert) equations the constraint forces of ψ = A v + b = 0 do no virtual
+    work. The variational equations instead make ∫ L + μ·ψ dt stationary, as if the rows belonged to
+    the Lagrangian L. This adds the momentum p = Aᵀμ to that of the motion. With q̇ = N(q) v,
+    Hamel's equations are
+
+        M a = f + J_hᵀλ − Aᵀμ̇ + Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v p,       A a = −γ,
+
+    where J_h has the rows with a φ, d/dt follows the motion, and ad*_v p is p_ω × ω for bodies in
+    space and zero elsewhere. This is the physical saddle system with one more force and with μ̇ =
+    −λ. The force is the curvature dθ(·, v) of the form θ = μ·A, with terms of explicit time
+    dependence. It vanishes for every μ if ψ is the rate of a φ; both motions are then the same.
+    Rows with a φ stay physical.
+
+    The velocities of this system are (v, μ): those of the physical system, then μ of every row
+    without a φ. Its positions are those of the physical system. It is stepped, batched and
+    differentiated like any other system.
+
+    Attributes:
+        system: the physical system, a `BodySystem` or `GeneralizedSystem`.
+        rows: the row numbers of each constraint, and the rows without a φ.
+
+    References:
+        Arnold, Kozlov, Neishtadt, Mathematical Aspects of Classical and Celestial Mechanics (2006),
+            section 1.4.
+        Bloch, Nonholonomic Mechanics and Control (2003), sections 1.3 and 5.2.
+    """
+
+    system: Any  # a System; `kick` and `squared_turn` need the protocol `Bodies`
+    rows: RowLayout = static()
+
+    @property
+    def layout(self) -> None:
+        """None, since μ belongs to no body."""
+        return
+
+    @property
+    def free(self) -> np.ndarray:
+        """The numbers of the rows with a multiplier μ, which are the rows without a φ."""
+        return np.asarray(self.rows.free)
+
+    def physical(self, state: State) -> State:
+        """Returns the state of the physical system, without the multipliers μ.
+
+        Args:
+            state: a state of the variational system.
+        """
+        return dataclasses.replace(state, v=state.v[: state.v.shape[0] - len(self.free)])
+
+    def multipliers(self, state: State, name: str) -> Array:
+        """Returns the multipliers μ of a constraint, one for each of its rows without a φ.
+
+        Args:
+            state: a state of the variational system.
+            name: name of the constraint.
+        """
+        chosen = np.isin(self.free, self.rows.rows(name))
+        return state.v[state.v.shape[0] - len(self.free) :][chosen]
+
+    @property
+    def constraints(self) -> tuple[Any, ...]:
+        """The constraints of the physical system."""
+        return self.system.constraints
+
+    @property
+    def params(self) -> Any:
+        """The parameters of the physical system."""
+        return self.system.params
+
+    @property
+    def bounds(self) -> tuple[Any, ...]:
+        """The groups of inequality constraints: none."""
+        return ()
+
+    def with_params(self, changes: PyTree) -> Self:
+        """Returns the system with other parameters of the physical system."""
+        return dataclasses.replace(self, system=self.system.with_params(changes))
+
+    @property
+    def turns(self) -> Array | tuple[()]:
+        """The expected angles of the counted joint coordinates, (n,) [rad]."""
+        return self.system.turns
+
+    @property
+    def counted(self) -> tuple[JointCoordinate, ...]:
+        """The joint coordinates whose whole turns are counted."""
+        return self.system.counted
+
+    def with_turns(self, turns: Array | tuple[()], remainder: Array | tuple[()] = ()) -> Self:
+        """Returns the system with other expected angles `turns` and rounding errors `remainder`."""
+        return dataclasses.replace(self, system=self.system.with_turns(turns, remainder))
+
+    def no_remainder(self, dtype: DType) -> Array | tuple[()]:
+        """Returns the `angle_remainder` of a new state: zeros, or () if angles are not reduced."""
+        return self.system.no_remainder(dtype)
+
+    def unwind(self, q: Array) -> tuple[Self, Array]:
+        """Moves whole turns of angles in the plane from q to the system; returns both."""
+        system, q = self.system.unwind(q)
+        return dataclasses.replace(self, system=system), q
+
+    def rewind(self, q: Array, after: Array) -> tuple[Array, Array | tuple[()]]:
+        """Returns coordinates with whole turns after a step, and the angles' rounding errors."""
+        return self.system.rewind(q, after)
+
+    def count(self, q: Array, v: Array, t: Doubled | Scalar) -> Array | tuple[()]:
+        """Returns the angles of the counted joint coordinates, (n,) [rad]."""
+        return self.system.count(q, self._split(v)[0], t)
+
+    def expect(
+        self, here: Snapshot, end: Array, dt: Array, within: bool
+    ) -> tuple[Array | tuple[()], Array]:
+        """Returns the expected angles after a step, and a bound on their error, () [rad]."""
+        return self.system.expect(here, self._split(end)[0], dt, within)
+
+    @property
+    def n_v(self) -> int:
+        """The number of velocities, multipliers μ included."""
+        return self.system.n_v + len(self.free)
+
+    def sizes(self, n_q: int) -> tuple[int, int]:
+        """Returns the numbers of positions and velocities of a state, multipliers μ included."""
+        positions, velocities = self.system.sizes(n_q)
+        return positions, velocities + len(self.free)
+
+    def snapshot(self, q: Array, v: Array, t: Doubled | Scalar) -> Snapshot:
+        """Returns the physical system at one instant, as a `Snapshot`."""
+        return self.system.snapshot(q, self._split(v)[0], t)
+
+    def mass(self, q: Array) -> Mass:
+        """Returns the mass matrix M of the physical system, with 1 on the diagonal for each μ."""
+        mass, ones = self.system.mass(q), jnp.ones(len(self.free), q.dtype)
+        if isinstance(mass, Diagonal):
+            return Diagonal(jnp.concatenate([mass.values, ones]))
+        return Full(jax.scipy.linalg.block_diag(mass.values, jnp.diag(ones)))
+
+    def force(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
+        """Returns the physical force f plus the curvature force, and zero for μ, (n_v,)."""
+        v, μ = self._split(v)
+        f = self.system.force(q, v, t, control)
+        return jnp.concatenate([f + self.curvature(q, v, t, μ), jnp.zeros_like(μ)])
+
+    def applied(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
+        """Returns `force` without the gyroscopic force of the physical system, (n_v,)."""
+        v, μ = self._split(v)
+        f = self.system.applied(q, v, t, control)
+        return jnp.concatenate([f + self.curvature(q, v, t, μ), jnp.zeros_like(μ)])
+
+    def curvature(self, q: Array, v: Array, t: Doubled | Scalar, μ: Array) -> Array:
+        """Returns the curvature force Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v Aᵀμ, (n_v,).
+
+        The class docstring defines its terms.
+        """
+        system, weights = self.system, jnp.zeros(self.rows.size, q.dtype)
+        weights = weights.at[self.free].set(μ)
+
+        def momentum(q: Array, later: Array) -> Array:
+            return linearize(system, q, v, Doubled.of(t) + later).jacobian.transpose(weights)
+
+        now = jnp.zeros_like(rounded(t))
+        along = (system.kinematics(q, v), jnp.ones_like(now))
+        p, ṗ = jax.jvp(momentum, (q, now), along)
+        slope = jax.grad(lambda q: linearize(system, q, v, t).rate @ weights)(q)
+        (pull,) = jax.vjp(lambda w: system.kinematics(q, w), v)[1](slope)
+        return pull - ṗ + system.coadjoint(q, v, p)
+
+    def complete(self, solution: Solution) -> Solution:
+        """Appends the rates μ̇ = −λ to the accelerations of a solution."""
+        a, _ = self._split(solution.acceleration)
+        rates = -solution.multipliers[self.free]
+        return solution._replace(acceleration=jnp.concatenate([a, rates]))
+
+    def kinematics(self, q: Array, v: Array) -> Array:
+        """Returns q̇ of the physical system, (n_q,)."""
+        return self.system.kinematics(q, self._split(v)[0])
+
+    def retract(self, q: Array, step: Array) -> Array:
+        """Returns the positions q ⊕ Δ after a step Δ of the physical velocities, (n_q,)."""
+        return self.system.retract(q, self._split(step)[0])
+
+    @property
+    def has_bodies(self) -> bool:
+        """True if the physical system consists of bodies."""
+        return self.system.has_bodies
+
+    @property
+    def turns_in_space(self) -> bool:
+        """True if bodies of the system have an orientation in space."""
+        return self.system.turns_in_space
+
+    def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
+        """Returns the rate ad*_v p of a momentum p due to turning bodies, with zero for μ."""
+        (v, μ), (p, _) = self._split(v), self._split(p)
+        return jnp.concatenate([self.system.coadjoint(q, v, p), jnp.zeros_like(μ)])
+
+    def kick(
+        self, q: Array, v: Array, acceleration: Array, dt: Array, small: bool = False
+    ) -> Array:
+        """Returns the physical velocities after a step h, and the multipliers μ + h μ̇, (n_v,)."""
+        (v, μ), (a, rate) = self._split(v), self._split(acceleration)
+        return jnp.concatenate([self.system.kick(q, v, a, dt, small), μ + dt * rate])
+
+    def gyroscopic_acceleration(self, q: Array, v: Array) -> Array:
+        """Returns the gyroscopic acceleration of the physical system, and zero for μ̇, (n_v,)."""
+        v, μ = self._split(v)
+        return jnp.concatenate([self.system.gyroscopic_acceleration(q, v), jnp.zeros_like(μ)])
+
+    def rotate(self, q: Array, v: Array, dt: Array) -> Array:
+        """Returns the physical velocities after a free rotation, and μ unchanged, (n_v,)."""
+        v, μ = self._split(v)
+        return jnp.concatenate([self.system.rotate(q, v, dt), μ])
+
+    def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
+        """Returns a velocity change in turned body frames, and its part for μ unchanged, (n_v,)."""
+        (step, _), (p, rest) = self._split(step), self._split(p)
+        return jnp.concatenate([self.system.in_turned_frames(q, step, p), rest])
+
+    def squared_turn(self, q: Array, v: Array, before: Array, rows: Rows, dt: Array) -> Array:
+        """Returns the square of the largest turn of a body or rod in a step, () [rad²]."""
+        v, before = self._split(v)[0], self._split(before)[0]
+        return self.system.squared_turn(q, v, before, rows, dt)
+
+    def squared_turns(
+        self, v: Array, before: Array, rows: Rows, dt: Array, whole: bool = False
+    ) -> Array:
+        """Returns the squared largest turn of the arms and axes of each row, (n_c,) [rad²]."""
+        v, before = self._split(v)[0], self._split(before)[0]
+        return self.system.squared_turns(v, before, rows, dt, whole)
+
+    def carry(self, q: Array, step: Array, p: Array) -> Array:
+        """Returns a momentum after a step, seen from its start, and its part for μ unchanged."""
+        (step, _), (p, rest) = self._split(step), self._split(p)
+        return jnp.concatenate([self.system.carry(q, step, p), rest])
+
+    def extent(self, q: Array) -> Array:
+        """Returns the largest position coordinate of the physical system, () [m]."""
+        return self.system.extent(q)
+
+    def normalize(self, q: Array) -> Array:
+        """Returns q with quaternions scaled to length one."""
+        return self.system.normalize(q)
+
+    def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:
+        """Returns the energy of the physical system [J]; if ψ is homogeneous in v, μ adds none."""
+        return self.system.energy(q, self._split(v)[0], t)
+
+    def motion(self, name: str, q: Array, v: Array) -> Motion:
+        """Returns the motion of a body's user frame, as arrays."""
+        return self.system.motion(name, q, self._split(v)[0])
+
+    def _split(self, v: Array) -> tuple[Array, Array]:
+        """Splits (v, μ) into the velocities v of the physical system and the multipliers μ."""
+        n = v.shape[0] - len(self.free)
+        return v[:n], v[n:]
+
+
+def vakonomic(
+    system: System, state: State, multipliers: Mapping[str, Any] | None = None
+) -> tuple[Vakonomic, State]:
+    """Replaces the physical equations by the variational ones, for all rows without a φ.
+
+    The variational equations are those of optimal control, where rows restrict the possible
+    motions. A wheel or a skate obeys the physical equations instead. A motion needs initial
+    multipliers μ besides q and v.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: the initial state of the physical system.
+        multipliers: μ by constraint name, () or (rows without a φ,); zero for other constraints.
+
+    Returns:
+        The variational system, and its initial state.
+
+    Raises:
+        ValueError: an unknown name, a constraint whose rows all have a φ, a wrong shape, or a
+            system with inequality rows.
+    """
+    if not isinstance(multipliers, Mapping | None):
+        raise TypeError(
+            "vakonomic: multipliers must be a mapping from names of constraints to μ, got"
+            f" {checks.shortened(multipliers)}."
+        )
+    if system.bounds:
+        names = [name for group in system.bounds for name in group.names]
+        raise ValueError(
+            f"vakonomic: there is no variational form of the inequality rows of {names} here; build"
+            " the scene without these elements."
+        )
+    layout = layout_of(checked_system(system, state), state.q, state.v, state.instant)
+    result = Vakonomic(system, layout)
+    μ = jnp.zeros(len(result.free), state.v.dtype)
+    for name, given in (multipliers or {}).items():
+        indices = np.flatnonzero(np.isin(result.free, layout.rows(name)))
+        if not len(indices):
+            others = [n for n in layout.names if not np.all(layout.holonomic[layout.rows(n)])]
+            raise ValueError(
+                f"vakonomic: constraint '{name}' has a φ in each of its rows and takes no μ; those"
+                f" that take one are {others}."
+            )
+        shape = np.shape(checks.check("vakonomic", f"μ of '{name}'", given)) and (len(indices),)
+        value = checks.real(f"vakonomic: '{name}'", "μ", given, μ.dtype, shape)
+        μ = μ.at[indices].set(value)
+    return result, dataclasses.replace(state, v=jnp.concatenate([state.v, μ]))

@@ -1,0 +1,1 @@
+"""Inequality constraints (contact, limits, friction, motors), their solvers, and impacts."""

@@ -1,0 +1,273 @@
+"""Ropes and contacts with friction: geometry and rows.
+
+The pairs that may touch are fixed when the scene is built. Every pair computes its gap, the normal
+from the first body to the second, and the point of contact in each step. The rows depend on these
+alone (`contact_rows`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+
+from jaxcon.constraints.joints import stretched, unit_vector
+from jaxcon.constraints.pairs import check_oriented
+from jaxcon.constraints.primitives import Row, distance
+from jaxcon.contact.contact_rows import MATERIAL, Touch, contact_rows, material
+from jaxcon.contact.limits import Ranged, one_sided, stop
+from jaxcon.contact.point_sets import given_points, own_points, spread, spread_place
+from jaxcon.contact.rows import BoundSet
+from jaxcon.core import checks, numerics
+from jaxcon.core.lanes import Vector
+from jaxcon.core.pytree import pytree
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.geometry.pose import Pose
+from jaxcon.system.elements import BetweenBodies, label, own_point
+
+if TYPE_CHECKING:
+    from jaxcon.constraints.primitives import JointFrame
+    from jaxcon.contact.boxes import BoxContact
+    from jaxcon.system.body_system import Snapshot
+
+
+@dataclass(frozen=True)
+class Rope(BetweenBodies):
+    """Limits the distance of two points: φ = l − ‖p_b − p_a‖ ≥ 0. λ is the tension.
+
+    Attributes:
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
+        length: length l > 0 [m]. If None, the distance at assembly.
+        point_a, point_b: end points in the world at assembly, (dim,) [m]. If None, the centers of
+            mass.
+        restitution: coefficient of restitution e, from 0 to 1, of the impact when the rope becomes
+            taut.
+        stiffness: stiffness k of an elastic rope [N/m]; None for an inextensible rope.
+        damping: damping c of an elastic rope [N s/m].
+        recovery: largest speed at which an overstretched rope shortens [m/s].
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    length: Any = None
+    point_a: Any = None
+    point_b: Any = None
+    restitution: Any = 0.0
+    stiffness: Any = None
+    damping: Any = 0.0
+    recovery: Any = 0.1
+    optional = ("restitution",)
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """Returns the end points in the body frames, the length, and the stop's parameters."""
+        return stretched(self, a, b) | stop(self, a.position.dtype)
+
+    @staticmethod
+    def bounds(
+        p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
+    ) -> tuple[list[Row], dict[str, Any]]:
+        """Returns the one-sided row with the gap l − ‖p_b − p_a‖."""
+        row = distance(a.point(p["anchor_a"]), b.point(p["anchor_b"]), p["length"])
+        pulls = tuple(-pull for pull in row.pulls)
+        slack, fields = one_sided(p, Row(-row.value, -row.rate, 0.0, pulls), dt)
+        return [slack], fields
+
+
+@dataclass(frozen=True)
+class PlaneContact(BetweenBodies):
+    """Contact of one or more balls of a body with another body's plane.
+
+    A ball of radius zero is a point. λ has the shape (1 + tangents,) for one ball, and (k, 1 +
+    tangents) for k balls. For a capsule, give the two balls at the ends of its axis, `center` of
+    shape (2, dim).
+
+    Attributes:
+        name: name of the element, unique in the scene.
+        body_a: the body with the plane, or `WORLD`.
+        body_b: the body with the ball.
+        radius: radius r ≥ 0 [m].
+        center: center of the ball in the world at assembly, (dim,) [m], or centers of k balls with
+            the same radius, (k, dim). If None, the center of mass.
+        normal: outward normal of the plane in the world at assembly, (dim,). If None, the last
+            axis.
+        point: a point of the plane in the world at assembly, (dim,) [m]. If None, the origin.
+        friction: coefficient of friction μ ≥ 0. With the number 0 there is a normal row only.
+        restitution: coefficient of restitution e, from 0 to 1.
+        stiffness, damping: spring and damper of a soft contact [N/m], [N s/m]. Without a stiffness,
+            contact is hard.
+        recovery: the largest speed at which a penetration closes [m/s].
+        rolling: length c ≥ 0 of rolling resistance [m], ‖τ‖ ≤ c λ_n for its moment τ; 0 for none.
+        spinning: length c ≥ 0 of resistance to spinning about the normal, in space [m]; 0 for none.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    radius: Any = 0.0
+    center: Any = None
+    normal: Any = None
+    point: Any = None
+    friction: Any = 0.0
+    restitution: Any = 0.0
+    stiffness: Any = None
+    damping: Any = 0.0
+    recovery: Any = 0.1
+    rolling: Any = 0.0
+    spinning: Any = 0.0
+    optional = MATERIAL
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """Returns the plane in the frame of a, the balls in the frame of b, and the material."""
+        radius = checks.real(label(self), "radius", self.radius, b.position.dtype, least=0)
+        ball = {"anchor_b": own_points(self, "center", self.center, b), "radius": radius}
+        return plane(self, a) | ball | material(self, a, b)
+
+    points = staticmethod(given_points)
+
+    @staticmethod
+    def bounds(
+        p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
+    ) -> tuple[list[Row], dict[str, Any]]:
+        """Returns the contact rows of each ball, whose gap is n·(p_b − p_a) − r."""
+        n = a.direction(p["normal"]).position
+        center = b.point(p["anchor_b"]).position
+        gap = n.dot(center - a.point(p["anchor_a"]).position) - p["radius"]
+        middle = center - n * (p["radius"] + gap / 2)
+        return contact_rows(p, Touch(gap, n, middle, a, b), dt)
+
+
+@dataclass(frozen=True)
+class CapsuleContact(BetweenBodies):
+    """Contact of two capsules at one point; a capsule whose segment has no length is a ball.
+
+    Attributes:
+        name: name of the element, unique in the scene.
+        body_a, body_b: names of the bodies, or `WORLD`.
+        radius_a, radius_b: radii r ≥ 0 [m].
+        segment_a, segment_b: the two ends of each capsule's axis in the world at assembly, (2, dim)
+            [m]. If None, both ends are the center of mass.
+        friction: coefficient of friction μ ≥ 0. With the number 0 there is a normal row only.
+        restitution: coefficient of restitution e, from 0 to 1.
+        stiffness, damping: spring and damper of a soft contact [N/m], [N s/m]. Without a stiffness,
+            contact is hard.
+        recovery: the largest speed at which a penetration closes [m/s].
+        rolling: length c ≥ 0 of rolling resistance [m], ‖τ‖ ≤ c λ_n for its moment τ; 0 for none.
+        spinning: length c ≥ 0 of resistance to spinning about the normal, in space [m]; 0 for none.
+    """
+
+    name: str
+    body_a: str
+    body_b: str
+    radius_a: Any = 0.0
+    radius_b: Any = 0.0
+    segment_a: Any = None
+    segment_b: Any = None
+    friction: Any = 0.0
+    restitution: Any = 0.0
+    stiffness: Any = None
+    damping: Any = 0.0
+    recovery: Any = 0.1
+    rolling: Any = 0.0
+    spinning: Any = 0.0
+    optional = MATERIAL
+
+    def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
+        """Returns the capsules in the frames of their bodies, and the material.
+
+        Raises:
+            ValueError: no radius is given; two segments never overlap.
+        """
+        if checks.plain_zero(self.radius_a) and checks.plain_zero(self.radius_b):
+            raise ValueError(f"{label(self)}: give radius_a, radius_b or both.")
+        result: dict[str, Array] = {}
+        for side, pose in (("a", a), ("b", b)):
+            given = getattr(self, f"segment_{side}")
+            shape = (2, *pose.position.shape)
+            ends = jnp.stack([pose.position] * 2) if given is None else given
+            ends = checks.real(label(self), f"segment_{side}", ends, pose.position.dtype, shape)
+            names = ("start", "end")
+            for what, x in zip(names, ends, strict=True):
+                point = own_point(self, f"segment_{side}", x, pose)
+                result[f"{what}_{side}"] = pose.local_point(point)
+            radius_given = getattr(self, f"radius_{side}")
+            radius = checks.real(
+                label(self), f"radius_{side}", radius_given, pose.position.dtype, least=0
+            )
+            result[f"radius_{side}"] = radius
+        return result | material(self, a, b)
+
+    @staticmethod
+    def bounds(
+        p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
+    ) -> tuple[list[Row], dict[str, Any]]:
+        """Returns the contact rows; the gap is ‖x_b − x_a‖ − r_a − r_b at the closest points."""
+        ends = [
+            f.point(p[f"{e}_{s}"]).position
+            for f, s in ((a, "a"), (b, "b"))
+            for e in ("start", "end")
+        ]
+        x_a, x_b = nearest(*ends)
+        apart = x_b - x_a
+        length = numerics.norm(apart)
+        n = apart * numerics.safe_divide(1.0, length)
+        gap = length - p["radius_a"] - p["radius_b"]
+        middle = x_a + n * (p["radius_a"] + gap / 2)
+        return contact_rows(p, Touch(gap, n, middle, a, b), dt)
+
+
+@pytree
+class Contacts(Ranged):
+    """A group of ropes or contacts of the class `law`, between bodies of the same kinds."""
+
+    def bounds(self, snapshot: Snapshot, control: PyTree, dt: Array) -> BoundSet:
+        """Returns the inequality rows at one instant, with their targets for a step of dt."""
+        p, places = self.params, self.places
+        points = self.law.points(p) if hasattr(self.law, "points") else None
+        if points is not None:
+            p = spread(p, points)
+            places = tuple(spread_place(place, points[0].shape[1]) for place in places)
+        rows, fields = self.law.bounds(p, *(snapshot.frame(place) for place in places), dt)
+        law = "contact" if "friction" in p else "single"
+        each = None if points is None else points[0].shape[1]
+        return BoundSet(law, tuple(rows), places, points=each, **fields)
+
+
+def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]:
+    """Returns the closest points of the segments pq and rs.
+
+    Parallel segments are closest along the part where they face each other; the result is the
+    middle of this part. If they do not face each other, the result is the two closest ends.
+
+    References:
+        Ericson, Real-Time Collision Detection (2005), section 5.1.9.
+    """
+    u, w, d = q - p, s - r, p - r
+    a, e, b = u.dot(u), w.dot(w), u.dot(w)
+    c, f = u.dot(d), w.dot(d)
+    apart = a * e - b * b
+    tiny = 16 * float(jnp.finfo(jnp.result_type(*p)).eps)
+    crossing = apart > tiny * a * e
+    x = jnp.clip(numerics.safe_divide(b * f - c * e, jnp.where(crossing, apart, 0)), 0, 1)
+    facing = [jnp.clip(numerics.safe_divide(end, a), 0, 1) for end in (-c, b - c)]
+    x = jnp.where(crossing, x, (facing[0] + facing[1]) / 2)
+    y = jnp.clip(numerics.safe_divide(b * x + f, e), 0, 1)
+    x = jnp.clip(numerics.safe_divide(b * y - c, a), 0, 1)
+    return p + u * x, r + w * y
+
+
+def plane(element: PlaneContact | BoxContact, a: Pose) -> dict[str, Array]:
+    """Returns the normal and a point of a plane in the frame of its body.
+
+    Raises:
+        ValueError: the body is a particle.
+    """
+    check_oriented(element, a)
+    dim, dtype = a.position.shape[0], a.position.dtype
+    given = (0.0,) * (dim - 1) + (1.0,) if element.normal is None else element.normal
+    normal = unit_vector(element, "normal", given, a)
+    origin = jnp.zeros(dim, dtype) if element.point is None else element.point
+    point = own_point(element, "point", origin, a)
+    return {"normal": a.local_direction(normal), "anchor_a": a.local_point(point)}

@@ -1,1 +1,0 @@
-"""Floor 4: from a scene to accelerations and multipliers."""

@@ -1,0 +1,1 @@
+"""Execution: steps, rollouts, initial states, and the memory of the reverse pass."""

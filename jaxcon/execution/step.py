@@ -1,0 +1,197 @@
+"""`jc.step` and `jc.forward_dynamics`: input is checked, then `shell` does the work."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from typing import Any, TypeVar
+
+import jax
+
+from jaxcon.constraints.rows import Violation
+from jaxcon.contact.rows import Reactions
+from jaxcon.core import checks
+from jaxcon.core.typing import Array, PyTree, Scalar
+from jaxcon.execution.shell import masked_step, solve_at
+from jaxcon.execution.validation import check_step
+from jaxcon.execution.wrenches import Origin
+from jaxcon.linear.saddle import Solution
+from jaxcon.methods.method import Method, check_method
+from jaxcon.methods.stability import warn_if_unstable
+from jaxcon.protocols import System
+from jaxcon.staging import batch_last
+from jaxcon.step import StepInfo, without_memory
+from jaxcon.system.state import State
+
+Info = TypeVar("Info", bound="StepInfo | SolutionAt")
+
+
+def step(
+    system: System, method: Method, state: State, control: PyTree, dt: Scalar
+) -> tuple[State, StepInfo]:
+    """Returns the state one step later. Pure: jit, vmap, grad, jvp and scan it.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        method: integrator, stabilizer and solvers.
+        state: from `Scene.build` or `init`.
+        control: (n_u,) by `system.layout.controls`, or what the user's force expects; None only
+            where no motor needs one.
+        dt: h, () [s].
+
+    Shapes and dtypes are always checked. Values are checked if they are Python or NumPy numbers; a
+    JAX array may still be computed, and a bad value in it ends the world with a status.
+
+    Returns:
+        The new state, and what the step found at its start. A world that fails keeps its last
+        finite state, has the reason in `status`, and has zero gradient. Other worlds are not
+        affected.
+
+    Raises:
+        ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.
+        TypeError: an argument has another type, such as a class in place of a method.
+    """
+    check_method(method, wait=False)
+    with checks.without_waiting():  # of dt as given: under jit an array of it would be traced
+        warn_if_unstable(method, dt, system, state)
+    given = _checked("step", system, method, state, control, dt)
+    return _reported(batch_last.call(masked_step, *given), system, state, given[3])
+
+
+def step_quietly(
+    system: System, method: Method, state: State, control: PyTree, dt: Scalar, owner: str = "step"
+) -> tuple[State, StepInfo]:
+    """`step` for another public function, the owner; without the warning of unstable gains."""
+    given = _checked(owner, system, method, state, control, dt)
+    return _reported(batch_last.call(masked_step, *given), system, state, given[3])
+
+
+def _checked(
+    owner: str, system: System, method: Method, state: State, control: PyTree, dt: Scalar
+) -> tuple[System, Method, State, PyTree, Array]:
+    """Returns the arguments of `masked_step`: those of a step, checked and as arrays."""
+    control = check_step(system, method, state, control, owner)
+    with checks.without_waiting():
+        h = checks.real(owner, "dt", dt, state.q.dtype, least=0)
+        method = method.known_at(dt, state.q.dtype)
+    return system, method, state, control, h
+
+
+def _reported(
+    result: tuple[State, StepInfo], system: System, state: State, control: PyTree
+) -> tuple[State, StepInfo]:
+    """Adds state, control and system to an info.
+
+    That is done outside of the compiled step: a rollout that does not record them does not carry
+    them.
+    """
+    new, info = result
+    where = without_memory(state) if info.state is None else info.state
+    return new, with_origin(dataclasses.replace(info, state=where, control=control), system)
+
+
+def with_origin(info: Info, system: System) -> Info:
+    """Returns an info that knows its system."""
+    info = copy.copy(info)
+    object.__setattr__(info, "origin", Origin(system))
+    return info
+
+
+def undo(system: System, method: Method, state: State, control: PyTree, dt: Scalar) -> State:
+    """Returns the state before a step of h, by a step of −h of a symmetric integrator.
+
+    Counted turns are those at the end of the step, not those before its start. Both tell the same
+    whole turns.
+    """
+    control = check_step(system, method, state, control, "rollout")
+    with checks.without_waiting():
+        h = checks.real("rollout", "dt", dt, state.q.dtype)
+    return batch_last.call(masked_step, system, method, state, control, -h)[0]
+
+
+@jax.tree_util.register_pytree_node_class
+class SolutionAt(Solution):
+    """A `Solution` that knows where it belongs; unpacks as `a, λ, status`.
+
+    Attributes:
+        state: without the memory of a method.
+        violation: φ and φ̇ by constraint.
+        reactions: forces of limits, friction and contact; None in a scene without.
+        control: control u.
+        origin: see `StepInfo.origin`.
+    """
+
+    state: Any = None
+    violation: Any = None
+    reactions: Any = None
+    control: Any = None
+    origin: Any = None
+
+    def __new__(
+        cls,
+        acceleration: Array,
+        multipliers: Array,
+        status: Array,
+        state: State | None = None,
+        violation: Violation | None = None,
+        reactions: Reactions | None = None,
+        control: PyTree = None,
+    ) -> SolutionAt:
+        """The solution at a state."""
+        solution = super().__new__(cls, acceleration, multipliers, status)
+        solution.state, solution.violation = state, violation
+        solution.reactions, solution.control = reactions, control
+        return solution
+
+    def _replace(self, **changes: Any) -> SolutionAt:  # type: ignore[override]
+        """Returns a solution with other a, λ or status, at the same state."""
+        solution = type(self)(*super()._replace(**changes), *self._place())
+        solution.origin = self.origin
+        return solution
+
+    def _place(self) -> tuple[Any, ...]:
+        return self.state, self.violation, self.reactions, self.control
+
+    def tree_flatten(self) -> Any:
+        """Children, the state among them."""
+        return (*self, *self._place()), None
+
+    @classmethod
+    def tree_unflatten(cls, _: None, children: tuple[Any, ...]) -> SolutionAt:
+        """Rebuilds the solution from its children."""
+        return cls(*children)
+
+
+def forward_dynamics(
+    system: System, state: State, control: PyTree, method: Method, dt: Scalar
+) -> SolutionAt:
+    """Returns a and λ at a state, with the method's feedback of φ and φ̇ at this state.
+
+    Inequality constraints are solved as over a step of h: a then is the mean over the step, with
+    the impulse of an impact divided by h.
+
+    To read the forces at a state, use `Unstabilized()`: feedback adds forces that are not of the
+    motion, and reacts to the rate φ̇ = ½hγ that semi-implicit Euler leaves, which is no error.
+
+    Args:
+        system: a `BodySystem` or `GeneralizedSystem`.
+        state: where.
+        control: as of `step`.
+        method: its stabilizer and solvers are used.
+        dt: h, () [s], on which default gains depend.
+
+    Returns:
+        acceleration (n_v,) [m/s², rad/s²], multipliers (n_c,) [N, N·m], status (): a `Solution`
+        that unpacks so. It also has the `state` and `control` given, `violation` and `reactions`.
+
+    Raises:
+        ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.
+        TypeError: an argument has another type, such as a class in place of a method.
+    """
+    control = check_step(system, method, state, control, "forward_dynamics")
+    with checks.without_waiting():
+        h = checks.real("forward_dynamics", "dt", dt, state.q.dtype, least=0)
+    given = (system, method, state, control, h)
+    (a, λ, status), violation, reactions = batch_last.call(solve_at, *given)
+    where = without_memory(state)
+    return with_origin(SolutionAt(a, λ, status, where, violation, reactions, control), system)

@@ -1,0 +1,227 @@
+"""Forces of a step by name: the wrench of each constraint, limit, contact and force element.
+
+An element acts on a body by a generalized force: Jᵀλ of its rows, or what a force element exerts.
+In space that is (F, Rᵀτ), F in the world frame and the torque about the center of mass x in the
+body frame. About a point p of the world the torque is τ + (x − p) × F.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.custom import Custom
+from jaxcon.core.checks import shortened
+from jaxcon.core.lanes import Vector, times, total
+from jaxcon.core.status import failed
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.staging import batch_last
+from jaxcon.staging.failure import mask_failed_gradients
+from jaxcon.staging.worlds import batch_of, broadcast_worlds, where_tree
+from jaxcon.system.forces import CustomForces
+from jaxcon.system.layout import Layout, Place
+from jaxcon.system.state import State, with_turns
+
+if TYPE_CHECKING:
+    from jaxcon.constraints.rows import RowLayout
+    from jaxcon.contact.rows import BoundSet, Reactions
+    from jaxcon.execution.step import SolutionAt
+    from jaxcon.protocols import Constraint, System
+    from jaxcon.step import StepInfo
+    from jaxcon.system.body_system import BodySystem, Snapshot
+
+Pull = tuple[Place, Vector]
+"""Bodies of one group, and the generalized force on each of them by lanes (element,)."""
+
+KINDS = ("constraints", "bounds", "forces")
+"""The fields of a system that hold groups of elements."""
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """The system of an info, which `jc.wrench` needs.
+
+    It is no pytree: what JAX returns from a transformation does not have it, so that a step whose
+    wrenches nobody reads neither computes nor carries anything for them.
+    """
+
+    system: System
+
+    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+        """Leaves the system out of a pickled info, as out of one that JAX rebuilds."""
+        return _nothing, ()
+
+
+def wrench_in(
+    system: BodySystem, info: StepInfo | SolutionAt, name: str, body: str | None = None
+) -> Array:
+    """Returns the wrench of an element on a body, in the world frame; see `jc.wrench`.
+
+    Args:
+        system: the system of the state.
+        info: of one world, with its state and control.
+        name: name of the element.
+        body: name of the body; by default the last of the element.
+
+    Raises:
+        ValueError: the element is unknown, or does not act on the body.
+    """
+    layout = system.layout
+    groups = [(kind, i, group) for kind in KINDS for i, group in enumerate(getattr(system, kind))]
+    place = next((x for x in groups if isinstance(name, str) and name in x[2].names), None)
+    if place is None:
+        names = [x for *_, group in groups for x in group.names]
+        raise ValueError(f"element {shortened(name)} is unknown; known are {names}.")
+    kind, index, group = place
+    element = group.names.index(name)
+    bodies = [side[element] for side in _sides(group, layout)]
+    moving = [x for x in bodies if x in layout.places]
+    target = bodies[-1] if body is None else body
+    sign, acting = 1, [i for i, x in enumerate(moving) if x == target]
+    # one moving and one fixed body: action is reaction
+    if target in bodies and not acting and len(set(bodies)) == 2:
+        sign, acting = -1, [*range(len(moving))]
+    if not acting:
+        raise ValueError(
+            f"body: element '{name}' acts on {bodies}; the wrench on {shortened(target)} does"
+            " not follow from theirs."
+        )
+    read = _reader(kind, index, info.violation.layout)
+    given = (system, info.state, info.control, info.multipliers, info.reactions, info.status)
+    blocks = batch_last.call(read, *given)
+    return sign * total(blocks[i][:, element] for i in acting)
+
+
+def _nothing() -> None:
+    """Returns None, in place of a pickled origin."""
+
+
+def _sides(group: Any, layout: Layout) -> list[tuple[str, ...]]:
+    """Returns the names of the bodies on each side of a group, one for each element."""
+    if isinstance(group, CustomForces):  # what acts on a fixed body is not computed
+        return [(body,) for body in group.law.bodies if body in layout.places]
+    if isinstance(group, Custom):
+        return [(body,) for body in group.law.bodies]
+    return [
+        place.fixed
+        if place.group is None
+        else tuple(layout.groups[place.group].names[i] for i in place.indices)
+        for place in group.places
+    ]
+
+
+@functools.lru_cache(maxsize=256)
+def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Array]]:
+    """Returns a function of the wrenches (d, element) on each moving side of one group.
+
+    They are zeros without a gradient in failed worlds.
+    """
+
+    def blocks(
+        system: BodySystem,
+        state: State,
+        control: PyTree,
+        multipliers: Array,
+        reactions: Reactions | None,
+    ) -> list[Array]:
+        system = with_turns(system, state.turns, state.angle_remainder)
+        snapshot = system.snapshot(state.q, state.v, state.instant)
+        group, anchors = getattr(system, kind)[index], None
+        if kind == "constraints":
+            pulls = _of_equalities(snapshot, group, layout, multipliers)
+        elif kind == "bounds":
+            assert reactions is not None
+            dt = jnp.ones_like(state.time)  # on which the directions of forces do not depend
+            rows = group.bounds(snapshot, control, dt)
+            pulls, anchors = _of_inequalities(group, rows, reactions), rows.place
+            if rows.points is not None:
+                return [*_wrenches(snapshot, pulls, None)]
+        else:
+            pulls = [pull for pull in group.pulls(snapshot, control) if pull[0].group is not None]
+            if not pulls:  # no control, no force
+                pulls = [(place, Vector()) for place in group.places if place.group is not None]
+        return [*_wrenches(snapshot, pulls, anchors or group.anchors(snapshot))]
+
+    def masked(status: Array, *given: Any) -> tuple[list[Array], Array]:
+        found = blocks(*given)
+        return where_tree(~failed(status), found, [jnp.zeros_like(x) for x in found]), status
+
+    def read(
+        system: BodySystem,
+        state: State,
+        control: PyTree,
+        multipliers: Array,
+        reactions: Reactions | None,
+        status: Array,
+    ) -> list[Array]:
+        given = (system, state, control, multipliers, reactions, status)
+        batch = batch_of(given, state.q.ndim - 1)
+        state, status = broadcast_worlds((state, status), batch)
+        given = (status, system, state, control, multipliers, reactions)
+        return mask_failed_gradients(masked, given)[0]
+
+    return read
+
+
+def _of_equalities(
+    snapshot: Snapshot, group: Constraint, layout: RowLayout, multipliers: Array
+) -> list[Pull]:
+    """Returns Jᵀλ of a group by its bodies."""
+    rows = group.rows(snapshot)
+    λ = []
+    if rows:  # a joint may be there to be read and driven only
+        numbers = np.stack([layout.rows(name) for name in group.names])
+        λ = list(jnp.moveaxis(multipliers[numbers], 1, 0))
+    moving = [(side, place) for side, place in enumerate(group.places) if place.group is not None]
+    return [(place, _sum(λ, [row.pulls[side] for row in rows])) for side, place in moving]
+
+
+def _of_inequalities(group: Any, rows: BoundSet, reactions: Reactions) -> list[Pull]:
+    """Returns Jᵀλ of a group by its bodies; sums the forces at several points of an element."""
+    points, every = rows.points or 1, (*rows.rows, *rows.rolls, *rows.spins)
+    numbers = np.stack([reactions.layout.rows(name) for name in group.names])
+    numbers = numbers.reshape(-1, len(every))
+    λ = list(jnp.moveaxis(reactions.multipliers[numbers], 1, 0))
+    if rows.direction is not None:
+        # the row is that of the nearer stop; in a fast step the farther one may have acted
+        assert reactions.direction is not None
+        λ[0] = λ[0] * rows.direction * reactions.direction[numbers[:, 0]]
+    pulls = []
+    for side, place in enumerate(rows.places):
+        if place.group is not None:
+            force = _sum(λ, [row.pulls[side] for row in every])
+            each = force.map(lambda x: x.reshape(-1, points, *x.shape[1:]).sum(axis=1))
+            pulls.append((Place(place.group, place.indices[::points]), each))
+    return pulls
+
+
+def _sum(multipliers: list[Array], pulls: list[Vector]) -> Vector:
+    """Returns Σ λ_r J_r over rows, lanes (element,); an empty vector without rows."""
+    if not pulls:  # a joint may be there to be read and driven only
+        return Vector()
+    rows = [[times(x, λ) for x in pull] for λ, pull in zip(multipliers, pulls, strict=True)]
+    zero = jnp.zeros_like(multipliers[0])
+    return Vector(*(zero + total(x) for x in zip(*rows, strict=True)))
+
+
+def _wrenches(snapshot: Snapshot, pulls: list[Pull], anchor: Vector | None) -> Iterator[Array]:
+    """Yields (F, τ) about the anchors, else about the centers of mass, (d, element) by side."""
+    layout, like = snapshot.system.layout, snapshot.q[:1]
+    dim = layout.dim
+    for place, pull in pulls:
+        assert place.group is not None
+        frame, shape = snapshot.frame(place), (len(place.indices), *like.shape[1:])
+        pull = pull or Vector(*(0.0,) * layout.groups[place.group].kind.n_v)
+        force = Vector(*pull[:dim])
+        lanes: list[Any] = [*force]
+        if len(pull) > dim:
+            torque = pull[2] if dim == 2 else frame.rotation @ Vector(*pull[dim:])
+            if anchor is not None:
+                torque = torque + (frame.position - anchor).cross(force)
+            lanes += [torque] if dim == 2 else [*torque]
+        yield jnp.stack([jnp.broadcast_to(jnp.asarray(x, like.dtype), shape) for x in lanes])

@@ -1,0 +1,38 @@
+"""Springs, dampers, actuators and applied forces.
+
+Springs and dampers: Spring, JointSpring, JointDamper, Bending, Flexure.
+Actuators: Motor, PositionServo, VelocityServo, AffineActuator.
+Applied forces: ExternalWrench, CustomForce, Force.
+"""
+
+from jaxcon.system.actuators import (
+    AffineActuator,
+    JointDamper,
+    JointSpring,
+    Motor,
+    PositionServo,
+    VelocityServo,
+)
+from jaxcon.system.elastic import Bending, Flexure
+from jaxcon.system.forces import CustomForce, ExternalWrench, Force, Spring
+
+
+def __dir__() -> list[str]:
+    """Returns the public names."""
+    return [*__all__]
+
+
+__all__ = [
+    "Spring",
+    "JointSpring",
+    "JointDamper",
+    "Bending",
+    "Flexure",
+    "Motor",
+    "PositionServo",
+    "VelocityServo",
+    "AffineActuator",
+    "ExternalWrench",
+    "CustomForce",
+    "Force",
+]

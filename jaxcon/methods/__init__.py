@@ -1,0 +1,1 @@
+"""Integrators, stabilizers, and `Method`, which combines them with the solvers."""

@@ -1,1 +1,0 @@
-"""Floor 2: what a system is and where its coordinates lie."""

@@ -1,1 +1,0 @@
-"""Floor 6: steps and rollouts."""

@@ -1,1 +1,0 @@
-"""Floor 5: what keeps a state on the constraint manifold."""

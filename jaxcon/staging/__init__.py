@@ -1,0 +1,1 @@
+"""Batches of worlds along the last axis, masked gradients, staged kernels. No mechanics."""

@@ -1,0 +1,493 @@
+"""Native functions: `vmap` moves the batch to the last axis and calls them once.
+
+A function written with lanes takes arrays with any number of trailing batch axes, and each of its
+operations is one loop over contiguous memory. Plain `jax.vmap` puts the batch first and rewrites
+every instruction, so that small matrices are processed one by one. `call` wraps the function in a
+primitive whose batching rule passes the whole batch along the last axis.
+
+The lowering rule for CPUs is also the place where a function is cut into stages. Without stages XLA
+computes shared values again in each kernel that needs them: a chain of 5 links then runs at 0.054
+instead of 2.9 million steps a second (two cores, a batch in the hundreds). See `fusion`.
+
+The derivative of a native function is a native function, too. The rules below bind the same
+primitive again, for the tangent map and for its transpose. So `grad`, `jvp`, `vmap(grad)`,
+`grad(vmap)`, `hessian` and `scan` compose with it and stay native.
+
+An argument that is not mapped gets a trailing axis of size 1, and the function broadcasts it: a
+parameter shared by all worlds is read once. The transpose of that broadcast is a sum over worlds.
+It is right when `grad` is outside `vmap`, and wrong when it is inside. Therefore a batched
+transposed map returns one cotangent for each world, whatever its arguments share.
+
+The reverse pass keeps only the arguments of each call. A call is a checkpoint, and its derivative
+evaluates the function once more.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive
+from jax.extend.core.primitives import stop_gradient_p
+from jax.interpreters import ad, batching, mlir, partial_eval
+
+from jaxcon.core import notices
+from jaxcon.core.jaxprs import without_unused
+from jaxcon.core.somewhere import asking
+from jaxcon.core.typing import Array, PyTree, Scalar, T
+from jaxcon.staging import fusion, meshes
+from jaxcon.staging.worlds import broadcast_worlds
+
+FEW = 64
+"""The largest size of a known array that becomes a constant of the program."""
+
+# Set while `Tangent` traces a derivative, read by the custom JVP rule in `failure`. JAX calls that
+# rule from inside its tracing, with a fixed signature, so that no argument can carry the order.
+_ORDER = ContextVar("order", default=0)
+
+# Set while `Transposed` traces, read by `_stopped`. JAX calls transpose rules with a fixed
+# signature.
+_TRANSPOSED = ContextVar("transposed", default=False)
+
+# Set around the loop of a rollout, read in `call`. Between them are the adjoint's scan, which users
+# may replace, and reverse passes that JAX traces: an argument would have to pass through all.
+_CONSTANTS = ContextVar("constants", default=True)
+
+
+def order() -> int:
+    """Returns the order of the derivative being traced: 0 for the native function itself."""
+    return _ORDER.get()
+
+
+@contextmanager
+def during(variable: ContextVar[T], value: T) -> Iterator[None]:
+    """Sets a context variable for the duration of a `with` block."""
+    before = variable.set(value)
+    try:
+        yield
+    finally:
+        variable.reset(before)
+
+
+Aval = tuple[tuple[int, ...], Any]
+"""A shape and a dtype."""
+
+
+class Native:
+    """A function of arrays with trailing batch axes, compared by identity.
+
+    Attributes:
+        function: (arrays) → list of arrays.
+        staged: True if it and its derivatives may be cut into stages.
+    """
+
+    def __init__(self, function: Callable[..., Any], staged: bool = True) -> None:
+        self.function, self.staged = function, staged
+        self.compiled = jax.jit(lambda *args: bound(args, self))
+        self.tangent = functools.lru_cache(maxsize=64)(functools.partial(TangentNative, self))
+        self.transposed = functools.lru_cache(maxsize=64)(functools.partial(TransposedNative, self))
+        self.part = functools.lru_cache(maxsize=64)(functools.partial(PartialNative, self))
+        self.among = functools.lru_cache(maxsize=64)(self._among)
+
+    def __call__(self, *args: Array) -> list[Array]:
+        """Calls the function."""
+        return list(self.function(*args))
+
+    def eager(self, *args: Array) -> list[Array]:
+        """Calls the function outside jit: compiled, unless jit is disabled."""
+        return self(*args) if jax.config.values["jax_disable_jit"] else self.compiled(*args)
+
+    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+        """Shapes and dtypes of the results, from the trace that `_in_stages` uses, too."""
+        avals = self.traced(*(((*x.shape, 1), x.dtype) for x in args)).out_avals
+        return [ShapedArray(y.shape[:-1], y.dtype) for y in avals]
+
+    def traced(self, *avals: Aval) -> ClosedJaxpr:
+        """The closed jaxpr for arguments of these shapes and dtypes, under JAX's current settings.
+
+        Operations keep the mesh and the default precision under which they were traced.
+        """
+        mesh, real = jax.sharding.get_abstract_mesh(), jnp.result_type(float)
+        return self.among((mesh, real, notices.is_observing()), *avals)
+
+    def _among(self, settings: tuple[Any, ...], *avals: Aval) -> ClosedJaxpr:
+        """`_traced`; the settings are a key of the cache."""
+        return self._traced(*avals)
+
+    def _traced(self, *avals: Aval) -> ClosedJaxpr:
+        """The closed jaxpr for arguments of these shapes and dtypes.
+
+        Raises:
+            TypeError: a user's function holds a traced value that is not among the arguments; its
+                derivative would silently be zero.
+        """
+        with meshes.apart():
+            closed = jax.make_jaxpr(self)(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
+        if any(isinstance(x, Tracer) for x in closed.consts):
+            raise TypeError(
+                "a function of the scene (a force, constraint, motion, mass or potential) closes"
+                " over a traced value, which would be invisible to vmap and grad: pass it through"
+                " params= instead."
+            )
+        return closed
+
+
+class TangentNative(Native):
+    """The tangent map (x, ẋ of the moved arguments) → tangents of the floating results."""
+
+    def __init__(self, whole: Native, moved: tuple[bool, ...]) -> None:
+        super().__init__(self._along, whole.staged)
+        self.whole, self.count = whole, len(moved)
+        self.places = [i for i, flag in enumerate(moved) if flag]
+
+    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+        """Returns the shapes of the floating results, from the trace of the whole."""
+        given: list[Any] = list(args[: self.count])
+        for i, x in zip(self.places, args[self.count :], strict=True):
+            shape = jnp.broadcast_shapes(x.shape, given[i].shape)
+            given[i] = jax.ShapeDtypeStruct(shape, given[i].dtype)
+        return list(filter(is_real, self.whole.shapes(given)))
+
+    def _along(self, *args: Array) -> list[Array]:
+        """Evaluates the tangent map."""
+        primals, tangents = list(args[: self.count]), []
+        for i, x in zip(self.places, args[self.count :], strict=True):
+            shape = jnp.broadcast_shapes(x.shape, primals[i].shape)
+            primals[i] = jnp.broadcast_to(primals[i], shape)
+            tangents.append(jnp.broadcast_to(x, shape))
+
+        def along(*xs: Array) -> list[Array]:
+            replaced = dict(zip(self.places, xs, strict=True))
+            results = self.whole(*(replaced.get(i, x) for i, x in enumerate(primals)))
+            return list(filter(is_real, results))
+
+        with during(_ORDER, order() + 1):
+            return jax.jvp(along, [primals[i] for i in self.places], tangents)[1]
+
+
+class TransposedNative(Native):
+    """The transpose (other arguments, ȳ) → cotangents of the linear arguments.
+
+    Attributes:
+        whole: the function.
+        linear: True for each argument in which it is linear.
+        avals: shapes and dtypes of these, without batch axes that are added later.
+        rank: of the first ȳ without such axes.
+    """
+
+    def __init__(
+        self, whole: Native, linear: tuple[bool, ...], avals: tuple[Aval, ...], rank: int
+    ) -> None:
+        super().__init__(self._back, whole.staged)
+        self.whole, self.linear, self.avals, self.rank = whole, linear, avals, rank
+        self.fixed = linear.count(False)
+
+    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+        """Returns the shapes of the linear arguments."""
+        return [ShapedArray(x.shape, x.dtype) for x in self._arguments(args)]
+
+    def _arguments(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+        """Shapes and dtypes of the linear arguments."""
+        batch = self._batch(args)
+        return [jax.ShapeDtypeStruct((*shape, *batch), dtype) for shape, dtype in self.avals]
+
+    def _batch(self, args: Sequence[Array | ShapedArray]) -> tuple[int, ...]:
+        """The shape of the batch axes that were added."""
+        added = args[self.fixed].ndim - self.rank
+        return jnp.broadcast_shapes(*(x.shape[x.ndim - added :] for x in args))
+
+    def _back(self, *args: Array) -> list[Array]:
+        """Evaluates the transpose."""
+        batch, given = self._batch(args), args[: self.fixed]
+
+        def along(*xs: Array) -> list[Array]:
+            moving, fixed = iter(xs), iter(given)
+            merged = (next(moving) if flag else next(fixed) for flag in self.linear)
+            return broadcast_worlds(self.whole(*merged), batch)
+
+        cotangents = broadcast_worlds(list(args[self.fixed :]), batch)
+        with during(_TRANSPOSED, True):
+            return list(jax.linear_transpose(along, *self._arguments(args))(cotangents))
+
+
+class PartialNative(Native):
+    """Some of the results of a native function; its trace is a part of the whole's."""
+
+    def __init__(self, whole: Native, wanted: tuple[bool, ...]) -> None:
+        super().__init__(self._chosen, whole.staged)
+        self.whole, self.wanted = whole, wanted
+
+    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+        """Returns the shapes of the wanted results."""
+        return self._among_wanted(self.whole.shapes(args))
+
+    def _chosen(self, *args: Array) -> list[Array]:
+        """Evaluates the wanted results."""
+        return self._among_wanted(self.whole(*args))
+
+    def _among_wanted(self, results: Sequence[Any]) -> list[Any]:
+        """Selects the wanted results."""
+        return [y for y, flag in zip(results, self.wanted, strict=True) if flag]
+
+    def _traced(self, *avals: Aval) -> ClosedJaxpr:
+        closed = self.whole.traced(*avals)
+        return ClosedJaxpr(without_unused(closed.jaxpr, self.wanted), closed.consts)
+
+
+native_p = Primitive("native")
+native_p.multiple_results = True
+
+
+def bound(args: Iterable[Any], fun: Native) -> list[Array]:
+    """Binds a native function, which may contain conditions on worlds; see `somewhere.asking`."""
+    return native_p.bind(*args, fun=fun, asks=asking())
+
+
+class Known(NamedTuple):
+    """An array that is a constant of the program, compared by value.
+
+    Attributes:
+        shape: of the array.
+        dtype: the name of its dtype.
+        data: its bytes.
+    """
+
+    shape: tuple[int, ...]
+    dtype: str
+    data: bytes
+
+    def lanes(self, axes: int) -> Array:
+        """The array with this number of trailing axes of size 1, as a value of the trace."""
+        value = np.frombuffer(self.data, self.dtype).reshape((*self.shape, *(1,) * axes))
+        return jax.lax.stop_gradient(jnp.asarray(value))
+
+
+def _known(x: Scalar) -> Known | None:
+    """The value of a concrete array of at most `FEW` numbers; None for others."""
+    if isinstance(x, Tracer) or np.size(x) > FEW:
+        return None
+    dtype = jnp.result_type(x)
+    if not jnp.issubdtype(dtype, np.number):
+        return None
+    value = np.asarray(x, dtype)
+    return Known(value.shape, dtype.name, value.tobytes())
+
+
+@contextmanager
+def as_it_is_called() -> Iterator[None]:
+    """Known values do not become constants of loops inside, unless the caller is traced itself.
+
+    JAX traces the body of a loop also where the loop runs at once. Other values must not cause
+    another compilation there.
+    """
+    with during(_CONSTANTS, _CONSTANTS.get() and _is_tracing()):
+        yield
+
+
+def _is_tracing() -> bool:
+    """Returns True while JAX is tracing."""
+    return isinstance(jax.lax.full((), 0.0), Tracer)
+
+
+def _native(
+    function: Callable[..., Any],
+    structure: Any,
+    shapes: Sequence[tuple[int, ...]],
+    known: tuple[Known | None, ...],
+    staged: bool,
+) -> tuple[Native, list[Any]]:
+    """The function of the leaves that are not `known`, of which there is at least one.
+
+    It comes with a list whose entry becomes the tree structure of the result during tracing. The
+    static data of a result may depend on shapes, such as the number of rows.
+    """
+    # a primitive returns arrays only, and JAX traces it from its own rules. The structure is known
+    # once `flat` runs; `jax.eval_shape` would find it before, but trace the function twice
+    result: list[Any] = [None]
+
+    def flat(*given: Array) -> list[Array]:
+        axes = given[0].ndim - len(next(s for s, x in zip(shapes, known, strict=True) if x is None))
+        moving = iter(given)
+        leaves = [next(moving) if x is None else x.lanes(axes) for x in known]
+        output = function(*jax.tree.unflatten(structure, leaves))
+        arrays, result[0] = jax.tree.flatten(output)
+        return [jnp.asarray(x) for x in arrays]
+
+    return Native(flat, staged), result
+
+
+_shared = functools.lru_cache(maxsize=256)(_native)
+_with_constants = functools.lru_cache(maxsize=64)(_native)
+"""A cache of its own, since each set of constant values makes another function."""
+
+
+def call(function: Callable[..., T], *args: PyTree, staged: bool = True) -> T:
+    """Calls function(*args), batched natively under `vmap`.
+
+    During tracing, small arrays with known values become constants of the function. The compiler
+    then removes trivial operations, such as a product with 1.
+
+    Args:
+        function: pure, defined once; takes pytrees of arrays and returns one. Given trailing batch
+            axes on all leaves (of the batch's size or of size 1) it must return them on all
+            results.
+        args: pytrees of arrays.
+        staged: True if it may be cut into stages; False for users' functions of any operations.
+
+    Returns:
+        The result of the function.
+    """
+    leaves, structure = jax.tree.flatten(args)
+    known = [None] * len(leaves)
+    if _CONSTANTS.get() and any(isinstance(x, Tracer) for x in leaves) and _is_tracing():
+        known = [_known(x) for x in leaves]
+    shapes = tuple(np.shape(x) for x in leaves)
+    cached = _with_constants if any(x is not None for x in known) else _shared
+    native, result = cached(function, structure, shapes, tuple(known), staged)
+    arrays = [jnp.asarray(x) for x, value in zip(leaves, known, strict=True) if value is None]
+    arrays = meshes.together(arrays)
+    arrays = bound(arrays, native)  # its trace fills `result`
+    return jax.tree.unflatten(result[0], arrays)
+
+
+def is_real(x: Array | ShapedArray | jax.ShapeDtypeStruct) -> bool:
+    """Returns True for floating-point arrays, which have derivatives."""
+    return jnp.issubdtype(x.dtype, jnp.inexact)
+
+
+def _abstract(*args: ShapedArray, fun: Native, asks: ClosedJaxpr) -> list[Any]:
+    """The types of the results."""
+    return meshes.typed(fun.shapes(args), args)
+
+
+def _batched(
+    args: Sequence[Array], axes: Sequence[int | None], *, fun: Native, asks: ClosedJaxpr
+) -> tuple[list[Array], list[int]]:
+    """The batching rule: the batch moves to the last axis."""
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+
+    def last(x: Array | float, axis: int | None) -> Array:
+        x = jnp.asarray(x)  # a constant of the trace may come as a Python number
+        return x[..., None] if axis is None else jnp.moveaxis(x, axis, -1)
+
+    results = bound(map(last, args, axes), fun)
+    results = [jnp.broadcast_to(y, (*y.shape[:-1], size)) for y in results]
+    return results, [y.ndim - 1 for y in results]
+
+
+def _jvp(
+    primals: Sequence[Array], tangents: Sequence[Array | ad.Zero], *, fun: Native, asks: ClosedJaxpr
+) -> tuple[list[Array], list[Array | ad.Zero]]:
+    """The JVP rule: binds the tangent map."""
+    results = bound(primals, fun)
+    moved = tuple(type(x) is not ad.Zero for x in tangents)
+    given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
+    moving = iter(bound((*primals, *given), fun.tangent(moved)))
+    return results, [
+        next(moving) if is_real(y) else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
+        for y in results
+    ]
+
+
+def _transpose(
+    cotangents: Sequence[Array | ad.Zero],
+    *args: Array | ad.UndefinedPrimal,
+    fun: Native,
+    asks: ClosedJaxpr,
+) -> list[Array | None]:
+    """The transpose rule: binds the transposed map."""
+    linear = tuple(ad.is_undefined_primal(x) for x in args)
+    fixed = [x for x, flag in zip(args, linear, strict=True) if not flag]
+    pairs = zip(args, linear, strict=True)
+    avals = tuple((x.aval.shape, x.aval.dtype) for x, flag in pairs if flag)
+    cotangents = [ad.instantiate_zeros(x) for x in cotangents]
+    transposed = fun.transposed(linear, avals, cotangents[0].ndim)
+    results = iter(bound((*fixed, *cotangents), transposed))
+    return [next(results) if flag else None for flag in linear]
+
+
+def _in_stages(*args: Array, fun: Native) -> list[Array]:
+    """Runs the function in stages, on arrays with a further last axis of size 1.
+
+    XLA lets LLVM unroll loops over the last axis of an array. Without this axis that takes up to
+    half of the compile time, and makes the vectorized code no faster.
+    """
+    lanes = [jnp.expand_dims(x, -1) for x in args]
+    if not (fun.staged and fusion.staged()):
+        return squeezed(*fun(*lanes))
+    # `squeezed` is a stage: if it were inlined, XLA would copy the results to move the batch first
+    return fusion.run_staged(fun, lanes, squeezed)
+
+
+def squeezed(*lanes: Array) -> list[Array]:
+    """Removes the last axis, of size 1, from arrays."""
+    return [jnp.squeeze(x, -1) for x in lanes]
+
+
+def _lowered(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Makes a lowering rule from a function (*args, fun=) that sees only shapes and dtypes."""
+    rule = mlir.lower_fun(function, multiple_results=True)
+
+    def lower(ctx: mlir.LoweringRuleContext, *args: Any, fun: Native, asks: ClosedJaxpr) -> Any:
+        with meshes.apart():
+            avals: Sequence[Any] = ctx.avals_in
+            plain = [meshes.plain(x) for x in avals]
+            return rule(ctx.replace(avals_in=plain), *args, fun=fun)
+
+    return lower
+
+
+def _stopped(cotangent: Array | ad.Zero, _: Array | ad.UndefinedPrimal) -> list[None]:
+    """The transpose rule of `stop_gradient` within native functions: zero.
+
+    A batched `lax.cond` evaluates each branch in all worlds, and applies `stop_gradient` to the
+    operands of worlds that take another branch, tangents included. JAX has no transpose of it
+    (jax-ml/jax#39219). The cotangents of those worlds are zero, and must not meet infinite numbers
+    of that branch. If a user's own derivative stops a tangent, it is zero in reverse mode only.
+
+    Raises:
+        NotImplementedError: outside native functions, as without this rule.
+    """
+    if not _TRANSPOSED.get():
+        raise NotImplementedError(
+            "Transpose rule (for reverse-mode differentiation) for 'stop_gradient' not implemented"
+        )
+    return [None]
+
+
+def _without_unused(
+    wanted: list[bool], *context: bool | JaxprEqn
+) -> tuple[list[bool], JaxprEqn | None]:
+    """The rule for dead code: removes unused results and the work for them.
+
+    The last argument is the equation. From JAX 0.12 on another one precedes it, about references
+    that are read later; native functions have none.
+    """
+    equation: Any = context[-1]
+    if not any(wanted):
+        return [False] * len(equation.invars), None
+    results = [x for x, flag in zip(equation.outvars, wanted, strict=True) if flag]
+    params = equation.params | {"fun": equation.params["fun"].part(tuple(wanted))}
+    pruned = equation if all(wanted) else equation.replace(outvars=results, params=params)
+    return [True] * len(equation.invars), pruned
+
+
+native_p.def_impl(lambda *args, fun, asks: fun.eager(*args))
+native_p.def_abstract_eval(_abstract)
+mlir.register_lowering(native_p, _lowered(lambda *args, fun: fun(*args)))
+mlir.register_lowering(native_p, _lowered(_in_stages), platform="cpu")
+batching.primitive_batchers[native_p] = _batched
+ad.primitive_jvps[native_p] = _jvp
+partial_eval.dce_rules[native_p] = _without_unused
+ad.primitive_transposes[native_p] = _transpose
+# JAX looks rules up by primitive in this one table, and a batched `lax.cond` inside a function
+# inserts `stop_gradient` where no code of ours can replace it. A rule of JAX itself takes
+# precedence
+ad.primitive_transposes.setdefault(stop_gradient_p, _stopped)

@@ -1,0 +1,93 @@
+"""The placement of arrays on a mesh, which JAX keeps in their types.
+
+Inside `jax.shard_map` a type lists the mesh axes along which an array varies. On a mesh with
+explicit axes it tells how each array axis is split. Native functions are traced and compiled
+without both, as if all mesh axes were left to the compiler. `typed` adds them to the results.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import jax
+from jax.core import ShapedArray
+from jax.sharding import AxisType, PartitionSpec
+
+from jaxcon.core.typing import Array, T
+
+
+def together(tree: T) -> T:
+    """Puts all arrays of a tree on the mesh in use, with the same varying axes.
+
+    The initial value of a loop needs this, since types must not change in it. The transpose is a
+    sum over devices. Calling this outside of a loop makes devices communicate once in the reverse
+    pass, not in every step.
+    """
+    mesh = jax.sharding.get_abstract_mesh()
+    if not (mesh.manual_axes or mesh.explicit_axes):
+        return tree
+    axes = frozenset().union(*(_varies(jax.typeof(x)) for x in jax.tree.leaves(tree)))
+
+    def cast(x: Array) -> Array:
+        missing = axes - _varies(jax.typeof(x))
+        if missing:
+            return jax.lax.pcast(x, tuple(sorted(missing)), to="varying")
+        outside = mesh.explicit_axes and jax.typeof(x).sharding.mesh.empty
+        return jax.sharding.reshard(x, PartitionSpec()) if outside else x
+
+    return jax.tree.map(cast, tree)
+
+
+def _varies(aval: Any) -> frozenset[Any]:
+    """The mesh axes along which an array varies; JAX has renamed the attribute in 0.10."""
+    return aval.manual_axis_type.varying if hasattr(aval, "manual_axis_type") else aval.vma
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Lets the compiler choose where arrays lie, along explicit mesh axes as well."""
+    mesh = jax.sharding.get_abstract_mesh()
+    explicit = mesh.explicit_axes
+    if not explicit:
+        yield
+        return
+    with jax.sharding.use_abstract_mesh(
+        mesh.update_axis_types(dict.fromkeys(explicit, AxisType.Auto))
+    ):
+        yield
+
+
+def plain(aval: ShapedArray | jax.ShapeDtypeStruct) -> ShapedArray:
+    """A type with only a shape and a dtype."""
+    return ShapedArray(aval.shape, aval.dtype)
+
+
+def typed(results: Sequence[Any], args: Sequence[Any]) -> list[ShapedArray]:
+    """The types of the results of a native function, placed as its arguments are.
+
+    Batch axes are last. They are split along explicit mesh axes as in the arguments. Other axes are
+    whole on each device.
+
+    Args:
+        results: shapes and dtypes.
+        args: types of the arguments.
+    """
+    if not args:
+        return [plain(y) for y in results]
+    split: dict[tuple[int, Any], Any] = {}
+    for x in args:
+        spec = (*x.sharding.spec, *(None,) * x.ndim)[: x.ndim]
+        places = zip(range(-x.ndim, 0), x.shape, spec, strict=True)
+        split |= {(place, size): axis for place, size, axis in places if axis is not None}
+    like = next((x for x in args if not x.sharding.mesh.empty), args[0])
+
+    def placed(y: ShapedArray | jax.ShapeDtypeStruct) -> ShapedArray:
+        n = len(y.shape)
+        spec = PartitionSpec(*(split.get((i - n, size)) for i, size in enumerate(y.shape)))
+        return like.update(
+            shape=y.shape, dtype=y.dtype, weak_type=False, sharding=like.sharding.update(spec=spec)
+        )
+
+    return [placed(y) for y in results]

@@ -1,0 +1,392 @@
+"""Flattens a traced function to a list of operations, without calls and repetitions."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core as jex
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var
+
+from jaxcon.core.jaxprs import called, without_unused
+from jaxcon.core.typing import Array, Scalar
+
+if TYPE_CHECKING:
+    from jaxcon.staging.batch_last import Native
+
+IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
+"""Primitives that return their arguments. XLA drops barriers, too, before it forms kernels."""
+
+REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
+    "reduce_sum": jax.lax.add,
+    "reduce_max": jax.lax.max,
+    "reduce_min": jax.lax.min,
+    "reduce_and": jax.lax.bitwise_and,
+    "reduce_or": jax.lax.bitwise_or,
+}
+"""Reductions that are replaced by elementwise halving where they run over the first axes."""
+
+
+class Constant:
+    """A literal or a captured array as an operand of an operation."""
+
+    def __init__(self, value: Scalar) -> None:
+        self.value = value
+
+
+Operand = int | Constant
+"""The number of a value, or a constant."""
+
+
+@dataclass
+class Operation:
+    """An instruction on numbered values.
+
+    Attributes:
+        inputs, outputs: operands and results.
+        plain: True where its dtypes and effects allow it in a kernel; False for random keys and for
+            side effects such as printing.
+        effects: True where it has side effects.
+    """
+
+    primitive: Primitive
+    params: dict[str, Any]
+    inputs: list[Operand]
+    outputs: list[int]
+    plain: bool
+    effects: bool
+
+    @property
+    def name(self) -> str:
+        """The name of the primitive."""
+        return self.primitive.name
+
+    def __call__(self, operands: list[Any]) -> list[Any]:
+        """Binds the primitive; returns its results."""
+        results = self.primitive.bind(*operands, **self.params)
+        return results if self.primitive.multiple_results else [results]
+
+
+def traced(function: Native, args: Sequence[Any]) -> ClosedJaxpr:
+    """The closed jaxpr of a native function, without unused equations."""
+    closed = function.traced(*((x.shape, x.dtype) for x in args))
+    return ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
+
+
+def evaluated(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
+    """The results of a closed jaxpr."""
+    return jex.jaxpr_as_fun(closed)(*args)
+
+
+class Program:
+    """A function as operations in order.
+
+    Attributes:
+        operations: in order.
+        inputs: numbers of the arguments.
+        outputs: numbers of the results, or constants.
+        makers: the operation that computes each value.
+        sizes: the number of entries of each value.
+        bytes: the size of each value [B].
+    """
+
+    def __init__(
+        self, closed: ClosedJaxpr, inner: Callable[[ClosedJaxpr], tuple[ClosedJaxpr, bool]]
+    ) -> None:
+        """Flattens a closed jaxpr.
+
+        Args:
+            closed: the jaxpr.
+            inner: rewrites the body of a loop; also returns True if a kernel may contain all of it.
+        """
+        self.operations: list[Operation] = []
+        self._inner = inner
+        self._known: dict[Any, list[int]] = {}
+        self.sizes: dict[int, int] = {}
+        self.bytes: dict[int, int] = {}
+        self._lengths: dict[int, list[Any]] = {}  # of operands of concatenations
+        self.inputs = [self._new(x) for x in closed.jaxpr.invars]
+        self.outputs = self._inline_closed(closed, list(self.inputs))
+        self._read_parts()
+        self.makers = {name: op for op in self.operations for name in op.outputs}
+        self._drop_unused()
+
+    def readers(self) -> dict[int, list[Operation]]:
+        """The operations that read each value."""
+        readers: dict[int, list[Operation]] = {}
+        for op in self.operations:
+            for x in op.inputs:
+                if not isinstance(x, Constant):
+                    readers.setdefault(x, []).append(op)
+        return readers
+
+    def evaluate(self, values: dict[int, Any], wanted: Operand) -> Any:
+        """Computes a value from known ones, and stores intermediate values in `values`."""
+        if isinstance(wanted, Constant):
+            return wanted.value
+        todo = [wanted]
+        while todo:
+            if todo[-1] in values:
+                todo.pop()
+                continue
+            op = self.makers[todo[-1]]
+            missing = [x for x in op.inputs if not isinstance(x, Constant) and x not in values]
+            if missing:
+                todo += missing
+                continue
+            operands = [x.value if isinstance(x, Constant) else values[x] for x in op.inputs]
+            values.update(zip(op.outputs, op(operands), strict=True))
+        return values[wanted]
+
+    def between(
+        self, known: Container[int], wanted: list[int]
+    ) -> tuple[list[int], list[Operation]]:
+        """The known values from which others are computed, and the operations for it."""
+        leaves: list[int] = []
+        operations: list[Operation] = []
+        seen: set[int] = set()
+        todo = list(reversed(wanted))
+        while todo:
+            x = todo.pop()
+            if x in seen:
+                continue
+            seen.add(x)
+            if x in known:
+                leaves.append(x)
+            else:
+                operations.append(self.makers[x])
+                todo += [y for y in self.makers[x].inputs if not isinstance(y, Constant)]
+        return leaves, operations
+
+    def _read_parts(self) -> None:
+        """Lets slices of a concatenation read the operand in which they lie.
+
+        This is done if all readers are such slices, so that the concatenation is never stored.
+        """
+        readers, results = self.readers(), {x for x in self.outputs if isinstance(x, int)}
+        for op in self.operations:
+            whole = op.outputs[:1]
+            slices = readers.get(whole[0], []) if op.name == "concatenate" else []
+            if not slices or not results.isdisjoint(whole):
+                continue
+            lengths = self._lengths[whole[0]]
+            parts = [_part(x, op.inputs, lengths, op.params["dimension"]) for x in slices]
+            for x, part in zip(slices, parts if all(parts) else (), strict=False):
+                x.inputs, x.params = part or (x.inputs, x.params)
+
+    def _drop_unused(self) -> None:
+        """Removes operations on which no result depends."""
+        needed = {x for x in self.outputs if not isinstance(x, Constant)}
+        operations: list[Operation] = []
+        for op in reversed(self.operations):
+            if op.effects or not needed.isdisjoint(op.outputs):
+                operations.append(op)
+                needed.update(x for x in op.inputs if not isinstance(x, Constant))
+        self.operations = operations[::-1]
+
+    def _new(self, variable: Var) -> int:
+        """Numbers a new value."""
+        name = len(self.sizes)
+        aval: Any = variable.aval
+        self.sizes[name] = aval.size
+        self.bytes[name] = aval.size * aval.dtype.itemsize
+        return name
+
+    def _inline_closed(self, jaxpr: Jaxpr | ClosedJaxpr, args: list[Operand]) -> list[Operand]:
+        """Appends the operations of a jaxpr; returns its results."""
+        if isinstance(jaxpr, ClosedJaxpr):
+            jaxpr, args = jaxpr.jaxpr, [*map(Constant, jaxpr.consts), *args]
+        names = dict(zip([*jaxpr.constvars, *jaxpr.invars], args, strict=True))
+
+        def read(x: Var | Literal) -> Operand:
+            return Constant(x.val) if isinstance(x, Literal) else names[x]
+
+        for equation in jaxpr.eqns:
+            results = self._append(equation, [read(x) for x in equation.invars])
+            names.update(zip(equation.outvars, results, strict=True))
+        return [read(x) for x in jaxpr.outvars]
+
+    def _append(self, equation: JaxprEqn, args: list[Operand]) -> list[Operand]:
+        """Appends an equation, flattened where it calls a function; returns its results."""
+        name, params = equation.primitive.name, equation.params
+        operands: list[Any] = [x.aval for x in equation.invars]
+        inner = called(equation)
+        if inner is not None:
+            return self._inline_closed(inner, args)
+        if name in IDENTITIES:
+            return args
+        if name == "custom_linear_solve":
+            lengths = params["const_lengths"]
+            first = lengths.matvec + lengths.vecmat
+            last = first + lengths.solve
+            given = [*args[first:last], *args[last + lengths.transpose_solve :]]
+            return self._inline_closed(params["jaxprs"].solve, given)
+        if name == "native":
+            return self._inline_closed(traced(params["fun"], operands), args)
+        folded = _known_result(equation, args)
+        if folded is not None:
+            return folded
+        if name in REDUCTIONS and _leading(params["axes"], operands[0].shape):
+            fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
+            return self._inline_closed(jax.make_jaxpr(fold)(operands[0]), args)
+        if name == "split":
+            parts = functools.partial(slices, params["sizes"], params["axis"])
+            return self._inline_closed(jax.make_jaxpr(parts)(operands[0]), args)
+        if name == "scan":
+            jaxpr, plain = self._inner(params["jaxpr"])
+            return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain)
+        if name == "while":  # its condition is evaluated outside of kernels, maybe on all devices
+            body = self._inner(params["body_jaxpr"])[0]
+            return self._emit(equation, params | {"body_jaxpr": body}, args, False)
+        if name == "cond":
+            branches, plain = zip(*map(self._inner, params["branches"]), strict=True)
+            return self._emit(equation, params | {"branches": branches}, args, all(plain))
+        return self._emit(equation, params, args, True)
+
+    def _emit(
+        self, equation: JaxprEqn, params: dict[str, Any], args: list[Operand], plain: bool
+    ) -> list[Any]:
+        """Appends an operation, or reuses the results of an identical one."""
+        primitive = equation.primitive
+        key = _key(primitive, params, args)
+        if key is not None and key in self._known:
+            return self._known[key]
+        outputs = [self._new(x) for x in equation.outvars]
+        operands: list[Any] = [x.aval for x in equation.invars]
+        if primitive.name == "concatenate":
+            axis = params["dimension"]
+            self._lengths[outputs[0]] = [x.shape[axis] for x in operands]
+        effects = bool(equation.effects)
+        avals = [x.aval for x in (*equation.invars, *equation.outvars)]
+        keys = any(map(_is_key, avals))
+        plain = plain and not keys and not effects
+        op = Operation(primitive, params, args, outputs, plain, effects)
+        self.operations.append(op)
+        if key is not None and not effects:
+            self._known[key] = outputs
+        return outputs
+
+
+def _part(
+    reader: Operation, operands: list[Operand], lengths: list[Any], axis: int
+) -> tuple[list[Operand], dict[str, Any]] | None:
+    """Operand and parameters of a slice that lies in one operand of a concatenation, or None.
+
+    Args:
+        reader: an operation that reads the concatenation.
+        operands: of the concatenation.
+        lengths: their sizes along its axis.
+        axis: the axis of the concatenation.
+    """
+    if reader.name != "slice" or not is_known(lengths):
+        return None
+    start = 0
+    low, high = reader.params["start_indices"], reader.params["limit_indices"]
+    for operand, length in zip(operands, lengths, strict=True):
+        if start <= low[axis] and high[axis] <= start + length:
+            shifted = {"start_indices": _shifted(low, axis, start)}
+            shifted["limit_indices"] = _shifted(high, axis, start)
+            return [operand], reader.params | shifted
+        start += length
+    return None
+
+
+def _shifted(indices: Sequence[int], axis: int, by: int) -> tuple[int, ...]:
+    """The indices less a number along one axis."""
+    return tuple(i - by if a == axis else i for a, i in enumerate(indices))
+
+
+def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -> Array:
+    """Reduces the first axes by combining their halves until one entry is left.
+
+    For an odd number of entries, the middle one belongs to both halves. A sum keeps the last entry
+    apart instead, as it must not count twice.
+    """
+    x = x.reshape((math.prod(x.shape[:axes]), *x.shape[axes:]))
+    waiting: list[Array] = []
+    while len(x) > 1:
+        if len(x) % 2 and operation is jax.lax.add:
+            waiting.append(x[-1])
+            x = x[:-1]
+        half = (len(x) + 1) // 2
+        x = operation(x[:half], x[len(x) - half :])
+    return functools.reduce(operation, waiting, x[0])
+
+
+def slices(sizes: Sequence[int], axis: int, x: Array) -> list[Array]:
+    """Splits an array into slices of these sizes along an axis; kernels read through slices."""
+    ends = itertools.accumulate(sizes)
+    pairs = zip(ends, sizes, strict=True)
+    return [jax.lax.slice_in_dim(x, end - size, end, axis=axis) for end, size in pairs]
+
+
+def _leading(axes: Sequence[int], shape: tuple[int, ...]) -> bool:
+    """Returns True for the first axes, of known sizes, none of them empty."""
+    sizes = shape[: len(axes)]
+    return tuple(axes) == tuple(range(len(axes))) and is_known(sizes) and all(sizes)
+
+
+def is_known(shape: Sequence[Any]) -> bool:
+    """Returns True where no size is symbolic, as those of `jax.export.symbolic_shape` are."""
+    return all(isinstance(n, int) for n in shape)
+
+
+def _known_result(equation: JaxprEqn, args: list[Operand]) -> list[Operand] | None:
+    """Simplifies an operation that does not depend on all its operands; None if not possible.
+
+    The compiler would do so only after it is decided which values are stored.
+    """
+    if len(equation.outvars) != 1:
+        return None
+    name = equation.primitive.name
+    aval: Any = equation.outvars[0].aval
+    if not is_known(aval.shape):  # a constant cannot have a symbolic size
+        return None
+    if 0 in aval.shape and not _is_key(aval):
+        return [Constant(np.zeros(aval.shape, aval.dtype))]
+    exponent = args[1] if name == "pow" and len(args) == 2 else None
+    power = equation.params.get("y") if name == "integer_pow" else exponent
+    if isinstance(power, Constant) and jnp.shape(power.value) == ():
+        power = power.value
+    if isinstance(power, int | float | np.generic) and power == 0:
+        return [Constant(np.ones(aval.shape, aval.dtype))]
+    if name == "pad" and not any(map(any, equation.params["padding_config"])):
+        return [args[0]]
+    if name == "select_n" and all(x is args[1] or x == args[1] for x in args[2:]):
+        return [args[1]]
+    if name == "select_n" and isinstance(args[0], Constant) and jnp.shape(args[0].value) == ():
+        return [args[1 + int(args[0].value)]]
+    return None
+
+
+def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> Any:
+    """A key that identical operations share; None where operations cannot be compared."""
+    if primitive.name in ("scan", "while", "cond"):
+        return None
+    parts: list[Any] = []
+    for x in args:
+        if not isinstance(x, Constant):
+            parts.append(x)
+        elif jnp.shape(x.value) == () and not _is_key(x.value):
+            value = np.asarray(x.value, jnp.result_type(x.value))
+            parts.append((str(value.dtype), value.tobytes()))
+        else:
+            parts.append((type(x.value).__name__, id(x.value)))  # kept alive by the operation
+    key = (primitive, tuple(sorted(params.items(), key=lambda item: item[0])), tuple(parts))
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return key
+
+
+def _is_key(x: Any) -> bool:
+    """Returns True for random keys and other arrays of extended dtypes."""
+    return jnp.issubdtype(getattr(x, "dtype", np.float32), jax.dtypes.extended)

@@ -1,0 +1,362 @@
+"""One step of a constrained system: the algorithm.
+
+    M a = f + Jᵀλ,    J a + C λ = b
+
+M is the mass matrix, f the forces, J = ∂φ̇/∂v the Jacobian of the constraints φ, and λ their
+multipliers. A step
+
+    1. linearizes the constraints, φ̈ = J a + γ    `Dynamics.linearize`
+    2. asks the stabilizer for b and C             `Stabilizer.constraint_equations`
+    3. assembles M, f, J, C, b                     `Dynamics.assemble`
+    4. solves for a and λ                          `Dynamics.solve`
+    5. advances q and v                            `Integrator.advance`
+    6. updates the stabilizer's memory             `Stabilizer.advance`, `Stabilizer.remember`
+    7. corrects q and v                            `Stabilizer.correct`
+    8. reports                                     `StepInfo`
+
+The integrator repeats 1 to 4 at each of its stages, by calling `Dynamics`. The memory, such as ∫φ
+or the last λ, is the same at all stages of a step. Limits, friction and contact add a force
+J_bᵀλ_b, with λ_b from the contact solver, once a step; see `contact.response`.
+
+Arrays are those of one world, or of a batch along one more axis at the end. Nothing here checks
+input, batches, masks failed worlds or stages kernels: `execution` does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxcon.constraints.rows import Rows, Violation, linearize, saddle
+from jaxcon.core import status
+from jaxcon.core.doubled import Doubled
+from jaxcon.core.pytree import pytree
+from jaxcon.core.status import Status
+from jaxcon.core.summary import Stacked, codes, listed, shape, span, table
+from jaxcon.core.typing import Array, PyTree
+from jaxcon.linear.saddle import Saddle, Solution
+from jaxcon.protocols import Solver, Stabilizer, System
+from jaxcon.staging.worlds import where_tree
+from jaxcon.system.jump import with_jump
+from jaxcon.system.state import MethodMemory, State, at_instant, is_finite
+
+if TYPE_CHECKING:
+    from jaxcon.contact.parts import StepPart
+    from jaxcon.contact.response import Response
+    from jaxcon.execution.wrenches import Origin
+    from jaxcon.methods.method import Method
+
+
+@pytree
+class StepInfo(Stacked):
+    """Accelerations, multipliers and violation at the start of a step; zeros in a failed world.
+
+    Recorded infos have leading axes, as trajectories of states do: `len(infos)`, `infos[10]`.
+
+    Attributes:
+        acceleration: a, (n_v,).
+        multipliers: λ, (n_c,).
+        violation: φ and φ̇ by constraint.
+        status: of this step, or what stopped the world before, ().
+        reactions: forces of limits, friction and contact; None in a scene without.
+        impacts: impacts at which the step was split; None without `Events`.
+        state: the state to which a and λ belong, without the memory of the method. That is the
+            state before the step, and for `GeneralizedAlpha` the point that it reached.
+        control: control u of the step.
+    """
+
+    # no field: fields are what `jit` returns and scans carry, and few infos are asked for a wrench.
+    # `execution.step.with_origin` sets it on an instance
+    origin: ClassVar[Origin | None] = None
+    """The system, for `jc.wrench`; None if JAX has rebuilt the info, as `jit` and indexing do."""
+
+    acceleration: Array
+    multipliers: Array
+    violation: Violation
+    status: Array
+    reactions: Any = None
+    impacts: Any = None
+    state: Any = None
+    control: Any = None
+
+    def leading(self) -> tuple[int, ...]:
+        """The shape of the leading axes; () of one world."""
+        return np.shape(self.status)
+
+    def __repr__(self) -> str:
+        """Time, status, violation, and the names of the elements whose forces it has."""
+        φ = getattr(self.violation, "position", None)
+        known = isinstance(φ, jax.Array | np.ndarray)
+        names = listed(self.violation.layout.names) if known else ""
+        reactions = self.reactions if isinstance(self.reactions, Mapping) else None
+        rows = [
+            ("time", span(self.state.time, "s") if isinstance(self.state, State) else ""),
+            ("status", codes(self.status)),
+            ("acceleration", shape(self.acceleration)),
+            ("multipliers", f"{shape(self.multipliers)} of {names}" if names else ""),
+            ("reactions", "" if reactions is None else f"of {listed([*reactions])}"),
+            ("violation", f"worst {span(self.violation.worst, 'm or rad')}" if names else ""),
+        ]
+        return table("StepInfo", rows)
+
+    def of_failed_world(self, state: State) -> StepInfo:
+        """Zeros and no impacts, at the state before the step."""
+        blank = jax.tree.map(jnp.zeros_like, self)
+        if self.impacts is not None:
+            blank = dataclasses.replace(blank, impacts=self.impacts.none())
+        if self.state is not None:
+            blank = dataclasses.replace(blank, state=without_memory(state))
+        return blank
+
+
+def step(
+    system: System,
+    method: Method,
+    state: State,
+    control: PyTree,
+    dt: Array,
+    part: StepPart | None = None,
+) -> tuple[State, StepInfo]:
+    """Advances a state by one step.
+
+    Args:
+        system: bodies or generalized coordinates, constraints and forces.
+        method: integrator, stabilizer and solvers.
+        state: at the start; its angles without whole turns.
+        control: u, as arrays.
+        dt: h, () [s].
+        part: of the step, where it is split at impacts; None for all of it.
+
+    Returns:
+        The new state, and what the step found. `info.status` is that of this step alone.
+    """
+    length = dt if part is None else part.length
+    memory = MethodMemory(*state.memory)
+
+    # 1 to 5: linearize, constraint equations, assemble, solve, advance
+    dynamics = method.dynamics(system, state, control, dt, part)
+    advanced = method.integrator.advance(dynamics, state, memory.integrator, length)
+    (q, v, time), solution, rows, *_ = advanced
+    end = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, length))
+
+    # 6: update the memory; a step that is split at impacts keeps that of the whole step, hence dt
+    stabilizer = method.stabilizer_for(dt)
+    remembered = stabilizer.advance(rows, memory.stabilizer, dt)
+    remembered = stabilizer.remember(remembered, solution)
+
+    # 7: correct
+    new, correction = stabilizer.correct(system, method.solver, state, end, remembered, length)
+
+    # 8: report
+    if state.memory:
+        contact_λ = rows.reactions.multipliers if memory.has_contact_multipliers else ()
+        parts = MethodMemory(advanced.memory, remembered, memory.recovery, contact_λ)
+        new = dataclasses.replace(new, memory=parts)
+    finite = jnp.where(is_finite(new), Status.OK, Status.NON_FINITE).astype(jnp.int32)
+    code = status.first(status.first(solution.status, finite), correction)
+    if jax.tree.leaves(remembered):
+        code = status.first(code, judge_memory(remembered, new.status))
+    reactions = rows.reactions
+    if reactions is not None:
+        reactions = reactions.without_jump()
+    a, λ, _ = solution
+    where = without_memory(end) if advanced.ends else None
+    return new, StepInfo(a, λ, rows.violation, code, reactions, state=where)
+
+
+@pytree
+class Dynamics:
+    """M a = f + Jᵀλ, J a + C λ = b during one step, for an integrator: `dynamics(q, v, t)`.
+
+    Attributes:
+        system: with the whole turns of the state.
+        stabilizer: with all its gains.
+        solver: of the saddle system.
+        control: u.
+        memory: of the stabilizer.
+        dt: h, () [s].
+        contact: the response of limits, friction and contact; None in a scene without.
+        constant_force: a force that stays during the step, (n_v,); None for none.
+    """
+
+    system: System
+    stabilizer: Stabilizer
+    solver: Solver
+    control: PyTree
+    memory: PyTree
+    dt: Array
+    contact: Response | None = None
+    constant_force: Array | None = None
+
+    def __call__(
+        self, q: Array, v: Array, t: Doubled | Array, rate_delay: Array | None = None
+    ) -> tuple[Solution, Rows]:
+        """a and λ at (q, v, t), and the rows there. With contact they are means over the step.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+            rate_delay: feedback sees φ̇ as it was this long ago, () [s]; None for now.
+        """
+        solved = self.solve(self.linearize(q, v, t), q, v, t, rate_delay)
+        return with_jump(solved.solution, solved.rows.jump, self.dt), solved.rows
+
+    def linearize(self, q: Array, v: Array, t: Doubled | Array) -> Rows:
+        """φ, φ̇, J, γ and M at one instant, with the inequality rows of the step.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+        """
+        inequalities = None
+        if self.contact is not None:
+            inequalities = partial(self.contact.rows, control=self.control, dt=self.dt)
+        rows = linearize(self.system, q, v, t, inequalities)
+        return dataclasses.replace(rows, mass=self.system.mass(q))
+
+    def assemble(self, rows: Rows, q: Array, v: Array, t: Doubled | Array) -> Saddle:
+        """M a = f + Jᵀλ, J a + C λ = b.
+
+        Args:
+            rows: with a target b.
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+        """
+        force = self.system.force(q, v, t, self.control)
+        for more in (rows.force, self.constant_force):
+            force = force if more is None else force + more
+        return saddle(self.system, q, rows, force, rows.right_hand_side, rows.noise)
+
+    def solve(
+        self,
+        rows: Rows,
+        q: Array,
+        v: Array,
+        t: Doubled | Array,
+        rate_delay: Array | None = None,
+        every_landing: bool = False,
+    ) -> Solved:
+        """a and λ at a point that has been linearized. Impacts are apart, as `rows.jump`.
+
+        Args:
+            rows: from `linearize`.
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+            rate_delay: feedback sees φ̇ as it was this long ago, () [s]; None for now.
+            every_landing: whether landings without rebound are impacts beside every contact solver.
+        """
+        seen = rows if rate_delay is None else rows.earlier(rate_delay)
+        equations = self.stabilizer.constraint_equations(seen, self.memory, self.dt)
+        system = self.assemble(equations, q, v, t)
+        if self.contact is not None:
+            delayed = rate_delay is not None
+            return Solved(
+                *self.contact.solve(self, rows, system, (q, v, t), delayed, every_landing)
+            )
+        own = self.stabilizer.solve(self.solver, seen, self.memory, self.dt, system)
+        if own is not None:
+            return Solved(self.system.complete(own), rows)
+        factored = self.solver.factor(system)
+        solution = self.system.complete(factored(system.force, system.target))
+        return Solved(solution, rows, lambda b: factored(jnp.zeros_like(system.force), b))
+
+    def at_step_start(
+        self, q: Array, v: Array, t: Doubled | Array
+    ) -> tuple[Solution, Rows, Dynamics]:
+        """a, λ and the rows at the start of a step, and the dynamics of its other stages.
+
+        Contact is solved once a step. In the other stages its force is constant. Impacts are apart,
+        as `rows.jump`, for the end of the step.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+        """
+        rows = self.linearize(q, v, t)
+        solution, rows, *_, force = self.solve(rows, q, v, t, every_landing=True)
+        if self.contact is None:
+            return solution, rows, self
+        rest = dataclasses.replace(self, contact=None, constant_force=force)
+        return solution, rows, rest
+
+
+class Solved(NamedTuple):
+    """The solution at one point of a step.
+
+    Attributes:
+        solution: a and λ.
+        rows: the constraints there, with the reactions of inequality rows.
+        solve_rows: b → the least a, in the metric of M, with J a + C λ = b, by the factors of the
+            step; None where the stabilizer has a method of its own.
+        one_sided_force: of limits and contacts, (n_v,); None without inequality rows.
+        contact_force: of all inequality rows, (n_v,); None without.
+    """
+
+    solution: Solution
+    rows: Rows
+    solve_rows: Callable[[Array], Solution] | None = None
+    one_sided_force: Array | None = None
+    contact_force: Array | None = None
+
+
+class Advanced(NamedTuple):
+    """The end of a step, and what was found at its start.
+
+    Attributes:
+        point: q (n_q,), v (n_v,) and the time reached, () [s]: `state.instant + dt`, which keeps
+            its remainder, or a rounded number.
+        solution: a and λ.
+        rows: the constraints.
+        memory: of the integrator.
+        ends: whether a and λ belong to the point reached, and not to the start of the step.
+    """
+
+    point: tuple[Array, Array, Any]
+    solution: Solution
+    rows: Rows
+    memory: PyTree = ()
+    ends: bool = False
+
+
+def reached(state: State, time: Doubled | Array, dt: Array) -> Doubled:
+    """The time of `Advanced.point`, with its remainder if it is the rounded end of the step.
+
+    Args:
+        state: at the start of the step.
+        time: of the point.
+        dt: the length of the step, () [s].
+    """
+    if isinstance(time, Doubled):
+        return time
+    return where_tree(time == state.time + dt, state.instant + dt, Doubled.of(time))
+
+
+def without_memory(state: State) -> State:
+    """The state without the memory of a method."""
+    return dataclasses.replace(state, memory=())
+
+
+def judge_memory(memory: PyTree, status: Array) -> Array:
+    """Returns NON_FINITE where an array of the stabilizer's memory is not finite, else OK, ().
+
+    Otherwise the next step would fail, and the derivative of this one would be NaN already.
+
+    Args:
+        memory: arrays of floating numbers, with the batch axes of the status at the end.
+        status: of the world, for its shape.
+    """
+    good, axes = jnp.ones_like(status, bool), status.ndim
+    for x in jax.tree.leaves(memory):
+        good &= jnp.all(jnp.isfinite(x), axis=tuple(range(x.ndim - axes)))
+    return jnp.where(good, Status.OK, Status.NON_FINITE).astype(jnp.int32)

@@ -1,0 +1,1 @@
+"""Systems of bodies or of generalized coordinates: states, mass, forces, motion."""

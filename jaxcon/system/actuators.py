@@ -1,0 +1,343 @@
+"""Forces along the coordinates of joints: springs, dampers, motors and servos.
+
+Each class describes one element for the user. A gear g scales the joint's coordinate θ to the
+coordinate l = g θ of the actuator. The static method `force` computes the forces of many elements
+along l, as lanes (element, …). The force along θ is g times as large.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+
+from jaxcon.core import checks
+from jaxcon.core.lanes import Vector, take
+from jaxcon.core.pytree import pytree, static
+from jaxcon.core.typing import Array, DType, Lane
+from jaxcon.system.coordinates import JointCoordinate, OnJoint
+from jaxcon.system.elements import Elements, Named, label
+from jaxcon.system.forces import Pulls
+
+if TYPE_CHECKING:
+    from jaxcon.system.body_system import Snapshot
+
+SHAPES: dict[str, tuple[int, ...]] = {
+    **dict.fromkeys(("stiffness", "damping", "rest", "gear"), ()),
+    **dict.fromkeys(("gain", "bias"), (3,)),
+    **dict.fromkeys(("control_range", "force_range"), (2,)),
+}
+"""The shapes of the numeric fields of elements, by field name."""
+
+
+@dataclass(frozen=True)
+class JointForce(OnJoint):
+    """The base class of forces along a joint's coordinate; `SHAPES` lists their numeric fields.
+
+    Attributes:
+        name: name of the element, unique in the scene.
+        joint: name of the joint.
+    """
+
+    name: str
+    joint: str
+
+    def attach(self, dtype: DType) -> dict[str, Array]:
+        """Returns the checked numbers of the element by field, without ranges that are None.
+
+        Raises:
+            ValueError: a wrong shape, a negative stiffness or damping, or a range whose lower end
+                is above its upper end.
+        """
+        owner, params = label(self), {}
+        for field, x in vars(self).items():
+            if field in SHAPES and not (x is None and field.endswith("range")):
+                limit: checks.NumberRange = (
+                    {"least": 0} if field in ("stiffness", "damping") else {}
+                )
+                params[field] = x = checks.real(owner, field, x, dtype, SHAPES[field], **limit)
+                if field.endswith("range") and checks.is_concrete(x) and not x[0] <= x[1]:
+                    raise ValueError(
+                        f"{owner}: {field} must be (lowest, highest), got {checks.numerals(x)}."
+                    )
+        return params
+
+
+@dataclass(frozen=True)
+class JointSpring(JointForce):
+    """A spring and damper about a joint's coordinate θ: force −k (θ − θ₀) − c θ̇.
+
+    θ is zero at assembly; angles count whole turns.
+
+    Attributes:
+        name: name of the element, unique in the scene.
+        joint: name of the joint.
+        stiffness: k [N m/rad] or [N/m].
+        damping: c [N m s/rad] or [N s/m].
+        rest: rest position θ₀ [rad] or [m].
+        coordinate: name of the joint's coordinate; needed if it has several.
+    """
+
+    stiffness: Any
+    damping: Any = 0.0
+    rest: Any = 0.0
+    coordinate: str | None = None
+
+    @staticmethod
+    def force(p: dict[str, Any], u: Lane, value: Lane, rate: Lane) -> Lane:
+        """Returns the force −k (θ − θ₀) − c θ̇ along the joint's coordinate θ.
+
+        Args:
+            p: the numbers of the elements, by field.
+            u: unused.
+            value: θ.
+            rate: θ̇.
+        """
+        return -p["stiffness"] * (value - p["rest"]) - p["damping"] * rate
+
+    @staticmethod
+    def potential(p: dict[str, Any], value: Lane) -> Lane:
+        """Returns the energy ½ k (θ − θ₀)² of the spring at the coordinate θ [J]."""
+        return p["stiffness"] * (value - p["rest"]) ** 2 / 2
+
+
+@dataclass(frozen=True)
+class JointDamper(JointForce):
+    """Viscous friction about a joint's coordinate θ: force −c θ̇.
+
+    Attributes:
+        name: name of the element, unique in the scene.
+        joint: name of the joint.
+        damping: c [N m s/rad] or [N s/m].
+        coordinate: name of the joint's coordinate; needed if it has several.
+    """
+
+    damping: Any
+    coordinate: str | None = None
+    counts = False
+
+    @staticmethod
+    def force(p: dict[str, Any], u: Lane, value: Lane, rate: Lane) -> Lane:
+        """Returns the damping force −c θ̇ along the joint's coordinate θ.
+
+        Args:
+            p: the numbers of the elements, by field.
+            u: unused.
+            value: unused.
+            rate: θ̇.
+        """
+        return -p["damping"] * rate
+
+
+@dataclass(frozen=True)
+class Motor(JointForce):
+    """A force or torque g clip(u) along a joint's coordinate, with control input u.
+
+    Attributes:
+        name: name of the element, unique in the scene; also the name of the control channel, one
+            number u.
+        joint: name of the joint.
+        gear: gear ratio g; the force on the joint is g times the force of the motor.
+        control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
+        coordinate: name of the joint's coordinate; needed if it has several.
+    """
+
+    gear: Any = 1.0
+    control_range: Any = None
+    coordinate: str | None = None
+    controls = 1
+    counts = False
+
+    @staticmethod
+    def force(p: dict[str, Any], u: Lane, value: Lane, rate: Lane) -> Lane:
+        """Returns the force of the motor: the clipped control input u.
+
+        Args:
+            p: the numbers of the elements, by field.
+            u: the control input.
+            value: unused.
+            rate: unused.
+        """
+        return u
+
+
+@dataclass(frozen=True)
+class PositionServo(JointForce):
+    """A servo that follows a position: force k (clip(u) − l) − c l̇ along l = g θ.
+
+    θ is the joint's coordinate; angles count whole turns.
+
+    Attributes:
+        name: name of the element, unique in the scene; also the name of the control channel, the
+            target position u.
+        joint: name of the joint.
+        stiffness: k [N m/rad] or [N/m].
+        damping: c [N m s/rad] or [N s/m].
+        gear: gear ratio g.
+        control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
+        force_range: (lowest, highest) force before gearing; the force is clipped to this range.
+            None for no limit.
+        coordinate: name of the joint's coordinate; needed if it has several.
+    """
+
+    stiffness: Any
+    damping: Any = 0.0
+    gear: Any = 1.0
+    control_range: Any = None
+    force_range: Any = None
+    coordinate: str | None = None
+    controls = 1
+
+    @staticmethod
+    def force(p: dict[str, Any], u: Lane, value: Lane, rate: Lane) -> Lane:
+        """Returns the force k (u − l) − c l̇ along the geared coordinate l.
+
+        Args:
+            p: the numbers of the elements, by field.
+            u: the target position.
+            value: l.
+            rate: l̇.
+        """
+        return p["stiffness"] * (u - value) - p["damping"] * rate
+
+
+@dataclass(frozen=True)
+class VelocityServo(JointForce):
+    """A servo that follows a velocity: force c (clip(u) − l̇) along l = g θ.
+
+    θ is the joint's coordinate.
+
+    Attributes:
+        name: name of the element, unique in the scene; also the name of the control channel, the
+            target velocity u.
+        joint: name of the joint.
+        damping: c [N m s/rad] or [N s/m].
+        gear: gear ratio g.
+        control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
+        force_range: (lowest, highest) force before gearing; the force is clipped to this range.
+            None for no limit.
+        coordinate: name of the joint's coordinate; needed if it has several.
+    """
+
+    damping: Any
+    gear: Any = 1.0
+    control_range: Any = None
+    force_range: Any = None
+    coordinate: str | None = None
+    controls = 1
+    counts = False
+
+    @staticmethod
+    def force(p: dict[str, Any], u: Lane, value: Lane, rate: Lane) -> Lane:
+        """Returns the force c (u − l̇) along the geared coordinate l.
+
+        Args:
+            p: the numbers of the elements, by field.
+            u: the target velocity.
+            value: unused.
+            rate: l̇.
+        """
+        return p["damping"] * (u - rate)
+
+
+@dataclass(frozen=True)
+class AffineActuator(JointForce):
+    """An actuator with the force (g₀ + g₁ l + g₂ l̇) clip(u) + b₀ + b₁ l + b₂ l̇ along l = g θ.
+
+    θ is the joint's coordinate; angles count whole turns.
+
+    Attributes:
+        name: name of the element, unique in the scene; also the name of the control channel, one
+            number u.
+        joint: name of the joint.
+        gain: (g₀, g₁, g₂).
+        bias: (b₀, b₁, b₂).
+        gear: gear ratio g.
+        control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
+        force_range: (lowest, highest) force before gearing; the force is clipped to this range.
+            None for no limit.
+        coordinate: name of the joint's coordinate; needed if it has several.
+    """
+
+    gain: Any = (1.0, 0.0, 0.0)
+    bias: Any = (0.0, 0.0, 0.0)
+    gear: Any = 1.0
+    control_range: Any = None
+    force_range: Any = None
+    coordinate: str | None = None
+    controls = 1
+
+    @staticmethod
+    def force(p: dict[str, Any], u: Lane, value: Lane, rate: Lane) -> Lane:
+        """Returns the force (g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇ along the coordinate l.
+
+        Args:
+            p: the numbers of the elements, by field.
+            u: the control input.
+            value: l.
+            rate: l̇.
+        """
+        at = Vector(1.0, value, rate)
+        return p["gain"].dot(at) * u + p["bias"].dot(at)
+
+
+@pytree
+class JointForces(Elements):
+    """A group of `JointForce` elements of one class, on the same coordinate of joints of one class.
+
+    Attributes:
+        coordinate: the joint coordinates.
+        starts: the index of the control input of each element; empty without control.
+    """
+
+    coordinate: JointCoordinate = static(default=None)  # type: ignore[assignment]
+    starts: tuple[int, ...] = static(default=())
+
+    def pulls(self, snapshot: Snapshot, control: Array | None) -> Pulls:
+        """Returns the generalized forces on the bodies of each side; u = 0 if control is None."""
+        coordinate = self.coordinate.read(snapshot)
+        u: Lane = 0.0
+        if self.starts and control is not None:
+            u = clip(self.params, "control_range", take(control, self.starts))
+        gear = self.params.get("gear", 1.0)
+        force = self.law.force(self.params, u, gear * coordinate.value, gear * coordinate.rate)
+        force = gear * clip(self.params, "force_range", force)
+        return [(p, pull * force) for p, pull in zip(self.places, coordinate.pulls, strict=True)]
+
+    def anchors(self, snapshot: Snapshot) -> Vector | None:
+        """Returns the anchors of the joints, world frame [m]; None without anchors."""
+        return self.coordinate.anchors(snapshot)
+
+    def potential(self, snapshot: Snapshot) -> Iterable[Lane]:
+        """Returns the energy stored in each element [J]; empty for elements without an energy."""
+        if self.law.potential is None:
+            return ()
+        return (self.law.potential(self.params, self.coordinate.read(snapshot).value),)
+
+
+def clip(p: dict[str, Any], field: str, x: Lane) -> Lane:
+    """Clips x to the range in a field; returns x unchanged if there is no such field."""
+    if field not in p:
+        return x
+    lowest, highest = p[field]
+    return jnp.clip(x, lowest, highest)
+
+
+def numbers(
+    element: Named, dtype: DType, *fields: str, shape: tuple[int, ...] = ()
+) -> dict[str, Array]:
+    """Returns fields of an element, checked to be finite numbers of one shape.
+
+    Args:
+        element: the element.
+        dtype: dtype of the result.
+        fields: names of the fields.
+        shape: the shape of each field.
+
+    Raises:
+        ValueError: a field has another shape, or is not finite.
+    """
+    owner = label(element)
+    return {f: checks.real(owner, f, getattr(element, f), dtype, shape) for f in fields}
