@@ -132,7 +132,10 @@ if not TYPE_CHECKING:  # else type checkers would take every name for one that e
             return importlib.import_module("jaxcon.environments")
         old = f"{__name__}.{name}"
         if (new := _renamed().get(old)) is not None:
-            raise AttributeError(f"{old} is {new} since 0.2.0; tools/rename.py rewrites code.")
+            raise AttributeError(
+                f"{old} is {new} since 0.2.0: see the changelog. tools/rename.py of the repository"
+                " rewrites code."
+            )
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

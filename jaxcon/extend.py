@@ -2,18 +2,32 @@
 
 Systems: System, Bodies, Constraint, InequalityGroup, Joint, Row.
 Methods: Stabilizer, Integrator, Solver, ContactSolver, Adjoint.
-Steps: Dynamics, Advanced, StepInfo, Rows, Saddle.
+Steps: Dynamics, Advanced, StepInfo, Rows, Saddle, Snapshot, BoundSet, Bounded, RowCounts, Path.
 Frames: Pose, Motion.
 Pytrees: pytree, static.
-Helpers: by_row, per_world, free_motion, judge.
+Rows of joints: meet, travel, distance, angle_between, same_orientation; unit, anchors,
+check_perpendicular.
+Helpers: by_row, per_world, free_motion, delassus, judge.
 """
 
 from jaxcon.constraints.base import Joint
-from jaxcon.constraints.primitives import Row
+from jaxcon.constraints.joints import anchors, check_perpendicular, unit
+from jaxcon.constraints.primitives import (
+    Row,
+    angle_between,
+    distance,
+    meet,
+    same_orientation,
+    travel,
+)
 from jaxcon.constraints.rows import Rows
+from jaxcon.contact.bounded import Bounded, RowCounts
+from jaxcon.contact.rows import BoundSet
 from jaxcon.core.pytree import pytree, static
+from jaxcon.execution.adjoints import Path
 from jaxcon.geometry.pose import Motion, Pose
 from jaxcon.linear.saddle import Saddle, free_motion, judge
+from jaxcon.linear.schur import delassus
 from jaxcon.methods.gains import by_row
 from jaxcon.protocols import (
     Adjoint,
@@ -28,6 +42,7 @@ from jaxcon.protocols import (
 )
 from jaxcon.staging.worlds import per_world
 from jaxcon.step import Advanced, Dynamics, StepInfo
+from jaxcon.system.body_system import Snapshot
 
 
 def __dir__() -> list[str]:
@@ -52,12 +67,26 @@ __all__ = [
     "StepInfo",
     "Rows",
     "Saddle",
+    "Snapshot",
+    "BoundSet",
+    "Bounded",
+    "RowCounts",
+    "Path",
     "Pose",
     "Motion",
     "pytree",
     "static",
+    "meet",
+    "travel",
+    "distance",
+    "angle_between",
+    "same_orientation",
+    "unit",
+    "anchors",
+    "check_perpendicular",
     "by_row",
     "per_world",
     "free_motion",
+    "delassus",
     "judge",
 ]

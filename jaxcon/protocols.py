@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from jaxcon.core.doubled import Doubled
     from jaxcon.core.lanes import Vector
     from jaxcon.execution.adjoints import Path
+    from jaxcon.linear.jacobian import Columns
     from jaxcon.linear.saddle import Factored, Mass, Saddle, Solution
     from jaxcon.step import Advanced, Dynamics
     from jaxcon.system.body_system import Snapshot
@@ -132,6 +133,18 @@ class System(TreeNode, Protocol):
     @property
     def bounds(self) -> tuple[Any, ...]:
         """Groups of inequality constraints; see `InequalityGroup`."""
+        ...
+
+    @property
+    def forces(self) -> tuple[Any, ...]:
+        """Groups of force elements; () where forces are the user's function."""
+        ...
+
+    def check(self, q: Array) -> None:
+        """Checks numbers that depend on q, (n_q,), when a state is made."""
+
+    def columns(self, place: Place) -> Columns:
+        """The columns of J that belong to the bodies of a place."""
         ...
 
     @property
@@ -259,6 +272,10 @@ class System(TreeNode, Protocol):
 class Bodies(System, Protocol):
     """A system of bodies; integrators advance the rotations in space separately from the rest."""
 
+    def kinetic_energy(self, q: Array, v: Array) -> Array:
+        """½ vᵀMv of the bodies without rotors, () [J]."""
+        ...
+
     def kick(
         self, q: Array, v: Array, acceleration: Array, dt: Array, small: bool = False
     ) -> Array:
@@ -296,19 +313,41 @@ class Bodies(System, Protocol):
         ...
 
 
-class Stabilizer(Protocol):
+class Stabilizer(TreeNode, Protocol):
     """Chooses b and C of J a + C λ = b, so that errors of the constraints do not grow.
 
     `constraint_equations` is the one method that is required. b = −γ holds φ̈ = 0 alone, so that
     errors of φ and φ̇ grow; see `Unstabilized`.
     """
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuses methods of version 0.1, which would never be called.
+
+        Raises:
+            TypeError: the class defines `target`, `impose` or `bounded`.
+        """
+        super().__init_subclass__(**options)
+        renamed = {"target": "constraint_equations", "impose": "constraint_equations"}
+        for old, new in (renamed | {"bounded": "cap_gains"}).items():
+            if callable(vars(cls).get(old)) and new not in vars(cls):
+                raise TypeError(
+                    f"{cls.__name__}: the method `{old}` of stabilizers is `{new}` since version"
+                    " 0.2; see jc.extend.Stabilizer for its arguments."
+                )
+
+    def check(self) -> None:
+        """Checks the numbers of the part; by default, does nothing.
+
+        Raises:
+            ValueError: a number is out of range.
+        """
+
     @abstractmethod
     def constraint_equations(self, rows: Rows, memory: Any, dt: Array) -> Rows:
-        """The rows with their target b, and with C and f where they change.
+        """The rows with their target b; fields of `Rows` for C and f where those change.
 
         Args:
-            rows: φ, φ̇, J, γ at one instant.
+            rows: φ, φ̇, J, γ at one instant, with φ̇ as feedback sees it.
             memory: of this stabilizer, as of the end of the last step; the same at all stages of
                 the step.
             dt: h, () [s].
@@ -329,9 +368,11 @@ class Stabilizer(Protocol):
         """True where `solve` has a method of its own."""
         return type(self).solve is not Stabilizer.solve
 
-    # memory: integrals, histories, the λ of the last step. `init` makes it. At the end of each step
-    # it becomes remember(advance(rows, memory, dt), solution), which `correct` and the next step
-    # get. Its leaves are floating arrays whose shapes stay; a batch adds an axis at their end.
+    # memory: integrals, histories, the λ of the last step. `jc.init` calls `init` and puts the
+    # result into `State.memory`; `jc.step` and `jc.rollout` do so for a state without memory. At
+    # the end of each step it becomes remember(advance(rows, memory, dt), solution), which `correct`
+    # and the next step get. `jc.forward_dynamics` uses the memory and does not update it. Leaves
+    # are arrays whose shapes and dtypes stay; a batch adds an axis at their end.
 
     def init(self, system: System, q: Array, v: Array) -> Any:
         """The memory at the start of a simulation of one world; () for none.
@@ -345,9 +386,10 @@ class Stabilizer(Protocol):
         return memory
 
     def remember(self, memory: Any, solution: Solution) -> Any:
-        """The memory after a step, from a and λ at its start.
+        """The memory after a step, from the a and λ of the step.
 
-        With contact, a and λ are means over the step. `GeneralizedAlpha` has them at the end.
+        They belong to the start of the step; with contact they are means over the step, and with
+        `GeneralizedAlpha` they belong to its end. λ is that of equality rows, (n_c,).
         """
         return memory
 
@@ -387,19 +429,19 @@ class Stabilizer(Protocol):
     # only for stabilizers with default gains, which depend on the integrator and the step
 
     def resolve(self, gains: tuple[Scalar, Scalar]) -> Self:
-        """With these (α, β) [1/s] in place of gains that were not given."""
+        """The stabilizer with (α, β) [1/s] in place of gains that were not given."""
         return self
 
     def rising(self, limit: Scalar) -> Self:
-        """With default gains that rise up to β = limit [1/s] where constraints accelerate fast."""
+        """The stabilizer with default gains that rise to β ≤ limit [1/s] in fast motions."""
         return self
 
     def steady(self, gains: tuple[Scalar, Scalar]) -> Self:
-        """With these default gains (α, β) [1/s], which do not rise."""
+        """The stabilizer with default gains (α, β) [1/s] that do not rise."""
         return self
 
     def cap_gains(self, stable_rate: Callable[[float], Any]) -> Self:
-        """With gains below the largest stable β [1/s].
+        """The stabilizer with gains below the largest stable β [1/s].
 
         Args:
             stable_rate: the smallest damping ratio α/β of the gains ↦ the largest stable β.
@@ -407,7 +449,7 @@ class Stabilizer(Protocol):
         return self
 
 
-class Integrator(Protocol):
+class Integrator(TreeNode, Protocol):
     """Advances q and v by accelerations.
 
     `advance` and `default_gains` are required. `report`, warnings of unstable gains and gains
@@ -420,6 +462,13 @@ class Integrator(Protocol):
     """True where limits, friction and contact may act beside it."""
     reads_within: ClassVar[bool] = True
     """True where it reads angles between the ends of a step."""
+
+    def check(self) -> None:
+        """Checks the numbers of the part; by default, does nothing.
+
+        Raises:
+            ValueError: a number is out of range.
+        """
 
     def init(self, system: System, q: Array, v: Array) -> Any:
         """The memory at the start of a simulation; () for none."""
@@ -455,8 +504,10 @@ class Integrator(Protocol):
         """The factor by which a constraint error may grow in a step: a spectral radius; or None."""
         return None
 
-    def error_map(self, alpha: Number, beta: Number, dt: Number) -> Any:
-        """(φ, φ̇) after a step from φ = 1, from φ̇ = 1 and under an acceleration of 1; or None."""
+    def error_map(
+        self, alpha: Number, beta: Number, dt: Number
+    ) -> tuple[tuple[Any, Any], tuple[Any, Any], tuple[Any, Any]] | None:
+        """Three pairs (φ, φ̇) after a step: from φ = 1, from φ̇ = 1, and under φ̈ = 1; or None."""
         return None
 
     def refuses(self, system: System, stabilizer: Stabilizer) -> str | None:
@@ -464,8 +515,15 @@ class Integrator(Protocol):
         return None
 
 
-class Solver(Protocol):
+class Solver(TreeNode, Protocol):
     """Solves the saddle system M a = f + Jᵀλ, J a + C λ = b."""
+
+    def check(self) -> None:
+        """Checks the numbers of the part; by default, does nothing.
+
+        Raises:
+            ValueError: a number is out of range.
+        """
 
     @abstractmethod
     def factor(self, system: Saddle) -> Factored:
@@ -477,7 +535,7 @@ class Solver(Protocol):
         return self.factor(system)(system.force, system.target)
 
 
-class ContactSolver(Protocol):
+class ContactSolver(TreeNode, Protocol):
     """Finds multipliers λ of inequality rows: u = G λ + c, each row obeying its law."""
 
     @property
@@ -508,8 +566,15 @@ class ContactSolver(Protocol):
         ...
 
 
-class Adjoint(Protocol):
+class Adjoint(TreeNode, Protocol):
     """Chooses what the reverse pass of a rollout keeps."""
+
+    def check(self) -> None:
+        """Checks the numbers of the part; by default, does nothing.
+
+        Raises:
+            ValueError: a number is out of range.
+        """
 
     @abstractmethod
     def scan(self, path: Path) -> tuple[State, Any]:

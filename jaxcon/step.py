@@ -8,15 +8,16 @@ multipliers. A step
     1. linearizes the constraints, φ̈ = J a + γ    `Dynamics.linearize`
     2. asks the stabilizer for b and C             `Stabilizer.constraint_equations`
     3. assembles M, f, J, C, b                     `Dynamics.assemble`
-    4. solves for a and λ                          `Dynamics.solve`
+    4. solves for a and λ                          `Solver.factor`
     5. advances q and v                            `Integrator.advance`
     6. updates the stabilizer's memory             `Stabilizer.advance`, `Stabilizer.remember`
     7. corrects q and v                            `Stabilizer.correct`
     8. reports                                     `StepInfo`
 
-The integrator repeats 1 to 4 at each of its stages, by calling `Dynamics`. The memory, such as ∫φ
-or the last λ, is the same at all stages of a step. Limits, friction and contact add a force
-J_bᵀλ_b, with λ_b from the contact solver, once a step; see `contact.response`.
+`Dynamics.solve` does 2 to 4. An explicit integrator does 1 to 4 at each of its stages, by calling
+`Dynamics`; `RATTLE` and `GeneralizedAlpha` solve equations of their own. The memory, such as ∫φ or
+the last λ, is the same at all stages of a step. Limits, friction and contact add a force J_bᵀλ_b,
+with λ_b from the contact solver, once a step; see `contact.response`.
 
 Arrays are those of one world, or of a batch along one more axis at the end. Nothing here checks
 input, batches, masks failed worlds or stages kernels: `execution` does.
@@ -26,6 +27,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -49,8 +51,26 @@ from jaxcon.system.state import MethodMemory, State, at_instant, is_finite
 if TYPE_CHECKING:
     from jaxcon.contact.parts import StepPart
     from jaxcon.contact.response import Response
-    from jaxcon.execution.wrenches import Origin
     from jaxcon.methods.method import Method
+
+
+@dataclass(frozen=True, eq=False)
+class Origin:
+    """The system of an info, which `jc.wrench` needs.
+
+    It is no pytree: what JAX returns from a transformation does not have it, so that a step whose
+    wrenches nobody reads neither computes nor carries anything for them.
+    """
+
+    system: System
+
+    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
+        """Leaves the system out of a pickled info, as out of one that JAX rebuilds."""
+        return _nothing, ()
+
+
+def _nothing() -> None:
+    """Returns None, in place of a pickled origin."""
 
 
 @pytree
@@ -60,12 +80,13 @@ class StepInfo(Stacked):
     Recorded infos have leading axes, as trajectories of states do: `len(infos)`, `infos[10]`.
 
     Attributes:
-        acceleration: a, (n_v,).
-        multipliers: λ, (n_c,).
-        violation: φ and φ̇ by constraint.
+        acceleration: a, (n_v,) [m/s², rad/s²].
+        multipliers: λ, (n_c,) [N, N m], in the unit that does work with the unit of φ.
+        violation: φ [m, rad] and φ̇ [m/s, rad/s] by constraint, at the start of the step.
         status: of this step, or what stopped the world before, ().
         reactions: forces of limits, friction and contact; None in a scene without.
-        impacts: impacts at which the step was split; None without `Events`.
+        impacts: impacts at which the step was split; None without `Events`, and in a scene that has
+            no hard stops, ropes or contacts.
         state: the state to which a and λ belong, without the memory of the method. That is the
             state before the step, and for `GeneralizedAlpha` the point that it reached.
         control: control u of the step.
@@ -92,8 +113,8 @@ class StepInfo(Stacked):
     def __repr__(self) -> str:
         """Time, status, violation, and the names of the elements whose forces it has."""
         φ = getattr(self.violation, "position", None)
-        known = isinstance(φ, jax.Array | np.ndarray)
-        names = listed(self.violation.layout.names) if known else ""
+        has_values = isinstance(φ, jax.Array | np.ndarray)
+        names = listed(self.violation.layout.names) if has_values else ""
         reactions = self.reactions if isinstance(self.reactions, Mapping) else None
         rows = [
             ("time", span(self.state.time, "s") if isinstance(self.state, State) else ""),
@@ -145,24 +166,26 @@ def step(
     (q, v, time), solution, rows, *_ = advanced
     end = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, length))
 
-    # 6: update the memory; a step that is split at impacts keeps that of the whole step, hence dt
-    stabilizer = method.stabilizer_for(dt)
-    remembered = stabilizer.advance(rows, memory.stabilizer, dt)
-    remembered = stabilizer.remember(remembered, solution)
+    # 6: update the memory, once a step and over all of dt. If impacts split the step, each part
+    # starts from the memory before the step, and only the memory of the last part is kept.
+    stabilizer = dynamics.stabilizer
+    integrals = stabilizer.advance(rows, memory.stabilizer, dt)
+    remembered = stabilizer.remember(integrals, solution)
 
     # 7: correct
     new, correction = stabilizer.correct(system, method.solver, state, end, remembered, length)
 
     # 8: report
+    reactions = rows.reactions
     if state.memory:
-        contact_λ = rows.reactions.multipliers if memory.has_contact_multipliers else ()
+        warm = reactions if memory.has_contact_multipliers else None
+        contact_λ = () if warm is None else warm.multipliers
         parts = MethodMemory(advanced.memory, remembered, memory.recovery, contact_λ)
         new = dataclasses.replace(new, memory=parts)
     finite = jnp.where(is_finite(new), Status.OK, Status.NON_FINITE).astype(jnp.int32)
     code = status.first(status.first(solution.status, finite), correction)
     if jax.tree.leaves(remembered):
         code = status.first(code, judge_memory(remembered, new.status))
-    reactions = rows.reactions
     if reactions is not None:
         reactions = reactions.without_jump()
     a, λ, _ = solution
@@ -194,18 +217,15 @@ class Dynamics:
     contact: Response | None = None
     constant_force: Array | None = None
 
-    def __call__(
-        self, q: Array, v: Array, t: Doubled | Array, rate_delay: Array | None = None
-    ) -> tuple[Solution, Rows]:
+    def __call__(self, q: Array, v: Array, t: Doubled | Array) -> tuple[Solution, Rows]:
         """a and λ at (q, v, t), and the rows there. With contact they are means over the step.
 
         Args:
             q: positions, (n_q,).
             v: velocities, (n_v,).
             t: time, () [s].
-            rate_delay: feedback sees φ̇ as it was this long ago, () [s]; None for now.
         """
-        solved = self.solve(self.linearize(q, v, t), q, v, t, rate_delay)
+        solved = self.solve(self.linearize(q, v, t), q, v, t)
         return with_jump(solved.solution, solved.rows.jump, self.dt), solved.rows
 
     def linearize(self, q: Array, v: Array, t: Doubled | Array) -> Rows:
@@ -232,8 +252,8 @@ class Dynamics:
             t: time, () [s].
         """
         force = self.system.force(q, v, t, self.control)
-        for more in (rows.force, self.constant_force):
-            force = force if more is None else force + more
+        for extra_force in (rows.force, self.constant_force):
+            force = force if extra_force is None else force + extra_force
         return saddle(self.system, q, rows, force, rows.right_hand_side, rows.noise)
 
     def solve(
@@ -255,17 +275,17 @@ class Dynamics:
             rate_delay: feedback sees φ̇ as it was this long ago, () [s]; None for now.
             every_landing: whether landings without rebound are impacts beside every contact solver.
         """
-        seen = rows if rate_delay is None else rows.earlier(rate_delay)
-        equations = self.stabilizer.constraint_equations(seen, self.memory, self.dt)
+        observed = rows if rate_delay is None else rows.earlier(rate_delay)
+        equations = self.stabilizer.constraint_equations(observed, self.memory, self.dt)
         system = self.assemble(equations, q, v, t)
         if self.contact is not None:
             delayed = rate_delay is not None
             return Solved(
                 *self.contact.solve(self, rows, system, (q, v, t), delayed, every_landing)
             )
-        own = self.stabilizer.solve(self.solver, seen, self.memory, self.dt, system)
-        if own is not None:
-            return Solved(self.system.complete(own), rows)
+        solution = self.stabilizer.solve(self.solver, observed, self.memory, self.dt, system)
+        if solution is not None:
+            return Solved(self.system.complete(solution), rows)
         factored = self.solver.factor(system)
         solution = self.system.complete(factored(system.force, system.target))
         return Solved(solution, rows, lambda b: factored(jnp.zeros_like(system.force), b))
@@ -298,7 +318,7 @@ class Solved(NamedTuple):
         solution: a and λ.
         rows: the constraints there, with the reactions of inequality rows.
         solve_rows: b → the least a, in the metric of M, with J a + C λ = b, by the factors of the
-            step; None where the stabilizer has a method of its own.
+            step, before `System.complete`; None where the stabilizer has a method of its own.
         one_sided_force: of limits and contacts, (n_v,); None without inequality rows.
         contact_force: of all inequality rows, (n_v,); None without.
     """

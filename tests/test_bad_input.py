@@ -360,7 +360,7 @@ MISTAKES = {
     ),
     "negative stiffness": (
         lambda: build(jc.Spring("s", "arm", "leg", stiffness=-1)),
-        ["spring 's'", "stiffness", "zero or more", "-1.0"],
+        ["Spring 's'", "stiffness", "zero or more", "-1.0"],
     ),
     "negative damping of a joint": (
         lambda: build(
@@ -555,6 +555,13 @@ def with_q(q):
     return dataclasses.replace(scenes.build("mixed-2d").state, q=q)
 
 
+def begun(stabilizer):
+    """A state of the mixed scene with the memory of a stabilizer."""
+    built = scenes.build("mixed-2d")
+    method = jc.Method(stabilizer=stabilizer)
+    return jc.init(built.system, method, built.state.q, built.state.v)
+
+
 def with_memory(memory):
     return dataclasses.replace(scenes.build("mixed-2d").state, memory=memory)
 
@@ -574,6 +581,20 @@ STEPS = {
     ),
     "memory that this method keeps": (
         lambda: stepping(state=with_memory({"integral": jnp.zeros(8)})),
+        ["memory that this method keeps", "jc.init"],
+    ),
+    "a count of steps in place of an integral": (
+        lambda: stepping(
+            state=begun(jc.Projection(every=10)),
+            method=jc.Method(stabilizer=jc.stabilizers.PID(integral=1.0)),
+        ),
+        ["memory that this method keeps", "jc.init"],
+    ),
+    "a window of another length": (
+        lambda: stepping(
+            state=begun(jc.stabilizers.SlidingWindowBaumgarte(window=8)),
+            method=jc.Method(stabilizer=jc.stabilizers.SlidingWindowBaumgarte(window=16)),
+        ),
         ["memory that this method keeps", "jc.init"],
     ),
     "batch without vmap": (

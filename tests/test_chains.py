@@ -121,6 +121,21 @@ def test_the_derivative_by_the_points():
     np.testing.assert_allclose(slope[2, 3], (1.0, 0.0), atol=IDENTITY)
 
 
+@pytest.mark.parametrize("build", [jc.chains.rope, jc.chains.rod])
+def test_the_derivative_by_the_mass(build):
+    """The potential energy is proportional to the mass, which is traced."""
+    points = np.array([(0.0, 0.0), (0.5, -1.0), (1.5, -1.0), (2.0, 0.5)])
+
+    def height(mass):
+        scene = jc.Scene(dim=2)
+        build(scene, "chain", points, mass)
+        return jc.energy(*scene.build()).potential
+
+    value, slope = jax.jit(jax.value_and_grad(height))(3.0)
+    np.testing.assert_allclose(value, height(3.0), rtol=IDENTITY)
+    np.testing.assert_allclose(slope, value / 3.0, rtol=IDENTITY)
+
+
 def test_the_plan_of_a_long_chain_is_one_run():
     """The traced program does not grow with the chain; planning and naming are not quadratic."""
     sizes = {}

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon.contact.contact import across_axes
+from jaxcon.core.lanes import Vector
 from jaxcon.verification import references
 
 H = 1e-3
@@ -633,6 +635,61 @@ def test_deep_overlap_ends_slowly():
     assert np.all(states.status == 0)
     assert float(jnp.abs(states.v).max()) < 0.05 + 1e-9
     assert float(states.q[-1, 2]) > 0.1 - 1e-4
+
+
+@dtypes
+@pytest.mark.parametrize("dim", [2, 3])
+def test_two_balls_at_one_place_separate(dim, dtype):
+    """They part along the x axis at the recovery speed, by values and derivatives."""
+    scene = jc.Scene(dim=dim, gravity=np.zeros(dim), dtype=dtype)
+    for name in "ab":
+        scene.add_particle(name, mass=1.0, position=np.ones(dim))
+    touch = {"radius_a": 0.01, "radius_b": 0.01, "recovery": 0.5}
+    scene.add(jc.contacts.CapsuleContact("touch", "a", "b", **touch))
+    system, state = scene.build()
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel(2, warm=False))
+
+    def apart(recovery, q):
+        changed = system.with_params({"touch": {"recovery": recovery}})
+        last, _ = jc.rollout(changed, method, state.replace(q=q), None, H, 100)
+        a, b = (jc.position(system, last, name) for name in "ab")
+        return b - a, (b - a, last.status)
+
+    given = jnp.asarray(0.5, dtype), state.q
+    slopes, (off, status) = jax.jit(jax.jacfwd(apart, argnums=(0, 1), has_aux=True))(*given)
+    assert status == jc.Status.OK
+    np.testing.assert_allclose(off, 0.1 * 0.5 * np.eye(dim)[0], atol=1e-5)
+    np.testing.assert_allclose(slopes[0], 0.1 * np.eye(dim)[0], rtol=1e-3)
+    assert jnp.all(jnp.isfinite(slopes[1]))
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "longer"),
+    [
+        ((1.0, 0.0, 0.0), (0.3, 2.0, 0.0), None),
+        ((1.0, 1.0, 0.0), (0.5, 0.5, 0.0), None),
+        ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0), None),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), None),
+        ((1.0, 2.0), (0.0, 1.0), 0),
+        ((0.0, 1.0), (1.0, 2.0), 1),
+        ((0.0, 0.0), (0.0, 0.0), None),
+    ],
+    ids=["crossing", "parallel", "one ball", "balls", "plane", "plane, b longer", "discs"],
+)
+@dtypes
+def test_where_axes_meet_the_normal_is_across_them(a, b, longer, dtype):
+    """In space both axes are normal to it, in the plane the longer one; it is x for balls."""
+
+    def across(axes):
+        return across_axes(*(Vector(*x[:, None]) for x in axes)).stack()[:, 0]
+
+    axes = jnp.asarray([a, b], dtype)
+    n = across(axes)
+    np.testing.assert_allclose(jnp.linalg.norm(n), 1.0, rtol=1e-6)
+    np.testing.assert_allclose((axes @ n)[slice(None) if longer is None else longer], 0, atol=1e-6)
+    if not any(a + b):
+        np.testing.assert_array_equal(n, np.eye(len(a))[0])
+    assert jnp.all(jnp.isfinite(jax.jacrev(across)(axes)))
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -126,6 +126,27 @@ def test_a_velocity_that_overflows_is_named_and_a_limit_that_is_passed():
     assert (found.term, found.name) == ("violation", "rod")
 
 
+@pytest.mark.parametrize(
+    ("upper", "term", "name"), [(2.0, "force", "wind"), (jnp.nan, "parameter", "stop.upper")]
+)
+def test_a_missing_stop_is_not_a_cause(upper, term, name):
+    """The missing lower stop is −inf; a stop at NaN is wrong."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("cart", mass=1.0, inertia=1.0)
+    scene.add(jc.Prismatic("rail", jc.WORLD, "cart", axis=(1.0, 0.0)))
+    scene.add(jc.Limit("stop", "rail", upper=2.0))
+    scene.add(jc.forces.CustomForce("wind", ("cart",), gust, params=jnp.asarray(1.5 * DT)))
+    system, state = scene.build()
+    system = jax.jit(lambda upper: system.with_params({"stop": {"upper": upper}}))(upper)
+    found = jc.analysis.find_first_failure(system, jc.Method(), state, None, DT, 4)
+    assert (found.term, found.name) == (term, name)
+
+
+def gust(body, t, control, until):
+    """Returns a force and torque that become NaN after the time `until`."""
+    return jnp.stack([jnp.sqrt(until - t), 0 * t, 0 * t])
+
+
 def test_nothing_is_found_where_nothing_fails(scene):
     assert jc.analysis.find_first_failure(*scene[:1], SCHUR, scene[1], None, DT, STEPS) is None
 

@@ -413,3 +413,24 @@ def test_a_policy_may_have_a_derivative_of_its_own(swing):
     free = swing(lambda shared, own, s: shared[0] * jnp.stack([s.q[1], own * s.q[0]]), shared, 1.0)
     assert value(shared, 1.0) == free
     assert_batched_either_way(value, shared, own, 1e-9)
+
+
+def test_forward_dynamics_of_a_singular_world_does_not_spoil_the_gradient_of_the_others():
+    """A rod without length has no direction; its world shares a mass with a healthy one."""
+    scene = jc.Scene(dim=2)
+    scene.add_particle("bob", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=1.0))
+    system, state = scene.build()
+    rods = jnp.array([[0.0, -1.0], [0.0, 0.0]])
+    states = jax.vmap(lambda q: dataclasses.replace(state, q=q))(rods)
+    method = jc.Method(solver=jc.solvers.Schur())
+
+    def tension(mass):
+        heavy = system.with_params({"bob": {"mass": mass}})
+        solve = lambda s: jc.forward_dynamics(heavy, s, None, method, 1e-3)  # noqa: E731
+        found = jax.vmap(solve)(states)
+        return jnp.sum(jnp.where(found.status[:, None] == 0, found.multipliers, 0)), found.status
+
+    slope, status = jax.grad(tension, has_aux=True)(2.0)
+    np.testing.assert_array_equal(status, [jc.Status.OK, jc.Status.SINGULAR])
+    np.testing.assert_allclose(slope, -9.81, rtol=1e-12)

@@ -13,7 +13,7 @@ from tolerances import DIFFERENCE, IDENTITY
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
 from jaxcon.core.pytree import pytree
-from jaxcon.methods.adaptive import judge
+from jaxcon.methods.adaptive import trend_and_oscillation
 from jaxcon.methods.stability import growth
 
 H = 0.01
@@ -259,15 +259,19 @@ def test_a_window_stays_below_the_limit_at_the_step(rows, integrator):
 
 def test_a_window_of_nothing_judges_nothing():
     noise = jnp.asarray([1e-9])
-    trend, oscillation = judge(jnp.zeros((8, 3)), noise)
+    trend, oscillation = trend_and_oscillation(jnp.zeros((8, 3)), noise)
     assert not np.any(trend)
     np.testing.assert_allclose(oscillation, 0.0, atol=1e-15)
-    slopes = jax.jacrev(judge)(jnp.zeros((8, 1)), noise)
+    slopes = jax.jacrev(trend_and_oscillation)(jnp.zeros((8, 1)), noise)
     assert all(np.all(np.isfinite(x)) for x in slopes)
     still = jnp.asarray([1.0, 1.0, 1.0, 1.0])[:, None]
-    np.testing.assert_allclose(np.concatenate(judge(still, noise)), [0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(
+        np.concatenate(trend_and_oscillation(still, noise)), [0.0, 0.0], atol=1e-12
+    )
     swing = jnp.asarray([1.0, -1.0, 1.0, -1.0])[:, None]
-    np.testing.assert_allclose(np.concatenate(judge(swing, noise)), [0.0, 1.0], atol=1e-8)
+    np.testing.assert_allclose(
+        np.concatenate(trend_and_oscillation(swing, noise)), [0.0, 1.0], atol=1e-8
+    )
 
 
 STABILIZERS = {
@@ -485,3 +489,57 @@ def test_a_known_step_and_a_traced_one_lead_to_the_same_state():
     known, traced = jax.jit(lambda: end(2e-3))(), jax.jit(end)(2e-3)
     np.testing.assert_allclose(known.q, traced.q, atol=1e-6)
     np.testing.assert_allclose(known.v, traced.v, atol=1e-5)
+
+
+def test_default_gains_of_hard_rows_beside_a_soft_one_rise_too():
+    """Without rising gains, the energy of the fast bob swings by more than 1 %."""
+    scene = jc.Scene(dim=2, dtype="float32", gravity=(0.0, 0.0))
+    scene.add_particle("bob", mass=1.0, position=(0.1, 0.0), velocity=(0.0, 50.0))
+    scene.add(jc.Distance("rod", jc.WORLD, "bob", length=0.1))
+    scene.add_particle("other", mass=1.0, position=(1.0, 0.0))
+    scene.add(jc.Distance("spring", jc.WORLD, "other", length=1.0))
+    system, state = scene.build()
+    soft = jc.stabilizers.Penalty({"spring": 100.0})
+    for dt in (1e-4, jnp.float32(1e-4)):
+        kinetic = lambda s, _: jc.energy(system, s).kinetic  # noqa: E731
+        method = jc.Method(stabilizer=soft)
+        _, energies = jc.rollout(system, method, state, None, dt, 1000, record=kinetic)
+        np.testing.assert_allclose(energies, energies[0], rtol=3e-4)
+
+
+def test_gains_of_a_traced_integrator_are_not_read():
+    @pytree
+    class Own(jc.extend.Integrator):
+        rate: Any
+
+        def advance(self, dynamics, state, memory, dt):
+            return jc.SemiImplicitEuler().advance(dynamics, state, memory, dt)
+
+        def default_gains(self, dt):
+            return self.rate, self.rate
+
+        def highest_rate(self, dt):
+            return 1 / dt
+
+    system, state = whirled(1.0)
+
+    @jax.jit
+    def end(rate):
+        return jc.step(system, jc.Method(Own(rate)), state, None, 1e-3)[0].q
+
+    expected = jc.step(system, jc.Method(Own(jnp.float32(5.0))), state, None, 1e-3)[0].q
+    np.testing.assert_allclose(end(jnp.float32(5.0)), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("target", "constraint_equations"),
+        ("impose", "constraint_equations"),
+        ("bounded", "cap_gains"),
+    ],
+)
+@pytest.mark.parametrize("base", [jc.stabilizers.Unstabilized, jc.Baumgarte, jc.extend.Stabilizer])
+def test_a_stabilizer_with_a_method_of_version_one_is_refused(base, old, new):
+    with pytest.raises(TypeError, match=f"^Mine: the method `{old}` of stabilizers is `{new}`"):
+        type("Mine", (base,), {old: lambda self, rows: rows})

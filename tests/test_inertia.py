@@ -175,6 +175,35 @@ def test_the_derivative_by_the_tensor_is_that_of_the_motion(name):
     assert abs(slope) > 1e-3
 
 
+OF_PLATES = {
+    "diagonal": np.diag([2.0, 0.5, 1.9]),
+    "z is not principal": np.array([[2.0, 0.1, 0.2], [0.1, 1.5, -0.3], [0.2, -0.3, 1.9]]),
+}
+
+
+@pytest.mark.parametrize("name", OF_PLATES)
+def test_the_plane_takes_the_moment_about_z(name):
+    """`from_tensor` sorts principal moments, so that none of them need belong to z."""
+    tensor = jnp.asarray(OF_PLATES[name])
+
+    def build(**solid):
+        scene = jc.Scene(dim=2)
+        scene.add_body("plate", **solid)
+        return scene.build()[0]
+
+    def moment(tensor):
+        solid = inertia.from_tensor(1.0, tensor)
+        given = build(inertia=solid).params["plate"]["inertia"]
+        changed = build(mass=1.0, inertia=1.0).with_params({"plate": {"inertia": solid}})
+        return jnp.stack([given, changed.params["plate"]["inertia"]])
+
+    np.testing.assert_allclose(moment(tensor), [1.9, 1.9], rtol=IDENTITY)
+    slopes = jax.jit(jax.jacrev(moment))(tensor)
+    expected = np.zeros((3, 3))
+    expected[2, 2] = 1.0
+    np.testing.assert_allclose(slopes, [expected, expected], atol=IDENTITY)
+
+
 @jax.jit
 def value_after_build(tensor):
     return jnp.sum(turn_after_build(tensor))

@@ -501,6 +501,41 @@ def test_what_a_method_remembers_is_not_of_the_new_frames():
     )
 
 
+@pytest.fixture(scope="module")
+def remembering():
+    """A body with an offset, and a state with the integrals of a PID."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("bar", inertia=inertia.Inertia(1.0, 0.1, (0.2, 0.1)))
+    scene.add(jc.Revolute("pin", jc.WORLD, "bar", point=(-0.3, 0.0)))
+    system, state = scene.build()
+    method = jc.Method(
+        stabilizer=jc.stabilizers.PID(proportional=9.0, derivative=6.0, integral=1.0)
+    )
+    return system, jc.init(system, method, state.q, state.v)
+
+
+def test_equal_frames_keep_what_a_method_remembers(remembering):
+    """A system returned by `jit` has new arrays of the same frames."""
+    system, state = remembering
+    assert jax.tree.leaves(state.memory)
+    heavier = jax.jit(lambda m: system.with_params({"bar": {"mass": m}}))(2.0)
+    restate = jc.systems.restate
+    inside = jax.jit(lambda s: restate(s, system, heavier))
+    one = jax.jit(lambda s, x: restate(s, x, x.with_params({"bar": {"mass": 2.0}})))
+    for after in (restate(state, system, heavier), inside(state), one(state, system)):
+        assert shape(after) == shape(state)
+        close(after, state, 1e-15)
+
+
+def test_frames_that_are_unknown_or_changed_drop_what_a_method_remembers(remembering):
+    system, state = remembering
+    both = jax.jit(jc.systems.restate)(state, system, system)
+    assert both.memory == ()
+    close((both.q, both.v), (state.q, state.v))
+    moved = system.with_params({"bar": {"center": (0.0, 0.1)}})
+    assert jc.systems.restate(state, system, moved).memory == ()
+
+
 def test_systems_of_other_bodies_have_other_states():
     one, other = scenes.build("mixed-3d"), scenes.build("mixed-2d")
     with pytest.raises(ValueError, match="the same bodies in the same order"):

@@ -5,8 +5,8 @@ import numpy as np
 
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize
-from jaxcon.contact.rows import linearize_at_rest
-from jaxcon.linear.islands import islands, largest_by_island, rows_beside_contact
+from jaxcon.contact.rows import linearize_at_rest, rows_beside_contact
+from jaxcon.linear.islands import islands, largest_by_island
 
 
 def doors(stops=(0, 1)):

@@ -105,8 +105,9 @@ def test_an_old_name_raises_with_its_new_one_which_exists(old):
     new = RENAMED["names"][old]
     module, _, name = new.rpartition(".")
     assert name in importlib.import_module(module).__all__
-    said = f"^{re.escape(old)} is {re.escape(new)} since 0.2.0; tools/rename.py rewrites code.$"
-    with pytest.raises(AttributeError, match=said):
+    hint = "see the changelog. tools/rename.py of the repository rewrites code."
+    said = re.escape(f"{old} is {new} since 0.2.0: {hint}")
+    with pytest.raises(AttributeError, match=f"^{said}$"):
         getattr(jc, old.removeprefix("jaxcon."))
 
 

@@ -140,3 +140,12 @@ def test_bounds(name):
     worlds = jax.tree.map(lambda *y: jnp.concatenate(y, -1), *map(bounded, X))
     found = jax.jit(LAWS[name].solve)(worlds, jnp.zeros_like(worlds.offset))
     same(derivatives(differentiated)(found.T), derivatives(slipping)())
+
+
+def test_a_tableau_may_be_lists_and_arrays():
+    own = jc.integrators.RungeKutta([[1.0]], np.array([0.5, 0.5]))
+    assert own == jc.integrators.RungeKutta(((1.0,),), (0.5, 0.5))
+    assert hash(own) == hash(jc.integrators.RungeKutta(((1.0,),), (0.5, 0.5)))
+    for a, b in ((None, None), ([[1.0]], "ab"), ([1.0], [0.5, 0.5])):
+        with pytest.raises(TypeError, match="RungeKutta: a must be rows of numbers"):
+            jc.integrators.RungeKutta(a, b)

@@ -528,7 +528,7 @@ def test_bad_numbers_are_refused(stabilizer, words):
 @pytest.mark.parametrize(
     ("stabilizer", "words"),
     [
-        (lambda: jc.stabilizers.Penalty(1.0, others=None), "Penalty: others must be a stabiliser"),
+        (lambda: jc.stabilizers.Penalty(1.0, others=None), "Penalty: others must be a stabilizer"),
         (
             lambda: jc.stabilizers.AugmentedLagrangian(feedback=None),
             "AugmentedLagrangian: feedback must be",
@@ -548,7 +548,7 @@ def test_bad_numbers_are_refused(stabilizer, words):
         ),
         (
             lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0, others=None)),
-            "Penalty: others must be a stabiliser",
+            "Penalty: others must be a stabilizer",
         ),
         (
             lambda: jc.stabilizers.Hybrid(jc.stabilizers.Penalty(1.0), soft_below={"rod": 1e-3}),

@@ -318,3 +318,54 @@ def test_violation_of_a_trajectory_is_that_of_its_states():
     expected = [float(abs(np.linalg.norm(q) - 1.1)) for q in (state.q, *states.q[:3])]
     np.testing.assert_allclose(infos.violation["rod"], expected, rtol=1e-9)
     np.testing.assert_allclose(infos.violation.worst, expected, rtol=1e-9)
+
+
+def test_accelerations_of_a_batch_of_infos():
+    built = scenes.build("revolute-3d-between")
+    system, name = built.system, built.system.layout.bodies[-1]
+
+    def stepped(speed):
+        state = dataclasses.replace(built.state, v=speed * jnp.ones_like(built.state.v))
+        return jc.step(system, IDEAL, state, None, 1e-3)[1]
+
+    speeds = jnp.array([0.1, 0.4])
+    infos = jax.vmap(stepped)(speeds)
+    for read in (jc.acceleration, jc.angular_acceleration):
+        rows = read(infos, name, system=system)
+        for row, speed in zip(rows, speeds, strict=True):
+            np.testing.assert_allclose(row, read(stepped(speed), name), rtol=IDENTITY, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "read",
+    ["position", "velocity", "orientation", "angular_velocity", "momentum", "center_of_mass"],
+)
+def test_readers_of_bodies_refuse_generalized_coordinates_by_their_name(read):
+    built = scenes.build("polar")
+    args = ["bob"] if read not in ("momentum", "center_of_mass") else []
+    with pytest.raises(TypeError, match=f"^{read}: generalized coordinates have no bodies"):
+        getattr(jc, read)(built.system, built.state, *args)
+
+
+def test_readers_name_themselves_in_errors():
+    built = scenes.build("revolute-2d-between")
+    name = built.system.layout.bodies[-1]
+    with pytest.raises(ValueError, match="^velocity: point must have shape"):
+        jc.velocity(built.system, built.state, name, (1.0, 2.0, 3.0))
+    with pytest.raises(ValueError, match="^coordinate_rate: joint 'none' is unknown"):
+        jc.coordinate_rate(built.system, built.state, "none")
+    with pytest.raises(ValueError, match="^angular_momentum: bodies must be different"):
+        jc.angular_momentum(built.system, built.state, [name, name])
+
+
+@pytest.mark.parametrize(
+    ("result", "error"),
+    [(lambda q, t, p: None, TypeError), (lambda q, t, p: q, ValueError)],
+)
+def test_a_potential_that_returns_no_number_is_refused(result, error):
+    system = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.ones(2), force=lambda q, v, t, u, p: -q, potential=result
+    )
+    state = jc.init(system, jc.Method(), jnp.ones(2), jnp.zeros(2))
+    with pytest.raises(error, match="^GeneralizedSystem: potential must return"):
+        jc.energy(system, state)

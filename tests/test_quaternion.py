@@ -151,6 +151,19 @@ def test_from_axis_angle(axis):
     close(got, rodrigues(phi))
 
 
+@pytest.mark.parametrize("zero", [(0, 0, 0), np.zeros(3)])
+def test_an_axis_without_a_length_is_refused(zero):
+    with pytest.raises(ValueError, match="from_axis_angle: axis must have a length"):
+        quaternion.from_axis_angle(zero, 1.0)
+
+
+def test_public_functions_take_arrays():
+    """Functions of lanes, `rotation` and `split`, are not public."""
+    q = random_unit(3)
+    assert set(dir(quaternion)).isdisjoint({"rotation", "split"})
+    assert quaternion.matrix(q).shape == (3, 3)
+
+
 TURNS = {
     "identity": (1e-9, 0, 0),
     "small": (1e-4, 2e-4, -1e-4),

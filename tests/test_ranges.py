@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxcon as jc
+from jaxcon.core import checks
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,58 @@ def system():
 def test_what_is_out_of_range_is_refused(system, name, change, match):
     with pytest.raises(ValueError, match=match):
         system.with_params({name: change})
+
+
+@pytest.fixture(scope="module")
+def mechanism():
+    scene = jc.Scene(dim=3)
+    solid = {"mass": 1.0, "inertia": (1.0, 1.0, 1.0)}
+    scene.add_body("ball", **solid, position=(0.0, 0.0, 0.1))
+    scene.add(jc.joints.RollingSphere("roll", jc.WORLD, "ball", radius=0.1))
+    for i, name in enumerate(("nut", "wheel", "pinion")):
+        scene.add_body(name, **solid, position=(1.0 + i, 0.0, 0.0))
+    axis = (0.0, 0.0, 1.0)
+    scene.add(jc.joints.Screw("thread", jc.WORLD, "nut", axis=axis, lead=0.01))
+    for name, body in (("first", "wheel"), ("second", "pinion")):
+        at = (2.0 if name == "first" else 3.0, 0.0, 0.0)
+        scene.add(jc.Revolute(name, jc.WORLD, body, point=at, axis=axis))
+    scene.add(jc.joints.Gear("gear", "first", "second", ratio=-2.0))
+    scene.add(jc.joints.Armature("rotor", "first", inertia=0.1))
+    scene.add(jc.contacts.Rope("rope", "ball", "nut", length=3.0))
+    scene.add(jc.Distance("rod", "ball", "wheel"))
+    scene.add(jc.Motor("motor", "first", control_range=(-1.0, 1.0)))
+    scene.add(jc.forces.JointSpring("coil", "first", stiffness=1.0))
+    scene.add(jc.forces.Flexure("flexure", "wheel", "pinion", bending=1.0, twisting=1.0))
+    scene.add(jc.Spring("spring", "ball", "nut", stiffness=1.0))
+    return scene.build()[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value", "match"),
+    [
+        ("roll", "radius", -0.1, "roll: radius must be positive"),
+        ("thread", "lead", 0.0, "thread: lead must have a length"),
+        ("gear", "ratio", 0.0, "gear: ratio must have a length"),
+        ("rotor", "inertia", 0.0, "rotor: inertia must be positive"),
+        ("rope", "length", 0.0, "rope: length must be positive"),
+        ("rod", "length", -1.0, "rod: length must be positive"),
+        ("motor", "control_range", (2.0, 1.0), "motor: control_range must be .lowest, highest."),
+        ("coil", "damping", -1.0, "coil: damping must be zero or more"),
+        ("flexure", "twisting", 2.5, "flexure: twisting must be at most twice bending"),
+        ("flexure", "bending", 0.4, "flexure: twisting must be at most twice bending"),
+        ("spring", "rest_length", -1.0, "spring: rest_length must be zero or more"),
+    ],
+)
+def test_what_a_joint_is_not_built_with_is_refused(mechanism, name, field, value, match):
+    """Traced values, and arrays that must not be waited for, have no value to check."""
+    with pytest.raises(ValueError, match=match):
+        mechanism.with_params({name: {field: value}})
+    numbers = mechanism.params[name] | {field: value}
+    with pytest.raises(ValueError, match=match):
+        jax.eval_shape(lambda: mechanism.with_params({name: numbers}).gravity)
+    jax.eval_shape(lambda x: mechanism.with_params({name: {field: x}}), jnp.asarray(value))
+    with checks.without_waiting():
+        mechanism.with_params({name: {field: jnp.asarray(value)}})
 
 
 def test_what_is_in_range_is_taken(system):

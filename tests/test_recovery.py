@@ -312,7 +312,7 @@ def test_what_is_refused(scene):
         (
             lambda: jc.stabilizers.Recovery(projector="projection"),
             TypeError,
-            "projector must be a stabiliser",
+            "projector must be a stabilizer",
         ),
         (
             lambda: jc.stabilizers.Recovery,

@@ -147,6 +147,21 @@ def test_a_scene_in_space_is_built_under_jit():
     np.testing.assert_array_equal(params["inertia"], (1.5, 1.0, 1.0))
 
 
+def test_only_a_body_with_an_angle_may_be_allowed_turns():
+    scene = jc.Scene(dim=2)
+    scene.add_body("spiral", mass=1.0, inertia=1.0, angle=10.0)
+    scene.add_particle("bead", mass=1.0)
+    for name in ("spirel", "bead"):
+        with pytest.raises(ValueError, match=rf"got '{name}'; known are \['spiral'\]"):
+            scene.allow_turns(name)
+    scene.allow_turns("spiral")
+    scene.build()  # without a warning
+    scene = jc.Scene(dim=3)
+    scene.add_body("spiral", **rigid(3))
+    with pytest.raises(ValueError, match="bodies in space .* got 'spiral'"):
+        scene.allow_turns("spiral")
+
+
 def test_mixed_dimensions_of_rank_are_not_needed():
     """Integers, lists, tuples and NumPy arrays are accepted as numbers."""
     scene = jc.Scene(dim=3, gravity=[0, 0, -10], dtype=jnp.float32)

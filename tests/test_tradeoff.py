@@ -185,6 +185,15 @@ def test_the_diagram_and_the_file_of_figures(result, tmp_path):
     assert len(result.table.splitlines()) == len(result.runs) + 1
 
 
+def test_the_diagram_has_the_unit_of_its_runs(result):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    for unit in ("m", "of q"):
+        runs = tuple(dataclasses.replace(run, unit=unit) for run in result.runs)
+        axes = dataclasses.replace(result, runs=runs).plot()
+        assert axes.get_ylabel() == f"error [{unit}]"
+        pyplot.close(axes.figure)
+
+
 def test_the_table_names_its_numbers_above_them(result):
     lines = result.table.splitlines()
     places = [m.end() for m in re.finditer(r"error|angle|violation|energy|cost|alone", lines[0])]

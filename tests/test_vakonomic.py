@@ -235,3 +235,19 @@ def test_bounded_rows_have_no_variational_form():
         ValueError, match=r"no variational form of the inequality rows of \['leash'\]"
     ):
         jc.systems.vakonomic(system, state)
+
+
+def test_the_rate_of_the_multipliers_is_minus_lambda_where_fast_turns_are_corrected():
+    """A bob whirls around a skate by 0.06 rad a step, so that the step is corrected."""
+    scene = jc.Scene(dim=2, gravity=(0.0, 0.0))
+    scene.add_body("skate", mass=MASS, inertia=MOMENT)
+    scene.add_particle("bob", mass=0.4, position=(0.2, 0.2), velocity=(-12.0, 12.0))
+    scene.add(jc.joints.KnifeEdge("blade", jc.WORLD, "skate", edge=(1.0, 0.0)))
+    scene.add(jc.Distance("rod", "skate", "bob"))
+    system, state = jc.systems.vakonomic(*scene.build(), {"blade": 0.3})
+    dt = 1e-3
+    plain, _ = jc.step(system, jc.Method(jc.integrators.ExplicitEuler()), state, None, dt)
+    new, info = jc.step(system, jc.Method(), state, None, dt)
+    rate = (system.multipliers(new, "blade") - 0.3) / dt
+    assert np.abs(rate - (system.multipliers(plain, "blade") - 0.3) / dt) > 1e-2
+    np.testing.assert_allclose(rate, -jc.multipliers(info, "blade"), rtol=1e-9)

@@ -10,32 +10,51 @@ The table is `jaxcon/renamed.json` unless another is given. Its parts:
     arguments   {"jaxcon.Method": {"bounded": "contact_solver"}}, of keywords in calls
     calls       {"jaxcon.wrench": ["info", "name", "body"]}, of functions with other arguments
     attributes  {"tail": "ending"}, of all fields, methods and keywords with this name
+    methods     {"feedback": "stabilizer_for"}, of methods whose calls are printed
+    overrides   [{"classes": ["Baumgarte"], "members": {"bounded": "cap_gains"}}], of methods and
+                flags in classes that derive from these
 
 Names are resolved by the imports of each file, so a local variable that is called like a name of
 the table stays as it is. Attributes have no types in Python. They are renamed wherever they occur
 after a dot, as a keyword, or in the body of a class. The names of `arguments` change in calls of
-their function; where they stand after a dot, the line is printed. Texts (comments, docstrings,
-Markdown, pages of Sphinx) are searched for `jc.Name`, dotted paths, imports, and autodoc
-directives.
+their function. Texts (comments, docstrings, annotations in quotes, Markdown, pages of Sphinx) are
+searched for `jc.Name`, dotted paths, imports, and autodoc directives. Other strings stay: they may
+be names of files or loggers.
 
-Prints the files that change, and the lines that need a look: `getattr(jc, name)`, `from jaxcon
-import *`, and calls with more arguments than `calls` says. In a notebook the line is that of its
-cell, in Markdown that of the piece of code. With `--check` it writes nothing, and ends with 1 if
-any file would change. Hidden folders and virtual environments are left out.
+Prints the files that change, and the lines that need a look:
+
+    - strings that contain an old dotted name
+    - names of `arguments` after a dot, as keywords of other functions, as keys, and in paths such
+      as "*/most"
+    - functions of `calls` with more arguments than now, with `*arguments`, or passed as values
+    - classes that define members of `overrides`
+    - imports of modules and names that no longer exist; they are looked up in the folder of the
+      table if that is the package
+    - `getattr(jc, name)` and `from jaxcon import *`
+
+In a notebook the line is that of its cell, in Markdown that of the piece of code. With `--check` it
+writes nothing, and ends with 1 if any file would change. Line endings and encodings stay. Hidden
+folders and virtual environments are left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import codecs
 import functools
+import io
 import json
 import re
+import symtable
 import sys
+import tokenize
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import libcst as cst
+from libcst import matchers
 from libcst.metadata import (
     MetadataWrapper,
     ParentNodeProvider,
@@ -45,13 +64,28 @@ from libcst.metadata import (
 )
 
 PACKAGE = "jaxcon"
-FENCE = re.compile(r"(```(?:python|py|\{code-cell\}[^\n]*)\n)(.*?)(```)", re.DOTALL)
+FENCE = re.compile(r"(```(?:python|py|\{code-cell\}[^\n]*)\r?\n)(.*?)(```)", re.DOTALL)
 IMPLICIT = "import jaxcon as jc\n"
 """The import that code in a text is assumed to have."""
 IMPORT = re.compile(rf"\bfrom ({PACKAGE}[\w.]*) import (\w+(?: as \w+)?(?:, \w+(?: as \w+)?)*)")
 MAGIC = re.compile(r"^([ \t]*)([%!].*)$", re.MULTILINE)
 MASKED = re.compile(r"^([ \t]*)#:MAGIC:", re.MULTILINE)
 DIRECTIVE = re.compile(r"^\.\. (?:py:)?(auto\w+|currentmodule|module):: +([\w.]+)", re.MULTILINE)
+
+USES = re.compile(rf"\b(?:from|import) +{PACKAGE}\b")
+PRAGMA = re.compile(r"#\s*(?:noqa|type:|pyright:|pylint:|ruff:|isort:|pragma:)")
+"""Comments that tell a tool about their line."""
+LOOKUPS = ("get", "pop", "setdefault", "getattr", "hasattr", "setattr")
+"""Functions with a key or the name of an attribute among their arguments."""
+INSIDE = cst.BaseExpression | cst.SubscriptElement | cst.Index | cst.BaseElement
+"""Nodes between an annotation and a string in it."""
+
+
+@functools.cache
+def defined_in(path: Path) -> frozenset[str]:
+    """Returns the names that a module defines or imports at its top level."""
+    symbols = symtable.symtable(path.read_text(encoding="utf-8"), str(path), "exec").get_symbols()
+    return frozenset(x.get_name() for x in symbols if x.is_assigned() or x.is_imported())
 
 
 @dataclass(frozen=True)
@@ -64,6 +98,9 @@ class Table:
         arguments: keywords by the old dotted name of the function or class.
         calls: positional arguments by the dotted name of a function that had more of them.
         attributes: of fields, methods and keyword arguments.
+        methods: of methods whose calls are printed.
+        overrides: "members" of classes that derive from any of "classes".
+        package: the folder of the package as it is now; None if it is unknown.
     """
 
     modules: dict[str, str] = field(default_factory=dict)
@@ -71,11 +108,15 @@ class Table:
     arguments: dict[str, dict[str, str]] = field(default_factory=dict)
     calls: dict[str, list[str]] = field(default_factory=dict)
     attributes: dict[str, str] = field(default_factory=dict)
+    methods: dict[str, str] = field(default_factory=dict)
+    overrides: list[dict[str, Any]] = field(default_factory=list)
+    package: Path | None = None
 
     @classmethod
     def read(cls, path: Path) -> Table:
         """Returns the table of a JSON file."""
-        return cls(**json.loads(path.read_text(encoding="utf-8")))
+        package = path.parent if (path.parent / "__init__.py").exists() else None
+        return cls(**json.loads(path.read_text(encoding="utf-8")), package=package)
 
     def dotted(self, name: str) -> str | None:
         """Returns the new dotted name of a module, or of something in one; None if unchanged."""
@@ -93,10 +134,37 @@ class Table:
         """New names of `arguments`, without their functions."""
         return {old: new for names in self.arguments.values() for old, new in names.items()}
 
+    def members(self, name: str) -> dict[str, str]:
+        """Returns the new names of members that classes derived from a class define."""
+        found = [x["members"] for x in self.overrides if name in x["classes"]]
+        return {old: new for members in found for old, new in members.items()}
+
+    def missing(self, module: str, name: str | None = None) -> str | None:
+        """Returns why a module, or a name in it, cannot be imported; None if it can."""
+        head, *rest = module.split(".")
+        if self.package is None or head != PACKAGE:
+            return None
+        folder = self.package.joinpath(*rest)
+        paths = [x for x in (folder / "__init__.py", folder.with_suffix(".py")) if x.exists()]
+        if not paths:
+            return f"there is no module {module} now"
+        if name is None or name in defined_in(paths[0]) or name.startswith("__"):
+            return None
+        if self.missing(f"{module}.{name}") is None:
+            return None
+        return f"{module} has no {name} now"
+
+    def found_in(self, text: str) -> Iterator[tuple[int, str]]:
+        """Yields (position, reason) of the old names that a text mentions."""
+        for pattern, new in ((IMPORT, self._new_import), (self._pattern, self._new_text)):
+            for found in pattern.finditer(text):
+                if new(found) != found[0]:
+                    yield found.start(), f"a string contains {found[0]}; it is {new(found)} now"
+            text = pattern.sub(lambda found: " " * len(found[0]), text)
+
     def in_text(self, text: str) -> str:
         """Returns a text with new names in place of the old ones that it mentions."""
-        text = IMPORT.sub(lambda found: self._new_import(*found.groups()), text)
-        return self._pattern.sub(lambda found: self._new_text(found[0]), text)
+        return self._pattern.sub(self._new_text, IMPORT.sub(self._new_import, text))
 
     def homes(self, module: str, names: Sequence[str]) -> list[tuple[str, str]]:
         """Returns (module, name) now of each of the names that are imported from a module."""
@@ -106,15 +174,16 @@ class Table:
             found.append((home, last))
         return found
 
-    def _new_import(self, module: str, imported: str) -> str:
-        names = imported.split(", ")
+    def _new_import(self, found: re.Match[str]) -> str:
+        module, names = found[1], found[2].split(", ")
         by_module: dict[str, list[str]] = {}
         homes = self.homes(module, [name.split(" ")[0] for name in names])
         for name, (home, last) in zip(names, homes, strict=True):
             by_module.setdefault(home, []).append(" ".join([last, *name.split(" ")[1:]]))
         return "; ".join(f"from {home} import {', '.join(x)}" for home, x in by_module.items())
 
-    def _new_text(self, old: str) -> str:
+    def _new_text(self, found: re.Match[str]) -> str:
+        old = found[0]
         head = PACKAGE if old.startswith(PACKAGE) else "jc"
         new = self.dotted(PACKAGE + old.replace("\\", "").removeprefix(head))
         assert new is not None
@@ -148,6 +217,38 @@ def expression(dotted: str) -> cst.Name | cst.Attribute:
     return node
 
 
+@dataclass
+class Notes:
+    """Comments that belong to an import statement, or to one name of it.
+
+    Attributes:
+        above: on lines of their own.
+        beside: at the end of the line.
+    """
+
+    above: list[str] = field(default_factory=list)
+    beside: list[str] = field(default_factory=list)
+
+
+def notes_of(node: cst.ImportFrom) -> tuple[Notes, list[Notes]]:
+    """Returns the comments inside the parentheses of an import: of all of it, and by name."""
+    assert not isinstance(node.names, cst.ImportStar)
+    gaps: list[list[Any]] = [[node.lpar.whitespace_after] if node.lpar else []]
+    for alias in node.names:
+        comma = alias.comma
+        has_comma = isinstance(comma, cst.Comma)
+        gaps.append([comma.whitespace_before, comma.whitespace_after] if has_comma else [])
+    gaps[-1] += [node.rpar.whitespace_before] if node.rpar else []
+    whole, notes = Notes(), [Notes() for _ in node.names]
+    for before, after, gap in zip([whole, *notes], [*notes, whole], gaps, strict=True):
+        for space in gap:
+            if isinstance(space, cst.ParenthesizedWhitespace):
+                lines = [x.comment for x in space.empty_lines]
+                before.beside += [x.value for x in [space.first_line.comment] if x is not None]
+                after.above += [x.value for x in lines if x is not None]
+    return whole, notes
+
+
 class Renamer(cst.CSTTransformer):
     """Renames in one module.
 
@@ -163,6 +264,13 @@ class Renamer(cst.CSTTransformer):
         super().__init__()
         self.table, self.module = table, module
         self.doubts: list[tuple[int, str]] = []
+        self._uses_package = True
+        self._notes: dict[cst.CSTNode, Notes] = {}
+        self._derived: dict[str, dict[str, str]] = {}
+
+    def visit_Module(self, node: cst.Module) -> None:  # noqa: N802
+        """Notes whether the package is imported anywhere."""
+        self._uses_package = USES.search(node.code) is not None
 
     def leave_ImportFrom(  # noqa: N802
         self, original_node: cst.ImportFrom, updated_node: cst.ImportFrom
@@ -175,30 +283,96 @@ class Renamer(cst.CSTTransformer):
             return updated_node
         names = [dotted_name(alias.name) or "" for alias in aliases]
         homes = self.table.homes(module, names)
+        reasons = [self.table.missing(home, last) for home, last in homes]
+        for reason in dict.fromkeys(x for x in reasons if x is not None):
+            self._doubt(original_node, reason)
         if homes == [(module, name) for name in names]:
             return updated_node
-        by_module: dict[str, list[cst.ImportAlias]] = {}
-        for alias, (home, last) in zip(aliases, homes, strict=True):
-            alias = alias.with_changes(name=cst.Name(last), comma=cst.MaybeSentinel.DEFAULT)
-            by_module.setdefault(home, []).append(alias)
-        statements = [
-            cst.ImportFrom(module=expression(home), names=names)
-            for home, names in by_module.items()
+        assert not isinstance(updated_node.names, cst.ImportStar)
+        renamed_aliases = [
+            alias.with_changes(name=cst.Name(last))
+            for alias, (_, last) in zip(updated_node.names, homes, strict=True)
         ]
+        if len({home for home, _ in homes}) == 1:
+            return updated_node.with_changes(module=expression(homes[0][0]), names=renamed_aliases)
+        return self._split(original_node, updated_node, renamed_aliases, [x for x, _ in homes])
+
+    def _split(
+        self,
+        original_node: cst.ImportFrom,
+        updated_node: cst.ImportFrom,
+        aliases: Sequence[cst.ImportAlias],
+        homes: Sequence[str],
+    ) -> cst.FlattenSentinel[cst.BaseSmallStatement]:
+        """Returns an import for each module, and one for each name that has a comment."""
+        whole, notes = notes_of(updated_node)
+        groups: dict[Any, tuple[str, list[cst.ImportAlias], Notes]] = {}
+        for k, (alias, home, note) in enumerate(zip(aliases, homes, notes, strict=True)):
+            key = (home, k) if note.above or note.beside else home
+            alias = alias.with_changes(comma=cst.MaybeSentinel.DEFAULT)
+            groups.setdefault(key, (home, [], note))[1].append(alias)
+        statements = []
+        for home, names, note in groups.values():
+            statements.append(cst.ImportFrom(module=expression(home), names=names))
+            pragmas = [x for x in whole.beside if PRAGMA.match(x)]
+            self._notes[statements[-1]] = Notes(note.above, note.beside + pragmas)
+        first, last = self._notes[statements[0]], self._notes[statements[-1]]
+        first.above[:0] = [x for x in whole.beside if not PRAGMA.match(x)]
+        last.above += whole.above
+        kept = [*whole.beside, *whole.above, *(x for y in notes for x in y.above + y.beside)]
+        in_line = isinstance(
+            self.get_metadata(ParentNodeProvider, original_node), cst.SimpleStatementLine
+        )
+        for comment in matchers.findall(original_node, matchers.Comment()):
+            assert isinstance(comment, cst.Comment)
+            if not in_line or self.table.in_text(comment.value) not in kept:
+                self._doubt(comment, f"the comment {comment.value} is left out")
         return cst.FlattenSentinel(statements)
 
     def leave_SimpleStatementLine(  # noqa: N802
         self, original_node: cst.SimpleStatementLine, updated_node: cst.SimpleStatementLine
     ) -> cst.SimpleStatementLine | cst.FlattenSentinel[cst.SimpleStatementLine]:
         """Gives each import a line where one has become several."""
-        body = updated_node.body
+        body, end = updated_node.body, updated_node.trailing_whitespace
         if len(body) == len(original_node.body):
             return updated_node
-        lines = [cst.SimpleStatementLine([x]) for x in body]
-        lines[0] = lines[0].with_changes(leading_lines=updated_node.leading_lines)
-        end = updated_node.trailing_whitespace
-        lines[-1] = lines[-1].with_changes(trailing_whitespace=end)
+        at_end = [] if end.comment is None else [end.comment.value]
+        pragmas = [x for x in at_end if PRAGMA.match(x)]
+        lines = []
+        for k, statement in enumerate(body):
+            notes = self._notes.get(statement, Notes())
+            above = [cst.EmptyLine(comment=cst.Comment(x)) for x in notes.above]
+            beside = notes.beside + (at_end if k == len(body) - 1 else pragmas)
+            trail = cst.TrailingWhitespace()
+            if beside:
+                space = cst.SimpleWhitespace("  ")
+                trail = trail.with_changes(whitespace=space, comment=cst.Comment("  ".join(beside)))
+            lines.append(cst.SimpleStatementLine([statement], above, trail))
+        above = [*updated_node.leading_lines, *lines[0].leading_lines]
+        lines[0] = lines[0].with_changes(leading_lines=above)
+        if lines[-1].trailing_whitespace.comment is None:
+            lines[-1] = lines[-1].with_changes(trailing_whitespace=end)
         return cst.FlattenSentinel(lines)
+
+    def visit_ClassDef(self, node: cst.ClassDef) -> None:  # noqa: N802
+        """Notes members of classes that derive from classes of `overrides`."""
+        members: dict[str, str] = {}
+        for argument in node.bases:
+            base = argument.value
+            base = base.value if isinstance(base, cst.Subscript) else base
+            for found in self.get_metadata(QualifiedNameProvider, base, set()):
+                if found.source is QualifiedNameSource.LOCAL:
+                    members |= self._derived.get(found.name, {})
+                elif found.name.startswith(f"{PACKAGE}."):
+                    members |= self.table.members(found.name.rpartition(".")[2])
+        if not members:
+            return
+        for found in self.get_metadata(QualifiedNameProvider, node, set()):
+            self._derived[found.name] = members
+        defined = dict(_members_of(node))
+        for old, new in members.items():
+            if old in defined and new not in defined:
+                self._doubt(defined[old], f"{node.name.value} defines {old}, which is {new} now")
 
     def visit_Arg(self, node: cst.Arg) -> None:  # noqa: N802
         """Notes where the package is handed to a function, such as `getattr`."""
@@ -207,13 +381,19 @@ class Renamer(cst.CSTTransformer):
                 self._doubt(node, f"{dotted_name(node.value)} is an argument of a function")
 
     def visit_Call(self, node: cst.Call) -> None:  # noqa: N802
-        """Notes calls with more positional arguments than their function takes now."""
+        """Notes calls with more positional arguments than now, and calls of `methods`."""
         keywords = [x.keyword.value for x in node.args if x.keyword is not None]
         given = sum(x.keyword is None and not x.star for x in node.args)
+        unpacks = any(x.star for x in node.args)
+        if isinstance(node.func, cst.Attribute) and self._uses_package:
+            old = node.func.attr.value
+            if (new := self.table.methods.get(old)) is not None and not self._imported(node.func):
+                self._doubt(node, f"{old} may be {new} now")
         for found in self.get_metadata(QualifiedNameProvider, node.func, set()):
             for name in (found.name, self.table.dotted(found.name)):
                 taken = self.table.calls.get(name or "")
-                if taken and given + sum(x in taken for x in keywords) > len(taken):
+                known = given + sum(x in taken for x in keywords) if taken else 0
+                if taken and (unpacks or known > len(taken)):
                     self._doubt(node, f"{name} takes ({', '.join(taken)}) now")
                     return
 
@@ -223,7 +403,10 @@ class Renamer(cst.CSTTransformer):
         """Renames `import a.b`."""
         names = []
         for alias in updated_node.names:
-            new = self.table.dotted(dotted_name(alias.name) or "")
+            old = dotted_name(alias.name) or ""
+            new = self.table.dotted(old)
+            if (reason := self.table.missing(new or old)) is not None:
+                self._doubt(original_node, reason)
             names.append(alias if new is None else alias.with_changes(name=expression(new)))
         return updated_node.with_changes(names=names)
 
@@ -231,6 +414,7 @@ class Renamer(cst.CSTTransformer):
         self, original_node: cst.Attribute, updated_node: cst.Attribute
     ) -> cst.BaseExpression:
         """Renames what is reached by way of an imported module, and attributes."""
+        self._check_value(original_node)
         if (new := self._of_module(original_node)) is not None:
             return new.with_changes(lpar=updated_node.lpar, rpar=updated_node.rpar)
         if original_node.attr.value in self.table.attributes and not self._imported(original_node):
@@ -254,6 +438,7 @@ class Renamer(cst.CSTTransformer):
             return self._attribute(updated_node)
         if isinstance(parent, cst.ImportAlias):
             return updated_node
+        self._check_value(original_node)
         for found in self.get_metadata(QualifiedNameProvider, original_node, set()):
             if found.source is QualifiedNameSource.IMPORT:
                 # what is called otherwise here keeps that name
@@ -270,20 +455,82 @@ class Renamer(cst.CSTTransformer):
     def leave_SimpleString(  # noqa: N802
         self, original_node: cst.SimpleString, updated_node: cst.SimpleString
     ) -> cst.SimpleString:
-        """Renames in docstrings and messages."""
-        return updated_node.with_changes(value=self.table.in_text(updated_node.value))
+        """Renames in docstrings and annotations; notes old names in other strings."""
+        if self._is_text(original_node):
+            return updated_node.with_changes(value=self.table.in_text(updated_node.value))
+        self._check_string(original_node, original_node.value)
+        value = original_node.evaluated_value
+        if isinstance(value, str) and self._uses_package:
+            names = value.split("/") if "/" in value or self._is_key(original_node) else []
+            for name in names:
+                if (new := self.table.fields.get(name)) is not None:
+                    self._doubt(original_node, f"{name} may be {new} now")
+        return updated_node
 
-    def leave_FormattedStringText(  # noqa: N802
-        self, original_node: cst.FormattedStringText, updated_node: cst.FormattedStringText
-    ) -> cst.FormattedStringText:
-        """Renames in messages."""
-        return updated_node.with_changes(value=self.table.in_text(updated_node.value))
+    def visit_FormattedStringText(self, node: cst.FormattedStringText) -> None:  # noqa: N802
+        """Notes old names in formatted strings."""
+        self._check_string(node, node.value)
 
     def leave_Comment(  # noqa: N802
         self, original_node: cst.Comment, updated_node: cst.Comment
     ) -> cst.Comment:
         """Renames in comments."""
         return updated_node.with_changes(value=self.table.in_text(updated_node.value))
+
+    def _is_text(self, node: cst.CSTNode) -> bool:
+        """Returns True for a string that stands alone, as docstrings do, or in an annotation."""
+        parent = self.get_metadata(ParentNodeProvider, node)
+        while isinstance(parent, cst.ConcatenatedString):
+            parent = self.get_metadata(ParentNodeProvider, parent)
+        if isinstance(parent, cst.Expr):
+            return True
+        while isinstance(parent, INSIDE):
+            of = dotted_name(parent.value) if isinstance(parent, cst.Subscript) else None
+            if isinstance(parent, cst.Call) or (of or "").split(".")[-1] == "Literal":
+                return False
+            parent = self.get_metadata(ParentNodeProvider, parent)
+        return isinstance(parent, cst.Annotation)
+
+    def _is_key(self, node: cst.SimpleString) -> bool:
+        """Returns True for a key of a dictionary, and for a string that is looked up in one."""
+        parent = self.get_metadata(ParentNodeProvider, node)
+        if isinstance(parent, cst.DictElement):
+            return parent.key is node
+        if isinstance(parent, cst.Comparison):
+            return parent.left is node  # "most" in fields
+        if isinstance(parent, cst.Arg):
+            call = self.get_metadata(ParentNodeProvider, parent)
+            func = call.func if isinstance(call, cst.Call) else None
+            func = func.attr if isinstance(func, cst.Attribute) else func
+            return isinstance(func, cst.Name) and func.value in LOOKUPS
+        return isinstance(parent, cst.Index)
+
+    def _check_string(self, node: cst.CSTNode, text: str) -> None:
+        """Notes the old names in a string that is not rewritten."""
+        for position, reason in self.table.found_in(text):
+            self._doubt(node, reason, text.count("\n", 0, position))
+
+    def _check_value(self, node: cst.Name | cst.Attribute) -> None:
+        """Notes functions of `calls` that are passed on, and names that the package lacks."""
+        parent = self.get_metadata(ParentNodeProvider, node, None)
+        if isinstance(parent, cst.ImportAlias | cst.ImportFrom | cst.AsName):
+            return
+        for found in self.get_metadata(QualifiedNameProvider, node, set()):
+            if found.source is not QualifiedNameSource.IMPORT:
+                continue
+            head, _, last = found.name.rpartition(".")
+            new = self.table.dotted(found.name)
+            if new is None and head == PACKAGE and isinstance(node, cst.Attribute):
+                reason = self.table.missing(head, last)
+                if reason is not None:
+                    self._doubt(node, reason)
+            called = isinstance(parent, cst.Call) and parent.func is node
+            if called or isinstance(parent, cst.Attribute):
+                continue
+            for name in (found.name, new):
+                if taken := self.table.calls.get(name or ""):
+                    self._doubt(node, f"{name} is passed on; it takes ({', '.join(taken)}) now")
+                    return
 
     def _keyword(self, argument: cst.Arg, name: str) -> str | None:
         """Returns the new name of a keyword in a call of a function of `arguments`, or None."""
@@ -347,9 +594,20 @@ class Renamer(cst.CSTTransformer):
             return expression(first + new.removeprefix(new_base))
         return None
 
-    def _doubt(self, node: cst.CSTNode, reason: str) -> None:
+    def _doubt(self, node: cst.CSTNode, reason: str, below: int = 0) -> None:
         line = self.get_metadata(PositionProvider, node).start.line
-        self.doubts.append((line, reason))
+        self.doubts.append((line + below, reason))
+
+
+def _members_of(node: cst.ClassDef) -> Iterator[tuple[str, cst.CSTNode]]:
+    """Yields the names that the body of a class defines, with the place of each."""
+    for statement in node.body.body:
+        is_line = isinstance(statement, cst.SimpleStatementLine)
+        for part in statement.body if is_line else (statement,):
+            targets = [x.target for x in part.targets] if isinstance(part, cst.Assign) else []
+            targets += [part.target] if isinstance(part, cst.AnnAssign) else []
+            targets += [part.name] if isinstance(part, cst.FunctionDef) else []
+            yield from ((x.value, part) for x in targets if isinstance(x, cst.Name))
 
 
 Report = Callable[[int, str], object]
@@ -371,7 +629,7 @@ def renamed(source: str, table: Table, module: str | None = None, report: Report
     """
     renamer = Renamer(table, module)
     code = MetadataWrapper(cst.parse_module(source)).visit(renamer).code
-    for doubt in renamer.doubts:
+    for doubt in sorted(renamer.doubts, key=lambda doubt: doubt[0]):
         report(*doubt)
     return code
 
@@ -451,7 +709,21 @@ def module_of(path: Path) -> str | None:
     return ".".join(names[:-1] if names[-1] == "__init__" else names)
 
 
-def rewritten(path: Path, table: Table, report: Report = silent) -> str:
+def decoded(path: Path) -> tuple[str, str]:
+    """Returns the text of a file with its line endings, and its encoding.
+
+    Raises:
+        SyntaxError: of a Python file with an unknown encoding.
+        UnicodeDecodeError: the file has another encoding.
+    """
+    content = path.read_bytes()
+    encoding = "utf-8-sig" if content.startswith(codecs.BOM_UTF8) else "utf-8"
+    if path.suffix == ".py":
+        encoding, _ = tokenize.detect_encoding(io.BytesIO(content).readline)
+    return content.decode(encoding), encoding
+
+
+def rewritten(path: Path, table: Table, report: Report = silent) -> bytes:
     """Returns the new content of a file.
 
     Args:
@@ -459,7 +731,18 @@ def rewritten(path: Path, table: Table, report: Report = silent) -> str:
         table: the names.
         report: called with lines that need a look.
     """
-    text = path.read_text(encoding="utf-8")
+    try:
+        text, encoding = decoded(path)
+    except (SyntaxError, UnicodeDecodeError) as error:
+        report(1, f"the file cannot be decoded: {error}")
+        return path.read_bytes()
+    if "\r\n" in text and not re.search(r"(?<!\r)\n", text):
+        new = _rewritten(path, text.replace("\r\n", "\n"), table, report)
+        return new.replace("\n", "\r\n").encode(encoding)
+    return _rewritten(path, text, table, report).encode(encoding)
+
+
+def _rewritten(path: Path, text: str, table: Table, report: Report) -> str:
     match path.suffix:
         case ".py":
             try:
@@ -498,11 +781,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     table, changed = Table.read(given.table), 0
     for path in files(given.paths):
         new = rewritten(path, table, lambda line, why, path=path: print(f"{path}:{line}: {why}"))
-        if new != path.read_text(encoding="utf-8"):
+        if new != path.read_bytes():
             changed += 1
             print(path)
             if not given.check:
-                path.write_text(new, encoding="utf-8")
+                path.write_bytes(new)
     return int(given.check and changed > 0)
 
 

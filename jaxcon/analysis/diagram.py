@@ -49,7 +49,9 @@ def draw(result: Tradeoff, onto: Axes | str | Path | None = None) -> Axes:
             0.5, 0.5, "no run was both stable and timed", transform=axes.transAxes, ha="center"
         )
     axes.set(xscale="log", yscale="log", xlabel="time for a simulated second of a world [s]")
-    axes.set(ylabel="error [m]", title=f"{result.horizon:g} s, {result.batch} worlds")
+    units = dict.fromkeys(f"[{run.unit}]" for run in result.runs)
+    axes.set(ylabel=" ".join(["error", *units]))
+    axes.set(title=f"{result.horizon:g} s, {result.batch} worlds")
     axes.legend(fontsize=7)
     if path:
         axes.figure.savefig(path, dpi=120, bbox_inches="tight")

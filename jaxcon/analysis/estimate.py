@@ -16,13 +16,15 @@ from jaxcon.contact.gauss_seidel import GaussSeidel
 from jaxcon.contact.interior_point import InteriorPoint
 from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.rows import kinds_of, linearize_at_rest
-from jaxcon.linear import effort
 from jaxcon.linear.conjugate_gradients import ConjugateGradients
 from jaxcon.methods.choice import Choice, innermost, words
 from jaxcon.methods.method import Method
 from jaxcon.protocols import ContactSolver, Solver, System
 from jaxcon.staging.operations import count
 from jaxcon.system.state import State
+
+INTERIOR_POINT_ITERATIONS = 15
+"""The assumed number of iterations of `InteriorPoint`."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +69,8 @@ def cost(system: System, method: Method, state: State, choice: Choice) -> Cost:
         choice: result of `choose`, with the operation counts of all solvers for this structure.
     """
     kinds = kinds_of(system, state.q, state.v)
-    bounded = method.resolve(system, state).contact_solver
-    contact, named = contact_operations(bounded, kinds), words(bounded) if kinds else ""
+    solver = method.contact_solver_for(system, state)
+    contact, named = contact_operations(solver, kinds), words(solver) if kinds else ""
     return Cost(_rows(system, state), _of_solver(method.solver, choice), contact, named)
 
 
@@ -97,9 +99,11 @@ def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | N
         return 0.0
     rows = solved_rows(solver, kinds)
     inner = solver.solver if isinstance(solver, ActiveSet) else solver
-    if isinstance(inner, GaussSeidel):
-        return effort.gauss_seidel(rows, inner.sweeps)
-    return effort.interior_point(rows) if isinstance(inner, InteriorPoint) else 0.0
+    if isinstance(inner, GaussSeidel):  # a sweep is a matrix–vector product
+        return inner.sweeps * (2.0 * rows * rows + 6.0 * rows)
+    if isinstance(inner, InteriorPoint):  # an iteration inverts a matrix, and applies it twice
+        return INTERIOR_POINT_ITERATIONS * (2.0 * rows**3 + 6.0 * rows * rows)
+    return 0.0
 
 
 def solved_rows(solver: ContactSolver | GaussSeidel, kinds: RowCounts) -> int:

@@ -42,7 +42,10 @@ class Finding:
 
 
 def given(system: System, state: State, control: PyTree) -> Iterator[Finding]:
-    """Yields a finding for each position, velocity, control or parameter that is not finite."""
+    """Yields a finding for each position, velocity, control or parameter that is not finite.
+
+    Parameters that may be infinite, such as a missing stop of a `Limit`, are only checked for NaN.
+    """
     yield from positions(system, state.q)
     yield from entries(system, "velocity", state.v)
     channels = (("control", 0, None),) if system.layout is None else system.layout.controls
@@ -51,10 +54,17 @@ def given(system: System, state: State, control: PyTree) -> Iterator[Finding]:
         if any(not np.all(np.isfinite(x)) for x in parts):
             yield Finding("control", name, f"is {checks.numerals(np.concatenate(parts))}")
     params = system.params if isinstance(system.params, dict) else {"params": system.params}
+    unbounded = {
+        f"{name}.{field}"
+        for group in system.bounds
+        for name in group.names
+        for field in group.unbounded_fields
+    }
     for name, fields in params.items():
         for path, leaf in jax.tree_util.tree_flatten_with_path(fields)[0]:
-            if not np.all(np.isfinite(leaf)):
-                key = jax.tree_util.keystr(path, simple=True, separator=".")
+            key = jax.tree_util.keystr(path, simple=True, separator=".")
+            good = ~np.isnan(leaf) if f"{name}.{key}" in unbounded else np.isfinite(leaf)
+            if not np.all(good):
                 whole = f"{name}.{key}" if key else name
                 yield Finding("parameter", whole, f"is {checks.numerals(leaf)}")
 

@@ -16,7 +16,6 @@ import numpy as np
 from jaxcon.analysis.estimate import contact_operations, solved_rows
 from jaxcon.analysis.setup import Setup, asked_gains
 from jaxcon.constraints.rank import linearized
-from jaxcon.contact.bounded import is_exact
 from jaxcon.contact.contact import Contacts, Rope
 from jaxcon.contact.contact_default import EXACT_UP_TO, default_contact_solver
 from jaxcon.contact.gauss_seidel import GaussSeidel
@@ -253,9 +252,10 @@ def dense(setup: Setup) -> str | None:
 def _slow_contact(setup: Setup) -> str | None:
     """Returns a warning if `InteriorPoint` has too many rows to be fast, or None."""
     kinds = kinds_of(setup.system, setup.state.q, setup.state.v)
-    if kinds is None or not isinstance(_inner(setup.method.contact_solver), InteriorPoint):
+    solver = setup.method.contact_solver_for(setup.system, setup.state)
+    if kinds is None or not isinstance(_inner(solver), InteriorPoint):
         return None
-    rows = solved_rows(setup.method.contact_solver, kinds)
+    rows = solved_rows(solver, kinds)
     other = contact_operations(GaussSeidel(), kinds)
     if rows <= EXACT_UP_TO or setup.cost.contact < DEARER * other:
         return None
@@ -340,10 +340,10 @@ def impact(setup: Setup) -> str | None:
         return None
     if rows.lands:  # a robot may have dozens, so only some are named
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
-    solver = method.resolve(setup.system, setup.state).contact_solver
+    solver = method.contact_solver_for(setup.system, setup.state)
     leaves_out = isinstance(solver, ActiveSet) and solver.leaves_out(rows.kinds)
     shared = isinstance(method.integrator, SemiImplicitEuler) and rows.restitution is None
-    shares = type(solver).__name__ if shared and not is_exact(solver) else None
+    shares = type(solver).__name__ if shared and not solver.exact else None
     warning = doubt(rows, shares, leaves_out)
     return None if warning is None else warning.removeprefix(PREFIX)
 

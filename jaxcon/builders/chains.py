@@ -168,7 +168,8 @@ def rope(
     xp, points = _points(scene, label, points)
     lengths = xp.sqrt(xp.sum((points[1:] - points[:-1]) ** 2, axis=1))
     share = mass / xp.sum(lengths) * lengths / 2
-    masses = xp.pad(share, (1, 0)) + xp.pad(share, (0, 1))
+    pad = np.pad if checks.is_concrete(share) else jnp.pad  # the mass may be traced alone
+    masses = pad(share, (1, 0)) + pad(share, (0, 1))
     n = len(points) - 1
     nodes = [f"{name}.{i}" for i in range(n + 1)]
     ends = {0: start, n: end}
@@ -273,8 +274,10 @@ def rod(
 def _points(scene: Scene, owner: str, points: Any) -> tuple[Any, Any]:
     """Checks points; returns the module for them (NumPy, or jax.numpy if traced) and the points."""
     xp = np if checks.is_concrete(points) else jnp
-    shape = np.shape(checks.check(owner, "points", points))
-    points = xp.asarray(checks.real(owner, "points", points, scene.dtype, shape))
+    given = checks.check(owner, "points", points)
+    points = checks.real(owner, "points", points, scene.dtype, np.shape(given))
+    if xp is np:  # `real` returns a JAX array, which is traced under jit
+        points = np.asarray(given, scene.dtype)
     if points.ndim != 2 or points.shape[1] != scene.dim or len(points) < 3:
         raise ValueError(
             f"{owner}: points must have shape (links + 1, {scene.dim}) with 2 links or more, got"

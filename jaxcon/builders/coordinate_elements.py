@@ -123,6 +123,7 @@ class CoordinateElements:
         groups: dict[Any, list[Any]] = {}
         for element in elements:
             ends, params = self.ends[element.name], element.attach(self.dtype)
+            element.check_numbers(label(element), vars(element))
             group, _, name = ends[0]
             if self.joints[group].law.coordinates[name] == "rad":
                 for field in element.angles:

@@ -211,6 +211,7 @@ class Gather:
             if element.framed:
                 poses += [self.offsets.get(name, self.origin) for name in element.bodies]
             params = element.attach(*poses)
+            element.check_numbers(label(element), vars(element))
             sides = tuple(self._place((name,)).group for name in element.bodies)
             fields = tuple((field, jax.tree.map(jnp.shape, x)) for field, x in params.items())
             groups.setdefault((element.kind, sides, fields), []).append((element, params))

@@ -131,7 +131,7 @@ class Scene:
             mass: () [kg].
             inertia: inertia about the center of mass [kg m²]: () in the plane; in space principal
                 moments (3,) or a full tensor (3, 3); or an `Inertia`, which also brings mass and
-                center.
+                center. Of an `Inertia` in space, the plane takes the moment about z.
             position: origin of the body's frame, world frame, (dim,) [m]. The origin is the center
                 of mass unless an `Inertia` says otherwise.
             quaternion: orientation, body to world, wxyz, (4,); in space.
@@ -166,8 +166,22 @@ class Scene:
         """Allows more than a turn as the angle of a body in the plane; `build` then does not warn.
 
         Args:
-            name: name of a body that was added.
+            name: name of a body in the plane that was added.
+
+        Raises:
+            ValueError: the body is unknown, a particle, or in space.
         """
+        if self.dim == 3:
+            raise ValueError(
+                "Scene.allow_turns: bodies in space have quaternions, which need no such"
+                f" permission, got {checks.shortened(name)}."
+            )
+        known = [body for body, given in self._bodies.items() if given.rigid]
+        if name not in known:
+            raise ValueError(
+                "Scene.allow_turns takes the name of a body with an angle, got"
+                f" {checks.shortened(name)}; known are {known}."
+            )
         self._bodies[name] = dataclasses.replace(self._bodies[name], winds=True)
 
     def add_particle(

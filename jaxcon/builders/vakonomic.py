@@ -16,10 +16,12 @@ from jaxcon.core.doubled import Doubled, rounded
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, DType, PyTree, Scalar
 from jaxcon.geometry.pose import Motion
+from jaxcon.linear.jacobian import Columns
 from jaxcon.linear.saddle import Diagonal, Full, Mass, Solution
 from jaxcon.protocols import System
 from jaxcon.system.body_system import Snapshot
 from jaxcon.system.coordinates import JointCoordinate
+from jaxcon.system.layout import Place
 from jaxcon.system.state import Energy, State, checked_system
 
 
@@ -89,6 +91,19 @@ class Vakonomic:
     def constraints(self) -> tuple[Any, ...]:
         """The constraints of the physical system."""
         return self.system.constraints
+
+    @property
+    def forces(self) -> tuple[Any, ...]:
+        """The force elements of the physical system."""
+        return self.system.forces
+
+    def check(self, q: Array) -> None:
+        """Checks numbers of the physical system that depend on q, (n_q,)."""
+        self.system.check(q)
+
+    def columns(self, place: Place) -> Columns:
+        """Returns the columns of J of the bodies that a `Place` names."""
+        return self.system.columns(place)
 
     @property
     def params(self) -> Any:
@@ -271,6 +286,10 @@ class Vakonomic:
     def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:
         """Returns the energy of the physical system [J]; if ψ is homogeneous in v, μ adds none."""
         return self.system.energy(q, self._split(v)[0], t)
+
+    def kinetic_energy(self, q: Array, v: Array) -> Array:
+        """Returns ½ vᵀMv of the physical system, () [J]."""
+        return self.system.kinetic_energy(q, self._split(v)[0])
 
     def motion(self, name: str, q: Array, v: Array) -> Motion:
         """Returns the motion of a body's user frame, as arrays."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from jaxcon.constraints.primitives import Row
@@ -30,7 +31,8 @@ class Armature(OnJoint):
     Attributes:
         name: name of the element, unique in the scene.
         joint: name of the joint.
-        inertia: I [kg m²] about an angle, [kg] along a travel.
+        inertia: I > 0 [kg m²] about an angle, [kg] along a travel. A joint without a rotor needs no
+            `Armature`.
         coordinate: name of the joint's coordinate; needed if it has several.
     """
 
@@ -39,14 +41,11 @@ class Armature(OnJoint):
     inertia: Any
     coordinate: str | None = None
     counts = False
+    ranges = MappingProxyType({"inertia": checks.NumberRange(above=0)})
 
     def attach(self, dtype: DType) -> dict[str, Array]:
-        """Returns the checked inertia I by field name, () [kg m²] or [kg].
-
-        Raises:
-            ValueError: the inertia is not positive; a joint without a rotor needs no `Armature`.
-        """
-        return {"inertia": checks.real(label(self), "inertia", self.inertia, dtype, above=0)}
+        """Returns the inertia I by field name, () [kg m²] or [kg]."""
+        return {"inertia": checks.real(label(self), "inertia", self.inertia, dtype)}
 
 
 @pytree

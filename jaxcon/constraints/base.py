@@ -37,6 +37,8 @@ class Joint(BetweenBodies):
     orientation of the second body in the first. A field whose name ends in `_b` is in the frame of
     the second body; `in_b` lists further fields in that frame.
 
+    `build` and `with_params` check numbers against the class attributes `ranges` and `nonzero`.
+
     Attributes:
         name: name of the element, unique in the scene.
         body_a, body_b: names of the first and the second body, or `WORLD`.

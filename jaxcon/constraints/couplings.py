@@ -62,6 +62,7 @@ class Pair(Coupling):
     joint_b: str
     coordinate_a: str | None
     coordinate_b: str | None
+    nonzero = ("ratio", "radius", "radius_a", "radius_b", "parts")
 
     @property
     def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
@@ -72,13 +73,9 @@ class Pair(Coupling):
         """Returns the numeric fields of the element as checked arrays.
 
         Raises:
-            ValueError: a number is zero or not finite.
+            ValueError: a number is not finite.
         """
-        fields = ("ratio", "radius", "radius_a", "radius_b", "parts")
-        params = numbers(self, dtype, *(f for f in fields if f in vars(self)))
-        for field, value in params.items():
-            checks.nonzero(label(self), field, value)
-        return params
+        return numbers(self, dtype, *(field for field in self.nonzero if field in vars(self)))
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 PERPENDICULAR = 1e-6
 """The largest cosine of two axes that count as perpendicular; rounding in float32 gives 1e-7."""
+POSITIVE_LENGTH = MappingProxyType({"length": checks.NumberRange(above=0)})
+"""The `Element.ranges` of elements with a length."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +81,7 @@ class Distance(Joint):
     length: Any = None
     point_a: Any = None
     point_b: Any = None
+    ranges = POSITIVE_LENGTH
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the points in the frames of their bodies, and the length."""
@@ -253,7 +256,14 @@ def turn_about(p: dict[str, Any], a: JointFrame, b: JointFrame) -> Row:
 
 
 def anchors(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
-    """Returns the joint's point in both frames; the second body's position unless given."""
+    """Returns the joint's point in the frames of both bodies, as `anchor_a` and `anchor_b`.
+
+    Args:
+        joint: a joint whose field `point` is (dim,) [m], world frame; None for the position of the
+            second body.
+        a: pose of the first body at assembly.
+        b: pose of the second body at assembly.
+    """
     point = own_point(joint, "point", b.position if joint.point is None else joint.point, b)
     own_point(joint, "point", point, a)
     return {"anchor_a": a.local_point(point), "anchor_b": b.local_point(point)}
@@ -305,6 +315,11 @@ def normals(n: Array) -> list[Array]:
 def unit(joint: Joint, what: str, pose: Pose) -> Array:
     """Returns a direction that is a field of a joint as a unit vector, world frame.
 
+    Args:
+        joint: the joint.
+        what: name of the field, a direction (3,) in the world frame.
+        pose: pose of the body that has the direction.
+
     Raises:
         ValueError: the direction is missing, or has the wrong shape or length zero.
     """
@@ -327,6 +342,11 @@ def unit_vector(joint: BetweenBodies, what: str, given: PyTree, pose: Pose) -> A
 
 def check_perpendicular(joint: Joint, u: Array, w: Array) -> None:
     """Checks that two unit axes of a joint are perpendicular, if they are concrete.
+
+    Args:
+        joint: the joint, for the message.
+        u: the first axis, (3,).
+        w: the second axis, (3,).
 
     Raises:
         ValueError: the cosine of the angle between them is not zero.
@@ -360,5 +380,6 @@ def stretched(element: Distance | Rope, a: Pose, b: Pose) -> dict[str, Array]:
             numerics.norm(end - start),
             "the distance of its points, as no length is given,",
         )
-    length = checks.real(label(element), what, length, a.position.dtype, above=0)
+    limits = element.ranges["length"]
+    length = checks.real(label(element), what, length, a.position.dtype, **limits)
     return {"anchor_a": a.local_point(start), "anchor_b": b.local_point(end), "length": length}

@@ -19,6 +19,7 @@ from jaxcon.constraints import primitives
 from jaxcon.constraints.base import Joint
 from jaxcon.constraints.joints import (
     PERPENDICULAR,
+    POSITIVE_LENGTH,
     Distance,
     Prismatic,
     anchors,
@@ -202,13 +203,13 @@ class Screw(Cylindrical):
     """
 
     lead: Any = None
+    nonzero = ("lead",)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the numbers of the sleeve joint (`Cylindrical`), and the lead."""
         if self.lead is None:
             raise ValueError(f"{label(self)}: a lead is needed, the travel in one turn [m].")
         lead = checks.real(label(self), "lead", self.lead, a.position.dtype)
-        checks.nonzero(label(self), "lead", lead)
         return Cylindrical.attach(self, a, b) | {"lead": lead}
 
     @staticmethod
@@ -307,6 +308,7 @@ class RevoluteSpherical(Joint):
     axis: Any
     dims = (3,)
     coordinates = MappingProxyType({"angle": "rad"})
+    ranges = POSITIVE_LENGTH
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the rod's ends in their bodies' frames, axis and rod in a, and the length."""
@@ -314,7 +316,9 @@ class RevoluteSpherical(Joint):
         n = unit(self, "axis", a)
         hinge, ball = own_point(self, "hinge", self.hinge, a), own_point(self, "ball", self.ball, b)
         length = numerics.norm(ball - hinge)
-        checks.check(label(self), "the distance from hinge to ball", length, above=0)
+        checks.check(
+            label(self), "the distance from hinge to ball", length, **self.ranges["length"]
+        )
         rod = (ball - hinge) / length
         cosine = n @ rod
         if checks.is_concrete(cosine) and abs(float(cosine)) > PERPENDICULAR:
@@ -511,6 +515,7 @@ class Span(Joint):
     point_a: Any = None
     point_b: Any = None
     coordinates = MappingProxyType({"stretch": "m"})
+    ranges = POSITIVE_LENGTH
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the two points in the frames of their bodies, and the distance between them."""

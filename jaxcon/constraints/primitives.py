@@ -88,13 +88,23 @@ class Row(NamedTuple):
 
 
 def meet(p: Point, r: Point) -> list[Row]:
-    """Returns the rows of r − p = 0 for two points, one row for each world axis."""
+    """Returns the rows of r − p = 0, one row for each world axis.
+
+    Args:
+        p: point of the first body.
+        r: point of the second body.
+    """
     d, ḋ, bias = r.position - p.position, r.velocity - p.velocity, r.bias - p.bias
     return [Row(d[i], ḋ[i], bias[i], (-p.pull(e), r.pull(e))) for i, e in enumerate(axes(len(d)))]
 
 
 def angle_between(u: Direction, w: Direction) -> Row:
-    """Returns the row of u · w, the cosine of the angle between two directions."""
+    """Returns the row of u · w, the cosine of the angle between two directions.
+
+    Args:
+        u: direction of the first body, a unit vector.
+        w: direction of the second body, a unit vector.
+    """
     return Row(
         u.position.dot(w.position),
         plus(u.velocity.dot(w.position), u.position.dot(w.velocity)),
@@ -113,7 +123,13 @@ def difference(x: Row, y: Row) -> Row:
 
 
 def travel(u: Direction, p: Point, r: Point) -> Row:
-    """Returns the row of u · (r − p): the position of r from p along a direction u of p's body."""
+    """Returns the row of u · (r − p): the position of r from p along a direction u of p's body.
+
+    Args:
+        u: direction of the first body, a unit vector.
+        p: point of the first body.
+        r: point of the second body.
+    """
     d, ḋ, bias = r.position - p.position, r.velocity - p.velocity, r.bias - p.bias
     return Row(
         u.position.dot(d),
@@ -127,6 +143,11 @@ def distance(p: Point, r: Point, length: Lane) -> Row:
     """Returns the row of ‖r − p‖ − l, the distance of two points less a length l.
 
     If the points coincide, the row has no direction, and its pulls are zero.
+
+    Args:
+        p: point of the first body.
+        r: point of the second body.
+        length: l, lanes (element,) [m].
     """
     d, ḋ = r.position - p.position, r.velocity - p.velocity
     span = numerics.norm(d)
@@ -151,6 +172,11 @@ def same_orientation(a: JointFrame, b: JointFrame, reference: Vector | Lane) -> 
         φ̇ = vec(e ω̃ − ω_a e) = e₀ (ω̃ − ω_a) + e⃗ × (ω̃ + ω_a),   γ = vec(ė ω̃ − ω_a ė).
 
     Components are along a's axes, so the rows turn with the joint and no frame is preferred.
+
+    Args:
+        a: motion of the first body.
+        b: motion of the second body.
+        reference: θ₀ [rad] in the plane, the quaternion q₀ in space.
     """
     if not isinstance(reference, Vector):
         value = b.angle - a.angle - reference

@@ -20,6 +20,7 @@ of an element refers to the point c; its force is the contact force.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -37,6 +38,9 @@ from jaxcon.system.frames import Direction, Point
 
 if TYPE_CHECKING:
     from jaxcon.constraints.primitives import JointFrame
+
+POSITIVE_RADIUS = MappingProxyType({"radius": checks.NumberRange(above=0)})
+"""The `Element.ranges` of rolling elements."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +73,7 @@ class RollingSphere(Joint):
     point: Any = None
     oriented = True
     dims = (3,)
+    ranges = POSITIVE_RADIUS
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the plane in the frame of a, the center in the frame of b, and the radius."""
@@ -124,6 +129,7 @@ class RollingCylinder(Joint):
     point: Any = None
     oriented = True
     dims = (3,)
+    ranges = POSITIVE_RADIUS
     in_b = ("axis",)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
@@ -186,6 +192,7 @@ class RollingDisc(Joint):
     point: Any = None
     oriented = True
     turns = True
+    ranges = POSITIVE_RADIUS
     in_b = ("axis",)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
@@ -291,9 +298,9 @@ def touch(
         reach: the height of the center above the plane, in radii.
 
     Raises:
-        ValueError: the radius is not positive, or a field has a wrong shape.
+        ValueError: a field has a wrong shape.
     """
-    radius = checks.real(label(joint), "radius", joint.radius, a.position.dtype, above=0)
+    radius = checks.real(label(joint), "radius", joint.radius, a.position.dtype)
     center, n = own_point(joint, "center", joint.center, b), normal(joint, a)
     contact = center - radius * reach * n if joint.point is None else joint.point
     point = own_point(joint, "point", contact, a)

@@ -26,7 +26,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,18 +37,6 @@ from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Scalar
 from jaxcon.linear import gauss_jordan, roots
-
-if TYPE_CHECKING:
-    from jaxcon.protocols import ContactSolver
-
-
-def is_exact(solver: ContactSolver) -> bool:
-    """Returns True if a solver finds the multipliers to full precision.
-
-    Landings (impacts without rebound) are then resolved within a step. A user's solver declares it
-    by an attribute `exact`.
-    """
-    return getattr(solver, "exact", False)
 
 
 @dataclass(frozen=True)
@@ -192,11 +180,19 @@ class Bounded:
         return (self.friction, *self.resistance)
 
     def velocity(self, multipliers: Array) -> Array:
-        """Returns the velocities u = G λ + c, (n,), for given multipliers λ."""
+        """Returns the velocities u = G λ + c, (n,).
+
+        Args:
+            multipliers: multipliers λ, (n,).
+        """
         return jnp.sum(self.matrix * multipliers[None], axis=1) + self.offset
 
     def residual(self, multipliers: Array) -> Array:
-        """Returns λ − P(λ − u/g), (n,), which is zero if and only if all laws hold; see `laws`."""
+        """Returns λ − P(λ − u/g), (n,), which is zero if and only if all laws hold; see `laws`.
+
+        Args:
+            multipliers: multipliers λ, (n,).
+        """
         live = (self.lower, self.upper, self.coefficients)
         return laws(self.kinds, self.diagonal(), multipliers, self.velocity(multipliers), live)
 

@@ -7,15 +7,16 @@ alone (`contact_rows`).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
-from jaxcon.constraints.joints import stretched, unit_vector
+from jaxcon.constraints.joints import POSITIVE_LENGTH, stretched, unit_vector
 from jaxcon.constraints.pairs import check_oriented
 from jaxcon.constraints.primitives import Row, distance
-from jaxcon.contact.contact_rows import MATERIAL, Touch, contact_rows, material
+from jaxcon.contact.contact_rows import MATERIAL, Touch, across, contact_rows, material
 from jaxcon.contact.limits import Ranged, one_sided, stop
 from jaxcon.contact.point_sets import given_points, own_points, spread, spread_place
 from jaxcon.contact.rows import BoundSet
@@ -60,6 +61,7 @@ class Rope(BetweenBodies):
     damping: Any = 0.0
     recovery: Any = 0.1
     optional = ("restitution",)
+    ranges = POSITIVE_LENGTH
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the end points in the body frames, the length, and the stop's parameters."""
@@ -143,6 +145,10 @@ class PlaneContact(BetweenBodies):
 class CapsuleContact(BetweenBodies):
     """Contact of two capsules at one point; a capsule whose segment has no length is a ball.
 
+    The normal points from the closest point of the first axis to the closest point of the second.
+    Where these points coincide, the normal is perpendicular to both axes. In the plane, and for
+    parallel axes, it is perpendicular to the longer axis. For two balls it is the world's x axis.
+
     Attributes:
         name: name of the element, unique in the scene.
         body_a, body_b: names of the bodies, or `WORLD`.
@@ -212,8 +218,12 @@ class CapsuleContact(BetweenBodies):
         x_a, x_b = nearest(*ends)
         apart = x_b - x_a
         length = numerics.norm(apart)
+        meet = length == 0
+        aside = across_axes(ends[1] - ends[0], ends[3] - ends[2])
         n = apart * numerics.safe_divide(1.0, length)
-        gap = length - p["radius_a"] - p["radius_b"]
+        n = Vector(*(jnp.where(meet, y, x) for x, y in zip(n, aside, strict=True)))
+        # where the axes meet, the norm has no derivative; the gap then changes along n
+        gap = jnp.where(meet, n.dot(apart), length) - p["radius_a"] - p["radius_b"]
         middle = x_a + n * (p["radius_a"] + gap / 2)
         return contact_rows(p, Touch(gap, n, middle, a, b), dt)
 
@@ -221,6 +231,11 @@ class CapsuleContact(BetweenBodies):
 @pytree
 class Contacts(Ranged):
     """A group of ropes or contacts of the class `law`, between bodies of the same kinds."""
+
+    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the changed numbers of an element by the ranges of its class and of contacts."""
+        self.law.check_numbers(name, numbers)
+        super().check_numbers(name, numbers)
 
     def bounds(self, snapshot: Snapshot, control: PyTree, dt: Array) -> BoundSet:
         """Returns the inequality rows at one instant, with their targets for a step of dt."""
@@ -256,6 +271,33 @@ def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]
     y = jnp.clip(numerics.safe_divide(b * x + f, e), 0, 1)
     x = jnp.clip(numerics.safe_divide(b * y - c, a), 0, 1)
     return p + u * x, r + w * y
+
+
+def across_axes(u: Vector, w: Vector) -> Vector:
+    """Returns the contact normal of two capsules whose axes u and w meet, a unit vector.
+
+    It is u × w / ‖u × w‖ in space. If the axes are parallel, and in the plane, it is normal to the
+    longer one. For two balls, whose axes are zero, it is the x axis of the world.
+    """
+    square_u, square_w = u.dot(u), w.dot(w)
+    longer = square_u >= square_w
+    square = jnp.where(longer, square_u, square_w)
+    # the direction across −e_n, the last axis downwards, is e_x
+    down = (0.0,) * (len(u) - 1) + (-1.0,)
+    unit = numerics.safe_divide(1.0, numerics.safe_sqrt(square))
+    along = (
+        jnp.where(square > 0, jnp.where(longer, x, y) * unit, z)
+        for x, y, z in zip(u, w, down, strict=True)
+    )
+    aside = across(Vector(*along))[0]
+    if len(u) == 2:
+        return aside
+    both = u.cross(w)
+    area = both.dot(both)
+    tiny = 16 * float(jnp.finfo(jnp.result_type(*u)).eps)
+    crossing = area > tiny * square_u * square_w
+    unit = numerics.safe_divide(1.0, numerics.safe_sqrt(jnp.where(crossing, area, 0)))
+    return Vector(*(jnp.where(crossing, x * unit, y) for x, y in zip(both, aside, strict=True)))
 
 
 def plane(element: PlaneContact | BoxContact, a: Pose) -> dict[str, Array]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ Body = tuple[int, int]
 """A body: the first column of its group in J, and its index in the group."""
 
 
-def default_contact_solver(system: System, q: Array, v: Array) -> Any:
+def default_contact_solver(system: System, q: Array, v: Array) -> ContactSolver:
     """Returns the fastest contact solver that suits the structure of a scene.
 
     `InteriorPoint` is exact, but inverts an n×n matrix in each of its 10 to 20 iterations, which is

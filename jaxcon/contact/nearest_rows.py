@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcon.contact.bounded import Bounded, RowCounts, is_exact
+from jaxcon.contact.bounded import Bounded, RowCounts
 from jaxcon.contact.interior_point import InteriorPoint
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
@@ -47,7 +47,7 @@ class ActiveSet(checks.Checked, ContactSolver):
     @property
     def exact(self) -> bool:
         """True if the solver finds the multipliers to full precision."""
-        return is_exact(self.solver)
+        return self.solver.exact
 
     @property
     def smoothing(self) -> Any:

@@ -172,12 +172,12 @@ class ImpactSet:
     """The rows that take part in an impact.
 
     Attributes:
-        outlook: forecast of the part before the impact.
+        forecast: forecast of the part before the impact.
         first: mask of the row whose closing gap caused the impact, (n,).
         happens: True for worlds with an impact, ().
     """
 
-    outlook: ContactForecast
+    forecast: ContactForecast
     first: Array
     happens: Array
 
@@ -187,7 +187,7 @@ class ImpactSet:
         All rows in contact are active at once: no gap closes further, and rows that were closing
         leave with e |φ̇|.
         """
-        gap_curvature, rounding = self.outlook.gap_curvature, self.outlook.rounding
+        gap_curvature, rounding = self.forecast.gap_curvature, self.forecast.rounding
         ends = mask(rows.ends, rows)
         touching = (
             self.first | (rows.gap <= rounding[None]) | resting(rows, gap_curvature, rounding, dt)

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows
 from jaxcon.contact import impacts
-from jaxcon.contact.bounded import is_exact
 from jaxcon.contact.limits import OneSided
 from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.parts import ImpactSet, StepPart
@@ -79,7 +78,8 @@ class Response:
                 with every solver.
 
         Raises:
-            ValueError: the stabilizer has a `solve` of its own, whose factors cannot be reused.
+            ValueError: the stabilizer has a `solve` of its own, whose factors cannot be reused, or
+                the state has the multipliers of another scene.
         """
         if dynamics.stabilizer.solves:
             raise ValueError(
@@ -89,10 +89,16 @@ class Response:
             )
         (q, v, t), dt, bounds = point, dynamics.dt, rows.inequalities
         assert isinstance(bounds, BoundRows)
+        if self.guess is not None and self.guess.shape[0] != bounds.kinds.size:
+            raise ValueError(
+                f"the state has multipliers of {self.guess.shape[0]} inequality rows, but this"
+                f" scene has {bounds.kinds.size}; start with"
+                " state = jc.init(system, method, state.q, state.v)."
+            )
         strikes = lands = False
         if self.part is None:
             # an impact needs two more solves; `GaussSeidel` avoids them if nothing can bounce
-            apart = every_landing or is_exact(self.solver) or bounds.restitution is not None
+            apart = every_landing or self.solver.exact or bounds.restitution is not None
             strikes = any(bounds.ends) and apart
             lands = delayed and not strikes
             shares = type(self.solver).__name__ if lands else None

@@ -28,6 +28,7 @@ from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree, Scalar
+from jaxcon.linear.islands import islands, nonzeros
 from jaxcon.linear.jacobian import Block, Gathered, Jacobian
 from jaxcon.system.elements import Grid
 from jaxcon.system.layout import Place
@@ -561,3 +562,36 @@ def has_ends(
     if not system.bounds:
         return False
     return any(jax.eval_shape(linearize_bounds, system, q, v, t, control, dt).ends)
+
+
+def rows_beside_contact(jacobian: Jacobian, bounds: BoundRows, multipliers: Array) -> Array | None:
+    """Marks the equality rows in whose island a joint limit or a contact is active.
+
+    Joint friction and velocity-limited motors do not count.
+
+    Args:
+        jacobian: the Jacobian of the equality rows, (n_c, n_v).
+        bounds: the inequality rows; only their structure is read.
+        multipliers: the multipliers of the inequality rows, (n, …); nonzero where a row is active.
+
+    Returns:
+        A mask of the equality rows, (n_c, …). None if no joint limit or contact touches an island
+        that contains equality rows.
+    """
+    of_rows, of_velocities = islands(jacobian)
+    touches = np.zeros((max(of_velocities, default=-1) + 1, len(multipliers)), bool)
+    rows, columns = nonzeros(bounds.jacobian)
+    touches[of_velocities[columns], rows] = True
+    touches[:, ~bounds.kinds.one_sided] = False
+    touched = touches[of_rows]
+    reaching = np.flatnonzero(touched.any(axis=0))
+    if not reaching.size:
+        return None
+    acting = multipliers != 0
+    if touched[:, reaching].all():  # all islands share one mask
+        acting = jnp.any(acting[reaching], axis=0)
+        return jnp.broadcast_to(acting, (len(of_rows), *acting.shape))
+    patterns, which = np.unique(touched, axis=0, return_inverse=True)
+    worlds = acting.reshape(len(acting), -1).astype(jnp.float32)
+    touching = jnp.asarray(patterns, jnp.float32) @ worlds > 0
+    return touching.reshape(len(patterns), *acting.shape[1:])[which.reshape(-1)]

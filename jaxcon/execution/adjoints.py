@@ -153,16 +153,16 @@ class Checkpoints(Adjoint):
             # more levels than halvings of the steps save nothing
             return whole_levels(steps, min(levels, steps.bit_length() + 1))
         checks.check("Checkpoints", "budget", self.budget, (), above=0)
-        own = bytes_of(state)
+        size = bytes_of(state)
         levels = range(1, steps.bit_length() + 2)
         choices = [f(steps, n) for n in levels for f in (whole_levels, equal_levels)]
         for sizes in choices:
-            if sum(kept(steps, sizes)) * own <= self.budget:
+            if sum(kept(steps, sizes)) * size <= self.budget:
                 return sizes
-        least = min(sum(kept(steps, sizes)) for sizes in choices) * own
+        least = min(sum(kept(steps, sizes)) for sizes in choices) * size
         raise ValueError(
             f"Checkpoints: budget={self.budget} bytes do not hold the states that a rollout of"
-            f" {steps} steps must keep; {least} bytes are the least for this state of {own} bytes."
+            f" {steps} steps must keep; {least} bytes are the least for this state of {size} bytes."
         )
 
 

@@ -15,7 +15,6 @@ from jaxcon.core.status import Status
 from jaxcon.core.typing import DType, Scalar
 from jaxcon.methods.method import Method, check_method
 from jaxcon.protocols import System
-from jaxcon.system.generalized import GeneralizedCoordinates
 from jaxcon.system.state import State
 
 
@@ -58,8 +57,7 @@ def init(
     q = checks.real("init", "q", q, dtype, (n_q,))
     v = checks.real("init", "v", v, dtype, (n_v,))
     check_dtype(system, dtype)
-    if isinstance(system, GeneralizedCoordinates):
-        system.check(q)
+    system.check(q)
     snapshot = system.snapshot(q, v, jnp.zeros((), dtype))
     for group in (*snapshot.system.constraints, *snapshot.system.bounds):
         if isinstance(group, Custom):

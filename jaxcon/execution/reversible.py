@@ -100,7 +100,7 @@ class _Walk:
         walk = jax.custom_vjp(lambda *args: self.forwards(*args)[0])
         walk.defvjp(self.begin, self.backwards, symbolic_zeros=True)
         try:
-            found = walk(real, (others, jax.lax.stop_gradient(self.of_back)))
+            results = walk(real, (others, jax.lax.stop_gradient(self.of_back)))
         except TypeError as error:
             if "forward-mode" not in str(error):
                 raise
@@ -108,14 +108,14 @@ class _Walk:
                 "Reversible: there is no forward-mode derivative through steps that are taken back;"
                 " take adjoint=jc.adjoints.EveryStep(), which keeps nothing in forward mode."
             ) from error
-        return self._merged(self.results, *found)
+        return self._merged(self.results, *results)
 
     def begin(self, *given: Any) -> tuple[Any, Any]:
         """Forward rule of the custom VJP. Returns the results, and residuals for `backwards`."""
         real, rest = (jax.tree.map(lambda x: x.value, x, is_leaf=_is_primal) for x in given)
         moved = jax.tree.map(lambda x: x.perturbed, given[0], is_leaf=_is_primal)
-        found, kept = self.forwards(real, rest)
-        return found, (_Moved(tuple(map(tuple, moved))), real, rest, kept)
+        results, kept = self.forwards(real, rest)
+        return results, (_Moved(tuple(map(tuple, moved))), real, rest, kept)
 
     def forwards(self, real: Any, rest: Any) -> tuple[Any, Any]:
         """Runs the rollout. Returns its results as (real leaves, others), and the kept states."""
@@ -123,22 +123,23 @@ class _Walk:
         count = _count(self.path.steps, self.size)
         room = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), start)
 
-        def step(known: Any, given: Any) -> Any:
-            state, seen = self.step(of_step, known[0], given)
-            put, place = jax.lax.dynamic_update_index_in_dim, self._segment(given[0])
-            return (state, jax.tree.map(lambda x, y: put(x, y, place, 0), known[1], state)), seen
+        def step(carry: Any, inputs: Any) -> Any:
+            (before, kept), place = carry, self._segment(inputs[0])
+            state, info = self.step(of_step, before, inputs)
+            put = jax.lax.dynamic_update_index_in_dim
+            return (state, jax.tree.map(lambda x, y: put(x, y, place, 0), kept, state)), info
 
-        def record(known: Any, seen: Any) -> PyTree:
-            return self.record(of_record, known[0], seen)
+        def record(carry: Any, info: Any) -> PyTree:
+            return self.record(of_record, carry[0], info)
 
         way: Any = {"step": step, "record": record, "start": (start, room), "inputs": inputs}
         (final, kept), rows = dataclasses.replace(self.path, **way).scan()  # type: ignore[misc]
         pairs = [p.split(x) for p, x in zip(self.results, (final, rows), strict=True)]
         return tuple(map(list, zip(*pairs, strict=True))), kept
 
-    def backwards(self, known: Any, cotangents: Any) -> tuple[Any, None]:
+    def backwards(self, residuals: Any, cotangents: Any) -> tuple[Any, None]:
         """Reverse rule of the custom VJP. Returns the cotangents of all perturbed real leaves."""
-        moved, real, rest, kept = known
+        moved, real, rest, kept = residuals
         constants, start, inputs = self._merged(self.parts, real, rest[0])
         of_numbers, _, of_inputs = parts = moved.parts(self.parts)
         (bar, rows_bar), _ = cotangents
@@ -154,21 +155,22 @@ class _Walk:
             lost = ends & _far(after, saved, allowed) | (number > 0) & failed(before.status)
             return where_tree(number == 0, start, before), lost
 
-        def one(known: Any, given: Any) -> Any:
-            after, bar, total, lost = known
-            before, missed = back(after, given)
-            rows = [_row(x, given[0] // self.path.every) for x in rows_bar]
-            more, bar, given_bar = self._pulled(parts, (constants, before, given), (bar, rows))
-            total = jax.tree.map(jnp.add, total, more)
-            return (before, bar, total, lost | missed), given_bar
+        def pull(carry: Any, inputs: Any) -> Any:
+            after, bar, total, lost = carry
+            before, missed = back(after, inputs)
+            rows = [_row(x, inputs[0] // self.path.every) for x in rows_bar]
+            point = constants, before, inputs
+            constants_bar, bar, inputs_bar = self._pulled(parts, point, (bar, rows))
+            total = jax.tree.map(jnp.add, total, constants_bar)
+            return (before, bar, total, lost | missed), inputs_bar
 
         final = jax.tree.map(lambda x: x[-1], kept)
         total = jax.tree.map(jnp.zeros_like, of_numbers.split(constants)[0])
         begin = final, bar, total, jnp.zeros_like(failed(final.status))
-        (_, bar, total, lost), inputs_bar = jax.lax.scan(one, begin, inputs, reverse=True)
+        (_, bar, total, lost), inputs_bar = jax.lax.scan(pull, begin, inputs, reverse=True)
         lost &= ~failed(final.status)  # a failed world has zero gradient anyway
-        found = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), (total, bar, inputs_bar))
-        return moved.spread(found), None
+        bars = jax.tree.map(lambda x: jnp.where(lost, jnp.nan, x), (total, bar, inputs_bar))
+        return moved.spread(bars), None
 
     def _pulled(self, parts: Any, at: Any, bars: Any) -> Any:
         """Pulls cotangents back through one step and its record.
@@ -225,8 +227,8 @@ class _Moved:
 
         Every real leaf of the state counts: after the first step all of them may have tangents.
         """
-        own = self.flags[0], (True,) * len(self.flags[1]), self.flags[2]
-        return tuple(parts.among(flags) for parts, flags in zip(of, own, strict=True))
+        flags = self.flags[0], (True,) * len(self.flags[1]), self.flags[2]
+        return tuple(parts.among(chosen) for parts, chosen in zip(of, flags, strict=True))
 
     def spread(self, found: Any) -> list[list[Any]]:
         """Returns cotangents of all real leaves; None for leaves without a tangent."""

@@ -2,12 +2,12 @@
 
     jc.step            checks the user's arguments                        execution/step.py
     batch_last.call    moves the batch last, stages kernels               staging/batch_last.py
-    masked_step        freezes failed worlds and masks their gradients    staging/failure.py
+    masked_step        freezes failed worlds and masks their gradients    execution/shell.py
     attempt            subtracts whole turns of angles and counts them    methods/attempt.py
     step.step          the algorithm                                      step.py
 
-`step` and `rollout` go through all of them, `forward_dynamics` through the first two. Each layer
-has a reason:
+`step` and `rollout` go through all of them. `forward_dynamics` has `solve_at` in place of
+`masked_step`, and solves without a step. Each layer has a reason:
 
 - The batch is the last axis, so that each operation is one loop over contiguous memory. `vmap`
   alone would make it the first axis, and process small matrices one by one.
@@ -60,6 +60,7 @@ def masked_step(
     def repaired(
         system: System, method: Method, state: State, tried: Attempted, dt: Array
     ) -> tuple[tuple[State, StepInfo], Array]:
+        assert method.recovery is not None
         system = with_turns(system, state.turns, state.angle_remainder)
         return _freeze(state, method.recovery.repair(system, method.solver, state, tried, dt))
 
@@ -85,6 +86,8 @@ def solve_at(
 ) -> tuple[Solution, Violation, Reactions | None]:
     """Solves the dynamics of a batch of worlds (trailing axis) at their states.
 
+    Worlds whose solution fails get zero gradients.
+
     Returns:
         The accelerations a and multipliers λ as a `Solution`; the violation; and contact reactions,
         None without inequality constraints.
@@ -94,8 +97,14 @@ def solve_at(
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
     state = broadcast_worlds(state, batch_of(args, state.q.ndim - 1))
-    turning = with_turns(system, state.turns, state.angle_remainder)
-    dynamics = method.dynamics(turning, state, control, dt)
-    solution, rows = dynamics(state.q, state.v, state.instant)
-    reactions = rows.reactions
-    return solution, rows.violation, None if reactions is None else reactions.without_jump()
+
+    def solved(
+        system: System, method: Method, state: State, control: PyTree, dt: Array
+    ) -> tuple[tuple[Solution, Violation, Reactions | None], Array]:
+        turning = with_turns(system, state.turns, state.angle_remainder)
+        dynamics = method.dynamics(turning, state, control, dt)
+        solution, rows = dynamics(state.q, state.v, state.instant)
+        reactions = None if rows.reactions is None else rows.reactions.without_jump()
+        return (solution, rows.violation, reactions), solution.status
+
+    return mask_failed_gradients(solved, (system, method, state, control, dt))[0]

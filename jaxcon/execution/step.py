@@ -14,13 +14,12 @@ from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree, Scalar
 from jaxcon.execution.shell import masked_step, solve_at
 from jaxcon.execution.validation import check_step
-from jaxcon.execution.wrenches import Origin
 from jaxcon.linear.saddle import Solution
-from jaxcon.methods.method import Method, check_method
+from jaxcon.methods.method import Method
 from jaxcon.methods.stability import warn_if_unstable
 from jaxcon.protocols import System
 from jaxcon.staging import batch_last
-from jaxcon.step import StepInfo, without_memory
+from jaxcon.step import Origin, StepInfo, without_memory
 from jaxcon.system.state import State
 
 Info = TypeVar("Info", bound="StepInfo | SolutionAt")
@@ -51,10 +50,9 @@ def step(
         ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.
         TypeError: an argument has another type, such as a class in place of a method.
     """
-    check_method(method, wait=False)
-    with checks.without_waiting():  # of dt as given: under jit an array of it would be traced
-        warn_if_unstable(method, dt, system, state)
     given = _checked("step", system, method, state, control, dt)
+    with checks.without_waiting():  # dt as given, since an array made of it is traced under jit
+        warn_if_unstable(method, dt, system, state)
     return _reported(batch_last.call(masked_step, *given), system, state, given[3])
 
 
@@ -183,6 +181,8 @@ def forward_dynamics(
     Returns:
         acceleration (n_v,) [m/s², rad/s²], multipliers (n_c,) [N, N·m], status (): a `Solution`
         that unpacks so. It also has the `state` and `control` given, `violation` and `reactions`.
+
+    A world whose solution fails has zero gradient.
 
     Raises:
         ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.

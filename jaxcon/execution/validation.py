@@ -74,7 +74,7 @@ def idle(system: System, control: PyTree) -> PyTree:
 
 def _motors(system: System) -> list[str]:
     """Returns the names of the actuators that need a control input."""
-    groups = (*getattr(system, "forces", ()), *getattr(system, "bounds", ()))
+    groups = (*system.forces, *system.bounds)
     driven = (g for g in groups if getattr(g, "starts", ()) and hasattr(g, "coordinate"))
     return [name for group in driven for name in group.names]
 

@@ -4,7 +4,7 @@ Every function takes arrays whose first axis enumerates components, or Vectors o
 axes are batches. Angular velocities ω are in the body frame, so that q̇ = ½ q ⊗ (0, ω).
 
 An argument with a wrong shape, or without real numbers, raises a ValueError that names it. Values
-are not checked: NaN in an argument becomes NaN in the result.
+of JAX arrays are not read: NaN in an argument becomes NaN in the result.
 
 References:
     Solà, Quaternion kinematics for the error-state Kalman filter (2017), sections 1-4.
@@ -26,14 +26,12 @@ __all__ = [
     "conjugate",
     "rotate",
     "matrix",
-    "rotation",
     "derivative",
     "exp",
     "log",
     "normalize",
     "from_axis_angle",
     "from_matrix",
-    "split",
 ]
 
 
@@ -207,14 +205,16 @@ def from_axis_angle(axis: Scalar | Sequence[Scalar], angle: Scalar) -> Array:
     """Returns the unit quaternion (4,) of a rotation by an angle about an axis.
 
     Args:
-        axis: the rotation axis, (3,), of any nonzero length.
+        axis: the rotation axis, (3,), of any nonzero length. A JAX array of zeros gives the
+            identity, since its values are not read.
         angle: the rotation angle, () [rad].
 
     Raises:
-        ValueError: an argument has no real numbers, or another shape.
+        ValueError: an argument has no real numbers, or another shape, or the axis is zero.
     """
     with checks.without_waiting():
         checks.check("quaternion.from_axis_angle", "axis", axis, (3,))
+        checks.nonzero("quaternion.from_axis_angle", "axis", axis)
         checks.check("quaternion.from_axis_angle", "angle", angle, ())
     axis = jnp.asarray(axis)
     if not jnp.issubdtype(axis.dtype, jnp.floating):

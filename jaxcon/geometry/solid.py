@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array, DType, PyTree, Scalar
+from jaxcon.geometry import quaternion
 from jaxcon.geometry.inertia import Inertia, check_triangle, from_tensor
 
 
@@ -21,8 +23,8 @@ def resolve_inertia(
     Args:
         owner: the first words of errors, such as "body 'rod'".
         mass: () [kg]; None if `given` is an `Inertia`, which contains the mass.
-        given: an `Inertia`; or a moment of inertia () in the plane; or principal moments (3,) or a
-            tensor (3, 3) in space [kg m²].
+        given: an `Inertia`, of which the plane takes the moment about z; or a moment of inertia ()
+            in the plane; or principal moments (3,) or a tensor (3, 3) in space [kg m²].
         dim: the dimension of space, 2 or 3.
         dtype: the dtype of the scene.
 
@@ -48,13 +50,29 @@ def resolve_inertia(
                 f" center of mass, got {shape}; of principal moments give the third."
             )
         given = Inertia(mass, given)
-    moments = given.moments
+    moments, axes = given.moments, given.axes
     if dim == 2 and np.shape(checks.check(owner, "inertia", moments, finite=False)) == (3,):
-        moments = moments[2]
+        moments = _about_z(checks.real(owner, "inertia", moments, dtype, (3,)), axes)
+        axes = None
     moments = checks.real(owner, "inertia", moments, dtype, () if dim == 2 else (3,), above=0)
     if dim == 3:
         check_triangle(owner, moments)
-    return Inertia(resolve_mass(owner, given.mass, dtype), moments, given.center, given.axes)
+    return Inertia(resolve_mass(owner, given.mass, dtype), moments, given.center, axes)
+
+
+def _about_z(moments: Array, axes: Array | None) -> Array:
+    """Returns the moment of inertia about the z axis of the body's own frame, () [kg m²].
+
+    With principal moments I and principal axes A it is (A diag(I) Aᵀ)_zz.
+
+    Args:
+        moments: I, (3,) [kg m²].
+        axes: A as a quaternion, (4,); None if the principal frame is the body's own frame.
+    """
+    if axes is None:
+        return moments[2]
+    z = quaternion.matrix(quaternion.normalize(jnp.asarray(axes, moments.dtype)))[2]
+    return jnp.sum(z * z * moments)
 
 
 def resolve_mass(owner: str, mass: PyTree, dtype: DType) -> Array:

@@ -135,30 +135,3 @@ def iterations(structure: Structure, rows: int, rounds: int, solves: int = 1) ->
     code += sum(4 * m * columns.components for _, m, columns in structure)
     iteration = 4.0 * entries(structure) + swept + 12 * rows
     return Effort(blocks + solves * rounds * iteration, code, float(8 * rows))
-
-
-ROUNDS = 15
-"""The assumed number of iterations of the interior-point method."""
-
-
-def interior_point(rows: int) -> float:
-    """Estimates the operations of `InteriorPoint`.
-
-    Each iteration inverts one n × n matrix (2 n³ operations) and applies the inverse twice.
-
-    Args:
-        rows: n, the number of inequality rows in the contact problem.
-    """
-    return ROUNDS * (2.0 * rows**3 + 6.0 * rows * rows)
-
-
-def gauss_seidel(rows: int, sweeps: int) -> float:
-    """Estimates the operations of `GaussSeidel`.
-
-    Each sweep costs about one matrix–vector product (2 n² operations).
-
-    Args:
-        rows: n, the number of inequality rows in the contact problem.
-        sweeps: the number of sweeps.
-    """
-    return sweeps * (2.0 * rows * rows + 6.0 * rows)

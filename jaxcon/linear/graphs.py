@@ -14,7 +14,7 @@ HUB = 4
 
 
 def independent_sets(
-    neighbours: dict[N, set[N]], degree: int = 2
+    neighbors: dict[N, set[N]], degree: int = 2
 ) -> tuple[list[N], dict[N, list[N]]]:
     """Orders nodes for elimination in few rounds. No two nodes of a round are neighbors.
 
@@ -29,7 +29,7 @@ def independent_sets(
     Returns:
         The order, and the later neighbors of each node in that order, fill included.
     """
-    graph = {node: set(around) for node, around in neighbours.items()}
+    graph = {node: set(around) for node, around in neighbors.items()}
     order: list[N] = []
     later: dict[N, set[N]] = {}
     hubs: set[N] = set(graph)
@@ -53,7 +53,7 @@ def independent_sets(
 
 
 def minimum_degree(
-    neighbours: dict[N, set[N]], distance: Mapping[N, int] | None = None
+    neighbors: dict[N, set[N]], distance: Mapping[N, int] | None = None
 ) -> tuple[list[N], dict[N, list[N]]]:
     """Orders the nodes by minimum degree.
 
@@ -63,14 +63,14 @@ def minimum_degree(
     other body is fixed. From the free end, the pivots of a chain of n links fall like 1/n³.
 
     Args:
-        neighbours: the neighbors of each node.
+        neighbors: the neighbors of each node.
         distance: the distance of each node from the ground; None to ignore it.
 
     Returns:
         The order, and the later neighbors of each node in that order, fill included.
     """
-    distance = distance or dict.fromkeys(neighbours, 0)
-    graph = {node: set(around) for node, around in neighbours.items()}
+    distance = distance or dict.fromkeys(neighbors, 0)
+    graph = {node: set(around) for node, around in neighbors.items()}
     rank = {node: i for i, node in enumerate(graph)}
     order: list[N] = []
     later: dict[N, set[N]] = {}
@@ -108,15 +108,15 @@ def _sorted(order: list[N], later: dict[N, set[N]]) -> dict[N, list[N]]:
     return {node: sorted(s, key=position.__getitem__) for node, s in later.items()}
 
 
-def distances(neighbours: dict[N, set[N]], start: list[N]) -> dict[N, int]:
+def distances(neighbors: dict[N, set[N]], start: list[N]) -> dict[N, int]:
     """Returns the number of edges from each node to its nearest node in `start`.
 
-    A node that is not connected to `start` gets the value len(neighbours).
+    A node that is not connected to `start` gets the value len(neighbors).
     """
     result = dict.fromkeys(start, 0)
     front, away = start, 0
     while front:
         away += 1
-        front = [other for node in front for other in neighbours[node] if other not in result]
+        front = [other for node in front for other in neighbors[node] if other not in result]
         result.update(dict.fromkeys(front, away))
-    return {node: result.get(node, len(neighbours)) for node in neighbours}
+    return {node: result.get(node, len(neighbors)) for node in neighbors}

@@ -1,9 +1,6 @@
 """Islands: sets of velocities that equality constraints couple, directly or indirectly."""
 
-from typing import Any
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.typing import Array
@@ -25,7 +22,7 @@ def islands(jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
             i = parent[i]
         return i
 
-    for row, column in zip(*_entries(jacobian), strict=True):
+    for row, column in zip(*nonzeros(jacobian), strict=True):
         parent[root(int(row))] = root(n_c + int(column))
     label = np.unique([root(i) for i in range(n_c + n_v)], return_inverse=True)[1]
     return label[:n_c], label[n_c:]
@@ -44,40 +41,7 @@ def largest_by_island(jacobian: Jacobian, x: Array) -> Array | None:
     return jax.ops.segment_max(x, label, len(values))[label] if len(values) > 1 else None
 
 
-def rows_beside_contact(jacobian: Jacobian, bounds: Any, multipliers: Array) -> Array | None:
-    """Marks the equality rows in whose island a joint limit or a contact is active.
-
-    Joint friction and velocity-limited motors do not count.
-
-    Args:
-        jacobian: the Jacobian of the equality rows, (n_c, n_v).
-        bounds: the inequality rows; only their structure is read.
-        multipliers: the multipliers of the inequality rows, (n, …); nonzero where a row is active.
-
-    Returns:
-        A mask of the equality rows, (n_c, …). None if no joint limit or contact touches an island
-        that contains equality rows.
-    """
-    of_rows, of_velocities = islands(jacobian)
-    touches = np.zeros((max(of_velocities, default=-1) + 1, len(multipliers)), bool)
-    rows, columns = _entries(bounds.jacobian)
-    touches[of_velocities[columns], rows] = True
-    touches[:, ~bounds.kinds.one_sided] = False
-    touched = touches[of_rows]
-    reaching = np.flatnonzero(touched.any(axis=0))
-    if not reaching.size:
-        return None
-    acting = multipliers != 0
-    if touched[:, reaching].all():  # all islands share one mask
-        acting = jnp.any(acting[reaching], axis=0)
-        return jnp.broadcast_to(acting, (len(of_rows), *acting.shape))
-    patterns, which = np.unique(touched, axis=0, return_inverse=True)
-    worlds = acting.reshape(len(acting), -1).astype(jnp.float32)
-    touching = jnp.asarray(patterns, jnp.float32) @ worlds > 0
-    return touching.reshape(len(patterns), *acting.shape[1:])[which.reshape(-1)]
-
-
-def _entries(jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
+def nonzeros(jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
     """Returns the row and column numbers of the structural nonzeros of J, in no fixed order."""
     entries = [np.zeros((2, 0), int)]
     for block in jacobian.blocks:

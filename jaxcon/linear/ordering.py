@@ -131,7 +131,7 @@ def plan(structure: Structure, run: int = RUN, order: str = "runs") -> Plan:
     if order not in ORDERS:
         raise ValueError(f"Sparse: order must be one of {ORDERS} or None, got {order!r}.")
     couplings = _couplings(structure)
-    neighbours = {
+    neighbors = {
         EliminationNode(start, element, size): set[EliminationNode]()
         for start, size, columns in structure
         for element in range(len(columns.indices))
@@ -140,17 +140,17 @@ def plan(structure: Structure, run: int = RUN, order: str = "runs") -> Plan:
     for c, coupling in enumerate(couplings):
         for first, second in coupling.pairs:
             for pair, swapped in (((first, second), False), ((second, first), True)):
-                neighbours[pair[0]].add(pair[1])
+                neighbors[pair[0]].add(pair[1])
                 kinds.setdefault(pair, []).append((c, swapped))
     if order == "levels":
-        nodes, later = independent_sets(neighbours)
+        nodes, later = independent_sets(neighbors)
         steps: list[EliminationBatch | EliminationRun] = [
             EliminationBatch((node,), (tuple(later[node]),)) for node in nodes
         ]
     else:
         bodies = Counter(start for start, _, _ in structure)
-        grounded = [node for node in neighbours if bodies[node.group] == 1]
-        found = minimum_degree(neighbours, distances(neighbours, grounded))
+        grounded = [node for node in neighbors if bodies[node.group] == 1]
+        found = minimum_degree(neighbors, distances(neighbors, grounded))
         steps = _steps(*found, kinds, run)
     return Plan(tuple(couplings), tuple(_at_once(steps)))
 

@@ -79,6 +79,12 @@ def _solve(complement: Complement, force: Array, target: Array) -> Solution:
 
 
 def delassus(mass: Mass, jacobian: Array, compliance: Array | None) -> Array:
-    """Returns the Delassus matrix A = J M⁻¹ Jᵀ + C, (n_c, n_c), for a dense J (n_c, n_v)."""
+    """Returns the Delassus matrix A = J M⁻¹ Jᵀ + C, (n_c, n_c), of one world.
+
+    Args:
+        mass: M.
+        jacobian: J, dense, (n_c, n_v).
+        compliance: diagonal of C, (n_c,); None for C = 0.
+    """
     a = jacobian @ mass.solve_columns(jacobian.T)
     return a if compliance is None else a + jnp.diag(compliance)

@@ -205,7 +205,7 @@ class SlidingWindowBaumgarte(checks.Checked, Stabilizer):
         δ, reach, r, η = (jnp.asarray(x, rows.bias.dtype)[None] for x in numbers)
         residuals = jnp.concatenate([memory.residuals[1:], rows.residual[None]])
         seen = memory.seen + 1
-        trend, oscillation = judge(residuals, δ)
+        trend, oscillation = trend_and_oscillation(residuals, δ)
         rate, bound = self._bounds(rows)
         pull = jnp.maximum(trend, 0) * (1 - oscillation) - oscillation - r * memory.raised
         # clip before the logarithm, whose derivative at 0 is infinite
@@ -216,7 +216,7 @@ class SlidingWindowBaumgarte(checks.Checked, Stabilizer):
         return History(residuals, raised, jnp.where(full, oscillation, memory.damping), seen)
 
 
-def judge(residuals: Array, noise: Array) -> tuple[Array, Array]:
+def trend_and_oscillation(residuals: Array, noise: Array) -> tuple[Array, Array]:
     """Returns the trend τ and the oscillation o of each row over a window, (n_c,) each.
 
     Args:

@@ -48,14 +48,14 @@ class ArrivalSearch:
     Attributes:
         gaps: function of a length s that returns the gaps φ after a part of the step of this
             length, (n,).
-        outlook: forecast of the rows at the start of the part.
+        forecast: forecast of the rows at the start of the part.
         length: the largest length s, ().
         wanted: mask of the worlds to search, ().
         tries: number of evaluations of `gaps` after the first, which is at the end of the part.
     """
 
     gaps: Callable[[Array], Array]
-    outlook: ContactForecast
+    forecast: ContactForecast
     length: Array
     wanted: Array
     tries: int
@@ -70,7 +70,7 @@ class ArrivalSearch:
             going = self.wanted & (first | self._off(bracket))
 
             def narrowed() -> Bracket:
-                gaps = jnp.where(self.outlook.open, self.gaps(bracket.here), jnp.inf)
+                gaps = jnp.where(self.forecast.open, self.gaps(bracket.here), jnp.inf)
                 new = where_tree(first, self._at_end(gaps), self._nearer(bracket, gaps))
                 return where_tree(going, new, bracket)
 
@@ -80,7 +80,7 @@ class ArrivalSearch:
 
     def _off(self, bracket: Bracket) -> Array:
         """Returns True where the smallest gap exceeds the rounding error, ()."""
-        return bracket.happens & (jnp.abs(bracket.gap) > self.outlook.rounding / 16)
+        return bracket.happens & (jnp.abs(bracket.gap) > self.forecast.rounding / 16)
 
     def _at_end(self, ends: Array) -> Bracket:
         """Returns the first bracket, from the gaps at the end of the part, (n,).
@@ -88,11 +88,11 @@ class ArrivalSearch:
         Each row whose gap ends below zero would close at some time if its φ were a parabola in s.
         The estimate is the earliest of these times.
         """
-        arriving, start, rate = self.outlook.arriving, self.outlook.gap, self.outlook.rate
+        arriving, start, rate = self.forecast.arriving, self.forecast.gap, self.forecast.rate
         at_once = jnp.any(arriving, axis=0)
-        happens = at_once | jnp.any(ends < -self.outlook.rounding[None], axis=0)
+        happens = at_once | jnp.any(ends < -self.forecast.rounding[None], axis=0)
         gap, row = nearest(jnp.where(at_once[None], jnp.where(arriving, start, jnp.inf), ends))
-        r, below = self.length[None], self.outlook.open & (ends < 0)
+        r, below = self.length[None], self.forecast.open & (ends < 0)
         half = numerics.safe_divide(jnp.where(below, ends, 0) - start - r * rate, r * r)
         root = numerics.safe_sqrt(rate * rate - 4 * half * start)
         late = numerics.safe_divide(rate + root, -2 * half)

@@ -163,6 +163,9 @@ class RisingBaumgarte(Baumgarte):
 class Wrapper(Stabilizer):
     """A stabilizer around an inner one, to which it forwards all methods that it does not override.
 
+    `completes` is not forwarded: a stabilizer with equations of its own also changes the forces of
+    a step that a projection would complete.
+
     Attributes:
         inner_field: name of the field that has the inner stabilizer.
     """
@@ -223,6 +226,14 @@ class Wrapper(Stabilizer):
         """Returns the stabilizer with (α, β) [1/s] for gains that the inner one does not give."""
         return self.with_inner(self.inner.resolve(gains))
 
+    def rising(self, limit: Scalar) -> Self:
+        """Returns the stabilizer with inner default gains that rise up to β = limit [1/s]."""
+        return self.with_inner(self.inner.rising(limit))
+
+    def steady(self, gains: tuple[Scalar, Scalar]) -> Self:
+        """Returns the stabilizer with inner default gains (α, β) [1/s], which do not rise."""
+        return self.with_inner(self.inner.steady(gains))
+
     def cap_gains(self, stable_rate: Callable[[float], Scalar]) -> Self:
         """Returns the stabilizer with inner rates β of at most stable_rate(smallest α/β) [1/s]."""
         return self.with_inner(self.inner.cap_gains(stable_rate))
@@ -256,9 +267,8 @@ def check_stabilizer(owner: str, what: str, part: Any) -> None:
         ValueError: a number of the stabilizer is out of range.
     """
     if isinstance(part, type) or not hasattr(part, "constraint_equations"):
-        raise TypeError(f"{owner}: {what} must be a stabiliser like Baumgarte(), got {part!r}.")
-    if hasattr(part, "check"):  # a user's stabilizer may have no `check`
-        part.check()
+        raise TypeError(f"{owner}: {what} must be a stabilizer like Baumgarte(), got {part!r}.")
+    part.check()
 
 
 def asks_nothing(stabilizer: Stabilizer) -> bool:

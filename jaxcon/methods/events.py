@@ -242,6 +242,12 @@ class World:
     control: PyTree
     dt: Array
 
+    @property
+    def events(self) -> Events:
+        """The options of the split."""
+        assert self.method.events is not None
+        return self.method.events
+
     def part(self, state: State, part: StepPart) -> Passed:
         """Advances by a part of the step. The memory of the result is that after the whole step."""
         (new, info), code = attempt(self.system, self.method, state, self.control, self.dt, part)
@@ -267,18 +273,18 @@ class World:
         assert dynamics.contact is not None
         return dynamics, dynamics.contact
 
-    def outlook(self, state: State) -> ContactForecast:
+    def forecast(self, state: State) -> ContactForecast:
         """Forecasts the inequality rows from a state on."""
         dynamics, response = self.dynamics(state)
         free = response.without(dynamics, state.q, state.v, state.instant)
-        return forecast(self.rows(state), free, state.q, self.dt, self.method.events.slips)
+        return forecast(self.rows(state), free, state.q, self.dt, self.events.slips)
 
-    def clearances(self, outlook: ContactForecast, passed: Passed) -> Array:
+    def clearances(self, forecast: ContactForecast, passed: Passed) -> Array:
         """Returns the gaps at the end of a part, (n,), then h times the slips, (contacts,)."""
         rows = self.rows(passed.state)
-        if outlook.sliding is None:
+        if forecast.sliding is None:
             return rows.gap
-        slips = outlook.sliding.clearance(rows, passed.impulses.multipliers)
+        slips = forecast.sliding.clearance(rows, passed.impulses.multipliers)
         return jnp.concatenate([rows.gap, self.dt[None] * slips])
 
     def go(
@@ -288,20 +294,20 @@ class World:
         state, active = progress.state, progress.active
         length = jnp.where(active, progress.left, self.dt / 2)  # unused, but valid, if finished
         still, at, most = jax.lax.stop_gradient((self, state, length))
-        outlook, awaited = still.outlook(at), active & awaited
+        forecast, awaited = still.forecast(at), active & awaited
 
         def gaps(s: Array) -> Array:
-            return still.clearances(outlook, still.part(at, StepPart(s, outlook.open, awaited)))
+            return still.clearances(forecast, still.part(at, StepPart(s, forecast.open, awaited)))
 
-        watched, tries = outlook.watched(still.dt), self.method.events.iterations
+        watched, tries = forecast.watched(still.dt), self.events.iterations
         bracket = ArrivalSearch(gaps, watched, most, awaited, tries).run()
-        hit = bracket.happens & (bracket.row < len(outlook.gap))
+        hit = bracket.happens & (bracket.row < len(forecast.gap))
         time = jnp.where(bracket.happens, bracket.here, length)
-        least = outlook.rounding / jnp.where(still.dt > 0, still.dt, 1)
-        given = (self, state, outlook, awaited, bracket.row)
+        least = forecast.rounding / jnp.where(still.dt > 0, still.dt, 1)
+        given = (self, state, forecast, awaited, bracket.row)
         passed, time = Arrival(flow, gap_of)(given, time, bracket.happens, least)
         there = dataclasses.replace(passed.state, memory=state.memory)
-        struck = ImpactSet(outlook, chosen(bracket.row, outlook.open), hit)
+        struck = ImpactSet(forecast, chosen(bracket.row, forecast.open), hit)
         jump, impulses = jax.lax.cond(
             somewhere(hit), strike, no_strike, self, there, struck, progress.direction
         )
@@ -324,14 +330,14 @@ Given = tuple[World, State, ContactForecast, Array, Array]
 
 def flow(given: Given, s: Array) -> Passed:
     """Returns F(x, s), the result of advancing by a part of the step of length s."""
-    world, state, outlook, awaited, _ = given
-    return world.part(state, StepPart(s, outlook.open, awaited))
+    world, state, forecast, awaited, _ = given
+    return world.part(state, StepPart(s, forecast.open, awaited))
 
 
 def gap_of(given: Given, passed: Passed) -> Array:
     """Returns the gap φ of the closing row at the end of a part, ()."""
-    world, _, outlook, _, row = given
-    gaps = world.clearances(outlook, passed)
+    world, _, forecast, _, row = given
+    gaps = world.clearances(forecast, passed)
     return jnp.sum(jnp.where(chosen(row, gaps), gaps, 0), axis=0)
 
 
@@ -356,5 +362,5 @@ def no_strike(
     world: World, state: State, struck: ImpactSet, direction: Array | None
 ) -> tuple[Array, Impulses]:
     """Returns a zero velocity change, (n_v,), and zero impulses, if there is no impact."""
-    none, zero = jnp.zeros_like(struck.outlook.gap), jnp.zeros_like(state.time)
+    none, zero = jnp.zeros_like(struck.forecast.gap), jnp.zeros_like(state.time)
     return jnp.zeros_like(state.v), Impulses(none, zero, zero + 1, direction)

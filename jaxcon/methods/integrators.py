@@ -18,11 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.rows import Rows, linearize
+from jaxcon.contact.rows import rows_beside_contact
 from jaxcon.core import checks, numerics, status
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, Number, PyTree
-from jaxcon.linear.islands import largest_by_island, rows_beside_contact
+from jaxcon.linear.islands import largest_by_island
 from jaxcon.linear.saddle import Solution
 from jaxcon.methods import dormand_prince
 from jaxcon.methods.gains import column
@@ -90,11 +91,9 @@ class SemiImplicitEuler(checks.Checked, Integrator):
         """Advances a state by one step of dt [s]."""
         system, h, here = dynamics.system, dt[None], (state.q, state.v, state.instant)
         if not system.has_bodies:
-            solution, rows = dynamics(*here, dt / 2)
-            v = moving = state.v + h * solution.acceleration
-            if (jump := rows.jump) is not None:
-                moving = v - jump.velocity + numerics.safe_divide(jump.travel, h)
-            return Advanced((system.retract(state.q, h * moving), v, here[2] + dt), solution, rows)
+            solution, rows, *_ = dynamics.solve(dynamics.linearize(*here), *here, dt / 2)
+            v = state.v + h * solution.acceleration
+            return _with_jump(system, state, h * v, v, solution, rows, dt)
         if system.turns_in_space:
             return self._in_space(dynamics, state, dt)
         solution, rows, solve_rows, *_ = dynamics.solve(dynamics.linearize(*here), *here, dt / 2)
@@ -325,8 +324,9 @@ def newton_correction(
         correction = solve_rows(-weight * numerics.safe_divide(error, h * h))
         # rounding errors over h² may contradict redundant rows; the first solve reports conflicts
         code = status.failures(correction.status)
-        change, mass = h * correction.acceleration, system.mass(state.q)
-        energies = [(x * mass.apply(x)).sum(axis=0) for x in (change, v_end)]
+        correction = system.complete(correction)
+        change = h * correction.acceleration
+        energies = [system.kinetic_energy(state.q, x) for x in (change, v_end)]
         fade = smooth(2 - 4 * numerics.safe_divide(*energies))[None]
         if system.turns_in_space:  # J belongs to the start of the step, and bodies turn after it
             change = system.carry(state.q, -h * v_end, change)
@@ -363,6 +363,25 @@ class RungeKutta(checks.Checked, Integrator):
 
     a: tuple[tuple[float, ...], ...] = static()
     b: tuple[float, ...] = static()
+
+    def __post_init__(self) -> None:
+        """Converts the tableau to tuples of numbers, which can be hashed, and checks it.
+
+        Raises:
+            TypeError: an entry is not a number, or is traced.
+            ValueError: a row has the wrong length, or the weights do not add up to 1.
+        """
+        try:
+            a = tuple(tuple(float(x) for x in row) for row in self.a)
+            b = tuple(float(x) for x in self.b)
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                "RungeKutta: a must be rows of numbers and b a row of numbers, got"
+                f" {checks.shortened(self.a)} and {checks.shortened(self.b)}."
+            ) from error
+        object.__setattr__(self, "a", a)
+        object.__setattr__(self, "b", b)
+        super().__post_init__()
 
     def __repr__(self) -> str:
         """Returns the constructor call, such as `RK4()`, with the tableau if it has no name."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +24,13 @@ from jaxcon.methods.baumgarte import Baumgarte
 from jaxcon.methods.choice import brief, choose
 from jaxcon.methods.integrators import SemiImplicitEuler
 from jaxcon.methods.stability import stable_rate
-from jaxcon.protocols import Integrator, Stabilizer, System
+from jaxcon.protocols import ContactSolver, Integrator, Solver, Stabilizer, System
 from jaxcon.step import Dynamics
 from jaxcon.system.state import MethodMemory, State
+
+if TYPE_CHECKING:
+    from jaxcon.methods.events import Events
+    from jaxcon.methods.recovery import Recovery
 
 PARTS = (
     ("integrator", "default_gains", "SemiImplicitEuler()"),
@@ -66,12 +70,12 @@ class Method:
             steps are not split, and impacts are resolved within a step.
     """
 
-    integrator: Any = SemiImplicitEuler()
-    stabilizer: Any = Baumgarte()
-    solver: Any = RankSafe()
-    recovery: Any = None
-    contact_solver: Any = None
-    events: Any = None
+    integrator: Integrator = SemiImplicitEuler()
+    stabilizer: Stabilizer = Baumgarte()
+    solver: Solver = RankSafe()
+    recovery: Recovery | None = None
+    contact_solver: ContactSolver | None = None
+    events: Events | None = None
 
     def __repr__(self) -> str:
         """Returns a table of the fields, each as Python code without default arguments."""
@@ -136,12 +140,9 @@ class Method:
         expected = self._memory_of_parts(system, state.q, state.v)
         given = MethodMemory(*state.memory)
         others = given._replace(contact_multipliers=())
-        wanted = (
-            self.contact_solver is not None and self.contact_solver.warm and bool(system.bounds)
-        )
-        missing = wanted and not given.has_contact_multipliers
-        has_memory = jax.tree.leaves(expected) or jax.tree.leaves(others)
-        if missing or (has_memory and jax.tree.structure(expected) != jax.tree.structure(others)):
+        warm = self.contact_solver is not None and self.contact_solver.warm and bool(system.bounds)
+        missing = warm and not given.has_contact_multipliers
+        if missing or not _same_arrays(expected, others):
             raise ValueError(
                 f"{owner}: the state does not have the memory that this method keeps; start with"
                 " state = jc.init(system, method, state.q, state.v)."
@@ -156,9 +157,18 @@ class Method:
         """
         if self.contact_solver is not None or not system.bounds:
             return self
-        return dataclasses.replace(
-            self, contact_solver=default_contact_solver(system, state.q, state.v)
-        )
+        return dataclasses.replace(self, contact_solver=self.contact_solver_for(system, state))
+
+    def contact_solver_for(self, system: System, state: State) -> ContactSolver:
+        """Returns the contact solver, by default the one that suits the structure of a system.
+
+        Args:
+            system: any system; its leaves may be traced.
+            state: the state of one world, or of a batch along trailing axes.
+        """
+        if self.contact_solver is not None:
+            return self.contact_solver
+        return default_contact_solver(system, state.q, state.v)
 
     def known_at(self, dt: Scalar, dtype: DType) -> Method:
         """Returns the method with the default gains of a known step size, unless they may rise.
@@ -174,7 +184,7 @@ class Method:
         kind = getattr(getattr(dt, "dtype", None), "kind", None)
         number = number or (kind in ("f", "i", "u") and np.shape(dt) == ())
         coarse = jnp.finfo(dtype).bits == 32 and self.integrator.has_rising_gains
-        if not coarse or not number or not checks.is_concrete(dt):
+        if not coarse or not number or not checks.is_concrete((dt, self.integrator)):
             return self
         gains = _steady_gains(self.integrator, float(dt), np.dtype(dtype))
         if gains is None:
@@ -210,13 +220,9 @@ class Method:
             stabilizer = self.recovery.relax(stabilizer, memory.recovery)
         contact = None
         if system.bounds:
-            solver = self.resolve(system, state).contact_solver
-            guess = (
-                memory.contact_multipliers
-                if solver.warm and memory.has_contact_multipliers
-                else None
-            )
-            contact = Response(solver, guess, part)
+            solver = self.contact_solver_for(system, state)
+            is_warm = solver.warm and memory.has_contact_multipliers
+            contact = Response(solver, memory.contact_multipliers if is_warm else None, part)
         return Dynamics(system, stabilizer, self.solver, control, memory.stabilizer, dt, contact)
 
     def check_system(self, system: System) -> None:
@@ -243,7 +249,7 @@ class Method:
                 " RATTLE is"
             )
         if self.recovery is not None:
-            return "a Recovery leads on from states to which no step leads back"
+            return "`Recovery` is not reversible"
         return None
 
     def __post_init__(self) -> None:
@@ -276,9 +282,20 @@ class Method:
         """
         self.__post_init__()
         for name, *_ in PARTS:
-            part = getattr(self, name)
-            if hasattr(part, "check"):  # a user's class may have no `check`
+            if (part := getattr(self, name)) is not None:
                 part.check()
+
+
+def _same_arrays(expected: PyTree, given: PyTree) -> bool:
+    """Returns True if two trees have arrays of the same shapes and dtypes at the same places."""
+    leaves, structure = jax.tree.flatten(expected)
+    others, other_structure = jax.tree.flatten(given)
+    if not leaves and not others:
+        return True  # a part without memory has () or None
+    return structure == other_structure and all(
+        (np.shape(a), jnp.result_type(a)) == (np.shape(b), jnp.result_type(b))
+        for a, b in zip(leaves, others, strict=True)
+    )
 
 
 def check_method(method: Method, wait: bool = True) -> None:

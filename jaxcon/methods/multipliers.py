@@ -126,8 +126,8 @@ class AugmentedLagrangian(checks.Checked, Wrapper):
             due_to_position = target_of(rows.residual) - target_of(jnp.zeros_like(rows.residual))
         if not system.target.size:
             return solver.solve(system)
-        judge = solver if isinstance(solver, RankSafe) else RankSafe(solver)
-        solver = judge.solver  # W makes every round solvable
+        rank_safe = solver if isinstance(solver, RankSafe) else RankSafe(solver)
+        solver = rank_safe.solver  # W makes every round solvable
         # after few rounds, the solution and its derivative still depend on W
         stiffness = finite_or_nan(jnp.asarray(self.stiffness, start.dtype))[None]
         weight = row_weights(system, 1e-6) / stiffness
@@ -149,12 +149,12 @@ class AugmentedLagrangian(checks.Checked, Wrapper):
             return solution
         # CONFLICT if b cannot be met; tested only where the residual is a large part of b
         left, length = remainder(system, system.target, solution), jnp.sqrt(scaled(system, 1e-6))
-        share = OPEN if judge.conflict is None else jnp.minimum(OPEN, judge.conflict)
+        share = OPEN if rank_safe.conflict is None else jnp.minimum(OPEN, rank_safe.conflict)
         code = conflicts(system, system.force, system.target, left, length, share)
         met = code == Status.OK
 
         def tested() -> Array:
-            code = dataclasses.replace(judge, always=True).solve(system).status
+            code = dataclasses.replace(rank_safe, always=True).solve(system).status
             return jnp.where(met | (code != Status.CONFLICT), Status.OK, code).astype(jnp.int32)
 
         code = jax.lax.cond(everywhere(met), lambda: jnp.zeros_like(solution.status), tested)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -13,11 +13,11 @@ from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import Array, PyTree, Scalar
 from jaxcon.execution.step import SolutionAt, forward_dynamics
-from jaxcon.execution.wrenches import wrench_in
 from jaxcon.geometry.pose import Motion
 from jaxcon.linear.proximal import RankSafe
 from jaxcon.methods.baumgarte import Unstabilized
 from jaxcon.methods.method import Method
+from jaxcon.readout.wrenches import wrench_in
 from jaxcon.step import StepInfo, without_memory
 from jaxcon.system import coordinates
 from jaxcon.system.layout import Place
@@ -73,7 +73,7 @@ def position(
         point: a point in the body's frame, (dim,) [m]; by default the origin of the frame.
     """
     motion = _motion(system, state, body, "position")
-    return motion.position if point is None else motion.point(_local(motion, point))
+    return motion.position if point is None else motion.point(_local(motion, point, "position"))
 
 
 def velocity(
@@ -88,7 +88,11 @@ def velocity(
         point: a point in the body's frame, (dim,) [m]; by default the origin of the frame.
     """
     motion = _motion(system, state, body, "velocity")
-    return motion.velocity if point is None else motion.point_velocity(_local(motion, point))
+    return (
+        motion.velocity
+        if point is None
+        else motion.point_velocity(_local(motion, point, "velocity"))
+    )
 
 
 def orientation(system: BodySystem, state: State, body: str) -> Array:
@@ -217,12 +221,12 @@ def _momentum(
     """
     system = checked_system(system, state, f"jc.{caller}(system, s, bodies)")
     if system.layout is None:
-        raise TypeError("momentum: a GeneralizedSystem has no bodies whose momentum could be read.")
+        raise TypeError(f"{caller}: generalized coordinates have no bodies.")
     names = (
         system.layout.bodies if bodies is None else [bodies] if isinstance(bodies, str) else bodies
     )
     if not names or len(set(names)) < len(names):
-        raise ValueError(f"momentum: bodies must be different names, got {list(names)}.")
+        raise ValueError(f"{caller}: bodies must be different names, got {list(names)}.")
     places = [Place(group, (i,)) for group, i in map(system.layout.locate, names)]
     return momentum_of(system.snapshot(state.q, state.v, state.instant), places)
 
@@ -272,12 +276,7 @@ def wrench(
     """
     bodies = _bodies_of(info, system, "wrench", "info, name")
 
-    def of_one(info: StepInfo | SolutionAt) -> Array:
-        return wrench_in(bodies, info, name, body)
-
-    for _ in info.status.shape:
-        of_one = jax.vmap(of_one)
-    return of_one(info)
+    return _over_leading_axes(lambda one: wrench_in(bodies, one, name, body), info)
 
 
 def reaction(
@@ -312,8 +311,8 @@ def reaction(
         ValueError: the element is unknown or does not act on the body.
     """
     method = Method(solver=RankSafe() if solver is None else solver, stabilizer=Unstabilized())
-    found = forward_dynamics(system, without_memory(state), control, method, dt)
-    return wrench(found, name, body)
+    solution = forward_dynamics(system, without_memory(state), control, method, dt)
+    return wrench(solution, name, body)
 
 
 def acceleration(
@@ -328,7 +327,8 @@ def acceleration(
     In scenes with contacts, it is the mean over the step.
 
     Args:
-        info: the info of a step of one world, or the result of `jc.forward_dynamics`.
+        info: the info of a step, or the result of `jc.forward_dynamics`. With `system`, leading
+            batch and time axes are allowed.
         body: name of the body.
         point: a point in the body's frame, (dim,) [m]; by default the origin of the frame.
         system: the system, for an info that JAX has rebuilt; see `jc.wrench`.
@@ -337,20 +337,27 @@ def acceleration(
         ValueError: the body is unknown, or the info needs a system.
         TypeError: `info` has another type, or belongs to a system of generalized coordinates.
     """
-    system = _bodies_of(info, system, "acceleration", "info, body")
-    motion = _motion(system, info.state, body, "acceleration")
-    where = motion.position if point is None else motion.point(_local(motion, point))
-    center = system.principal_motion(body, info.state.q, info.state.v)
-    a = info.acceleration[system.layout.v(body)]
-    dim = system.layout.dim
-    if center.orientation is None:
-        return a
-    arm = where - center.position
-    if dim == 2:
-        ω, α = center.angular_velocity, a[2]
-        return a[:2] + α * jnp.stack([-arm[1], arm[0]]) - ω**2 * arm
-    ω, α = (center.rotation @ x for x in (center.angular_velocity, a[3:]))
-    return a[:3] + jnp.cross(α, arm) + jnp.cross(ω, jnp.cross(ω, arm))
+    bodies = _bodies_of(info, system, "acceleration", "info, body")
+
+    def of_one(info: StepInfo | SolutionAt) -> Array:
+        motion = _motion(bodies, info.state, body, "acceleration")
+        where = (
+            motion.position
+            if point is None
+            else motion.point(_local(motion, point, "acceleration"))
+        )
+        center = bodies.principal_motion(body, info.state.q, info.state.v)
+        a = info.acceleration[bodies.layout.v(body)]
+        if center.orientation is None:
+            return a
+        arm = where - center.position
+        if bodies.layout.dim == 2:
+            ω, α = center.angular_velocity, a[2]
+            return a[:2] + α * jnp.stack([-arm[1], arm[0]]) - ω**2 * arm
+        ω, α = (center.rotation @ x for x in (center.angular_velocity, a[3:]))
+        return a[:3] + jnp.cross(α, arm) + jnp.cross(ω, jnp.cross(ω, arm))
+
+    return _over_leading_axes(of_one, info)
 
 
 def angular_acceleration(
@@ -359,7 +366,8 @@ def angular_acceleration(
     """Returns the angular acceleration of a body [rad/s²]: () in 2D; (3,) in the body frame in 3D.
 
     Args:
-        info: the info of a step of one world, or the result of `jc.forward_dynamics`.
+        info: the info of a step, or the result of `jc.forward_dynamics`. With `system`, leading
+            batch and time axes are allowed.
         body: name of the body.
         system: the system, for an info that JAX has rebuilt; see `jc.wrench`.
 
@@ -367,13 +375,17 @@ def angular_acceleration(
         ValueError: the body is unknown or does not turn, or the info needs a system.
         TypeError: `info` has another type, or belongs to a system of generalized coordinates.
     """
-    system = _bodies_of(info, system, "angular_acceleration", "info, body")
-    motion = _oriented(system, info.state, body, "angular_acceleration")
-    α = info.acceleration[system.layout.v(body)][system.layout.dim :]
-    if system.layout.dim == 2:
-        return α[0]
-    center = system.principal_motion(body, info.state.q, info.state.v)
-    return motion.rotation.T @ (center.rotation @ α)
+    bodies = _bodies_of(info, system, "angular_acceleration", "info, body")
+
+    def of_one(info: StepInfo | SolutionAt) -> Array:
+        motion = _oriented(bodies, info.state, body, "angular_acceleration")
+        α = info.acceleration[bodies.layout.v(body)][bodies.layout.dim :]
+        if bodies.layout.dim == 2:
+            return α[0]
+        center = bodies.principal_motion(body, info.state.q, info.state.v)
+        return motion.rotation.T @ (center.rotation @ α)
+
+    return _over_leading_axes(of_one, info)
 
 
 def multipliers(info: StepInfo | SolutionAt, name: str) -> Array:
@@ -415,8 +427,8 @@ def _bodies_of(
         TypeError: `info` has another type, or the system has no bodies.
     """
     _check_info(info, caller, arguments)
-    known: Any = system
-    if known is None:
+    owner: Any = system
+    if owner is None:
         if info.origin is None:
             raise ValueError(
                 f"{caller}: this info knows no system, since JAX has rebuilt it: jit, vmap, a"
@@ -424,13 +436,22 @@ def _bodies_of(
                 f" jc.{caller}({arguments}, system=system), or record"
                 f" jc.{caller}({arguments}) in the rollout."
             )
-        known = info.origin.system
-    if known.layout is None:
+        owner = info.origin.system
+    if owner.layout is None:
         raise TypeError(
             f"{caller}: generalized coordinates have no bodies; see jc.multipliers and"
             " info.acceleration."
         )
-    return known
+    return owner
+
+
+def _over_leading_axes(
+    read: Callable[[StepInfo | SolutionAt], Array], info: StepInfo | SolutionAt
+) -> Array:
+    """Applies a reader of the info of one world to an info with leading axes."""
+    for _ in info.status.shape:
+        read = jax.vmap(read)
+    return read(info)
 
 
 def _check_info(info: StepInfo | SolutionAt, caller: str, arguments: str) -> None:
@@ -450,20 +471,25 @@ def _row(system: BodySystem, state: State, joint: str, name: str | None, caller:
     """Evaluates a joint coordinate. Returns its value and rate; arguments as in `coordinate`."""
     system = checked_system(system, state, f"jc.{caller}(system, s, joint)")
     where = coordinates.directory(system.constraints)
-    end = coordinates.find(system.constraints, where, "coordinate", joint, name)
-    along = coordinates.at(coordinates.numbered(system.counted), [end])
-    return along.read(system.snapshot(state.q, state.v, state.instant))
+    end = coordinates.find(system.constraints, where, caller, joint, name)
+    joint_coordinate = coordinates.at(coordinates.numbered(system.counted), [end])
+    return joint_coordinate.read(system.snapshot(state.q, state.v, state.instant))
 
 
-def _local(motion: Motion, point: Scalar | Sequence[float]) -> Array:
+def _local(motion: Motion, point: Scalar | Sequence[float], caller: str) -> Array:
     """Converts a point in a body's frame to an array (dim,) of the motion's dtype, after checks."""
-    dtype, shape = motion.position.dtype, motion.position.shape
-    return checks.real("position or velocity", "point", point, dtype, shape)
+    return checks.real(caller, "point", point, motion.position.dtype, motion.position.shape)
 
 
 def _motion(system: BodySystem, state: State, body: str, caller: str) -> Motion:
-    """Returns the motion of a body's frame. Error messages name the public function `caller`."""
+    """Returns the motion of a body's frame. Error messages name the public function `caller`.
+
+    Raises:
+        TypeError: the system has generalized coordinates, hence no bodies.
+    """
     system = checked_system(system, state, f"jc.{caller}(system, s, body)")
+    if not system.has_bodies:
+        raise TypeError(f"{caller}: generalized coordinates have no bodies; see state.q.")
     return system.motion(body, state.q, state.v)
 
 

@@ -7,8 +7,9 @@ along l, as lanes (element, …). The force along θ is g times as large.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -43,26 +44,38 @@ class JointForce(OnJoint):
 
     name: str
     joint: str
+    ranges = MappingProxyType(dict.fromkeys(("stiffness", "damping"), checks.NumberRange(least=0)))
 
     def attach(self, dtype: DType) -> dict[str, Array]:
-        """Returns the checked numbers of the element by field, without ranges that are None.
+        """Returns the numbers of the element by field, without ranges that are None.
 
         Raises:
-            ValueError: a wrong shape, a negative stiffness or damping, or a range whose lower end
-                is above its upper end.
+            ValueError: a wrong shape, or a number that is not finite.
         """
-        owner, params = label(self), {}
-        for field, x in vars(self).items():
-            if field in SHAPES and not (x is None and field.endswith("range")):
-                limit: checks.NumberRange = (
-                    {"least": 0} if field in ("stiffness", "damping") else {}
+        return {
+            field: checks.real(label(self), field, x, dtype, SHAPES[field])
+            for field, x in vars(self).items()
+            if field in SHAPES and not (x is None and field.endswith("range"))
+        }
+
+    @classmethod
+    def check_numbers(cls, owner: str, numbers: Mapping[str, Any]) -> None:
+        """Checks that stiffness and damping are not negative, and the order of ranges.
+
+        Args:
+            owner: first words of errors.
+            numbers: the numbers by field.
+
+        Raises:
+            ValueError: a number is negative, or the lower end of a range is above its upper end.
+        """
+        super().check_numbers(owner, numbers)
+        for field in ("control_range", "force_range"):
+            x = numbers.get(field)
+            if x is not None and checks.is_concrete(x) and not x[0] <= x[1]:
+                raise ValueError(
+                    f"{owner}: {field} must be (lowest, highest), got {checks.numerals(x)}."
                 )
-                params[field] = x = checks.real(owner, field, x, dtype, SHAPES[field], **limit)
-                if field.endswith("range") and checks.is_concrete(x) and not x[0] <= x[1]:
-                    raise ValueError(
-                        f"{owner}: {field} must be (lowest, highest), got {checks.numerals(x)}."
-                    )
-        return params
 
 
 @dataclass(frozen=True)

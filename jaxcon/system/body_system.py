@@ -69,14 +69,13 @@ class Snapshot:
         q: positions, (n_q,).
         v: velocities, (n_v,).
         instant: the time and its rounding error [s].
-        joint_rows: cached rows of joint coordinates: for each (group, joints), the rows by
-            coordinate name.
     """
 
     def __init__(self, system: System, q: Array, v: Array, instant: Doubled | Scalar) -> None:
         # Any, since elements on bodies use attributes that the protocol `System` lacks
         self.system: Any = system
         self.q, self.v, self.instant = q, v, instant
+        # rows of joint coordinates that were read: for each (group, joints), by coordinate name
         self.joint_rows: dict[Any, dict[str, Any]] = {}
 
     @property
@@ -99,7 +98,11 @@ class Snapshot:
         return tuple(frames)
 
     def motion(self, name: str) -> Motion:
-        """Returns the motion of a body's user frame, as arrays."""
+        """Returns the motion of a body's user frame, as arrays.
+
+        Args:
+            name: name of the body.
+        """
         return self.system.motion(name, self.q, self.v)
 
     def map(self, function: Callable[[Array], Array]) -> Snapshot:
@@ -107,7 +110,11 @@ class Snapshot:
         return Snapshot(*jax.tree.map(function, (self.system, self.q, self.v, self.instant)))
 
     def frame(self, place: Place) -> Any:
-        """Returns the `BodyFrame` of the bodies that a `Place` names, or of the world."""
+        """Returns the `BodyFrame` of bodies, or of the world.
+
+        Args:
+            place: the group and the indices of the bodies.
+        """
         if place.group is None:
             return WorldFrame(self.system.layout.dim)
         return self.frames[place.group].gather(place.take)
@@ -491,6 +498,9 @@ class BodySystem:
         v = jnp.zeros((self.n_v, *q.shape[1:]), q.dtype)
         return joined([x for g in self.layout.groups for x in g.kind.normalize(g.unpack(q, v)[0])])
 
+    def check(self, q: Array) -> None:
+        """Checks nothing: the numbers of bodies do not depend on q."""
+
     def columns(self, place: Place) -> Columns:
         """Returns the indices in v, as columns of J, of the bodies that a `Place` names."""
         if place.group is None:
@@ -516,6 +526,10 @@ class BodySystem:
             x = x + jnp.asarray((0, 0, 2 * jnp.pi), x.dtype) * self.laps[index]
         return kind.motion(x, v[self.layout.v(name)])
 
+    def kinetic_energy(self, q: Array, v: Array) -> Array:
+        """Returns ½ vᵀMv, () [J], without rotors."""
+        return (v * self.mass(q).apply(v)).sum(axis=0) / 2
+
     def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:
         """Returns the energy [J]: kinetic ½ vᵀMv, and potential of gravity and springs.
 
@@ -528,7 +542,7 @@ class BodySystem:
             potential = potential - jnp.sum(properties.mass * height)
         stored = total(jnp.sum(x) for f in self.forces for x in f.potential(snapshot))
         rotors = (c for c in self.constraints if c.is_inertia)
-        kinetic = jnp.sum(self.mass(q).values * v * v) / 2
+        kinetic = self.kinetic_energy(q, v)
         kinetic = kinetic + total(jnp.sum(c.kinetic(snapshot)) for c in rotors)
         return Energy(kinetic, potential + stored)
 

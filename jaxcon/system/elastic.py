@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
@@ -41,6 +43,13 @@ class Bending(ForceElement):
     point_a: Any = None
     point_b: Any = None
     point_c: Any = None
+    ranges = MappingProxyType(
+        {
+            "stiffness": checks.NumberRange(least=0),
+            "before": checks.NumberRange(above=0),
+            "after": checks.NumberRange(above=0),
+        }
+    )
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -56,7 +65,7 @@ class Bending(ForceElement):
         )
         checks.nonzero(owner, "point_b − point_a", middle - first)
         checks.nonzero(owner, "point_c − point_b", last - middle)
-        stiffness = checks.real(owner, "stiffness", self.stiffness, a.position.dtype, least=0)
+        stiffness = checks.real(owner, "stiffness", self.stiffness, a.position.dtype)
         return {
             "anchor_a": a.local_point(first),
             "anchor_b": b.local_point(middle),
@@ -127,6 +136,7 @@ class Flexure(ForceElement):
     twisting: Any = 0.0
     straight: bool = False
     by_principal_axes = True
+    ranges = MappingProxyType(dict.fromkeys(("bending", "twisting"), checks.NumberRange(least=0)))
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -137,21 +147,16 @@ class Flexure(ForceElement):
         """Returns the stiffnesses, and the directions of the second body when the joint is relaxed.
 
         Raises:
-            ValueError: a body is a particle, or a stiffness is out of range.
+            ValueError: a body is a particle.
         """
         owner, dtype = f"Flexure '{self.name}'", a.position.dtype
         for name, pose in zip(self.bodies, (a, b), strict=True):
             if pose.orientation is None:
                 raise ValueError(f"{owner}: '{name}' is a particle: it has no orientation.")
         checks.flag(owner, "straight", self.straight)
-        bending = checks.real(owner, "bending", self.bending, dtype, least=0)
-        twisting = checks.real(owner, "twisting", self.twisting, dtype, least=0)
+        bending = checks.real(owner, "bending", self.bending, dtype)
+        twisting = checks.real(owner, "twisting", self.twisting, dtype)
         dim = a.position.shape[0]
-        if checks.is_concrete((bending, twisting)) and float(twisting) > 2 * float(bending):
-            raise ValueError(
-                f"{owner}: twisting must be at most twice bending, got {float(twisting):g} and"
-                f" {float(bending):g}: beyond that the straight joint is unstable at large turns."
-            )
         params = {"bending": bending}
         if dim == 3:
             params["twisting"] = twisting
@@ -161,6 +166,25 @@ class Flexure(ForceElement):
                 f"relaxed_{i}": b.local_direction(a.direction(x)) for i, x in enumerate(directions)
             }
         return params
+
+    @classmethod
+    def check_numbers(cls, owner: str, numbers: Mapping[str, Any]) -> None:
+        """Checks that both stiffnesses are not negative, and that k_t ≤ 2 k_b.
+
+        Args:
+            owner: first words of errors.
+            numbers: the numbers by field; in the plane there is no twisting.
+
+        Raises:
+            ValueError: a stiffness is out of range.
+        """
+        super().check_numbers(owner, numbers)
+        bending, twisting = numbers["bending"], numbers.get("twisting", 0.0)
+        if checks.is_concrete((bending, twisting)) and float(twisting) > 2 * float(bending):
+            raise ValueError(
+                f"{owner}: twisting must be at most twice bending, got {float(twisting):g} and"
+                f" {float(bending):g}: beyond that the straight joint is unstable at large turns."
+            )
 
     @staticmethod
     def forces(p: dict[str, Any], a: BodyFrame, b: BodyFrame) -> tuple[Vector, Vector]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self, TypeAlias
 
 import jax
@@ -59,11 +60,35 @@ class Element:
     """The fields that may be infinite, such as the limit of a joint without a stop."""
     optional: ClassVar[tuple[str, ...]] = ()
     """The fields that remove rows if they are the Python number 0, such as a contact's friction."""
+    ranges: ClassVar[Mapping[str, checks.NumberRange]] = MappingProxyType({})
+    """The valid ranges of numbers by field."""
+    nonzero: ClassVar[tuple[str, ...]] = ()
+    """The fields that must not be zero."""
 
     @property
     def kind(self) -> Any:
         """A hashable value by which elements are grouped: the class, unless overridden."""
         return type(self)
+
+    @classmethod
+    def check_numbers(cls, owner: str, numbers: Mapping[str, Any]) -> None:
+        """Checks the ranges of an element's numbers; skips traced values and fields that are None.
+
+        `build` calls it with the fields that the user gave, and `with_params` with changed numbers.
+
+        Args:
+            owner: first words of errors.
+            numbers: the numbers by field; other fields are ignored.
+
+        Raises:
+            ValueError: a number is out of range.
+        """
+        for field, limits in cls.ranges.items():
+            if numbers.get(field) is not None:
+                checks.check(owner, field, numbers[field], **limits)
+        for field in cls.nonzero:
+            if numbers.get(field) is not None:
+                checks.nonzero(owner, field, numbers[field])
 
 
 class BetweenBodies(Element):
@@ -162,7 +187,8 @@ class Elements:
         return dataclasses.replace(self, params=params)
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
-        """Checks the changed numbers of an element, by field; accepts all by default."""
+        """Checks the changed numbers of an element, by field, as its class does."""
+        self.law.check_numbers(name, numbers)
 
     def select(self, indices: tuple[int, ...]) -> Self:
         """Returns the elements with the given indices."""

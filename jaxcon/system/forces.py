@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -19,7 +20,14 @@ from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane, PyTree
 from jaxcon.geometry.pose import Pose
 from jaxcon.staging.worlds import per_world
-from jaxcon.system.elements import BetweenBodies, Element, Elements, UserElement, own_point
+from jaxcon.system.elements import (
+    BetweenBodies,
+    Element,
+    Elements,
+    UserElement,
+    label,
+    own_point,
+)
 from jaxcon.system.frames import BodyFrame
 from jaxcon.system.layout import Place
 
@@ -73,20 +81,23 @@ class Spring(ForceElement):
     rest_length: Any = None
     point_a: Any = None
     point_b: Any = None
+    ranges = MappingProxyType(
+        dict.fromkeys(("stiffness", "damping", "rest_length"), checks.NumberRange(least=0))
+    )
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the numbers of the element, with anchors in body frames."""
         dtype = a.position.dtype
         start = own_point(self, "point_a", self.point_a, a)
         end = own_point(self, "point_b", self.point_b, b)
-        owner = f"spring '{self.name}'"
+        owner = label(self)
         length = numerics.norm(end - start) if self.rest_length is None else self.rest_length
         return {
             "anchor_a": a.local_point(start),
             "anchor_b": b.local_point(end),
-            "stiffness": checks.real(owner, "stiffness", self.stiffness, dtype, least=0),
-            "damping": checks.real(owner, "damping", self.damping, dtype, least=0),
-            "rest_length": checks.real(owner, "rest_length", length, dtype, least=0),
+            "stiffness": checks.real(owner, "stiffness", self.stiffness, dtype),
+            "damping": checks.real(owner, "damping", self.damping, dtype),
+            "rest_length": checks.real(owner, "rest_length", length, dtype),
         }
 
     @staticmethod

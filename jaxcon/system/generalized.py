@@ -76,6 +76,9 @@ class GeneralizedCoordinates:
         """Returns the system at one instant, as a `Snapshot`."""
         return Snapshot(dataclasses.replace(self, size=v.shape[0]), q, v, t)
 
+    forces = ()
+    """Empty: forces are the user's function."""
+
     turns = counted = ()
     """Empty: generalized coordinates include whole turns."""
 
@@ -195,10 +198,21 @@ class GeneralizedCoordinates:
         return Columns(0, self.n_v, 1, place.indices)
 
     def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:
-        """Returns the kinetic energy ½ vᵀMv, and the user's potential(q, t, θ) or zero [J]."""
+        """Returns the kinetic energy ½ vᵀMv, and the user's potential(q, t, θ) or zero [J].
+
+        Raises:
+            ValueError: the user's function returns another shape.
+        """
         potential = jnp.zeros((), q.dtype)
         if self.potential is not None:
-            potential = self.potential(q, rounded(t), self.params)
+            potential = functions.call(
+                OWNER, "potential", self.potential, q, rounded(t), self.params
+            )
+            potential = functions.array(OWNER, "potential", potential)
+            if potential.shape != ():
+                raise ValueError(
+                    f"GeneralizedSystem: potential must return (), got {potential.shape}."
+                )
         return Energy(v @ self.mass(q).apply(v) / 2, potential)
 
     def with_params(self, params: PyTree) -> Self:

@@ -22,7 +22,7 @@ import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
-from jaxcon.core.typing import Array, Scalar
+from jaxcon.core.typing import Array, PyTree, Scalar
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.inertia import Inertia
 from jaxcon.geometry.pose import Pose
@@ -179,8 +179,13 @@ def restate(state: State, before: BodySystem, after: BodySystem) -> State:
 
     Returns:
         The state of `after`. The method's memory depends on the old frames, so only the multipliers
-        of inequality constraints are kept. For a method with other memory, pass the result s to
-        `jc.init(after, method, s.q, s.v, s.time, s.turns)`.
+        of inequality constraints are kept if frames changed. For a method with other memory, pass
+        the result s to `jc.init(after, method, s.q, s.v, s.time, s.turns)`.
+
+        Concrete frames are compared by values. Traced frames count as changed unless both systems
+        contain the same arrays. A function under `jit` therefore keeps the memory if it takes one
+        system and changes that with `with_params`. If it takes both systems as arguments, q and v
+        are right, but the memory is dropped if a body has a center or axes of its own.
 
     Raises:
         TypeError, ValueError: the state does not belong to `before`, or the systems differ in more
@@ -190,7 +195,11 @@ def restate(state: State, before: BodySystem, after: BodySystem) -> State:
     if getattr(after, "layout", None) != before.layout:
         raise ValueError("restate: the systems must have the same bodies in the same order.")
     q, v, offsets, memory = state.q, state.v, before.offsets, state.memory
-    others = [n for n in offsets | after.offsets if offsets.get(n) is not after.offsets.get(n)]
+    others = [
+        name
+        for name in offsets | after.offsets
+        if not _same_tree(offsets.get(name), after.offsets.get(name))
+    ]
     for name in others:
         group = before.layout.groups[before.layout.locate(name)[0]]
         offset = after.offsets.get(name)
@@ -253,6 +262,14 @@ def _identity(moments: Array) -> Pose:
 def _same(x: Scalar, y: Scalar) -> bool:
     """Returns True if two arrays are concrete and equal."""
     return checks.is_concrete((x, y)) and np.array_equal(x, y)
+
+
+def _same_tree(x: PyTree, y: PyTree) -> bool:
+    """Returns True if two trees have the same structure, and arrays that are identical or equal."""
+    if jax.tree.structure(x) != jax.tree.structure(y):
+        return False
+    pairs = zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True)
+    return all(a is b or _same(a, b) for a, b in pairs)
 
 
 def _side(place: Place, shifts: Mapping[str, Pose], layout: Layout) -> Shift | None:

@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="BodySystem")
 
-POSITIVE = {"inertia", "length"}
-NOT_NEGATIVE = {"stiffness", "damping", "rest_length"}
-"""The fields of elements whose concrete values must be positive, or not negative."""
-
 
 def read(system: BodySystem, only: Collection[str] | None = None) -> dict[str, Any]:
     """Returns the numbers of a system by name: `gravity`, and the fields of bodies and elements.
@@ -109,7 +105,7 @@ def _body(system: BodySystem, name: str) -> tuple[dict[str, Any], Pose | None]:
 
 
 def _check(system: BodySystem, known: Mapping[str, Any], name: str, fields: PyTree) -> None:
-    """Checks a change of one name: that name and fields exist, and that values are in range.
+    """Checks that a changed name and its fields exist.
 
     Args:
         system: the system.
@@ -118,7 +114,7 @@ def _check(system: BodySystem, known: Mapping[str, Any], name: str, fields: PyTr
         fields: new values by field.
 
     Raises:
-        ValueError: an unknown name or field, or a value out of range.
+        ValueError: an unknown name or field.
     """
     if name in system.fixed:
         raise ValueError(f"with_params: '{name}' is fixed to the world and has no numbers.")
@@ -135,9 +131,3 @@ def _check(system: BodySystem, known: Mapping[str, Any], name: str, fields: PyTr
         owners = (group for group in system.bounds if name in group.names)
         why = "".join(group.missing_field_hint(unknown) for group in owners)
         raise ValueError(f"'{name}' has no {sorted(unknown)}, it has {sorted(known[name])}.{why}")
-    if name in system.layout.places:
-        return
-    for field in fields.keys() & POSITIVE | fields.keys() & NOT_NEGATIVE:
-        shape, dtype = known[name][field].shape, system.gravity.dtype
-        limit = checks.NumberRange(above=0) if field in POSITIVE else checks.NumberRange(least=0)
-        checks.real(f"with_params: '{name}'", field, fields[field], dtype, shape, **limit)

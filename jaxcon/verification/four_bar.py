@@ -132,8 +132,8 @@ def four_bar() -> list[Check]:
     turn = 2 * np.arctan2(solid[:, 6], solid[:, 3])
     return [
         *checks,
-        Check(case, "centres of mass, angles − plane [m]", error(middle, flat[:, :2]), 1e-9),
-        Check(case, "centres of mass, space − plane [m]", error(solid[:, :2], flat[:, :2]), 1e-9),
+        Check(case, "centers of mass, angles − plane [m]", error(middle, flat[:, :2]), 1e-9),
+        Check(case, "centers of mass, space − plane [m]", error(solid[:, :2], flat[:, :2]), 1e-9),
         Check(case, "angles, angles − plane [rad]", error(angles, flat[:, 2]), 1e-9),
         Check(case, "angles, space − plane [rad]", turned(turn, flat[:, 2]), 1e-9),
         Check(case, "out of the plane [m]", error(solid[:, 2], np.zeros((10, 3))), 1e-9),

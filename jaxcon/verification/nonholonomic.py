@@ -63,7 +63,7 @@ def chaplygin_sleigh() -> list[Check]:
     energy = v**2 @ [p["m"], p["m"], p["I_com"]] / 2
     force = multipliers(system, states, "blade")[:, 0]
     results = {
-        "centre of mass to 5 s [m]": (q[:, :2], "com"),
+        "center of mass to 5 s [m]": (q[:, :2], "com"),
         "blade [m]": (q[:, :2] - p["a"] * along, "blade"),
         "θ [rad]": (q[:, 2], "theta"),
         "forward speed u [m/s]": (np.sum(along * v[:, :2], -1), "u"),

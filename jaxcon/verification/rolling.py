@@ -80,7 +80,7 @@ def rolling_disc() -> list[Check]:
         expected = [force[key] for key in ("along_heading", "lateral", "vertical")]
         contact = jc.wrench(solution, "roll", system=system)[:3]
         checks += [
-            Check(case, f"{name} turn: centre to 1 s [m]", error(states.q[:, :3], circle), 1e-8),
+            Check(case, f"{name} turn: center to 1 s [m]", error(states.q[:, :3], circle), 1e-8),
             Check(case, f"{name} turn: radius of the path [m]", float(radius), 1e-12),
             Check(case, f"{name} turn: force of the contact [N]", error(contact, expected), 1e-8),
         ]
@@ -109,7 +109,7 @@ def rolling_coin() -> list[Check]:
     contact = center - p["r"] * arm / np.linalg.norm(arm, axis=1, keepdims=True)
     deviation = abs(contact[-1, 0] - data["exudyn_value"]["contact_x_at_0p5"])
     return [
-        Check(case, "centre to 0.5 s [m]", error(center, column(rows, "centre")), 1e-8),
+        Check(case, "center to 0.5 s [m]", error(center, column(rows, "centre")), 1e-8),
         Check(case, "contact [m]", error(contact[:, :2], column(rows, "contact_xy")), 1e-8),
         Check(case, "contact x at 0.5 s against EXUDYN [m]", float(deviation), 1e-6),
     ]

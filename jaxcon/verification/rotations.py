@@ -112,7 +112,7 @@ def steady_top() -> list[Check]:
         circle = [np.sin(tilt) * f(rate * times) for f in (np.cos, np.sin)]
         expected = p["l"] * np.stack([*circle, np.full(4, np.cos(tilt))], -1)
         deviation = error(states.q[:, :3], expected)
-        checks.append(Check("steady_top", f"{name}: centre of mass to 1 s [m]", deviation, 1e-8))
+        checks.append(Check("steady_top", f"{name}: center of mass to 1 s [m]", deviation, 1e-8))
     return checks
 
 
@@ -138,7 +138,7 @@ def heavy_top() -> list[Check]:
     force = multipliers(system, states, "pivot")  # on the top, world frame
     forces = column(rows, "joint_force_on_body")
     return [
-        Check(case, "centre of mass to 2 s [m]", error(states.q[:, :3], column(rows, "com")), 1e-8),
+        Check(case, "center of mass to 2 s [m]", error(states.q[:, :3], column(rows, "com")), 1e-8),
         Check(case, "orientation", up_to_sign(states.q[:, 3:], column(rows, "quat")), 1e-8),
         Check(case, "ω [rad/s]", error(states.v[:, 3:], column(rows, "omega_body")), 1e-8),
         Check(case, "force of the joint [N]", error(force, forces), 1e-6),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     from jaxcon.constraints.rows import RowLayout
     from jaxcon.contact.rows import BoundSet, Reactions
     from jaxcon.execution.step import SolutionAt
-    from jaxcon.protocols import Constraint, System
+    from jaxcon.protocols import Constraint
     from jaxcon.step import StepInfo
     from jaxcon.system.body_system import BodySystem, Snapshot
 
@@ -40,21 +39,6 @@ Pull = tuple[Place, Vector]
 
 KINDS = ("constraints", "bounds", "forces")
 """The fields of a system that hold groups of elements."""
-
-
-@dataclass(frozen=True, eq=False)
-class Origin:
-    """The system of an info, which `jc.wrench` needs.
-
-    It is no pytree: what JAX returns from a transformation does not have it, so that a step whose
-    wrenches nobody reads neither computes nor carries anything for them.
-    """
-
-    system: System
-
-    def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
-        """Leaves the system out of a pickled info, as out of one that JAX rebuilds."""
-        return _nothing, ()
 
 
 def wrench_in(
@@ -95,10 +79,6 @@ def wrench_in(
     given = (system, info.state, info.control, info.multipliers, info.reactions, info.status)
     blocks = batch_last.call(read, *given)
     return sign * total(blocks[i][:, element] for i in acting)
-
-
-def _nothing() -> None:
-    """Returns None, in place of a pickled origin."""
 
 
 def _sides(group: Any, layout: Layout) -> list[tuple[str, ...]]:
