@@ -273,7 +273,7 @@ class Bodies(System, Protocol):
     """A system of bodies; integrators advance the rotations in space separately from the rest."""
 
     def kinetic_energy(self, q: Array, v: Array) -> Array:
-        """½ vᵀMv of the bodies without rotors, () [J]."""
+        """The kinetic energy ½ vᵀMv, without that of rotors, () [J]."""
         ...
 
     def kick(
@@ -329,7 +329,8 @@ class Stabilizer(TreeNode, Protocol):
         super().__init_subclass__(**options)
         renamed = {"target": "constraint_equations", "impose": "constraint_equations"}
         for old, new in (renamed | {"bounded": "cap_gains"}).items():
-            if callable(vars(cls).get(old)) and new not in vars(cls):
+            inherited = any(old in vars(base) for base in cls.__mro__[1:])  # its caller, too
+            if callable(vars(cls).get(old)) and new not in vars(cls) and not inherited:
                 raise TypeError(
                     f"{cls.__name__}: the method `{old}` of stabilizers is `{new}` since version"
                     " 0.2; see jc.extend.Stabilizer for its arguments."
@@ -344,7 +345,9 @@ class Stabilizer(TreeNode, Protocol):
 
     @abstractmethod
     def constraint_equations(self, rows: Rows, memory: Any, dt: Array) -> Rows:
-        """The rows with their target b; fields of `Rows` for C and f where those change.
+        """The rows with their target b, as `rows.with_target(b)` returns them.
+
+        To change C or f, also set the fields `compliance` or `force` of the rows.
 
         Args:
             rows: φ, φ̇, J, γ at one instant, with φ̇ as feedback sees it.
@@ -352,8 +355,6 @@ class Stabilizer(TreeNode, Protocol):
                 the step.
             dt: h, () [s].
 
-        Returns:
-            The rows, most often `rows.with_target(b)`.
         """
         ...
 

@@ -58,8 +58,8 @@ if TYPE_CHECKING:
 class Origin:
     """The system of an info, which `jc.wrench` needs.
 
-    It is no pytree: what JAX returns from a transformation does not have it, so that a step whose
-    wrenches nobody reads neither computes nor carries anything for them.
+    It is not a pytree, so JAX transformations drop it. Steps therefore carry nothing for wrenches
+    that are not read.
     """
 
     system: System
@@ -81,7 +81,7 @@ class StepInfo(Stacked):
 
     Attributes:
         acceleration: a, (n_v,) [m/s², rad/s²].
-        multipliers: λ, (n_c,) [N, N m], in the unit that does work with the unit of φ.
+        multipliers: λ, (n_c,), in units of work per unit of φ [N, N m].
         violation: φ [m, rad] and φ̇ [m/s, rad/s] by constraint, at the start of the step.
         status: of this step, or what stopped the world before, ().
         reactions: forces of limits, friction and contact; None in a scene without.
@@ -178,8 +178,9 @@ def step(
     # 8: report
     reactions = rows.reactions
     if state.memory:
-        warm = reactions if memory.has_contact_multipliers else None
-        contact_λ = () if warm is None else warm.multipliers
+        contact_λ = memory.contact_multipliers
+        if reactions is not None and memory.has_contact_multipliers:
+            contact_λ = reactions.multipliers
         parts = MethodMemory(advanced.memory, remembered, memory.recovery, contact_λ)
         new = dataclasses.replace(new, memory=parts)
     finite = jnp.where(is_finite(new), Status.OK, Status.NON_FINITE).astype(jnp.int32)
@@ -317,8 +318,8 @@ class Solved(NamedTuple):
     Attributes:
         solution: a and λ.
         rows: the constraints there, with the reactions of inequality rows.
-        solve_rows: b → the least a, in the metric of M, with J a + C λ = b, by the factors of the
-            step, before `System.complete`; None where the stabilizer has a method of its own.
+        solve_rows: b → the least a, in the metric of M, with J a + C λ = b. Uses the factors of the
+            step. Does not call `System.complete`. None if the stabilizer has its own `solve`.
         one_sided_force: of limits and contacts, (n_v,); None without inequality rows.
         contact_force: of all inequality rows, (n_v,); None without.
     """

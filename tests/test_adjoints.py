@@ -292,3 +292,20 @@ def test_a_budget_takes_as_few_levels_as_it_can():
 def test_what_is_no_adjoint_is_refused(adjoint, error, match):
     with pytest.raises(error, match=match):
         jc.rollout(SYSTEM, METHOD, STATE, jnp.zeros((6, 2)), DT, 6, adjoint=adjoint)
+
+
+def test_the_numbers_of_an_adjoint_of_a_user_are_checked():
+    class Own(jc.extend.Adjoint):
+        def check(self):
+            raise ValueError("Own: its number is wrong")
+
+        def scan(self, path):
+            return path.scan()
+
+        def kept(self, steps, state):
+            return (steps,)
+
+    system, state = pushed()
+    for adjoint in (Own(), jc.adjoints.Truncated(5, within=Own())):
+        with pytest.raises(ValueError, match="Own: its number is wrong"):
+            jc.rollout(system, jc.Method(), state, None, 1e-3, 2, adjoint=adjoint)

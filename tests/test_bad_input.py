@@ -570,7 +570,18 @@ def gains(x):
     return jc.Method(stabilizer=jc.Baumgarte(x, x))
 
 
+class Bare:
+    """A solver that does not derive from the protocol."""
+
+    def factor(self, system):
+        return jc.solvers.Schur().factor(system)
+
+
 STEPS = {
+    "a solver without the base of solvers": (
+        lambda: jc.Method(solver=Bare()),
+        ["Method: solver: Bare must derive from jc.extend.Solver"],
+    ),
     "control of wrong length": (
         lambda: stepping(control=jnp.zeros(2)),
         ["control", r"\(3,\)", r"\(2,\)", "push"],

@@ -736,3 +736,32 @@ def test_bad_numbers_are_refused(element, match):
     scene.add(element)
     with pytest.raises(ValueError, match=match):
         scene.build()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_capsules_whose_axes_cross_part_along_the_normal_of_both(dim, dtype):
+    """The computed closest points differ by rounding, whose direction must not be the normal.
+
+    In the plane the normal is that of the longer axis, the second.
+    """
+    first = np.array([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
+    second = np.array([[0.3, -0.37, 0.0], [0.31, 0.77, 0.0]])
+    scene = jc.Scene(dim=dim, dtype=dtype, gravity=np.zeros(dim))
+    inertia = 0.1 if dim == 2 else (0.1, 0.1, 0.1)
+    scene.add_body("body", mass=1.0, inertia=inertia, position=second.mean(axis=0)[:dim])
+    ends = {"segment_a": first[:, :dim], "segment_b": second[:, :dim]}
+    touch = jc.contacts.CapsuleContact(
+        "touch", jc.WORLD, "body", radius_a=0.01, radius_b=0.01, recovery=0.05, **ends
+    )
+    scene.add(touch)
+    system, state = scene.build()
+    end, _ = jc.step(system, jc.Method(), state, None, 1e-2)
+    along = np.asarray(end.v[:dim] / np.linalg.norm(end.v[:dim]))
+    axis = np.diff(second[:, :dim], axis=0)[0] / np.linalg.norm(np.diff(second, axis=0))
+    assert end.status == jc.Status.OK
+    assert np.linalg.norm(end.v[:dim]) > 1e-2
+    if dim == 3:
+        np.testing.assert_allclose(abs(along), [0.0, 0.0, 1.0], atol=1e-5)
+    else:
+        assert abs(along @ axis) < 1e-5

@@ -434,3 +434,27 @@ def test_forward_dynamics_of_a_singular_world_does_not_spoil_the_gradient_of_the
     slope, status = jax.grad(tension, has_aux=True)(2.0)
     np.testing.assert_array_equal(status, [jc.Status.OK, jc.Status.SINGULAR])
     np.testing.assert_allclose(slope, -9.81, rtol=1e-12)
+
+
+def test_a_state_with_multipliers_of_contacts_is_stepped_without_contacts():
+    """Rows of contacts have none in a scene without them, and the wrong number in another."""
+
+    def built(floors):
+        scene = jc.Scene(dim=2)
+        scene.add_particle("ball", mass=1.0, position=(0.0, 0.1))
+        for i in range(floors):
+            scene.add(jc.PlaneContact(f"floor_{i}", jc.WORLD, "ball", radius=0.1))
+        return scene.build()
+
+    method = jc.Method(contact_solver=jc.solvers.GaussSeidel())
+    system, state = built(1)
+    begun = jc.init(system, method, state.q, state.v)
+    bare, _ = built(0)
+    for end in (
+        jc.step(bare, method, begun, None, 1e-2)[0],
+        jc.rollout(bare, method, begun, None, 1e-2, 1)[0],
+    ):
+        np.testing.assert_allclose(end.v, [0.0, -0.0981], rtol=1e-12)
+        assert end.memory.contact_multipliers.shape == (1,)
+    with pytest.raises(ValueError, match="multipliers of 1 inequality rows, but this scene has 2"):
+        jc.step(built(2)[0], method, begun, None, 1e-2)

@@ -543,3 +543,18 @@ def test_gains_of_a_traced_integrator_are_not_read():
 def test_a_stabilizer_with_a_method_of_version_one_is_refused(base, old, new):
     with pytest.raises(TypeError, match=f"^Mine: the method `{old}` of stabilizers is `{new}`"):
         type("Mine", (base,), {old: lambda self, rows: rows})
+
+
+def test_a_stabilizer_may_call_methods_of_its_own_whatever_their_names():
+    class Base(jc.extend.Stabilizer):
+        def constraint_equations(self, rows, memory, dt):
+            return rows.with_target(self.target(rows))
+
+        def target(self, rows):
+            return -rows.bias
+
+    class Own(Base):
+        def target(self, rows):
+            return -rows.bias - rows.rate
+
+    assert Own.constraint_equations is Base.constraint_equations

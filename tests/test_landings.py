@@ -497,10 +497,7 @@ def test_a_solver_of_a_user_lands_without_further_attributes():
     """Landings are then spread over two steps, which needs fewer attributes of a solver."""
 
     @pytree
-    class Own:
-        warm = False
-        smoothing = None
-
+    class Own(jc.extend.ContactSolver):
         def solve(self, problem, start):
             return jc.solvers.GaussSeidel(60, warm=False).solve(problem, start)
 

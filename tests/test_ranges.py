@@ -77,8 +77,8 @@ def mechanism():
     ("name", "field", "value", "match"),
     [
         ("roll", "radius", -0.1, "roll: radius must be positive"),
-        ("thread", "lead", 0.0, "thread: lead must have a length"),
-        ("gear", "ratio", 0.0, "gear: ratio must have a length"),
+        ("thread", "lead", 0.0, "thread: lead must be finite and not zero"),
+        ("gear", "ratio", 0.0, "gear: ratio must be finite and not zero"),
         ("rotor", "inertia", 0.0, "rotor: inertia must be positive"),
         ("rope", "length", 0.0, "rope: length must be positive"),
         ("rod", "length", -1.0, "rod: length must be positive"),
@@ -221,3 +221,20 @@ def test_a_negative_traced_restitution_or_recovery_lets_nothing_in(upper, change
     x, v = slid(stop, {"restitution": 0.0} | changes)
     assert jnp.max(x) < max(upper, 0) + 1e-12
     assert jnp.allclose(v[-1], 0.0, atol=1e-12)
+
+
+def test_numbers_are_compared_as_the_scene_holds_them():
+    """In float32, 1e-50 is zero, and stored stiffnesses of 0.1 and 0.2 are in range together."""
+    scene = jc.Scene(dtype="float32")
+    for name in ("a", "b"):
+        scene.add_body(name, mass=1.0, inertia=(0.1, 0.1, 0.1))
+    scene.add(jc.forces.Flexure("flexure", "a", "b", bending=0.1, twisting=0.2))
+    scene.add(jc.forces.Flexure("other", "a", "b", bending=jnp.float32(0.7), twisting=1.4))
+    scene.add(jc.Distance("rod", "a", "b", point_a=(1.0, 0.0, 0.0)))
+    system, _ = scene.build()
+    system.with_params({"flexure": {"bending": 0.1}})
+    with pytest.raises(ValueError, match="rod: length must be positive"):
+        system.with_params({"rod": {"length": 1e-50}})
+    scene.add(jc.joints.RollingSphere("roll", "a", "b", normal=(0.0, 0.0, 1.0), radius=1e-50))
+    with pytest.raises(ValueError, match="radius must be positive"):
+        scene.build()

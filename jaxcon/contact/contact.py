@@ -21,7 +21,7 @@ from jaxcon.contact.limits import Ranged, one_sided, stop
 from jaxcon.contact.point_sets import given_points, own_points, spread, spread_place
 from jaxcon.contact.rows import BoundSet
 from jaxcon.core import checks, numerics
-from jaxcon.core.lanes import Vector
+from jaxcon.core.lanes import Vector, total
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.geometry.pose import Pose
@@ -146,8 +146,9 @@ class CapsuleContact(BetweenBodies):
     """Contact of two capsules at one point; a capsule whose segment has no length is a ball.
 
     The normal points from the closest point of the first axis to the closest point of the second.
-    Where these points coincide, the normal is perpendicular to both axes. In the plane, and for
-    parallel axes, it is perpendicular to the longer axis. For two balls it is the world's x axis.
+    Where these points coincide up to rounding, the normal is perpendicular to both axes. In the
+    plane, and for parallel axes, it is perpendicular to the longer axis. For two balls it is the
+    world's x axis.
 
     Attributes:
         name: name of the element, unique in the scene.
@@ -218,7 +219,8 @@ class CapsuleContact(BetweenBodies):
         x_a, x_b = nearest(*ends)
         apart = x_b - x_a
         length = numerics.norm(apart)
-        meet = length == 0
+        rounding = 16 * float(jnp.finfo(jnp.result_type(length)).eps)
+        meet = length <= rounding * total(abs(x) for end in ends for x in end)
         aside = across_axes(ends[1] - ends[0], ends[3] - ends[2])
         n = apart * numerics.safe_divide(1.0, length)
         n = Vector(*(jnp.where(meet, y, x) for x, y in zip(n, aside, strict=True)))

@@ -365,16 +365,17 @@ def flag(owner: str, what: str, x: PyTree) -> None:
 
 
 def nonzero(owner: str, what: str, x: PyTree) -> None:
-    """Checks that a vector is finite and not zero.
+    """Checks that a number or vector is finite and not zero.
 
     Raises:
-        ValueError: the vector is zero, not finite or not numeric.
+        ValueError: the value is zero, not finite or not numeric.
     """
     values = _numbers(owner, what, x)
     if is_concrete(values):
         values = np.asarray(values, float)
         if not np.all(np.isfinite(values)) or not np.linalg.norm(values) > 0:
-            raise ValueError(f"{owner}: {what} must have a length, got {numerals(values)}.")
+            wanted = "have a length" if values.ndim else "be finite and not zero"
+            raise ValueError(f"{owner}: {what} must {wanted}, got {numerals(values)}.")
 
 
 def radians(owner: str, what: str, x: Scalar) -> None:

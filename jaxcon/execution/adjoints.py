@@ -231,16 +231,18 @@ EVERY_STEP = EveryStep()
 
 
 def check_adjoint(adjoint: Adjoint) -> None:
-    """Checks that an adjoint is an instance such as `Checkpoints()`.
+    """Checks that an adjoint is an instance such as `Checkpoints()`, and its numbers.
 
     Raises:
         TypeError: `adjoint` is a class, or has no method `scan`.
+        ValueError: a number of the adjoint is out of range.
     """
-    if isinstance(adjoint, type) or not hasattr(adjoint, "scan"):
+    if isinstance(adjoint, type) or not hasattr(adjoint, "scan") or not hasattr(adjoint, "check"):
         raise TypeError(
             "rollout: adjoint must be a value such as jc.adjoints.EveryStep() or"
             f" jc.adjoints.Checkpoints(), got {adjoint!r}."
         )
+    adjoint.check()
     if isinstance(adjoint, Truncated | Discounted):
         check_adjoint(adjoint.within)
 

@@ -205,16 +205,14 @@ def from_axis_angle(axis: Scalar | Sequence[Scalar], angle: Scalar) -> Array:
     """Returns the unit quaternion (4,) of a rotation by an angle about an axis.
 
     Args:
-        axis: the rotation axis, (3,), of any nonzero length. A JAX array of zeros gives the
-            identity, since its values are not read.
+        axis: the rotation axis, (3,), of any nonzero length. An axis of zeros gives the identity.
         angle: the rotation angle, () [rad].
 
     Raises:
-        ValueError: an argument has no real numbers, or another shape, or the axis is zero.
+        ValueError: an argument has no real numbers, or another shape.
     """
     with checks.without_waiting():
         checks.check("quaternion.from_axis_angle", "axis", axis, (3,))
-        checks.nonzero("quaternion.from_axis_angle", "axis", axis)
         checks.check("quaternion.from_axis_angle", "angle", angle, ())
     axis = jnp.asarray(axis)
     if not jnp.issubdtype(axis.dtype, jnp.floating):

@@ -41,6 +41,13 @@ PARTS = (
     ("events", "splits", "Events()"),
 )
 """The fields of a `Method`: name, an attribute that the field's value must have, and an example."""
+PROTOCOLS = {
+    "integrator": "Integrator",
+    "stabilizer": "Stabilizer",
+    "solver": "Solver",
+    "contact_solver": "ContactSolver",
+}
+"""The protocol of `jc.extend` that a user's class for a field derives from."""
 OPTIONAL = ("recovery", "contact_solver", "events")
 """The fields of a `Method` that may be None."""
 
@@ -256,7 +263,8 @@ class Method:
         """Checks that each field has a value of its kind; each value checks its own numbers.
 
         Raises:
-            TypeError: a field has a class or a name, not a value like `RK4()`.
+            TypeError: a field has a class or a name, not a value like `RK4()`, or its class does
+                not derive from its protocol.
         """
         for part, verb, example in PARTS:
             value = getattr(self, part)
@@ -271,6 +279,11 @@ class Method:
                     hint = hint or f"; call it: {got}()"
                 raise TypeError(
                     f"Method: {part} must be a value such as {example}, got {got}{hint}."
+                )
+            if not hasattr(value, "check"):
+                raise TypeError(
+                    f"Method: {part}: {type(value).__name__} must derive from"
+                    f" jc.extend.{PROTOCOLS[part]}, which has defaults for all other methods."
                 )
 
     def check(self) -> None:

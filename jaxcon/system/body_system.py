@@ -527,7 +527,7 @@ class BodySystem:
         return kind.motion(x, v[self.layout.v(name)])
 
     def kinetic_energy(self, q: Array, v: Array) -> Array:
-        """Returns ½ vᵀMv, () [J], without rotors."""
+        """Returns the kinetic energy ½ vᵀMv, without that of rotors, () [J]."""
         return (v * self.mass(q).apply(v)).sum(axis=0) / 2
 
     def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector, take
 from jaxcon.core.pytree import pytree, static
-from jaxcon.core.typing import Array, Lane, PyTree
+from jaxcon.core.typing import Array, DType, Lane, PyTree
 from jaxcon.geometry.pose import Pose
 from jaxcon.system.layout import WHOLE, Place
 
@@ -183,7 +183,8 @@ class Elements:
                     f"{name}.{field}", params[field], i, value, field in self.unbounded_fields
                 )
             if given:
-                self.check_numbers(name, self.get(i) | dict(given))
+                dtype = jnp.result_type(jax.tree.leaves(params)[0])
+                self.check_numbers(name, rounded(self.get(i) | dict(given), dtype))
         return dataclasses.replace(self, params=params)
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
@@ -264,6 +265,23 @@ def element_at(x: Numbers, i: int) -> Array:
     if isinstance(x, Grid):
         return x.values[i]
     return Vector(*(lane[i] for lane in x)).stack() if isinstance(x, Vector) else x[i]
+
+
+def rounded(numbers: Mapping[str, Any], dtype: DType) -> dict[str, Any]:
+    """Casts the concrete numbers among fields to the dtype of the scene; others are unchanged.
+
+    Numbers are compared with their ranges as the scene holds them: in float32, 1e-50 is zero.
+
+    Args:
+        numbers: numbers and other values by field.
+        dtype: dtype of the scene.
+    """
+
+    def cast(x: Any) -> Any:
+        kinds = int | float | np.number | np.ndarray | jax.Array
+        return np.asarray(x, dtype) if isinstance(x, kinds) and checks.is_concrete(x) else x
+
+    return {field: cast(x) for field, x in numbers.items()}
 
 
 def replace_at(owner: str, x: Numbers, i: int, value: PyTree, unbounded: bool = False) -> Any:
