@@ -1,5 +1,5 @@
 # pyright: strict
-"""The parts of a simulation, by the questions that are asked of them. Read this file first.
+"""The protocols of the parts of a simulation. Read this file first.
 
 `step.py` and the layers around it know the parts of a scene and of a method by these protocols:
 
@@ -63,7 +63,7 @@ class Constraint(Protocol):
         return None
 
     is_inertia: ClassVar[bool] = False
-    """True for rotors: they hold nothing, and resist acceleration."""
+    """True for rotors: they add inertia and constrain nothing."""
     closes_loops: ClassVar[bool] = True
     """True where rows depend on others if they close a loop of bodies, as those of joints do."""
     independent: ClassVar[bool] = True
@@ -88,7 +88,7 @@ class InequalityGroup(Protocol):
 
     @abstractmethod
     def bounds(self, snapshot: Snapshot, control: PyTree, dt: Array) -> BoundSet:
-        """The rows at one instant, and the velocities that a step of dt [s] wants of them."""
+        """The rows at one instant, and their target velocities for a step of dt [s]."""
         ...
 
     @property
@@ -100,7 +100,7 @@ class InequalityGroup(Protocol):
     @property
     @abstractmethod
     def numbers(self) -> Mapping[str, Any]:
-        """The numbers by field; one that is not finite ends its world."""
+        """The numbers by field. A world with a number that is not finite stops."""
         ...
 
     @property
@@ -291,7 +291,7 @@ class Bodies(System, Protocol):
         ...
 
     def gyroscopic_acceleration(self, q: Array, v: Array) -> Array:
-        """The part of a by which bodies without forces turn, (n_v,)."""
+        """The gyroscopic part of the acceleration a, (n_v,)."""
         ...
 
     def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
@@ -309,7 +309,7 @@ class Bodies(System, Protocol):
     def squared_turns(
         self, v: Array, before: Array, rows: Rows, dt: Array, whole: bool = False
     ) -> Array:
-        """The square of the largest turn of what a row holds of its bodies, (n_c,) [rad²]."""
+        """The squared largest turn of the arms and axes of each row in a step, (n_c,) [rad²]."""
         ...
 
 
@@ -354,7 +354,6 @@ class Stabilizer(TreeNode, Protocol):
             memory: of this stabilizer, as of the end of the last step; the same at all stages of
                 the step.
             dt: h, () [s].
-
         """
         ...
 
@@ -370,10 +369,10 @@ class Stabilizer(TreeNode, Protocol):
         return type(self).solve is not Stabilizer.solve
 
     # memory: integrals, histories, the λ of the last step. `jc.init` calls `init` and puts the
-    # result into `State.memory`; `jc.step` and `jc.rollout` do so for a state without memory. At
-    # the end of each step it becomes remember(advance(rows, memory, dt), solution), which `correct`
-    # and the next step get. `jc.forward_dynamics` uses the memory and does not update it. Leaves
-    # are arrays whose shapes and dtypes stay; a batch adds an axis at their end.
+    # result into `State.memory`; `jc.step` and `jc.rollout` refuse a state without it. At the end
+    # of each step it becomes remember(advance(rows, memory, dt), solution), which `correct` and the
+    # next step get. `jc.forward_dynamics` uses the memory and does not update it. Leaves are arrays
+    # whose shapes and dtypes stay; a batch adds an axis at their end.
 
     def init(self, system: System, q: Array, v: Array) -> Any:
         """The memory at the start of a simulation of one world; () for none.

@@ -179,7 +179,7 @@ def step(
     reactions = rows.reactions
     if state.memory:
         contact_λ = memory.contact_multipliers
-        if reactions is not None and memory.has_contact_multipliers:
+        if reactions is not None and len(contact_λ) == len(reactions.multipliers):
             contact_λ = reactions.multipliers
         parts = MethodMemory(advanced.memory, remembered, memory.recovery, contact_λ)
         new = dataclasses.replace(new, memory=parts)
@@ -274,7 +274,8 @@ class Dynamics:
             v: velocities, (n_v,).
             t: time, () [s].
             rate_delay: feedback sees φ̇ as it was this long ago, () [s]; None for now.
-            every_landing: whether landings without rebound are impacts beside every contact solver.
+            every_landing: True to treat landings without rebound as impacts with every contact
+                solver.
         """
         observed = rows if rate_delay is None else rows.earlier(rate_delay)
         equations = self.stabilizer.constraint_equations(observed, self.memory, self.dt)

@@ -571,16 +571,40 @@ def gains(x):
 
 
 class Bare:
-    """A solver that does not derive from the protocol."""
+    """Parts of a method that do not derive from their protocols."""
+
+    smoothing = None
 
     def factor(self, system):
         return jc.solvers.Schur().factor(system)
+
+    def constraint_equations(self, rows, memory, dt):
+        return rows.with_target(-rows.bias)
+
+    def check(self):
+        pass
 
 
 STEPS = {
     "a solver without the base of solvers": (
         lambda: jc.Method(solver=Bare()),
         ["Method: solver: Bare must derive from jc.extend.Solver"],
+    ),
+    "a stabilizer without the base of stabilizers": (
+        lambda: jc.Method(stabilizer=jc.stabilizers.Penalty(1.0, others=Bare())),
+        ["Penalty: others: Bare must derive from jc.extend.Stabilizer"],
+    ),
+    "a solver in another without the base of solvers": (
+        lambda: jc.Method(solver=jc.solvers.RankSafe(Bare())),
+        ["RankSafe: solver: Bare must derive from jc.extend.Solver"],
+    ),
+    "a contact solver in another without the base of contact solvers": (
+        lambda: jc.Method(contact_solver=jc.solvers.ActiveSet(solver=Bare())),
+        ["ActiveSet: solver: Bare must derive from jc.extend.ContactSolver"],
+    ),
+    "a recovery without a check": (
+        lambda: jc.Method(recovery=type("Own", (), {"repair": None})()),
+        [r"Method: recovery must be a value such as Recovery\(\)"],
     ),
     "control of wrong length": (
         lambda: stepping(control=jnp.zeros(2)),

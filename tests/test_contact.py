@@ -681,7 +681,7 @@ def test_where_axes_meet_the_normal_is_across_them(a, b, longer, dtype):
     """In space both axes are normal to it, in the plane the longer one; it is x for balls."""
 
     def across(axes):
-        return across_axes(*(Vector(*x[:, None]) for x in axes)).stack()[:, 0]
+        return across_axes(*(Vector(*x[:, None]) for x in axes))[0].stack()[:, 0]
 
     axes = jnp.asarray([a, b], dtype)
     n = across(axes)
@@ -740,13 +740,16 @@ def test_bad_numbers_are_refused(element, match):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_capsules_whose_axes_cross_part_along_the_normal_of_both(dim, dtype):
+@pytest.mark.parametrize("angle", [1.46, 0.0035])
+def test_capsules_whose_axes_cross_part_along_the_normal_of_both(angle, dim, dtype):
     """The computed closest points differ by rounding, whose direction must not be the normal.
 
     In the plane the normal is that of the longer axis, the second.
     """
     first = np.array([[0.0, 0.0, 0.0], [1.0, 0.1, 0.0]])
-    second = np.array([[0.3, -0.37, 0.0], [0.31, 0.77, 0.0]])
+    turned = np.arctan2(0.1, 1.0) + angle
+    along_second = np.array([np.cos(turned), np.sin(turned), 0.0])
+    second = np.array([0.33, 0.033, 0.0]) + np.outer([-0.37, 0.77], along_second)
     scene = jc.Scene(dim=dim, dtype=dtype, gravity=np.zeros(dim))
     inertia = 0.1 if dim == 2 else (0.1, 0.1, 0.1)
     scene.add_body("body", mass=1.0, inertia=inertia, position=second.mean(axis=0)[:dim])
@@ -765,3 +768,15 @@ def test_capsules_whose_axes_cross_part_along_the_normal_of_both(dim, dtype):
         np.testing.assert_allclose(abs(along), [0.0, 0.0, 1.0], atol=1e-5)
     else:
         assert abs(along @ axis) < 1e-5
+
+
+def test_small_balls_far_from_the_origin_do_not_touch_before_they_meet():
+    """In float32 coordinates of 20 m are rounded to 2 µm, a fiftieth of a radius."""
+    scene = jc.Scene(dim=3, dtype="float32", gravity=np.zeros(3))
+    for name, z in (("a", 20.0), ("b", 20.0004)):
+        scene.add_body(name, mass=1.0, inertia=(1e-8,) * 3, position=(20.0, 20.0, z))
+    scene.add(jc.contacts.CapsuleContact("touch", "a", "b", radius_a=1e-4, radius_b=1e-4))
+    system, state = scene.build()
+    end, info = jc.step(system, jc.Method(), state, None, 1e-3)
+    np.testing.assert_array_equal(end.v, 0.0)
+    np.testing.assert_allclose(info.reactions.gap[0], 2e-4, atol=1e-5)

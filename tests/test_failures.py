@@ -437,7 +437,10 @@ def test_forward_dynamics_of_a_singular_world_does_not_spoil_the_gradient_of_the
 
 
 def test_a_state_with_multipliers_of_contacts_is_stepped_without_contacts():
-    """Rows of contacts have none in a scene without them, and the wrong number in another."""
+    """Multipliers are kept in a scene without contacts.
+
+    In a scene with other rows, they are kept if they are not used, and refused if they are.
+    """
 
     def built(floors):
         scene = jc.Scene(dim=2)
@@ -456,5 +459,9 @@ def test_a_state_with_multipliers_of_contacts_is_stepped_without_contacts():
     ):
         np.testing.assert_allclose(end.v, [0.0, -0.0981], rtol=1e-12)
         assert end.memory.contact_multipliers.shape == (1,)
+    exact = jc.Method(contact_solver=jc.solvers.InteriorPoint())
+    end, _ = jc.rollout(built(2)[0], exact, begun, None, 1e-2, 1)
+    assert end.status == jc.Status.OK
+    assert end.memory.contact_multipliers.shape == (1,)
     with pytest.raises(ValueError, match="multipliers of 1 inequality rows, but this scene has 2"):
         jc.step(built(2)[0], method, begun, None, 1e-2)

@@ -369,3 +369,11 @@ def test_a_potential_that_returns_no_number_is_refused(result, error):
     state = jc.init(system, jc.Method(), jnp.ones(2), jnp.zeros(2))
     with pytest.raises(error, match="^GeneralizedSystem: potential must return"):
         jc.energy(system, state)
+
+
+def test_a_reaction_names_itself_in_errors():
+    built, coordinates = scenes.build("revolute-2d-between"), scenes.build("polar")
+    with pytest.raises(TypeError, match="^reaction: generalized coordinates have no bodies"):
+        jc.reaction(coordinates.system, coordinates.state, "rod")
+    with pytest.raises(ValueError, match="^reaction: dt must be"):
+        jc.reaction(built.system, built.state, "joint", dt=-1.0)

@@ -25,7 +25,7 @@ from jaxcon.system.coordinates import (
     numbered,
     turns_over,
 )
-from jaxcon.system.elements import Element, label, rounded, stack
+from jaxcon.system.elements import Element, label, stack
 from jaxcon.system.layout import Layout, Place
 
 
@@ -123,7 +123,7 @@ class CoordinateElements:
         groups: dict[Any, list[Any]] = {}
         for element in elements:
             ends, params = self.ends[element.name], element.attach(self.dtype)
-            element.check_numbers(label(element), rounded(vars(element), self.dtype))
+            element.check_numbers(label(element), vars(element), self.dtype)
             group, _, name = ends[0]
             if self.joints[group].law.coordinates[name] == "rad":
                 for field in element.angles:

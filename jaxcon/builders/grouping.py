@@ -23,7 +23,7 @@ from jaxcon.core import checks
 from jaxcon.core.typing import Array, DType, PyTree, Scalar
 from jaxcon.geometry.pose import Pose
 from jaxcon.system.body_system import MassProperties
-from jaxcon.system.elements import BetweenBodies, Element, label, rounded, stack
+from jaxcon.system.elements import BetweenBodies, Element, label, stack
 from jaxcon.system.forces import (
     CustomForce,
     CustomForces,
@@ -211,9 +211,7 @@ class Gather:
             if element.framed:
                 poses += [self.offsets.get(name, self.origin) for name in element.bodies]
             params = element.attach(*poses)
-            element.check_numbers(
-                label(element), rounded(vars(element), self.origin.position.dtype)
-            )
+            element.check_numbers(label(element), vars(element), self.origin.position.dtype)
             sides = tuple(self._place((name,)).group for name in element.bodies)
             fields = tuple((field, jax.tree.map(jnp.shape, x)) for field, x in params.items())
             groups.setdefault((element.kind, sides, fields), []).append((element, params))

@@ -7,7 +7,8 @@ alone (`contact_rows`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -21,9 +22,9 @@ from jaxcon.contact.limits import Ranged, one_sided, stop
 from jaxcon.contact.point_sets import given_points, own_points, spread, spread_place
 from jaxcon.contact.rows import BoundSet
 from jaxcon.core import checks, numerics
-from jaxcon.core.lanes import Vector, total
+from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array, DType, Lane, PyTree
 from jaxcon.geometry.pose import Pose
 from jaxcon.system.elements import BetweenBodies, label, own_point
 
@@ -146,9 +147,9 @@ class CapsuleContact(BetweenBodies):
     """Contact of two capsules at one point; a capsule whose segment has no length is a ball.
 
     The normal points from the closest point of the first axis to the closest point of the second.
-    Where these points coincide up to rounding, the normal is perpendicular to both axes. In the
-    plane, and for parallel axes, it is perpendicular to the longer axis. For two balls it is the
-    world's x axis.
+    Where axes meet or cross deep inside, the normal is perpendicular to both axes. In the plane,
+    and for parallel axes in space, it is perpendicular to the longer axis. For two balls with the
+    same center it is the world's x axis.
 
     Attributes:
         name: name of the element, unique in the scene.
@@ -216,16 +217,20 @@ class CapsuleContact(BetweenBodies):
             for f, s in ((a, "a"), (b, "b"))
             for e in ("start", "end")
         ]
-        x_a, x_b = nearest(*ends)
-        apart = x_b - x_a
+        x_a, x_b, within = nearest(*ends)
+        apart, radii = x_b - x_a, p["radius_a"] + p["radius_b"]
         length = numerics.norm(apart)
-        rounding = 16 * float(jnp.finfo(jnp.result_type(length)).eps)
-        meet = length <= rounding * total(abs(x) for end in ends for x in end)
-        aside = across_axes(ends[1] - ends[0], ends[3] - ends[2])
+        aside, crossing = across_axes(ends[1] - ends[0], ends[3] - ends[2])
+        resolved = length > rounding_of(ends, x_a, x_b, radii)
+        if len(apart) == 2:  # axes that cross in the plane meet
+            resolved &= ~(within & crossing)
+        # deep inside, x_b − x_a loses its direction to rounding; u × w is the same direction
+        meet = ~resolved | (within & crossing & (length <= DEEP * radii))
+        aside = aside * jnp.where(resolved & (aside.dot(apart) < 0), -1.0, 1.0)
         n = apart * numerics.safe_divide(1.0, length)
         n = Vector(*(jnp.where(meet, y, x) for x, y in zip(n, aside, strict=True)))
         # where the axes meet, the norm has no derivative; the gap then changes along n
-        gap = jnp.where(meet, n.dot(apart), length) - p["radius_a"] - p["radius_b"]
+        gap = jnp.where(meet, n.dot(apart), length) - radii
         middle = x_a + n * (p["radius_a"] + gap / 2)
         return contact_rows(p, Touch(gap, n, middle, a, b), dt)
 
@@ -234,10 +239,10 @@ class CapsuleContact(BetweenBodies):
 class Contacts(Ranged):
     """A group of ropes or contacts of the class `law`, between bodies of the same kinds."""
 
-    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+    def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         """Checks the changed numbers of an element by the ranges of its class and of contacts."""
-        self.law.check_numbers(name, numbers)
-        super().check_numbers(name, numbers)
+        self.law.check_numbers(name, numbers, dtype)
+        super().check_numbers(name, numbers, dtype)
 
     def bounds(self, snapshot: Snapshot, control: PyTree, dt: Array) -> BoundSet:
         """Returns the inequality rows at one instant, with their targets for a step of dt."""
@@ -252,8 +257,30 @@ class Contacts(Ranged):
         return BoundSet(law, tuple(rows), places, points=each, **fields)
 
 
-def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]:
-    """Returns the closest points of the segments pq and rs.
+DEEP = 1e-2
+"""The distance of two axes, as a fraction of the radii, below which the contact is deep."""
+
+
+def rounding_of(ends: Sequence[Vector], x_a: Vector, x_b: Vector, radii: Lane) -> Lane:
+    """Returns a bound on the rounding error of the distance of two segments' closest points.
+
+    It is zero for two balls, whose centers are not computed, and at most a thousandth of the radii.
+
+    Args:
+        ends: p, q, r and s, the ends of the segments pq and rs.
+        x_a: closest point of the first segment.
+        x_b: closest point of the second segment.
+        radii: the sum of the radii [m].
+    """
+    p, q, r, s = ends
+    eps = float(jnp.finfo(jnp.result_type(*p)).eps)
+    size = functools.reduce(jnp.maximum, (abs(x) for x in (*x_a, *x_b)))
+    has_axis = (q - p).dot(q - p) + (s - r).dot(s - r) > 0
+    return jnp.where(has_axis, jnp.minimum(16 * eps * size, 1e-3 * radii), 0)
+
+
+def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector, Array]:
+    """Returns the closest points of the segments pq and rs, and whether both are between ends.
 
     Parallel segments are closest along the part where they face each other; the result is the
     middle of this part. If they do not face each other, the result is the two closest ends.
@@ -272,14 +299,15 @@ def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector]
     x = jnp.where(crossing, x, (facing[0] + facing[1]) / 2)
     y = jnp.clip(numerics.safe_divide(b * x + f, e), 0, 1)
     x = jnp.clip(numerics.safe_divide(b * y - c, a), 0, 1)
-    return p + u * x, r + w * y
+    within = (x > 0) & (x < 1) & (y > 0) & (y < 1)
+    return p + u * x, r + w * y, within
 
 
-def across_axes(u: Vector, w: Vector) -> Vector:
-    """Returns the contact normal of two capsules whose axes u and w meet, a unit vector.
+def across_axes(u: Vector, w: Vector) -> tuple[Vector, Array]:
+    """Returns a unit normal of two capsules whose axes u and w meet, and whether these cross.
 
-    It is u × w / ‖u × w‖ in space. If the axes are parallel, and in the plane, it is normal to the
-    longer one. For two balls, whose axes are zero, it is the x axis of the world.
+    The normal is u × w / ‖u × w‖ in space. In the plane, and for parallel axes in space, it is
+    perpendicular to the longer axis. For two balls, whose axes are zero, it is the world's x axis.
     """
     square_u, square_w = u.dot(u), w.dot(w)
     longer = square_u >= square_w
@@ -291,15 +319,15 @@ def across_axes(u: Vector, w: Vector) -> Vector:
         jnp.where(square > 0, jnp.where(longer, x, y) * unit, z)
         for x, y, z in zip(u, w, down, strict=True)
     )
-    aside = across(Vector(*along))[0]
-    if len(u) == 2:
-        return aside
-    both = u.cross(w)
-    area = both.dot(both)
+    aside, both = across(Vector(*along))[0], u.cross(w)
+    area = both * both if len(u) == 2 else both.dot(both)
     tiny = 16 * float(jnp.finfo(jnp.result_type(*u)).eps)
     crossing = area > tiny * square_u * square_w
+    if len(u) == 2:
+        return aside, crossing
     unit = numerics.safe_divide(1.0, numerics.safe_sqrt(jnp.where(crossing, area, 0)))
-    return Vector(*(jnp.where(crossing, x * unit, y) for x, y in zip(both, aside, strict=True)))
+    normal = (jnp.where(crossing, x * unit, y) for x, y in zip(both, aside, strict=True))
+    return Vector(*normal), crossing
 
 
 def plane(element: PlaneContact | BoxContact, a: Pose) -> dict[str, Array]:

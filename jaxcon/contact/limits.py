@@ -47,7 +47,7 @@ class Ranged(Elements):
         """The parameters by field."""
         return self.params
 
-    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+    def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         """Checks the parameters of one element, given by field."""
         check_ranges(name, numbers)
 

@@ -69,6 +69,7 @@ class ActiveSet(checks.Checked, ContactSolver):
                 "ActiveSet: solver must be one of inequality rows, as InteriorPoint() or"
                 f" GaussSeidel(), got {self.solver!r}."
             )
+        checks.derives("ActiveSet", "solver", self.solver, ContactSolver)
         self.solver.check()
 
     def solve(self, problem: Bounded, start: Array) -> Array:

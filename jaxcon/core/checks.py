@@ -87,6 +87,25 @@ class Checked:
         """Checks the fields; by default, does nothing. Subclasses override it."""
 
 
+def derives(owner: str, what: str, value: object, protocol: type) -> None:
+    """Checks that the class of a user's part derives from a protocol of `jc.extend`.
+
+    Args:
+        owner: the class that takes the part, for errors.
+        what: the name of its argument, for errors.
+        value: the part.
+        protocol: the protocol, whose methods have defaults.
+
+    Raises:
+        TypeError: the class does not derive from the protocol.
+    """
+    if protocol not in type(value).__mro__:
+        raise TypeError(
+            f"{owner}: {what}: {type(value).__name__} must derive from"
+            f" jc.extend.{protocol.__name__}, which has defaults for most methods."
+        )
+
+
 def is_floating(x: PyTree) -> bool:
     """Returns True if x is a float or a floating array, and False for any other object."""
     return isinstance(x, float) or jnp.issubdtype(getattr(x, "dtype", bool), jnp.floating)
@@ -364,16 +383,16 @@ def flag(owner: str, what: str, x: PyTree) -> None:
         raise ValueError(f"{owner}: {what} must be True or False, got {shortened(x)}.")
 
 
-def nonzero(owner: str, what: str, x: PyTree) -> None:
-    """Checks that a number or vector is finite and not zero.
+def nonzero(owner: str, what: str, x: PyTree, dtype: DType = np.float64) -> None:
+    """Checks that a number or vector is finite and not zero in a dtype.
 
     Raises:
         ValueError: the value is zero, not finite or not numeric.
     """
     values = _numbers(owner, what, x)
     if is_concrete(values):
-        values = np.asarray(values, float)
-        if not np.all(np.isfinite(values)) or not np.linalg.norm(values) > 0:
+        values = np.asarray(values, dtype)
+        if not np.all(np.isfinite(values)) or not np.any(values):
             wanted = "have a length" if values.ndim else "be finite and not zero"
             raise ValueError(f"{owner}: {what} must {wanted}, got {numerals(values)}.")
 

@@ -234,14 +234,15 @@ def check_adjoint(adjoint: Adjoint) -> None:
     """Checks that an adjoint is an instance such as `Checkpoints()`, and its numbers.
 
     Raises:
-        TypeError: `adjoint` is a class, or has no method `scan`.
+        TypeError: `adjoint` is a class, or does not derive from `jc.extend.Adjoint`.
         ValueError: a number of the adjoint is out of range.
     """
-    if isinstance(adjoint, type) or not hasattr(adjoint, "scan") or not hasattr(adjoint, "check"):
+    if isinstance(adjoint, type) or not hasattr(adjoint, "scan"):
         raise TypeError(
             "rollout: adjoint must be a value such as jc.adjoints.EveryStep() or"
             f" jc.adjoints.Checkpoints(), got {adjoint!r}."
         )
+    checks.derives("rollout", "adjoint", adjoint, Adjoint)
     adjoint.check()
     if isinstance(adjoint, Truncated | Discounted):
         check_adjoint(adjoint.within)

@@ -30,8 +30,8 @@ from jaxcon.step import StepInfo
 from jaxcon.system.state import State, checked_system
 
 FEEDBACK = (
-    "controls are a function of the state, and that before a step is not known until the step is"
-    " undone"
+    "controls are a function of the state, and the state before a step is unknown until the step"
+    " is undone"
 )
 """The reason why steps under a policy cannot be undone, for an error message."""
 

@@ -98,8 +98,8 @@ def with_origin(info: Info, system: System) -> Info:
 def undo(system: System, method: Method, state: State, control: PyTree, dt: Scalar) -> State:
     """Returns the state before a step of h, by a step of −h of a symmetric integrator.
 
-    Counted turns are those at the end of the step, not those before its start. Both tell the same
-    whole turns.
+    Counted turns are those at the end of the step. They differ from those at its start by less than
+    half a turn, so readers find the same whole turns.
     """
     control = check_step(system, method, state, control, "rollout")
     with checks.without_waiting():
@@ -168,8 +168,8 @@ def forward_dynamics(
     Inequality constraints are solved as over a step of h: a then is the mean over the step, with
     the impulse of an impact divided by h.
 
-    To read the forces at a state, use `Unstabilized()`: feedback adds forces that are not of the
-    motion, and reacts to the rate φ̇ = ½hγ that semi-implicit Euler leaves, which is no error.
+    To read the forces at a state, use `Unstabilized()`. Feedback adds forces. It also reacts to
+    φ̇ = ½hγ, which semi-implicit Euler leaves in every step.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
@@ -179,8 +179,9 @@ def forward_dynamics(
         dt: h, () [s], on which default gains depend.
 
     Returns:
-        acceleration (n_v,) [m/s², rad/s²], multipliers (n_c,) [N, N·m], status (): a `Solution`
-        that unpacks so. It also has the `state` and `control` given, `violation` and `reactions`.
+        A `Solution` that unpacks as `a, λ, status`: acceleration (n_v,) [m/s², rad/s²], multipliers
+        (n_c,) [N, N m] and status (). It also has the `state` and `control` given, `violation` and
+        `reactions`.
 
     A world whose solution fails has zero gradient.
 
@@ -188,9 +189,16 @@ def forward_dynamics(
         ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.
         TypeError: an argument has another type, such as a class in place of a method.
     """
-    control = check_step(system, method, state, control, "forward_dynamics")
+    return solved(system, state, control, method, dt, "forward_dynamics")
+
+
+def solved(
+    system: System, state: State, control: PyTree, method: Method, dt: Scalar, owner: str
+) -> SolutionAt:
+    """`forward_dynamics` for a public function, the owner, which errors name."""
+    control = check_step(system, method, state, control, owner)
     with checks.without_waiting():
-        h = checks.real("forward_dynamics", "dt", dt, state.q.dtype, least=0)
+        h = checks.real(owner, "dt", dt, state.q.dtype, least=0)
     given = (system, method, state, control, h)
     (a, λ, status), violation, reactions = batch_last.call(solve_at, *given)
     where = without_memory(state)

@@ -22,6 +22,7 @@ CALLS = {
     "step": "jc.step(system, method, s, control, dt)",
     "rollout": "jc.rollout(system, method, s, controls, dt, steps)",
     "forward_dynamics": "jc.forward_dynamics(system, s, control, method, dt)",
+    "reaction": "jc.reaction(system, s, name)",
 }
 """The call of a function whose batch is made by `jax.vmap`, for messages."""
 

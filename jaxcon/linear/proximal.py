@@ -77,7 +77,8 @@ class RankSafe(checks.Checked, Solver):
                 "RankSafe: solver must be Sparse(), Schur(), Dense() or ConjugateGradients(), got"
                 f" {checks.shortened(self.solver)}."
             )
-        getattr(self.solver, "check", lambda: None)()
+        checks.derives("RankSafe", "solver", self.solver, Solver)
+        self.solver.check()
 
     def factor(self, system: Saddle) -> Factored:
         """Factors the system; returns a function (f, b) → `Solution`.

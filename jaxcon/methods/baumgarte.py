@@ -268,10 +268,7 @@ def check_stabilizer(owner: str, what: str, part: Any) -> None:
     """
     if isinstance(part, type) or not hasattr(part, "constraint_equations"):
         raise TypeError(f"{owner}: {what} must be a stabilizer like Baumgarte(), got {part!r}.")
-    if not hasattr(part, "check"):
-        raise TypeError(
-            f"{owner}: {what}: {type(part).__name__} must derive from jc.extend.Stabilizer."
-        )
+    checks.derives(owner, what, part, Stabilizer)
     part.check()
 
 

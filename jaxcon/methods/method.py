@@ -42,12 +42,12 @@ PARTS = (
 )
 """The fields of a `Method`: name, an attribute that the field's value must have, and an example."""
 PROTOCOLS = {
-    "integrator": "Integrator",
-    "stabilizer": "Stabilizer",
-    "solver": "Solver",
-    "contact_solver": "ContactSolver",
+    "integrator": Integrator,
+    "stabilizer": Stabilizer,
+    "solver": Solver,
+    "contact_solver": ContactSolver,
 }
-"""The protocol of `jc.extend` that a user's class for a field derives from."""
+"""The protocol that a user's class for a field derives from."""
 OPTIONAL = ("recovery", "contact_solver", "events")
 """The fields of a `Method` that may be None."""
 
@@ -252,8 +252,8 @@ class Method:
         """Returns the reason why a step by −h does not undo a step by h; None if it does."""
         if not self.integrator.symmetric:
             return (
-                f"a step of {type(self.integrator).__name__} is not undone by one of −h, as one of"
-                " RATTLE is"
+                f"{type(self.integrator).__name__} is not symmetric: a step by −h does not undo a"
+                " step by h; RATTLE() is"
             )
         if self.recovery is not None:
             return "`Recovery` is not reversible"
@@ -270,7 +270,8 @@ class Method:
             value = getattr(self, part)
             if value is None and part in OPTIONAL:
                 continue
-            if isinstance(value, type) or not hasattr(value, verb):
+            is_part = hasattr(value, verb) and (part in PROTOCOLS or hasattr(value, "check"))
+            if isinstance(value, type) or not is_part:
                 fits = [other for other, can, _ in PARTS if hasattr(value, can)]
                 hint = f"; that is one for {fits[0]}=" if fits and fits[0] != part else ""
                 got, name = repr(value), getattr(value, "__name__", "")
@@ -280,11 +281,8 @@ class Method:
                 raise TypeError(
                     f"Method: {part} must be a value such as {example}, got {got}{hint}."
                 )
-            if not hasattr(value, "check"):
-                raise TypeError(
-                    f"Method: {part}: {type(value).__name__} must derive from"
-                    f" jc.extend.{PROTOCOLS[part]}, which has defaults for all other methods."
-                )
+            if part in PROTOCOLS:
+                checks.derives("Method", part, value, PROTOCOLS[part])
 
     def check(self) -> None:
         """Checks the fields and their numbers, including shapes and traced numbers.

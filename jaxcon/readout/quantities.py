@@ -12,7 +12,7 @@ from jaxcon.constraints.rows import Violation, linearize
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import Array, PyTree, Scalar
-from jaxcon.execution.step import SolutionAt, forward_dynamics
+from jaxcon.execution.step import SolutionAt, solved
 from jaxcon.geometry.pose import Motion
 from jaxcon.linear.proximal import RankSafe
 from jaxcon.methods.baumgarte import Unstabilized
@@ -309,9 +309,12 @@ def reaction(
 
     Raises:
         ValueError: the element is unknown or does not act on the body.
+        TypeError: the system has generalized coordinates, hence no bodies.
     """
+    if getattr(system, "layout", ()) is None:
+        raise TypeError("reaction: generalized coordinates have no bodies; see jc.multipliers.")
     method = Method(solver=RankSafe() if solver is None else solver, stabilizer=Unstabilized())
-    solution = forward_dynamics(system, without_memory(state), control, method, dt)
+    solution = solved(system, without_memory(state), control, method, dt, "reaction")
     return wrench(solution, name, body)
 
 

@@ -59,17 +59,18 @@ class JointForce(OnJoint):
         }
 
     @classmethod
-    def check_numbers(cls, owner: str, numbers: Mapping[str, Any]) -> None:
+    def check_numbers(cls, owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         """Checks that stiffness and damping are not negative, and the order of ranges.
 
         Args:
             owner: first words of errors.
             numbers: the numbers by field.
+            dtype: dtype of the scene.
 
         Raises:
             ValueError: a number is negative, or the lower end of a range is above its upper end.
         """
-        super().check_numbers(owner, numbers)
+        super().check_numbers(owner, numbers, dtype)
         for field in ("control_range", "force_range"):
             x = numbers.get(field)
             if x is not None and checks.is_concrete(x) and not x[0] <= x[1]:

@@ -8,10 +8,11 @@ from types import MappingProxyType
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector, axes, times, total
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.typing import Array, DType, Lane
 from jaxcon.geometry.pose import Pose
 from jaxcon.system.elements import own_point
 from jaxcon.system.forces import ForceElement
@@ -168,22 +169,26 @@ class Flexure(ForceElement):
         return params
 
     @classmethod
-    def check_numbers(cls, owner: str, numbers: Mapping[str, Any]) -> None:
+    def check_numbers(cls, owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         """Checks that both stiffnesses are not negative, and that k_t ≤ 2 k_b.
 
         Args:
             owner: first words of errors.
             numbers: the numbers by field; in the plane there is no twisting.
+            dtype: dtype of the scene.
 
         Raises:
             ValueError: a stiffness is out of range.
         """
-        super().check_numbers(owner, numbers)
+        super().check_numbers(owner, numbers, dtype)
         bending, twisting = numbers["bending"], numbers.get("twisting", 0.0)
-        if checks.is_concrete((bending, twisting)) and float(twisting) > 2 * float(bending):
+        if not checks.is_concrete((bending, twisting)):
+            return
+        bending, twisting = (np.asarray(x, dtype) for x in (bending, twisting))
+        if twisting > 2 * bending:
             raise ValueError(
-                f"{owner}: twisting must be at most twice bending, got {float(twisting):g} and"
-                f" {float(bending):g}: beyond that the straight joint is unstable at large turns."
+                f"{owner}: twisting must be at most twice bending, got {twisting:g} and"
+                f" {bending:g}: beyond that the straight joint is unstable at large turns."
             )
 
     @staticmethod

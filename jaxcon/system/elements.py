@@ -71,7 +71,7 @@ class Element:
         return type(self)
 
     @classmethod
-    def check_numbers(cls, owner: str, numbers: Mapping[str, Any]) -> None:
+    def check_numbers(cls, owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         """Checks the ranges of an element's numbers; skips traced values and fields that are None.
 
         `build` calls it with the fields that the user gave, and `with_params` with changed numbers.
@@ -79,16 +79,17 @@ class Element:
         Args:
             owner: first words of errors.
             numbers: the numbers by field; other fields are ignored.
+            dtype: dtype of the scene, in which numbers are compared: in float32, 1e-50 is zero.
 
         Raises:
             ValueError: a number is out of range.
         """
         for field, limits in cls.ranges.items():
             if numbers.get(field) is not None:
-                checks.check(owner, field, numbers[field], **limits)
+                checks.check(owner, field, numbers[field], dtype=dtype, **limits)
         for field in cls.nonzero:
             if numbers.get(field) is not None:
-                checks.nonzero(owner, field, numbers[field])
+                checks.nonzero(owner, field, numbers[field], dtype)
 
 
 class BetweenBodies(Element):
@@ -183,13 +184,13 @@ class Elements:
                     f"{name}.{field}", params[field], i, value, field in self.unbounded_fields
                 )
             if given:
-                dtype = jnp.result_type(jax.tree.leaves(params)[0])
-                self.check_numbers(name, rounded(self.get(i) | dict(given), dtype))
+                dtype = checks.chosen_dtype(self.params)
+                self.check_numbers(name, self.get(i) | dict(given), dtype)
         return dataclasses.replace(self, params=params)
 
-    def check_numbers(self, name: str, numbers: Mapping[str, Any]) -> None:
+    def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         """Checks the changed numbers of an element, by field, as its class does."""
-        self.law.check_numbers(name, numbers)
+        self.law.check_numbers(name, numbers, dtype)
 
     def select(self, indices: tuple[int, ...]) -> Self:
         """Returns the elements with the given indices."""
@@ -265,23 +266,6 @@ def element_at(x: Numbers, i: int) -> Array:
     if isinstance(x, Grid):
         return x.values[i]
     return Vector(*(lane[i] for lane in x)).stack() if isinstance(x, Vector) else x[i]
-
-
-def rounded(numbers: Mapping[str, Any], dtype: DType) -> dict[str, Any]:
-    """Casts the concrete numbers among fields to the dtype of the scene; others are unchanged.
-
-    Numbers are compared with their ranges as the scene holds them: in float32, 1e-50 is zero.
-
-    Args:
-        numbers: numbers and other values by field.
-        dtype: dtype of the scene.
-    """
-
-    def cast(x: Any) -> Any:
-        kinds = int | float | np.number | np.ndarray | jax.Array
-        return np.asarray(x, dtype) if isinstance(x, kinds) and checks.is_concrete(x) else x
-
-    return {field: cast(x) for field, x in numbers.items()}
 
 
 def replace_at(owner: str, x: Numbers, i: int, value: PyTree, unbounded: bool = False) -> Any:
