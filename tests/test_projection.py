@@ -211,7 +211,7 @@ def test_every_third_step_and_the_batch():
     system, state = dumbbell()
     method = jc.Method(stabilizer=jc.Projection(every=3))
     start = jc.init(system, method, moved(state, 0.1).q, state.v)
-    memory = start.memory._replace(stabilizer=jnp.asarray([0, 1]))
+    memory = start.memory._replace(stabilizer=jnp.asarray([0, 1], jnp.int32))
     batch = jax.tree.map(lambda x: jnp.stack([x, x]), dataclasses.replace(start, memory=()))
     batch = dataclasses.replace(batch, memory=memory)
     step = jax.jit(jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0]))
