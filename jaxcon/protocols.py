@@ -329,7 +329,9 @@ class Stabilizer(TreeNode, Protocol):
         super().__init_subclass__(**options)
         renamed = {"target": "constraint_equations", "impose": "constraint_equations"}
         for old, new in (renamed | {"bounded": "cap_gains"}).items():
-            inherited = any(old in vars(base) for base in cls.__mro__[1:])  # its caller, too
+            inherited = any(
+                old in vars(base) for base in cls.__mro__[1:]
+            )  # by a base that calls it
             if callable(vars(cls).get(old)) and new not in vars(cls) and not inherited:
                 raise TypeError(
                     f"{cls.__name__}: the method `{old}` of stabilizers is `{new}` since version"

@@ -681,7 +681,8 @@ def test_where_axes_meet_the_normal_is_across_them(a, b, longer, dtype):
     """In space both axes are normal to it, in the plane the longer one; it is x for balls."""
 
     def across(axes):
-        return across_axes(*(Vector(*x[:, None]) for x in axes))[0].stack()[:, 0]
+        skew = jnp.linalg.norm(jnp.cross(*axes)) > 0
+        return across_axes(*(Vector(*x[:, None]) for x in axes), skew[None]).stack()[:, 0]
 
     axes = jnp.asarray([a, b], dtype)
     n = across(axes)
@@ -740,8 +741,8 @@ def test_bad_numbers_are_refused(element, match):
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize("angle", [1.46, 0.0035])
-def test_capsules_whose_axes_cross_part_along_the_normal_of_both(angle, dim, dtype):
+@pytest.mark.parametrize(("angle", "radius"), [(1.46, 0.01), (0.0035, 0.01), (0.0035, 0.001)])
+def test_capsules_whose_axes_cross_part_along_the_normal_of_both(angle, radius, dim, dtype):
     """The computed closest points differ by rounding, whose direction must not be the normal.
 
     In the plane the normal is that of the longer axis, the second.
@@ -755,7 +756,7 @@ def test_capsules_whose_axes_cross_part_along_the_normal_of_both(angle, dim, dty
     scene.add_body("body", mass=1.0, inertia=inertia, position=second.mean(axis=0)[:dim])
     ends = {"segment_a": first[:, :dim], "segment_b": second[:, :dim]}
     touch = jc.contacts.CapsuleContact(
-        "touch", jc.WORLD, "body", radius_a=0.01, radius_b=0.01, recovery=0.05, **ends
+        "touch", jc.WORLD, "body", radius_a=radius, radius_b=radius, recovery=0.05, **ends
     )
     scene.add(touch)
     system, state = scene.build()
@@ -763,7 +764,7 @@ def test_capsules_whose_axes_cross_part_along_the_normal_of_both(angle, dim, dty
     along = np.asarray(end.v[:dim] / np.linalg.norm(end.v[:dim]))
     axis = np.diff(second[:, :dim], axis=0)[0] / np.linalg.norm(np.diff(second, axis=0))
     assert end.status == jc.Status.OK
-    assert np.linalg.norm(end.v[:dim]) > 1e-2
+    assert np.linalg.norm(end.v[:dim]) > radius
     if dim == 3:
         np.testing.assert_allclose(abs(along), [0.0, 0.0, 1.0], atol=1e-5)
     else:
@@ -780,3 +781,29 @@ def test_small_balls_far_from_the_origin_do_not_touch_before_they_meet():
     end, info = jc.step(system, jc.Method(), state, None, 1e-3)
     np.testing.assert_array_equal(end.v, 0.0)
     np.testing.assert_allclose(info.reactions.gap[0], 2e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_nearly_parallel_capsules_apart_have_their_distance_as_gap(dim, dtype):
+    """Over small angles, rounding decides whether axes count as parallel."""
+    first = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])[:, :dim]
+    scene = jc.Scene(dim=dim, dtype=dtype, gravity=np.zeros(dim))
+    inertia = 0.1 if dim == 2 else (0.1, 0.1, 0.1)
+    scene.add_body("body", mass=1.0, inertia=inertia)
+    ends = {"segment_a": first, "segment_b": first}
+    scene.add(
+        jc.contacts.CapsuleContact("touch", jc.WORLD, "body", radius_a=0.01, radius_b=0.01, **ends)
+    )
+    system, state = scene.build()
+
+    def gap(angle):
+        half = jnp.array([jnp.cos(angle / 2), 0.0, 0.0, jnp.sin(angle / 2)], dtype)
+        turn = angle[None] if dim == 2 else half
+        place = jnp.array([0.0, -0.05, 0.0], dtype)[:dim]
+        at = dataclasses.replace(state, q=jnp.concatenate([place, turn]))
+        return jc.step(system, jc.Method(), at, None, 1e-6)[1].reactions.gap[0]
+
+    angles = np.concatenate([np.linspace(1e-3, 2e-3, 200), 10.0 ** np.linspace(-9, -3, 50)])
+    gaps = jax.jit(jax.vmap(gap))(jnp.asarray(angles, dtype))
+    np.testing.assert_allclose(gaps, 0.03 - np.sin(angles), atol=1.1e-3)

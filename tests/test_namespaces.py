@@ -51,6 +51,13 @@ def test_a_namespace_shows_its_names_only(name):
     assert importlib.import_module(module.__name__) is module
 
 
+def test_environments_show_their_names_and_the_adapters_that_can_be_imported():
+    shown = dir(jc.environments)
+    gymnasium = {"FunctionalEnv", "GymnasiumEnv", "GymnasiumVectorEnv"}
+    assert {*shown} - {"BraxEnv"} == {*jc.environments.__all__, *gymnasium}
+    assert all(getattr(jc.environments, name) is not None for name in gymnasium)
+
+
 def test_a_name_is_in_two_places_only_if_it_is_at_the_top():
     places = {}
     for name, module in FACADES.items():

@@ -235,6 +235,9 @@ def test_numbers_are_compared_as_the_scene_holds_them():
     system.with_params({"flexure": {"bending": 0.1}})
     with pytest.raises(ValueError, match="rod: length must be positive"):
         system.with_params({"rod": {"length": 1e-50}})
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "a", radius=0.1, stiffness=10.0))
+    with pytest.raises(ValueError, match="floor: stiffness must be positive"):
+        scene.build()[0].with_params({"floor": {"stiffness": 1e-50}})
     scene.add(jc.joints.RollingSphere("roll", "a", "b", normal=(0.0, 0.0, 1.0), radius=1e-50))
     with pytest.raises(ValueError, match="radius must be positive"):
         scene.build()

@@ -147,8 +147,8 @@ class CapsuleContact(BetweenBodies):
     """Contact of two capsules at one point; a capsule whose segment has no length is a ball.
 
     The normal points from the closest point of the first axis to the closest point of the second.
-    Where axes meet or cross deep inside, the normal is perpendicular to both axes. In the plane,
-    and for parallel axes in space, it is perpendicular to the longer axis. For two balls with the
+    Where the axes cross between their ends, the normal is perpendicular to both. In the plane, and
+    where parallel axes coincide, it is perpendicular to the longer axis. For two balls with the
     same center it is the world's x axis.
 
     Attributes:
@@ -217,20 +217,20 @@ class CapsuleContact(BetweenBodies):
             for f, s in ((a, "a"), (b, "b"))
             for e in ("start", "end")
         ]
-        x_a, x_b, within = nearest(*ends)
+        x_a, x_b, skew, crossing = nearest(*ends)
         apart, radii = x_b - x_a, p["radius_a"] + p["radius_b"]
         length = numerics.norm(apart)
-        aside, crossing = across_axes(ends[1] - ends[0], ends[3] - ends[2])
         resolved = length > rounding_of(ends, x_a, x_b, radii)
         if len(apart) == 2:  # axes that cross in the plane meet
-            resolved &= ~(within & crossing)
-        # deep inside, x_b − x_a loses its direction to rounding; u × w is the same direction
-        meet = ~resolved | (within & crossing & (length <= DEEP * radii))
+            resolved &= ~crossing
+        # u × w is the direction of x_b − x_a between the ends, with less rounding
+        across_both = ~resolved | crossing
+        aside = across_axes(ends[1] - ends[0], ends[3] - ends[2], skew)
         aside = aside * jnp.where(resolved & (aside.dot(apart) < 0), -1.0, 1.0)
         n = apart * numerics.safe_divide(1.0, length)
-        n = Vector(*(jnp.where(meet, y, x) for x, y in zip(n, aside, strict=True)))
+        n = Vector(*(jnp.where(across_both, y, x) for x, y in zip(n, aside, strict=True)))
         # where the axes meet, the norm has no derivative; the gap then changes along n
-        gap = jnp.where(meet, n.dot(apart), length) - radii
+        gap = jnp.where(across_both, n.dot(apart), length) - radii
         middle = x_a + n * (p["radius_a"] + gap / 2)
         return contact_rows(p, Touch(gap, n, middle, a, b), dt)
 
@@ -257,14 +257,10 @@ class Contacts(Ranged):
         return BoundSet(law, tuple(rows), places, points=each, **fields)
 
 
-DEEP = 1e-2
-"""The distance of two axes, as a fraction of the radii, below which the contact is deep."""
-
-
 def rounding_of(ends: Sequence[Vector], x_a: Vector, x_b: Vector, radii: Lane) -> Lane:
-    """Returns a bound on the rounding error of the distance of two segments' closest points.
+    """Estimates the rounding error of the distance of two segments' closest points [m].
 
-    It is zero for two balls, whose centers are not computed, and at most a thousandth of the radii.
+    It is zero for two balls, and at most a thousandth of the sum of the radii.
 
     Args:
         ends: p, q, r and s, the ends of the segments pq and rs.
@@ -279,11 +275,15 @@ def rounding_of(ends: Sequence[Vector], x_a: Vector, x_b: Vector, radii: Lane) -
     return jnp.where(has_axis, jnp.minimum(16 * eps * size, 1e-3 * radii), 0)
 
 
-def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector, Array]:
-    """Returns the closest points of the segments pq and rs, and whether both are between ends.
+def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector, Lane, Array]:
+    """Returns the closest points of the segments pq and rs.
 
     Parallel segments are closest along the part where they face each other; the result is the
     middle of this part. If they do not face each other, the result is the two closest ends.
+
+    Returns:
+        The two points; True if the segments are not parallel; and True if they are not parallel and
+        both points lie between the ends.
 
     References:
         Ericson, Real-Time Collision Detection (2005), section 5.1.9.
@@ -293,21 +293,26 @@ def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector,
     c, f = u.dot(d), w.dot(d)
     apart = a * e - b * b
     tiny = 16 * float(jnp.finfo(jnp.result_type(*p)).eps)
-    crossing = apart > tiny * a * e
-    x = jnp.clip(numerics.safe_divide(b * f - c * e, jnp.where(crossing, apart, 0)), 0, 1)
+    skew = apart > tiny * a * e
+    x = jnp.clip(numerics.safe_divide(b * f - c * e, jnp.where(skew, apart, 0)), 0, 1)
     facing = [jnp.clip(numerics.safe_divide(end, a), 0, 1) for end in (-c, b - c)]
-    x = jnp.where(crossing, x, (facing[0] + facing[1]) / 2)
+    x = jnp.where(skew, x, (facing[0] + facing[1]) / 2)
     y = jnp.clip(numerics.safe_divide(b * x + f, e), 0, 1)
     x = jnp.clip(numerics.safe_divide(b * y - c, a), 0, 1)
-    within = (x > 0) & (x < 1) & (y > 0) & (y < 1)
-    return p + u * x, r + w * y, within
+    crossing = skew & (x > 0) & (x < 1) & (y > 0) & (y < 1)
+    return p + u * x, r + w * y, skew, crossing
 
 
-def across_axes(u: Vector, w: Vector) -> tuple[Vector, Array]:
-    """Returns a unit normal of two capsules whose axes u and w meet, and whether these cross.
+def across_axes(u: Vector, w: Vector, skew: Lane) -> Vector:
+    """Returns a unit vector across the axes u and w of two capsules.
 
-    The normal is u × w / ‖u × w‖ in space. In the plane, and for parallel axes in space, it is
+    It is u × w / ‖u × w‖ in space. In the plane, and for parallel axes in space, it is
     perpendicular to the longer axis. For two balls, whose axes are zero, it is the world's x axis.
+
+    Args:
+        u: axis of the first capsule, any length.
+        w: axis of the second capsule.
+        skew: True where the axes are not parallel.
     """
     square_u, square_w = u.dot(u), w.dot(w)
     longer = square_u >= square_w
@@ -319,15 +324,12 @@ def across_axes(u: Vector, w: Vector) -> tuple[Vector, Array]:
         jnp.where(square > 0, jnp.where(longer, x, y) * unit, z)
         for x, y, z in zip(u, w, down, strict=True)
     )
-    aside, both = across(Vector(*along))[0], u.cross(w)
-    area = both * both if len(u) == 2 else both.dot(both)
-    tiny = 16 * float(jnp.finfo(jnp.result_type(*u)).eps)
-    crossing = area > tiny * square_u * square_w
+    aside = across(Vector(*along))[0]
     if len(u) == 2:
-        return aside, crossing
-    unit = numerics.safe_divide(1.0, numerics.safe_sqrt(jnp.where(crossing, area, 0)))
-    normal = (jnp.where(crossing, x * unit, y) for x, y in zip(both, aside, strict=True))
-    return Vector(*normal), crossing
+        return aside
+    both = u.cross(w)
+    unit = numerics.safe_divide(1.0, numerics.safe_sqrt(jnp.where(skew, both.dot(both), 0)))
+    return Vector(*(jnp.where(skew, x * unit, y) for x, y in zip(both, aside, strict=True)))
 
 
 def plane(element: PlaneContact | BoxContact, a: Pose) -> dict[str, Array]:

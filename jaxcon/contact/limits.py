@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.custom import CustomOnBodies, CustomOnCoordinates, UserFunction
 from jaxcon.constraints.primitives import Row
@@ -49,32 +50,39 @@ class Ranged(Elements):
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         """Checks the parameters of one element, given by field."""
-        check_ranges(name, numbers)
+        check_ranges(name, numbers, dtype)
 
 
-def check_ranges(owner: str, numbers: Mapping[str, Any]) -> None:
+def check_ranges(owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
     """Checks the parameters of one element with inequality rows, by field; skips traced values.
+
+    Args:
+        owner: first words of errors.
+        numbers: the parameters by field.
+        dtype: dtype of the scene, in which they are compared.
 
     Raises:
         ValueError: a parameter is out of range, or the lower stop is not below the upper one.
     """
     for field in numbers.keys() & {*POSITIVE, *NOT_NEGATIVE}:
         limit: Any = {"above": 0} if field in POSITIVE else {"least": 0}
-        checks.check(owner, field, numbers[field], **limit)
+        checks.check(owner, field, numbers[field], dtype=dtype, **limit)
     e = numbers.get("restitution", 0.0)
     if checks.is_concrete(e) and e > 1:
         raise ValueError(f"{owner}: restitution must lie in 0 to 1, got {float(e):g}.")
     if "lower" in numbers:
-        check_ends(owner, numbers["lower"], numbers["upper"])
+        check_ends(owner, numbers["lower"], numbers["upper"], dtype)
 
 
-def check_ends(owner: str, lower: Array | float, upper: Array | float) -> None:
-    """Checks that the lower stop is below the upper stop.
+def check_ends(owner: str, lower: Array | float, upper: Array | float, dtype: DType) -> None:
+    """Checks that the lower stop is below the upper stop in the dtype of the scene.
 
     Raises:
         ValueError: the lower stop is not below the upper stop.
     """
-    if checks.is_concrete((lower, upper)) and not lower < upper:
+    if not checks.is_concrete((lower, upper)):
+        return
+    if not np.asarray(lower, dtype) < np.asarray(upper, dtype):
         raise ValueError(
             f"{owner}: lower must be below upper, got {checks.numerals(lower)} and"
             f" {checks.numerals(upper)}; what does not move at all is a Fixed joint or a Drive."
@@ -155,7 +163,7 @@ class Limit(OnJoint):
         upper = checks.real(
             label(self), "upper", far if self.upper is None else self.upper, dtype, finite=False
         )
-        check_ends(label(self), lower, upper)
+        check_ends(label(self), lower, upper, dtype)
         return {"lower": lower, "upper": upper} | stop(self, dtype)
 
     @staticmethod
@@ -380,7 +388,7 @@ def stop(element: HasStop, dtype: DType) -> dict[str, Array]:
     if element.stiffness is not None:
         numbers |= {"stiffness": element.stiffness, "damping": element.damping}
     result = {what: checks.real(owner, what, x, dtype) for what, x in numbers.items()}
-    check_ranges(owner, result)
+    check_ranges(owner, result, dtype)
     return result
 
 
@@ -445,7 +453,7 @@ class OneSided:
         fields, name = dict(changes.get(self.law.name, {})), self.law.name
         params = fields.pop("params", self.params)
         new = {k: replace_at(f"{name}.{k}", self.numbers[k], 0, x) for k, x in fields.items()}
-        check_ranges(name, fields)
+        check_ranges(name, fields, checks.chosen_dtype(self.numbers))
         return dataclasses.replace(self, params=params, numbers=self.numbers | new)
 
     def bounds(self: Any, snapshot: Snapshot, control: PyTree, dt: Array) -> BoundSet:

@@ -386,13 +386,19 @@ def flag(owner: str, what: str, x: PyTree) -> None:
 def nonzero(owner: str, what: str, x: PyTree, dtype: DType = np.float64) -> None:
     """Checks that a number or vector is finite and not zero in a dtype.
 
+    The squared length of a vector must be a normal number of the dtype, so that it can be divided
+    by its length.
+
     Raises:
         ValueError: the value is zero, not finite or not numeric.
     """
     values = _numbers(owner, what, x)
     if is_concrete(values):
         values = np.asarray(values, dtype)
-        if not np.all(np.isfinite(values)) or not np.any(values):
+        with np.errstate(over="ignore", under="ignore"):
+            square = np.sum(values * values)
+        is_zero = square < np.finfo(dtype).tiny if values.ndim else values == 0
+        if not np.all(np.isfinite(values)) or is_zero:
             wanted = "have a length" if values.ndim else "be finite and not zero"
             raise ValueError(f"{owner}: {what} must {wanted}, got {numerals(values)}.")
 

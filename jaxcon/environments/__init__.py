@@ -82,6 +82,12 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
+def __dir__() -> list[str]:
+    """Returns the public names, with the adapters whose library is installed."""
+    needs = {name: "brax" if name == "BraxEnv" else "gymnasium" for name in ADAPTERS}
+    return [*__all__, *(name for name, library in needs.items() if find_spec(library) is not None)]
+
+
 if find_spec("gymnasium") is not None:
     from jaxcon.environments import gym
 

@@ -231,11 +231,13 @@ EVERY_STEP = EveryStep()
 
 
 def check_adjoint(adjoint: Adjoint) -> None:
-    """Checks that an adjoint is an instance such as `Checkpoints()`, and its numbers.
+    """Checks that an adjoint is an instance of a class that derives from `jc.extend.Adjoint`.
+
+    Calls its method `check`, too.
 
     Raises:
         TypeError: `adjoint` is a class, or does not derive from `jc.extend.Adjoint`.
-        ValueError: a number of the adjoint is out of range.
+        ValueError: `check` of a user's adjoint raises it.
     """
     if isinstance(adjoint, type) or not hasattr(adjoint, "scan"):
         raise TypeError(

@@ -98,8 +98,8 @@ def with_origin(info: Info, system: System) -> Info:
 def undo(system: System, method: Method, state: State, control: PyTree, dt: Scalar) -> State:
     """Returns the state before a step of h, by a step of −h of a symmetric integrator.
 
-    Counted turns are those at the end of the step. They differ from those at its start by less than
-    half a turn, so readers find the same whole turns.
+    `turns` of the result are angles extrapolated back from the end of the step. Like those before
+    the step, they are within half a turn of the true angles, so the same whole turns are counted.
     """
     control = check_step(system, method, state, control, "rollout")
     with checks.without_waiting():
@@ -189,13 +189,13 @@ def forward_dynamics(
         ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.
         TypeError: an argument has another type, such as a class in place of a method.
     """
-    return solved(system, state, control, method, dt, "forward_dynamics")
+    return forward_dynamics_for("forward_dynamics", system, state, control, method, dt)
 
 
-def solved(
-    system: System, state: State, control: PyTree, method: Method, dt: Scalar, owner: str
+def forward_dynamics_for(
+    owner: str, system: System, state: State, control: PyTree, method: Method, dt: Scalar
 ) -> SolutionAt:
-    """`forward_dynamics` for a public function, the owner, which errors name."""
+    """Solves as `forward_dynamics` does. Errors name `owner`, the public function called."""
     control = check_step(system, method, state, control, owner)
     with checks.without_waiting():
         h = checks.real(owner, "dt", dt, state.q.dtype, least=0)

@@ -205,7 +205,7 @@ def from_axis_angle(axis: Scalar | Sequence[Scalar], angle: Scalar) -> Array:
     """Returns the unit quaternion (4,) of a rotation by an angle about an axis.
 
     Args:
-        axis: the rotation axis, (3,), of any nonzero length. An axis of zeros gives the identity.
+        axis: the rotation axis, (3,), of any length; zeros give the identity.
         angle: the rotation angle, () [rad].
 
     Raises:

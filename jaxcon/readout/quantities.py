@@ -12,7 +12,7 @@ from jaxcon.constraints.rows import Violation, linearize
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import Array, PyTree, Scalar
-from jaxcon.execution.step import SolutionAt, solved
+from jaxcon.execution.step import SolutionAt, forward_dynamics_for
 from jaxcon.geometry.pose import Motion
 from jaxcon.linear.proximal import RankSafe
 from jaxcon.methods.baumgarte import Unstabilized
@@ -314,7 +314,8 @@ def reaction(
     if getattr(system, "layout", ()) is None:
         raise TypeError("reaction: generalized coordinates have no bodies; see jc.multipliers.")
     method = Method(solver=RankSafe() if solver is None else solver, stabilizer=Unstabilized())
-    solution = solved(system, without_memory(state), control, method, dt, "reaction")
+    given = system, without_memory(state), control, method, dt
+    solution = forward_dynamics_for("reaction", *given)
     return wrench(solution, name, body)
 
 
