@@ -115,18 +115,19 @@ __version__ = "0.2.0"
 
 @functools.cache
 def _renamed() -> dict[str, str]:
-    """Returns new dotted names by old ones."""
+    """Returns a dictionary from old to new dotted names."""
     table = Path(__file__).with_name("renamed.json")
     return json.loads(table.read_text(encoding="utf-8"))["names"]
 
 
-if not TYPE_CHECKING:  # else type checkers would take every name for one that exists
+if not TYPE_CHECKING:  # otherwise type checkers would accept every name
 
     def __getattr__(name: str) -> Any:
         """Imports `environments` at its first use: the import registers tasks with Gymnasium.
 
         Raises:
-            AttributeError: of a name before 0.2.0, with the new name.
+            AttributeError: the name does not exist; for a name from before 0.2.0, the message
+                gives the new name.
         """
         if name == "environments":
             return importlib.import_module("jaxcon.environments")

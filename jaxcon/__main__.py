@@ -103,7 +103,7 @@ def run_tradeoff(options: argparse.Namespace) -> int:
 
     try:
         system, state = find_scene(options.scene)
-        # imports and building count too, but leave at least half of the budget to compare with
+        # imports and building use up the budget, but the comparison gets at least half of it
         budget = max(options.budget - (time.perf_counter() - begin), options.budget / 2)
         result = tradeoff(
             system, state, options.seconds, batch=options.batch, file=options.file, budget=budget

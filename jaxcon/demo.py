@@ -134,7 +134,7 @@ def default_gains(dtype: DType) -> Gains:
 
 
 def errors(gains: Gains, worlds: Worlds, steps: int) -> tuple[State, Array]:
-    """Simulates a batch from initial states that are first made consistent with the constraints.
+    """Simulates a batch with PID feedback, from the given initial positions and velocities.
 
     Returns:
         The final states, and the joint errors φ of every step, (copies, steps, rows) [m].

@@ -3,20 +3,20 @@
 
 `step.py` and the layers around it know the parts of a scene and of a method by these protocols:
 
-    System           what moves: M, f, the kinematics of q, and its constraints
-    Constraint       equal equality constraints, side by side: φ, φ̇, J and γ
-    InequalityGroup  equal limits, contacts or motors, side by side
+    System           a mechanical model: M, f, the kinematics of q, and the constraints
+    Constraint       a group of equality constraints of one kind: φ, φ̇, J and γ
+    InequalityGroup  a group of limits, contacts or motors of one kind
     Stabilizer       b and C of J a + C λ = b, and the correction after a step
     Integrator       the next q and v from accelerations
     Solver           a and λ of M a = f + Jᵀλ, J a + C λ = b
     ContactSolver    the multipliers of inequality constraints
-    Adjoint          what the reverse pass of a rollout keeps
+    Adjoint          the states that the reverse pass of a rollout keeps
 
 To write a part, inherit from its protocol. Methods marked `@abstractmethod` and fields without a
-value are required, all other methods of a part have a default. A new `System` is the exception: it
-needs all methods of its protocol, and those of `Bodies` if it consists of bodies.
+value are required; all other methods have a default. `System` is the exception: a new system needs
+all methods of `System`, and also those of `Bodies` if it consists of bodies.
 Parts are pytrees (`core.pytree`), so that their numbers can be traced, batched and differentiated.
-Arrays have the shapes that the docstrings give, and in a batch of worlds one more axis at the end.
+Docstrings give the shapes of arrays in one world; a batch of worlds adds one axis at the end.
 """
 
 from __future__ import annotations
@@ -45,40 +45,40 @@ if TYPE_CHECKING:
 
 
 class Constraint(Protocol):
-    """A group of equal equality constraints of a system, stored side by side."""
+    """A group of equality constraints of one kind, whose rows are computed together."""
 
     names: tuple[str, ...]
     """The names of the constraints."""
 
     places: tuple[Place, ...]
-    """The bodies on each side of the constraints."""
+    """The bodies of the constraints, one `Place` for each side, such as all first bodies."""
 
     @abstractmethod
     def rows(self, snapshot: Snapshot) -> list[Row]:
-        """φ, φ̇, J and γ of the group at one instant; each row has a pull for each place."""
+        """The rows at one instant: φ, φ̇, γ, and the entries of J (`pulls`) for each place."""
         ...
 
     def anchors(self, snapshot: Snapshot) -> Vector | None:
-        """The points about which wrenches are given, world frame; None for centers of mass."""
+        """The points about which torques are taken, world frame; None for centers of mass."""
         return None
 
     is_inertia: ClassVar[bool] = False
     """True for rotors: they add inertia and constrain nothing."""
     closes_loops: ClassVar[bool] = True
-    """True where rows depend on others if they close a loop of bodies, as those of joints do."""
+    """True if these constraints may close a loop of bodies, in which rows may be redundant."""
     independent: ClassVar[bool] = True
-    """False where the rows of one constraint may depend on each other."""
+    """False if the rows of a single constraint may be linearly dependent."""
     has_vectors: ClassVar[bool] = False
-    """True where rows are components of vectors along axes that were chosen freely."""
+    """True if rows may be the components of one vector along arbitrary axes, as in joints."""
 
     @property
     def driven(self) -> Hashable | None:
-        """The joint coordinate whose motion is prescribed; None for none."""
+        """A key of the joint coordinate whose motion is prescribed; None if none is prescribed."""
         return None
 
 
 class InequalityGroup(Protocol):
-    """A group of equal elements with bounded multipliers: limits, contacts, friction, motors."""
+    """A group of elements of one kind with bounded λ: limits, contacts, friction or motors."""
 
     @property
     @abstractmethod
@@ -94,32 +94,32 @@ class InequalityGroup(Protocol):
     @property
     @abstractmethod
     def places(self) -> tuple[Place, ...]:
-        """The bodies on each side of the elements."""
+        """The bodies of the elements, one `Place` for each side, such as all first bodies."""
         ...
 
     @property
     @abstractmethod
     def numbers(self) -> Mapping[str, Any]:
-        """The numbers by field. A world with a number that is not finite stops."""
+        """The numeric fields by name. A world stops if a number is not finite."""
         ...
 
     @property
     def unbounded_fields(self) -> tuple[str, ...]:
-        """The fields of `numbers` that may be infinite."""
+        """The fields of `numbers` that may be infinite, such as the stops of a limit."""
         return ()
 
     @property
     def coordinate(self) -> JointCoordinate | None:
-        """The joint coordinate on which the elements act; None for contacts and the like."""
+        """The joint coordinate on which the elements act; None for elements such as contacts."""
         return None
 
     def anchors(self, snapshot: Snapshot) -> Vector | None:
-        """The points about which wrenches are given, world frame; None for centers of mass."""
+        """The points about which torques are taken, world frame; None for centers of mass."""
         return None
 
 
 class System(TreeNode, Protocol):
-    """Positions q, velocities v, and M a = f + Jᵀλ.
+    """A mechanical system: positions q, velocities v, and the equations M a = f + Jᵀλ.
 
     `BodySystem` (bodies), `GeneralizedCoordinates` (the user's own coordinates) and `Vakonomic`
     implement it.
@@ -141,7 +141,7 @@ class System(TreeNode, Protocol):
         ...
 
     def check(self, q: Array) -> None:
-        """Checks numbers that depend on q, (n_q,), when a state is made."""
+        """Checks the numbers that depend on q, (n_q,); called when an initial state is made."""
 
     def columns(self, place: Place) -> Columns:
         """The columns of J that belong to the bodies of a place."""
@@ -162,23 +162,23 @@ class System(TreeNode, Protocol):
         ...
 
     def snapshot(self, q: Array, v: Array, t: Doubled | Scalar) -> Snapshot:
-        """The system at one instant; frames and joint coordinates are computed once in it."""
+        """The system at one instant, which computes each frame and joint coordinate only once."""
         ...
 
     def mass(self, q: Array) -> Mass:
-        """M, (n_v, n_v)."""
+        """The mass matrix M, (n_v, n_v)."""
         ...
 
     def force(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
-        """f, (n_v,) [N, N m], the gyroscopic force −ω × Iω included."""
+        """The generalized force f, (n_v,) [N, N m], including the gyroscopic force −ω × Iω."""
         ...
 
     def applied(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
-        """f without the gyroscopic force, (n_v,) [N, N m]."""
+        """The generalized force f without the gyroscopic force, (n_v,) [N, N m]."""
         ...
 
     def complete(self, solution: Solution) -> Solution:
-        """The solution with accelerations that follow from multipliers, as μ̇ = −λ."""
+        """Adds accelerations that follow from multipliers, such as μ̇ = −λ of `Vakonomic`."""
         ...
 
     def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:
@@ -187,21 +187,21 @@ class System(TreeNode, Protocol):
 
     @property
     def params(self) -> Any:
-        """The numbers of the system: by element and field for bodies, any pytree elsewhere."""
+        """The numbers of the system: by element and field for bodies, else any pytree."""
         ...
 
     def with_params(self, changes: Any, /) -> Self:
-        """The system with other numbers; nothing is traced again."""
+        """The system with changed numbers; compiled functions are not traced again."""
         ...
 
-    # kinematics: v is q̇ in the plane and on generalized coordinates, and not in space
+    # kinematics: v equals q̇ in the plane and for generalized coordinates, but not in space
 
     def kinematics(self, q: Array, v: Array) -> Array:
         """q̇, (n_q,)."""
         ...
 
     def retract(self, q: Array, step: Array) -> Array:
-        """q ⊕ Δ for a finite step Δ = h v, (n_v,); rotations by their exponential."""
+        """q ⊕ Δ for a finite step Δ = h v, (n_v,); rotations use the exponential map."""
         ...
 
     def normalize(self, q: Array) -> Array:
@@ -209,22 +209,22 @@ class System(TreeNode, Protocol):
         ...
 
     def carry(self, q: Array, step: Array, p: Array) -> Array:
-        """(dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum after a step Δ as seen from its start."""
+        """(dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum p after a step Δ, transformed to its start."""
         ...
 
     def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
-        """ad*_v p, (n_v,): the rate at which turning with the bodies changes a momentum p."""
+        """ad*_v p, (n_v,): the rate of a body-frame momentum p due to the turning frames."""
         ...
 
     def extent(self, q: Array) -> Array:
-        """The largest coordinate, () [m], for bounds on rounding errors."""
+        """The largest |x| of the position coordinates x, () [m], for bounds on rounding errors."""
         ...
 
     # rotations in space, whose free motion integrators advance separately
 
     @property
     def has_bodies(self) -> bool:
-        """True for a system of bodies; False where it is not known which coordinates turn."""
+        """True for a system of bodies; False if the coordinates need not belong to bodies."""
         ...
 
     @property
@@ -241,36 +241,48 @@ class System(TreeNode, Protocol):
 
     @property
     def turns(self) -> Array | tuple[()]:
-        """Angles within half a turn of the counted coordinates, (n,) [rad]; () for none."""
+        """Expected angles of counted coordinates, within half a turn, (n,) [rad]; () for none."""
         ...
 
     def with_turns(self, turns: Array | tuple[()], remainder: Array | tuple[()] = ()) -> Self:
-        """The system with these reference angles."""
+        """The system with other expected angles `turns` and rounding errors `remainder`."""
         ...
 
     def no_remainder(self, dtype: DType) -> Array | tuple[()]:
-        """The `angle_remainder` of a state that has made no turns."""
+        """The `angle_remainder` of a new state: zeros, or () if angles are not reduced."""
         ...
 
     def unwind(self, q: Array) -> tuple[Self, Array]:
-        """The system that knows the whole turns in q, and q without them."""
+        """Moves whole turns of angles from q into the system; returns the system and q."""
         ...
 
     def rewind(self, q: Array, after: Array) -> tuple[Array, Array | tuple[()]]:
-        """The end of a step with the whole turns of its start q, and the rounding remainder."""
+        """Restores whole turns after a step; returns positions and rounding errors of angles.
+
+        Args:
+            q: positions at the start of the step, with whole turns, (n_q,).
+            after: positions at the end of the step, computed without whole turns, (n_q,).
+        """
         ...
 
     def count(self, q: Array, v: Array, t: Doubled | Scalar) -> Any:
-        """The counted coordinates over all turns, (n,) [rad]."""
+        """The counted coordinates, whole turns included, (n,) [rad]."""
         ...
 
     def expect(self, here: Snapshot, end: Array, dt: Array, within: bool) -> tuple[Any, Array]:
-        """The expected counted coordinates after a step, and their largest error, () [rad]."""
+        """The expected counted coordinates after a step, and a bound on their error, () [rad].
+
+        Args:
+            here: the snapshot at the start of the step.
+            end: v after the step, (n_v,).
+            dt: h, () [s].
+            within: True if angles are also read inside the step.
+        """
         ...
 
 
 class Bodies(System, Protocol):
-    """A system of bodies; integrators advance the rotations in space separately from the rest."""
+    """A system of bodies; integrators advance free rotations in space separately."""
 
     def kinetic_energy(self, q: Array, v: Array) -> Array:
         """The kinetic energy ½ vᵀMv, without that of rotors, () [J]."""
@@ -279,15 +291,23 @@ class Bodies(System, Protocol):
     def kick(
         self, q: Array, v: Array, acceleration: Array, dt: Array, small: bool = False
     ) -> Array:
-        """v after a step of dt (1,) [s] under a, (n_v,); free rotation is advanced separately."""
+        """The velocities after a step of v̇ = a, (n_v,); free rotation is advanced separately.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities before the step, (n_v,).
+            acceleration: a at q and v, (n_v,), with its gyroscopic part.
+            dt: h, (1,) [s].
+            small: True for a cheaper rule, for bodies that turn by far less than a radian.
+        """
         ...
 
     def rotate(self, q: Array, v: Array, dt: Array) -> Array:
-        """v after a free rotation of dt (1,) [s], (n_v,)."""
+        """The velocities after a free rotation during dt, (1,) [s], (n_v,)."""
         ...
 
     def coast(self, q: Array, v: Array, dt: Array) -> Array:
-        """The mean gyroscopic acceleration of a free rotation less that at its start, (n_v,)."""
+        """The mean gyroscopic acceleration of a free rotation, less its initial value, (n_v,)."""
         ...
 
     def gyroscopic_acceleration(self, q: Array, v: Array) -> Array:
@@ -295,29 +315,45 @@ class Bodies(System, Protocol):
         ...
 
     def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
-        """The change p of velocities in body frames that have turned by Δ, (n_v,)."""
+        """A velocity change p, (n_v,), in body frames that have turned by a step Δ."""
         ...
 
     def by_body(self, q: Array, x: Array) -> Array:
-        """A mask of the velocities of bodies that have a nonzero x, (n_v,)."""
+        """A mask of velocities, (n_v,): True for all of a body if any of its x is nonzero."""
         ...
 
     def squared_turn(self, q: Array, v: Array, before: Array, rows: Rows, dt: Array) -> Array:
-        """The square of the largest turn of a body or rod in a step, () [rad²]."""
+        """The square of the largest turn of a body or rod in a step, () [rad²].
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities of the step, (n_v,).
+            before: velocities at which the rows were computed, (n_v,).
+            rows: the constraint rows.
+            dt: h, (1,) [s].
+        """
         ...
 
     def squared_turns(
         self, v: Array, before: Array, rows: Rows, dt: Array, whole: bool = False
     ) -> Array:
-        """The squared largest turn of the arms and axes of each row in a step, (n_c,) [rad²]."""
+        """The square of the largest turn of an arm or axis of each row, (n_c,) [rad²].
+
+        Args:
+            v: velocities of the step, (n_v,).
+            before: velocities at which the rows were computed, (n_v,).
+            rows: the constraint rows.
+            dt: h, (1,) [s].
+            whole: True to include rotation about an arm or axis, which does not turn it.
+        """
         ...
 
 
 class Stabilizer(TreeNode, Protocol):
     """Chooses b and C of J a + C λ = b, so that errors of the constraints do not grow.
 
-    `constraint_equations` is the one method that is required. b = −γ holds φ̈ = 0 alone, so that
-    errors of φ and φ̇ grow; see `Unstabilized`.
+    Only `constraint_equations` is required. b = −γ makes φ̈ zero, but errors of φ and φ̇ then grow;
+    see `Unstabilized`.
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -331,7 +367,7 @@ class Stabilizer(TreeNode, Protocol):
         for old, new in (renamed | {"bounded": "cap_gains"}).items():
             inherited = any(
                 old in vars(base) for base in cls.__mro__[1:]
-            )  # by a base that calls it
+            )  # the base that defines the old name also calls it
             if callable(vars(cls).get(old)) and new not in vars(cls) and not inherited:
                 raise TypeError(
                     f"{cls.__name__}: the method `{old}` of stabilizers is `{new}` since version"
@@ -347,14 +383,14 @@ class Stabilizer(TreeNode, Protocol):
 
     @abstractmethod
     def constraint_equations(self, rows: Rows, memory: Any, dt: Array) -> Rows:
-        """The rows with their target b, as `rows.with_target(b)` returns them.
+        """Returns the rows with their target b, by `rows.with_target(b)`.
 
         To change C or f, also set the fields `compliance` or `force` of the rows.
 
         Args:
-            rows: φ, φ̇, J, γ at one instant, with φ̇ as feedback sees it.
-            memory: of this stabilizer, as of the end of the last step; the same at all stages of
-                the step.
+            rows: φ, φ̇, J, γ at one instant. With `SemiImplicitEuler`, φ̇ is the rate half a step
+                earlier.
+            memory: the stabilizer's memory after the last step, the same at all stages of the step.
             dt: h, () [s].
         """
         ...
@@ -362,19 +398,19 @@ class Stabilizer(TreeNode, Protocol):
     def solve(
         self, solver: Solver, rows: Rows, memory: Any, dt: Array, system: Saddle
     ) -> Solution | None:
-        """The solution, where the stabilizer has a method of its own; None to use the solver's."""
+        """The solution, if the stabilizer computes it by itself; None to use the solver."""
         return None
 
     @property
     def solves(self) -> bool:
-        """True where `solve` has a method of its own."""
+        """True if the stabilizer computes the solution by its own `solve`."""
         return type(self).solve is not Stabilizer.solve
 
     # memory: integrals, histories, the λ of the last step. `jc.init` calls `init` and puts the
     # result into `State.memory`; `jc.step` and `jc.rollout` refuse a state without it. At the end
-    # of each step it becomes remember(advance(rows, memory, dt), solution), which `correct` and the
-    # next step get. `jc.forward_dynamics` uses the memory and does not update it. Leaves are arrays
-    # whose shapes and dtypes stay; a batch adds an axis at their end.
+    # of each step the new memory is remember(advance(rows, memory, dt), solution); `correct` and
+    # the next step get it. `jc.forward_dynamics` uses the memory but does not update it. Leaves are
+    # arrays whose shapes and dtypes do not change; a batch adds an axis at the end.
 
     def init(self, system: System, q: Array, v: Array) -> Any:
         """The memory at the start of a simulation of one world; () for none.
@@ -390,8 +426,8 @@ class Stabilizer(TreeNode, Protocol):
     def remember(self, memory: Any, solution: Solution) -> Any:
         """The memory after a step, from the a and λ of the step.
 
-        They belong to the start of the step; with contact they are means over the step, and with
-        `GeneralizedAlpha` they belong to its end. λ is that of equality rows, (n_c,).
+        a and λ belong to the start of the step, or to its end with `GeneralizedAlpha`. With contact
+        they are means over the step. λ has the equality rows only, (n_c,).
         """
         return memory
 
@@ -417,15 +453,15 @@ class Stabilizer(TreeNode, Protocol):
 
     @property
     def completes(self) -> bool:
-        """True where `correct` finds the constraint forces of the step, as `Projection` does.
+        """True if `correct` adds the missing constraint forces of the step, like `Projection()`.
 
-        It then keeps φ = 0 at q⁺ and φ̇ = 0 at (q⁺, v⁺).
+        After each step, φ = 0 at the new q, and φ̇ = 0 at the new q and v.
         """
         return False
 
     @property
     def remembers(self) -> bool:
-        """True where there is a memory, so that `init` is overridden."""
+        """True if the stabilizer has a memory, that is, if it overrides `init`."""
         return type(self).init is not Stabilizer.init
 
     # only for stabilizers with default gains, which depend on the integrator and the step
@@ -446,7 +482,8 @@ class Stabilizer(TreeNode, Protocol):
         """The stabilizer with gains below the largest stable β [1/s].
 
         Args:
-            stable_rate: the smallest damping ratio α/β of the gains ↦ the largest stable β.
+            stable_rate: function of the smallest damping ratio α/β of the gains that returns the
+                largest stable β.
         """
         return self
 
@@ -454,16 +491,16 @@ class Stabilizer(TreeNode, Protocol):
 class Integrator(TreeNode, Protocol):
     """Advances q and v by accelerations.
 
-    `advance` and `default_gains` are required. `report`, warnings of unstable gains and gains
-    capped at the stable rate need `growth`, too.
+    `advance` and `default_gains` are required. `report`, warnings about unstable gains and
+    `Stabilizer.cap_gains` also need `growth`.
     """
 
     symmetric: ClassVar[bool] = False
-    """True where a step by −h undoes one by h."""
+    """True if a step by −h undoes a step by h."""
     supports_inequalities: ClassVar[bool] = True
-    """True where limits, friction and contact may act beside it."""
+    """True if the integrator works in scenes with limits, friction and contact."""
     reads_within: ClassVar[bool] = True
-    """True where it reads angles between the ends of a step."""
+    """True if the integrator reads angles inside a step, not only at its start."""
 
     def check(self) -> None:
         """Checks the numbers of the part; by default, does nothing.
@@ -481,9 +518,9 @@ class Integrator(TreeNode, Protocol):
         """One step of dt [s] from a state.
 
         Args:
-            dynamics: `dynamics(q, v, t)` solves for a and λ.
-            state: at the start.
-            memory: of this integrator.
+            dynamics: the equations of motion; `dynamics(q, v, t)` solves for a and λ.
+            state: the state at the start of the step.
+            memory: the integrator's memory.
             dt: h, () [s].
         """
         ...
@@ -494,26 +531,26 @@ class Integrator(TreeNode, Protocol):
         ...
 
     def highest_rate(self, dt: Array) -> Any:
-        """β [1/s] to which default gains may rise in float32; None where they do not rise."""
+        """The largest β [1/s] to which default gains may rise in float32; None if they do not."""
         return None
 
     @property
     def has_rising_gains(self) -> bool:
-        """True where default gains may rise; see `highest_rate`."""
+        """True if default gains may rise; see `highest_rate`."""
         return type(self).highest_rate is not Integrator.highest_rate
 
     def growth(self, alpha: float, beta: float, dt: float) -> float | None:
-        """The factor by which a constraint error may grow in a step: a spectral radius; or None."""
+        """The growth factor of a constraint error in a step, a spectral radius; None if unknown."""
         return None
 
     def error_map(
         self, alpha: Number, beta: Number, dt: Number
     ) -> tuple[tuple[Any, Any], tuple[Any, Any], tuple[Any, Any]] | None:
-        """Three pairs (φ, φ̇) after a step: from φ = 1, from φ̇ = 1, and under φ̈ = 1; or None."""
+        """The error (φ, φ̇) after a step from φ = 1, φ̇ = 1, and under φ̈ = 1; None if unknown."""
         return None
 
     def refuses(self, system: System, stabilizer: Stabilizer) -> str | None:
-        """The reason why it does not work with a system or stabilizer; None where it does."""
+        """The reason to refuse a system or stabilizer; None if the integrator works with both."""
         return None
 
 
@@ -529,7 +566,7 @@ class Solver(TreeNode, Protocol):
 
     @abstractmethod
     def factor(self, system: Saddle) -> Factored:
-        """The solution as a function of f and b; those of the system are not used."""
+        """Factors M, J and C; returns a function (f, b) → solution. Ignores f and b of `system`."""
         ...
 
     def solve(self, system: Saddle) -> Solution:
@@ -538,16 +575,16 @@ class Solver(TreeNode, Protocol):
 
 
 class ContactSolver(TreeNode, Protocol):
-    """Finds multipliers λ of inequality rows: u = G λ + c, each row obeying its law."""
+    """Finds λ of inequality rows so that λ and the velocities u = G λ + c obey the rows' laws."""
 
     @property
     def exact(self) -> bool:
-        """True if laws are met to rounding; landings are then impacts within a step."""
+        """True if laws hold to rounding; landings are then resolved as impacts within a step."""
         return False
 
     @property
     def warm(self) -> bool:
-        """True if it starts from the multipliers of the last step."""
+        """True if the solver starts from the multipliers of the last step (warm start)."""
         return False
 
     @property
@@ -564,12 +601,12 @@ class ContactSolver(TreeNode, Protocol):
 
     @abstractmethod
     def solve(self, problem: Bounded, start: Array) -> Array:
-        """λ, (n,), from a first guess (n,)."""
+        """The multipliers λ, (n,), from the initial guess `start`, (n,)."""
         ...
 
 
 class Adjoint(TreeNode, Protocol):
-    """Chooses what the reverse pass of a rollout keeps."""
+    """Chooses which states the reverse pass of a rollout keeps, and which it recomputes."""
 
     def check(self) -> None:
         """Checks the numbers of the part; by default, does nothing.

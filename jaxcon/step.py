@@ -19,8 +19,8 @@ multipliers. A step
 the last λ, is the same at all stages of a step. Limits, friction and contact add a force J_bᵀλ_b,
 with λ_b from the contact solver, once a step; see `contact.response`.
 
-Arrays are those of one world, or of a batch along one more axis at the end. Nothing here checks
-input, batches, masks failed worlds or stages kernels: `execution` does.
+Arrays belong to one world, or have one more axis at the end for a batch. This module does not check
+input, vectorize, mask failed worlds or stage kernels; `execution` does.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ if TYPE_CHECKING:
 class Origin:
     """The system of an info, which `jc.wrench` needs.
 
-    It is not a pytree, so JAX transformations drop it. Steps therefore carry nothing for wrenches
-    that are not read.
+    An `Origin` is not a pytree, so JAX transformations drop it. Steps therefore need not carry the
+    system for wrenches that are never read.
     """
 
     system: System
 
     def __reduce__(self) -> tuple[Callable[[], None], tuple[()]]:
-        """Leaves the system out of a pickled info, as out of one that JAX rebuilds."""
+        """Pickles as None, so that a pickled info does not contain the system."""
         return _nothing, ()
 
 
@@ -83,16 +83,16 @@ class StepInfo(Stacked):
         acceleration: a, (n_v,) [m/s², rad/s²].
         multipliers: λ, (n_c,), in units of work per unit of φ [N, N m].
         violation: φ [m, rad] and φ̇ [m/s, rad/s] by constraint, at the start of the step.
-        status: of this step, or what stopped the world before, ().
-        reactions: forces of limits, friction and contact; None in a scene without.
+        status: status of this step; in a world that has stopped, the reason for the stop, ().
+        reactions: forces of limits, friction and contact; None in a scene without them.
         impacts: impacts at which the step was split; None without `Events`, and in a scene that has
             no hard stops, ropes or contacts.
-        state: the state to which a and λ belong, without the memory of the method. That is the
-            state before the step, and for `GeneralizedAlpha` the point that it reached.
+        state: the state to which a and λ belong, without the memory of the method. It is the state
+            before the step, or with `GeneralizedAlpha` the end of the step.
         control: control u of the step.
     """
 
-    # no field: fields are what `jit` returns and scans carry, and few infos are asked for a wrench.
+    # a class attribute, as `jit` returns and scans carry all fields, but few wrenches are read.
     # `execution.step.with_origin` sets it on an instance
     origin: ClassVar[Origin | None] = None
     """The system, for `jc.wrench`; None if JAX has rebuilt the info, as `jit` and indexing do."""
@@ -107,11 +107,11 @@ class StepInfo(Stacked):
     control: Any = None
 
     def leading(self) -> tuple[int, ...]:
-        """The shape of the leading axes; () of one world."""
+        """Returns the shape of the leading axes; () for one world."""
         return np.shape(self.status)
 
     def __repr__(self) -> str:
-        """Time, status, violation, and the names of the elements whose forces it has."""
+        """Returns a table of time, status, shapes, names of elements with forces, and violation."""
         φ = getattr(self.violation, "position", None)
         has_values = isinstance(φ, jax.Array | np.ndarray)
         names = listed(self.violation.layout.names) if has_values else ""
@@ -127,7 +127,7 @@ class StepInfo(Stacked):
         return table("StepInfo", rows)
 
     def of_failed_world(self, state: State) -> StepInfo:
-        """Zeros and no impacts, at the state before the step."""
+        """Returns the info of a failed world: zeros, no impacts, and the state before the step."""
         blank = jax.tree.map(jnp.zeros_like, self)
         if self.impacts is not None:
             blank = dataclasses.replace(blank, impacts=self.impacts.none())
@@ -149,13 +149,13 @@ def step(
     Args:
         system: bodies or generalized coordinates, constraints and forces.
         method: integrator, stabilizer and solvers.
-        state: at the start; its angles without whole turns.
+        state: the state at the start of the step, with angles reduced by whole turns.
         control: u, as arrays.
         dt: h, () [s].
-        part: of the step, where it is split at impacts; None for all of it.
+        part: the part to advance if the step is split at impacts; None for the whole step.
 
     Returns:
-        The new state, and what the step found. `info.status` is that of this step alone.
+        The new state and the info of the step. `info.status` is the status of this step alone.
     """
     length = dt if part is None else part.length
     memory = MethodMemory(*state.memory)
@@ -196,17 +196,17 @@ def step(
 
 @pytree
 class Dynamics:
-    """M a = f + Jᵀλ, J a + C λ = b during one step, for an integrator: `dynamics(q, v, t)`.
+    """The equations M a = f + Jᵀλ, J a + C λ = b of a step; `dynamics(q, v, t)` solves them.
 
     Attributes:
-        system: with the whole turns of the state.
-        stabilizer: with all its gains.
-        solver: of the saddle system.
+        system: the system, with the whole turns of the state.
+        stabilizer: the stabilizer, with all gains set.
+        solver: the solver of the saddle system.
         control: u.
-        memory: of the stabilizer.
+        memory: the stabilizer's memory.
         dt: h, () [s].
-        contact: the response of limits, friction and contact; None in a scene without.
-        constant_force: a force that stays during the step, (n_v,); None for none.
+        contact: the response of limits, friction and contact; None in a scene without them.
+        constant_force: a force that is constant during the step, (n_v,); None for none.
     """
 
     system: System
@@ -219,7 +219,7 @@ class Dynamics:
     constant_force: Array | None = None
 
     def __call__(self, q: Array, v: Array, t: Doubled | Array) -> tuple[Solution, Rows]:
-        """a and λ at (q, v, t), and the rows there. With contact they are means over the step.
+        """Returns a and λ (their means over the step, with contact) and the rows at (q, v, t).
 
         Args:
             q: positions, (n_q,).
@@ -230,7 +230,7 @@ class Dynamics:
         return with_jump(solved.solution, solved.rows.jump, self.dt), solved.rows
 
     def linearize(self, q: Array, v: Array, t: Doubled | Array) -> Rows:
-        """φ, φ̇, J, γ and M at one instant, with the inequality rows of the step.
+        """Returns the rows at one instant: φ, φ̇, J, γ, M, and the inequality rows of the step.
 
         Args:
             q: positions, (n_q,).
@@ -244,10 +244,10 @@ class Dynamics:
         return dataclasses.replace(rows, mass=self.system.mass(q))
 
     def assemble(self, rows: Rows, q: Array, v: Array, t: Doubled | Array) -> Saddle:
-        """M a = f + Jᵀλ, J a + C λ = b.
+        """Returns the saddle system M a = f + Jᵀλ, J a + C λ = b.
 
         Args:
-            rows: with a target b.
+            rows: the rows, with a target b.
             q: positions, (n_q,).
             v: velocities, (n_v,).
             t: time, () [s].
@@ -266,16 +266,16 @@ class Dynamics:
         rate_delay: Array | None = None,
         every_landing: bool = False,
     ) -> Solved:
-        """a and λ at a point that has been linearized. Impacts are apart, as `rows.jump`.
+        """Solves for a and λ at a linearized point; impacts are not in a, but in `rows.jump`.
 
         Args:
             rows: from `linearize`.
             q: positions, (n_q,).
             v: velocities, (n_v,).
             t: time, () [s].
-            rate_delay: feedback sees φ̇ as it was this long ago, () [s]; None for now.
-            every_landing: True to treat landings without rebound as impacts with every contact
-                solver.
+            rate_delay: delay τ, () [s]: feedback acts on φ̇ at the time t − τ; None for no delay.
+            every_landing: True to resolve landings (impacts without rebound) as impacts, whichever
+                contact solver is used.
         """
         observed = rows if rate_delay is None else rows.earlier(rate_delay)
         equations = self.stabilizer.constraint_equations(observed, self.memory, self.dt)
@@ -295,10 +295,10 @@ class Dynamics:
     def at_step_start(
         self, q: Array, v: Array, t: Doubled | Array
     ) -> tuple[Solution, Rows, Dynamics]:
-        """a, λ and the rows at the start of a step, and the dynamics of its other stages.
+        """Returns a, λ and the rows at the start of a step, and the dynamics of its other stages.
 
-        Contact is solved once a step. In the other stages its force is constant. Impacts are apart,
-        as `rows.jump`, for the end of the step.
+        Contact is solved once a step; the contact force is constant in the other stages. Impacts
+        are not in a, but in `rows.jump`, which the integrator adds at the end of the step.
 
         Args:
             q: positions, (n_q,).
@@ -319,10 +319,11 @@ class Solved(NamedTuple):
     Attributes:
         solution: a and λ.
         rows: the constraints there, with the reactions of inequality rows.
-        solve_rows: b → the least a, in the metric of M, with J a + C λ = b. Uses the factors of the
-            step. Does not call `System.complete`. None if the stabilizer has its own `solve`.
-        one_sided_force: of limits and contacts, (n_v,); None without inequality rows.
-        contact_force: of all inequality rows, (n_v,); None without.
+        solve_rows: function of b that returns the smallest a, in the metric of M, with J a + C λ =
+            b. It uses the factors of the step and does not call `System.complete`. None if the
+            stabilizer has its own `solve`.
+        one_sided_force: force of limits and contacts, (n_v,); None without inequality rows.
+        contact_force: force of all inequality rows, (n_v,); None without inequality rows.
     """
 
     solution: Solution
@@ -333,15 +334,15 @@ class Solved(NamedTuple):
 
 
 class Advanced(NamedTuple):
-    """The end of a step, and what was found at its start.
+    """The end of a step, and the solution of the equations of motion.
 
     Attributes:
-        point: q (n_q,), v (n_v,) and the time reached, () [s]: `state.instant + dt`, which keeps
-            its remainder, or a rounded number.
+        point: q (n_q,), v (n_v,) and the time () [s] at the end of the step. The time is
+            `state.instant + dt`, which includes the rounding error, or a rounded number.
         solution: a and λ.
-        rows: the constraints.
-        memory: of the integrator.
-        ends: whether a and λ belong to the point reached, and not to the start of the step.
+        rows: the constraints at the start of the step.
+        memory: the integrator's new memory.
+        ends: True if a and λ belong to the end of the step, False if they belong to its start.
     """
 
     point: tuple[Array, Array, Any]
@@ -352,11 +353,14 @@ class Advanced(NamedTuple):
 
 
 def reached(state: State, time: Doubled | Array, dt: Array) -> Doubled:
-    """The time of `Advanced.point`, with its remainder if it is the rounded end of the step.
+    """Returns the time of `Advanced.point` with its rounding error.
+
+    The rounding error is known if the time is a `Doubled` or equals `state.time + dt`; otherwise it
+    is set to zero.
 
     Args:
-        state: at the start of the step.
-        time: of the point.
+        state: the state at the start of the step.
+        time: the time of the point.
         dt: the length of the step, () [s].
     """
     if isinstance(time, Doubled):
@@ -365,18 +369,18 @@ def reached(state: State, time: Doubled | Array, dt: Array) -> Doubled:
 
 
 def without_memory(state: State) -> State:
-    """The state without the memory of a method."""
+    """Returns the state without the memory of a method."""
     return dataclasses.replace(state, memory=())
 
 
 def judge_memory(memory: PyTree, status: Array) -> Array:
     """Returns NON_FINITE where an array of the stabilizer's memory is not finite, else OK, ().
 
-    Otherwise the next step would fail, and the derivative of this one would be NaN already.
+    Without this check, the next step would fail, and the derivative of this step would be NaN.
 
     Args:
-        memory: arrays of floating numbers, with the batch axes of the status at the end.
-        status: of the world, for its shape.
+        memory: floating-point arrays, with the batch axes of the status at the end.
+        status: status of the world, of which only the shape is used.
     """
     good, axes = jnp.ones_like(status, bool), status.ndim
     for x in jax.tree.leaves(memory):

@@ -1,4 +1,4 @@
-"""Systems beside scenes of bodies, and what is computed with them.
+"""Vakonomic systems, states for changed inertia, and types of results.
 
 Vakonomic systems: Vakonomic, vakonomic.
 States for changed inertia: restate.

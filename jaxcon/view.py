@@ -205,7 +205,7 @@ PARTS = {"crank": "#c8501e", "coupler": "#2f6f9f", "rocker": "#3f8f5f"}
 def main_job(
     tuning: Tuning, fresh: Validation, world: tuple[BodySystem, State], step: float, path: str
 ) -> None:
-    """Draws the picture of the demo: the mechanism, the loss, and the errors of other linkages.
+    """Draws the picture of the demo: mechanism, loss, and errors of linkages not used for tuning.
 
     Args:
         tuning: the result of tuning the gains.

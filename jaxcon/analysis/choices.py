@@ -30,13 +30,17 @@ MethodParts: TypeAlias = tuple[
 ]
 """The name of a method, with its integrator, stabilizer, contact solver and events."""
 SMALL = 30
-"""The largest number of constraint rows for which dense elimination is tried as well."""
+"""The largest number of constraint rows for which dense elimination (`Schur`) is compared too."""
 LOOKED = 11
 """The largest number of configurations at which the rank of J is computed."""
 
 
 def methods_for(system: System, reference: Reference) -> dict[str, Method]:
-    """Returns methods to compare: integrators × stabilizers with one solver, then other solvers.
+    """Returns the methods that `tradeoff` compares by default on a system.
+
+    Combinations of integrator, stabilizer, contact solver and events come first, all with one
+    linear solver: `Sparse`, or `RankSafe` if rows of J are dependent. For kinematic loops with
+    independent rows, RK4 with `Baumgarte` is added with other linear solvers.
 
     Args:
         system: the system, in float64.

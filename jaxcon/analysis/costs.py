@@ -55,7 +55,8 @@ class Batch:
     def of(cls, problem: Problem, reference: Reference, worlds: int) -> Batch:
         """Returns a batch whose worlds start at the reference's points in turn.
 
-        Only starts of parts in which the reference is good are used.
+        These points are the starts of the parts of the horizon. Parts that end after
+        `reference.until` are not used, since the reference is inaccurate there.
         """
         index = np.arange(worlds) % reference.last
         points = jax.tree.map(lambda x: x[index], reference.points)
@@ -63,7 +64,10 @@ class Batch:
 
 
 class Pace(Lowered):
-    """The program that steps a batch with one method. h and the number of steps are traced."""
+    """The program that steps a batch with one method.
+
+    The step size h and the number of steps are traced.
+    """
 
     def __init__(self, batch: Batch, method: Method, dtype: str | DType) -> None:
         self.batch, self.dtype = batch, np.dtype(dtype)
@@ -110,9 +114,9 @@ class Pace(Lowered):
 
 
 class Slope(Lowered):
-    """The program that differentiates short rollouts of a batch by their initial q and v.
+    """The program that differentiates short rollouts of a batch with respect to initial q and v.
 
-    h is traced.
+    The step size h is traced.
     """
 
     def __init__(self, batch: Batch, method: Method, dtype: str | DType) -> None:

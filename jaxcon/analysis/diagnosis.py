@@ -38,7 +38,7 @@ METHODS = {
     "conflict": "least-squares residual of φ, which no motion removes; see report",
     "rank": "φ in combinations of rows that hardly any motion changes; see report",
 }
-"""For each cause of violation: how it is measured, and its remedy."""
+"""The measurement and the remedy of each cause of violation, by name of the cause."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +101,10 @@ def diagnose(
     """Simulates three times to separate the causes of constraint violation.
 
     The first run begins at the given state. The second begins at the assembled state, which
-    satisfies the constraints. The third begins there too, with half the step size. The difference
-    of the first two runs shows the error of the initial state. The difference of the last two shows
-    the integration error. Errors by round-off, conflicting rows and rank deficiency follow from the
-    constraint rows at the end of the first run.
+    satisfies the constraints. The third begins at the assembled state, too, but has half the step
+    size. The difference of the first two runs shows the error of the initial state. The difference
+    of the last two shows the integration error. Errors by round-off, conflicting rows and rank
+    deficiency follow from the constraint rows at the end of the first run.
 
     Args:
         system: the system of a built scene, or a `jc.GeneralizedSystem`.
@@ -210,7 +210,12 @@ def _rounding(system: System, state: State) -> float:
 
 
 def _lost(system: System, state: State) -> dict[str, float]:
-    """Returns the parts of φ that no motion removes ("conflict") and hardly any motion ("rank")."""
+    """Returns the largest violations due to conflicting rows and to nearly dependent rows.
+
+    Returns:
+        Under "conflict", the largest part of φ that no motion changes. Under "rank", the largest
+        part of φ in combinations of rows that hardly any motion changes.
+    """
     rows, jacobian, mass = linearized(checked_system(system, state), state)
     unit = UnitRows(rows.layout, jacobian, mass)
     return {

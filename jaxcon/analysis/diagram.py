@@ -17,7 +17,7 @@ TOP = 0.98
 
 
 def draw(result: Tradeoff, onto: Axes | str | Path | None = None) -> Axes:
-    """Draws the errors of a `Tradeoff` over their costs, with a line per method and precision.
+    """Plots error over cost for the runs of a `Tradeoff`, with a line per method and precision.
 
     Args:
         result: the comparison to draw.

@@ -56,10 +56,13 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Extrapolates central differences with halved steps to zero step size.
 
     Each column of Neville's table eliminates the next even power of the step. Each entry is
-    computed from two entries of the column before. The best entry is the one closest to both. One
-    entry may be close by chance. The uncertainty is therefore the fourth smallest of these
-    distances, or the entry's rounding error (`scatter`) if that is larger. The rounding error does
-    not select the entry: a kink within the larger steps makes it large everywhere.
+    computed from two entries of the previous column. The spread of an entry is its distance from
+    the farther one of these two. The entry with the smallest spread is the derivative. A single
+    spread may be small by chance. The uncertainty is therefore the fourth smallest spread in the
+    table, or the rounding error (`scatter`) of the selected entry if that is larger.
+
+    Rounding errors do not select the entry: a kink within the larger steps makes them large for
+    all entries.
 
     Args:
         slopes: central differences, (directions, levels), the largest step first.

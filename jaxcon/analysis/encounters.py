@@ -98,7 +98,14 @@ def _simultaneous(hits: list[Hit]) -> str | None:
 
 
 def _grazing(here: list[Hit], beside: list[list[Hit]]) -> str | None:
-    """Describes a grazing impact: too slow to bounce, or absent after a small change of x."""
+    """Describes a grazing impact; None if there is none.
+
+    Such an impact is too slow to bounce, or a small change of the arguments adds or removes it.
+
+    Args:
+        here: impacts at the arguments.
+        beside: impacts at each changed value of the arguments.
+    """
     slow = next((hit for hit in here if not hit.bounces), None)
     if slow is not None:
         return f"a grazing impact: {slow.name} hits at {slow.time:.6g} s too slowly to bounce"

@@ -35,8 +35,8 @@ class Cost:
 
     Attributes:
         rows: operations to linearize equality and inequality constraints, counted from a trace.
-        solver: operations to factorize the constraint matrix and to substitute once per inequality
-            row. None if there is no estimate for the solver.
+        solver: operations of the linear solver: one factorization, one substitution for the
+            accelerations, and one for each inequality row. None if there is no estimate for it.
         contact: operations to solve the inequality constraints; 0 if there are none.
         contact_solver: description of the contact solver; empty without inequality constraints.
     """
@@ -66,7 +66,7 @@ def cost(system: System, method: Method, state: State, choice: Choice) -> Cost:
         system: the system, with the counted turns of the state.
         method: the method with its solvers.
         state: state of one world.
-        choice: result of `choose`, with the operation counts of all solvers for this structure.
+        choice: result of `choose`, with the operation counts of linear solvers for this system.
     """
     kinds = kinds_of(system, state.q, state.v)
     solver = method.contact_solver_for(system, state)

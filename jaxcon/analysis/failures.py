@@ -1,4 +1,4 @@
-"""Locates the first failing step of a rollout: its step, world and wrong term. Host code."""
+"""Locates the first failure of a rollout: the step, the world and the wrong term. Host code."""
 
 from __future__ import annotations
 
@@ -28,7 +28,10 @@ from jaxcon.step import Dynamics, Solved, reached
 from jaxcon.system.state import MethodMemory, State, at_instant, with_turns
 
 Carry: TypeAlias = tuple[Array, State, State, PyTree, Array]
-"""The step index; the states before and after the last step; its controls and status codes."""
+"""The number of steps taken; then four values of the last step.
+
+These are the states before the step, the states after it, the controls, and the status codes.
+"""
 
 
 @dataclass(frozen=True)
@@ -95,8 +98,8 @@ def find_first_failure(
         steps: number of steps.
 
     Returns:
-        A `jc.analysis.Failure`; None if no world fails. If several worlds fail in the same step, it
-        describes the one with the lowest index.
+        A `jc.analysis.Failure`; None if no world fails. If several worlds fail in the same step,
+        the result describes the world with the lowest index.
     """
     checks.count("find_first_failure", "steps", steps, 0)
     checks.check("find_first_failure", "dt", dt, least=0)
@@ -226,7 +229,7 @@ class Watched(Dynamics):
         rate_delay: Array | None = None,
         every_landing: bool = False,
     ) -> Solved:
-        """Solves as `Dynamics.solve` does, and records the wrong terms of this stage."""
+        """Solves for accelerations and multipliers, and records the wrong terms of this stage."""
         solved = super().solve(rows, q, v, t, rate_delay, every_landing)
         if checks.is_concrete((q, v, t, solved.solution)):
             self.seen.append(self._judge(q, v, t, solved.solution, solved.rows))
@@ -235,9 +238,10 @@ class Watched(Dynamics):
     def _judge(
         self, q: Array, v: Array, t: Doubled | Array, solution: Solution, rows: Rows
     ) -> tuple[list[Finding], Status]:
-        """Returns the wrong terms at one stage, and the status.
+        """Returns the wrong terms at one stage, and the status of a step that fails there.
 
-        If no term is wrong but the solver failed, its failure is the finding.
+        If no term is wrong but the solver failed, the only finding is the solver's failure. The
+        status is the solver's failure status, or NON_FINITE if the solver did not fail.
         """
         code = Status(int(solution.status))
         system = self.system

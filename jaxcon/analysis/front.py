@@ -31,7 +31,8 @@ class Run:
         name: name of the method.
         dtype: "float32" or "float64".
         dt: step size h [s].
-        outcome: "ok", or for a diverged run the failure and its time.
+        outcome: "ok"; for a diverged run the failure status and its time, or the violation or
+            energy error that is too large.
         error: the largest distance from the reference solution [m], at the ends of the parts of the
             horizon. It is at least the reference's own error, and infinite for a diverged run. A
             body's distance is √(d² + k²θ²). Here d is the distance of centers of mass, θ the angle
@@ -101,8 +102,8 @@ class StabilityLimit:
     Attributes:
         name: name of the method.
         dtype: "float32" or "float64".
-        stable: the largest step size at which the method was stable, as at all smaller ones tried
-            [s]; None if there is none.
+        stable: the largest step size [s] up to which the method was stable at all tested step
+            sizes; None if there is none.
         unstable: the smallest unstable step size above `stable` [s]; None if all were stable.
     """
 
@@ -171,8 +172,8 @@ class Tradeoff:
     def recommend(self, *, error: float | None = None, cost: float | None = None) -> Run:
         """Returns the cheapest run within an error limit, or the most accurate within a cost limit.
 
-        Errors are measured up to the time `until`. After it, the motion may be chaotic, and no run
-        follows the reference.
+        Errors are measured up to the time `until`. Later, the reference is not accurate enough to
+        measure errors, for example because the motion is chaotic.
 
         Args:
             error: largest allowed `error` [m].
@@ -183,8 +184,8 @@ class Tradeoff:
             The run. Simulate with its `method`, `dt` and `dtype`.
 
         Raises:
-            ValueError: no run meets the limit, and the message gives the best value; or the limit
-                is not positive; or not exactly one limit is given.
+            ValueError: no run meets the limit (the message gives the best value), the limit is
+                below the error of the reference or not positive, or not exactly one limit is given.
         """
         check("recommend", "error= [m]", error, (), above=0, finite=False, optional=True)
         check("recommend", "cost= [s/s]", cost, (), above=0, finite=False, optional=True)
@@ -237,7 +238,7 @@ class Tradeoff:
         return "\n".join(table([run for runs in self.grouped.values() for run in runs]))
 
     def to_json(self, path: str | Path | None = None) -> str:
-        """Returns all results as JSON, without the method objects. Also writes a file if given.
+        """Returns all results as JSON, without the method objects; with `path`, also writes a file.
 
         Numbers that are not finite become null.
 

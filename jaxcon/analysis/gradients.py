@@ -22,10 +22,10 @@ NO_DERIVATIVE = "there plain steps have no derivative that differences could con
 
 @dataclass(frozen=True)
 class LeafGradient:
-    """Directional derivatives of f by one leaf of x: reverse mode, forward mode and differences.
+    """Directional derivatives of f with respect to one leaf of x, computed in three ways.
 
-    A direction is as long as the leaf itself. The derivative is thus the change of f per relative
-    change of the leaf.
+    The ways are reverse mode, forward mode and finite differences. Each direction is as long as the
+    leaf itself. The derivative is thus the change of f per relative change of the leaf.
 
     Attributes:
         name: name of the leaf in x.
@@ -114,8 +114,9 @@ class GradientCheck:
     Attributes:
         leaves: one `LeafGradient` for each leaf with floating-point numbers.
         tolerance: the largest allowed relative error.
-        notes: structural reasons why derivatives of f may be wrong, such as some impacts. If a leaf
-            is wrong, also the simultaneous, grazing or accumulating impacts of f at x.
+        notes: jaxcon's warnings that derivatives of f through some impacts may be wrong with the
+            method in use. If a leaf is wrong or undecided, also the simultaneous, grazing or
+            accumulating impacts of f at x.
     """
 
     leaves: tuple[LeafGradient, ...]
@@ -124,7 +125,7 @@ class GradientCheck:
 
     @property
     def ok(self) -> bool:
-        """True if the derivatives by all leaves are right."""
+        """True if all leaves are `ok`: their derivatives agree with accurate differences."""
         return all(leaf.ok for leaf in self.leaves)
 
     @property
@@ -158,20 +159,20 @@ def check_gradients(
 ) -> GradientCheck:
     """Compares derivatives of f at x by reverse mode, forward mode and central differences.
 
-    Each leaf of x is checked separately. A leaf of up to `directions` numbers is varied along each
-    of them. A larger leaf is varied along `directions` random directions. Central differences use
-    ten step sizes, from ε^⅛ of the leaf's size downward by halves. Ridders' method extrapolates
-    them to zero and estimates their uncertainty, so no step size needs to be chosen. If f returns
-    several numbers, a random linear combination of them is checked.
+    Each leaf of x is checked separately. In a leaf of up to `directions` numbers, each number is
+    varied alone. A larger leaf is varied along `directions` random directions. Central differences
+    use ten step sizes: the largest is ε^⅛ times the leaf's size, and each further one is half the
+    previous one. Ridders' method extrapolates the differences to step size zero and estimates their
+    uncertainty, so no step size needs to be chosen. If f returns several numbers, a random linear
+    combination of them is checked.
 
     Args:
         f: function from x to a number or a pytree of numbers, such as a rollout.
         x: pytree of arguments. Leaves without floating-point numbers, and empty leaves, stay fixed.
         tolerance: the largest allowed relative error, by default ε^⅓ of the coarsest dtype in x and
-            f: 6e-6 in float64, 5e-3 in float32. It is relative to the derivative by a single
-            number, or to the largest derivative along random directions. If rounding hides a
-            derivative from the differences, the error is relative to the smallest derivative that
-            they resolve.
+            f: 6e-6 in float64, 5e-3 in float32. Errors are relative to the derivative itself if a
+            single number is varied, else to the largest derivative over all random directions. The
+            allowed error is never below the smallest derivative that the differences resolve.
         directions: number of directions per leaf.
         seed: seed of random directions.
 
@@ -230,7 +231,14 @@ def check_gradients(
 
 
 def _alone(at: list[Array], place: int, way: Array, eps: float) -> list[Array]:
-    """Returns the differences' largest perturbation: of one leaf, along one of its directions."""
+    """Returns the largest perturbation in central differences along one direction of one leaf.
+
+    Args:
+        at: the leaves.
+        place: index of the perturbed leaf; the perturbation of all other leaves is zero.
+        way: the direction, with the shape of the leaf.
+        eps: ε of the coarsest dtype in the computation.
+    """
     step = steps(eps)[0]
     return [x.dtype.type(step) * way if i == place else 0 * x for i, x in enumerate(at)]
 
@@ -238,13 +246,14 @@ def _alone(at: list[Array], place: int, way: Array, eps: float) -> list[Array]:
 def _scale(result: tuple[np.ndarray, ...], hidden: float, alone: bool) -> np.ndarray:
     """Returns the values by which errors are divided to make them relative, (n,).
 
-    If each direction varies a single number, this is the derivative along it. Otherwise it is the
-    largest derivative over all directions.
+    If each direction varies a single number, errors are divided by the derivative along the
+    direction. Otherwise they are divided by the largest derivative over all directions.
 
     Args:
         result: four arrays (n,): derivatives by reverse mode, forward mode and differences, and
             uncertainties.
-        hidden: lower bound of the result: the smallest derivative that the differences resolve.
+        hidden: lower bound of the result: the smallest derivative that the differences resolve,
+            divided by the tolerance.
         alone: True if each direction varies a single number.
     """
     largest = np.fmax.reduce(np.abs(result[:3]), axis=0)
@@ -263,9 +272,10 @@ def _weighted(
     results: list[jax.ShapeDtypeStruct],
     random: np.random.Generator,
 ) -> Callable[[list[Array]], tuple[Array, Array]]:
-    """Returns a function from x to (f(x), sum of the absolute terms).
+    """Returns a function from x to a number, and the sum of the absolute values of its terms.
 
-    If f has several results, f(x) is replaced by a random linear combination of them.
+    The number is f(x) if f returns a single number. Otherwise it is a random linear combination of
+    all numbers in f(x).
     """
     alone = len(results) == 1 and results[0].size == 1
     weights = [np.ones(y.shape) if alone else random.normal(size=y.shape) for y in results]

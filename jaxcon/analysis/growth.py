@@ -23,14 +23,14 @@ from jaxcon.system.state import State, checked_system
 FULL = 16
 """The largest number of perturbation directions of (q, v).
 
-If more are independent, this many random ones are used.
+If there are more independent directions, this many random combinations of them are used.
 """
 
 
 POLYNOMIAL = 4.0
-"""The largest exponent · time at which growth may be polynomial rather than exponential.
+"""The largest product of exponent and time at which growth may be polynomial, not exponential.
 
-For growth ∝ t², the fitted exponent · time is 2.8.
+For growth ∝ t², the product of fitted exponent and time is 2.8.
 """
 
 
@@ -52,7 +52,7 @@ class GradientGrowth:
     spacing: float
 
     def horizon(self, error: float | None = None) -> float:
-        """Returns the time after which derivatives by the initial state are meaningless [s].
+        """Returns the time after which derivatives with respect to the start are meaningless [s].
 
         The initial state has a relative error δ, at least the rounding error. When growth · δ = 1,
         this error has grown to the size of the state itself. The simulated motion, and hence its
@@ -102,8 +102,8 @@ def gradient_growth(
     Uses forward mode.
 
     Only initial perturbations that keep φ and φ̇ unchanged are used; feedback would quickly remove
-    others. With n independent ones, the growth is ‖∂x_t/∂x_0‖_F/√n in SI units. If n > 16, 16
-    random ones are used.
+    others. With n independent perturbations, the growth is ‖∂x_t/∂x_0‖_F/√n in SI units. If n > 16,
+    16 random combinations of them are used.
 
     Args:
         system: the system of a built scene, or a `jc.GeneralizedSystem`.
@@ -177,7 +177,10 @@ def _exponent(time: np.ndarray, growth: np.ndarray) -> float:
 
 
 def _allowed(system: System, state: State) -> np.ndarray:
-    """Returns an orthonormal basis of perturbations (δq, δv) that keep φ and φ̇, (2 n_v, n)."""
+    """Returns an orthonormal basis of perturbations (δq, δv) without change of φ and φ̇.
+
+    The basis has shape (2 n_v, n).
+    """
     n = len(state.v)
 
     def both(move: Array) -> tuple[Array, Array]:

@@ -32,14 +32,15 @@ SLOWER = 1.3
 FIRST = 5
 """The factor by which the first task of a kind may take longer than tasks of other kinds.
 
-For example, compiling a gradient of RK4 on five bodies in 3D takes three minutes. The runs of both
-batches take half a minute.
+For example, for RK4 on five bodies in 3D, compiling the gradient takes three minutes, but the runs
+take only half a minute.
 """
 
 GRADIENT = 3
 """The factor by which the first gradient may take longer than compiling the runs of its method.
 
-On a four-bar it is 1.5 to 2.2. The first gradient serves to predict later ones.
+On a four-bar, the measured factor is 1.5 to 2.2. The time of later gradients is predicted from the
+first gradient.
 """
 
 
@@ -199,7 +200,7 @@ class Clock:
         return SLOWER * self.longest.get(work, guess)
 
     def lasts(self, work: str, share: float = 1.0, guess: float | None = None) -> bool:
-        """Returns True if one more task of a kind is expected to end within a budget share."""
+        """Returns True if one more task of a kind should end within a share of the budget."""
         return self.spent + self.asks(work, guess) < share * self.budget
 
     @contextlib.contextmanager

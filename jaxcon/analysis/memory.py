@@ -24,7 +24,10 @@ from jaxcon.step import StepInfo
 from jaxcon.system.state import State
 
 BATCHES = 64, 256
-"""The two compiled batch sizes. From the first one on, memory grows in proportion to the batch."""
+"""The two batch sizes for which programs are compiled.
+
+From the smaller one on, memory grows linearly with the batch size.
+"""
 SHORT, LONGER = 4, 68
 """The lengths of the two rollouts whose gradients are compiled [steps]."""
 DT = 1e-3
@@ -65,7 +68,7 @@ def memory(system: System, method: Method, state: State, control: PyTree = None)
     """Returns the memory per world of `jax.jit(jax.vmap(step))`, as XLA plans it for this device.
 
     A step is compiled for two batch sizes, which takes seconds. The difference gives the memory per
-    world. It does not include scene parameters, code, or residuals for derivatives.
+    world. Memory of scene parameters, code and residuals for derivatives is not included.
 
     Args:
         system: the system of a built scene, or a `jc.GeneralizedSystem`.
@@ -92,13 +95,15 @@ def memory(system: System, method: Method, state: State, control: PyTree = None)
 
 @dataclass(frozen=True)
 class GradientMemory:
-    """Memory to differentiate a rollout by its initial state, for any length and adjoint.
+    """Memory for the gradient of a rollout with respect to its initial q and v.
+
+    The length of the rollout and its adjoint are arguments of `of`.
 
     Attributes:
         start: the state of one world, as shapes and dtypes.
-        state: size of one kept state of one world [B].
-        step: size of the residuals that the reverse pass needs per step and world, without
-            parameters [B].
+        state: size of one checkpoint (a kept state) of one world [B].
+        step: size of the residuals (intermediate values) that the reverse pass needs, per step and
+            world, without parameters [B].
         working: memory per world that does not depend on the number of steps [B].
         shared: memory that depends neither on the batch size nor on the number of steps [B]. The
             step indices are not included.

@@ -138,7 +138,10 @@ def _root(rate: Rate) -> Rate:
 
 
 def _spin(system: System, v: np.ndarray) -> Rate:
-    """Returns the largest angular part of any body in an array (n_v,); 0 without bodies."""
+    """Returns the largest angular speed of a body in velocities v (n_v,); 0 without bodies.
+
+    For accelerations in place of v, returns the largest angular acceleration.
+    """
     layout = system.layout
     if layout is None:
         return Rate(0.0, "")
@@ -157,7 +160,7 @@ def _curved(
 ) -> Rate:
     """Returns the rate at which constraint forces turn the direction of v, in the metric of M.
 
-    It is |Jᵀλ| / |v|, with the multipliers λ that the velocity-dependent part of γ causes.
+    The rate is |Jᵀλ| / |v|. Here λ are the multipliers due to the velocity-dependent part of γ.
 
     Args:
         setup: the scene, its state and the method.

@@ -28,7 +28,8 @@ GOAL = 1e-13
 GOOD = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Errors, relative to the size of the motion, up to which a reference counts as accurate.
 
-The first value that covers half of the horizon is used, or else the last one.
+The smallest value that the error does not exceed in the first half of the horizon is used; if there
+is none, the largest value.
 """
 REST = 1e-4
 """The energy error, as a share of the total energy, at which a scene at rest counts as diverged."""
@@ -62,7 +63,7 @@ class Ruler:
     A body's distance is √(d² + k²θ²). Here d is the distance of its centers of mass, θ the angle
     between its orientations, and k its largest radius of gyration. To first order, it is at least
     the root mean square displacement of the body's mass. The distance of two configurations is the
-    largest one of all bodies.
+    largest distance of any body.
     """
 
     def __init__(self, system: System, q: Array) -> None:
@@ -223,7 +224,8 @@ def make(course: Course, observe: Observer, moved: float, seconds: float) -> Ref
     """Halves the step size until two runs agree, their agreement stops improving, or time is up.
 
     Args:
-        course: the program that simulates the problem from `started` by `method_for` in float64.
+        course: the program that simulates the problem in float64. The problem comes from `started`,
+            and the method from `method_for`.
         observe: evaluates energies and violations.
         moved: distance by which `started` moved the initial state.
         seconds: time budget for the runs, without compilation [s].
@@ -272,11 +274,12 @@ class RunPair(NamedTuple):
 
 
 def _closer(best: RunPair | None, new: RunPair, size: float) -> tuple[RunPair, bool]:
-    """Returns the pair of runs that agrees better, and True if it is the new one.
+    """Returns the pair of runs that agree better, and True if that is the new pair.
 
-    The mean logarithm of distances is compared. At the end of a chaotic motion two runs may agree
-    by chance, which a third run reveals. The error of the best pair is therefore at least the
-    distance of its finer run from the next run.
+    The pairs are compared by the mean logarithm of their distances. At the end of a chaotic motion,
+    both runs of a pair may agree by chance. A third run, with half the step size of the finer run,
+    reveals this. If the best pair remains the best, its distances are therefore raised to at
+    least those between its finer run and the third run.
     """
     if best is None or _logarithm(new.apart, size) < _logarithm(best.apart, size):
         return new, True
@@ -286,14 +289,17 @@ def _closer(best: RunPair | None, new: RunPair, size: float) -> tuple[RunPair, b
 
 
 def _logarithm(apart: np.ndarray, size: float) -> float:
-    """Returns the mean logarithm of distances, each raised by the rounding error."""
+    """Returns the mean logarithm of distances, after adding the rounding error to each."""
     return float(np.mean(np.log(apart + np.finfo(float).eps * size)))
 
 
 def _trusted(
     problem: Problem, observe: Observer, ruler: Ruler, best: RunPair, moved: float
 ) -> Reference:
-    """Returns the best run as a `Reference`, limited to the time up to which it is accurate."""
+    """Returns the finer run of the best pair as a `Reference`, with its error estimate.
+
+    The reference is compared with other runs only up to the time until which it is accurate.
+    """
     _, trip, apart, count = best
     pairs = zip(problem.start, trip.points, strict=True)
     points = Points(*(np.concatenate([x[None], y]) for x, y in pairs))

@@ -201,7 +201,8 @@ def report(
         dt: step size h, () [s]. None leaves out gains, the expected violation and the warnings that
             depend on the step size.
         control: control input of one world for one step, as in `jc.step`.
-        batch: number of worlds stepped together, for the choice of a solver and for the time.
+        batch: number of worlds stepped together. It affects the choice of a solver and the measured
+            time.
         measure: True traces a step to count its operations, compiles it to get its memory, and runs
             some steps to get the expected violation. This takes seconds, or minutes for hundreds of
             rows.

@@ -26,7 +26,10 @@ from jaxcon.system.body_system import BodySystem
 from jaxcon.system.state import State, checked_system
 
 ASIDE = 0.05
-"""The size of the displacement to a state whose rank of J is compared with the given state's."""
+"""The largest entry of the displacement to a nearby state [m, rad].
+
+The rank of J at the given state is compared with the rank at this nearby state.
+"""
 NEWTON = 20
 """The largest number of Newton iterations to satisfy the constraints at a displaced state."""
 
@@ -92,7 +95,7 @@ class Setup:
 
     @cached_property
     def even(self) -> UnitRows:
-        """The unit-length rows if all bodies had mass 1 and their actual radii of gyration."""
+        """The unit-length rows for bodies of mass 1 with their actual radii of gyration."""
         if not isinstance(self.system, BodySystem):
             return self.unit
         groups = tuple(
@@ -223,9 +226,10 @@ def _retract(system: System, q: Array, step: Array) -> Array:
 
 
 def asked_gains(method: Method, dt: float) -> tuple[float, float]:
-    """Returns the gains (α, β) of the method's first feedback with scalar gains.
+    """Returns the scalar gains (α, β) of the method's feedback [1/s].
 
-    If there is none, returns the default gains.
+    If the stabilizer consists of several parts, the first part with scalar gains counts. If no part
+    has scalar gains, returns the default gains.
     """
     for part in parts(method.stabilizer_for(jnp.asarray(dt))):
         pair = [getattr(part, name, None) for name in ("alpha", "beta")]

@@ -22,12 +22,13 @@ from jaxcon.core.status import Status
 from jaxcon.methods.method import Method
 
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
-"""The default numbers of steps per part of the horizon, limited by `MOST`."""
+"""The default numbers of steps per part of the horizon."""
 MOST = 20_000
+"""The largest number of steps over the horizon, for default step sizes shorter than a part."""
 OPEN = 0.05
-"""The largest max |φ| of a run that has not diverged, relative to the size of the motion."""
+"""The max |φ|, relative to the size of the motion, above which a run counts as diverged."""
 GAINED = 1.0
-"""The largest energy error of a run that has not diverged, relative to the exchanged energy."""
+"""The energy error, relative to `Reference.scale`, above which a run counts as diverged."""
 BISECTIONS = 4
 """The number of bisections between a stable and an unstable step size, on a logarithmic scale."""
 SHARE = 1 / 60
@@ -37,7 +38,7 @@ ASKED = 1 / 4
 FEW = 10
 """The number of steps per part in a short run that predicts the time of the first full run."""
 NO_GAIN = 0.8
-"""The share of the least error so far above which a smaller step is no improvement."""
+"""The ratio of a run's error to the least error so far above which the run is no improvement."""
 REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeError)
 """The exceptions raised by a method that does not fit a scene."""
 
@@ -90,7 +91,7 @@ class Sweep:
 
     @property
     def counts(self) -> list[int]:
-        """Numbers of steps per part, ascending. A step size that divides no part is reduced."""
+        """Numbers of steps per part, ascending; a step size is reduced until it divides a part."""
         parts = self.problem.parts
         if self.dts is None:
             return [n for n in COUNTS if n == 1 or n * parts <= MOST]
@@ -174,7 +175,10 @@ class Sweep:
         return dataclasses.replace(unit, runs=runs, differentiated=True)
 
     def _refined(self, course: Course, name: str, method: Method) -> tuple[list[Run], str]:
-        """Runs the method with smaller and smaller steps, as long as it is useful.
+        """Runs the method with smaller and smaller steps.
+
+        Stops before a run that would take too much of the budget. With default step sizes, also
+        stops if errors no longer fall, or are below the error of the reference.
 
         Returns:
             The runs; and the reason why there are no smaller steps, or an empty text.

@@ -27,7 +27,10 @@ NO_TIME = "no time was left of the budget"
 REFERENCE_SHARE = 0.1
 """The share of the budget for the runs of the reference."""
 EARLY = 0.75
-"""The share of the budget within which the gradient of the first method is timed early."""
+"""The share of the budget within which an early gradient must be predicted to end.
+
+Only the gradient of the first method is timed early: before the runs of the other methods.
+"""
 OVER = 1.5
 """The share of the budget for the first method; above 1, since any result needs one method."""
 RUNS_SHARE = 0.7
@@ -59,10 +62,11 @@ def tradeoff(
     Their difference is the error estimate. For a chaotic motion the reference is accurate only up
     to some time, and errors are measured up to that time.
 
-    The horizon is cut into ten or more equal parts. The error of a run is its largest distance from
-    the reference at the ends of these parts. Costs are measured on this device, in a batch whose
-    worlds start at different points of the reference. The result includes diverged runs. It also
-    lists all skipped methods and measurements, with reasons.
+    The horizon is cut into equal parts: at least ten, or with a policy one for each interval
+    `hold`. The error of a run is its largest distance from the reference at the ends of these
+    parts. Costs are measured on this device, in a batch whose worlds start at different points of
+    the reference. The result includes diverged runs. It also lists all skipped methods and
+    measurements, with reasons.
 
     If the initial state violates constraints, it is moved to the nearest positions and velocities
     that satisfy them. Runs in float64 work even if float64 is disabled in JAX; the JAX

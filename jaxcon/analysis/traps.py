@@ -57,7 +57,7 @@ COARSE = 1.0
 FINE = 0.2
 """The recommended angle of the fastest motion in a step [rad]."""
 DEARER = 3.0
-"""The factor in operations over a better solver above which a report warns."""
+"""The ratio of a solver's operations to those of a better solver above which a report warns."""
 MANY = 12
 """The least number of constraint rows at which `DEARER` applies."""
 FEW_NAMES = 3
@@ -338,7 +338,7 @@ def impact(setup: Setup) -> str | None:
     method, rows = setup.method, bound_rows(setup)
     if method.events is not None or rows is None:
         return None
-    if rows.lands:  # a robot may have dozens, so only some are named
+    if rows.lands:  # a robot may have dozens of such elements, so only some are named
         rows = dataclasses.replace(rows, lands=(listed(rows.lands),))
     solver = method.contact_solver_for(setup.system, setup.state)
     leaves_out = isinstance(solver, ActiveSet) and solver.leaves_out(rows.kinds)

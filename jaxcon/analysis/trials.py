@@ -27,7 +27,11 @@ from jaxcon.readout.quantities import energy, violation
 from jaxcon.system.state import State
 
 PARTS = 10
-"""The least number of parts of a horizon. More are used if control inputs change more often."""
+"""The least number of parts of a horizon, except with a policy.
+
+If an array of controls has more rows than that, each row has a part of its own. With a policy, each
+interval `hold` is a part.
+"""
 
 
 class Points(NamedTuple):

@@ -33,8 +33,8 @@ class Assembly:
     """The result of `assemble`; `print` it, and get the state by `check()`.
 
     Attributes:
-        state: the nearest state; its status is NOT_CONVERGED if a constraint could not be met, and
-            no step continues from it.
+        state: the nearest state. If a constraint could not be met, its status is NOT_CONVERGED, a
+            failure: steps from this state leave it unchanged.
         violation: the remaining φ and φ̇ by constraint.
         distance: (dᵀ M d)^½ of the displacement d from the given configuration, ().
         tolerance: the largest |φ| and |φ̇| allowed, (2,).
@@ -134,10 +134,10 @@ def assemble(
 ) -> Assembly:
     """Finds the nearest configuration and velocity that satisfy every constraint.
 
-    Positions are q = q₀ ⊕ d, with the least ½ dᵀ M d under φ(q, t) = 0; rotations use their
-    exponential. Velocities v have the least ½ (v − v₀)ᵀ M (v − v₀) under J v + ∂φ/∂t = 0 and ψ = 0.
-    Held bodies keep their q and v. The search is local: it closes a loop in the way nearest to the
-    start.
+    The positions q = q₀ ⊕ d minimize ½ dᵀ M d subject to the position constraints φ(q, t) = 0. The
+    sum ⊕ turns bodies by the exponential map. The velocities v minimize ½ (v − v₀)ᵀ M (v − v₀)
+    subject to J v + ∂φ/∂t = 0 and the velocity constraints ψ = 0. Held bodies keep their q and v.
+    The search is local: it closes a loop in the way nearest to the start.
 
     The function is pure: jit and vmap it. The derivative with respect to q₀, v₀, t and every number
     of the system is that of the solution, not of the iterations. So
@@ -152,8 +152,8 @@ def assemble(
         hold: what does not move: names of bodies, indices in v (`system.layout.v(name)`), or a mask
             (n_v,).
         time: t, () [s]; the state's time, or 0, unless given.
-        tolerance: the |φ| and |φ̇| that count as zero; (1 + max |q|) ε^⅔ and (1 + max |v|) ε^⅔
-            unless given, with ε the spacing of floating-point numbers.
+        tolerance: the largest |φ| and |φ̇| that count as zero; (1 + max |q|) ε^⅔ and
+            (1 + max |v|) ε^⅔ unless given, with ε the spacing of floating-point numbers.
 
     Returns:
         The `Assembly`. `assemble(…).check()` returns the state, or raises if it did not converge.
@@ -268,10 +268,10 @@ def _weighted(jacobian: Array, factor: Array) -> Array:
 
 
 def _unweighted(y: Array, factor: Array) -> Array:
-    """Returns L⁻ᵀ y, the displacement or velocity for a scaled one y.
+    """Returns L⁻ᵀ y: undoes the scaling y = Lᵀ d of a displacement or velocity d.
 
     Args:
-        y: the scaled displacement, (n,).
+        y: the scaled displacement or velocity, (n,).
         factor: the Cholesky factor L of M, (n, n).
     """
     return jax.scipy.linalg.solve_triangular(factor, y, trans=1, lower=True)

@@ -39,10 +39,11 @@ def hanging(
 ) -> np.ndarray:
     """Finds the joints of a chain of equal links that hangs at rest between two points.
 
-    Equal masses hang at the joints. Tᵢ = (H, V + i) is the tension of link i, horizontally and
-    upwards, in units of a joint's weight; (H, V) is the tension of link 0. The links lie along
-    their tensions and span the gap Δ between the ends: ∇ Σ s ‖Tᵢ‖ = Δ with s the length of a link.
-    This is a convex problem in (H, V), solved by Newton's method.
+    Equal masses hang at the joints. The tension of link i is Tᵢ = (H, V + i), with a horizontal and
+    an upward component, in units of the weight at a joint. The links lie along their tensions and
+    span the gap Δ between the ends: Σ s Tᵢ / ‖Tᵢ‖ = Δ, with the length s of a link. Newton's method
+    finds the (H, V) that minimizes the convex function Σ s ‖Tᵢ‖ − (H, V)·Δ, whose gradient vanishes
+    there.
 
     Args:
         start: first end, (dim,) [m].
@@ -55,7 +56,8 @@ def hanging(
         The ends and the joints between them, (links + 1, dim) [m].
 
     Raises:
-        ValueError: the chain is too short, or the ends lie above one another.
+        ValueError: the chain is too short, one end lies above the other, or a link would be under
+            pressure.
     """
     a, b = (_known(what, x) for what, x in (("start", start), ("end", end)))
     length = float(_known("length", length, (), above=0))
@@ -168,7 +170,7 @@ def rope(
     xp, points = _points(scene, label, points)
     lengths = xp.sqrt(xp.sum((points[1:] - points[:-1]) ** 2, axis=1))
     share = mass / xp.sum(lengths) * lengths / 2
-    pad = np.pad if checks.is_concrete(share) else jnp.pad  # the mass may be traced alone
+    pad = np.pad if checks.is_concrete(share) else jnp.pad  # only the mass may be traced
     masses = pad(share, (1, 0)) + pad(share, (0, 1))
     n = len(points) - 1
     nodes = [f"{name}.{i}" for i in range(n + 1)]
@@ -215,7 +217,7 @@ def rod(
         name: name of the rod; its elements are called name.0, name.joint0, name.bend1.
         points: ends of the links, (links + 1, dim) [m], concrete numbers.
         mass: mass of the whole rod [kg].
-        radius: radius of the rod's round cross-section [m]; in space.
+        radius: radius of the rod's round cross-section [m]; required in space.
         start: name of the body on which the first end turns; None for a free end.
         end: name of the body on which the last end turns; None for a free end.
         bending: bending stiffness B = E I [N m²]; none unless given.
@@ -295,7 +297,7 @@ def _points(scene: Scene, owner: str, points: Any) -> tuple[Any, Any]:
 
 
 def _frames(tangents: np.ndarray) -> np.ndarray:
-    """Returns quaternions that turn x to each tangent, by the shortest turn from link to link."""
+    """Returns quaternions that turn the x axis to the tangents, by shortest turns between links."""
     result = []
     turn, before = np.array([1.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
     for t in tangents:

@@ -1,4 +1,4 @@
-"""Groups elements that act on joint coordinates, by the groups of these joints."""
+"""Groups elements of one class that act on coordinates of the same groups of joints."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class CoordinateElements:
     def drives(
         self, drives: list[Drive], params: Callable[[Any], PyTree], bare: Callable[[Any], Any]
     ) -> list[Drives]:
-        """Returns the prescribed motions, each as a group of one.
+        """Returns the prescribed motions, each as a group with one element.
 
         Args:
             drives: the drives of the scene.

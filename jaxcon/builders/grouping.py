@@ -78,7 +78,7 @@ class Gather:
         dtype: dtype of every number.
         layout: names and indices.
         poses: the principal frames to which elements are attached, by body name.
-        offsets: the user's frames in the principal frames, by body name.
+        offsets: the pose of the user's frame in the principal frame, by body name.
         elements: all elements of the scene.
     """
 

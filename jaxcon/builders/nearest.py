@@ -34,7 +34,7 @@ POLISHINGS = 40
 STIFFNESS = 10.0
 """The penalty parameter ρ of the augmented Lagrangian, for rows of length one."""
 CURVATURE = 1e-3
-"""The smallest curvature of ½ ‖y‖² along the surface that a step assumes."""
+"""The lower bound that a step assumes on the curvature of ½ ‖y‖² along the surface."""
 
 
 def cutoff(dtype: DType) -> float:
@@ -50,8 +50,9 @@ def pseudoinverse(matrix: Array) -> Array:
 def restore(surface: Surface, start: Array, tolerance: Array) -> tuple[Array, Array]:
     """Finds a point with |c| ≤ tolerance, or else returns the point with the least ‖c‖ found.
 
-    A symmetric start may be stationary, such as a linkage drawn as one line. If the first attempt
-    ends off the surface, further attempts start from random points at a distance of about |c|.
+    ‖c‖ may be stationary at a symmetric start, such as a linkage drawn as one line. If the first
+    attempt ends off the surface, further attempts start from random points, at a distance of about
+    |c| from `start`.
 
     Args:
         surface: the function c, (n,) → (m,).
@@ -132,11 +133,11 @@ def _value_and_jacobian(surface: Surface, y: Array) -> tuple[Array, Array]:
 
 
 def tangent(surface: Surface, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Returns a Newton step towards the nearest point of the surface: y = Jᵀλ and c = 0.
+    """Computes a Newton step for the equations of the nearest point, y = Jᵀλ and c = 0.
 
     The step t along the surface satisfies P W P t = −P (y + W n), with W = 1 − Σ λᵢ ∇²cᵢ and P the
-    projector on the tangent space. The eigenvalues of P W P are made positive, so that t goes
-    downhill.
+    projector on the tangent space. The eigenvalues of P W P are made positive, so that t is a
+    descent direction.
 
     Returns:
         c, the multipliers λ = J⁺ᵀ y, the step n = −J⁺ c to the surface, and the step t along it.

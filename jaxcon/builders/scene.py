@@ -52,14 +52,15 @@ def _dtype(given: Any) -> Any:
 
 @functools.cache
 def _with_options(cls: type, base: type[Element]) -> type:
-    """Returns a subclass of a user's class that has the default options of a base class."""
+    """Returns a subclass of a user's class and of `base`, which gives it default options."""
     return type(cls.__name__, (cls, base), {"__module__": cls.__module__, "__doc__": cls.__doc__})
 
 
 def completed(element: Any) -> Element:
-    """Returns an element of a user's class without a base, with the default options of its role.
+    """Copies an element; the class of the copy also derives from `Joint` or `ForceElement`.
 
-    The role is a joint or a force, by the methods of the class.
+    This gives default options to a user's class that does not derive from `Element`. The copy is a
+    `Joint` if the element has a method `rows`, and a `ForceElement` if it has a method `forces`.
 
     Raises:
         TypeError: the element is neither a joint nor a force.
@@ -130,13 +131,14 @@ class Scene:
             name: name of the body, unique in the scene.
             mass: () [kg].
             inertia: inertia about the center of mass [kg m²]: () in the plane; in space principal
-                moments (3,) or a full tensor (3, 3); or an `Inertia`, which also brings mass and
-                center. Of an `Inertia` in space, the plane takes the moment about z.
+                moments (3,) or a full tensor (3, 3); or an `Inertia`, which also has the mass and
+                the center of mass. In the plane, an `Inertia` with three moments gives the moment
+                about z.
             position: origin of the body's frame, world frame, (dim,) [m]. The origin is the center
-                of mass unless an `Inertia` says otherwise.
+                of mass unless an `Inertia` has another `center`.
             quaternion: orientation, body to world, wxyz, (4,); in space.
-            angle: orientation, () [rad]; in the plane. `build` warns of more than a turn, since the
-                angle was probably given in degrees.
+            angle: orientation, () [rad]; in the plane. `build` warns if the angle exceeds a turn,
+                because it was then probably given in degrees.
             velocity: velocity of the origin, world frame, (dim,) [m/s].
             angular_velocity: () in the plane, (3,) in the body frame in space [rad/s].
             fixed: True if the body is part of the world; it then needs no mass and has no
@@ -163,7 +165,7 @@ class Scene:
         )
 
     def allow_turns(self, name: str) -> None:
-        """Allows more than a turn as the angle of a body in the plane; `build` then does not warn.
+        """Lets the angle of a body in the plane exceed a turn without a warning from `build`.
 
         Args:
             name: name of a body in the plane that was added.
@@ -230,11 +232,11 @@ class Scene:
         self._elements[element.name] = element
 
     def build(self) -> tuple[BodySystem, State]:
-        """Checks the scene, and makes the system with every element attached in the current pose.
+        """Checks the scene, and makes the system, with elements attached at the given poses.
 
         Returns:
             The system, and the state at assembly. If the default method warm starts its solver of
-            inequality constraints, the state has the multipliers for it.
+            inequality constraints, the memory of the state has initial multipliers of zero for it.
 
         Raises:
             ValueError: an unknown name, a joint between a body and itself, a wrong shape or dtype,

@@ -31,20 +31,20 @@ class Vakonomic:
 
     In the physical (d'Alembert) equations the constraint forces of ψ = A v + b = 0 do no virtual
     work. The variational equations instead make ∫ L + μ·ψ dt stationary, as if the rows belonged to
-    the Lagrangian L. This adds the momentum p = Aᵀμ to that of the motion. With q̇ = N(q) v,
-    Hamel's equations are
+    the Lagrangian L. This adds the momentum p = Aᵀμ to M v. With q̇ = N(q) v, Hamel's equations are
 
         M a = f + J_hᵀλ − Aᵀμ̇ + Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v p,       A a = −γ,
 
-    where J_h has the rows with a φ, d/dt follows the motion, and ad*_v p is p_ω × ω for bodies in
-    space and zero elsewhere. This is the physical saddle system with one more force and with μ̇ =
-    −λ. The force is the curvature dθ(·, v) of the form θ = μ·A, with terms of explicit time
-    dependence. It vanishes for every μ if ψ is the rate of a φ; both motions are then the same.
-    Rows with a φ stay physical.
+    where J_h has the rows of position constraints φ(q, t) = 0, and γ is the part of ψ̇ without a.
+    d/dt is the rate along the motion, and ad*_v p is p_ω × ω for bodies in space and zero
+    elsewhere. This is the physical saddle system with one more force and with μ̇ = −λ. The force is
+    the curvature dθ(·, v) of the form θ = μ·A, with terms of explicit time dependence. If ψ is the
+    rate of a φ, the force vanishes for every μ; the variational and the physical motion are then
+    equal. Rows with a φ stay physical.
 
-    The velocities of this system are (v, μ): those of the physical system, then μ of every row
-    without a φ. Its positions are those of the physical system. It is stepped, batched and
-    differentiated like any other system.
+    The velocities of this system are (v, μ): the physical velocities, then one μ for each row
+    without a φ. Its positions are the physical positions. It is stepped, batched and differentiated
+    like any other system.
 
     Attributes:
         system: the physical system, a `BodySystem` or `GeneralizedSystem`.
@@ -254,7 +254,7 @@ class Vakonomic:
         return jnp.concatenate([self.system.rotate(q, v, dt), μ])
 
     def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
-        """Returns a velocity change in turned body frames, and its part for μ unchanged, (n_v,)."""
+        """Returns a velocity change p in turned body frames; its part for μ stays, (n_v,)."""
         (step, _), (p, rest) = self._split(step), self._split(p)
         return jnp.concatenate([self.system.in_turned_frames(q, step, p), rest])
 
@@ -271,7 +271,10 @@ class Vakonomic:
         return self.system.squared_turns(v, before, rows, dt, whole)
 
     def carry(self, q: Array, step: Array, p: Array) -> Array:
-        """Returns a momentum after a step, seen from its start, and its part for μ unchanged."""
+        """Returns (dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum p after a step Δ, seen from the step's start.
+
+        The part of p for μ is unchanged.
+        """
         (step, _), (p, rest) = self._split(step), self._split(p)
         return jnp.concatenate([self.system.carry(q, step, p), rest])
 
@@ -284,7 +287,7 @@ class Vakonomic:
         return self.system.normalize(q)
 
     def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:
-        """Returns the energy of the physical system [J]; if ψ is homogeneous in v, μ adds none."""
+        """Returns the energy of the physical system [J]; μ adds none if ψ is homogeneous in v."""
         return self.system.energy(q, self._split(v)[0], t)
 
     def kinetic_energy(self, q: Array, v: Array) -> Array:
@@ -304,11 +307,12 @@ class Vakonomic:
 def vakonomic(
     system: System, state: State, multipliers: Mapping[str, Any] | None = None
 ) -> tuple[Vakonomic, State]:
-    """Replaces the physical equations by the variational ones, for all rows without a φ.
+    """Replaces the physical equations by the variational ones, for all velocity-level rows.
 
-    The variational equations are those of optimal control, where rows restrict the possible
-    motions. A wheel or a skate obeys the physical equations instead. A motion needs initial
-    multipliers μ besides q and v.
+    Velocity-level rows ψ = 0 are the rows that do not derive from a position constraint φ = 0. The
+    variational equations describe optimal control, where rows restrict the possible motions. A
+    wheel or a skate obeys the physical equations instead. A motion needs initial multipliers μ
+    besides q and v.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.

@@ -33,7 +33,7 @@ class Armature(OnJoint):
         joint: name of the joint.
         inertia: I > 0 [kg m²] about an angle, [kg] along a travel. A joint without a rotor needs no
             `Armature`.
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     name: str
@@ -63,7 +63,8 @@ class Armatures(Elements, Constraint):
 
     def rows(self, snapshot: Snapshot) -> list[Row]:
         """Returns the row J a + λ/I = −γ of each rotor, without a φ and without feedback."""
-        compliance = 1 / finite_or_nan(self.params["inertia"])  # NaN for I = ∞: 0 would lock it
+        # NaN for I = ∞, since the compliance 0 would lock the joint
+        compliance = 1 / finite_or_nan(self.params["inertia"])
         row = self.coordinate.read(snapshot)
         return [row._replace(value=0.0, rate=0.0, compliance=compliance)]
 

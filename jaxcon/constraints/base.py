@@ -93,7 +93,7 @@ class Joint(BetweenBodies):
     def coordinate_rows(
         cls, name: str, p: dict[str, Any], a: JointFrame, b: JointFrame
     ) -> dict[str, Row]:
-        """Returns rows by name: that of the named coordinate, and others computed along with it.
+        """Returns the row of the named coordinate, and rows computed along with it, by name.
 
         Args:
             name: name of the coordinate.

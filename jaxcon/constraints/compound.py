@@ -104,9 +104,9 @@ class Compound(Joint):
     massless bodies are added between a and b. The joint has 6 rows less its degrees of freedom.
 
     Its coordinates are "travel_1", …, "angle_1", …, in the order of the axes. Springs, motors and
-    other elements act on each by name. The middle one of three hinges stays between the two
+    other elements act on each by name. The middle angle of three hinges lies between the two
     positions at which the axes lie in one plane (gimbal lock; ±90° for perpendicular axes). At
-    these positions the rate of its angle does not belong to any motion.
+    these positions the rates of the angles are undefined and returned as zero.
 
     Attributes:
         name: name of the element, unique in the scene.

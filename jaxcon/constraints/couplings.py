@@ -181,7 +181,7 @@ class Pulley(Pair):
     Attributes:
         name: name of the element, unique in the scene.
         span_a, span_b: names of the `Span`s between pulley and load.
-        parts: n, not zero.
+        parts: the number n of parts of rope in the second span, not zero.
     """
 
     name: str

@@ -52,7 +52,7 @@ class UserFunction(Element):
         """Returns the function φ̇(q, v, t), the time derivative of φ along a motion.
 
         Args:
-            call: φ as call(q, None, t).
+            call: the function φ, called as call(q, None, t).
             kinematics: the function (q, v) → q̇.
         """
 
@@ -66,7 +66,7 @@ class UserFunction(Element):
         """Returns φ(q, t), (m,).
 
         Args:
-            call: φ as call(q, None, t).
+            call: the function φ, called as call(q, None, t).
             q: positions.
             t: time, () [s].
         """

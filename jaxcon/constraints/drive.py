@@ -46,7 +46,7 @@ class Drive(OnJoint):
         motion: the function `motion(t, params)` → θ* (); pure and hashable, twice differentiable in
             t.
         params: any pytree of arrays.
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     name: str

@@ -302,7 +302,7 @@ def normals(n: Array) -> list[Array]:
     """Returns the directions normal to a unit vector n, (dim,), that complete a right-handed basis.
 
     In space the first direction is n × e, with e the world axis along which n has its smallest
-    component; x comes before y before z.
+    component: the first of x, y and z if components are equal.
     """
     if n.shape == (2,):
         return [jnp.stack([-n[1], n[0]])]
@@ -313,7 +313,7 @@ def normals(n: Array) -> list[Array]:
 
 
 def unit(joint: Joint, what: str, pose: Pose) -> Array:
-    """Returns a direction that is a field of a joint as a unit vector, world frame.
+    """Returns the direction in a field of a joint, as a unit vector in the world frame.
 
     Args:
         joint: the joint.

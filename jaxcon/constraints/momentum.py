@@ -59,8 +59,8 @@ class AngularMomentum(PrescribedMomentum):
     """The angular momentum of bodies about their common center of mass is given: L(q, v) = L*.
 
     The constraint has 1 velocity-level row in the plane and 3 in space. Internal forces do not
-    change L, so λ is zero if no external torque acts; otherwise λ is the torque that keeps L.
-    Feedback reduces an error of L as it does for a `VelocityLevel` row.
+    change L, so λ is zero if no external torque acts; otherwise λ is the torque that keeps L. Under
+    feedback an error ψ = L − L* decays as ψ̇ = −2α ψ.
 
         L = Σ m (x − c) × ẋ + R I ω,    L̇ = Σ m (x − c) × ẍ + R (I ω̇ + ω × I ω)
 

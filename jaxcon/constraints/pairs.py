@@ -86,10 +86,11 @@ class PointOnPlane(Joint):
         axis: the normal n, world frame at assembly, (dim,), any length but zero.
         point: a point on the plane, world frame at assembly, (dim,) [m]; the second body's center
             of mass unless given.
-        x_axis: the direction of the coordinate x, world frame at assembly, (dim,); its part in the
-            plane counts, and y is axis × x. Unless given, x is axis × e with e the world axis along
-            which the axis has its smallest component, x before y before z. For a normal along world
-            z, x points along world y, and y along −x. In the plane x is the axis turned by +90°.
+        x_axis: the direction of the coordinate x, world frame at assembly, (dim,); only its part in
+            the plane counts, and y is axis × x. Unless given, x is axis × e, with e the world axis
+            along which the axis has its smallest component: the first of x, y and z if components
+            are equal. For a normal along world z, x points along world y, and y along −x. In scenes
+            in the plane, x is the axis turned by +90°.
     """
 
     axis: Any
@@ -239,10 +240,10 @@ class Planar(Parallel):
         axis: the normal n, world frame at assembly, (3,), any length but zero.
         point: a point on the plane, world frame at assembly, (3,) [m]; the second body's center of
             mass unless given.
-        x_axis: the direction of the coordinate x, world frame at assembly, (3,); its part in the
-            plane counts, and y is axis × x. Unless given, x is axis × e with e the world axis along
-            which the axis has its smallest component, x before y before z. For a normal along world
-            z, x points along world y, and y along −x.
+        x_axis: the direction of the coordinate x, world frame at assembly, (3,); only its part in
+            the plane counts, and y is axis × x. Unless given, x is axis × e, with e the world axis
+            along which the axis has its smallest component: the first of x, y and z if components
+            are equal. For a normal along world z, x points along world y, and y along −x.
     """
 
     point: Any = None
@@ -432,10 +433,10 @@ class Universal(Joint):
 class ConstantVelocity(Joint):
     """Two shafts at any angle below π that turn equally fast, in space, 4 rows.
 
-    The shafts meet in a point. The rotation of b relative to a, counted from shafts in line, is
-    about an axis normal to both shafts: its unit quaternion (w, x, y, z), with z along the shaft of
-    a, has z = 0. With a₁, a₂ normal to the shaft in a, and b₁, b₂ the same directions in b when the
-    shafts are in line,
+    The shafts meet in a point. The rotation of b relative to a, measured from the pose with the
+    shafts in line, is about an axis normal to both shafts. Its unit quaternion (w, x, y, z), with z
+    along the shaft of a, therefore has z = 0. a₁ and a₂ are directions of a normal to its shaft. b₁
+    and b₂ are the directions of b that coincide with them when the shafts are in line. Then
 
         φ = a₂·b₁ − a₁·b₂ = 4 w z = (1 + cos β) sin τ,
 

@@ -27,7 +27,7 @@ from jaxcon.system.frames import BodyFrame, Direction, Point
 
 
 class JointFrame(BodyFrame, Protocol):
-    """The motion of one body of each joint, as lanes (element, …), as joints use it.
+    """The interface by which joints read the motion of one body per joint, as lanes (element, …).
 
     `PlanarFrame` has `angle` and `laps`, `SpatialFrame` has `quaternion` and `spin`, and
     `WorldFrame` has all four.

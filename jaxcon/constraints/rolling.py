@@ -2,8 +2,8 @@
 
 A plane is a face of body a: a point p, a unit normal n and two tangents t, all fixed in a. Body a
 may be the world, a moving body, or a body with prescribed motion such as a turntable. Body b
-touches the plane at c + ρ, where c is a point of b, and ρ the arm from c to the contact. The point
-of b at the contact moves over the plane along t, with the relative angular velocity Ω = ω_b − ω_a,
+touches the plane at c + ρ, where c is a point of b, and ρ the arm from c to the contact. With the
+relative angular velocity Ω = ω_b − ω_a, the point of b at the contact moves over the plane along t
 at the speed
 
     ψ = t·(ċ − v_a(c)) + Ω·(ρ × t),        t·(ċ − v_a(c)) = d/dt t·(c − p),
@@ -165,8 +165,8 @@ class RollingDisc(Joint):
     In space the disc with axis e may lean and turn. Its lowest point lies at ρ = −r s from its
     center c. Here s = (n − κ e)/σ is the direction in the disc nearest to n, with κ = n·e and
     σ = ‖n × e‖. The contact row is φ = n·(c − p) − r σ. In scenes in the plane the disc rolls on a
-    line, with ρ = −r n. A disc that lies flat (σ = 0) touches everywhere; its rows are then those
-    of its center.
+    line, with ρ = −r n. A disc that lies flat (σ = 0) touches everywhere; its rows then take the
+    center as the contact point.
 
     Attributes:
         name: name of the element, unique in the scene.

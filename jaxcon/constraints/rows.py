@@ -146,7 +146,7 @@ class Violation:
         return jnp.max(jnp.abs(self.velocity), axis=-1, initial=0)
 
     def __repr__(self) -> str:
-        """Describes one world by a line for each constraint; others by the shapes of arrays."""
+        """Describes one world by a line for each constraint; a batch or tracer by array shapes."""
         concrete = checks.is_concrete((self.position, self.velocity))
         if np.ndim(self.position) != 1 or not concrete:
             shapes = f"position {np.shape(self.position)}, velocity {np.shape(self.velocity)}"

@@ -1,7 +1,8 @@
 """Inequality rows and their laws: complementarity, boxes and friction cones.
 
-After the equality rows are eliminated, a step is a problem for the multipliers λ of the inequality
-rows and the velocities u at its end:
+After the equality rows are eliminated, a step is a problem for the multipliers λ and the velocities
+u of the inequality rows. u is at the end of the step, and relative to the target velocities. G is
+∂u/∂λ, and c is u for λ = 0:
 
     u = G λ + c,   each row or contact obeying its law:
 
@@ -80,7 +81,7 @@ class RowCounts:
 
     @property
     def starts(self) -> tuple[int, ...]:
-        """The index of the first row of each disc, and the number of all rows at the end."""
+        """The index of the first row of each disc; the last entry is the number of all rows."""
         sizes = [disc.count * disc.rank for disc in self.discs]
         return tuple(itertools.accumulate(sizes, initial=self.normal + self.contacts))
 
@@ -326,7 +327,7 @@ def implicit_multipliers(
     """Returns λ with its derivative, by implicit differentiation of the laws.
 
     Args:
-        problem: problem as a constant, which gives the matrix of the derivative.
+        problem: the problem with constant numbers; its `slope` is the matrix of the derivative.
         multipliers: solution λ of the problem, (n,).
         velocity: function of λ that returns u − u*, differentiable in its closed-over values.
         live: lower and upper bounds and μ, differentiable.
@@ -338,10 +339,10 @@ def implicit_multipliers(
     here = problem.velocity(multipliers)
 
     def law(x: Array) -> Array:
-        # these have no derivative; it must be stopped inside this function, see `roots.implicit`
+        # treat these as constants; stop their gradients inside this function, see `roots.implicit`
         fixed, smooth, there = jax.lax.stop_gradient((scale, corner, here))
-        # use the value of u from which the matrix below is computed: at the corner of a law,
-        # rounding decides if a contact presses or opens, and both must decide alike
+        # use the value of u from which `prepared` computes the matrix: at the corner of a law,
+        # rounding decides if a contact presses or opens, and residual and matrix must agree
         u = velocity(x)
         return laws(kinds, fixed, x, there + (u - jax.lax.stop_gradient(u)), live, smooth)
 

@@ -2,7 +2,8 @@
 
 On the path, the product of each complementary pair is the target τ. One-sided rows and normals have
 one pair, λ u = τ. Boxes have one pair for each bound. A contact has a further pair for each of its
-discs, in the second-order cone: (λ_n, y) ∘ (ψ, w) = (τ, 0) with y = λ_t/μ and w = μ u_t, which is
+discs, in the second-order cone: (λ_n, y) ∘ (ψ, w) = (τ, 0) with y = λ_t/μ, w = μ u_t and a dual
+variable ψ. In components,
 
     λ_n ψ + y·w = τ,   λ_n w + ψ y = 0.
 
@@ -227,7 +228,13 @@ def moved(
 
 
 def _slip_rate(cone: Cone, normal: Array, tail: Vector) -> Vector:
-    """Returns the change of the slip w = μ u_t by (λ_n, λ_t/μ), for a constant cone product."""
+    """Returns the change of the slip w = μ u_t at a constant cone product.
+
+    Args:
+        cone: the current variables of the cone.
+        normal: the change of λ_n.
+        tail: the change of λ_t/μ.
+    """
     change = cone.slip * normal + tail * cone.head
     head = -(cone.head * normal + cone.slip.dot(tail))
     return _through(cone, -change - cone.tail * (head / cone.normal))

@@ -1,8 +1,8 @@
 """Ropes and contacts with friction: geometry and rows.
 
-The pairs that may touch are fixed when the scene is built. Every pair computes its gap, the normal
-from the first body to the second, and the point of contact in each step. The rows depend on these
-alone (`contact_rows`).
+The pairs that may touch are fixed when the scene is built. In each step, every pair computes its
+gap, the normal from the first body to the second, and the point of contact. `contact_rows` makes
+the rows from these and the motion of the bodies.
 """
 
 from __future__ import annotations
@@ -147,9 +147,9 @@ class CapsuleContact(BetweenBodies):
     """Contact of two capsules at one point; a capsule whose segment has no length is a ball.
 
     The normal points from the closest point of the first axis to the closest point of the second.
-    Where the axes cross between their ends, the normal is perpendicular to both. In the plane, and
-    where parallel axes coincide, it is perpendicular to the longer axis. For two balls with the
-    same center it is the world's x axis.
+    If the axes cross between their ends in space, the normal is perpendicular to both. If the axes
+    intersect in the plane, or are collinear and overlap, it is perpendicular to the longer axis.
+    For two balls with the same center it is the world's x axis.
 
     Attributes:
         name: name of the element, unique in the scene.
@@ -186,7 +186,7 @@ class CapsuleContact(BetweenBodies):
         """Returns the capsules in the frames of their bodies, and the material.
 
         Raises:
-            ValueError: no radius is given; two segments never overlap.
+            ValueError: both radii are the number 0; segments without thickness never overlap.
         """
         if checks.plain_zero(self.radius_a) and checks.plain_zero(self.radius_b):
             raise ValueError(f"{label(self)}: give radius_a, radius_b or both.")
@@ -223,7 +223,8 @@ class CapsuleContact(BetweenBodies):
         resolved = length > rounding_of(ends, x_a, x_b, radii)
         if len(apart) == 2:  # axes that cross in the plane meet
             resolved &= ~crossing
-        # u × w is the direction of x_b − x_a between the ends, with less rounding
+        # if the axes u and w cross between their ends, u × w has the direction of x_b − x_a, with
+        # less rounding error
         across_both = ~resolved | crossing
         aside = across_axes(ends[1] - ends[0], ends[3] - ends[2], skew)
         aside = aside * jnp.where(resolved & (aside.dot(apart) < 0), -1.0, 1.0)
@@ -240,7 +241,7 @@ class Contacts(Ranged):
     """A group of ropes or contacts of the class `law`, between bodies of the same kinds."""
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
-        """Checks the changed numbers of an element by the ranges of its class and of contacts."""
+        """Checks the changed numbers of an element by its class, then by `check_ranges`."""
         self.law.check_numbers(name, numbers, dtype)
         super().check_numbers(name, numbers, dtype)
 
@@ -317,7 +318,7 @@ def across_axes(u: Vector, w: Vector, skew: Lane) -> Vector:
     square_u, square_w = u.dot(u), w.dot(w)
     longer = square_u >= square_w
     square = jnp.where(longer, square_u, square_w)
-    # the direction across −e_n, the last axis downwards, is e_x
+    # two balls have no axis: take the last world axis, downwards; the direction across it is e_x
     down = (0.0,) * (len(u) - 1) + (-1.0,)
     unit = numerics.safe_divide(1.0, numerics.safe_sqrt(square))
     along = (

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jaxcon.constraints.primitives import JointFrame
 
 MATERIAL = ("friction", "rolling", "spinning", "restitution")
-"""Fields of contacts for which no rows or parameters exist if they are the number 0."""
+"""Fields of contacts that make no rows and no parameter if they are the Python number 0."""
 
 
 class Touch(NamedTuple):
@@ -46,15 +46,15 @@ class Touch(NamedTuple):
 
 
 def contact_rows(p: dict[str, Any], touch: Touch, dt: Array) -> tuple[list[Row], dict[str, Any]]:
-    """Returns the rows of a contact and their targets and coefficients.
+    """Returns the rows of a contact, and further fields of their `BoundSet`.
 
-    The rows are the normal, and with friction the tangents. The coefficients include rolling and
-    spinning resistance.
+    The rows are the normal row and, with friction, the tangent rows. The fields are the target, the
+    coefficients, and the rows of rolling and spinning resistance.
     """
     # If the gap to a fixed body is open, the force acts at the surface of the moving body, where
-    # the contact will be. At the middle of the gap, its lever arm would depend on the gap, and the
-    # rotation of the body on the phase of the landing within the step. Two moving bodies share
-    # one point, which conserves angular momentum.
+    # the contact will be. At the middle of the gap, its lever arm would depend on the gap. The
+    # rotation of the body would then depend on when within the step it lands. Two moving bodies
+    # share one point, which conserves angular momentum.
     half, place = touch.normal * (jnp.maximum(touch.gap, 0) / 2), touch.place
     if isinstance(touch.a, WorldFrame):
         place = place + half
@@ -114,7 +114,8 @@ def material(element: HasStop, a: Pose, b: Pose) -> dict[str, Array]:
     """Returns the checked parameters of a contact, without fields that are the number 0.
 
     Raises:
-        ValueError: a parameter is out of range, or resists a rotation that does not exist.
+        ValueError: a parameter is out of range, a particle has rolling or spinning resistance, or
+            a contact in the plane has spinning resistance.
     """
     owner, dtype = label(element), a.position.dtype
     given = {what: getattr(element, what, 0.0) for what in MATERIAL[:3]}

@@ -22,9 +22,10 @@ class GaussSeidel(checks.Checked, ContactSolver):
     """Projected Gauss–Seidel: a fixed number of sweeps over rows and contacts, with a warm start.
 
     A sweep solves each row with all other rows fixed: λᵢ ← P(λᵢ − uᵢ/Gᵢᵢ), where P projects onto
-    the bounds. In a contact the normal comes first, then the tangents, λ_t ← P(λ_t − u_t/ρ) with ρ,
-    the larger eigenvalue of their block of G. A fixed point satisfies Signorini's and Coulomb's
-    laws without relaxation. Convergence is linear, and slow if light bodies carry heavy ones.
+    the bounds. In a contact the normal comes first, then the tangents: λ_t ← P(λ_t − u_t/ρ), where
+    ρ is the larger eigenvalue of the tangents' block of G. A fixed point satisfies Signorini's and
+    Coulomb's laws without relaxation. Convergence is linear, and slow if light bodies carry heavy
+    ones.
 
     Attributes:
         sweeps: number of sweeps in a step.
@@ -125,7 +126,7 @@ def _rows(problem: Bounded, multipliers: Array, pivot: Pivots) -> Array:
 
 
 def _contacts(problem: Bounded, multipliers: Array, pivot: Pivots) -> Array:
-    """Solves contacts one after another: the normal, then the tangents with its new value."""
+    """Solves contacts one after another: the normal, then the tangents with the new λ_n."""
     kinds = problem.kinds
     if not kinds.contacts:
         return multipliers

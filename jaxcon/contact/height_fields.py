@@ -37,9 +37,9 @@ class HeightFieldContact(BetweenBodies):
     the grid it is extrapolated linearly. φ is the distance of a ball from the nearest point of the
     surface, and φ̇ its velocity along the normal there. A ball touches at one point. In a valley
     narrower than the ball, this point is a local minimum of the distance, found by descent from the
-    point below the center. A box touches only at the given points, such as
-    `center=jc.contacts.box_corners(…)`; the ground between them has no effect. The same holds for a
-    capsule. λ has the shape (1 + tangents,) for one ball, and (k, 1 + tangents) for k balls.
+    point below the center. A box or capsule touches only at the given points, such as
+    `center=jc.contacts.box_corners(…)`; the ground between them has no effect. λ has the shape (1 +
+    tangents,) for one ball, and (k, 1 + tangents) for k balls.
 
     Attributes:
         name: name of the element, unique in the scene.
@@ -147,8 +147,9 @@ def surface(p: dict[str, Any], like: Lane) -> Surface:
 def above(ground: Surface, point: Vector) -> tuple[Lane, Vector]:
     """Returns the distance of a point from the ground, and the normal at the nearest point.
 
-    High above rough ground the search for the nearest point may not converge. The distance is then
-    that from the last iterate, an upper bound, with the sign of the height above the ground below.
+    High above rough ground the search for the nearest point may not converge. The distance from the
+    last iterate is then returned, an upper bound. It is positive if the point is above the ground
+    vertically below it, and negative otherwise.
     """
     place = ground.nearest(point)
     shape = ground.at(place)

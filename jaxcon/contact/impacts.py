@@ -1,4 +1,4 @@
-"""Impacts within a plain step: their times and effects, and the derivatives of both.
+"""Impacts within a plain step, which is not split at impacts: times, effects and derivatives.
 
 An impact at time t + τ changes the velocities from v⁻ = v + τ a⁻ to v⁺ = v⁻ + Δv. Then the bodies
 move on with other accelerations a⁺. At the end of a step h, with the remaining time r = h − τ,
@@ -6,14 +6,14 @@ move on with other accelerations a⁺. At the end of a step h, with the remainin
     v_end = v + h a⁻ + Δv + r (a⁺ − a⁻),
     q_end = q ⊕ (h v + h² a⁻/2) ⊕ (r Δv + r² (a⁺ − a⁻)/2 − r² ω × Δω/2).
 
-The derivative of the last term in each line with respect to τ is the extra term of a saltation
-matrix. It contains all velocities that an impulse changes, also along tangents and through joints:
-they are v⁻ before τ and v⁺ after it.
+The derivatives of the terms in r with respect to τ are the extra terms of a saltation matrix. They
+cover every velocity that an impulse changes, also along tangents and through joints: it is v⁻
+before τ and v⁺ after it.
 
 After an impact without rebound, φ̇ = 0. The sign of φ̈ = J a⁺ + J̇ v⁺ then decides if the contact
 opens: contact forces obey 0 ≤ λ ⊥ φ̈ ≥ 0 and Coulomb's law. For example, the end of a rod that
-turns fast lifts off at once. In plain steps, rows with impacts include J̇ v, too. The next step
-therefore comes to the same decision, however long the remaining time r is.
+turns fast lifts off at once. In a plain step, the rows that can have impacts also include J̇ v.
+The next step therefore comes to the same decision, however long the remaining time r is.
 
 The impulse is computed at the configuration of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the
 start of the step. Otherwise the direction of the impulse would depend on τ if the normal turns
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from jaxcon.protocols import System
 
 ROUNDING = 64
-"""The rounding error of a velocity, in units of the spacing at the largest velocity."""
+"""The rounding error of a velocity, in floating-point spacings of the largest velocity."""
 
 PREFIX = "gradients through impacts: "
 """The first words of the warning about derivatives through impacts."""
@@ -58,7 +58,9 @@ SLOW = 2
 
 
 class Seen(NamedTuple):
-    """The kind of a record of impacts: masks of hits and bounces (n,), the time, and h.
+    """The label of an observation of impacts in `notices`.
+
+    The values of the observation are the masks of hits and of bounces, (n,), the time, and h.
 
     Attributes:
         layout: assignment of rows to elements.
@@ -99,7 +101,7 @@ class Laws(Protocol):
     def find(
         self, q: Array, v: Array, t: Doubled | Array, rows: BoundRows, acts: Array, lasts: Array
     ) -> Found:
-        """Returns the impulses of the active rows; if `lasts`, (), their forces over a step."""
+        """Returns impulses of the active rows in an impact, or forces in a step if `lasts`, ()."""
         ...
 
 
@@ -151,8 +153,9 @@ def candidates(rows: BoundRows, free: Array, dt: Array) -> Array:
 
     Candidates have λ = 0 before the impact, which is harmless if their gap stays open. A row
     without restitution is a candidate only if it closes faster than accelerations change its rate
-    in a step; slower rows rest and carry load. A row in contact must close faster than h |J| |a|:
-    in a stack whose blocks fall together, J a is zero, and rates are rounding errors.
+    in a step, h |J a|; slower rows rest and carry load. If it is in contact, it must close faster
+    than the larger bound h |J| |a|. For example, J a is zero in a stack whose blocks fall together,
+    and the rates are rounding errors.
 
     Args:
         rows: inequality rows at the start of the step.
@@ -196,7 +199,7 @@ def arrive(
             the rate u from `at_start` and the acceleration c = J a⁻ + J̇ v of the gap.
         may: mask of the `candidates`, (n,).
         change: rate change h c over the step, (n,), with the forces of the other rows.
-        lag: velocities belong to the time lag · h before the positions.
+        lag: the delay of velocities behind positions, in units of h.
         dt: step size h, () [s].
         response: derivative ∂a/∂λ, (n_v, n), whose nonzeros show which row changes which velocity;
             None if unknown.
@@ -243,7 +246,8 @@ def passes_range(rows: BoundRows, speed: Array, time: Array) -> Array | None:
         time: the given time for each row, (n,) [s].
 
     Returns:
-        True for each world in which a joint does, (); None without such stops.
+        True for each world in which a joint crosses its range, (); None if no joint has two stops,
+        or no row can bounce.
     """
     if rows.far is None or rows.restitution is None:
         return None
@@ -260,7 +264,7 @@ def leaving_speeds(
         e: coefficient of restitution, (n,).
         arrivals: the hitting rows and their times.
         change: rate change h c over the step, (n,), with the forces of the other rows.
-        lag: velocities belong to the time lag · h before the positions.
+        lag: the delay of velocities behind positions, in units of h.
         dt: step size h, () [s].
     """
     rate = at_start(rows, change, lag) + change * numerics.safe_divide(arrivals.times, dt[None])
@@ -268,9 +272,10 @@ def leaving_speeds(
 
 
 def at_start(rows: BoundRows, change: Array, lag: float) -> Array:
-    """Returns φ̇ at the start of the step, (n,), if velocities belong to lag · h before it.
+    """Returns φ̇ at the start of the step, (n,), if velocities belong to the time lag · h before it.
 
-    Only forces change φ̇ in the time between, since `rows.rate` = J v already uses J at the start.
+    Only forces change φ̇ between these two times, since `rows.rate` = J v already uses J at the
+    start of the step.
     """
     forced = change if rows.rate_change is None else change - rows.rate_change
     return rows.rate + lag * forced
@@ -281,9 +286,10 @@ def at_impact(
 ) -> tuple[BoundRows, Array]:
     """Returns the rows with their targets for an impact, and a mask of the active rows, (n,).
 
-    Hitting rows leave with e |φ̇|, or stay closed if they are slow. Other rows may close their gap
-    within the time of a step, so the impact does not push them apart. If `lasts`, (), the result is
-    for the motion after the impact: rows have the targets of a step and do not bounce.
+    Hitting rows leave with e |φ̇|, or stay closed if they are slow. The targets of other rows let
+    them close their gap within a step, so the impact does not push them apart. Where `lasts`, (),
+    is True, the result is for the motion after the impact: rows have the targets of a step and do
+    not bounce.
     """
     ends, hits = mask(rows.ends, rows), arrivals.hits
     hard = mask(rows.hard, rows)
@@ -317,16 +323,17 @@ def closing(rows: BoundRows, change: Array, dt: Array) -> Array:
 def landing(rows: BoundRows, change: Array, dt: Array) -> BoundRows:
     """Sets the targets of contacts without restitution for a step in which they may land.
 
-    A contact that closes after τ = s h ends the step with its mean velocity s u⁻. Along the normal
-    this velocity closes the gap, and along the tangents it delays friction until τ. The next step
-    completes the impact. The impulses of the two steps are the fractions 1 − s and s of the whole
-    impulse. One acts before and one after the impact, so the mean time and place are right. Unlike
-    an `Impact`, this method costs nothing; it is meant for solvers that trade accuracy for speed.
+    A contact that closes after τ = s h has the velocity u⁻ until τ, and zero afterwards. The target
+    of the step is the mean velocity, s u⁻, and the next step completes the impact. Along the normal
+    this target closes the gap, and along the tangents it delays friction until τ. The impulses of
+    the two steps are the fractions 1 − s and s of the whole impulse. One acts before and one after
+    the impact, so the mean time and place are right. Unlike an `Impact`, this method costs nothing;
+    it is meant for solvers that trade accuracy for speed.
 
     Args:
         rows: inequality rows at the start of the step.
         change: rate change h J a without inequality rows, (n,), a constant; rows that close no
-            faster are at rest.
+            faster than |h J a| are at rest.
         dt: step size h, () [s].
     """
     kinds = rows.kinds
@@ -399,8 +406,9 @@ class Impact:
             the impact.
         dt: step size h, () [s].
         response: derivative ∂a/∂λ, (n_v, n); None if unknown.
-        lag: velocities belong to the time lag · h before the positions. If not 0, bodies rotate by
-            the sum of the displacement by the impact and that of the step.
+        lag: the delay of velocities behind positions, in units of h. If it is not 0, a body rotates
+            once, by the sum of the displacements of the step and of the impact. If it is 0, the
+            body rotates by the first, then by the second.
     """
 
     laws: Laws

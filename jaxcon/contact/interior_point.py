@@ -47,8 +47,9 @@ class InteriorPoint(checks.Checked, ContactSolver):
     Attributes:
         iterations: largest number of iterations; converged worlds of a batch wait for the others.
         polish: largest number of final Newton steps on the laws themselves. They are needed since
-            rounding ends the path early: near the boundary of a cone two numbers nearly cancel. The
-            same number of further rounds releases contacts that cannot all carry load.
+            rounding ends the path early: near the boundary of a cone two numbers nearly cancel. If
+            these steps do not suffice, as many further rounds unload redundant contacts, such as
+            one of the four corners of a face.
         smoothing: width of the smoothed corners of the laws, for the derivative only [m/s, rad/s].
 
     References:
@@ -96,10 +97,10 @@ class InteriorPoint(checks.Checked, ContactSolver):
 
 
 def target(problem: Bounded, point: PathPoint, share: Array) -> Target:
-    """Returns a fraction of the mean product as target, but at least what rounding allows.
+    """Returns a fraction of the mean product as the target, bounded below by `least`.
 
-    The mean includes only the excess of each cone over its smallest possible product. Otherwise,
-    cones would slow down the other pairs.
+    The mean includes only the excess of each cone's product over its lower bound. Otherwise, cones
+    would slow down the other pairs.
     """
     numbers, heads = products(problem.kinds, point)
     plain, ends = least(problem, point)
@@ -111,7 +112,7 @@ def target(problem: Bounded, point: PathPoint, share: Array) -> Target:
 def least(problem: Bounded, point: PathPoint) -> tuple[float, list[Array]]:
     """Returns the smallest products that rounding allows, of pairs of numbers and of cones.
 
-    Near the boundary of a cone two numbers nearly cancel, so the product of a cone ends much
+    Near the boundary of a cone two numbers nearly cancel, so the smallest product of a cone is much
     larger.
     """
     eps = float(jnp.finfo(problem.offset.dtype).eps)

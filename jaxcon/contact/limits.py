@@ -1,4 +1,4 @@
-"""Joint limits, dry friction in joints, rate motors, and inequalities of users' functions.
+"""Joint limits, dry friction in joints, rate motors, and inequalities from users' functions.
 
 Elements on a joint act on its coordinate θ, an angle that counts whole turns, or a travel. The
 first part of the module checks the ranges of their parameters, and of the parameters of contacts.
@@ -112,9 +112,9 @@ class Limit(OnJoint):
     the stop but not pass it. A penetration closes within a step if a speed of 1 mm/s or 1 mrad/s
     suffices (10 µm/s or 10 µrad/s in float64). Otherwise a fifth of it closes, but at least at this
     speed, and no faster than `recovery`. A coordinate that reaches the stop within the step leaves
-    it with −e φ̇ at the time of impact. A stop with a stiffness is a spring and a damper behind the
-    gap, implicit over the step. If a step would pass the farther stop, that stop acts in place of
-    the nearer one.
+    it at the rate −e φ̇, with φ̇ at the time of impact. A stop with a stiffness is a spring and a
+    damper behind the gap, integrated implicitly. If a step would pass the farther stop, that stop
+    acts in place of the nearer one.
 
     A step resolves one impact of a stop. If a joint rebounds so fast that it would cross its whole
     range in the rest of the step, the world ends with the status `LOST_IMPACTS`. With e = 1, stops
@@ -338,9 +338,10 @@ def saturating(p: dict[str, Any], row: Row, rate: Lane) -> tuple[Row, dict[str, 
 
 
 def one_sided(p: dict[str, Any], row: Row, dt: Array) -> tuple[Row, dict[str, Any]]:
-    """Returns a one-sided row, with the smallest φ̇ that a step may end with for its gap φ.
+    """Returns a one-sided row and its target: the smallest φ̇ allowed at the end of a step.
 
-    Rebounds raise this target; see `jaxcon.contact.impacts`. A soft stop adds a compliance.
+    The target follows from the gap φ. Rebounds raise it; see `jaxcon.contact.impacts`. A soft stop
+    adds a compliance.
     """
     h = dt[None]
     closing = numerics.safe_divide(-row.value, h)
@@ -357,7 +358,7 @@ def one_sided(p: dict[str, Any], row: Row, dt: Array) -> tuple[Row, dict[str, An
     if "stiffness" not in p:
         return row, fields
     # behind the gap, λ = −k (φ + h u) − c u is written u + C λ = u* with 1/C = h k + c; if the gap
-    # is open, spring and damper act on the travel beyond the stop alone, u + φ/h
+    # is open, spring and damper act only on the part of the motion beyond the stop, u + φ/h
     k = not_negative(p["stiffness"])
     both = h * k + not_negative(p["damping"])
     # with k = c = 0 there is no stop; above this threshold the derivative of 1/both is finite
@@ -410,10 +411,11 @@ class Inequality(UserFunction):
     system. On bodies, it is `function(*poses, t, params)` with the `Pose` of each body. It returns
     φ, (m,); automatic differentiation computes J. A step treats φ like the gap of a `Limit`: φ may
     reach zero but not become negative. A negative φ closes like a penetration of a `Limit`, at
-    speeds in the unit of φ per second. A row whose φ reaches zero leaves with −e φ̇.
+    speeds in the unit of φ per second. A row whose φ reaches zero leaves at the rate −e φ̇.
 
     Attributes:
-        function: pure and hashable; define it once, since every new function object is a new trace.
+        function: the user's function, pure and hashable; define it once, since each new function
+            object is traced again.
         bodies: names of the bodies; empty for generalized coordinates.
         name: name of the element, unique in the system.
         params: any pytree of arrays, leaves of the system; on bodies only.

@@ -1,9 +1,9 @@
 """Parts of a step before and after an impact, and the inequality rows of a part.
 
-Hard stops, ropes and contacts have impacts. At the start of a part, such a row is closed or open. A
-closed row acts as in plain stepping. An open row is inactive until its gap closes, which ends the
-part. A row is closed if it is at rest: its gap and speed are no larger than accelerations could
-make them in a step.
+Hard stops, ropes and contacts have impacts. At the start of a part, each of their rows is closed or
+open. A closed row acts as in a step that is not split. An open row is inactive until its gap
+closes, which ends the part. A row is closed if it is at rest: its gap and speed are no larger than
+accelerations could make them in a step.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
 
 SHORTEST = 1e-6
-"""The shortest part, as a fraction of a step, whose length the targets of rows divide by."""
+"""The smallest length, as a fraction of a step, by which the targets of open rows are divided."""
 
 ROUNDING = 64
 """The rounding error of a gap, in floating-point spacings of 1 + max |q|."""

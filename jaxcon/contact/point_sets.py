@@ -100,7 +100,7 @@ def own_frame(
 
 
 def given_points(p: dict[str, Any]) -> Vector | None:
-    """Returns the points of each element as lanes (element, k); None if each has only one point."""
+    """Returns the points of elements as lanes (element, k); None if they have one point each."""
     if not isinstance(p["anchor_b"], Grid):
         return None
     points = p["anchor_b"].values
@@ -120,7 +120,7 @@ def corners(p: dict[str, Any]) -> Vector:
 
 
 def spread(p: dict[str, Any], points: Vector) -> dict[str, Any]:
-    """Repeats the parameters of elements for each of their points, lanes (element × point,)."""
+    """Repeats each element's parameters once per contact point, as lanes (element × point,)."""
     count = points[0].shape[1]
 
     def each(x: Array | Grid) -> Array | Grid:
@@ -134,7 +134,7 @@ def spread(p: dict[str, Any], points: Vector) -> dict[str, Any]:
 
 
 def spread_place(place: Place, count: int) -> Place:
-    """Repeats the bodies of elements for each of their points."""
+    """Repeats each element's body once per contact point of the element, `count` times."""
     indices = tuple(i for i in place.indices for _ in range(count))
     return Place(place.group, indices, tuple(n for n in place.fixed for _ in range(count)))
 

@@ -34,9 +34,9 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
     """Refines multipliers near a solution; returns the best iterate.
 
     A round is a Newton step on the residual, or a Gauss–Seidel sweep if Newton does not reduce the
-    residual. If `rounds` do not suffice, the same number continues from the best iterate, with
-    every other sweep extrapolated by `carried`. If a large residual remains, for example if a
-    contact jams, three times as many rounds start at λ = 0.
+    residual. If `rounds` do not suffice, as many further rounds continue from the best iterate, and
+    `carried` extrapolates every other sweep. If a large residual remains, for example if a contact
+    jams, three times as many rounds start at λ = 0.
 
     Args:
         problem: the problem u = G λ + c with bounds on λ.
@@ -50,7 +50,8 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
         return Tried(x, residual, jnp.abs(residual * scale))
 
     zero, near = tried(jnp.zeros_like(multipliers)), tried(multipliers)
-    start = chosen((near.worst < zero.worst)[None], near, zero)  # zero if λ is worse by rounding
+    # start at zero if rounding makes λ worse than that
+    start = chosen((near.worst < zero.worst)[None], near, zero)
     terms = problem.matrix * start.multipliers[None]
     terms = jnp.sum(jnp.abs(terms), axis=1) + jnp.abs(problem.offset)
     # a tolerance by row: a corner high above the floor has a large u, which must not relax the

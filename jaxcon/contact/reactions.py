@@ -114,7 +114,7 @@ class ContactProblem:
         return dataclasses.replace(self, start=accelerations[:, 0], answers=accelerations[:, 1:])
 
     def _facing(self) -> ContactProblem:
-        """Returns the problem with each stop that a step without λ would pass.
+        """Returns the problem with the opposite stop where a step without λ would pass that stop.
 
         Replacing a stop by the opposite one changes only the sign of its row.
         """
@@ -127,7 +127,7 @@ class ContactProblem:
         return dataclasses.replace(self, rows=rows, answers=answers)
 
     def _by_velocities(self) -> bool:
-        """Returns True if `_probing` has a force for each velocity, since there are more rows."""
+        """Returns True if `_probing` has one force per velocity, as rows outnumber velocities."""
         return isinstance(self.rows.jacobian, Jacobian) and len(self.start) < len(self.bare)
 
     def _probing(self) -> Array:
@@ -303,9 +303,9 @@ class ContactProblem:
     def cap_energy(self, free: Array, multipliers: Array, increment: Array) -> Array:
         """Returns the largest s ≤ 1 for which λ + s Δλ adds no energy, for each world.
 
-        Over a step, λ + s Δλ may do no positive work, or no more work than λ. Multipliers do the
-        work h λ·(u₀ + u)/2, where u₀ are the velocities without them. The work of boxes is not
-        limited, since boxes are motors and friction in joints.
+        The work of λ + s Δλ in a step must not exceed zero, or the work of λ if that is positive.
+        Multipliers do the work h λ·(u₀ + u)/2, where u₀ are the velocities without them. The work
+        of boxes is not limited, since boxes are motors and friction in joints.
 
         Args:
             free: velocities u₀ without multipliers, (n,).

@@ -173,8 +173,8 @@ class Response:
         There are two estimates. The local one, h J̇ v, has no bound: a slack rope that passes its
         anchor at a distance d has J̇ v = −v²/d. The other is the change of φ̇ over the step. It is
         at most 2 |J| |v|, but meaningless if a contact moves from one end of a body to the other.
-        The result is the smaller of the two, or zero if their signs differ. The derivative is that
-        of the change.
+        The result is the smaller of the two, or zero if their signs differ. Its derivative is that
+        of the second estimate.
         """
         system, dt = dynamics.system, dynamics.dt
 
@@ -212,9 +212,9 @@ class Response:
     def find(
         self, dynamics: Dynamics, point: Point, rows: BoundRows, acts: Array, lasts: Array | bool
     ) -> tuple[Solution, Reactions]:
-        """Solves for the response to the active rows: of an impact, or of a step if `lasts`.
+        """Solves for the response to the active rows: to an impact, or in a step if `lasts`.
 
-        The response to an impact is Δv with the impulses Λ_e and Λ. That of a step is a with the
+        An impact has a velocity change Δv and impulses Λ_e and Λ. A step has an acceleration a and
         forces λ_e and λ. Only the rows in the mask `acts` are active. Λ_e and λ_e belong to the
         equality rows, Λ and λ to the inequality rows. An impact takes no time, so smooth forces
         drop out: M Δv = J_eᵀ Λ_e + Jᵀ Λ and J_e Δv + C Λ_e = 0.
@@ -298,7 +298,7 @@ def _struck(
 
 
 def lost_impacts(code: Array, lost: Array | None) -> Array:
-    """Returns the status, or LOST_IMPACTS if impacts are lost and it is not a failure, ()."""
+    """Returns the status, or LOST_IMPACTS where impacts are lost and nothing else failed, ()."""
     if lost is None:
         return code
     note = jnp.where(lost, status.Status.LOST_IMPACTS, status.Status.OK)
@@ -328,7 +328,7 @@ class _Laws:
         acts: Array,
         lasts: Array,
     ) -> impacts.Found:
-        """Returns the impulses of the active rows; if `lasts`, (), their forces over a step."""
+        """Returns impulses of the active rows in an impact, or forces in a step if `lasts`, ()."""
         solution, reactions = self._response.find(self.dynamics, (q, v, t), rows, acts, lasts)
         a, joints, _ = solution
         return impacts.Found(a, reactions.multipliers, joints, reactions.residual, reactions.kept)

@@ -420,7 +420,7 @@ def _lands(system: System, pairs: list[tuple[tuple[str, ...], BoundSet]]) -> tup
         return ()
     names: list[str] = []
     for group, (element_names, rows) in zip(system.bounds, pairs, strict=True):
-        # the coordinate of a joint is the same wherever its bodies are
+        # the coordinate of a joint does not depend on where its bodies are
         on_joint = group.coordinate is not None
         if on_joint or not (rows.hard and rows.rows[0].holonomic) or rows.restitution is not None:
             continue
@@ -504,7 +504,7 @@ def _kinds(sets: list[BoundSet], sizes: list[int]) -> RowCounts:
 
 
 def _by_row(flags: list[bool], sizes: list[int], kinds: RowCounts) -> tuple[bool, ...]:
-    """Repeats flags of the first rows of sets for each row; tangents get False."""
+    """Expands one flag for each set to one for each row; all rows of discs get False."""
     first = [flag for flag, k in zip(flags, sizes, strict=True) for _ in range(k)]
     return (*first, *(False,) * (kinds.size - len(first)))
 

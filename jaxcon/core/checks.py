@@ -53,7 +53,7 @@ def without_waiting() -> Iterator[None]:
 
 
 class NumberRange(TypedDict, total=False):
-    """The keyword arguments by which `check` limits values; see there."""
+    """The keyword arguments of `check` that limit the allowed values."""
 
     above: float
     least: float
@@ -386,8 +386,8 @@ def flag(owner: str, what: str, x: PyTree) -> None:
 def nonzero(owner: str, what: str, x: PyTree, dtype: DType = np.float64) -> None:
     """Checks that a number or vector is finite and not zero in a dtype.
 
-    The squared length of a vector must be a normal number of the dtype, so that it can be divided
-    by its length.
+    The squared length of a vector must not underflow to a subnormal number of the dtype, so that
+    the vector can be divided by its length.
 
     Raises:
         ValueError: the value is zero, not finite or not numeric.

@@ -46,7 +46,7 @@ def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Call
     Devices do not wait for each other, even in iterative solvers. The result can be jitted and
     differentiated. The gradient with respect to `shared` is summed on each device over the whole
     motion, and over devices once at the end. With `jit(grad(vmap(f)))` of a batch from `shard`,
-    devices would exchange it in every step.
+    devices would exchange the gradient in every step.
 
         settled = jc.devices.over_devices(jax.vmap(settle, in_axes=(None, 0)))
         slope = jax.jit(jax.grad(lambda p, worlds: jnp.mean(settled(p, worlds))))
@@ -57,8 +57,8 @@ def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Call
         mesh: see `shard`.
 
     Returns:
-        (shared, batch) → the result of the function. The batch need not be sharded before. A call
-        raises the ValueError of `shard`.
+        A function (shared, batch) → the result. The batch need not be sharded before the call. A
+        call raises a ValueError if the batch cannot be split over the devices; see `shard`.
 
     Raises:
         TypeError: `mesh` is no mesh.
@@ -81,7 +81,9 @@ def gathered(tree: T, mesh: Mesh) -> T:
 
 
 def _line(mesh: Mesh | None) -> Mesh:
-    """Returns a one-dimensional mesh of the same devices, with the axis "worlds".
+    """Returns a one-dimensional mesh, with the axis "worlds", of the devices of `mesh`.
+
+    If `mesh` is None, the result contains all devices.
 
     Raises:
         TypeError: `mesh` is no mesh.

@@ -20,7 +20,7 @@ CALLS = {
     "checkpoint": "jaxpr",
     "remat2": "jaxpr",
 }
-"""Primitives that only call a function, with the parameter that contains its jaxpr."""
+"""Primitives that only call a function, with the parameter that contains the function's jaxpr."""
 
 
 def called(equation: JaxprEqn) -> Any:

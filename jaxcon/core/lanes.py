@@ -88,7 +88,7 @@ class Vector:
     def of_rows(cls, x: Array, start: int, components: int, elements: int) -> Vector:
         """Splits consecutive rows of an array into the components of a vector, (element, …) each.
 
-        The rows of the first component start at row `start`; those of each next component follow.
+        Rows of the first component start at row `start`; rows of further components follow.
         """
         # one split, since its transpose is one concatenation; slices give a sum of padded arrays
         rest = len(x) - start - components * elements
@@ -110,7 +110,7 @@ class Vector:
         return total(times(x, y) for x, y in zip(self, other, strict=True))
 
     def cross(self, other: Vector) -> Any:
-        """Returns the cross product x × y: a Vector in space, its normal component in the plane."""
+        """Returns x × y: a Vector in space, the scalar component along the normal in the plane."""
         if len(self) == 2:
             (a, b), (c, d) = self, other
             return minus(times(a, d), times(b, c))

@@ -32,7 +32,7 @@ def pytree(cls: type[T]) -> type[T]:
 
     Instances are compared and hashed by structure and leaves (see `equality`), so a `Method` can be
     a static argument of `jax.jit`. `jax.export` can write instances of the library's classes. JAX
-    rebuilds instances without calling `__post_init__`, so it may check user input.
+    rebuilds instances without calling `__post_init__`, so that method may check user input.
     """
     cls = dataclass(frozen=True, eq=False)(cls)
     if cls.__eq__ is object.__eq__:

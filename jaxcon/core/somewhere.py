@@ -59,10 +59,11 @@ _by_device.def_partition(
 
 @functools.cache
 def asking() -> ClosedJaxpr:
-    """Returns a jaxpr of such a condition, as a parameter for primitives that lower to conditions.
+    """Returns a jaxpr with custom partitioning, as a parameter of primitives that lower to it.
 
-    A program with a custom partitioning must know its devices when it is lowered. JAX detects this
-    by searching the jaxpr and its parameters, and would not find the condition otherwise.
+    A program with a custom partitioning must know its devices when it is lowered. JAX therefore
+    searches the jaxpr and the parameters of its primitives for custom partitionings. Without this
+    parameter, JAX would miss a partitioning that a primitive introduces only when it is lowered.
     """
     return jax.make_jaxpr(_by_device)(np.zeros(1, bool))
 

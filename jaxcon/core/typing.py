@@ -25,7 +25,7 @@ Scalar: TypeAlias = jax.Array | np.ndarray | np.number | np.bool_ | float
 """A real number or an array of real numbers, in any form that a user may pass."""
 
 Lane: TypeAlias = jax.Array | float
-"""One vector component of many bodies and worlds: an array, or a Python number when tracing."""
+"""One vector component of many bodies and worlds: an array, or a number known when tracing."""
 
 DType: TypeAlias = np.dtype | type[np.generic]
 """The floating dtype of a scene."""

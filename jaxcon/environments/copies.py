@@ -20,7 +20,7 @@ Randomize = Callable[[Environment, Array], Environment]
 """(environment, key) → an environment of equal structure, for one copy and one episode."""
 
 MODES = ("NextStep", "SameStep", "Disabled")
-"""The modes that set when a finished copy is reset, by Gymnasium's names."""
+"""Gymnasium's names of the modes. A mode determines when a finished copy is reset."""
 
 RESTART_SHARES, LEAST_RESTARTS = (16, 4, 1), 64
 """Initial states are computed for 1/16, 1/4 or all of the copies, but for at least 64."""
@@ -51,7 +51,7 @@ def begin(
         environment: the environment to copy.
         key: a JAX key. The key of each copy is derived from it and does not depend on n.
         count: n, the number of copies.
-        randomize: draws the environment of a copy, again for each episode; None for equal copies.
+        randomize: draws a copy's environment anew for each episode; None for equal copies.
 
     Returns:
         The copies and their observations (n, …).
@@ -76,9 +76,10 @@ def advance(
         copies: the copies before the actions.
         actions: (n, number of actions).
         mode: "NextStep": a finished copy ignores its action, is reset and gets reward 0.
-            "SameStep": a copy is reset right after its last action, whose observation and info are
-            `final_obs` and `final_info` of the info. "Disabled": copies are never reset.
-        randomize: as for `begin`.
+            "SameStep": a copy is reset right after its last action; the info then has the
+            observation and info before the reset, as `final_obs` and `final_info`. "Disabled":
+            copies are never reset.
+        randomize: the function given to `begin`.
 
     Returns:
         The copies, and the outcome of each, (n, …).
@@ -126,7 +127,7 @@ def restart(
         environment: the environment given to `begin`.
         copies: the current copies.
         chosen: a mask of the copies to restart, (n,).
-        randomize: as for `begin`.
+        randomize: the function given to `begin`.
     """
     count = chosen.shape[0]
     sizes = sorted(
@@ -135,7 +136,7 @@ def restart(
     old = copies.episode, copies.world
 
     def restarted(size: int) -> tuple[Episode, Any]:
-        # index[i] is the copy that is the i-th to restart, and n if there are fewer than i
+        # index[i] is the i-th copy to restart, counted from 0; n if there are not so many
         index = jnp.searchsorted(
             jnp.cumsum(chosen), jnp.arange(1, size + 1), method="scan_unrolled"
         )

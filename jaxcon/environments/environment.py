@@ -59,7 +59,8 @@ class Episode:
         goal: the target that the task drew for this episode; () for none.
         steps: the number of actions taken, ().
         key: the JAX key for the next draws of this episode.
-        violation: the largest |φ| at the start of a step of the last action, ().
+        violation: the largest constraint violation |φ|, () [m or rad], among the starts of all
+            steps of the last action.
     """
 
     state: State
@@ -120,7 +121,7 @@ class Environment:
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The components of an action: names, with the unit to which −1 to 1 refers."""
+        """The name of each component of an action, with the quantity that ±1 stands for."""
         raise NotImplementedError
 
     @property
@@ -129,7 +130,9 @@ class Environment:
         raise NotImplementedError
 
     def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Returns the view of a rendered image, with the size of `frame`; by default `frame`.
+        """Returns the view of a rendered image, by default `frame`.
+
+        Its width and height must be those of `frame`, because all images of a task share a canvas.
 
         Args:
             episode: the episode that is drawn.
@@ -215,7 +218,7 @@ class Environment:
         return self.act(episode, self.allowed(action))
 
     def act(self, episode: Episode, action: Array) -> Episode:
-        """Returns the episode after one action, which is not clipped."""
+        """Returns the episode after one action, without clipping the action."""
         control = self.control(episode, action)
         controls = jnp.broadcast_to(control, (self.skip, *control.shape))
         state, worst = rollout(

@@ -89,8 +89,9 @@ def project(x: Array, rows: Array, bounds: Array) -> Array:
     """Returns the point a nearest to x with G a ≤ h, by a fixed number of interior-point steps.
 
     Solves a − x + Gᵀλ = 0, s = h − G a + δ λ, λ s = μ for small μ and δ. λ are multipliers and s
-    are slacks. Through δ, contradictory rows are violated in the least-squares sense. The
-    derivative is that of this solution.
+    are slacks. Contradictory rows cannot all be satisfied; the term δ λ lets them be violated in
+    the least-squares sense. The result is differentiated implicitly at the solution of these
+    equations.
 
     Args:
         x: the desired point, (k,).

@@ -20,7 +20,7 @@ class FunctionalEnv(FuncEnv):
     """Gymnasium's functional interface. Its `params` are an `Environment`.
 
     To change parameters, pass an environment of equal structure with other numbers as `params`.
-    Under `jax.vmap`, a batch of environments gives each copy its own.
+    Under `jax.vmap`, a batch of environments gives each copy its own environment.
 
     Args:
         task: the name of a task, or an environment.

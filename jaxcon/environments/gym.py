@@ -163,7 +163,7 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 def in_words(info: dict[str, Array]) -> dict[str, Any]:
-    """Converts the info of one copy to Python types, and its status code to the name."""
+    """Converts the info of one copy to Python types, and the status code to its name."""
     return {
         "diverged": bool(info["diverged"]),
         "status": Status(int(info["status"])).name,

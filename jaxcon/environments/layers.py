@@ -28,12 +28,13 @@ class Layered(Environment):
 
     The controller is called before every action of the low-level task. It may be constrained, for
     example by `feasible_action`. Observation, initial state and termination are those of the
-    low-level task. The reward of a target is the low-level reward at its end.
+    low-level task. The reward of a target is the low-level reward over the time that the target is
+    held.
 
     Attributes:
         task: the low-level task. Its system, method and dt are fields of this environment.
         controller: a pure function; define it once, since every new function object recompiles.
-        targets: the components of a target: names, with the unit to which −1 to 1 refers.
+        targets: the name of each component of a target, with the quantity that ±1 stands for.
         hold: the number of low-level actions for which a target is held.
     """
 
@@ -51,7 +52,7 @@ class Layered(Environment):
         Args:
             task: the low-level task.
             controller: (environment, episode, target within −1 to 1) → action of the task.
-            targets: the components of a target: names, with the unit to which −1 to 1 refers.
+            targets: the name of each component of a target, with the quantity that ±1 stands for.
             hold: the number of low-level actions for which a target is held.
 
         Raises:
@@ -84,7 +85,7 @@ class Layered(Environment):
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The components of an action, which are those of a target."""
+        """The components of an action: `targets`, because an action is a target."""
         return self.targets
 
     @property
@@ -128,7 +129,8 @@ class Layered(Environment):
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
         """Returns the reward of the low-level task over the time of a target.
 
-        Its action is the one that the controller chooses at the state where the target ends.
+        The low-level reward also depends on a low-level action. This is the action that the
+        controller chooses at the end of the target.
         """
         low_level = self.below.allowed(self.controller(self.below, after, action))
         return dataclasses.replace(self.below, skip=self.skip).reward(before, low_level, after)

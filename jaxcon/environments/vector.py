@@ -85,8 +85,8 @@ class GymnasiumVectorEnv(VectorEnv):
     `gymnasium.wrappers.vector.JaxToNumpy` or `JaxToTorch`. A copy that diverges, such as after an
     action of NaN, is truncated and reset. Its info has `diverged`.
 
-    The attribute `copies` holds the state of all copies. `step` donates its arrays to the next
-    state; to keep a state, use `save`.
+    The attribute `copies` holds the state of all copies. `step` donates the arrays of this state to
+    the next state; to keep a state, use `save`.
 
     Args:
         task: the name of a task, or an environment.
@@ -94,9 +94,9 @@ class GymnasiumVectorEnv(VectorEnv):
         max_episode_steps: the number of actions after which an episode is truncated; None for the
             horizon of the task, and −1 for no limit, as in Gymnasium.
         render_mode: None or "rgb_array".
-        autoreset_mode: when a finished copy is reset: in the next step (default), in the same step,
-            whose info then has `final_obs` and `final_info`, or only by
-            `reset(options={"reset_mask": …})`.
+        autoreset_mode: "NextStep" (default) resets a finished copy in the next step. "SameStep"
+            resets it in the step that finishes it; the info then has `final_obs` and `final_info`.
+            "Disabled" leaves it to `reset(options={"reset_mask": …})`.
         randomize: (environment, key) → the environment of a copy for one episode.
         devices: the number of devices over which the copies are sharded; it must divide `num_envs`.
             On a CPU, `jax.config.update("jax_num_cpu_devices", 2)` before the first use of JAX
@@ -230,7 +230,7 @@ class GymnasiumVectorEnv(VectorEnv):
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns an image of each copy, (height, width, 3), of bytes.
 
-        Without a render mode, it warns and returns None.
+        Without a render mode, the method warns and returns None.
         """
         if self.render_mode is None:
             adapters.warn_of_no_mode()

@@ -34,7 +34,7 @@ Carry = tuple[State, StepInfo]
 
 @dataclass(frozen=True)
 class Path:
-    """A rollout in terms of functions, as adjoints run it.
+    """The functions and inputs of a rollout, which `Adjoint.scan` runs.
 
     Attributes:
         step: function (state, (step index, control)) → (new state, info).
@@ -42,8 +42,8 @@ class Path:
         start: the initial state.
         inputs: (step indices, controls), with a first axis of length `steps`.
         steps, every: the number of steps, and the number of steps from one record to the next.
-        back: function (state, inputs of the step to it) → the state before that step. A text if
-            steps cannot be undone: the reason, for an error message.
+        back: function (state, inputs of the step to it) → the state before that step. If steps
+            cannot be undone, a text with the reason, for an error message.
     """
 
     step: Callable[[State, Inputs], tuple[State, StepInfo]]
@@ -68,7 +68,7 @@ class Path:
         first = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self.inputs)
         seen = jax.eval_shape(lambda s, x: self.step(s, x)[1], self.start, first)
         empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), seen)
-        empty, _ = together((empty, self.start))  # on the mesh of the states
+        empty, _ = together((empty, self.start))  # on the same devices as the states
 
         def one(carry: Carry, inputs: Inputs) -> tuple[Carry, None]:
             return self.step(carry[0], inputs), None
@@ -193,7 +193,7 @@ class Truncated(Adjoint):
         return self.within.scan(dataclasses.replace(path, step=step))
 
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """Returns the number of kept states by level, as the adjoint `within` does."""
+        """Returns the number of kept states of each level, by `within.kept`."""
         return self.within.kept(steps, state)
 
 
@@ -223,7 +223,7 @@ class Discounted(Adjoint):
         return self.within.scan(dataclasses.replace(path, step=step))
 
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """Returns the number of kept states by level, as the adjoint `within` does."""
+        """Returns the number of kept states of each level, by `within.kept`."""
         return self.within.kept(steps, state)
 
 

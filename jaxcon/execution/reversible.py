@@ -31,13 +31,14 @@ class Reversible(Adjoint):
     more forward pass.
 
     Reconstructed states differ from the original ones by rounding errors. Stepping back amplifies
-    these errors: little for a regular motion, as e^ct for a chaotic or damped one. At each kept
-    state, the reconstruction starts again from the stored values. Before that, it is compared with
-    them. If positions or velocities differ by more than ε^⅓ of the largest ones, the gradient of
-    this world is NaN. The state after the first step is always kept and compared. Errors between
+    these errors: little for a regular motion, exponentially for a chaotic or damped one. At each
+    kept state, the reconstructed values are compared with the stored values and replaced by them.
+    If positions or velocities differ by more than ε^⅓ of the largest ones, the gradient of this
+    world is NaN. The state after the first step is always kept and compared. Errors between
     kept states are not detected.
 
-    In forward mode, use another adjoint: no adjoint keeps states there.
+    There is no forward-mode derivative. In forward mode, use another adjoint, such as
+    `EveryStep()`, which then keeps no states.
 
     Attributes:
         segments: number of steps from one kept state to the next. By default only the states after
@@ -223,7 +224,7 @@ class _Moved:
     flags: tuple[tuple[bool, ...], ...]
 
     def parts(self, of: tuple[LeafPartition, ...]) -> tuple[LeafPartition, ...]:
-        """Returns the partitions with only leaves with tangents as real.
+        """Returns the partitions in which only leaves with tangents count as real.
 
         Every real leaf of the state counts: after the first step all of them may have tangents.
         """

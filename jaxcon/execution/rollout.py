@@ -118,7 +118,7 @@ def rollout(
 
 
 def _recorded(record: Record, system: System) -> Record:
-    """Wraps a user's record function: errors name it, and its info knows the system."""
+    """Wraps a user's record function: errors name it, and it gets an info with the system."""
 
     def recorded(state: State, info: StepInfo) -> PyTree:
         return functions.tree(
@@ -144,11 +144,11 @@ def masked_policy(policy: Callable[[State], PyTree], state: State) -> Any:
 
     def masked(state: State, constants: PyTree) -> PyTree:
         args, rank = (state, constants), state.q.ndim - 1
-        if has_vjp:  # JAX cannot batch its tangents, so masking goes outside
+        if has_vjp:  # JAX cannot batch tangents of a custom VJP, so the mask goes outside
             return mask_failed_gradients(per_world(judged, rank), args)[0]
         return per_world(lambda *one: mask_failed_gradients(judged, one)[0], rank)(*args)
 
-    # batch last, as steps are: second derivatives are masked there, too
+    # the batch is last, as in steps, so that second derivatives are masked, too
     return batch_last.call(masked, state, captured, staged=False)
 
 

@@ -7,7 +7,7 @@
     step.step          the algorithm                                      step.py
 
 `step` and `rollout` go through all of them. `forward_dynamics` has `solve_at` in place of
-`masked_step`, and solves without a step. Each layer has a reason:
+`masked_step`, and solves for a and λ without a step. Each layer has a reason:
 
 - The batch is the last axis, so that each operation is one loop over contiguous memory. `vmap`
   alone would make it the first axis, and process small matrices one by one.

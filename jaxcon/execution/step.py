@@ -1,4 +1,4 @@
-"""`jc.step` and `jc.forward_dynamics`: input is checked, then `shell` does the work."""
+"""`jc.step` and `jc.forward_dynamics`, which check their input and then call `shell`."""
 
 from __future__ import annotations
 
@@ -28,23 +28,24 @@ Info = TypeVar("Info", bound="StepInfo | SolutionAt")
 def step(
     system: System, method: Method, state: State, control: PyTree, dt: Scalar
 ) -> tuple[State, StepInfo]:
-    """Returns the state one step later. Pure: jit, vmap, grad, jvp and scan it.
+    """Advances a state by one step. A pure function for jit, vmap, grad, jvp and scan.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
         method: integrator, stabilizer and solvers.
         state: from `Scene.build` or `init`.
-        control: (n_u,) by `system.layout.controls`, or what the user's force expects; None only
-            where no motor needs one.
-        dt: h, () [s].
+        control: control input u, (n_u,), with the channels of `system.layout.controls`; for
+            generalized coordinates, the pytree that the user's force takes. None if no motor needs
+            a control.
+        dt: step size h, () [s].
 
-    Shapes and dtypes are always checked. Values are checked if they are Python or NumPy numbers; a
-    JAX array may still be computed, and a bad value in it ends the world with a status.
+    Shapes and dtypes are always checked. Values are checked if they are Python or NumPy numbers.
+    JAX arrays are not checked, since a device may still be computing them; a bad value in one stops
+    the world with a status.
 
     Returns:
-        The new state, and what the step found at its start. A world that fails keeps its last
-        finite state, has the reason in `status`, and has zero gradient. Other worlds are not
-        affected.
+        The new state, and the `StepInfo` of the step. A world that fails keeps its last finite
+        state, has the reason in `status`, and has zero gradient. Other worlds are not affected.
 
     Raises:
         ValueError: shapes or dtypes disagree (at trace time), or a motor has no control.
@@ -59,7 +60,7 @@ def step(
 def step_quietly(
     system: System, method: Method, state: State, control: PyTree, dt: Scalar, owner: str = "step"
 ) -> tuple[State, StepInfo]:
-    """`step` for another public function, the owner; without the warning of unstable gains."""
+    """Steps without a warning about unstable gains; errors name `owner`, a public function."""
     given = _checked(owner, system, method, state, control, dt)
     return _reported(batch_last.call(masked_step, *given), system, state, given[3])
 
@@ -67,7 +68,7 @@ def step_quietly(
 def _checked(
     owner: str, system: System, method: Method, state: State, control: PyTree, dt: Scalar
 ) -> tuple[System, Method, State, PyTree, Array]:
-    """Returns the arguments of `masked_step`: those of a step, checked and as arrays."""
+    """Checks the arguments of a step; returns the arguments of `masked_step`, as arrays."""
     control = check_step(system, method, state, control, owner)
     with checks.without_waiting():
         h = checks.real(owner, "dt", dt, state.q.dtype, least=0)
@@ -80,8 +81,8 @@ def _reported(
 ) -> tuple[State, StepInfo]:
     """Adds state, control and system to an info.
 
-    That is done outside of the compiled step: a rollout that does not record them does not carry
-    them.
+    This happens outside of the compiled step, so that a rollout carries state, control and system
+    only if it records them.
     """
     new, info = result
     where = without_memory(state) if info.state is None else info.state
@@ -89,7 +90,7 @@ def _reported(
 
 
 def with_origin(info: Info, system: System) -> Info:
-    """Returns an info that knows its system."""
+    """Returns a copy of an info, with the system as its `origin`."""
     info = copy.copy(info)
     object.__setattr__(info, "origin", Origin(system))
     return info
@@ -98,8 +99,9 @@ def with_origin(info: Info, system: System) -> Info:
 def undo(system: System, method: Method, state: State, control: PyTree, dt: Scalar) -> State:
     """Returns the state before a step of h, by a step of −h of a symmetric integrator.
 
-    `turns` of the result are angles extrapolated back from the end of the step. Like those before
-    the step, they are within half a turn of the true angles, so the same whole turns are counted.
+    The `turns` of the result are extrapolated back from the end of the step, so they differ from
+    the original ones. Both are within half a turn of the true angles, so the same whole turns are
+    counted.
     """
     control = check_step(system, method, state, control, "rollout")
     with checks.without_waiting():
@@ -109,12 +111,12 @@ def undo(system: System, method: Method, state: State, control: PyTree, dt: Scal
 
 @jax.tree_util.register_pytree_node_class
 class SolutionAt(Solution):
-    """A `Solution` that knows where it belongs; unpacks as `a, λ, status`.
+    """A `Solution` with the state at which it was computed; unpacks as `a, λ, status`.
 
     Attributes:
-        state: without the memory of a method.
+        state: the state, without the memory of a method.
         violation: φ and φ̇ by constraint.
-        reactions: forces of limits, friction and contact; None in a scene without.
+        reactions: forces of limits, friction and contact; None in a scene without them.
         control: control u.
         origin: see `StepInfo.origin`.
     """
@@ -135,7 +137,7 @@ class SolutionAt(Solution):
         reactions: Reactions | None = None,
         control: PyTree = None,
     ) -> SolutionAt:
-        """The solution at a state."""
+        """Makes the solution at a state."""
         solution = super().__new__(cls, acceleration, multipliers, status)
         solution.state, solution.violation = state, violation
         solution.reactions, solution.control = reactions, control
@@ -151,7 +153,7 @@ class SolutionAt(Solution):
         return self.state, self.violation, self.reactions, self.control
 
     def tree_flatten(self) -> Any:
-        """Children, the state among them."""
+        """Returns the children: a, λ, status, and the fields from `state` to `control`."""
         return (*self, *self._place()), None
 
     @classmethod
@@ -165,22 +167,22 @@ def forward_dynamics(
 ) -> SolutionAt:
     """Returns a and λ at a state, with the method's feedback of φ and φ̇ at this state.
 
-    Inequality constraints are solved as over a step of h: a then is the mean over the step, with
-    the impulse of an impact divided by h.
+    With inequality constraints, a is the mean acceleration over a step of size h, which includes
+    the impulses of impacts divided by h.
 
     To read the forces at a state, use `Unstabilized()`. Feedback adds forces. It also reacts to
     φ̇ = ½hγ, which semi-implicit Euler leaves in every step.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.
-        state: where.
-        control: as of `step`.
-        method: its stabilizer and solvers are used.
-        dt: h, () [s], on which default gains depend.
+        state: the state at which to solve.
+        control: control input u, as in `jc.step`.
+        method: the method, whose stabilizer and solvers are used.
+        dt: step size h, () [s], on which default gains and inequality constraints depend.
 
     Returns:
         A `Solution` that unpacks as `a, λ, status`: acceleration (n_v,) [m/s², rad/s²], multipliers
-        (n_c,) [N, N m] and status (). It also has the `state` and `control` given, `violation` and
+        (n_c,) [N, N m] and status (). It also has the fields `state`, `control`, `violation` and
         `reactions`.
 
     A world whose solution fails has zero gradient.
@@ -195,7 +197,7 @@ def forward_dynamics(
 def forward_dynamics_for(
     owner: str, system: System, state: State, control: PyTree, method: Method, dt: Scalar
 ) -> SolutionAt:
-    """Solves as `forward_dynamics` does. Errors name `owner`, the public function called."""
+    """Implements `forward_dynamics`; errors name `owner`, the public function called."""
     control = check_step(system, method, state, control, owner)
     with checks.without_waiting():
         h = checks.real(owner, "dt", dt, state.q.dtype, least=0)

@@ -24,7 +24,7 @@ CALLS = {
     "forward_dynamics": "jc.forward_dynamics(system, s, control, method, dt)",
     "reaction": "jc.reaction(system, s, name)",
 }
-"""The call of a function whose batch is made by `jax.vmap`, for messages."""
+"""Calls with the state s of one world; messages show how to apply `jax.vmap` to them."""
 
 
 def check_step(
@@ -35,8 +35,8 @@ def check_step(
     Args:
         system: the system.
         method: the method.
-        state: of one world.
-        control: of one step.
+        state: the state of one world.
+        control: the control of one step.
         owner: the public function that was called, for messages; a key of `CALLS`.
 
     Raises:

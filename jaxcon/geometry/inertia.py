@@ -44,9 +44,9 @@ def __dir__() -> list[str]:
 APART = 0.45
 """The exponent p of the smallest relative distance ε^p between principal moments.
 
-Derivatives of the principal axes use moments that are at least so far apart; ε is the machine
-precision. The resulting error is 1e-7 in float64 and 8e-4 in float32. A smaller distance would
-amplify rounding errors by more than 1/ε^0.45.
+To differentiate the principal axes, moments that are closer than this distance are moved apart; ε
+is the machine precision. The resulting error is 1e-7 in float64 and 8e-4 in float32. A smaller
+distance would amplify rounding errors by more than 1/ε^0.45.
 """
 
 
@@ -219,7 +219,8 @@ def log_cholesky(body: Inertia) -> Array:
     """Returns the parameters θ (10,) of a body in space; inverts `from_log_cholesky`.
 
     Args:
-        body: an inertia that satisfies the triangle inequality strictly, so that it is not flat.
+        body: an inertia that satisfies the triangle inequality strictly. A flat body, for which one
+            moment is the sum of the other two, has no parameters.
     """
     moments = jnp.asarray(body.moments, jnp.result_type(float, *body.moments))
     axes = jnp.eye(4, dtype=moments.dtype)[0] if body.axes is None else body.axes

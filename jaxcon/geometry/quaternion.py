@@ -3,7 +3,7 @@
 Every function takes arrays whose first axis enumerates components, or Vectors of lanes; trailing
 axes are batches. Angular velocities ω are in the body frame, so that q̇ = ½ q ⊗ (0, ω).
 
-An argument with a wrong shape, or without real numbers, raises a ValueError that names it. Values
+If an argument has a wrong shape or is not real, a ValueError names the argument. Values
 of JAX arrays are not read: NaN in an argument becomes NaN in the result.
 
 References:
@@ -47,9 +47,10 @@ IDENTITY = Vector(1.0, 0.0, 0.0, 0.0)
 
 
 def _of_components(*sizes: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """A decorator by which a function of Vectors also accepts arrays, whose shapes it checks.
+    """Returns a decorator that lets a function of Vectors also accept arrays.
 
-    The decorated function raises a ValueError for arrays of other shapes or without real numbers.
+    The decorated function checks the arrays. It raises a ValueError if an array has a wrong shape,
+    or contains no real numbers.
 
     Args:
         sizes: the number of components of each argument.
@@ -209,7 +210,7 @@ def from_axis_angle(axis: Scalar | Sequence[Scalar], angle: Scalar) -> Array:
         angle: the rotation angle, () [rad].
 
     Raises:
-        ValueError: an argument has no real numbers, or another shape.
+        ValueError: an argument is not real, or has a wrong shape.
     """
     with checks.without_waiting():
         checks.check("quaternion.from_axis_angle", "axis", axis, (3,))
@@ -230,7 +231,7 @@ def from_matrix(r: Array) -> Array:
         r: R, (3, 3).
 
     Raises:
-        ValueError: `r` has no real numbers, or another shape.
+        ValueError: `r` is not real, or has a wrong shape.
 
     References:
         Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1 (1978).

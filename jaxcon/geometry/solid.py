@@ -23,8 +23,9 @@ def resolve_inertia(
     Args:
         owner: the first words of errors, such as "body 'rod'".
         mass: () [kg]; None if `given` is an `Inertia`, which contains the mass.
-        given: an `Inertia`, of which the plane takes the moment about z; or a moment of inertia ()
-            in the plane; or principal moments (3,) or a tensor (3, 3) in space [kg m²].
+        given: an `Inertia`; or a moment of inertia () in the plane; or principal moments (3,) or a
+            tensor (3, 3) in space [kg m²]. If an `Inertia` has three moments, its moment about z
+            is used in the plane.
         dim: the dimension of space, 2 or 3.
         dtype: the dtype of the scene.
 

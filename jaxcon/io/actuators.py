@@ -23,8 +23,8 @@ class Transmission(NamedTuple):
         at: the joint coordinate θ = qpos − reference.
         gear: the gear ratio g.
         reference: the value of qpos at assembly.
-        measured: True if the actuator length is g qpos; False for free joints, whose actuator
-            length is zero.
+        measured: True if the actuator length is g (θ + reference); False for free joints, whose
+            actuator length is zero.
     """
 
     at: Coordinate
@@ -45,7 +45,10 @@ Each entry has MuJoCo's field, its enumeration, and the names of the supported v
 """
 
 Element: TypeAlias = Motor | AffineActuator | Compound | Twist
-"""A scene element: an actuator, or a joint without constraint rows that defines its coordinate."""
+"""A scene element: an actuator, or a joint without constraint rows.
+
+Such a joint defines the coordinate on which an actuator acts.
+"""
 
 
 def actuators(
@@ -122,9 +125,10 @@ def _law(
 
 
 def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
-    """Returns the force range of an actuator before its gear, (2,); None if there are no limits.
+    """Returns the force range of an actuator, (2,); None if there are no limits.
 
-    The range respects the limits of the actuator and of its joint.
+    The force is taken before multiplication by the gear ratio. The range respects the limits of the
+    actuator and of its joint.
 
     Raises:
         NotImplementedError: the joint limits the sum of several actuators.

@@ -54,7 +54,7 @@ class Compiled:
         self.mujoco.mj_kinematics(self.model, self.data)
 
     def _compile(self, source: Source) -> Any:
-        """Compiles the source to an `MjModel`; raises the errors that the class lists."""
+        """Compiles the source to an `MjModel`; for its errors see `Compiled`."""
         model = self.mujoco.MjModel
         if isinstance(source, model):
             return source

@@ -108,7 +108,7 @@ def _coupling(
 ) -> Drive | PolynomialCoupling:
     """Builds the coupling y − y₀ = Σ cₖ (x − x₀)ᵏ of two joint coordinates x and y.
 
-    If the constraint names only one joint, y is held at y₀ + c₀.
+    If the constraint names only one joint, its coordinate y is held at y₀ + c₀.
     """
     m = compiled.model
     first, second, coefficients = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i, :5]

@@ -328,8 +328,8 @@ def _flat(
         layout: the layout of the system.
         offsets: the frame of each link in the principal frame of its body, by name; links without
             an entry have equal frames.
-        qpos: (nq,).
-        qvel: (nv,).
+        qpos: MuJoCo's positions, (nq,).
+        qvel: MuJoCo's velocities, (nv,).
     """
     names = [node.name for node in tree.nodes]
     kind = layout.groups[layout.locate(names[0])[0]].kind

@@ -86,8 +86,8 @@ class MujocoModel:
         """Returns the model with changed parameters; the poses of all links at `start` are kept.
 
         Args:
-            changes: new values by name; see `with_params` of the system. They refer to the frames
-                of MuJoCo's bodies.
+            changes: new values by name; see `with_params` of the system. The values refer to the
+                frames of MuJoCo's bodies.
 
         Raises:
             ValueError: a name or field is unknown, a shape is wrong, or a value is out of range.

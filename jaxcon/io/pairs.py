@@ -12,7 +12,7 @@ from jaxcon.io.compiled import Compiled
 ROUND = ("sphere", "capsule")
 ON_PLANE = (*ROUND, "box")
 FLAT = ("plane", "hfield")
-"""Shapes without contacts between each other in MuJoCo."""
+"""The shapes that have no contacts with each other in MuJoCo."""
 
 
 class GeomPair(NamedTuple):
@@ -46,9 +46,13 @@ def pairs(compiled: Compiled) -> list[GeomPair]:
 
 
 def _acts(compiled: Compiled, pair: GeomPair) -> bool:
-    """Returns True if a pair can touch, its bodies move relatively, and the user keeps it."""
+    """Returns True if a pair of geoms needs a contact.
+
+    It needs none if both shapes are in `FLAT`, if both geoms belong to the same link or to the
+    world, or if the user ignores contacts between moving bodies ("self_contact").
+    """
     weld, body = compiled.model.body_weldid, compiled.model.geom_bodyid
-    first, second = (int(weld[body[g]]) for g in pair[:2])  # the moving body; 0 for the world
+    first, second = (int(weld[body[g]]) for g in pair[:2])  # link's first body; 0 for world
     flat = all(kind in FLAT for kind in shapes(compiled, pair))
     left_out = first and second and "self_contact" in compiled.ignored
     return first != second and not flat and not left_out
@@ -118,8 +122,8 @@ class Margins:
     """The rule for the distance at which contact begins, from the margins and gaps of two geoms.
 
     The rule differs between versions of MuJoCo: the sum or the maximum of both margins, with or
-    without the gap subtracted. The installed version is probed by a model with margins of 1 and 2
-    and a gap of 1/4.
+    without the gap subtracted. To find the rule of the installed version, a model with margins of 1
+    and 2 and a gap of 1/4 is evaluated.
     """
 
     PROBE = (

@@ -17,7 +17,10 @@ from jaxcon.io.links import Link, LinkJoint
 from jaxcon.system.actuators import JointDamper, JointSpring
 
 Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Compound | Twist
-"""A scene element: a passive element, or a joint without constraint rows for its coordinate."""
+"""A scene element: a passive element, or a joint without constraint rows.
+
+Such a joint defines the coordinate on which passive elements act.
+"""
 
 
 def passive(
@@ -56,7 +59,7 @@ def passive(
 def _along(
     label: str, at: Coordinate, numbers: dict[str, float], rest: float, names: Names
 ) -> Iterator[Element]:
-    """Yields the spring, damper, rotor and dry friction of one coordinate that are not zero.
+    """Yields the nonzero elements of one coordinate: spring, damper, rotor and dry friction.
 
     Args:
         label: the name of the joint, for the names of the elements.

@@ -95,10 +95,13 @@ def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
 
 
 def refuse(compiled: Compiled) -> None:
-    """Checks that all features of a model that affect its motion are supported or ignored.
+    """Refuses a model with features that affect its motion but that jaxcon does not simulate.
+
+    Features listed in `REFUSED` are refused unless the user ignores them. Features that
+    `_unsupported` describes are always refused.
 
     Raises:
-        NotImplementedError: the model has an unsupported feature.
+        NotImplementedError: the model has such a feature.
     """
     for key, (what, search) in REFUSED.items():
         if key not in compiled.ignored and (names := search(compiled)):
@@ -129,7 +132,7 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
 
 
 def _unsupported_contacts(compiled: Compiled) -> Iterable[str]:
-    """Yields descriptions of the unsupported contact features, except shapes and condim."""
+    """Yields descriptions of the unsupported contact features that are not in `REFUSED`."""
     m, contacts = compiled.model, pairs.pairs(compiled)
     if contacts and m.opt.enableflags & int(compiled.mujoco.mjtEnableBit.mjENBL_OVERRIDE):
         yield "the flag override='enable' of a model with contacts"

@@ -1,4 +1,4 @@
-"""Runs the starts of an identification in one batch, with checkpoints."""
+"""Runs the searches from all starts of an identification in one batch, with checkpoints."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jaxcon.learning.least_squares import Fit, FitProgress, Values, least_square
 from jaxcon.learning.stretches import FARTHEST, Point, Stretches
 
 HORIZONS = (1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Shares of a recording that are fitted one after another if the direct fit is poor."""
+"""Shares of a recording, fitted one after another if the fit of the whole recording is poor."""
 EXCESS = 2.0
 """The ratio of residuals to noise above which noise does not explain the residuals."""
 DOUBT = 1.2
@@ -58,9 +58,9 @@ class Attempt:
     """The search from one start of an identification.
 
     With nodes, the recording is cut into segments (stretches), and a sequence of fits closes the
-    gaps between them. Each fit, called a decade, allows gaps a tenth as large as the fit before. If
-    the user gave no noise, it is estimated again after each decade, since the weight of the gaps
-    depends on it. Without nodes there is one decade.
+    gaps between segments. Each fit, called a decade, allows a tenth of the gap that the previous
+    fit allowed. If the user gave no noise, it is estimated again after each decade, since the
+    weight of the gaps depends on the noise. Without nodes there is one decade.
 
     The longer the recording of an oscillation, the more local minima the fit has. If the residuals
     of a fit without nodes exceed their noise, a second fit begins at `begin`. It covers longer and
@@ -76,7 +76,8 @@ class Attempt:
         noise: factor by which the standard deviation of the data is multiplied.
         decade: index of the current decade.
         progress: state of the current fit.
-        direct: the finished fit of the whole recording, while parts are fitted; otherwise None.
+        direct: the finished fit of the whole recording, stored while parts of the recording are
+            fitted; otherwise None.
         horizon: index into `HORIZONS` of the part that is being fitted.
     """
 
@@ -159,7 +160,7 @@ class Attempt:
         """Fits the first part of the recording.
 
         Args:
-            progress: the state of the fit from which it starts or resumes.
+            progress: the state from which the fit starts or resumes.
             horizon: length of the part, as a share of the recording's duration.
             tie: weight of a prior on the parameters z: adds the residuals tie · (z − begin).
         """
@@ -206,7 +207,7 @@ class Attempt:
         self.widths = tuple(widths)
 
     def _narrow(self, fit: Fit) -> None:
-        """Starts the next fit, with smaller gaps. Estimates the noise if the user gave none."""
+        """Prepares the next fit, with smaller gaps. Estimates the noise if the user gave none."""
         if self._estimated:
             problem, width = self.problem, self.widths[self.decade]
             left = remaining(problem, fit, problem.condensed(fit.jacobian, width), self.noise)
@@ -255,7 +256,9 @@ def _restored(contents: dict[str, np.ndarray], prefix: str = "") -> FitProgress 
 
 
 def remaining(problem: Stretches, fit: Fit, J: np.ndarray, noise: float) -> float:
-    """Estimates the noise from the residuals of a fit, relative to its noise factor.
+    """Returns the noise estimated from the residuals of a fit, divided by the fit's noise factor.
+
+    It is NaN if no degree of freedom is left.
 
     Args:
         problem: the least-squares problem of the recording.
@@ -332,7 +335,7 @@ def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Calla
 
 
 def _about(problem: Stretches, attempts: list[Attempt]) -> dict[str, object]:
-    """Returns the settings of a search that must match those of a checkpoint, by description."""
+    """Returns the settings in which a search and its checkpoint must agree, by description."""
     first, space = attempts[0], problem.space
     limits: PyTree = [*space.low, *space.high]
     numbers = [np.asarray(x) for x in jax.tree.leaves(problem.seen)]

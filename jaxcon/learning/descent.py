@@ -26,7 +26,7 @@ from jaxcon.staging.failure import mask_failed_gradients
 from jaxcon.staging.worlds import where_tree
 
 RETRIES = 20
-"""The number of rejected steps in a row that ends a search. Each is half as long as the last."""
+"""The number of times that a rejected step is halved and repeated before a search ends."""
 RECOVERY = 1.2
 """The factor by which the step fraction grows after each accepted step, up to 1."""
 WORSE = 1000.0
@@ -71,7 +71,7 @@ class Best:
 
 @pytree
 class AcceptedPoint:
-    """The last accepted point, from which a rejected step is repeated with a smaller fraction.
+    """The last accepted point, from which a rejected step is repeated at half its length.
 
     Attributes:
         y: search coordinates of the point.
@@ -242,9 +242,10 @@ class Descent:
         return dataclasses.replace(new, ahead=ahead), losses
 
     def compare(self, before: Search, after: Search, key: Array | None) -> Search:
-        """Compares the points before and after a chunk by the same keys, to exclude lucky samples.
+        """Updates the best point by comparing the points before and after a chunk.
 
-        If the loss after the chunk is not finite or far too large, the search returns to the point
+        Both losses use the same random keys, so that a lucky draw of samples does not decide. If
+        the loss after the chunk is not finite or far too large, the search returns to the point
         before the chunk.
         """
         assert key is not None
@@ -332,8 +333,9 @@ class Descent:
 
         If all accepted losses are nonnegative, a step may multiply the loss by at most 1000.
 
-        Any loss, such as a logarithm, may exceed the highest accepted loss by at most min(max(|f|,
-        d), max(|f| / 100, 10 d)). Here f is the first loss and d the range of accepted losses.
+        A loss of any sign, such as a logarithm, may exceed the highest accepted loss by at most
+        min(max(|f|, d), max(|f| / 100, 10 d)). Here f is the first accepted loss, and d the
+        difference between the highest accepted loss and the lowest loss.
         Rounding errors near a loss of zero are ignored.
 
         Args:
@@ -368,7 +370,10 @@ class Descent:
         return secants.add(step, g - flat(origin.slope)[0], g)
 
     def slope(self, y: tuple[Array, ...], key: Array | None) -> tuple[Value, tuple[Array, ...]]:
-        """Returns (loss, extras) as `evaluate` does, and the gradient of the loss at y."""
+        """Returns the loss at y with its extras, and the gradient of the loss at y.
+
+        The extras are the auxiliary output and the number of non-finite samples; see `evaluate`.
+        """
         if not self.forward:
             return jax.value_and_grad(self.evaluate, has_aux=True)(y, key)
         x, back = flat(y)
@@ -396,7 +401,9 @@ class Descent:
 
 
 def split(result: PyTree) -> tuple[Array, PyTree]:
-    """Splits the return value of a user's loss into (loss, aux); without aux, it is ().
+    """Splits the return value of a user's loss into (loss, aux).
+
+    aux is () if the loss returns no auxiliary output.
 
     Raises:
         TypeError: the loss is not a floating scalar.

@@ -30,7 +30,7 @@ from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.stretches import Stretches
 
 VAGUE = 1.0
-"""The standard deviation of a direction's relative change above which it counts as undetermined."""
+"""The standard deviation of relative change above which a direction counts as undetermined."""
 
 ALIKE = 1e-2
 """The relative difference of costs below which two starts count as equally good."""
@@ -45,8 +45,8 @@ class Identified:
     initial or final magnitude, whichever is larger. This divisor is at least 1 for a parameter that
     starts within √ε of 0.
 
-    Singular values s are those of the Jacobian of the residuals, divided by their noise. Hence 1/s
-    is the standard deviation of the estimate along the direction (the Cramér–Rao bound).
+    The singular values s are those of the Jacobian ∂(residuals / noise)/∂(relative changes). Hence
+    1/s is the standard deviation of the estimate along the direction (the Cramér–Rao bound).
 
     Attributes:
         params: the parameters, in the structure of the start.
@@ -71,8 +71,9 @@ class Identified:
             or in units of the data. Infinite for starts with non-finite residuals.
         stopped: the reason why the search ended, as text. "converged" means a minimum whose
             residuals are at most twice the noise. The noise is the given one, or is estimated from
-            differences between neighboring data. Other minima are called local. Residuals below √ε
-            of the data count as noise.
+            differences between neighboring residuals. For any other minimum, the text warns that
+            it is local or that the model is incomplete. Residuals below √ε of the data count as
+            noise.
     """
 
     params: Any
@@ -272,7 +273,9 @@ def _scale(space: Space, y: Array) -> Array:
 
 
 def _report(problem: Stretches, end: End, continuity: float, ends: np.ndarray) -> Identified:
-    """Converts the best fit to an `Identified`. Nodes count as unknown in the errors of parameters.
+    """Converts the best fit to an `Identified`.
+
+    The standard deviations of the parameters include the uncertainty of the nodes.
 
     Args:
         problem: the least-squares problem of the recording.

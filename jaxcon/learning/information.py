@@ -8,11 +8,10 @@ from jaxcon.learning.least_squares import Fit, Precision
 
 
 def noise_left(fit: Fit, rows: int, observed: int, precision: Precision) -> float:
-    """Returns the root mean square residual per degree of freedom; NaN if there is none.
+    """Returns the root mean square residual per degree of freedom; NaN if no freedom is left.
 
-    The number of degrees of freedom is the number of data minus those that the unknowns absorb. The
-    unknowns absorb the trace of the projection onto the columns of J, restricted to data rows.
-    Unknowns on a bound absorb none.
+    The number of degrees of freedom is the number of data minus the trace, over the data rows, of
+    the projection onto the columns of J. Columns of unknowns on a bound are left out.
 
     Args:
         fit: a fit whose residuals are data rows, followed by continuity rows.
@@ -30,9 +29,8 @@ def singular_directions(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns singular values and directions of ∂r/∂x, while other unknowns y are free.
 
-    r are residuals, and x the unknowns of interest.
-
-    The columns of ∂r/∂y are projected out of ∂r/∂x.
+    r are the residuals, and x the unknowns of interest. The columns of ∂r/∂y are projected out of
+    ∂r/∂x.
 
     Args:
         J: the Jacobian ∂r/∂x, (m, n).
@@ -41,8 +39,8 @@ def singular_directions(
         precision: floating-point precision of r.
 
     Returns:
-        Singular values of J · unit, (n,), 0 for directions that r does not determine; and unit
-        directions as rows, (n, n).
+        Singular values of J · unit, (n,), 0 for directions that r does not determine; and the
+        directions, as rows of length 1, (n, n).
     """
     n, D = J.shape[1], precision.scale(J)
     U, *_ = precision.reached(others)
@@ -65,14 +63,13 @@ def _padded(J: np.ndarray) -> np.ndarray:
 def deviations(s: np.ndarray, V: np.ndarray, tolerance: float) -> np.ndarray:
     """Returns the standard deviation (Σ (v / s)²)^½ of each unknown, (n,).
 
-    The sum is over directions v with singular values s.
-
-    It is infinite if the unknown takes part in a direction with s = 0.
+    The sum is over directions v with singular values s. The standard deviation is infinite if the
+    unknown takes part in a direction with s = 0.
 
     Args:
         s: singular values, (k,).
         V: directions v as rows, (k, n).
-        tolerance: an unknown takes part in a direction if its component |v| is larger.
+        tolerance: an unknown takes part in a direction if its component |v| is larger than this.
     """
     shares = (s[:, None] != 0) | (np.abs(V) > tolerance)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -33,7 +33,7 @@ EVERY_STEP = "every step was taken before it converged"
 START = 1e-3
 """The initial Levenberg–Marquardt damping μ."""
 FAINT = 8
-"""The number of rounding errors of the data below which a column of the Jacobian counts as zero."""
+"""The norm below which a column of the Jacobian counts as zero, in rounding errors of the data."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Fit:
         z: unknowns, (n,).
         residual: the residual r at z, (m,).
         jacobian: ∂r/∂z at z, (m, n).
-        free: mask of the unknowns that do not press against a bound, (n,).
+        free: mask of the unknowns that a descent step does not push beyond a bound, (n,).
         costs: ½ ‖r‖² at the start and after each step.
         stopped: the reason why the search ended, as text.
         broken: True if an interrupt or a machine error stopped the search.
@@ -77,7 +77,7 @@ class Precision:
         return self.tolerance**2 * self.size
 
     def scale(self, J: np.ndarray) -> np.ndarray:
-        """Returns the norms D of the columns of J, (n,). Infinite for mere rounding errors."""
+        """Returns the norms D of the columns of J, (n,); infinite for mere rounding errors."""
         norms = np.sqrt(np.sum(J * J, axis=0))
         return np.where(norms > FAINT * self.rounding, norms, np.inf)
 
@@ -141,8 +141,8 @@ def least_squares(
         steps: maximum number of steps since the start.
         precision: floating-point precision of r.
         note: callback that receives the progress after each step.
-        reach: the largest change of each unknown in one step, (n,). It keeps the first step of a
-            logarithm from overflowing, after which the fit could not recover.
+        reach: the largest change of each unknown in one step, (n,). Without it, the first step of
+            an unknown that is a logarithm could overflow, and the fit would not recover.
 
     References:
         Moré, The Levenberg–Marquardt algorithm: implementation and theory (1978).

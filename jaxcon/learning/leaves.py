@@ -160,7 +160,7 @@ def space_of(params: PyTree, positive: PyTree, bounds: Bounds, owner: str) -> Sp
 
 
 def _check_numbers(names: list[str], leaves: list[PyTree], owner: str) -> None:
-    """Checks that all leaves are numbers, and no Python or NumPy integers.
+    """Checks that all leaves are numbers other than Python or NumPy integers.
 
     A user who writes an integer probably means a float. Integer arrays of JAX are allowed, since
     larger trees contain them, such as the status of a state.

@@ -120,8 +120,8 @@ def violation(off: Violation, dt: Scalar) -> Array:
 
     The mean is over rows and time; φ is in m, φ̇ in m/s.
 
-    Use it as the only term of a loss: the logarithm weights small and large violations equally. As
-    one of several terms, use `jc.learning.losses.mean_violation`.
+    Use it as the only term of a loss: the logarithm weights small and large violations equally. In
+    a loss with several terms, use `jc.learning.losses.mean_violation` instead.
 
     Args:
         off: the recorded `info.violation` of all steps.
@@ -205,13 +205,14 @@ def weighted(
 
 
 def unless_failed(x: _T, state: State) -> _T:
-    """Replaces a loss by NaN in failed worlds, so that a search avoids these parameters.
+    """Replaces a loss by NaN in failed worlds, so that a search avoids their parameters.
 
     A failed world keeps its last finite state. A loss computed from that state would look valid.
 
     Args:
-        x: a loss, or predictions. For a batch, leaves that begin with the batch axes become NaN for
-            the failed worlds. Other leaves, such as a mean, become NaN if any world has failed.
+        x: a loss, or predictions. For a batch, leaves whose first axes are the batch axes become
+            NaN in the failed worlds. Other leaves, such as a mean, become NaN if any world has
+            failed.
         state: the final state of a world or a batch.
 
     Raises:

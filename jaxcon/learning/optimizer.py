@@ -37,7 +37,7 @@ class SearchAware:
     Attributes:
         init: function from y to the initial memory of the optimizer.
         update: function (slope, memory, y, loss, search) → ((point, step), memory). `point` is a
-            `Best`, the point from which it steps.
+            `Best`, the point from which the optimizer steps.
     """
 
     init: Callable[[tuple[Array, ...]], OptimizerMemory]

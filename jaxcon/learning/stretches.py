@@ -21,7 +21,7 @@ from jaxcon.learning.leaves import Space
 from jaxcon.learning.losses import misfit
 
 FARTHEST = float(np.log(10.0))
-"""The largest change of a logarithm in one step of the fit."""
+"""The largest change of a parameter's logarithm in one step of the fit."""
 NEIGHBORS = 16
 """The least number of differences between neighboring data from which noise is estimated."""
 
@@ -120,7 +120,7 @@ class Stretches:
     def gaps(self) -> int:
         """The number of gap residuals: differences between a segment's end and the next start.
 
-        They follow the data residuals.
+        In r, the gap residuals follow the data residuals.
         """
         stretches, n = self.nodes.shape
         return (stretches - 1) * n
@@ -176,7 +176,7 @@ class Stretches:
         return int(np.sum(np.isfinite(flat) & (self.times <= horizon)))
 
     def until(self, horizon: float, r: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns r and J with zero rows for data after a time, a share of the duration."""
+        """Returns r and J with zero rows for data after `horizon`, a share of the duration."""
         later = np.append(self.times > horizon, np.zeros(self.gaps, bool))
         return np.where(later, 0, r), np.where(later[:, None], 0, J)
 
@@ -239,9 +239,10 @@ class Stretches:
         and the next node.
 
         Substitutes x_{k+1} = e_k(p, x_k) − g_k for node k + 1, with the end e_k of stretch k. The
-        columns of the parameters p and the first node x₀ then describe one motion without gaps. In
-        the original J, this information is lost in rounding errors, since gaps have large weights.
-        If the motion is too unstable to be predicted to √ε, J is returned unchanged.
+        columns of the parameters p and the first node x₀ then tell how one motion without gaps
+        depends on p and x₀. In the original J, gaps have large weights, so this dependence is lost
+        in rounding errors. If the motion is too unstable to be predicted to √ε, J is returned
+        unchanged.
 
         Args:
             J: Jacobian of all residuals by parameters and nodes, (m, p + stretches · n).
@@ -261,13 +262,15 @@ class Stretches:
         return np.concatenate([data @ T, alone])
 
     def widths(self, residual: np.ndarray, continuity: float) -> list[float]:
-        """Returns standard deviations of the gaps by decade, from their initial size downward.
+        """Returns the allowed standard deviation of the gaps in each fit of the sequence.
 
-        Each is a tenth of the previous one. If small gaps were required from the start, the search
-        would creep along a narrow valley.
+        The first value is near the size of the gaps at the start. Each further value is a tenth of
+        the previous one. If small gaps were required from the start, the search would creep along a
+        narrow valley.
 
         Args:
-            residual: all residuals r at the start, with gaps that are not scaled.
+            residual: all residuals r at the start, with gaps that are not divided by a standard
+                deviation.
             continuity: the final standard deviation.
         """
         gaps = residual[residual.size - self.gaps :]
@@ -296,7 +299,7 @@ class Stretches:
 
     @property
     def start(self) -> np.ndarray:
-        """The unknowns, with zeros for parameters and the given initial states of segments."""
+        """The unknowns: zeros for the parameters, then the given initial states of the segments."""
         return np.append(np.zeros(self.scale.size), self.nodes)
 
     def _begins(self, z: np.ndarray) -> np.ndarray:
@@ -312,8 +315,8 @@ class Stretches:
     def _derivatives(self) -> Wrapped:
         """The jitted function (x, data, noise) → ((r, end), their Jacobians), by forward mode.
 
-        x are the parameters and the node of each stretch, (points, stretches, p + n). r are its
-        data residuals, and end is its end state.
+        x holds the parameters and the node of each stretch, (points, stretches, p + n). r holds
+        the data residuals of each stretch, and end its final state.
         """
 
         # compiled for each problem, since variables that `simulate` closes over may have changed
@@ -356,7 +359,7 @@ class Stretches:
         """Simulates one segment from its initial state. Returns the predictions and the end state.
 
         Raises:
-            ValueError: the function does not return an end in the structure of a node.
+            ValueError: `simulate` does not return an end state in the structure of a node.
         """
         first = jax.tree.map(lambda x: x[0], self.given)
         result = self._simulated(params, ravel_pytree(first)[1](node))
@@ -393,7 +396,7 @@ def _scatters(residuals: list[np.ndarray]) -> list[float]:
 
 
 def _placed(by_r: np.ndarray, by_end: np.ndarray, p: int) -> np.ndarray:
-    """Assembles the Jacobian of all data residuals, then all ends, by parameters and nodes.
+    """Assembles the Jacobian of all data residuals, then all end states, by parameters and nodes.
 
     Args:
         by_r: ∂r/∂(parameters, node) of each stretch, (stretches, m, p + n).

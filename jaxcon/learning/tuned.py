@@ -24,7 +24,7 @@ REASONS = {
 CLOSE = 1e-3
 """The relative distance of every parameter to a minimum below which a search has converged."""
 LATE = 0.01
-"""The share of the total decrease of the loss below which the second half of the steps is idle."""
+"""The share of the total loss decrease below which the second half of the steps counts as idle."""
 RECENT = 0.1
 """The share of steps, at the end, over which the current rate of progress is measured."""
 

@@ -62,10 +62,11 @@ def tune(
     logarithm is the search coordinate. Steps are clipped to the bounds: the loss is never evaluated
     out of bounds, and the optimum may lie on a bound.
 
-    The result is the best evaluated point, never worse than the start. A step is rejected and
-    repeated with half its length if the loss or its gradient is not finite after it. The same
-    happens if the loss grows a thousandfold, or far above all losses so far. With samples, this is
-    checked at the end of each chunk. After 20 rejections in a row a search ends.
+    The result is the best evaluated point, never worse than the start. A step is rejected if the
+    loss or its gradient is not finite after it. A step is also rejected if the loss grows a
+    thousandfold, or far above all losses so far. With samples, growth of the loss is checked only
+    at the end of each chunk. A rejected step is repeated with half its length. The search ends if
+    20 repetitions in a row are rejected.
 
     A keyboard interrupt, or a machine error after the first chunk, stops the search. The best
     result so far is returned.
@@ -100,12 +101,13 @@ def tune(
         spread: standard deviation of the other starts around `params`: a number, or a mapping from
             names to numbers. It is relative for positive leaves.
         key: random key for samples and random starts.
-        patience: number of steps without progress after which a search ends; None never ends it.
+        patience: number of steps without progress after which a search ends; None for no limit.
         tolerance: the decrease of the loss that counts as progress.
         checkpoint: path of a file that is written after each chunk. If it exists, the search
             resumes from it and gives the same numbers as an uninterrupted search. `steps` may be
             increased if `optimizer` is given. The rate of the default optimizer depends on `steps`.
-        chunk: number of steps per call of the compiled scan. After each chunk progress is checked.
+        chunk: number of steps per call of the compiled scan. After each chunk, the checkpoint is
+            written, and `tune` returns if all searches have ended.
         forward: True computes gradients by forward mode, with one pass per parameter. Use it for
             few parameters, long rollouts, or loops without reverse mode. Line searches still use
             reverse mode.
@@ -174,7 +176,7 @@ def _scan(descent: Descent, chunk: int) -> Wrapped:
     mesh = descent.mesh
 
     def run_starts(shared: tuple[Array, Array | None], search: Search) -> tuple[Search, Array]:
-        """Runs a chunk of the searches of one device."""
+        """Runs a chunk of steps of the searches on one device."""
         limit, key = shared
         return jax.vmap(lambda s: descent.run(s, limit, key, chunk))(search)
 
@@ -240,9 +242,9 @@ def _running(search: Search, steps: int) -> np.ndarray:
 def _about(
     space: Space, starts: tuple[Array, ...], key: Array | None, chunk: int, rate: int | None
 ) -> dict[str, object]:
-    """Returns the settings of a search that must match those of a checkpoint, by description.
+    """Returns the settings in which a search and its checkpoint must agree, by description.
 
-    The compiled program is not included.
+    The compiled program, which must agree too, is not included.
 
     Args:
         space: map between parameters and search coordinates.

@@ -1,7 +1,8 @@
 """Small dense matrices as unrolled scalar formulas, for the blocks of a sparse factorization.
 
-A matrix is a list of rows, and each entry is a lane: an array over equal blocks and worlds. A
-symmetric matrix and its factor are stored as the rows of their lower triangle.
+A matrix is a list of rows. Each entry is a lane: an array with one value for each of many equal
+blocks and for each world. Of a symmetric matrix and of its factor, only the lower triangle is
+stored, row by row.
 """
 
 from collections.abc import Iterable, Sequence

@@ -40,10 +40,11 @@ class ConjugateGradients(checks.Checked, Solver):
     iterations, and `Sparse` is then faster.
 
     The algorithm is the method of conjugate residuals: it minimizes the residual in the norm of the
-    preconditioner. Consistent redundant rows share λ. Constraint drift and rounding, amplified by
-    the feedback of the stabilizer, make redundant rows slightly inconsistent. The solution is then
-    the least-squares solution of least λ. If its residual exceeds a hundredth of b and J M⁻¹ f, and
-    exceeds rounding, the rows contradict each other and the status is CONFLICT.
+    preconditioner. If redundant rows are consistent, λ is the solution of least norm. Constraint
+    drift and rounding, amplified by the feedback of the stabilizer, make redundant rows slightly
+    inconsistent. λ is then the least-squares solution of least norm. The status is CONFLICT, for
+    rows that contradict each other, if the residual exceeds 1% of the size of b and J M⁻¹ f, plus
+    rounding.
 
     The status is NOT_CONVERGED if the residual is neither below the tolerance nor minimal. It is
     SINGULAR if M is not positive definite.
@@ -54,8 +55,8 @@ class ConjugateGradients(checks.Checked, Solver):
         tikhonov: ε of a regularized system (A + ε diag A) λ = b − J M⁻¹ f, or None; see `Sparse`.
         tolerance: the residual at which the iteration of a world stops, relative to the right-hand
             side, in the norm of the preconditioner. A tolerance of 0.1 or more accepts rough
-            solutions, whose error the feedback of later steps corrects. None takes the precision to
-            the power ⅔: 2e-5 in float32, 4e-11 in float64.
+            solutions, whose error the feedback of later steps corrects. None takes the machine
+            precision to the power ⅔: 2e-5 in float32, 4e-11 in float64.
         iterations: the number of iterations, the same for all worlds.
 
     References:
@@ -128,12 +129,12 @@ def descend(
 
     Each iteration minimizes ‖r‖ over all search directions p so far, with z = P⁻¹ r. The step size
     zᵀA z / ‖A p‖² does not depend on the part of r outside the range of A. The step size of plain
-    conjugate gradients, ‖r‖² / pᵀA p, does, and diverges once that part dominates r.
+    conjugate gradients, ‖r‖² / pᵀA p, depends on that part and diverges once it dominates r.
 
-    The iteration of a world stops when ‖r‖ reaches the tolerance, or when ‖r‖ is minimal. A minimal
-    r lies outside the range of A, and z lies in the null space of A. The component of x along z is
-    then an error, proportional to r and to the condition number. Removing it leaves the x of least
-    norm in P.
+    The iteration of a world stops when ‖r‖ reaches the tolerance, or when ‖r‖ is minimal. If ‖r‖ is
+    minimal, r has no part in the range of A, and z lies in the null space of A. The component of x
+    along z is then an error, proportional to ‖r‖ and to the condition number. Removing this
+    component leaves the x of least norm in P.
 
     Args:
         a: x → A x, symmetric and positive semidefinite.
@@ -161,9 +162,9 @@ def descend(
         return jnp.sum(x * y, axis=0)
 
     def is_least(size: Array, z: Array, az: Array, paz: Array) -> Array:
-        """Returns True where ‖r‖ is minimal: ‖A P⁻¹ r‖ is small, or zᵀA z is rounding.
+        """Returns True where ‖r‖ is minimal: ‖A P⁻¹ r‖ is small, or zᵀA z is at rounding level.
 
-        Both are compared with ‖r‖² = `size`.
+        ‖A P⁻¹ r‖² and zᵀA z are compared with ‖r‖² = `size`.
         """
         flat = dot(az, paz) <= zero * zero * size
         return flat | (dot(z, az) <= 16 * float(information.eps) * size)

@@ -14,8 +14,9 @@ class Dense(Solver):
     """Solves K (a, λ) = (f, b) with K = [[M, −Jᵀ], [J, C]] by LU with pivoting.
 
     `Dense` is slow, but needs neither a definite A = J M⁻¹ Jᵀ + C nor an invertible M. All other
-    solvers are tested against it. Pivots compare across units because the factored matrix is S K S,
-    with the scale S = diag(1/√M_ii, 1/√A_ii). A_ii is computed with the diagonal of M only.
+    solvers are tested against it. The factored matrix is S K S, with S = diag(1/√M_ii, 1/√A_ii):
+    this scale makes pivots of different units comparable. A_ii is computed with the diagonal of M
+    only.
 
     The status is SINGULAR if K is singular to working precision. An indefinite mass matrix is not
     detected as long as K is regular.

@@ -18,7 +18,7 @@ class Effort:
     Attributes:
         operations: the number of additions and multiplications for each world.
         instructions: the size of the compiled code; a loop body or a LAPACK call counts once.
-        numbers: the numbers stored between factorization and substitution, for each world.
+        numbers: the number of floats stored between factorization and substitution, for each world.
     """
 
     operations: float
@@ -34,7 +34,7 @@ def structure_of(jacobian: Jacobian) -> Structure:
 def clique(structure: Structure) -> int:
     """Returns the largest number of rows that touch one body.
 
-    These rows form a clique of the graph of A: all constraints of a body are neighbors.
+    These rows form a clique in the graph of A, since all constraints of a body are neighbors.
     """
     rows: dict[tuple[int, int], int] = {}
     for _, size, columns in structure:
@@ -58,14 +58,15 @@ def elimination(
         structure: the structure of J.
         order: the elimination order, "runs" or "levels"; see `Sparse`.
         solves: the number of substitutions with one factorization.
-        most: the limit on instructions. The result is None if the rows that touch one body exceed
-            this limit alone; those rows are eliminated one block after another.
+        most: the limit on instructions. The result is None if the elimination of the rows that
+            touch one body already exceeds this limit; these rows are eliminated one block after
+            another.
     """
 
     def factor(m: float, r: float) -> float:
         """Returns the operations that eliminate a node of m rows, with r rows of later neighbors.
 
-        They are LDLᵀ of the node, A_qp L⁻ᵀ for the neighbors q, and the update of the neighbors.
+        They compute LDLᵀ of the node, A_qp L⁻ᵀ for the neighbors q, and the neighbors' updates.
         """
         return m**3 / 3 + m * m * r + m * r * (r + 1)
 

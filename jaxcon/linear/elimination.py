@@ -22,10 +22,11 @@ Lanes = list[Lane]
 
 
 class Pieces:
-    """A sparse block matrix or vector, stored as pieces; a block is the sum of its key's pieces.
+    """A sparse block matrix or vector; the block at a key is the sum of the pieces added to it.
 
     A key is an `EliminationNode` (vector) or a pair of nodes (matrix). Many keys are read and
-    written at once, as lanes (key, …). No data moves where these pieces lie in order in one array.
+    written at once, as lanes (key, …). If the pieces of these keys lie in order in one array,
+    reading them takes no gather.
     """
 
     def __init__(self) -> None:
@@ -195,7 +196,7 @@ class Elimination:
             self.updates.add([(later[i], later[j])], jax.tree.map(lambda x: x[None], product))
 
         def down(b: Pieces, taken: Pieces) -> Lanes:
-            """Substitutes forward along the run; the carry is H_q y_p for next node and border."""
+            """Substitutes forward along a run; the carry is H_q y_p of next and border nodes."""
 
             def eliminate(carry: list[Lanes], right: Lanes, k: Array) -> tuple[list[Lanes], Lanes]:
                 factor, gain = row_of((factors, gains), k)

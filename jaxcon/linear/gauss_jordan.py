@@ -12,7 +12,7 @@ Index = int | Array
 UNROLLED = 4
 """The largest number of rows n for which the elimination is unrolled."""
 LARGE, BLOCK = 48, 4
-"""The smallest number of rows n for which rows are eliminated in blocks, and the rows of a block.
+"""LARGE is the smallest number of rows n for which rows are eliminated in blocks of BLOCK rows.
 A matrix of this size exceeds the fastest cache: memory traffic costs more than arithmetic."""
 
 

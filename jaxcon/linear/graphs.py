@@ -18,9 +18,9 @@ def independent_sets(
 ) -> tuple[list[N], dict[N, list[N]]]:
     """Orders nodes for elimination in few rounds. No two nodes of a round are neighbors.
 
-    A round eliminates nodes of degree at most `degree`; if there are none, those of the smallest
-    degree. A node with two neighbors connects these two, whose degrees do not grow. So a chain of n
-    nodes takes log₂ n rounds (cyclic reduction).
+    A round eliminates nodes of degree at most `degree`; if there are none, it eliminates nodes of
+    the smallest degree. Eliminating a node with two neighbors connects the two neighbors, so their
+    degrees do not grow. So a chain of n nodes takes log₂ n rounds (cyclic reduction).
 
     Hubs are eliminated after all other nodes, and do not count in the degrees of other nodes. A
     constraint that touches every body would otherwise raise nearly all degrees above `degree`, and
@@ -59,8 +59,8 @@ def minimum_degree(
 
     Among nodes of equal degree, neighbors of the last eliminated node come first, so that chains
     are eliminated from one end to the other. Next come the nodes nearest to the ground. A chain
-    that is eliminated from the ground on is well conditioned: each pivot is that of a joint whose
-    other body is fixed. From the free end, the pivots of a chain of n links fall like 1/n³.
+    eliminated from the ground outward is well conditioned: each pivot is that of a joint to a fixed
+    body. Eliminated from the free end, a chain of n links has pivots that fall like 1/n³.
 
     Args:
         neighbors: the neighbors of each node.

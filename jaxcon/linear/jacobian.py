@@ -124,7 +124,7 @@ class Jacobian:
         )
 
     def reach(self, v: Array) -> Array:
-        """Returns |J| |v|, (n_c,): the bound on |J v| if no terms canceled each other."""
+        """Returns |J| |v|, (n_c,): an upper bound on |J v|, reached if no terms cancel."""
         return self.map(lambda x: (row.map(abs) for row in x.value)).apply(jnp.abs(v))
 
     def transpose(self, multipliers: Array) -> Array:
@@ -238,7 +238,7 @@ class Gathered:
         return jnp.sum(self.transposed * v[:, None], axis=0)
 
     def reach(self, v: Array) -> Array:
-        """Returns |J| |v|, (n,): the bound on |J v| if no terms canceled each other."""
+        """Returns |J| |v|, (n,): an upper bound on |J v|, reached if no terms cancel."""
         return jnp.sum(jnp.abs(self.transposed * v[:, None]), axis=0)
 
     def transpose(self, multipliers: Array) -> Array:

@@ -39,7 +39,7 @@ class EliminationNode:
 class BlockCoupling:
     """The off-diagonal blocks of A that two Jacobian blocks contribute to.
 
-    Each pair of elements, one of either Jacobian block, touches a common body.
+    The elements are paired: both elements of a pair, one from each block, touch a common body.
 
     Attributes:
         blocks: the positions of the two Jacobian blocks in `Jacobian.blocks`.
@@ -185,7 +185,10 @@ def _steps(
     kinds: dict[tuple[EliminationNode, EliminationNode], list[tuple[int, bool]]],
     run: int,
 ) -> list[EliminationBatch | EliminationRun]:
-    """Splits the elimination order into runs, which are nodes that follow each other alike.
+    """Splits the elimination order into runs and single nodes.
+
+    A run is a sequence of consecutive elements of one group, each coupled to the next one in the
+    same way, with the same border.
 
     Args:
         order: the nodes in the order of elimination.
@@ -230,7 +233,8 @@ def _at_once(
     """Merges equal, independent nodes into one step.
 
     A step depends on all earlier steps that update its nodes. Its level is the length of the
-    longest chain of such dependencies. Single nodes of one level, group and neighbor sizes merge.
+    longest chain of such dependencies. Single nodes merge if their levels, groups and neighbor
+    sizes are equal.
     """
     waits: dict[EliminationNode, int] = {}
     levels: dict[tuple[Hashable, ...], list[EliminationBatch | EliminationRun]] = {}

@@ -66,9 +66,9 @@ class Lexicographic(checks.Checked, Solver):
     """Solves M a = f + Jᵀλ and J a + C λ = b by priority level; constructed by `Priority`.
 
     Level 0 is solved first, by least squares if its rows contradict each other. Among the remaining
-    accelerations, level 1 is satisfied as well as possible, and so on. Any freedom left gives the
-    acceleration nearest to M⁻¹f in the metric of M (Gauss). Level k acts in the null space of the
-    levels above it. With N the projector onto that null space in the metric of M,
+    accelerations, level 1 is satisfied as well as possible, and so on. Of the accelerations that
+    remain, the solution is the one nearest to M⁻¹f in the metric of M (Gauss). Level k acts in the
+    null space of the levels above it. With N the projector onto that null space in the metric of M,
 
         a ← a + N (J_k N)⁺ (b_k − J_k a),    N ← N − N (J_k N)⁺ J_k.
 
@@ -84,12 +84,14 @@ class Lexicographic(checks.Checked, Solver):
     (μ² / (σ² + μ²))⁶ of the target is not met.
 
     The highest level is not damped: the mechanism passes singular positions, and no lower level
-    disturbs it. A damped intermediate level yields slightly to the levels below it. At angles
-    around √μ, its error is a few hundredths of their targets.
+    disturbs it. A damped intermediate level yields slightly to the levels below it. Where its rows
+    are at angles around √μ to rows of higher levels, its error is a few hundredths of the targets
+    of the lower levels.
 
     Rows with a compliance, such as rows of rotors and soft constraints, can always be satisfied.
-    The status is CONFLICT if the rows of one level contradict each other. A level that higher
-    levels prevent from being satisfied is not a conflict. `report` names both.
+    The status is CONFLICT if the rows of one level contradict each other. A level that cannot be
+    satisfied because of higher levels is not a conflict. `report` names the constraints in both
+    cases.
 
     The gradient is exact while no row changes between dependent and independent. Eigenvalues that
     count as zero are held at zero, so that the gradient is finite everywhere.

@@ -27,9 +27,10 @@ def implicit(
     The tangent equation f′(x) ẋ = y is solved iteratively, by ẋ ← ẋ + P (y − f′(x) ẋ), and its
     transpose likewise. This converges like the iteration x ← x − P f(x) near the root.
 
-    JAX gives every number that f closes over a tangent, possibly zero. If the derivative of f with
-    respect to such a number is infinite, as of 1/h² at h = 0, a zero tangent gives NaN. Compute
-    such factors outside of f. If they have no meaningful derivative, stop their gradient inside f.
+    JAX assigns a tangent, possibly zero, to every number that f closes over. If the derivative of f
+    with respect to such a number is infinite, like that of 1/h² at h = 0, a zero tangent gives NaN.
+    Compute such factors outside of f. If they have no meaningful derivative, stop their gradient
+    inside f.
 
     Args:
         function: f, (n, …) → (n, …).

@@ -115,5 +115,5 @@ class Sparse(checks.Checked, Solver):
 
 
 def suits_device() -> str:
-    """Returns the elimination order that suits the default device: "runs" on a CPU, or "levels"."""
+    """Returns the elimination order for the default device: "runs" on a CPU, otherwise "levels"."""
     return "runs" if jax.default_backend() == "cpu" else "levels"

@@ -56,7 +56,7 @@ class AdaptiveBaumgarte(Baumgarte):
         check_gains(owner, {"least": 0, "most": 1}, optional=False, floor=self.floor)
 
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
-        """Returns the rows with the target b of J a + C λ = b; its `noise` uses the unscaled β₀."""
+        """Returns the rows with the target b of J a + C λ = b, and `noise` for the unscaled β₀."""
         return super().constraint_equations(weakened(rows, self.scale(rows)), memory, dt)
 
     def scale(self, rows: Rows) -> Array:

@@ -61,7 +61,7 @@ class ArrivalSearch:
     tries: int
 
     def run(self) -> Bracket:
-        """Returns the bracket of each world; without a closing gap, it ends with the part."""
+        """Returns the bracket of each world; if no gap closes, it ends at the end of the part."""
         zero, none = jnp.zeros_like(self.length), jnp.zeros(self.wanted.shape, bool)
         row = jnp.zeros(self.wanted.shape, jnp.int32)
         unknown = Bracket(none, zero, self.length, self.length, self.length, zero + jnp.inf, row)
@@ -126,10 +126,10 @@ class Arrival(Generic[Start, End]):
 
     With y = F(x, s) and φ(x, y) = 0,
 
-        ẏ = ∂F ẋ + F′ ṡ,    ṡ = −(φ along ẋ and ∂F ẋ)/(φ along F′),
+        ẏ = ∂F ẋ + F′ ṡ,    ṡ = −Dφ(ẋ, ∂F ẋ)/Dφ(0, F′),    ∂F = ∂F/∂x,  F′ = ∂F/∂s,
 
-    exact to every order. If |φ along F′| is at most `least`, as at a grazing contact, the time has
-    no derivative, and ṡ is set to zero.
+    where Dφ(ẋ, ẏ) is the directional derivative of φ. This is exact to every order. If |Dφ(0, F′)|
+    is at most `least`, as at a grazing contact, s has no derivative, and ṡ is set to zero.
 
     Attributes:
         flow: function F(x, s) → y, for each world.
@@ -147,7 +147,7 @@ class Arrival(Generic[Start, End]):
             time: closing time s, ().
             closes: mask of the worlds in which a gap closes at s, (). In other worlds s keeps its
                 own derivative.
-            least: threshold on |φ̇|, (): below it, s gets no derivative.
+            least: threshold on |Dφ(0, F′)|, (): at or below it, s gets no derivative.
         """
         parts = LeafPartition.of(x)
 

@@ -40,7 +40,7 @@ class Baumgarte(checks.Checked, Stabilizer):
     "leg*" names a group of constraints. Constraints that a mapping leaves out get the default.
     Gains are leaves of the pytree.
 
-    Beside `SemiImplicitEuler`, the feedback sees the half-step rate
+    With `SemiImplicitEuler`, the feedback acts on the half-step rate
 
         p = φ̇ − ½hγ = (φ − φ⁻)/h + O(h²)
 
@@ -57,8 +57,9 @@ class Baumgarte(checks.Checked, Stabilizer):
 
     In float32, the default β of semi-implicit Euler is at most 917/s if bodies move slowly, since
     β² times the rounding error of φ is noise in the multipliers. If constraints accelerate fast, β
-    rises up to 1/h. For a rotor 0.1 m off its axis at h = 0.1 ms, β rises from about 45 rad/s on.
-    Gains given by the user do not change: Baumgarte(0.5/h, 1/h) suits fast bodies at every h.
+    rises up to 1/h. For a rotor 0.1 m off its axis at h = 0.1 ms, β rises if the rotor turns faster
+    than about 45 rad/s. Gains given by the user do not change: Baumgarte(0.5/h, 1/h) suits fast
+    bodies at every h.
 
     Attributes:
         alpha: gain α of the rate [1/s]; None for the default.
@@ -136,12 +137,12 @@ class Baumgarte(checks.Checked, Stabilizer):
 
 @pytree
 class RisingBaumgarte(Baumgarte):
-    """Default gains that rounding limits, but that rise if constraints accelerate fast.
+    """Default gains, limited by rounding errors, that rise if constraints accelerate fast.
 
     The rounding error ε of φ [m] causes a spurious acceleration β² ε. β rises until this
     acceleration is 5e-4 of Σ|γ_i| over the rows of the constraint. If a body turns at ω [rad/s], γ
-    is ω² times the lever arm. If β were only a few ω, errors of the steps would add up, and energy
-    would drift by percents.
+    is ω² times the lever arm. If β were only a few times ω, errors of the steps would add up, and
+    energy would drift by percents.
 
     Attributes:
         limit: the largest β [1/s].
@@ -163,8 +164,8 @@ class RisingBaumgarte(Baumgarte):
 class Wrapper(Stabilizer):
     """A stabilizer around an inner one, to which it forwards all methods that it does not override.
 
-    `completes` is not forwarded: a stabilizer with equations of its own also changes the forces of
-    a step that a projection would complete.
+    `completes` is not forwarded: it assumes the constraint forces for b = −γ, which a wrapper with
+    constraint equations of its own changes.
 
     Attributes:
         inner_field: name of the field that has the inner stabilizer.
@@ -258,7 +259,7 @@ def check_stabilizer(owner: str, what: str, part: Any) -> None:
     """Checks a stabilizer that is a field of another class.
 
     Args:
-        owner: the name of this class, for error messages.
+        owner: the name of the class with the field, for error messages.
         what: the name of the field.
         part: the value that the user gave.
 

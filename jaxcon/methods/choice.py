@@ -30,7 +30,7 @@ PROGRAM = 30_000
 HELD = 4e9
 """The most memory that the matrices of all worlds may need [B]."""
 SURE = 20.0
-"""The largest cost of elimination in units of the cost of iterations, which may not converge."""
+"""Elimination is taken up to this multiple of the cost of iterations, which may not converge."""
 LONG = 80
 """The largest length of text that `brief` prints; a longer part is printed as its class."""
 
@@ -154,7 +154,7 @@ def _inner(
     Args:
         facts: properties of the system.
         efforts: effort of each solver, by its name.
-        width: bytes that one number of each world takes in all worlds together.
+        width: memory of one number per world, summed over all worlds [B].
         order: the order of elimination, "runs" or "levels"; None for the one that suits the device.
         place: the platform: "cpu", "gpu" or "tpu".
     """
@@ -217,7 +217,7 @@ def innermost(solver: Solver) -> Solver:
 
 
 def brief(part: object) -> str:
-    """Returns a part of a method as Python code without defaults; its class if that is long."""
+    """Returns a part of a method as Python code without defaults; if too long, only its class."""
     name = f"{type(part).__name__}(…)"
     if not dataclasses.is_dataclass(part) or not checks.is_concrete(cast(Any, part)):
         return checks.shortened(part) if isinstance(part, int | float) else name

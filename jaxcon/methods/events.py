@@ -35,7 +35,7 @@ class Impacts:
         times: time of each impact, (splits,) [s]; infinite beyond the last impact. Times have
             derivatives.
         elements: index in `names` of the element that each impact hits, (splits,); −1 beyond the
-            last.
+            last impact.
         names: names of all elements with inequality rows.
     """
 
@@ -69,17 +69,18 @@ class Events(checks.Checked):
     step if φ̇ is more than a rounding error. At a grazing contact the time has no derivative, and
     zero is used. Second derivatives through an impact are finite, but wrong.
 
-    After `splits` impacts, the rest of the step is a plain step. If a joint would cross the range
-    between two elastic stops in this rest, the world ends with the status `LOST_IMPACTS`.
+    After `splits` impacts, the remaining time is advanced by a plain step. If a joint would cross
+    the whole range between two elastic stops in this time, the world ends with the status
+    `LOST_IMPACTS`.
 
     Rows at rest act as in plain steps. A row is at rest if its gap is at most ½ h² |J||a| and its
     speed at most ½ h |J||a|, the changes that accelerations cause in a step. A ball that bounces
     ever lower thus comes to rest within one step of the exact time.
 
-    An impact is missed if its row closes and opens again within one step. The first of two
-    crossings by the nearest row is missed, too. Soft stops and contacts, friction in joints and
+    An impact is missed if its row closes and opens again within one step. If gaps close twice in a
+    step, the first closing may be missed, too. Soft stops and contacts, friction in joints and
     motors are forces and do not split a step. A step costs three or four plain steps. If some world
-    of a batch has an impact, each evaluation at an estimate of s* costs one more.
+    of a batch has an impact, each evaluation at an estimate of s* costs one more plain step.
 
     Attributes:
         splits: the largest number of impacts in a step.
@@ -249,7 +250,7 @@ class World:
         return self.method.events
 
     def part(self, state: State, part: StepPart) -> Passed:
-        """Advances by a part of the step. The memory of the result is that after the whole step."""
+        """Advances by a part of the step; the result has the memory after the whole step."""
         (new, info), code = attempt(self.system, self.method, state, self.control, self.dt, part)
         reactions = info.reactions
         impulses = Impulses(
@@ -280,7 +281,7 @@ class World:
         return forecast(self.rows(state), free, state.q, self.dt, self.events.slips)
 
     def clearances(self, forecast: ContactForecast, passed: Passed) -> Array:
-        """Returns the gaps at the end of a part, (n,), then h times the slips, (contacts,)."""
+        """Returns the gaps (n,), then h times the slips (contacts,), at the end of a part."""
         rows = self.rows(passed.state)
         if forecast.sliding is None:
             return rows.gap

@@ -84,7 +84,7 @@ class Scheme(NamedTuple):
     def of(cls, rho: Array, dt: Array) -> Scheme:
         """Returns the coefficients with spectral radius ρ at infinite frequency.
 
-        Of all schemes with this ρ, the damping of low frequencies is the smallest.
+        Among all schemes with this ρ, these coefficients damp low frequencies the least.
 
         References:
             Chung, Hulbert, A time integration algorithm for structural dynamics with improved
@@ -117,8 +117,9 @@ class GeneralizedAlpha(checks.Checked, Integrator):
 
         M v̇⁺ = f(q⁺, v⁺, t⁺) + Jᵀλ⁺,    φ(q⁺, t⁺) = 0,    ψ(q⁺, v⁺, t⁺) = 0,    J v̇⁺ + C λ⁺ = b,
 
-    The last equation is for rows with compliance, such as rotors. q⁺ and v⁺ follow from averaged
-    accelerations a, with the coefficients of Chung and Hulbert:
+    ψ = 0 is for velocity-level rows, and the last equation for rows with compliance, such as
+    rotors. q⁺ and v⁺ follow from averaged accelerations a, with the coefficients of Chung and
+    Hulbert:
 
         (1 − α_m) a⁺ + α_m a = (1 − α_f) v̇⁺ + α_f v̇,
         q⁺ = q ⊕ h (v + h ((½ − β) a + β a⁺)),    v⁺ = v + h ((1 − γ) a + γ a⁺).
@@ -209,7 +210,7 @@ class GeneralizedAlpha(checks.Checked, Integrator):
         healthy = jnp.zeros_like(state.status)
 
         def first_step() -> tuple[LastStep, Array]:
-            """Returns the memory, from the saddle system in worlds without one, and its status."""
+            """Returns the memory and a status; at the first step, by solving the saddle system."""
             (a, λ, code), _ = dynamics(state.q, state.v, state.instant)
             fresh = LastStep(a, a, λ, memory.started)
             return where_tree(memory.started, (memory, healthy), (fresh, code))
@@ -257,7 +258,7 @@ class GeneralizedAlpha(checks.Checked, Integrator):
         return Advanced((q, v, t), solution._replace(status=code), rows, new, ends=True)
 
     def _softness(self, dynamics: Dynamics, state: State, rows: Rows) -> Array | None:
-        """Returns the regularization ε W of each row, (n_c,), zero with compliance; or None."""
+        """Returns the regularization ε W, (n_c,), zero for rows with compliance; None for none."""
         if self.tikhonov is None and not rows.layout.loops:
             return None
         dtype = rows.bias.dtype

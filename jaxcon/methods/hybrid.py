@@ -46,13 +46,14 @@ class Hybrid(checks.Checked, Stabilizer):
     C₁ and b₁ belong to the soft law, C₂ and b₂ to the feedback. Δq and Δv are the correction after
     the step. Φ is the norm of φ over all rows of the system, since a projection moves all bodies.
     The weights are ½ at the thresholds `soft_below` and `project_above`. At ten times a threshold,
-    the law below it has the weight 10⁻²ⁿ. Laws are blended, never switched, so gradients exist
-    everywhere. Velocity-level rows have no φ and follow `middle`. A failed projection stops its
-    world whatever its weight. A projection with a single iteration fails only if its solver fails.
+    the law that acts below it has the weight 10⁻²ⁿ. Laws are blended, never switched, so gradients
+    exist everywhere. Velocity-level rows have no φ and follow `middle`. A failed projection stops
+    its world, whatever the weight of the projection. A projection with a single iteration fails
+    only if its solver fails.
 
     Attributes:
         small: the stabilizer for small violations, an implicit `Penalty`.
-        middle: the stabilizer for the middle; its default gains are at most 50/s.
+        middle: the stabilizer for medium violations; its default gains are at most 50/s.
         large: the stabilizer whose `correct` acts on large violations, or None.
         soft_below: threshold on ‖φ‖ below which constraints are soft.
         project_above: threshold on Φ above which the state is projected.

@@ -259,10 +259,10 @@ def newton_correction(
     weight 0, so rounding errors divided by h² do not affect them.
 
     The correction fades out if the arms and axes of a row turn by 1 to √2 rad. It also fades out if
-    its kinetic energy is ¼ to ½ of the motion's, as near a singular configuration. A Newton step
-    from so far away is useless. A body in space may spin about its arm by 4 rad in a step. A change
-    Δω turns the end of such a body by dexp_{hω} Δω h; the correction is multiplied by the inverse
-    of that map.
+    its kinetic energy is ¼ to ½ of the motion's, as near a singular configuration. For such large
+    errors Newton steps are useless. A body in space may spin about its arm by 4 rad in a step. A
+    change Δω turns the end of such a body by dexp_{hω} Δω h; the correction is multiplied by the
+    inverse of this map.
 
     The correction changes the velocities of friction and motor rows by e/h, so they miss their
     targets. For bodies in space, this holds for all inequality rows. In the plane, islands on which

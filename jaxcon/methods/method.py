@@ -54,7 +54,7 @@ OPTIONAL = ("recovery", "contact_solver", "events")
 
 @pytree
 class Method:
-    """An integrator, a stabilizer and solvers; the defaults suit scenes that are not tuned.
+    """An integrator, a stabilizer and solvers; the defaults are for use without tuning.
 
     Attributes:
         integrator: `SemiImplicitEuler()`, `Heun()`, `RK4()`, or any `RungeKutta(a, b)`; `RATTLE()`
@@ -102,10 +102,10 @@ class Method:
 
         If M is diagonal, the choice is `Sparse()`, elimination along the structure. It is `Schur()`
         (dense matrices) if elimination needs more operations or too long a program. It is
-        `ConjugateGradients()` if both of these need twenty times its operations, or more memory
-        than allowed. If M is not diagonal, the choice is `Schur()`. `RankSafe` wraps the solver if
-        constraints close loops or are linearly dependent in this state. The choice is
-        deterministic.
+        `ConjugateGradients()` if both elimination and dense matrices need more than twenty times
+        the operations of the iterations, or too much memory. If M is not diagonal, the choice is
+        `Schur()`. `RankSafe` wraps the solver if constraints close loops or are linearly dependent
+        in this state. The choice is deterministic.
 
         Args:
             system: a `BodySystem`, `GeneralizedSystem` or `Vakonomic`.
@@ -260,7 +260,7 @@ class Method:
         return None
 
     def __post_init__(self) -> None:
-        """Checks that each field has a value of its kind; each value checks its own numbers.
+        """Checks that each field has an instance of a suitable class, but not the numbers in it.
 
         Raises:
             TypeError: a field has a class or a name, not a value like `RK4()`, or its class does

@@ -74,7 +74,7 @@ class AugmentedLagrangian(checks.Checked, Wrapper):
     τ g ≤ h/2 for small σ, and g is 1 for large σ. Steps are stable for every stiffness and σ if the
     gains are stable for rigid rows.
 
-    The derivative is that of the rounds. Rotors constrain nothing and are solved directly.
+    Derivatives are those of the computed rounds. Rotors constrain nothing and are solved directly.
     Contradictory rows are satisfied in the least-squares sense. If the residual exceeds a quarter
     of b, `RankSafe` solves once more to test whether b can be met. If it cannot, the status is
     CONFLICT.
@@ -165,7 +165,7 @@ class AugmentedLagrangian(checks.Checked, Wrapper):
         return Held(zeros_by_row(system, q, v), self.feedback.init(system, q, v))
 
     def advance(self, rows: Rows, memory: Held, dt: Array) -> Held:
-        """Returns the memory with that of the feedback advanced; the multipliers do not change."""
+        """Advances the memory of the feedback; the multipliers do not change."""
         return memory._replace(feedback=self.feedback.advance(rows, memory.feedback, dt))
 
     def remember(self, memory: Held, solution: Solution) -> Held:

@@ -34,8 +34,8 @@ class Penalty(checks.Checked, Wrapper):
     A single row is stable for every k and d. For k → ∞ it is the rigid constraint, with an error
     that vanishes in one step. s is increased by ε/A_ii; ε is the relative precision and 1/A_ii the
     effective mass of the row. With k = d = 0 a body is therefore free except for a damper that
-    removes the fraction ε of φ̇ in a step. The gradients with respect to k and d are finite there,
-    and are those of the spring.
+    removes the fraction ε of φ̇ in a step. At k = d = 0, the gradients with respect to k and d are
+    finite and equal those of the spring.
 
     Explicit springs apply λ as a force, computed from φ and φ̇ at the start of the step and at each
     stage. With semi-implicit Euler this is stable only for k < 4 m/h². Both kinds report λ.
@@ -149,7 +149,7 @@ class Penalty(checks.Checked, Wrapper):
         return soft
 
     def constants(self, rows: Rows) -> tuple[Array, Array]:
-        """Returns the stiffness k and the damping d of each row, (n_c,); arbitrary if rigid."""
+        """Returns the stiffness k and damping d of each row, (n_c,); unused for rigid rows."""
         if self.time is None:
             k, d = (by_row(x, 0.0, rows, "Penalty") for x in (self.stiffness, self.damping))
         else:

@@ -110,10 +110,10 @@ class Projection(checks.Checked, Stabilizer):
             floating-point spacing is finer.
         iterations: the largest number of quasi-Newton iterations d ← d − factor · S φ(q* ⊕ d),
             where S b is the smallest step with J₀ d = b. They end when the error is at rounding
-            level. Each iteration multiplies the error by about the distance of q* from the point of
-            J₀, relative to the size of the scene. About six suffice after a step of 0.01 rad; a
-            step of 1 rad needs all. One iteration is the linearized projection, which leaves an
-            error of O(‖d‖²) and is differentiated as computed.
+            level. Each iteration multiplies the error by about the distance of q* from the
+            configuration of J₀, relative to the size of the scene. About six suffice after a step
+            of 0.01 rad; a step of 1 rad needs all. One iteration is the linearized projection,
+            which leaves an error of O(‖d‖²) and is differentiated as computed.
         tolerance: the allowed max |φ|, a number or a `Tolerance`. Iterations of a world stop at
             this tolerance; the status is NOT_CONVERGED if it is exceeded at the end. If None,
             iterations stop at 2 ε (1 + max |x|) over all positions x, and the status is

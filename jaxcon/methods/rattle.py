@@ -35,8 +35,8 @@ class RATTLE(checks.Checked, Integrator):
     For bodies that turn in space, (dexp⁻¹_{hΩ})ᵀ IΩ = IΩ + (h/2) Ω × IΩ + c h² Ω × (Ω × IΩ); for
     all others p± = M V. The map from (q, v) to (q⁺, v⁺) derives from a discrete Lagrangian. It is
     therefore symplectic, reversible and of second order, and the energy error stays bounded.
-    Momenta of symmetries, φ = 0 and φ̇ = 0 are conserved up to rounding. A body must turn by less
-    than one whole turn a step.
+    Momenta that belong to symmetries are conserved, and φ = 0 and φ̇ = 0 hold, up to rounding. A
+    body must turn by less than one whole turn a step.
 
     Quasi-Newton iterations find V and λ together with one factorization of [M, −Jᵀ; J, 0] at q.
     Each iteration multiplies the error by about half of the angle by which bodies turn in a step.

@@ -53,8 +53,8 @@ class Recovery(checks.Checked):
 
     The feedback gets r² φ and r φ̇ in place of φ and φ̇, which works for any feedback. Springs of a
     `Penalty` do not change. An integrator that satisfies constraints by itself has no feedback to
-    relax; only projection and damping can help it. If the step fails again, or the state before it
-    violates the limit, the state is also projected to the nearest valid configuration. After
+    relax; only projection and damping can help it. If the step fails again, or the state before the
+    step violates the limit, the state is also projected to the nearest valid configuration. After
     `retries` consecutive failures, the failure is final. It is final at once if the state before
     the step is not finite.
 
@@ -171,7 +171,11 @@ class Recovery(checks.Checked):
             wanted: Array,
             dt: Array,
         ) -> tuple[State, Array]:
-            """Returns the projected state, and a failure status if unwanted or not finite."""
+            """Returns the projected state and a status.
+
+            The status is a failure if the projection fails, if its result is not finite, or if the
+            world needs no projection (`wanted` is False).
+            """
             new, code = projector.correct(system, solver, state, state, (), dt)
             finite = jnp.where(is_finite(new), Status.OK, Status.NON_FINITE).astype(jnp.int32)
             code = jnp.where(wanted, first(code, finite), Status.NOT_CONVERGED)
@@ -204,7 +208,7 @@ class Recovery(checks.Checked):
 
 @pytree
 class Relaxed(Wrapper):
-    """A stabilizer with all rates multiplied by r: it gets r² φ and r φ̇.
+    """A stabilizer with all rates multiplied by r: the inner one gets r² φ and r φ̇.
 
     Attributes:
         stabilizer: the inner stabilizer.

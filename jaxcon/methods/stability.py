@@ -33,7 +33,7 @@ MARGIN = 1e-9
 """Growth of an error per step that counts as marginal, not as unstable."""
 
 SLOW = 1e-3
-"""Growth of springs per step that counts as marginal: many explicit methods amplify slowly."""
+"""Growth of springs per step that counts as marginal: many explicit methods amplify slightly."""
 
 
 def largest_stable_rate(integrator: Integrator, dt: float, damping_ratio: float = 1.0) -> float:
@@ -101,9 +101,9 @@ def stable_rate(integrator: Integrator, dt: Array, least_ratio: float) -> Any:
 def growth(
     integrator: Integrator, alpha: float, beta: float, integral: float, dt: float
 ) -> float | None:
-    """Returns the spectral radius of a step on (φ, φ̇, ∫φ), for gains α, β and K_i; or None.
+    """Returns the spectral radius of a step on (φ, φ̇, ∫φ), for gains α, β and K_i.
 
-    It is None of an integrator that does not tell its growth.
+    The result is None for an integrator whose `growth` returns None.
 
     The error obeys φ̈ + 2α φ̇ + β² φ + K_i ∫φ = 0. The integral is constant during a step, and
     advances by h φ after it.
@@ -154,7 +154,7 @@ def instability(
 
 
 def default_gains(method: Method, dt: Array) -> tuple[Scalar, Scalar]:
-    """Returns default gains (α, β) [1/s]: those of the stabilizer, else of the integrator.
+    """Returns default gains (α, β) [1/s]: the stabilizer's `fallback`, else the integrator's.
 
     Args:
         method: method with the integrator and the stabilizer.

@@ -254,9 +254,9 @@ def wrench(
     Forces of inequality constraints are averages over the step. Forces of equality constraints
     include the stabilizer's feedback; `jc.reaction` excludes it.
 
-    An `info` knows its system until JAX rebuilds it: as the result of `jit`, `vmap` or a rollout,
-    by `info[10]`, `jax.tree.map` or from a pickle. Then give `system=`. In a rollout, record the
-    wrench: `record=lambda state, info: jc.wrench(info, "hinge")`.
+    An `info` has its system until JAX rebuilds it. Results of `jit`, `vmap` and rollouts, and
+    results of `info[10]`, `jax.tree.map` and unpickling have no system: give `system=`. In a
+    rollout, record the wrench: `record=lambda state, info: jc.wrench(info, "hinge")`.
 
     Args:
         info: the info returned by `jc.step` or recorded by `jc.rollout`, or the result of
@@ -418,13 +418,13 @@ def multipliers(info: StepInfo | SolutionAt, name: str) -> Array:
 def _bodies_of(
     info: StepInfo | SolutionAt, system: BodySystem | None, caller: str, arguments: str
 ) -> BodySystem:
-    """Returns the system of an info, or the one given.
+    """Returns the given system, or the system of the info if none is given.
 
     Args:
         info: the info.
-        system: the system that the user gives; None for that of the info.
+        system: the system that the user gives; None to take the system of the info.
         caller: name of the public function, for messages.
-        arguments: of the public function, for messages.
+        arguments: the arguments of the public function, for messages.
 
     Raises:
         ValueError: the info knows no system, and none is given.
@@ -452,7 +452,7 @@ def _bodies_of(
 def _over_leading_axes(
     read: Callable[[StepInfo | SolutionAt], Array], info: StepInfo | SolutionAt
 ) -> Array:
-    """Applies a reader of the info of one world to an info with leading axes."""
+    """Applies a function of the info of one world to an info with leading axes, by vmap."""
     for _ in info.status.shape:
         read = jax.vmap(read)
     return read(info)

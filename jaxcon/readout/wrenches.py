@@ -1,8 +1,8 @@
 """Forces of a step by name: the wrench of each constraint, limit, contact and force element.
 
-An element acts on a body by a generalized force: Jᵀλ of its rows, or what a force element exerts.
-In space that is (F, Rᵀτ), F in the world frame and the torque about the center of mass x in the
-body frame. About a point p of the world the torque is τ + (x − p) × F.
+An element acts on a body by a generalized force: Jᵀλ of its rows, or the force of a force element.
+In space, the generalized force is (F, Rᵀτ): the force F in the world frame, and the torque τ about
+the center of mass x, rotated to the body frame. About a point p, the torque is τ + (x − p) × F.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ def wrench_in(
 
     Args:
         system: the system of the state.
-        info: of one world, with its state and control.
+        info: the info of one world, with its state and control.
         name: name of the element.
-        body: name of the body; by default the last of the element.
+        body: name of the body; by default the element's last body.
 
     Raises:
         ValueError: the element is unknown, or does not act on the body.
@@ -83,7 +83,7 @@ def wrench_in(
 
 def _sides(group: Any, layout: Layout) -> list[tuple[str, ...]]:
     """Returns the names of the bodies on each side of a group, one for each element."""
-    if isinstance(group, CustomForces):  # what acts on a fixed body is not computed
+    if isinstance(group, CustomForces):  # forces on fixed bodies are not computed
         return [(body,) for body in group.law.bodies if body in layout.places]
     if isinstance(group, Custom):
         return [(body,) for body in group.law.bodies]
@@ -97,9 +97,9 @@ def _sides(group: Any, layout: Layout) -> list[tuple[str, ...]]:
 
 @functools.lru_cache(maxsize=256)
 def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Array]]:
-    """Returns a function of the wrenches (d, element) on each moving side of one group.
+    """Returns a function that computes the wrenches of one group, (d, element) by moving side.
 
-    They are zeros without a gradient in failed worlds.
+    In failed worlds, wrenches and their gradients are zero.
     """
 
     def blocks(
@@ -116,7 +116,7 @@ def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Arra
             pulls = _of_equalities(snapshot, group, layout, multipliers)
         elif kind == "bounds":
             assert reactions is not None
-            dt = jnp.ones_like(state.time)  # on which the directions of forces do not depend
+            dt = jnp.ones_like(state.time)  # any value: directions of forces do not depend on it
             rows = group.bounds(snapshot, control, dt)
             pulls, anchors = _of_inequalities(group, rows, reactions), rows.place
             if rows.points is not None:
@@ -151,10 +151,10 @@ def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Arra
 def _of_equalities(
     snapshot: Snapshot, group: Constraint, layout: RowLayout, multipliers: Array
 ) -> list[Pull]:
-    """Returns Jᵀλ of a group by its bodies."""
+    """Returns the generalized forces Jᵀλ of a group of constraints, for each moving side."""
     rows = group.rows(snapshot)
     λ = []
-    if rows:  # a joint may be there to be read and driven only
+    if rows:  # a joint without rows, such as a Span, only measures a coordinate
         numbers = np.stack([layout.rows(name) for name in group.names])
         λ = list(jnp.moveaxis(multipliers[numbers], 1, 0))
     moving = [(side, place) for side, place in enumerate(group.places) if place.group is not None]
@@ -162,7 +162,7 @@ def _of_equalities(
 
 
 def _of_inequalities(group: Any, rows: BoundSet, reactions: Reactions) -> list[Pull]:
-    """Returns Jᵀλ of a group by its bodies; sums the forces at several points of an element."""
+    """Returns Jᵀλ of a group for each moving side; sums over the contact points of an element."""
     points, every = rows.points or 1, (*rows.rows, *rows.rolls, *rows.spins)
     numbers = np.stack([reactions.layout.rows(name) for name in group.names])
     numbers = numbers.reshape(-1, len(every))
@@ -182,7 +182,7 @@ def _of_inequalities(group: Any, rows: BoundSet, reactions: Reactions) -> list[P
 
 def _sum(multipliers: list[Array], pulls: list[Vector]) -> Vector:
     """Returns Σ λ_r J_r over rows, lanes (element,); an empty vector without rows."""
-    if not pulls:  # a joint may be there to be read and driven only
+    if not pulls:  # a joint without rows, such as a Span
         return Vector()
     rows = [[times(x, λ) for x in pull] for λ, pull in zip(multipliers, pulls, strict=True)]
     zero = jnp.zeros_like(multipliers[0])
@@ -190,7 +190,7 @@ def _sum(multipliers: list[Array], pulls: list[Vector]) -> Vector:
 
 
 def _wrenches(snapshot: Snapshot, pulls: list[Pull], anchor: Vector | None) -> Iterator[Array]:
-    """Yields (F, τ) about the anchors, else about the centers of mass, (d, element) by side."""
+    """Yields (F, τ) of each side, (d, element), about anchors or, if None, centers of mass."""
     layout, like = snapshot.system.layout, snapshot.q[:1]
     dim = layout.dim
     for place, pull in pulls:

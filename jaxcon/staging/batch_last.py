@@ -1,22 +1,22 @@
-"""Native functions: `vmap` moves the batch to the last axis and calls them once.
+"""Native functions: `vmap` calls them once, with the whole batch along the last axis.
 
 A function written with lanes takes arrays with any number of trailing batch axes, and each of its
 operations is one loop over contiguous memory. Plain `jax.vmap` puts the batch first and rewrites
 every instruction, so that small matrices are processed one by one. `call` wraps the function in a
 primitive whose batching rule passes the whole batch along the last axis.
 
-The lowering rule for CPUs is also the place where a function is cut into stages. Without stages XLA
-computes shared values again in each kernel that needs them: a chain of 5 links then runs at 0.054
-instead of 2.9 million steps a second (two cores, a batch in the hundreds). See `fusion`.
+On CPUs, the lowering rule also cuts a function into stages. Without stages, XLA computes shared
+values again in each kernel that needs them: a chain of 5 links then runs at 0.054 instead of 2.9
+million steps a second (two cores, a batch in the hundreds). See `fusion`.
 
 The derivative of a native function is a native function, too. The rules below bind the same
-primitive again, for the tangent map and for its transpose. So `grad`, `jvp`, `vmap(grad)`,
-`grad(vmap)`, `hessian` and `scan` compose with it and stay native.
+primitive again, for the tangent map and for its transpose. So native functions compose with `grad`,
+`jvp`, `vmap(grad)`, `grad(vmap)`, `hessian` and `scan`, and the results are native.
 
 An argument that is not mapped gets a trailing axis of size 1, and the function broadcasts it: a
 parameter shared by all worlds is read once. The transpose of that broadcast is a sum over worlds.
-It is right when `grad` is outside `vmap`, and wrong when it is inside. Therefore a batched
-transposed map returns one cotangent for each world, whatever its arguments share.
+The sum is right for `grad(vmap(f))`, and wrong for `vmap(grad(f))`. Therefore a batched transposed
+map returns one cotangent for each world, also for arguments that the worlds share.
 
 The reverse pass keeps only the arguments of each call. A call is a checkpoint, and its derivative
 evaluates the function once more.
@@ -46,18 +46,18 @@ from jaxcon.staging import fusion, meshes
 from jaxcon.staging.worlds import broadcast_worlds
 
 FEW = 64
-"""The largest size of a known array that becomes a constant of the program."""
+"""The largest number of entries of a concrete array that becomes a constant of the program."""
 
-# Set while `Tangent` traces a derivative, read by the custom JVP rule in `failure`. JAX calls that
-# rule from inside its tracing, with a fixed signature, so that no argument can carry the order.
+# Set while `TangentNative` traces a derivative, read by the custom JVP rule in `failure`. JAX calls
+# that rule from inside its tracing, with a fixed signature: no argument can carry the order.
 _ORDER = ContextVar("order", default=0)
 
-# Set while `Transposed` traces, read by `_stopped`. JAX calls transpose rules with a fixed
+# Set while `TransposedNative` traces, read by `_stopped`. JAX calls transpose rules with a fixed
 # signature.
 _TRANSPOSED = ContextVar("transposed", default=False)
 
-# Set around the loop of a rollout, read in `call`. Between them are the adjoint's scan, which users
-# may replace, and reverse passes that JAX traces: an argument would have to pass through all.
+# Set around the loop of a rollout, read in `call`. An argument instead would have to pass through
+# the adjoint's scan, which users may replace, and through reverse passes that JAX traces.
 _CONSTANTS = ContextVar("constants", default=True)
 
 
@@ -85,7 +85,7 @@ class Native:
 
     Attributes:
         function: (arrays) → list of arrays.
-        staged: True if it and its derivatives may be cut into stages.
+        staged: True if the function and its derivatives may be cut into stages.
     """
 
     def __init__(self, function: Callable[..., Any], staged: bool = True) -> None:
@@ -105,27 +105,28 @@ class Native:
         return self(*args) if jax.config.values["jax_disable_jit"] else self.compiled(*args)
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
-        """Shapes and dtypes of the results, from the trace that `_in_stages` uses, too."""
+        """Returns shapes and dtypes of the results, by the trace that `_in_stages` reuses."""
         avals = self.traced(*(((*x.shape, 1), x.dtype) for x in args)).out_avals
         return [ShapedArray(y.shape[:-1], y.dtype) for y in avals]
 
     def traced(self, *avals: Aval) -> ClosedJaxpr:
-        """The closed jaxpr for arguments of these shapes and dtypes, under JAX's current settings.
+        """Returns the closed jaxpr for these shapes and dtypes, under JAX's current settings.
 
-        Operations keep the mesh and the default precision under which they were traced.
+        The cache distinguishes settings, because operations keep the mesh and the default precision
+        under which they were traced.
         """
         mesh, real = jax.sharding.get_abstract_mesh(), jnp.result_type(float)
         return self.among((mesh, real, notices.is_observing()), *avals)
 
     def _among(self, settings: tuple[Any, ...], *avals: Aval) -> ClosedJaxpr:
-        """`_traced`; the settings are a key of the cache."""
+        """Returns `_traced(*avals)`; `settings` is only a part of the key of the cache."""
         return self._traced(*avals)
 
     def _traced(self, *avals: Aval) -> ClosedJaxpr:
-        """The closed jaxpr for arguments of these shapes and dtypes.
+        """Returns the closed jaxpr for arguments of these shapes and dtypes.
 
         Raises:
-            TypeError: a user's function holds a traced value that is not among the arguments; its
+            TypeError: a user's function closes over a traced value, with respect to which the
                 derivative would silently be zero.
         """
         with meshes.apart():
@@ -140,7 +141,10 @@ class Native:
 
 
 class TangentNative(Native):
-    """The tangent map (x, ẋ of the moved arguments) → tangents of the floating results."""
+    """The tangent map of a native function: (x, ẋ) → tangents of the floating results.
+
+    x has all arguments. ẋ has the tangents of the arguments whose flag `moved` is True.
+    """
 
     def __init__(self, whole: Native, moved: tuple[bool, ...]) -> None:
         super().__init__(self._along, whole.staged)
@@ -148,7 +152,7 @@ class TangentNative(Native):
         self.places = [i for i, flag in enumerate(moved) if flag]
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
-        """Returns the shapes of the floating results, from the trace of the whole."""
+        """Returns the shapes of the floating results, by the trace of the whole function."""
         given: list[Any] = list(args[: self.count])
         for i, x in zip(self.places, args[self.count :], strict=True):
             shape = jnp.broadcast_shapes(x.shape, given[i].shape)
@@ -173,13 +177,13 @@ class TangentNative(Native):
 
 
 class TransposedNative(Native):
-    """The transpose (other arguments, ȳ) → cotangents of the linear arguments.
+    """The transpose of a native function: (other arguments, ȳ) → cotangents of linear arguments.
 
     Attributes:
         whole: the function.
-        linear: True for each argument in which it is linear.
-        avals: shapes and dtypes of these, without batch axes that are added later.
-        rank: of the first ȳ without such axes.
+        linear: for each argument, True if the function is linear in it.
+        avals: shapes and dtypes of the linear arguments, without batch axes that are added later.
+        rank: the number of axes of the first ȳ, without such batch axes.
     """
 
     def __init__(
@@ -218,7 +222,7 @@ class TransposedNative(Native):
 
 
 class PartialNative(Native):
-    """Some of the results of a native function; its trace is a part of the whole's."""
+    """A native function that returns some of the results of another, and reuses its trace."""
 
     def __init__(self, whole: Native, wanted: tuple[bool, ...]) -> None:
         super().__init__(self._chosen, whole.staged)
@@ -246,7 +250,11 @@ native_p.multiple_results = True
 
 
 def bound(args: Iterable[Any], fun: Native) -> list[Array]:
-    """Binds a native function, which may contain conditions on worlds; see `somewhere.asking`."""
+    """Binds the primitive with a native function.
+
+    The parameter `asks` tells JAX that the function may contain conditions on worlds; see
+    `somewhere.asking`.
+    """
     return native_p.bind(*args, fun=fun, asks=asking())
 
 
@@ -254,7 +262,7 @@ class Known(NamedTuple):
     """An array that is a constant of the program, compared by value.
 
     Attributes:
-        shape: of the array.
+        shape: the shape of the array.
         dtype: the name of its dtype.
         data: its bytes.
     """
@@ -264,13 +272,13 @@ class Known(NamedTuple):
     data: bytes
 
     def lanes(self, axes: int) -> Array:
-        """The array with this number of trailing axes of size 1, as a value of the trace."""
+        """Returns the array with trailing axes of size 1 added, as a constant of the trace."""
         value = np.frombuffer(self.data, self.dtype).reshape((*self.shape, *(1,) * axes))
         return jax.lax.stop_gradient(jnp.asarray(value))
 
 
 def _known(x: Scalar) -> Known | None:
-    """The value of a concrete array of at most `FEW` numbers; None for others."""
+    """Returns the value of a concrete array of at most `FEW` numbers; None for other leaves."""
     if isinstance(x, Tracer) or np.size(x) > FEW:
         return None
     dtype = jnp.result_type(x)
@@ -282,10 +290,10 @@ def _known(x: Scalar) -> Known | None:
 
 @contextmanager
 def as_it_is_called() -> Iterator[None]:
-    """Known values do not become constants of loops inside, unless the caller is traced itself.
+    """Within this context, known values become constants only if the caller is itself traced.
 
-    JAX traces the body of a loop also where the loop runs at once. Other values must not cause
-    another compilation there.
+    JAX traces the body of a loop even if the loop is called outside `jit`. Known values then stay
+    arguments, so that calling the loop with other values does not compile it again.
     """
     with during(_CONSTANTS, _CONSTANTS.get() and _is_tracing()):
         yield
@@ -303,10 +311,11 @@ def _native(
     known: tuple[Known | None, ...],
     staged: bool,
 ) -> tuple[Native, list[Any]]:
-    """The function of the leaves that are not `known`, of which there is at least one.
+    """Returns a native function of the leaves that are not `known`, and a list of one entry.
 
-    It comes with a list whose entry becomes the tree structure of the result during tracing. The
-    static data of a result may depend on shapes, such as the number of rows.
+    At least one leaf must not be known. The entry of the list becomes the tree structure of the
+    result during tracing, because the static data of a result may depend on shapes, such as the
+    number of rows.
     """
     # a primitive returns arrays only, and JAX traces it from its own rules. The structure is known
     # once `flat` runs; `jax.eval_shape` would find it before, but trace the function twice
@@ -325,21 +334,22 @@ def _native(
 
 _shared = functools.lru_cache(maxsize=256)(_native)
 _with_constants = functools.lru_cache(maxsize=64)(_native)
-"""A cache of its own, since each set of constant values makes another function."""
+"""`_native` with a separate cache, since each set of constant values makes another function."""
 
 
 def call(function: Callable[..., T], *args: PyTree, staged: bool = True) -> T:
-    """Calls function(*args), batched natively under `vmap`.
+    """Calls function(*args); `vmap` calls it once, with the whole batch along the last axis.
 
     During tracing, small arrays with known values become constants of the function. The compiler
     then removes trivial operations, such as a product with 1.
 
     Args:
-        function: pure, defined once; takes pytrees of arrays and returns one. Given trailing batch
-            axes on all leaves (of the batch's size or of size 1) it must return them on all
-            results.
+        function: a pure function from pytrees of arrays to a pytree of arrays. It should be defined
+            once, since it is cached by identity. If all leaves of its arguments have trailing
+            batch axes (of the batch's size or of size 1), all its results must have them.
         args: pytrees of arrays.
-        staged: True if it may be cut into stages; False for users' functions of any operations.
+        staged: True if the function may be cut into stages; False for users' functions, which may
+            contain any operations.
 
     Returns:
         The result of the function.
@@ -363,7 +373,7 @@ def is_real(x: Array | ShapedArray | jax.ShapeDtypeStruct) -> bool:
 
 
 def _abstract(*args: ShapedArray, fun: Native, asks: ClosedJaxpr) -> list[Any]:
-    """The types of the results."""
+    """Returns the types of the results."""
     return meshes.typed(fun.shapes(args), args)
 
 
@@ -416,13 +426,13 @@ def _transpose(
 def _in_stages(*args: Array, fun: Native) -> list[Array]:
     """Runs the function in stages, on arrays with a further last axis of size 1.
 
-    XLA lets LLVM unroll loops over the last axis of an array. Without this axis that takes up to
-    half of the compile time, and makes the vectorized code no faster.
+    XLA lets LLVM unroll loops over the last axis of an array. Without the further axis, unrolling
+    takes up to half of the compile time, and makes the vectorized code no faster.
     """
     lanes = [jnp.expand_dims(x, -1) for x in args]
     if not (fun.staged and fusion.staged()):
         return squeezed(*fun(*lanes))
-    # `squeezed` is a stage: if it were inlined, XLA would copy the results to move the batch first
+    # `squeezed` is a stage: if it were inlined, XLA would copy results to move their axes
     return fusion.run_staged(fun, lanes, squeezed)
 
 
@@ -448,12 +458,13 @@ def _stopped(cotangent: Array | ad.Zero, _: Array | ad.UndefinedPrimal) -> list[
     """The transpose rule of `stop_gradient` within native functions: zero.
 
     A batched `lax.cond` evaluates each branch in all worlds, and applies `stop_gradient` to the
-    operands of worlds that take another branch, tangents included. JAX has no transpose of it
-    (jax-ml/jax#39219). The cotangents of those worlds are zero, and must not meet infinite numbers
-    of that branch. If a user's own derivative stops a tangent, it is zero in reverse mode only.
+    operands of worlds that take another branch, tangents included. JAX has no transpose rule for
+    `stop_gradient` (jax-ml/jax#39219). The cotangents of those worlds are zero, and must not be
+    multiplied by infinite derivatives of the branch. If a user's own derivative rule stops a
+    tangent, this tangent counts as zero in reverse mode only.
 
     Raises:
-        NotImplementedError: outside native functions, as without this rule.
+        NotImplementedError: the call is outside native functions, where JAX itself has no rule.
     """
     if not _TRANSPOSED.get():
         raise NotImplementedError(
@@ -467,8 +478,8 @@ def _without_unused(
 ) -> tuple[list[bool], JaxprEqn | None]:
     """The rule for dead code: removes unused results and the work for them.
 
-    The last argument is the equation. From JAX 0.12 on another one precedes it, about references
-    that are read later; native functions have none.
+    The last argument is the equation. From JAX 0.12 on, an argument about references that are read
+    later precedes it; native functions have no references.
     """
     equation: Any = context[-1]
     if not any(wanted):

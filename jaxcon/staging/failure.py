@@ -22,13 +22,13 @@ def mask_failed_gradients(function: Callable[..., T], args: PyTree) -> T:
 
     A forward `where` is not enough: the transpose of a NaN derivative multiplies a zero cotangent
     by NaN. So tangents are masked on both sides of the linearized function, T ↦ P (f′ (P T)) with
-    P = 1 in healthy worlds and 0 in failed ones. Its transpose is masked on both sides as well, and
-    gradients of parameters shared between worlds are those of the healthy worlds. In second
-    derivatives, the derivative by the point of linearization is masked, too.
+    P = 1 in healthy worlds and 0 in failed ones. The transpose is then masked on both sides, too:
+    healthy worlds alone contribute to gradients of parameters that worlds share. In second
+    derivatives, the derivative with respect to the point of linearization is masked as well.
 
     Args:
-        function: returns a pytree and the status of the world, ().
-        args: a pytree of its arguments.
+        function: a function that returns a pytree and the status of the world, ().
+        args: the arguments of the function, a tuple of pytrees.
 
     Returns:
         The result of the function.

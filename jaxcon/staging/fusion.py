@@ -6,11 +6,11 @@ chain of shared values: frames, Jacobians, factors, solutions. Its kernels would
 work a thousand times over. Without staging, a chain of 5 links runs at 0.054 million steps a second
 (two cores, a batch in the hundreds). With staging it runs at 2.9 million.
 
-Optimization barriers do not help, because XLA removes them before it forms kernels. A call that may
-not be inlined does. `run_staged` therefore cuts a function into stages, and each stage is such a
-call. It computes values that do not depend on each other, and later stages read them from cache.
-All stages together are one kernel on one thread, so that no time is lost on launching kernels and
-passing them between threads.
+Optimization barriers do not help, because XLA removes them before it forms kernels. Calls that XLA
+must not inline do help. `run_staged` therefore cuts a function into stages, and each stage is such
+a call. A stage computes values that do not depend on each other, and later stages read them from
+cache. All stages together are one kernel on one thread, so that no time is lost on launching
+kernels and passing them between threads.
 
 The attributes of these calls are hints to XLA's call inliner and CPU emitter, as of jaxlib 0.10. A
 compiler that does not know them gives the same results more slowly. The environment variable
@@ -45,14 +45,14 @@ if TYPE_CHECKING:
     from jaxcon.staging.batch_last import Native
 
 WORTH = 3
-"""The number of operations from which storing a shared value pays off."""
+"""The smallest number of operations for which storing a shared value pays off."""
 
 KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 """The attributes of calls that XLA must not inline."""
 
 
 def _names(text: str) -> frozenset[str]:
-    """The words of a text."""
+    """Returns the words of a text."""
     return frozenset(text.split())
 
 
@@ -60,10 +60,10 @@ MOVES = _names(
     "reshape squeeze expand_dims slice rev transpose broadcast_in_dim convert_element_type iota"
     " dynamic_slice"
 )
-"""Operations that only move data: kernels read through them."""
+"""Operations that only move data: kernels read their operands directly."""
 
 MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice")
-"""Primitives whose result has entries from other positions of the operand."""
+"""Primitives whose result has the entries of the operand at other positions."""
 
 ARITHMETIC = _names(
     "add sub mul neg abs sign square integer_pow max min and or not xor eq ne lt le gt ge"
@@ -84,31 +84,31 @@ OTHERS = _names(
 
 
 LIGHT = 1.5e5
-"""The cost in `Stages.is_light` from which a call with one result gets a second one.
+"""The estimated cost below which a call is light; see `Stages.is_light` and `uninlined`.
 
 XLA splits a computation among threads if it estimates a cost of 2e5 or more: ten for each byte read
-or written, one for each operation on a number, and two for each transcendental one.
+or written, one for each operation on a number, and two for each transcendental operation.
 """
 
 MOST = 130
-"""The most steps in one kernel; compile time grows faster than the size of a kernel."""
+"""The largest number of steps in one kernel; compile time grows faster than a kernel's size."""
 
 FEW_PARTS = 8
 """Branches with loops stay out of kernels only if the program then has at most this many parts.
 
 XLA runs a sequence of more than eight launches on several threads, which costs microseconds. A
-rollout adds two or three launches of its own. The Stewart platform has seven parts then, and still
-runs faster.
+rollout adds two or three launches of its own. With its branches outside of kernels, the Stewart
+platform has seven parts, and still runs faster.
 """
 
 PER_OPERAND = 20
-"""Instructions of branches with loops for each operand, above which they stay out of kernels.
+"""The number of instructions per operand above which branches with loops stay out of kernels.
 
 An untaken branch makes the kernel that holds it slower, by up to a quarter, and longer to compile.
-Outside, it costs launches, its operands are stored, and it runs slower where it is taken. Chains of
-links or particles have 15 to 17 instructions for each operand, take their branch often, and run
-faster with it in the kernel. Closed kinematic chains have 23 to 44, and run faster with it outside.
-All branches with loops of a program go together, by their mean.
+Outside of kernels, a branch costs launches, its operands are stored, and it runs slower when it is
+taken. Chains of links or particles have 15 to 17 instructions per operand, take their branch often,
+and run faster with the branch in the kernel. Closed kinematic chains have 23 to 44, and run faster
+with the branch outside. The mean over all branches with loops of a program decides for all of them.
 """
 
 Step = Operation | list[int]
@@ -146,8 +146,9 @@ class Stages:
     """A program as a sequence of stages and of operations outside of stages.
 
     Attributes:
-        parts: the steps of each kernel, with their values that later parts need. A step is an
-            operation, or the values that a stage computes.
+        parts: for each part, its steps, and those of their values that later parts need. A part is
+            a kernel, or one step outside of kernels. A step is an operation, or the values that a
+            stage computes.
     """
 
     def __init__(self, closed: ClosedJaxpr, apart: bool = False) -> None:
@@ -175,7 +176,7 @@ class Stages:
 
     @property
     def are_one_kernel(self) -> bool:
-        """True where one kernel may contain all of it."""
+        """True if one kernel can contain the whole program."""
         return len(self.parts) == 1 and all(map(_fits, self.parts[0][0]))
 
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
@@ -190,7 +191,7 @@ class Stages:
                 self._store_stage(values, step)
 
     def _store_stage(self, values: dict[int, Any], wanted: list[int]) -> None:
-        """Computes the values of a stage; light ones get a call each.
+        """Computes the values of a stage; each value that is light to compute gets its own call.
 
         A call with several results fills a table of their addresses, which costs more than a call.
         """
@@ -205,7 +206,7 @@ class Stages:
             self._store(values, others, self._evaluate, call)
 
     def _branch(self, step: Operation, values: dict[int, Any]) -> None:
-        """Computes the results of a condition; values that only it reads move into its branches."""
+        """Computes the results of a condition; its branches compute operands not yet computed."""
         index, *operands = step.inputs
         read = [x for x in operands if not isinstance(x, Constant)]
         leaves, _ = self.program.between(values, read)
@@ -235,7 +236,7 @@ class Stages:
         how: Callable[..., None],
         call: Callable[..., list[Array]],
     ) -> None:
-        """Computes values from known ones in a call of their own."""
+        """Computes the wanted values from known values, in one separate call."""
         leaves, _ = self.program.between(values, wanted)
 
         def compute(*given: Array) -> list[Array]:
@@ -247,7 +248,7 @@ class Stages:
         values.update(zip(wanted, results, strict=True))
 
     def is_light(self, known: Container[int], wanted: list[int]) -> bool:
-        """Returns True where XLA does not split the computation of these values among threads."""
+        """Returns True if XLA does not split the computation of these values among threads."""
         leaves, operations = self.program.between(known, wanted)
         sizes = self.program.sizes
         if not is_known([sizes[x] for x in (*leaves, *wanted)]):
@@ -258,7 +259,10 @@ class Stages:
         return cost < LIGHT
 
     def _may_overwrite(self, known: Container[int], wanted: list[int]) -> bool:
-        """Returns True where a result of a stage would fit in the place of moved data."""
+        """Returns True if a result of a stage has the size of an operand whose data it moves.
+
+        XLA might then write the result in place of the operand; see `_stage_with_arguments`.
+        """
         sizes = {self.program.sizes[x] for x in wanted}
         operations = self.program.between(known, wanted)[1]
         moved = (x for op in operations if op.name in MOVED for x in op.inputs)
@@ -266,17 +270,17 @@ class Stages:
 
 
 def work(name: str) -> int:
-    """An upper bound of the operations of XLA for a primitive on a number."""
+    """Returns an upper bound on the number of XLA operations of a primitive for each entry."""
     return 32 if name in COSTLY or name in ("integer_pow", "nextafter") else 4
 
 
 def worth_storing(program: Program) -> set[int]:
-    """The values that more than one kernel needs and that are costly to compute.
+    """Returns the values to store: those that several kernels need and that are costly to compute.
 
-    In a backward pass, a value is stored where two later kernels need it, or an operation outside
-    of kernels. In a forward pass, values that are cheap given the other stored ones are dropped
-    again. A row of an array that a loop changes in place is not cheap: a kernel that reads it after
-    the change would make the compiler copy the array.
+    A sweep backward over the operations selects values that two later kernels need, or that an
+    operation outside of kernels reads. A sweep forward drops values that are cheap to compute from
+    the other stored values. A row of an array that a loop changes in place is not cheap: a kernel
+    that reads it after the change would make the compiler copy the array.
     """
     stored, ends = _needed_twice(program)
     work: dict[int, frozenset[int]] = {}
@@ -297,7 +301,11 @@ def worth_storing(program: Program) -> set[int]:
 
 
 def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
-    """The values that several kernels need, and those that end a kernel in any case."""
+    """Returns the values that several kernels need, and the values that end a kernel.
+
+    A kernel ends at results of the program, and at values that an operation outside of kernels
+    reads, unless this operation is a condition whose branches can compute them.
+    """
     readers = program.readers()
     results = {x for x in program.outputs if not isinstance(x, Constant)}
     stored: set[int] = set()
@@ -323,7 +331,10 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
 
 
 def _in_stages(program: Program, stored: set[int]) -> list[Step]:
-    """The operations and stages in order; a value joins the last stage unless it depends on it."""
+    """Returns the operations and stages in order.
+
+    A stored value joins the last stage, unless it depends on that stage or on a later operation.
+    """
     steps: list[Any] = []
     last = -1  # stage
     made: dict[int, int] = {}
@@ -345,7 +356,7 @@ def _in_stages(program: Program, stored: set[int]) -> list[Step]:
 
 def _in_parts(steps: list[Step]) -> list[list[Step]]:
     """Groups steps into kernels of even size; a step that fits no kernel is a part of its own."""
-    # as many kernels as without the steps that fit none
+    # the size of kernels is chosen as if every step fitted into a kernel
     count = max(1, math.ceil(len(steps) / MOST))
     most = math.ceil(len(steps) / count)
     parts: list[list[Step]] = []
@@ -377,7 +388,10 @@ def _has_loop(op: Operation) -> bool:
 
 
 def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[Step], list[int]]]:
-    """The parts, each with its values that later parts or the results need."""
+    """Returns each part with those of its values that later parts or the results need.
+
+    Parts without such values or side effects are left out.
+    """
     made = [[x for step in part for x in _values(step)] for part in parts]
     known = {*program.inputs, *(x for part in made for x in part)}
     outputs = [x for x in program.outputs if not isinstance(x, Constant)]
@@ -392,7 +406,7 @@ def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[
 
 
 def _operations(program: Program, step: Step) -> list[Operation]:
-    """The operations that compute the values of a step."""
+    """Returns the operations that compute the values of a step."""
     return [step] if isinstance(step, Operation) else [program.makers[x] for x in step]
 
 
@@ -402,31 +416,34 @@ def _acts(part: list[Step]) -> bool:
 
 
 def _values(step: Step) -> list[int]:
-    """The values that a step computes."""
+    """Returns the values that a step computes."""
     return step.outputs if isinstance(step, Operation) else step
 
 
 def _fits(step: Step) -> bool:
-    """Returns True where a kernel may contain the step."""
+    """Returns True if a kernel may contain the step."""
     return not isinstance(step, Operation) or (step.name in OTHERS and step.plain)
 
 
 def _computes(op: Operation, name: int) -> bool:
-    """Returns True for an operand of a condition, which its branches can compute themselves."""
+    """Returns True if the value is an operand that the branches of a condition can compute.
+
+    The index of the branch must be computed before.
+    """
     return op.name == "cond" and op.inputs[0] != name
 
 
 def _elementwise(op: Operation) -> bool:
-    """Returns True where an operation is fused into the kernels that read it."""
+    """Returns True if an operation is fused into the kernels that read its result."""
     return op.plain and (op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY)
 
 
 def _kernel(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
     """Calls a function as one kernel.
 
-    XLA finds the buffers of a kernel by the operands of its instructions. It fails at an argument
-    that is no operand: a constant, or one whose results are not used. The barrier hides constants,
-    and all arguments go through a call that does nothing.
+    XLA finds the buffers of a kernel by the operands of its instructions. It fails if an argument
+    is no operand: a constant, or an argument that no result depends on. The barrier hides
+    constants, and a call that does nothing makes all arguments operands.
     """
 
     def kernel(*args: Array) -> list[Array]:
@@ -464,14 +481,14 @@ def uninlined(
 ) -> list[Array]:
     """Calls a function without inlining by XLA.
 
-    A single result gets a second, unused one, which the barrier keeps. Without it XLA would split a
-    costly call among threads, which is not possible inside a kernel. Each result is a buffer whose
-    address every call of the kernel looks up, so a light call goes without.
+    A call with a single result gets a second, unused result, which the barrier keeps. Otherwise XLA
+    would split a costly call among threads, which is not possible inside a kernel. Each result is a
+    buffer whose address every call of the kernel looks up, so light calls get no second result.
 
     Args:
         function: a function of arrays.
-        args: its arguments.
-        light: True where it is too cheap for XLA to split.
+        args: the arguments of the function.
+        light: True if the call is too cheap for XLA to split.
     """
 
     @functools.wraps(function)
@@ -487,7 +504,7 @@ def uninlined(
 
 
 def _settled_body(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, bool]:
-    """The body of a loop in stages, and True if all of it fits a kernel."""
+    """Returns the body of a loop or branch in stages, and True if all of it fits into a kernel."""
     inputs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in closed.jaxpr.invars]
     stages = Stages(closed)
     plain = all(_fits(step) for steps, _ in stages.parts for step in steps)

@@ -1,8 +1,9 @@
 """The placement of arrays on a mesh, which JAX keeps in their types.
 
-Inside `jax.shard_map` a type lists the mesh axes along which an array varies. On a mesh with
-explicit axes it tells how each array axis is split. Native functions are traced and compiled
-without both, as if all mesh axes were left to the compiler. `typed` adds them to the results.
+Inside `jax.shard_map`, a type lists the mesh axes along which an array varies. On a mesh with
+explicit axes, a type tells how each array axis is split. Native functions are traced and compiled
+without this information, as if all mesh axes were left to the compiler. `typed` adds it to the
+types of the results.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from jaxcon.core.typing import Array, T
 
 
 def together(tree: T) -> T:
-    """Puts all arrays of a tree on the mesh in use, with the same varying axes.
+    """Puts all arrays of a tree on the mesh in use, with equal sets of varying mesh axes.
 
-    The initial value of a loop needs this, since types must not change in it. The transpose is a
-    sum over devices. Calling this outside of a loop makes devices communicate once in the reverse
-    pass, not in every step.
+    The initial value of a loop needs this, since types must not change within a loop. The transpose
+    of this operation is a sum over devices. If it is called outside of a loop, devices communicate
+    once in the reverse pass, not in every step.
     """
     mesh = jax.sharding.get_abstract_mesh()
     if not (mesh.manual_axes or mesh.explicit_axes):
@@ -41,13 +42,13 @@ def together(tree: T) -> T:
 
 
 def _varies(aval: Any) -> frozenset[Any]:
-    """The mesh axes along which an array varies; JAX has renamed the attribute in 0.10."""
+    """Returns the mesh axes along which an array varies; JAX 0.10 has renamed the attribute."""
     return aval.manual_axis_type.varying if hasattr(aval, "manual_axis_type") else aval.vma
 
 
 @contextmanager
 def apart() -> Iterator[None]:
-    """Lets the compiler choose where arrays lie, along explicit mesh axes as well."""
+    """Makes explicit mesh axes automatic in this context: the compiler places all arrays."""
     mesh = jax.sharding.get_abstract_mesh()
     explicit = mesh.explicit_axes
     if not explicit:
@@ -60,14 +61,15 @@ def apart() -> Iterator[None]:
 
 
 def plain(aval: ShapedArray | jax.ShapeDtypeStruct) -> ShapedArray:
-    """A type with only a shape and a dtype."""
+    """Returns a type with a shape and a dtype, but no placement."""
     return ShapedArray(aval.shape, aval.dtype)
 
 
 def typed(results: Sequence[Any], args: Sequence[Any]) -> list[ShapedArray]:
-    """The types of the results of a native function, placed as its arguments are.
+    """Returns the types of the results of a native function, placed like its arguments.
 
-    Batch axes are last. They are split along explicit mesh axes as in the arguments. Other axes are
+    Batch axes are last. A result axis is split along the explicit mesh axis by which an argument's
+    axis of equal size is split at the same place, counted from the last axis. All other axes are
     whole on each device.
 
     Args:

@@ -1,4 +1,4 @@
-"""Arithmetic of a traced function, counted from its jaxpr, each distinct value once.
+"""Counts the arithmetic operations of a traced function from its jaxpr.
 
 Each arithmetic operation on a floating-point number counts as one, whether it is an addition, a
 division or a sine; data movement, comparisons and integers count as none. Repeated computations
@@ -29,18 +29,18 @@ Branch = Callable[[Iterable[float]], float]
 
 
 def count(jaxpr: Jaxpr, branch: Branch = max) -> float:
-    """The number of arithmetic operations of a jaxpr, inner jaxprs included.
+    """Returns the number of arithmetic operations of a jaxpr, inner jaxprs included.
 
     Args:
         jaxpr: the program.
-        branch: chooses the cost of a conditional from those of its branches: max or min.
+        branch: max or min, which computes the cost of a conditional from the costs of its branches.
     """
     values = Values(branch)
     return values.evaluate(jaxpr, [values.fresh() for _ in jaxpr.invars])[0]
 
 
 def instructions(jaxpr: Jaxpr) -> int:
-    """The number of equations of a jaxpr, with inner jaxprs flattened; loop bodies count once."""
+    """Returns the number of equations of a jaxpr and its inner jaxprs; loop bodies count once."""
     total = 0
     for equation in jaxpr.eqns:
         inner = list(inside(equation))
@@ -49,7 +49,7 @@ def instructions(jaxpr: Jaxpr) -> int:
 
 
 def primitives(jaxpr: Jaxpr) -> set[str]:
-    """The names of the primitives of a jaxpr, inner jaxprs included."""
+    """Returns the names of the primitives of a jaxpr, inner jaxprs included."""
     names: set[str] = set()
     for equation in jaxpr.eqns:
         names.add(equation.primitive.name)
@@ -60,9 +60,9 @@ def primitives(jaxpr: Jaxpr) -> set[str]:
 class Values:
     """Numbers the distinct values of a program.
 
-    Two equations with the same primitive, parameters and inputs give the same values; additions and
-    multiplications also with their inputs exchanged. A loop is known by the jaxpr of its body, and
-    within it values are distinct from those outside.
+    Two equations with the same primitive, parameters and inputs give the same values. The order of
+    inputs does not matter for the primitives in `COMMUTING`. A loop is identified by the jaxpr of
+    its body; values inside a loop are distinct from values outside.
 
     Attributes:
         branch: see `count`.
@@ -79,11 +79,14 @@ class Values:
         return next(self.numbers)
 
     def evaluate(self, jaxpr: Jaxpr, given: list[int]) -> tuple[float, list[int]]:
-        """The operations of a jaxpr that have not been counted yet, and its results.
+        """Counts the operations of a jaxpr that have not been counted before.
 
         Args:
             jaxpr: the open jaxpr.
-            given: the numbers of its inputs.
+            given: the numbers that identify its inputs.
+
+        Returns:
+            The number of operations, and the numbers that identify the results.
         """
         used = without_unused(jaxpr)
         place = dict(zip(used.invars, given, strict=True))
@@ -100,7 +103,11 @@ class Values:
         return total, [number(x) for x in used.outvars]
 
     def equation(self, equation: JaxprEqn, inputs: list[int]) -> tuple[float, list[int]]:
-        """The operations of an equation that have not been counted yet, and its results."""
+        """Counts the operations of an equation that have not been counted before.
+
+        Returns:
+            The number of operations, and the numbers that identify the results.
+        """
         evaluated = called_by(equation, inputs)
         if evaluated is not None:
             return self.evaluate(*evaluated)
@@ -112,7 +119,7 @@ class Values:
         return operations(equation, self.branch), self.known[key]
 
     def literal(self, x: Literal) -> int:
-        """The number of a literal of the program."""
+        """Returns the number that identifies a literal of the program."""
         value = np.asarray(x.val)
         aval: Any = x.aval
         key = "literal", value.tobytes(), value.dtype.name, aval.shape
@@ -120,9 +127,9 @@ class Values:
 
 
 def called_by(equation: JaxprEqn, inputs: list[int]) -> tuple[Any, list[int]] | None:
-    """The jaxpr that an equation merely calls, and its inputs; None for other equations.
+    """Returns the jaxpr that an equation merely calls, and its inputs; None for other equations.
 
-    A linear solve calls its solver; its matrix is only needed for derivatives.
+    A linear solve calls its solver; the matrix of the solve is only needed for derivatives.
     """
     name, params = equation.primitive.name, equation.params
     if name == "custom_linear_solve":
@@ -136,7 +143,7 @@ def called_by(equation: JaxprEqn, inputs: list[int]) -> tuple[Any, list[int]] | 
 
 
 def parameters(equation: JaxprEqn) -> Any:
-    """Returns the parameters of an equation as a key; a new object where they cannot be hashed."""
+    """Returns the parameters of an equation as a key; a new object if they cannot be hashed."""
     params = tuple(sorted(equation.params.items()))
     try:
         hash(params)
@@ -157,7 +164,7 @@ def operations(equation: JaxprEqn, branch: Branch = max) -> float:
 
 
 def inside(equation: JaxprEqn) -> Iterator[Any]:
-    """The jaxprs that an equation evaluates; none for a plain instruction."""
+    """Yields the jaxprs that an equation evaluates; none for a plain instruction."""
     name, params = equation.primitive.name, equation.params
     if name == "custom_linear_solve":  # calls its solver; the matrix is only needed for derivatives
         yield params["jaxprs"].solve.jaxpr
@@ -179,7 +186,7 @@ def inside(equation: JaxprEqn) -> Iterator[Any]:
 
 
 def arithmetic(equation: JaxprEqn) -> float:
-    """Returns the arithmetic operations of one instruction, by its size."""
+    """Returns the number of arithmetic operations of one instruction, from its shapes."""
     if not equation.outvars:
         return 0.0
     name = equation.primitive.name

@@ -31,7 +31,7 @@ REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
     "reduce_and": jax.lax.bitwise_and,
     "reduce_or": jax.lax.bitwise_or,
 }
-"""Reductions that are replaced by elementwise halving where they run over the first axes."""
+"""Reductions that `by_halves` replaces by elementwise operations, if they are over first axes."""
 
 
 class Constant:
@@ -51,9 +51,9 @@ class Operation:
 
     Attributes:
         inputs, outputs: operands and results.
-        plain: True where its dtypes and effects allow it in a kernel; False for random keys and for
-            side effects such as printing.
-        effects: True where it has side effects.
+        plain: True if a kernel may contain the operation; False for random keys, for side effects
+            such as printing, and for loops and branches that do not fit into a kernel.
+        effects: True if the operation has side effects.
     """
 
     primitive: Primitive
@@ -75,23 +75,23 @@ class Operation:
 
 
 def traced(function: Native, args: Sequence[Any]) -> ClosedJaxpr:
-    """The closed jaxpr of a native function, without unused equations."""
+    """Returns the closed jaxpr of a native function, without unused equations."""
     closed = function.traced(*((x.shape, x.dtype) for x in args))
     return ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
 
 
 def evaluated(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """The results of a closed jaxpr."""
+    """Returns the results of a closed jaxpr."""
     return jex.jaxpr_as_fun(closed)(*args)
 
 
 class Program:
-    """A function as operations in order.
+    """A traced function as a flat list of operations on numbered values.
 
     Attributes:
-        operations: in order.
-        inputs: numbers of the arguments.
-        outputs: numbers of the results, or constants.
+        operations: the operations, in the order of the jaxpr.
+        inputs: the numbers of the arguments.
+        outputs: the numbers of the results, or constants.
         makers: the operation that computes each value.
         sizes: the number of entries of each value.
         bytes: the size of each value [B].
@@ -104,7 +104,8 @@ class Program:
 
         Args:
             closed: the jaxpr.
-            inner: rewrites the body of a loop; also returns True if a kernel may contain all of it.
+            inner: a function that rewrites the body of a loop or a branch, and also returns True
+                if a kernel may contain all of the body.
         """
         self.operations: list[Operation] = []
         self._inner = inner
@@ -119,7 +120,7 @@ class Program:
         self._drop_unused()
 
     def readers(self) -> dict[int, list[Operation]]:
-        """The operations that read each value."""
+        """Returns the operations that read each value."""
         readers: dict[int, list[Operation]] = {}
         for op in self.operations:
             for x in op.inputs:
@@ -148,7 +149,7 @@ class Program:
     def between(
         self, known: Container[int], wanted: list[int]
     ) -> tuple[list[int], list[Operation]]:
-        """The known values from which others are computed, and the operations for it."""
+        """Returns the known values from which others are computed, and the operations to do so."""
         leaves: list[int] = []
         operations: list[Operation] = []
         seen: set[int] = set()
@@ -168,7 +169,8 @@ class Program:
     def _read_parts(self) -> None:
         """Lets slices of a concatenation read the operand in which they lie.
 
-        This is done if all readers are such slices, so that the concatenation is never stored.
+        This is done if every reader is a slice that lies in one operand. The concatenation is then
+        never stored.
         """
         readers, results = self.readers(), {x for x in self.outputs if isinstance(x, int)}
         for op in self.operations:
@@ -277,12 +279,14 @@ class Program:
 def _part(
     reader: Operation, operands: list[Operand], lengths: list[Any], axis: int
 ) -> tuple[list[Operand], dict[str, Any]] | None:
-    """Operand and parameters of a slice that lies in one operand of a concatenation, or None.
+    """Returns the inputs and parameters with which a slice reads an operand of a concatenation.
+
+    The result is None if the reader is no slice, or does not lie in one operand.
 
     Args:
         reader: an operation that reads the concatenation.
-        operands: of the concatenation.
-        lengths: their sizes along its axis.
+        operands: the operands of the concatenation.
+        lengths: the sizes of the operands along the axis.
         axis: the axis of the concatenation.
     """
     if reader.name != "slice" or not is_known(lengths):
@@ -299,15 +303,15 @@ def _part(
 
 
 def _shifted(indices: Sequence[int], axis: int, by: int) -> tuple[int, ...]:
-    """The indices less a number along one axis."""
+    """Returns indices with the number `by` subtracted along one axis."""
     return tuple(i - by if a == axis else i for a, i in enumerate(indices))
 
 
 def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -> Array:
     """Reduces the first axes by combining their halves until one entry is left.
 
-    For an odd number of entries, the middle one belongs to both halves. A sum keeps the last entry
-    apart instead, as it must not count twice.
+    For an odd number of entries, the middle entry belongs to both halves. A sum keeps the last
+    entry apart instead, because no entry may count twice.
     """
     x = x.reshape((math.prod(x.shape[:axes]), *x.shape[axes:]))
     waiting: list[Array] = []
@@ -328,20 +332,20 @@ def slices(sizes: Sequence[int], axis: int, x: Array) -> list[Array]:
 
 
 def _leading(axes: Sequence[int], shape: tuple[int, ...]) -> bool:
-    """Returns True for the first axes, of known sizes, none of them empty."""
+    """Returns True if `axes` are the first axes in order, with known sizes that are not 0."""
     sizes = shape[: len(axes)]
     return tuple(axes) == tuple(range(len(axes))) and is_known(sizes) and all(sizes)
 
 
 def is_known(shape: Sequence[Any]) -> bool:
-    """Returns True where no size is symbolic, as those of `jax.export.symbolic_shape` are."""
+    """Returns True if no size is symbolic; `jax.export.symbolic_shape` makes symbolic sizes."""
     return all(isinstance(n, int) for n in shape)
 
 
 def _known_result(equation: JaxprEqn, args: list[Operand]) -> list[Operand] | None:
     """Simplifies an operation that does not depend on all its operands; None if not possible.
 
-    The compiler would do so only after it is decided which values are stored.
+    The compiler would simplify it as well, but only after `fusion` has chosen the values to store.
     """
     if len(equation.outvars) != 1:
         return None
@@ -367,7 +371,7 @@ def _known_result(equation: JaxprEqn, args: list[Operand]) -> list[Operand] | No
 
 
 def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> Any:
-    """A key that identical operations share; None where operations cannot be compared."""
+    """Returns a key that identical operations share; None if an operation cannot be compared."""
     if primitive.name in ("scan", "while", "cond"):
         return None
     parts: list[Any] = []

@@ -53,7 +53,7 @@ def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
 
 
 def batch_of(tree: PyTree, rank: int) -> tuple[int, ...]:
-    """The shape of the `rank` trailing batch axes over all arrays of a tree."""
+    """Returns the shape of the `rank` trailing batch axes over all arrays of a tree."""
     shapes = (x.shape[x.ndim - rank :] for x in jax.tree.leaves(tree) if isinstance(x, jax.Array))
     return jnp.broadcast_shapes(*shapes)
 
@@ -73,18 +73,18 @@ def where_tree(chosen: Array, x: T, y: T) -> T:
 
 
 def expand_like(x: Array, like: Array) -> Array:
-    """Adds leading axes of size 1 to x (…), a number of each world, as an array (n, …) has."""
+    """Adds leading axes of size 1 to x (…), a value per world, to broadcast with `like` (n, …)."""
     return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)
 
 
 def where_wanted(wanted: Array, function: Callable[[Args], T], args: Args, others: T) -> T:
     """Evaluates function(args) in the worlds where `wanted` is set; the others keep `others`.
 
-    If no world is set, the function is skipped. In a process with a single CPU device, the set
-    worlds are gathered and evaluated in chunks of an eighth of the batch, so that one world does
-    not cost a whole batch. Accelerators evaluate the whole batch, because their time hardly
-    depends on its size. Several devices do so too, because gathering would move worlds between
-    them, and so does a program for batches of any size.
+    If no world is wanted, the function is skipped. In a process with a single CPU device, the
+    wanted worlds are gathered and evaluated in chunks of an eighth of the batch, so that one world
+    does not cost a whole batch. The whole batch is evaluated in three cases: on accelerators, whose
+    time hardly depends on its size; on several devices, because gathering would move worlds
+    between them; and if the batch size is symbolic.
 
     Args:
         wanted: a boolean for each world, (…).

@@ -91,7 +91,7 @@ class JointSpring(JointForce):
         stiffness: k [N m/rad] or [N/m].
         damping: c [N m s/rad] or [N s/m].
         rest: rest position θ₀ [rad] or [m].
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     stiffness: Any
@@ -125,7 +125,7 @@ class JointDamper(JointForce):
         name: name of the element, unique in the scene.
         joint: name of the joint.
         damping: c [N m s/rad] or [N s/m].
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     damping: Any
@@ -155,7 +155,7 @@ class Motor(JointForce):
         joint: name of the joint.
         gear: gear ratio g; the force on the joint is g times the force of the motor.
         control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     gear: Any = 1.0
@@ -193,7 +193,7 @@ class PositionServo(JointForce):
         control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
         force_range: (lowest, highest) force before gearing; the force is clipped to this range.
             None for no limit.
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     stiffness: Any
@@ -232,7 +232,7 @@ class VelocityServo(JointForce):
         control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
         force_range: (lowest, highest) force before gearing; the force is clipped to this range.
             None for no limit.
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     damping: Any
@@ -272,7 +272,7 @@ class AffineActuator(JointForce):
         control_range: (lowest, highest) u; u is clipped to this range. None for no limit.
         force_range: (lowest, highest) force before gearing; the force is clipped to this range.
             None for no limit.
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     gain: Any = (1.0, 0.0, 0.0)

@@ -66,7 +66,7 @@ class Particle:
         return v.map(jnp.zeros_like)
 
     def carry(self, step: Vector, p: Vector) -> Vector:
-        """Returns a momentum p after a step, seen from before it: p unchanged, since v = q̇."""
+        """Returns a momentum p pulled back to the start of a step: p unchanged, since v = q̇."""
         return p
 
     in_turned_frames = carry
@@ -178,7 +178,7 @@ class SpatialRigid(Particle):
         return Vector(*none, *Vector(*p[3:]).cross(Vector(*v[3:])))
 
     def carry(self, step: Vector, p: Vector) -> Vector:
-        """Returns (dexp⁻¹_φ)ᵀ p: an angular momentum p after a turn φ, seen from before the turn.
+        """Returns (dexp⁻¹_φ)ᵀ p: an angular momentum p after a turn φ, pulled back to its start.
 
         p is in the body frame. The result is p + ½ φ × p + c φ × (φ × p), with the coefficient c
         from `numerics.inverse_exponential`.
@@ -200,7 +200,7 @@ class SpatialRigid(Particle):
         return Vector(*p[:3], *quaternion.rotate(back, Vector(*p[3:])))
 
     def gyroscopic_acceleration(self, v: Vector, moments: Moments) -> Vector:
-        """Returns the gyroscopic acceleration (0, −I⁻¹ (ω × Iω)), which needs no forces."""
+        """Returns the acceleration of bodies without forces, (0, −I⁻¹ (ω × Iω))."""
         shares = shares_of(Vector.of(moments))
         return Vector(*zeros(3), *(spun(shares, Vector(*v[3:])) * -1.0))
 

@@ -127,18 +127,19 @@ class BodySystem:
     Attributes:
         gravity: gravitational acceleration, (dim,) [m/s²].
         inertia: mass properties of each group of bodies.
-        constraints: groups of constraints of one kind.
-        forces: groups of force elements of one kind.
+        constraints: groups of constraints, each of one kind.
+        forces: groups of force elements, each of one kind.
         offsets: the poses of user's frames in principal frames, by body name; only for bodies whose
             two frames differ.
         fixed: the pose of each frame that is fixed to the world, by name.
         turns: the expected angles of the `counted` coordinates, (n,) [rad]; see `State.turns`.
         layout: names and indices.
         counted: the joint coordinates whose whole turns are counted.
-        bounds: groups of inequality elements of one kind.
+        bounds: groups of inequality elements, each of one kind.
         remainder: the rounding errors of the angles of bodies in the plane, (bodies,) [rad]; empty
             if unknown.
-        laps: whole turns that were removed from these angles, (bodies,); empty for none.
+        laps: whole turns that `unwind` removed from the angles of bodies in the plane, (bodies,);
+            empty for none.
     """
 
     gravity: Array
@@ -199,7 +200,7 @@ class BodySystem:
         return system, self._with_angles(q, angle)
 
     def rewind(self, q: Array, after: Array) -> tuple[Array, Array | tuple[()]]:
-        """Returns the coordinates after a step with whole turns, and the rounding errors of angles.
+        """Adds whole turns to the coordinates after a step; also returns rounding errors of angles.
 
         Args:
             q: coordinates at the start of the step, (n_q,).
@@ -314,11 +315,11 @@ class BodySystem:
         return self._by_group(lambda kind, _, ω, x: kind.coadjoint(ω, x), q, v, p)
 
     def carry(self, q: Array, step: Array, p: Array) -> Array:
-        """Returns (dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum after a step Δ = h v, seen from its start.
+        """Returns (dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum after a step Δ = h v, pulled back to its start.
 
-        With −Δ for Δ the result is dexp⁻¹_Δ p: the change of Δ that displaces the end q ⊕ Δ by p,
-        where p is in the body frames at the start. For velocities that are rates of coordinates,
-        the result is p.
+        With −Δ in place of Δ the result is dexp⁻¹_Δ p: the change of Δ that displaces the end q ⊕ Δ
+        by p, where p is in the body frames at the start. For velocities that are rates of
+        coordinates, the result is p.
         """
         return self._by_group(lambda kind, _, Δ, x: kind.carry(Δ, x), q, step, p)
 
@@ -384,7 +385,7 @@ class BodySystem:
         )
 
     def by_body(self, q: Array, x: Array) -> Array:
-        """Returns a mask of velocities, (n_v,): True for all of a body if any of its x ≠ 0."""
+        """Returns a mask, (n_v,): True for all velocities of a body with a nonzero entry in x."""
         return self._by_group(
             lambda kind, _, x: [functools.reduce(operator.or_, (y != 0 for y in x))] * kind.n_v,
             q,
@@ -465,7 +466,7 @@ class BodySystem:
         return jnp.concatenate(squares)
 
     def _bends(self, start: int, blocks: list[Block], rows: Rows) -> bool:
-        """Returns True for constraints between particles only that are not rods.
+        """Returns True if constraints are not rods, and act only on particles.
 
         Args:
             start: number of the constraints' first row.
@@ -476,7 +477,7 @@ class BodySystem:
         return start not in rows.swings and sizes == {self.layout.dim}
 
     def complete(self, solution: Solution) -> Solution:
-        """Returns the solution of the saddle system unchanged; bodies need no further rates."""
+        """Returns the solution of the saddle system unchanged: no accelerations follow from λ."""
         return solution
 
     def sizes(self, n_q: int) -> tuple[int, int]:
@@ -565,9 +566,9 @@ class BodySystem:
         four fields.
 
         If `center` or `axes` change, the points and axes of joints keep their places on the body,
-        also points at its old center of mass. `jc.systems.restate` then converts states. Anchors in
-        the same change are given in the new principal frame. If the user's frame was the principal
-        frame before, programs are traced once more.
+        including points at its old center of mass. `jc.systems.restate` then converts states.
+        Anchors that change in the same call are given in the new principal frame. If the user's
+        frame was the principal frame before, programs are traced once more.
 
         Args:
             changes: the part of `params` that changes: `{"rod": {"length": 2.0}}`.

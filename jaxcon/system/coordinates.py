@@ -249,7 +249,7 @@ class TurnCounter(OnJoint):
     Attributes:
         name: name of the element, unique in the scene.
         joint: name of the joint.
-        coordinate: name of the joint's coordinate; needed if it has several.
+        coordinate: name of the joint's coordinate; needed if the joint has several.
     """
 
     name: str

@@ -156,7 +156,7 @@ class Elements:
         )
 
     def anchors(self, snapshot: Snapshot) -> Vector | None:
-        """Returns the points of attack on the last body, world frame [m]; None without anchors."""
+        """Returns the anchors on the elements' last body, world frame [m]; None without anchors."""
         for field, side in (("anchor_b", 1), ("anchor", 0)):
             if isinstance(self.params.get(field), Vector):
                 return snapshot.frame(self.places[side]).point(self.params[field]).position
@@ -189,7 +189,7 @@ class Elements:
         return dataclasses.replace(self, params=params)
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
-        """Checks the changed numbers of an element, by field, as its class does."""
+        """Checks the changed numbers of an element, given by field, by its class."""
         self.law.check_numbers(name, numbers, dtype)
 
     def select(self, indices: tuple[int, ...]) -> Self:

@@ -153,12 +153,12 @@ class Force(ForceElement):
 
     @staticmethod
     def forces(p: dict[str, Any], a: BodyFrame) -> tuple[Vector]:
-        """Returns the generalized force of F at the point of attack."""
+        """Returns the generalized force of the force F at its point of application."""
         return (a.point(p["anchor"]).pull(Vector.of(p["force"])),)
 
     @staticmethod
     def potential(p: dict[str, Any], a: BodyFrame) -> Lane:
-        """Returns the potential energy −F · p [J], with the force F and the point of attack p."""
+        """Returns the potential energy −F · p [J] of the force F at its point of application p."""
         return times(-1, a.point(p["anchor"]).position.dot(Vector.of(p["force"])))
 
 
@@ -172,8 +172,8 @@ class ExternalWrench(Element):
     Attributes:
         name: name of the element, unique in the scene; also the name of the control channel.
         body: name of the body.
-        point: the point of attack, world point at assembly, (dim,) [m]; the center of mass unless
-            given.
+        point: the point of application, world frame at assembly, (dim,) [m]; the center of mass
+            unless given.
     """
 
     name: str
@@ -296,7 +296,7 @@ def world_wrench(frame: BodyFrame, anchor: Vector | None, wrench: Vector) -> Vec
 
     Args:
         frame: the motion of the bodies.
-        anchor: the point of attack in the body frame [m]; None for the origin.
+        anchor: the point of application in the body frame [m]; None for the origin.
         wrench: (F, τ) [N, N m].
     """
     dim = len(frame.position)

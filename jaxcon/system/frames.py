@@ -48,7 +48,7 @@ class Direction(Point):
 
 
 class BodyFrame(Protocol):
-    """The motion of bodies of one kind, or of the world, as elements use it.
+    """The interface by which elements read the motion of bodies of one kind, or of the world.
 
     Particles have `point` and `material` only; elements with `oriented` set get no particles.
     """

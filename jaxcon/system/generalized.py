@@ -154,7 +154,7 @@ class GeneralizedCoordinates:
     applied = force
 
     def carry(self, q: Array, step: Array, p: Array) -> Array:
-        """Returns a momentum p after a step, seen from before it: p unchanged, because v is q̇."""
+        """Returns a momentum p pulled back to the start of a step: p unchanged, because v is q̇."""
         return p
 
     def extent(self, q: Array) -> Array:

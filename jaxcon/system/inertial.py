@@ -7,7 +7,8 @@ and axes that elements fix to the body, stay in place on it. In the new P they a
 
     points  s → Aᵀ (s − p),   directions  u → Aᵀ u,   turns  q_a* q_b → A_a* (q_a* q_b) A_b,
 
-where q_a* q_b is the orientation of body b in body a.
+where q_a* q_b is the orientation of body b in body a, and A_a and A_b are the turns of both bodies'
+principal frames.
 """
 
 from __future__ import annotations
@@ -175,7 +176,7 @@ def restate(state: State, before: BodySystem, after: BodySystem) -> State:
     Args:
         state: state of one world of `before`.
         before: the system of the state.
-        after: this system with other numbers, from `BodySystem.with_params`.
+        after: the system `before` with other numbers, from `BodySystem.with_params`.
 
     Returns:
         The state of `after`. The method's memory depends on the old frames, so only the multipliers
@@ -183,9 +184,10 @@ def restate(state: State, before: BodySystem, after: BodySystem) -> State:
         the result s to `jc.init(after, method, s.q, s.v, s.time, s.turns)`.
 
         Concrete frames are compared by values. Traced frames count as changed unless both systems
-        contain the same arrays. A function under `jit` therefore keeps the memory if it takes one
-        system and changes that with `with_params`. If it takes both systems as arguments, q and v
-        are right, but the memory is dropped if a body has a center or axes of its own.
+        contain the same arrays. A function under `jit` that takes one system and changes it with
+        `with_params` therefore keeps the memory. A function that takes both systems as arguments
+        returns the right q and v. It drops the memory if a body's principal frame differs from its
+        user's frame.
 
     Raises:
         TypeError, ValueError: the state does not belong to `before`, or the systems differ in more

@@ -52,12 +52,13 @@ class MethodMemory(NamedTuple):
 class State(Stacked):
     """The state of a world: everything that a step changes.
 
-    A state with leading axes is a batch or a trajectory. It can be sliced along the first of them:
+    A state with leading axes is a batch or a trajectory. It can be sliced along its first axis:
     `len(path)`, `path[10]`, `path[::5]`.
 
     Time is the sum of two floats, `time` and `time_remainder`: a million steps of 1 ms, summed in
-    one float32, would be 0.9 % off. `time` is the float nearest to the sum; functions of time get
-    it. If `time` was replaced, the remainder may exceed its rounding error; it then counts as zero.
+    one float32, would be 0.9 % off. `time` is the float nearest to the sum, and the argument of
+    functions of time. If `time` was replaced, the old remainder may exceed the rounding error of
+    the new `time`. The remainder then counts as zero.
 
     Attributes:
         q: positions, (n_q,); `system.layout` maps names to indices.
@@ -95,7 +96,7 @@ class State(Stacked):
         angle_remainder: Array | tuple[()] = (),
     ) -> None:
         if time_remainder is UNSET:
-            # a State of vmap axes or of shardings has no numbers: the remainder copies time
+            # if the fields are vmap axes or shardings instead of numbers, copy that of time
             time_remainder = time
             if isinstance(time, int | float | np.ndarray | np.generic):
                 time_remainder = 0 * time if isinstance(time, int | float) else np.zeros_like(time)
@@ -184,7 +185,7 @@ def _check_kinds(state: State) -> None:
     The check does not wait for values that a device still computes.
 
     Raises:
-        ValueError: a field has another type, or the status is no `Status`.
+        ValueError: a field has another type, or the status is not a `Status` code.
     """
     for what in ("q", "v", "time", "time_remainder", "turns", "angle_remainder"):
         x: Any = getattr(state, what)

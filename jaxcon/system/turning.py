@@ -7,7 +7,7 @@ angle
     r = θ + ε − 2π n,    where n is the number of whole turns in θ,
 
 and its result r⁺ gives the new angle θ⁺ + ε⁺ = θ + (r⁺ − (θ − 2π n)). If |θ| is below half a turn,
-then n = 0, and r rounds to θ. Both maps have the identity as derivative. In float64 angles are not
+then n = 0, and r rounds to θ. The derivatives dr/dθ and dθ⁺/dr⁺ are 1. In float64 angles are not
 reduced: near 200 π they are multiples of 1e-13.
 """
 
@@ -95,7 +95,7 @@ def _(primals: Arrays, tangents: Arrays) -> tuple[tuple[Array, Array], tuple[Arr
 def reduced(angle: Array, remainder: Array) -> tuple[Array, Array]:
     """Returns the reduced angle r = θ + ε − 2π n and the number n of turns, both (bodies,).
 
-    If θ was replaced, ε may exceed its rounding error; it then counts as zero.
+    If θ was replaced, the old ε may exceed the rounding error of the new θ; ε then counts as zero.
 
     Args:
         angle: θ, (bodies,) [rad].

@@ -66,10 +66,10 @@ def linearized(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Returns the mass matrix M and the derivatives of the accelerations of lean and steer.
 
-    The derivatives are with respect to y = (lean, steer) and to ẏ, (2, 2) each. M = BᵀM B, where
-    the columns of B are the velocities for unit rates of lean and steer. The function places the
-    nonlinear bicycle at q(y). Its velocities there satisfy the constraints and have a given forward
-    speed. The function then differentiates the accelerations.
+    The derivatives are with respect to y = (lean, steer) and to ẏ, (2, 2) each. M = Bᵀ M_v B, with
+    the mass matrix M_v of the bodies. The columns of B are the velocities for unit rates of lean
+    and steer. The function places the nonlinear bicycle at q(y). Its velocities there satisfy the
+    constraints and have a given forward speed. The function then differentiates the accelerations.
     """
 
     def accelerations(y: jax.Array, ẏ: jax.Array) -> jax.Array:

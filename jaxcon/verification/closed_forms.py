@@ -1,6 +1,7 @@
 """Textbook mechanisms whose accelerations and forces have a one-line closed form.
 
-Ropes stay taut here. A rope that becomes taut needs an impact law, and is an inequality constraint.
+Ropes stay taut here, so they are equality constraints. A rope that can go slack is an inequality
+constraint, and needs an impact law for the moment when it becomes taut.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def wall_and_floor(rod: jc.extend.Pose, t: jax.Array, half: jax.Array) -> jax.Ar
 
 
 def ladder() -> list[Check]:
-    """Checks where a ladder that slides down a smooth wall leaves it: at sin θ = ⅔ sin θ₀.
+    """Checks that a ladder sliding down a smooth wall leaves the wall at sin θ = ⅔ sin θ₀.
 
     θ is the angle of the ladder from the floor, and θ₀ its initial value.
     """
@@ -45,7 +45,7 @@ def ladder() -> list[Check]:
 
 
 def sphere_departure() -> list[Check]:
-    """Checks where a point mass that slides down a smooth sphere leaves it: at cos θ = ⅔.
+    """Checks that a point mass sliding down a smooth sphere leaves the sphere at cos θ = ⅔.
 
     θ is the angle from the top, which is an equilibrium. The motion therefore starts at 0.3 rad,
     with the velocity gained on the way there.

@@ -23,7 +23,7 @@ def hooke_joint() -> list[Check]:
 
     θ is the angle of the input shaft and φ the angle of the output shaft. Derivatives are checked
     too. A bearing and a drive hold the input shaft at constant speed. Only the universal joint and
-    a constraint on its direction hold the output shaft, so no row is redundant.
+    a constraint on the direction of the output shaft hold that shaft, so no row is redundant.
 
     References:
         Textbook; ω_out/ω_in = cos β/(1 − sin²β cos²θ), θ from the plane of the shafts.

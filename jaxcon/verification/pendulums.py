@@ -23,7 +23,7 @@ def hanging_chain(
 ) -> tuple[BodySystem, jc.State]:
     """Builds a planar chain of point masses, each on a rod from the one above.
 
-    Angles are from downward [rad].
+    Angles are measured from the downward vertical [rad].
     """
     scene = jc.Scene(dim=2, gravity=(0.0, -g))
     above, position, velocity = jc.WORLD, np.zeros(2), np.zeros(2)

@@ -1,4 +1,4 @@
-"""Reorientation with zero angular momentum by internal motion, as by a falling cat."""
+"""Bodies that reorient themselves with zero angular momentum, like a falling cat."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ def bead_on_hoop() -> list[Check]:
     """Checks a bead on a hoop that rotates about its vertical diameter.
 
     Its angle θ obeys θ̈ = Ω² sin θ cos θ − (g/R) sin θ, with the radius R and rate Ω of the hoop.
-    Both reactions are multipliers. λ of the distance points outward. λ of the plane is the force
-    along its normal, m(2 Ω R θ̇ cos θ).
+    Both reactions are multipliers. The λ of the distance is the radial force, positive outward. The
+    λ of the plane is the force along the normal of the plane, m(2 Ω R θ̇ cos θ).
 
     References:
         Extrapolation in 80-bit arithmetic; the Jacobi integral is conserved, the energy is not.

@@ -149,11 +149,13 @@ def knife_edge_incline() -> list[Check]:
 
 
 def vakonomic_knife_edge() -> list[Check]:
-    """Checks conserved quantities of a skate under the variational equations, from μ = 0.1.
+    """Checks conserved quantities of a skate on an incline under the variational equations.
 
-    μ is the multiplier of the blade. The skate slides down. With ψ = ẋ sin φ − ẏ cos φ, these are
-    constant: m ẏ − μ cos φ, m ẋ + μ sin φ − m g t sin α, and the energy. The spin obeys
-    J φ̈ = μ (ẋ cos φ + ẏ sin φ). `KnifeEdge` has the opposite sign of ψ, so the code has −μ.
+    Unlike under the physical equations, the skate slides down. Three quantities are constant:
+    m ẏ − μ cos φ, m ẋ + μ sin φ − m g t sin α, and the energy. Here φ is the heading, α the slope,
+    and μ the multiplier of the blade, initially 0.1. The spin obeys J φ̈ = μ (ẋ cos φ + ẏ sin φ).
+    The slip ψ = ẋ sin φ − ẏ cos φ is zero. `KnifeEdge` has the opposite sign of ψ, so the code has
+    −μ.
 
     References:
         Bloch, Baillieul, Crouch, Marsden, Nonholonomic Mechanics and Control (2003), section 1.6.

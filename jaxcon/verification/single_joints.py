@@ -35,8 +35,8 @@ def single_joints() -> list[Check]:
     computation and ADAMS, or half of the last printed digit if that is larger.
 
     The reaction acts on the ground. Its torque is about the anchor of the joint on the ground.
-    Errors of the torque are relative to the largest torque. As in ADAMS, the torque includes that
-    of a spring about the hinge.
+    Errors of the torque are relative to the largest torque. As in ADAMS, the torque of the reaction
+    includes the torque of a spring about the hinge.
 
     References:
         Project Chrono, unit tests of joints and force elements, with trajectories of MSC ADAMS.

@@ -24,9 +24,10 @@ def hold(t: jax.Array, params: None) -> jax.Array:
 
 
 def two_links() -> tuple[BodySystem, jc.State]:
-    """Builds two links along world y. A drive holds the hinge of the first link, whose axis is x.
+    """Builds two links along world y, with a drive that holds the first link.
 
-    In this pose, z of the links points along world y, and y of the links points down.
+    The hinge of the first link has the axis x. In this pose, z of the links points along world y,
+    and y of the links points down.
     """
     p = references.load("static_reactions_gazebo")["parameters"]
     turned = (np.sqrt(0.5), -np.sqrt(0.5), 0.0, 0.0)  # −π/2 about x

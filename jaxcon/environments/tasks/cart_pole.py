@@ -38,9 +38,10 @@ class CartPole(Environment):
     Observation: position [m] and velocity [m/s] of the cart. Then, for each pole from the cart
     outwards, cosine and sine of its angle from upright, and its angular velocity [rad/s].
 
-    Reward, 0 to 1: u · (1 + near(x, 1 m))/2 · (1 + near(θ̇, 5 rad/s))/2 · (4 + near(action, 1))/5,
+    Reward, 0 to 1: u · (1 + near(d, 1 m))/2 · (1 + near(ω, 5 rad/s))/2 · (4 + near(action, 1))/5,
     with near(x, s) = 1/(1 + (x/s)²). The height u of the tip is 0 at its lowest point and 1 at its
-    highest.
+    highest. d is the distance of the cart from the middle of the track. ω is the root mean square
+    of the angular velocities of the poles.
 
     An episode starts with all poles hanging within 0.1 rad and the cart within 0.1 m of the middle.
     Initial velocities are within 0.05 of zero. The episode terminates when the cart is 3 m from the
@@ -115,7 +116,7 @@ class CartPole(Environment):
 
     @property
     def observed(self) -> tuple[Channel, ...]:
-        """The observation channels: those of the cart, then those of each pole."""
+        """The observation channels of the cart, then of each pole."""
         cart = Channel("cart", "m", -2 * TRACK, 2 * TRACK), Channel("speed", "m/s", -50.0, 50.0)
         return *cart, *(channel for name in self.poles for channel in angle_channels(name, 100.0))
 

@@ -60,7 +60,8 @@ class CatRighting(Environment):
 
     Reward, 0 to 1: (1 + u)/2 · (1 + near(β, 0.8 rad))/2 · (4 + near(action, 1))/5, with near(x, s)
     = 1/(1 + (x/s)²). Here u, −1 to 1, is the upward component of the back direction, averaged over
-    both halves, and β is the bend. For several actions, x is their root mean square.
+    both halves, and β is the bend. In near(action, 1), the action is the root mean square of its
+    components.
 
     An episode starts at rest with the back down, within 0.3 rad of roll and 0.2 rad of pitch, with
     any heading. The spine is bent by up to 0.1 rad about y and z. The episode terminates when the

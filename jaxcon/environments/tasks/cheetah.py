@@ -53,9 +53,9 @@ class HalfCheetah(Environment):
     Action: the torques of back thigh, shin, foot and front thigh, shin, foot. ±1 is the largest
     torque of a motor.
 
-    Observation: MuJoCo's qpos without its first entry (8,): height of the torso relative to the
-    model file [m], its pitch and the six joint angles [rad]. Then qvel (9,): forward and upward
-    velocity of the torso [m/s], its pitch rate and the rates of the joints [rad/s].
+    Observation: MuJoCo's qpos without its first entry (8,): height of the torso above its position
+    in the model file [m], its pitch and the six joint angles [rad]. Then qvel (9,): forward and
+    upward velocity of the torso [m/s], its pitch rate and the rates of the joints [rad/s].
 
     Reward: v − 0.1 Σ aᵢ², with the mean velocity v of the torso during the action a [m/s]. It is
     not limited to 0 to 1.
@@ -130,7 +130,7 @@ class HalfCheetah(Environment):
 
     @property
     def observed(self) -> tuple[Channel, ...]:
-        """The observation channels: qpos without its first entry, the distance run, and qvel."""
+        """The observation channels: qpos without its first entry (the distance run), then qvel."""
         units = ["rad" if turns else "m" for turns in self.turning]
         each = list(zip(self.joints, units, strict=True))
         places = [Channel(name, unit, -MOST, MOST) for name, unit in each[1:]]

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 HIP, THIGH, SHANK, SOLE = 0.05, 0.2, 0.3, 0.02
-"""Half the distance of the hips, lengths of the bars, and radius of the ball at the foot [m]."""
+"""Half the distance between the hips, the lengths of the bars, and the radius of the foot [m]."""
 DEPTH, LOW = 0.4, 0.2
-"""The initial distance from the hips to the foot, and the trunk height that terminates [m]."""
+"""The initial hip-to-foot distance, and the trunk height below which an episode terminates [m]."""
 SIDES = (("left", -1.0), ("right", 1.0))
 STOPS = (0.15, 1.75)
 """The joint limits of a thigh: its outward angle from straight down [rad]."""
@@ -46,7 +46,8 @@ class FiveBarHopper(Environment):
 
     Reward, 0 to 1: near(v − v*, 0.3 m/s) · (2 − near(c, 0.02 m))/2 · (9 + near(action, 1))/10, with
     near(x, s) = 1/(1 + (x/s)²). Here v is the velocity, v* the desired velocity, and c the
-    clearance of the foot above the ground. For several actions, x is their root mean square.
+    clearance of the foot above the ground. In near(action, 1), the action is the root mean square
+    of its components.
 
     An episode draws a desired velocity of 0.4 to 0.8 m/s in either direction. It starts at rest
     with the foot below the trunk and 0.02 to 0.1 m above the ground. It terminates when the trunk

@@ -36,8 +36,8 @@ class Parking(Environment):
     The blade is behind the center of mass and never slips sideways. The sleigh can therefore reach
     a position beside it only by driving forward and backward.
 
-    Action: thrust along the blade, and torque. ±1 is the largest (`force` and `torque` among the
-    parameters of "drive").
+    Action: thrust along the blade, and torque. ±1 is the largest thrust or torque (`force` and
+    `torque` among the parameters of "drive").
 
     Observation: the target position relative to the blade, ahead and to the left [m]. Cosine and
     sine of the heading relative to the target heading. Velocity along the blade [m/s] and yaw rate

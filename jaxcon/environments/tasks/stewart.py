@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 HEIGHT, PLATE, THICK = 1.0, 0.4, 0.02
-"""The height of the platform at home, its radius, and the height of its surface [m]."""
+"""The height of the platform at home, its radius, and the surface height above its center [m]."""
 LEGS = range(6)
 
 
@@ -49,7 +49,8 @@ class StewartBalancing(Environment):
 
     Reward, 0 to 1: near(d, 0.1 m) · (1 + near(v, 0.4 m/s))/2 · (4 + near(action, 1))/5, with
     near(x, s) = 1/(1 + (x/s)²). Here d is the distance of the ball from the center of the plate,
-    and v its speed relative to the plate. For several actions, x is their root mean square.
+    and v its speed relative to the plate. In near(action, 1), the action is the root mean square of
+    its components.
 
     An episode starts with the platform at home and at rest. The ball is within 0.15 m of the center
     along x and y, and rolls at up to 0.2 m/s along each. The episode terminates when the ball is
