@@ -115,7 +115,7 @@ __version__ = "0.2.0"
 
 @functools.cache
 def _renamed() -> dict[str, str]:
-    """Returns a dictionary from old to new dotted names."""
+    """Returns a dictionary from dotted names of earlier versions to current dotted names."""
     table = Path(__file__).with_name("renamed.json")
     return json.loads(table.read_text(encoding="utf-8"))["names"]
 

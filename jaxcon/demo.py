@@ -124,7 +124,7 @@ def feedback(gains: Gains) -> Method:
 
 
 def default_gains(dtype: DType) -> Gains:
-    """Returns the PID gains that equal the default feedback.
+    """Returns the PID gains that are equivalent to the default feedback.
 
     They are K_p = β² [1/s²], K_d = 2α [1/s] and K_i = 0 [1/s³], with the default feedback
     parameters α and β.
@@ -240,7 +240,11 @@ def validate(gains: Tuning, worlds: Worlds, seconds: float, windows: int = 100) 
     dtype = worlds[1].q.dtype
 
     def run(gains: Gains, system: System, state: State) -> tuple[State, tuple[Array, Array]]:
-        """Simulates one world; returns its final state, and the `record` of each step."""
+        """Simulates one world.
+
+        Returns:
+            The final state; and for each step the mean φ² and the largest |φ|, (steps,) each.
+        """
         method = feedback(gains)
         start = init(system, method, state.q, state.v)
         dt = jnp.asarray(STEP, dtype)

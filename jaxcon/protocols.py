@@ -141,10 +141,10 @@ class System(TreeNode, Protocol):
         ...
 
     def check(self, q: Array) -> None:
-        """Checks the numbers that depend on q, (n_q,); called when an initial state is made."""
+        """Checks numbers of the system that depend on q, (n_q,); `jc.init` calls this."""
 
     def columns(self, place: Place) -> Columns:
-        """The columns of J that belong to the bodies of a place."""
+        """The columns of J that belong to the bodies of a `Place`."""
         ...
 
     @property
@@ -158,7 +158,7 @@ class System(TreeNode, Protocol):
         ...
 
     def sizes(self, n_q: int) -> tuple[int, int]:
-        """The numbers of positions and velocities of a state that has n_q positions."""
+        """The expected lengths of q and v; n_q is the length of the given q."""
         ...
 
     def snapshot(self, q: Array, v: Array, t: Doubled | Scalar) -> Snapshot:
@@ -187,33 +187,36 @@ class System(TreeNode, Protocol):
 
     @property
     def params(self) -> Any:
-        """The numbers of the system: by element and field for bodies, else any pytree."""
+        """The parameters of the system, a pytree.
+
+        For bodies, it is a dictionary by the names of elements and of their fields.
+        """
         ...
 
     def with_params(self, changes: Any, /) -> Self:
-        """The system with changed numbers; compiled functions are not traced again."""
+        """The system with changed parameters; compiled functions are not traced again."""
         ...
 
     # kinematics: v equals q̇ in the plane and for generalized coordinates, but not in space
 
     def kinematics(self, q: Array, v: Array) -> Array:
-        """q̇, (n_q,)."""
+        """The rates of change q̇ of the positions, (n_q,), for velocities v."""
         ...
 
     def retract(self, q: Array, step: Array) -> Array:
-        """q ⊕ Δ for a finite step Δ = h v, (n_v,); rotations use the exponential map."""
+        """The positions q ⊕ Δ after a step Δ = h v, (n_v,); rotations use the exponential map."""
         ...
 
     def normalize(self, q: Array) -> Array:
-        """q with quaternions of unit length."""
+        """The positions q with quaternions scaled to unit length, (n_q,)."""
         ...
 
     def carry(self, q: Array, step: Array, p: Array) -> Array:
-        """(dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum p after a step Δ, transformed to its start."""
+        """The momentum p after a step Δ, transformed to the start of Δ: (dexp⁻¹_Δ)ᵀ p, (n_v,)."""
         ...
 
     def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
-        """ad*_v p, (n_v,): the rate of a body-frame momentum p due to the turning frames."""
+        """The rate ad*_v p, (n_v,), of a body-frame momentum p due to the turning of the frames."""
         ...
 
     def extent(self, q: Array) -> Array:
@@ -229,7 +232,7 @@ class System(TreeNode, Protocol):
 
     @property
     def turns_in_space(self) -> bool:
-        """True where bodies have an orientation in space."""
+        """True if bodies have an orientation in space."""
         ...
 
     # whole turns of joints and planar bodies, which a state counts
@@ -241,7 +244,7 @@ class System(TreeNode, Protocol):
 
     @property
     def turns(self) -> Array | tuple[()]:
-        """Expected angles of counted coordinates, within half a turn, (n,) [rad]; () for none."""
+        """Expected angles of counted coordinates, (n,) [rad], within half a turn; () for none."""
         ...
 
     def with_turns(self, turns: Array | tuple[()], remainder: Array | tuple[()] = ()) -> Self:
@@ -249,11 +252,11 @@ class System(TreeNode, Protocol):
         ...
 
     def no_remainder(self, dtype: DType) -> Array | tuple[()]:
-        """The `angle_remainder` of a new state: zeros, or () if angles are not reduced."""
+        """The `angle_remainder` of a new state: zeros, or () if whole turns stay in q."""
         ...
 
     def unwind(self, q: Array) -> tuple[Self, Array]:
-        """Moves whole turns of angles from q into the system; returns the system and q."""
+        """Moves whole turns of angles from q into the system; returns the new system and q."""
         ...
 
     def rewind(self, q: Array, after: Array) -> tuple[Array, Array | tuple[()]]:
@@ -266,11 +269,11 @@ class System(TreeNode, Protocol):
         ...
 
     def count(self, q: Array, v: Array, t: Doubled | Scalar) -> Any:
-        """The counted coordinates, whole turns included, (n,) [rad]."""
+        """The values of the counted coordinates, whole turns included, (n,) [rad]."""
         ...
 
     def expect(self, here: Snapshot, end: Array, dt: Array, within: bool) -> tuple[Any, Array]:
-        """The expected counted coordinates after a step, and a bound on their error, () [rad].
+        """The expected angles of counted coordinates after a step, and an error bound, () [rad].
 
         Args:
             here: the snapshot at the start of the step.
@@ -303,7 +306,7 @@ class Bodies(System, Protocol):
         ...
 
     def rotate(self, q: Array, v: Array, dt: Array) -> Array:
-        """The velocities after a free rotation during dt, (1,) [s], (n_v,)."""
+        """The velocities, (n_v,), after torque-free rotation for the time dt, (1,) [s]."""
         ...
 
     def coast(self, q: Array, v: Array, dt: Array) -> Array:
@@ -315,11 +318,11 @@ class Bodies(System, Protocol):
         ...
 
     def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
-        """A velocity change p, (n_v,), in body frames that have turned by a step Δ."""
+        """The velocity change p, (n_v,), expressed in body frames that have turned by a step Δ."""
         ...
 
     def by_body(self, q: Array, x: Array) -> Array:
-        """A mask of velocities, (n_v,): True for all of a body if any of its x is nonzero."""
+        """A mask of velocities, (n_v,): True for all velocities of a body with a nonzero x."""
         ...
 
     def squared_turn(self, q: Array, v: Array, before: Array, rows: Rows, dt: Array) -> Array:
@@ -357,7 +360,7 @@ class Stabilizer(TreeNode, Protocol):
     """
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Refuses methods of version 0.1, which would never be called.
+        """Refuses classes that define a method by its name of version 0.1, which nothing calls.
 
         Raises:
             TypeError: the class defines `target`, `impose` or `bounded`.
@@ -442,7 +445,16 @@ class Stabilizer(TreeNode, Protocol):
         memory: Any,
         dt: Array,
     ) -> tuple[State, Array]:
-        """The corrected state after a step, and a status."""
+        """The corrected state after a step, and a status.
+
+        Args:
+            system: the system.
+            solver: the linear solver of the method.
+            before: the state before the step.
+            state: the state after the step, to be corrected.
+            memory: the stabilizer's memory after the step.
+            dt: h, () [s].
+        """
         return state, 0 * state.status
 
     @property
@@ -482,8 +494,8 @@ class Stabilizer(TreeNode, Protocol):
         """The stabilizer with gains below the largest stable β [1/s].
 
         Args:
-            stable_rate: function of the smallest damping ratio α/β of the gains that returns the
-                largest stable β.
+            stable_rate: function of the smallest damping ratio α/β of the gains; returns the
+                largest stable β [1/s].
         """
         return self
 
@@ -515,7 +527,7 @@ class Integrator(TreeNode, Protocol):
 
     @abstractmethod
     def advance(self, dynamics: Dynamics, state: State, memory: Any, dt: Array) -> Advanced:
-        """One step of dt [s] from a state.
+        """Advances a state by one step of dt [s].
 
         Args:
             dynamics: the equations of motion; `dynamics(q, v, t)` solves for a and λ.
@@ -540,13 +552,23 @@ class Integrator(TreeNode, Protocol):
         return type(self).highest_rate is not Integrator.highest_rate
 
     def growth(self, alpha: float, beta: float, dt: float) -> float | None:
-        """The growth factor of a constraint error in a step, a spectral radius; None if unknown."""
+        """The growth factor of a constraint error in a step, a spectral radius; None if unknown.
+
+        Args:
+            alpha: the feedback gain α [1/s].
+            beta: the feedback gain β [1/s].
+            dt: h [s].
+        """
         return None
 
     def error_map(
         self, alpha: Number, beta: Number, dt: Number
     ) -> tuple[tuple[Any, Any], tuple[Any, Any], tuple[Any, Any]] | None:
-        """The error (φ, φ̇) after a step from φ = 1, φ̇ = 1, and under φ̈ = 1; None if unknown."""
+        """Three errors (φ, φ̇) after a step with feedback; None if unknown.
+
+        The errors before the step are φ = 1, then φ̇ = 1, then zero. In the third case a
+        disturbance φ̈ = 1 acts during the step.
+        """
         return None
 
     def refuses(self, system: System, stabilizer: Stabilizer) -> str | None:
@@ -570,16 +592,23 @@ class Solver(TreeNode, Protocol):
         ...
 
     def solve(self, system: Saddle) -> Solution:
-        """The acceleration and the multipliers."""
+        """The accelerations a and multipliers λ that solve the saddle system."""
         return self.factor(system)(system.force, system.target)
 
 
 class ContactSolver(TreeNode, Protocol):
-    """Finds λ of inequality rows so that λ and the velocities u = G λ + c obey the rows' laws."""
+    """Finds the multipliers λ of inequality rows.
+
+    λ and the velocities u = G λ + c of the rows obey the law of each row. u is the velocity at the
+    end of the step less its target, G the response of u to λ, and c the value of u without λ.
+    """
 
     @property
     def exact(self) -> bool:
-        """True if laws hold to rounding; landings are then resolved as impacts within a step."""
+        """True if the laws of the rows hold to rounding.
+
+        Landings (impacts without rebound) are then resolved as impacts within a step.
+        """
         return False
 
     @property
@@ -589,7 +618,7 @@ class ContactSolver(TreeNode, Protocol):
 
     @property
     def smoothing(self) -> Scalar | None:
-        """The width of smoothed corners of the laws, for the derivative only [m/s, rad/s]."""
+        """The width of rounded corners of the rows' laws, for derivatives only [m/s, rad/s]."""
         return None
 
     def check(self) -> None:
@@ -617,10 +646,10 @@ class Adjoint(TreeNode, Protocol):
 
     @abstractmethod
     def scan(self, path: Path) -> tuple[State, Any]:
-        """The final state of a rollout, and its record."""
+        """Runs a rollout; returns its final state and its record."""
         ...
 
     @abstractmethod
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """The number of states that the reverse pass keeps, by level of checkpoints."""
+        """The number of states that the reverse pass keeps at each level of checkpoints."""
         ...

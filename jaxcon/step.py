@@ -92,7 +92,7 @@ class StepInfo(Stacked):
         control: control u of the step.
     """
 
-    # a class attribute, as `jit` returns and scans carry all fields, but few wrenches are read.
+    # not a field: `jit` would return it and scans would carry it, but few wrenches are read;
     # `execution.step.with_origin` sets it on an instance
     origin: ClassVar[Origin | None] = None
     """The system, for `jc.wrench`; None if JAX has rebuilt the info, as `jit` and indexing do."""
@@ -219,7 +219,9 @@ class Dynamics:
     constant_force: Array | None = None
 
     def __call__(self, q: Array, v: Array, t: Doubled | Array) -> tuple[Solution, Rows]:
-        """Returns a and λ (their means over the step, with contact) and the rows at (q, v, t).
+        """Solves for a and λ at (q, v, t); returns them with the rows.
+
+        With contact, a and λ are means over the step.
 
         Args:
             q: positions, (n_q,).
@@ -318,7 +320,7 @@ class Solved(NamedTuple):
 
     Attributes:
         solution: a and λ.
-        rows: the constraints there, with the reactions of inequality rows.
+        rows: the constraints at this point, with the reactions of inequality rows.
         solve_rows: function of b that returns the smallest a, in the metric of M, with J a + C λ =
             b. It uses the factors of the step and does not call `System.complete`. None if the
             stabilizer has its own `solve`.
@@ -353,14 +355,14 @@ class Advanced(NamedTuple):
 
 
 def reached(state: State, time: Doubled | Array, dt: Array) -> Doubled:
-    """Returns the time of `Advanced.point` with its rounding error.
+    """Returns the time at the end of a step with its rounding error.
 
     The rounding error is known if the time is a `Doubled` or equals `state.time + dt`; otherwise it
     is set to zero.
 
     Args:
         state: the state at the start of the step.
-        time: the time of the point.
+        time: the time in `Advanced.point`, rounded or not, () [s].
         dt: the length of the step, () [s].
     """
     if isinstance(time, Doubled):

@@ -78,7 +78,10 @@ def links(system: BodySystem, q: Array | np.ndarray) -> dict[str, np.ndarray]:
 
 @jax.jit
 def _links(system: BodySystem, q: Array) -> dict[str, Array]:
-    """Computes the points that `links` returns, as JAX arrays; compiled."""
+    """Computes the anchors on each moving body in the world frame, (n, dim) [m]; compiled.
+
+    If a body has fewer than two anchors, its center of mass is added as the first point.
+    """
     v = jnp.zeros(system.n_v, q.dtype)
     layout = system.layout
     result = {}
@@ -94,7 +97,7 @@ def _links(system: BodySystem, q: Array) -> dict[str, Array]:
 
 
 def _anchors(group: Constraint | Elements, located: tuple[int, int]) -> list[Array]:
-    """Returns the anchors of a group of elements on one body, in the body frame, (dim,) each [m].
+    """Returns the anchors of a group's elements on one body, in the body frame, (dim,) each [m].
 
     Args:
         group: a group of constraints or forces.
@@ -183,7 +186,7 @@ def animate(
         lines = axes.lines[first:]
 
     def show(i: int) -> Sequence[Line2D]:
-        """Moves the lines to frame i."""
+        """Moves the lines to their points in frame i, and returns the lines."""
         for line, points in zip(lines, frames[i], strict=True):
             line.set_data(*points[:, shown].T)
         return lines
@@ -343,7 +346,10 @@ def _draw_loss(axes: Axes, tuning: Tuning) -> None:
 
 
 def _draw_errors(axes: Axes, fresh: Validation) -> None:
-    """Plots the joint errors over time: the median over the linkages, and the middle 90 %."""
+    """Plots the joint errors over time, with default gains and with tuned gains.
+
+    A line shows the median over the linkages. A band contains the middle 90 % of the linkages.
+    """
     for rms, mean, color, label in zip(
         fresh.rms, fresh.mean, (BEFORE, AFTER), ("default", "tuned"), strict=True
     ):

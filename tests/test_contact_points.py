@@ -351,7 +351,9 @@ def test_parallel_capsules_touch_in_the_middle_of_what_faces():
     starts, ends = np.array([8.0, -1.0, 3.0, 11.0]), np.array([9.0, 1.0, 2.0, 12.0])
     lanes = (0.0 * starts, 10.0 + 0.0 * starts, starts, ends)
     corners = [Vector(jnp.asarray(x), jnp.full(4, float(i > 1))) for i, x in enumerate(lanes)]
-    x, y = nearest(*corners)
+    x, y, skew, crossing = nearest(*corners)
+    assert not np.any(skew)
+    assert not np.any(crossing)
     np.testing.assert_allclose(x[0], [8.5, 0.5, 2.5, 10.0], atol=1e-15)
     np.testing.assert_allclose(y[0], [8.5, 0.5, 2.5, 11.0], atol=1e-15)
 

@@ -30,7 +30,7 @@ MethodParts: TypeAlias = tuple[
 ]
 """The name of a method, with its integrator, stabilizer, contact solver and events."""
 SMALL = 30
-"""The largest number of constraint rows for which dense elimination (`Schur`) is compared too."""
+"""The largest number of constraint rows for which dense elimination (`Schur`) is also compared."""
 LOOKED = 11
 """The largest number of configurations at which the rank of J is computed."""
 
@@ -39,8 +39,9 @@ def methods_for(system: System, reference: Reference) -> dict[str, Method]:
     """Returns the methods that `tradeoff` compares by default on a system.
 
     Combinations of integrator, stabilizer, contact solver and events come first, all with one
-    linear solver: `Sparse`, or `RankSafe` if rows of J are dependent. For kinematic loops with
-    independent rows, RK4 with `Baumgarte` is added with other linear solvers.
+    linear solver: `Sparse`, or `RankSafe` if rows of the constraint Jacobian J are dependent. For
+    kinematic loops with independent rows, RK4 with `Baumgarte` is also compared with the linear
+    solvers `RankSafe` and, if there are few rows, `Schur`.
 
     Args:
         system: the system, in float64.
@@ -90,11 +91,13 @@ def _pairs(system: System, reference: Reference) -> list[MethodParts]:
 
 
 def _rank(system: System, reference: Reference) -> tuple[bool, bool, int]:
-    """Checks the rank of J at some configurations of the reference motion.
+    """Checks the rank of the constraint Jacobian J at some configurations of the reference motion.
 
     Returns:
-        True if the bodies form kinematic loops; True if all rows are independent at the checked
-        configurations; the number of rows.
+        loops: True if the bodies form kinematic loops.
+        independent: True if all rows are independent at the checked configurations. Always True
+            without loops, where nothing is checked.
+        rows: the number of constraint rows.
     """
     points = reference.points
     with precision(np.float64):

@@ -53,10 +53,10 @@ class Batch:
 
     @classmethod
     def of(cls, problem: Problem, reference: Reference, worlds: int) -> Batch:
-        """Returns a batch whose worlds start at the reference's points in turn.
+        """Returns a batch whose world i starts at the reference state at the start of part i.
 
-        These points are the starts of the parts of the horizon. Parts that end after
-        `reference.until` are not used, since the reference is inaccurate there.
+        Only the parts of the horizon up to the time `reference.until` are used, since the reference
+        is inaccurate later. If there are more worlds than parts, the parts are used repeatedly.
         """
         index = np.arange(worlds) % reference.last
         points = jax.tree.map(lambda x: x[index], reference.points)
@@ -96,7 +96,9 @@ class Pace(Lowered):
         return planned(self.program) / self.batch.worlds
 
     def seconds(self, dt: float) -> float:
-        """Returns the time of a step per world [s], the median of several runs of the batch.
+        """Measures the time of one step of the batch, divided by the number of worlds [s].
+
+        The result is the median of several runs.
 
         Args:
             dt: step size [s].
@@ -142,7 +144,9 @@ class Slope(Lowered):
             self.lowered = jax.jit(many).lower(*self.args, jnp.asarray(1e-3, self.dtype))
 
     def seconds(self, dt: float) -> float:
-        """Returns the time to compute value and gradient, per step and world [s].
+        """Measures the time to compute the value and gradient of a rollout, per step and world [s].
+
+        The result is the median of several runs.
 
         Args:
             dt: step size [s].

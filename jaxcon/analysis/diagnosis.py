@@ -184,7 +184,11 @@ def _run(
     controls: PyTree,
     dt: Scalar,
 ) -> tuple[State, Array]:
-    """Runs a rollout. Returns the final state, and φ at the start and after each recorded step."""
+    """Runs a rollout and records the constraint residual φ; compiled.
+
+    Returns:
+        The final state, and φ at the start and at each recorded step, (steps / every + 1, n_c).
+    """
 
     def record(state: State, _: StepInfo | None = None) -> Array:
         return linearize(checked_system(system, state), state.q, state.v, state.instant).residual
@@ -200,7 +204,7 @@ def _largest(path: np.ndarray) -> float:
 
 
 def _rounding(system: System, state: State) -> float:
-    """Returns the error of φ when each q_j is rounded, ε max_i Σ_j |∂φ_i/∂q_j| |q_j|."""
+    """Returns the largest error of φ due to rounding of q: ε max_i Σ_j |∂φ_i/∂q_j| |q_j|."""
 
     def residual(q: Array) -> Array:
         return linearize(checked_system(system, state), q, state.v, state.instant).residual
@@ -212,9 +216,12 @@ def _rounding(system: System, state: State) -> float:
 def _lost(system: System, state: State) -> dict[str, float]:
     """Returns the largest violations due to conflicting rows and to nearly dependent rows.
 
+    φ is split by the singular values of the unit-length rows of J.
+
     Returns:
-        Under "conflict", the largest part of φ that no motion changes. Under "rank", the largest
-        part of φ in combinations of rows that hardly any motion changes.
+        "conflict": the largest part of φ at zero singular values, which no displacement changes.
+        "rank": the largest part of φ at small nonzero singular values, up to `WEAK`. Only large
+            displacements change it.
     """
     rows, jacobian, mass = linearized(checked_system(system, state), state)
     unit = UnitRows(rows.layout, jacobian, mass)
@@ -225,5 +232,5 @@ def _lost(system: System, state: State) -> dict[str, float]:
 
 
 def _momenta(system: BodySystem, state: State) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the linear and the angular momentum of all bodies."""
+    """Returns the total linear momentum and the total angular momentum of all bodies."""
     return np.asarray(momentum(system, state)), np.asarray(angular_momentum(system, state))

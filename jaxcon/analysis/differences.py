@@ -23,7 +23,13 @@ def steps(eps: float) -> np.ndarray:
 
 
 def unseen(eps: float) -> float:
-    """Returns the smallest derivative that differences can resolve, relative to the value of f."""
+    """Returns the smallest derivative that differences can resolve, relative to the value of f.
+
+    It is the assumed relative rounding error of f, divided by the largest relative step size.
+
+    Args:
+        eps: ε of the coarsest dtype in the computation.
+    """
     return ROUNDING * eps / steps(eps)[0]
 
 
@@ -61,8 +67,8 @@ def ridders(slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     spread may be small by chance. The uncertainty is therefore the fourth smallest spread in the
     table, or the rounding error (`scatter`) of the selected entry if that is larger.
 
-    Rounding errors do not select the entry: a kink within the larger steps makes them large for
-    all entries.
+    The estimated rounding errors do not select the entry: if f has a kink within the larger steps,
+    these estimates are too large for all entries.
 
     Args:
         slopes: central differences, (directions, levels), the largest step first.
@@ -110,8 +116,8 @@ def scatter(slopes: np.ndarray) -> np.ndarray:
         slopes: central differences, (directions, levels), the largest step first.
 
     Returns:
-        Standard deviations of all entries after the first column, column by column, (directions,
-        n).
+        Standard deviations of the rounding errors of all entries after the first column, column by
+        column, (directions, n).
     """
     columns, unit = neville(slopes), neville(np.diag(2.0 ** np.arange(slopes.shape[1])))
     between = np.linalg.norm(np.diff(unit[2], axis=1), axis=0)

@@ -40,7 +40,7 @@ class Hit(NamedTuple):
 def cases(
     f: Callable[[list[Array]], PyTree], at: list[Array], moves: Iterable[list[Array]]
 ) -> list[str]:
-    """Describes impacts during the evaluation of f at which derivatives do not exist.
+    """Describes the impacts during an evaluation of f at which f has no derivative.
 
     Such impacts are simultaneous, grazing or accumulating.
 
@@ -48,6 +48,9 @@ def cases(
         f: function from a list of arrays to a pytree of arrays.
         at: the arrays at which f is differentiated.
         moves: changes of `at`. Impacts are also counted at `at` plus and minus each change.
+
+    Returns:
+        One text for each of the three kinds of impacts that occurs.
     """
     with notices.observed() as seen:
         program = jax.jit(f)
@@ -69,12 +72,12 @@ def cases(
 
 
 def _hits(kind: Seen, *values: np.ndarray) -> list[Hit]:
-    """Returns the impacts that all worlds had in one step.
+    """Converts an observation of one step to a list of its impacts, over all rows and worlds.
 
     Args:
-        kind: the observation's kind, with the layout of the inequality rows.
-        values: four arrays: masks of impacts and of bounces by row and world; times and step sizes
-            by world.
+        kind: the label of the observation, with the layout of the inequality rows.
+        values: four arrays. The first two are the masks of impacts and of bounces, (rows, worlds).
+            The last two are the time and the step size of each world, (worlds,).
     """
     hits, bounces = (x.reshape(len(x), -1) for x in values[:2])
     time, dt = (x.ravel() for x in values[2:])
@@ -86,7 +89,10 @@ def _hits(kind: Seen, *values: np.ndarray) -> list[Hit]:
 
 
 def _simultaneous(hits: list[Hit]) -> str | None:
-    """Describes simultaneous impacts: impacts of several rows of one world in one step."""
+    """Describes the first simultaneous impacts; None if there are none.
+
+    Impacts are simultaneous if several rows of one world have them in the same step.
+    """
     steps: dict[tuple[int, float], list[Hit]] = defaultdict(list)
     for hit in hits:
         steps[hit.row[1], hit.time].append(hit)
@@ -119,7 +125,10 @@ def _grazing(here: list[Hit], beside: list[list[Hit]]) -> str | None:
 
 
 def _accumulating(hits: list[Hit]) -> str | None:
-    """Describes accumulating impacts: many impacts of one row within few steps."""
+    """Describes the first accumulating impacts; None if there are none.
+
+    Impacts accumulate if one row has `MANY` of them within `FEW` steps.
+    """
     rows: dict[tuple[str, tuple[int, int]], list[Hit]] = defaultdict(list)
     for hit in hits:
         rows[hit.name, hit.row].append(hit)

@@ -1,7 +1,8 @@
-"""Estimates the operation count of a world's accelerations from its structure. Host code.
+"""Estimates the number of operations to compute the accelerations of one world. Host code.
 
-No step is traced or compiled, which would take seconds to minutes for hundreds of rows. For exact
-counts, `work.work` traces a whole step; `work.seconds` measures its time.
+The estimate uses the structure of the system. No step is traced or compiled, which would take
+seconds to minutes for hundreds of rows. For exact counts, `work.work` traces a whole step;
+`work.seconds` measures its time.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class Cost:
 
     @property
     def operations(self) -> float:
-        """The sum over all parts, without parts that have no estimate."""
+        """The total number of operations; a part without an estimate counts as zero."""
         return self.rows + (self.solver or 0.0) + self.contact
 
     def __str__(self) -> str:
@@ -63,7 +64,7 @@ def cost(system: System, method: Method, state: State, choice: Choice) -> Cost:
     """Estimates the number of operations to compute the accelerations once.
 
     Args:
-        system: the system, with the counted turns of the state.
+        system: the system, as `checked_system` returns it for the state.
         method: the method with its solvers.
         state: state of one world.
         choice: result of `choose`, with the operation counts of linear solvers for this system.
@@ -75,7 +76,14 @@ def cost(system: System, method: Method, state: State, choice: Choice) -> Cost:
 
 
 def _of_solver(solver: Solver, choice: Choice) -> float | None:
-    """Returns the operations of the constraint solver; None if they are unknown."""
+    """Returns the estimated number of operations of a linear solver; None without an estimate.
+
+    The number is 0 if there are no constraints.
+
+    Args:
+        solver: the linear solver of the method.
+        choice: result of `choose`, with the operation counts of linear solvers.
+    """
     solver = innermost(solver)
     if not choice.efforts:
         return 0.0  # there are no constraints
@@ -122,7 +130,7 @@ def solved_rows(solver: ContactSolver | GaussSeidel, kinds: RowCounts) -> int:
 
 
 def _rows(system: System, state: State) -> float:
-    """Returns the number of operations to linearize all rows of one world."""
+    """Counts the operations to linearize the equality and inequality constraints of one world."""
     point = state.q, state.v, state.time
     operations = count(jax.make_jaxpr(linearize)(system, *point).jaxpr)
     if not system.bounds:

@@ -28,9 +28,10 @@ from jaxcon.step import Dynamics, Solved, reached
 from jaxcon.system.state import MethodMemory, State, at_instant, with_turns
 
 Carry: TypeAlias = tuple[Array, State, State, PyTree, Array]
-"""The number of steps taken; then four values of the last step.
+"""The loop carry of `_replay`: the number of steps taken, and four values of the last step.
 
-These are the states before the step, the states after it, the controls, and the status codes.
+These values are the states before the step, the states after it, the controls, and the status
+codes.
 """
 
 
@@ -185,7 +186,8 @@ def _look(
     """Evaluates one step of one world term by term.
 
     Returns:
-        The wrong terms, the index of the integrator's stage where they occur, and the status.
+        The wrong terms; the index of the integrator's stage where they occur; and the failure
+        status that belongs to them.
     """
     control = check_step(system, method, state, control)
     h = jnp.asarray(dt, state.q.dtype)
@@ -229,7 +231,10 @@ class Watched(Dynamics):
         rate_delay: Array | None = None,
         every_landing: bool = False,
     ) -> Solved:
-        """Solves for accelerations and multipliers, and records the wrong terms of this stage."""
+        """Solves for accelerations and multipliers, and records the wrong terms of this stage.
+
+        Nothing is recorded if the values are traced.
+        """
         solved = super().solve(rows, q, v, t, rate_delay, every_landing)
         if checks.is_concrete((q, v, t, solved.solution)):
             self.seen.append(self._judge(q, v, t, solved.solution, solved.rows))
@@ -238,10 +243,14 @@ class Watched(Dynamics):
     def _judge(
         self, q: Array, v: Array, t: Doubled | Array, solution: Solution, rows: Rows
     ) -> tuple[list[Finding], Status]:
-        """Returns the wrong terms at one stage, and the status of a step that fails there.
+        """Finds the wrong terms at one stage of the integrator.
 
-        If no term is wrong but the solver failed, the only finding is the solver's failure. The
-        status is the solver's failure status, or NON_FINITE if the solver did not fail.
+        If no term is wrong but the solver failed, the findings name the dependent rows for status
+        SINGULAR, and the solver for any other status.
+
+        Returns:
+            The wrong terms; and the status of a step that fails at this stage. It is the solver's
+            failure status, or NON_FINITE if the solver did not fail.
         """
         code = Status(int(solution.status))
         system = self.system

@@ -103,7 +103,10 @@ def _infinite(term: str, x: Array, places: dict[str, np.ndarray] | None) -> Iter
 
 
 def masses(system: System, q: Array) -> Iterator[Finding]:
-    """Yields a finding for each body whose mass or moment of inertia is not positive."""
+    """Yields a finding for each body whose mass or moment of inertia is not positive.
+
+    If there is no such body, yields a finding for a mass matrix that is not positive definite.
+    """
     mass = system.mass(q)
     wrong = jnp.where(mass.diagonal > 0, mass.diagonal, jnp.nan)
     yield from (Finding("mass", f.name, "is not positive") for f in entries(system, "mass", wrong))
@@ -128,7 +131,7 @@ def forces(
 
 
 def terms(rows: Rows) -> Iterator[Finding]:
-    """Yields a finding for each constraint and each non-finite term of its linearization."""
+    """Yields a finding for each non-finite term in the linearization of each constraint."""
     values = {"residual": rows.residual, "rate": rows.rate, "bias": rows.bias}
     if rows.layout.size:
         values["jacobian"] = rows.jacobian.dense()
@@ -142,7 +145,10 @@ def terms(rows: Rows) -> Iterator[Finding]:
 
 
 def dependent(system: System, q: Array, rows: Rows) -> list[Finding]:
-    """Returns a finding for each constraint with rows that depend linearly on other rows."""
+    """Returns a finding for each constraint with rows that depend linearly on rows before them.
+
+    If there is no such row, returns one finding for the whole system.
+    """
     by_name: dict[str, list[int]] = {}
     unit = UnitRows(rows.layout, rows.jacobian.dense(), system.mass(q).dense())
     for i in dependent_rows(unit.values, unit.tolerance):

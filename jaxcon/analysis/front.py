@@ -76,7 +76,7 @@ class Run:
         return self.outcome == OK
 
     def plain(self) -> dict[str, Any]:
-        """Returns all fields except the method, for JSON. Non-finite numbers become None."""
+        """Returns all fields except `method` by name, for JSON. Non-finite numbers become None."""
         values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "method"}
         bad = (k for k, x in values.items() if isinstance(x, float) and not math.isfinite(x))
         return values | dict.fromkeys(bad)
@@ -283,7 +283,7 @@ class Tradeoff:
 
     @property
     def excuses(self) -> dict[str, list[str]]:
-        """The skipped methods with their precisions, by reason."""
+        """The skipped methods, grouped by reason; each text is a method's name and precisions."""
         by_reason: dict[str, dict[str, list[str]]] = {}
         for x in self.left_out:
             by_reason.setdefault(x.reason, {}).setdefault(x.name, []).append(x.dtype)

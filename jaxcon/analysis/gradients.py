@@ -50,7 +50,10 @@ class LeafGradient:
 
     @property
     def error(self) -> float:
-        """The largest relative error of both modes, minus the uncertainty of the differences."""
+        """The largest relative distance of reverse or forward mode from the finite differences.
+
+        The uncertainty of the differences is subtracted.
+        """
         return self._beyond(self.forward, self.reverse)
 
     @property
@@ -69,7 +72,13 @@ class LeafGradient:
         return self.agrees and not self.undecided
 
     def _beyond(self, *modes: np.ndarray) -> float:
-        """Returns the largest relative error of given modes, minus the differences' uncertainty."""
+        """Returns the largest relative distance of given derivatives from the finite differences.
+
+        The uncertainty of the differences is subtracted.
+
+        Args:
+            modes: for each mode, the derivatives by direction, (n,).
+        """
         apart = np.maximum.reduce([np.abs(x - self.difference) for x in modes])
         return self._largest(np.maximum(apart - self.uncertainty, 0.0))
 
@@ -82,7 +91,7 @@ class LeafGradient:
         return f"{head} differences by {self.error:.1e}{self._verdict()}"
 
     def _verdict(self) -> str:
-        """Returns the reason why the leaf is undecided or wrong; empty if it is right."""
+        """Explains why the derivatives are undecided or wrong; empty if they are right."""
         if self.ok:
             return ""
         if self.agrees:
@@ -97,7 +106,7 @@ class LeafGradient:
         )
 
     def _culprit(self) -> str:
-        """Returns a text that says which modes disagree with the differences."""
+        """Says which modes (reverse, forward) disagree with the finite differences, as text."""
         modes = self.reverse, self.forward
         reverse, forward = (not self._beyond(mode) <= self.tolerance for mode in modes)
         if reverse and forward:
@@ -231,11 +240,13 @@ def check_gradients(
 
 
 def _alone(at: list[Array], place: int, way: Array, eps: float) -> list[Array]:
-    """Returns the largest perturbation in central differences along one direction of one leaf.
+    """Returns the perturbations of all leaves in the central difference with the largest step.
+
+    Only one leaf is perturbed, along one direction. The perturbations of all other leaves are zero.
 
     Args:
         at: the leaves.
-        place: index of the perturbed leaf; the perturbation of all other leaves is zero.
+        place: index of the perturbed leaf.
         way: the direction, with the shape of the leaf.
         eps: ε of the coarsest dtype in the computation.
     """
@@ -272,10 +283,16 @@ def _weighted(
     results: list[jax.ShapeDtypeStruct],
     random: np.random.Generator,
 ) -> Callable[[list[Array]], tuple[Array, Array]]:
-    """Returns a function from x to a number, and the sum of the absolute values of its terms.
+    """Returns a function that reduces f(x) to a single number to differentiate.
 
-    The number is f(x) if f returns a single number. Otherwise it is a random linear combination of
-    all numbers in f(x).
+    If f returns a single number, the function returns it. Otherwise it returns a random linear
+    combination of all numbers in f(x). A second result of the function is the sum of the absolute
+    values of the terms of this combination.
+
+    Args:
+        f: function from a list of arrays to a pytree.
+        results: shapes and dtypes of the floating-point leaves of f(x).
+        random: generator of the weights.
     """
     alone = len(results) == 1 and results[0].size == 1
     weights = [np.ones(y.shape) if alone else random.normal(size=y.shape) for y in results]
@@ -298,9 +315,11 @@ def _is_floating(x: Any) -> bool:
 
 
 def _directions(leaf: Array, count: int, random: np.random.Generator) -> Array:
-    """Returns directions (n, …) in which a leaf is varied, with the leaf's size as length.
+    """Returns the directions in which a leaf is varied, (n, …).
 
-    If the leaf is zero, their length is 1. Sizes and lengths are maximum norms.
+    A leaf of up to `count` numbers has one direction for each number. A larger leaf has `count`
+    random directions. The maximum norm of each direction is that of the leaf, or 1 if the leaf is
+    zero.
     """
     size = float(jnp.max(jnp.abs(leaf), initial=0)) or 1.0
     if leaf.size <= count:

@@ -28,9 +28,9 @@ If there are more independent directions, this many random combinations of them 
 
 
 POLYNOMIAL = 4.0
-"""The largest product of exponent and time at which growth may be polynomial, not exponential.
+"""The threshold on exponent times time up to which growth may be polynomial, not exponential.
 
-For growth ∝ t², the product of fitted exponent and time is 2.8.
+For growth ∝ t², the fitted exponent times the time is 2.8.
 """
 
 
@@ -99,11 +99,11 @@ def gradient_growth(
 ) -> GradientGrowth:
     """Computes the growth of the derivatives ‖∂x_t/∂x_0‖ along a rollout, with x = (q, v).
 
-    Uses forward mode.
+    The derivatives are computed by forward mode.
 
-    Only initial perturbations that keep φ and φ̇ unchanged are used; feedback would quickly remove
-    others. With n independent perturbations, the growth is ‖∂x_t/∂x_0‖_F/√n in SI units. If n > 16,
-    16 random combinations of them are used.
+    Only initial perturbations that keep φ and φ̇ unchanged are used, since feedback would quickly
+    remove all others. With n independent perturbations, the growth is ‖∂x_t/∂x_0‖_F/√n in SI units.
+    If n > 16, 16 random combinations of the perturbations are used.
 
     Args:
         system: the system of a built scene, or a `jc.GeneralizedSystem`.
@@ -177,9 +177,9 @@ def _exponent(time: np.ndarray, growth: np.ndarray) -> float:
 
 
 def _allowed(system: System, state: State) -> np.ndarray:
-    """Returns an orthonormal basis of perturbations (δq, δv) without change of φ and φ̇.
+    """Returns an orthonormal basis of the perturbations (δq, δv) that leave φ and φ̇ unchanged.
 
-    The basis has shape (2 n_v, n).
+    The basis vectors are the columns of the result, (2 n_v, n).
     """
     n = len(state.v)
 

@@ -121,7 +121,7 @@ def integrability(
 
 
 def _nearby(system: System, state: State) -> State:
-    """Returns a state with random small changes of q and t, which may violate the constraints."""
+    """Returns a state with a random small change of q, 0.1 s later; it may violate constraints."""
     step = 0.1 * np.random.default_rng(0).normal(size=state.v.shape)
     q = system.retract(state.q, jnp.asarray(step, state.q.dtype))
     return dataclasses.replace(state, q=q, time=state.time + 0.1)
@@ -156,7 +156,7 @@ def _growth(
 
 
 class _Metric:
-    """Velocity coordinates w in which the mass matrix M at a configuration is the identity.
+    """Velocity coordinates w in which M at one configuration is a multiple of the identity.
 
     Attributes:
         out: matrix of v = out @ w, (n_v, n_v): L⁻ᵀ, where L Lᵀ is M divided by its mean diagonal.
@@ -173,7 +173,14 @@ class _Metric:
         self.inward = factor.T @ np.linalg.pinv(np.asarray(N, np.float64).T)
 
     def of(self, fields: Array) -> np.ndarray:
-        """Returns the coordinates w of vector fields (fields, n_q + 1) at the configuration."""
+        """Converts the values of vector fields at the configuration to velocity coordinates w.
+
+        Args:
+            fields: rates of (q, t), (fields, n_q + 1).
+
+        Returns:
+            The coordinates w, (fields, n_v). The rate of t is dropped.
+        """
         return np.asarray(fields, np.float64)[:, :-1] @ self.inward.T
 
 
@@ -185,13 +192,17 @@ def _rows(system: System, q: Array, t: Array, rows: np.ndarray) -> tuple[Array, 
 
 
 def _allowed(system: System, metric: _Metric, rows: np.ndarray, basis: Array) -> Fields:
-    """Returns the allowed vector fields: projected constant velocities, and the drift with time.
+    """Returns a function that evaluates the allowed vector fields at x = (q, t).
+
+    Constraint rows have the form A v + b = 0. The first fields have the velocities of `basis`,
+    projected onto the velocities with A v = 0; t does not change along them. The last field has the
+    shortest velocity with A v = −b; along this field, t changes at rate 1.
 
     Args:
         system: the system.
-        metric: coordinates in which M is the identity.
+        metric: coordinates w in which M is a multiple of the identity.
         rows: indices of independent rows.
-        basis: velocities to project onto the allowed ones, (fields, n_v), in these coordinates.
+        basis: velocities before the projection, in the coordinates w, (fields, n_v).
     """
 
     def fields(x: Array) -> Array:
@@ -214,15 +225,18 @@ def _allowed(system: System, metric: _Metric, rows: np.ndarray, basis: Array) ->
 def _grow(
     fields: Fields, metric: _Metric, x: Array, allowed: np.ndarray, room: int, tolerance: float
 ) -> tuple[tuple[int, ...], np.ndarray]:
-    """Adds Lie brackets level by level. Returns the dimensions, and velocities of the last level.
+    """Extends the space of allowed velocities by Lie brackets, level by level.
 
     Args:
         fields: the allowed vector fields.
-        metric: coordinates in which M is the identity.
+        metric: coordinates w in which M is a multiple of the identity.
         x: configuration and time (q, t), (n_q + 1,).
-        allowed: an orthonormal basis of the allowed velocities, in these coordinates.
+        allowed: an orthonormal basis of the allowed velocities, in the coordinates w, (n₁, n_v).
         room: the largest possible dimension.
         tolerance: relative length below which a bracket adds no dimension.
+
+    Returns:
+        The dimension of each level; and the velocities that span the last level, (n_last, n_v).
     """
     span = list(allowed)
     growth, last = [len(span)], fields
@@ -247,7 +261,8 @@ def _grow(
 def _brackets(fields: Fields, others: Fields) -> Callable[[Array], tuple[Array, Array]]:
     """Returns a function that computes both terms of the Lie brackets of all pairs of fields.
 
-    The bracket of X and Y is [X, Y] = DY X − DX Y. The function maps x to all DY X and all DX Y,
+    A pair has a field X of `fields` and a field Y of `others`. Their bracket is
+    [X, Y] = DY X − DX Y. The function maps x to two arrays, all DY X and all DX Y,
     (pairs, n_q + 1) each.
     """
 
@@ -262,7 +277,12 @@ def _brackets(fields: Fields, others: Fields) -> Callable[[Array], tuple[Array, 
 
 
 def _chosen(brackets: Callable[[Array], tuple[Array, Array]], indices: np.ndarray) -> Fields:
-    """Returns selected brackets as vector fields."""
+    """Returns a function that evaluates selected Lie brackets at x, as vector fields.
+
+    Args:
+        brackets: function that computes both terms of all brackets, as `_brackets` returns it.
+        indices: indices of the selected brackets.
+    """
 
     def fields(x: Array) -> Array:
         first, second = brackets(x)

@@ -1,4 +1,4 @@
-"""Saved results of `tradeoff`, from which it resumes, and its time budget."""
+"""The results that `tradeoff` saves in a file and resumes from, and its time budget."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Wanted:
 
     @property
     def key(self) -> str:
-        """The key of this method's results in the ledger, equal in all processes."""
+        """The key of this method's results in the ledger; it is the same in every process."""
         leaves, structure = jax.tree.flatten(self.method)
         # functions print with their addresses, which differ between processes
         plain = re.sub(r" at 0x[0-9a-f]+", "", str(structure))
@@ -76,7 +76,7 @@ class Ledger:
 
     Attributes:
         file: path of the file; None keeps results in memory only.
-        about: the settings of the comparison, which must match those in the file.
+        about: the settings of the comparison, which must match the settings in the file.
         contents: reference and results as JSON values.
     """
 
@@ -179,7 +179,7 @@ class Clock:
 
     @property
     def spent(self) -> float:
-        """The elapsed time [s]."""
+        """The time since the clock was created [s]."""
         return time.perf_counter() - self.begin
 
     @property
@@ -200,12 +200,22 @@ class Clock:
         return SLOWER * self.longest.get(work, guess)
 
     def lasts(self, work: str, share: float = 1.0, guess: float | None = None) -> bool:
-        """Returns True if one more task of a kind should end within a share of the budget."""
+        """Predicts whether one more task of a kind will end within a share of the budget.
+
+        Args:
+            work: the kind of the task, such as "runs".
+            share: the share of the budget.
+            guess: estimate for the first task of its kind [s], as in `asks`.
+        """
         return self.spent + self.asks(work, guess) < share * self.budget
 
     @contextlib.contextmanager
     def timing(self, work: str) -> Iterator[None]:
-        """Measures the duration of a task of a kind, as a context manager."""
+        """Measures the time spent in a `with` block, and updates the longest time of its kind.
+
+        Args:
+            work: the kind of the task in the block, such as "runs".
+        """
         begin = self.spent
         yield
         self.longest[work] = max(self.longest.get(work, 0.0), self.spent - begin)

@@ -33,7 +33,10 @@ def table(runs: Sequence[Run]) -> list[str]:
 
 
 def figures(run: Run) -> str:
-    """Formats the measured values of a run as table cells, or the reason why it diverged."""
+    """Formats the measured values of a run as table cells.
+
+    For a diverged run, returns the reason for the divergence in place of the values.
+    """
     if not run.ok:
         return f"  diverged: {run.outcome}"
     values = {name: getattr(run, name) for name in COLUMNS}

@@ -188,11 +188,11 @@ def gradient_memory(
 
 
 def nothing(state: State, info: StepInfo) -> None:
-    """Records no values; for rollouts of which only the final state is used."""
+    """Records no values; the `record` function of rollouts that need only the final state."""
 
 
 def _numbers(steps: int) -> int:
-    """Returns the memory of the step indices of a rollout, which all worlds share [B]."""
+    """Returns the size of a rollout's array of step indices [B]. All worlds share this array."""
     return steps * np.dtype(jnp.result_type(int)).itemsize
 
 

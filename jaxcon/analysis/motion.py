@@ -61,12 +61,12 @@ class StepAngle:
 
     @property
     def turn(self) -> float:
-        """The angle h |ω| of the fastest body at the velocities of the state [rad]."""
+        """The angle h |ω| of the fastest rotation in one step, at the current velocities [rad]."""
         return self.dt * self.turning.value
 
     @property
     def swing(self) -> float:
-        """The angle h ω of the fastest motion that gravity and springs can cause [rad]."""
+        """The angle h ω per step of the fastest motion that gravity and springs can cause [rad]."""
         return self.dt * self.swinging.value
 
     def __str__(self) -> str:
@@ -115,7 +115,8 @@ def _with_rotors(setup: Setup) -> tuple[UnitRows, np.ndarray]:
     """Adds the inertia of rotors to the mass matrix M.
 
     Returns:
-        The unit-length rows in the metric of this M, and its Cholesky factor L with M = L Lᵀ.
+        The constraint rows, scaled to unit length in the metric of the sum M; and the Cholesky
+        factor L of the sum, M = L Lᵀ.
     """
     mass, layout = np.asarray(setup.mass, np.float64), setup.rows.layout
     if not layout.inertial:
@@ -133,14 +134,19 @@ def _value(rate: Rate) -> float:
 
 
 def _root(rate: Rate) -> Rate:
-    """Converts an angular acceleration x, or x = κ |a| [rad/s²], to the rate √x [rad/s]."""
+    """Returns a `Rate` with the square root √x [rad/s] of a given value x [rad/s²].
+
+    x is an angular acceleration, or κ |a| of a path with curvature κ and acceleration a.
+    """
     return Rate(float(np.sqrt(rate.value)), rate.name)
 
 
 def _spin(system: System, v: np.ndarray) -> Rate:
-    """Returns the largest angular speed of a body in velocities v (n_v,); 0 without bodies.
+    """Returns the largest angular speed of all bodies, with the name of the body.
 
-    For accelerations in place of v, returns the largest angular acceleration.
+    Args:
+        system: the system. The result is 0 if it has no bodies.
+        v: velocities, (n_v,). For accelerations, the result is the largest angular acceleration.
     """
     layout = system.layout
     if layout is None:
@@ -160,7 +166,8 @@ def _curved(
 ) -> Rate:
     """Returns the rate at which constraint forces turn the direction of v, in the metric of M.
 
-    The rate is |Jᵀλ| / |v|. Here λ are the multipliers due to the velocity-dependent part of γ.
+    The rate is |Jᵀλ| / |v|. Here λ are the multipliers due to the velocity-dependent part of γ in
+    φ̈ = J a + γ.
 
     Args:
         setup: the scene, its state and the method.
@@ -180,10 +187,10 @@ def _curved(
 
 
 def _natural(setup: Setup, unit: UnitRows, factor: np.ndarray, λ: np.ndarray) -> Rate:
-    """Returns the highest natural frequency √|κ|, with the eigenvalue κ of K of largest magnitude.
+    """Returns the highest natural frequency √|κ| of the scene at rest.
 
-    K = −∂(f + Jᵀλ)/∂q is the stiffness at the multipliers λ of the scene at rest. It is projected
-    onto the null space of J, in the metric of M.
+    κ is the eigenvalue of largest magnitude of the stiffness K = −∂(f + Jᵀλ)/∂q at constant
+    multipliers λ. K is projected onto the null space of J, in the metric of M.
 
     Args:
         setup: the scene, its state and the method.
@@ -211,7 +218,7 @@ def _natural(setup: Setup, unit: UnitRows, factor: np.ndarray, λ: np.ndarray) -
 
 
 def _owner(system: System, x: np.ndarray) -> str:
-    """Returns the name of the body or coordinate with the largest part in an array (n_v,)."""
+    """Returns the name of the body or coordinate whose entries of x, (n_v,), are the largest."""
     layout = system.layout
     if layout is None:
         return f"coordinate {int(np.argmax(np.abs(x)))}"

@@ -45,7 +45,7 @@ def probe(system: System, method: Method, state: State, control: PyTree, dt: flo
     Args:
         system: the system of a built scene, or a `jc.GeneralizedSystem`.
         method: integrator, stabilizer and solver.
-        state: state of one world, as returned by `begun`.
+        state: state of one world, with the initial memory of the method (see `begun`).
         control: control input, as in `jc.step`, or None.
         dt: step size h [s].
     """
@@ -64,10 +64,11 @@ def begun(system: System, method: Method, state: State) -> State:
 def _run(
     method: Method, system: System, start: State, control: PyTree, dt: Array
 ) -> tuple[State, tuple[Array, Array]]:
-    """Runs a rollout.
+    """Takes `STEPS` steps with a constant control; compiled.
 
     Returns:
-        The final state; and for each step max |φ| and the residual of the inequality constraints.
+        The final state; and for each step max |φ| and the residual of the inequality constraints,
+        (STEPS,) each.
     """
 
     def record(state: State, info: StepInfo) -> tuple[Array, Array]:

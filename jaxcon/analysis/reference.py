@@ -26,10 +26,11 @@ MOST = 1 << 20
 GOAL = 1e-13
 """The difference of two runs, relative to the size of the motion, at which refinement stops."""
 GOOD = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
-"""Errors, relative to the size of the motion, up to which a reference counts as accurate.
+"""The thresholds on the reference's error, relative to the size of the motion.
 
-The smallest value that the error does not exceed in the first half of the horizon is used; if there
-is none, the largest value.
+The smallest threshold that the error does not exceed in the first half of the horizon is used; if
+there is none, the largest threshold. The reference is accurate until its error exceeds the
+threshold.
 """
 REST = 1e-4
 """The energy error, as a share of the total energy, at which a scene at rest counts as diverged."""
@@ -60,10 +61,10 @@ def butcher() -> RungeKutta:
 class Ruler:
     """Measures the distance of two configurations [m]; ‖q₁ − q₂‖ for generalized coordinates.
 
-    A body's distance is √(d² + k²θ²). Here d is the distance of its centers of mass, θ the angle
-    between its orientations, and k its largest radius of gyration. To first order, it is at least
-    the root mean square displacement of the body's mass. The distance of two configurations is the
-    largest distance of any body.
+    A body's distance is √(d² + k²θ²). Here d is the distance between its two centers of mass, θ the
+    angle between its two orientations, and k its largest radius of gyration. To first order, a
+    body's distance is at least the root mean square displacement of its mass. The distance of two
+    configurations is the largest distance of any body.
     """
 
     def __init__(self, system: System, q: Array) -> None:
@@ -196,7 +197,7 @@ def started(problem: Problem, observe: Observer) -> tuple[Problem, float]:
     """Moves the initial state of a problem onto the constraints, unless it satisfies them.
 
     Returns:
-        The problem, and the distance moved, (Σ m d²)^½ [kg^½ m].
+        The problem with the moved initial state, and the distance moved, (Σ m d²)^½ [kg^½ m].
 
     Raises:
         SimulationError: no nearby configuration satisfies the constraints; the message names the
@@ -216,12 +217,18 @@ def started(problem: Problem, observe: Observer) -> tuple[Problem, float]:
 
 
 def method_for(system: System) -> Method:
-    """Returns the reference's method: order six, or RK4 with events if there are inequalities."""
+    """Returns the method of the reference solution: an explicit Runge–Kutta method of order six.
+
+    For systems with inequality constraints, it is RK4 with `Events`.
+    """
     return Method(RK4(), events=Events()) if system.bounds else Method(butcher())
 
 
 def make(course: Course, observe: Observer, moved: float, seconds: float) -> Reference:
-    """Halves the step size until two runs agree, their agreement stops improving, or time is up.
+    """Computes the reference solution, by runs with smaller and smaller step sizes.
+
+    The step size is halved until two successive runs agree, until their agreement stops improving,
+    or until the time or the number of steps reaches its limit.
 
     Args:
         course: the program that simulates the problem in float64. The problem comes from `started`,
@@ -264,7 +271,7 @@ class RunPair(NamedTuple):
         fine: the run with the smaller step size.
         apart: the largest distance of the runs from the start to the end of each part, (parts,)
             [m].
-        each: number of steps per part of `fine`.
+        each: number of steps of `fine` per part of the horizon.
     """
 
     coarse: Trip
@@ -276,10 +283,17 @@ class RunPair(NamedTuple):
 def _closer(best: RunPair | None, new: RunPair, size: float) -> tuple[RunPair, bool]:
     """Returns the pair of runs that agree better, and True if that is the new pair.
 
-    The pairs are compared by the mean logarithm of their distances. At the end of a chaotic motion,
-    both runs of a pair may agree by chance. A third run, with half the step size of the finer run,
-    reveals this. If the best pair remains the best, its distances are therefore raised to at
-    least those between its finer run and the third run.
+    A pair agrees better if the mean logarithm of the distances between its runs is smaller.
+
+    The two runs of a pair may be close by chance, for example at the end of a chaotic motion. The
+    next run with half the step size reveals this. If the best pair stays the best, its distances
+    are therefore raised to the distances between its finer run and the next run, where these are
+    larger.
+
+    Args:
+        best: the best pair so far; None for the first pair.
+        new: the pair of the last two runs.
+        size: size of the motion [m].
     """
     if best is None or _logarithm(new.apart, size) < _logarithm(best.apart, size):
         return new, True
@@ -289,7 +303,12 @@ def _closer(best: RunPair | None, new: RunPair, size: float) -> tuple[RunPair, b
 
 
 def _logarithm(apart: np.ndarray, size: float) -> float:
-    """Returns the mean logarithm of distances, after adding the rounding error to each."""
+    """Returns the mean logarithm of distances, after adding the rounding error to each distance.
+
+    Args:
+        apart: distances, (parts,) [m].
+        size: size of the motion [m], which gives the rounding error.
+    """
     return float(np.mean(np.log(apart + np.finfo(float).eps * size)))
 
 
@@ -298,7 +317,18 @@ def _trusted(
 ) -> Reference:
     """Returns the finer run of the best pair as a `Reference`, with its error estimate.
 
-    The reference is compared with other runs only up to the time until which it is accurate.
+    Its `until` is the end of the last part of the horizon in which the error meets the threshold of
+    `GOOD`.
+
+    Args:
+        problem: the problem.
+        observe: evaluates energies and violations.
+        ruler: measures distances between configurations.
+        best: the pair of runs that agree best.
+        moved: distance by which `started` moved the initial state.
+
+    Raises:
+        SimulationError: the error exceeds the largest threshold in the first part already.
     """
     _, trip, apart, count = best
     pairs = zip(problem.start, trip.points, strict=True)
@@ -320,7 +350,12 @@ def _trusted(
 
 
 def _hopeless(trip: Trip, steps: int) -> str:
-    """Returns the error message that says why there is no reference."""
+    """Returns the error message that says why there is no reference solution.
+
+    Args:
+        trip: the last run.
+        steps: number of steps of this run.
+    """
     code, when = trip.status, float(trip.points.time[-1])
     if not trip.failed:
         return (

@@ -39,7 +39,7 @@ class Setup:
     """A scene at a state, with a method, and quantities derived from them.
 
     Attributes:
-        system: the system, with the counted turns of the state.
+        system: the system, as `checked_system` returns it for the state.
         state: state of one world.
         method: the method that steps the scene.
         dt: step size h [s]; None if not given.
@@ -73,7 +73,10 @@ class Setup:
         batch: int = 1,
         measured: bool = True,
     ) -> Setup:
-        """Checks a user's arguments and linearizes the constraints. Returns the `Setup`."""
+        """Returns the `Setup` of a user's arguments, which are checked first.
+
+        The constraints are linearized at the state. Without a method, the default `Method` is used.
+        """
         system = checked_system(system, state, "jc.report(system, s)")
         if dt is not None:
             checks.check("report", "dt", dt, (), above=0)
@@ -95,7 +98,12 @@ class Setup:
 
     @cached_property
     def even(self) -> UnitRows:
-        """The unit-length rows for bodies of mass 1 with their actual radii of gyration."""
+        """The unit-length rows for another mass matrix, in which every body has mass 1.
+
+        Radii of gyration stay the same, so moments of inertia are divided by the mass of the body.
+        A comparison with `unit` shows the effect of mass ratios. For systems without bodies, both
+        are equal.
+        """
         if not isinstance(self.system, BodySystem):
             return self.unit
         groups = tuple(
@@ -146,14 +154,14 @@ class Setup:
 
     @cached_property
     def probe(self) -> Probe | None:
-        """The violation after some steps; None without a step size or without `measured`."""
+        """The violation after some steps; None without a step size or if `measured` is False."""
         if self.dt is None or not self.measured:
             return None
         return probe(self.system, self.method, self.state, self.control, self.dt)
 
     @cached_property
     def violation(self) -> dict[str, tuple[float, float]]:
-        """(‖φ‖, ‖φ̇‖) by constraint; for a velocity constraint ψ = 0, both are ‖ψ‖."""
+        """The violation (‖φ‖, ‖φ̇‖) by constraint; for a velocity constraint ψ = 0, both are ‖ψ‖."""
         layout, violation = self.rows.layout, {}
         φ, rate = (np.asarray(x, np.float64) for x in (self.rows.residual, self.rows.rate))
         for name in layout.names:
@@ -177,10 +185,10 @@ class Setup:
         return len(dependent_rows(beside.values, beside.tolerance)) < len(self.dependent)
 
     def _closed(self, state: State) -> UnitRows | None:
-        """Returns the unit-length rows at a nearby position that satisfies all constraints.
+        """Moves a state onto the constraints, and returns the unit-length rows at that position.
 
-        Uses Newton's method, with the shortest steps in the metric of M. None if it does not
-        converge.
+        Uses Newton's method with the shortest steps in the metric of M. The result is None if the
+        method does not converge.
         """
         for _ in range(NEWTON):
             rows, jacobian, mass = linearized(self.system, state)
@@ -194,7 +202,7 @@ class Setup:
         return None
 
     def velocities(self, x: np.ndarray) -> np.ndarray:
-        """Returns the displacement Δ = L⁻ᵀ x, (n_v,), with the Cholesky factor L of M = L Lᵀ.
+        """Returns the displacement Δ = L⁻ᵀ x, (n_v,). L is the Cholesky factor of M = L Lᵀ.
 
         Args:
             x: coordinates in which the metric of M is the identity, (n_v,).
@@ -202,7 +210,7 @@ class Setup:
         return np.linalg.solve(np.linalg.cholesky(np.asarray(self.mass, np.float64)).T, x)
 
     def moved(self, step: np.ndarray) -> State:
-        """Returns the state with its position displaced to q ⊕ Δ.
+        """Returns the state with its position q displaced to q ⊕ Δ, by `System.retract`.
 
         Args:
             step: displacement Δ, (n_v,).
@@ -210,7 +218,12 @@ class Setup:
         return self._displaced(self.state, step)
 
     def _displaced(self, state: State, step: np.ndarray) -> State:
-        """Returns a given state with its position displaced to q ⊕ Δ; `step` is Δ (n_v,)."""
+        """Returns a given state with its position q displaced to q ⊕ Δ, by `System.retract`.
+
+        Args:
+            state: the state to displace.
+            step: displacement Δ, (n_v,).
+        """
         move = np.asarray(step, state.q.dtype)
         return dataclasses.replace(state, q=host.evaluate(_retract, self.system, state.q, move))
 

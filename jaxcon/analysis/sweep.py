@@ -24,7 +24,10 @@ from jaxcon.methods.method import Method
 COUNTS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000)
 """The default numbers of steps per part of the horizon."""
 MOST = 20_000
-"""The largest number of steps over the horizon, for default step sizes shorter than a part."""
+"""The largest number of steps over the horizon with default step sizes.
+
+One step per part of the horizon is always allowed.
+"""
 OPEN = 0.05
 """The max |φ|, relative to the size of the motion, above which a run counts as diverged."""
 GAINED = 1.0
@@ -32,13 +35,13 @@ GAINED = 1.0
 BISECTIONS = 4
 """The number of bisections between a stable and an unstable step size, on a logarithmic scale."""
 SHARE = 1 / 60
-"""The share of the budget that a single run may take."""
+"""The share of the budget that a single run with a default step size may take."""
 ASKED = 1 / 4
 """The share of the budget that all runs of a method may take, even at the user's step sizes."""
 FEW = 10
 """The number of steps per part in a short run that predicts the time of the first full run."""
 NO_GAIN = 0.8
-"""The ratio of a run's error to the least error so far above which the run is no improvement."""
+"""The share of the least error so far below which a run's error counts as an improvement."""
 REFUSED = (ValueError, TypeError, NotImplementedError, jax.errors.JaxRuntimeError)
 """The exceptions raised by a method that does not fit a scene."""
 
@@ -91,7 +94,10 @@ class Sweep:
 
     @property
     def counts(self) -> list[int]:
-        """Numbers of steps per part, ascending; a step size is reduced until it divides a part."""
+        """The numbers of steps per part of the horizon, in ascending order.
+
+        The user's step sizes are reduced until they divide a part.
+        """
         parts = self.problem.parts
         if self.dts is None:
             return [n for n in COUNTS if n == 1 or n * parts <= MOST]
@@ -105,6 +111,9 @@ class Sweep:
             name: name of the method.
             method: the method.
             dtype: "float32" or "float64".
+
+        Returns:
+            The results; for a skipped method, only the reason.
         """
         begin = time.perf_counter()
         try:
@@ -121,7 +130,14 @@ class Sweep:
             return Unit(left_out=(LeftOut(name, dtype, first_line(error)),))
 
     def _measured(self, course: Course, pace: Pace, name: str, method: Method) -> Unit:
-        """Measures the errors of a method, then its stability limit and its costs."""
+        """Measures the errors of a method, then its stability limit, then its costs.
+
+        Args:
+            course: the program for the errors.
+            pace: the program for the costs.
+            name: name of the method.
+            method: the method.
+        """
         course.go(self.problem.dt(1), 1)  # the first run of a program takes longer than later ones
         runs, why = self._refined(course, name, method)
         limit = self._limit(course, name, runs) if runs else None
@@ -208,16 +224,17 @@ class Sweep:
         return runs, ""
 
     def _seconds(self, course: Course, trip: Trip | None, dt: float, count: int) -> float:
-        """Predicts the duration of a run from the previous run [s].
+        """Predicts the duration of the next run [s].
 
-        Without a previous run, a short run is timed if the user gave step sizes. For default step
-        sizes the prediction is then 0.
+        The prediction scales the duration of the previous run by the number of steps. Before the
+        first run, a short run is timed instead if the user gave step sizes; with default step
+        sizes, the prediction is 0.
 
         Args:
             course: the simulation program.
-            trip: the previous run, or None.
+            trip: the previous run; None before the first run.
             dt: step size of the next run [s].
-            count: its number of steps per part.
+            count: number of steps per part of the next run.
         """
         if trip is not None:
             return trip.seconds * trip.dt / dt
@@ -293,6 +310,9 @@ def compiled_side_by_side(*makers: Callable[[], Any]) -> list[Any]:
 
 
 def first_line(error: BaseException) -> str:
-    """Returns the first line of an exception's message, as a reason for skipping a method."""
+    """Formats an exception as "refused: " and the first line of its message.
+
+    If the message is empty, the name of the exception's type takes its place.
+    """
     text = str(error).strip().splitlines()
     return f"refused: {text[0]}" if text else f"refused: {type(error).__name__}"

@@ -27,9 +27,10 @@ NO_TIME = "no time was left of the budget"
 REFERENCE_SHARE = 0.1
 """The share of the budget for the runs of the reference."""
 EARLY = 0.75
-"""The share of the budget within which an early gradient must be predicted to end.
+"""The share of the budget within which the gradient of the first method is timed early.
 
-Only the gradient of the first method is timed early: before the runs of the other methods.
+Early means before the runs of the other methods. The gradient is timed later if it is predicted to
+exceed this share.
 """
 OVER = 1.5
 """The share of the budget for the first method; above 1, since any result needs one method."""
@@ -157,7 +158,7 @@ def _go(
     wanted: list[Wanted],
     options: tuple[bool, bool | None],
 ) -> list[LeftOut]:
-    """Measures all methods, then gradients. Returns the measurements that did not fit the budget.
+    """Measures all methods, then times gradients, as long as the budget lasts.
 
     Args:
         sweep: measures one method.
@@ -165,6 +166,9 @@ def _go(
         clock: the remaining budget.
         wanted: methods and precisions, the most important first.
         options: (`gradients`, `progress`) of `tradeoff`.
+
+    Returns:
+        The measurements that did not fit the budget, or came after an interrupt.
     """
     gradients, progress = options
     bar = progress_bar(
@@ -205,7 +209,14 @@ def _differentiate(
 ) -> None:
     """Times the gradient of a measured method, if it fits in a share of the budget.
 
-    Does nothing if the method has no stable run or its gradient is already timed.
+    Does nothing if the method is not measured, has no stable run, or its gradient is already timed.
+
+    Args:
+        sweep: measures the gradient.
+        ledger: saved results, which are updated.
+        clock: the remaining budget.
+        choice: the method and its precision.
+        share: the share of the budget within which the gradient must be predicted to end.
     """
     if choice not in ledger:
         return

@@ -1,7 +1,7 @@
 """Warnings about typical mistakes in constrained simulations ("traps", chapter 3.11). Host code.
 
-Each trap has a function. It returns a warning if the scene or the method makes this mistake, or
-None.
+Each trap has a function, which returns a warning if the scene or the method makes the mistake, and
+None otherwise.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ COARSE = 1.0
 FINE = 0.2
 """The recommended angle of the fastest motion in a step [rad]."""
 DEARER = 3.0
-"""The ratio of a solver's operations to those of a better solver above which a report warns."""
+"""The multiple of a better solver's operations above which a report warns about a solver."""
 MANY = 12
 """The least number of constraint rows at which `DEARER` applies."""
 FEW_NAMES = 3
@@ -83,14 +83,14 @@ def listed(names: Sequence[str]) -> str:
 
 
 def gains(setup: Setup) -> str | None:
-    """Trap 1: feedback gains or springs that are too stiff for the step size."""
+    """Returns a warning if feedback gains or springs are too stiff for the step size (trap 1)."""
     if setup.dt is None:
         return None
     return instability(setup.method, setup.dt, setup.system, setup.state)
 
 
 def coarse(setup: Setup) -> str | None:
-    """Trap 11: a step size that is too large for the motion itself."""
+    """Returns a warning if the step size is too large for the fastest motion (trap 11)."""
     angle = setup.angle
     if not angle or max(angle.turn, angle.swing) <= COARSE:
         return None
@@ -115,7 +115,10 @@ def coarse(setup: Setup) -> str | None:
 
 
 def singular(setup: Setup) -> str | None:
-    """Trap 2: a singular position, or rows that are nearly dependent due to extreme mass ratios."""
+    """Returns a warning if the position is singular, or rows are nearly dependent (trap 2).
+
+    Rows may be nearly dependent due to the position, or due to extreme mass ratios.
+    """
     if setup.dependent:
         if not setup.passing:
             return None
@@ -150,7 +153,11 @@ def singular(setup: Setup) -> str | None:
 
 
 def order(setup: Setup) -> str | None:
-    """Trap 3: results that depend on the order of the inequality rows (`GaussSeidel`)."""
+    """Returns a warning if results depend on the order of the inequality rows (trap 3).
+
+    They do if the sweeps of `GaussSeidel` leave a residual. The residual is only known if the setup
+    has a `probe`.
+    """
     swept = _inner(setup.method.contact_solver)
     if not isinstance(swept, GaussSeidel) or setup.probe is None or not setup.system.bounds:
         return None
@@ -170,7 +177,7 @@ def _inner(solver: ContactSolver | None) -> ContactSolver | None:
 
 
 def overconstrained(setup: Setup) -> str | None:
-    """Trap 4: redundant or contradicting constraint rows."""
+    """Returns a warning if constraint rows are redundant or contradict each other (trap 4)."""
     if setup.conflicts:
         return (
             f"{', '.join(setup.conflicts)} contradict each other: no motion meets all of them."
@@ -187,7 +194,7 @@ def overconstrained(setup: Setup) -> str | None:
 
 
 def start(setup: Setup) -> str | None:
-    """Trap 5: an initial state that violates constraints."""
+    """Returns a warning if the initial state violates constraints (trap 5)."""
     layout, off, fast, slips = setup.rows.layout, [], [], []
     h = setup.dt or 0.0
     for name, (size, rate) in setup.violation.items():
@@ -214,7 +221,11 @@ def start(setup: Setup) -> str | None:
 
 
 def curved(setup: Setup) -> str | None:
-    """Trap 6: an initial violation that one linear correction cannot remove, due to curvature."""
+    """Returns a warning if one linear correction cannot remove the initial violation (trap 6).
+
+    The reason is the curvature of the constraints. Only methods that correct a violation by one
+    linear step are checked.
+    """
     φ = np.asarray(setup.rows.residual, np.float64)
     if setup.dt is None or not np.max(np.abs(φ), initial=0) > OFF or not _linear(setup):
         return None
@@ -234,7 +245,11 @@ def curved(setup: Setup) -> str | None:
 
 
 def dense(setup: Setup) -> str | None:
-    """Trap 7: dense matrices although J is sparse or few of many contacts are active."""
+    """Returns a warning if a solver spends many operations on a dense matrix (trap 7).
+
+    This concerns `Dense` and `Schur`, although J is sparse, and `InteriorPoint` with many
+    inequality rows.
+    """
     if slow := _slow_contact(setup):
         return slow
     efforts, name = setup.choice.efforts, type(innermost(setup.method.solver)).__name__
@@ -250,7 +265,10 @@ def dense(setup: Setup) -> str | None:
 
 
 def _slow_contact(setup: Setup) -> str | None:
-    """Returns a warning if `InteriorPoint` has too many rows to be fast, or None."""
+    """Returns a warning if `InteriorPoint` takes many more operations than `GaussSeidel` would.
+
+    The warning is None if it does not, or if the method uses another contact solver.
+    """
     kinds = kinds_of(setup.system, setup.state.q, setup.state.v)
     solver = setup.method.contact_solver_for(setup.system, setup.state)
     if kinds is None or not isinstance(_inner(solver), InteriorPoint):
@@ -278,7 +296,7 @@ def _slow_contact(setup: Setup) -> str | None:
 
 
 def iterations(setup: Setup) -> str | None:
-    """Trap 8: more iterations than needed."""
+    """Returns a warning if a part of the method makes more iterations than needed (trap 8)."""
     solver = innermost(setup.method.solver)
     if isinstance(solver, ConjugateGradients) and (text := _swept(setup, solver.iterations)):
         return text
@@ -334,7 +352,7 @@ def colliding(setup: Setup) -> tuple[str, ...]:
 
 
 def impact(setup: Setup) -> str | None:
-    """Trap 9: gradients through impacts that ignore the change of the impact time."""
+    """Returns a warning if gradients of the method through impacts may be wrong (trap 9)."""
     method, rows = setup.method, bound_rows(setup)
     if method.events is not None or rows is None:
         return None
@@ -349,7 +367,10 @@ def impact(setup: Setup) -> str | None:
 
 
 def outside(setup: Setup) -> str | None:
-    """Trap 10: joints that start outside a hard limit and return at a limited speed."""
+    """Returns a warning if joints start outside their hard limits (trap 10).
+
+    Such joints return into their range at a limited speed, the parameter `recovery`.
+    """
     joints, rates = [], []
     for group, θ in _limited(setup):
         params = {field: np.asarray(x) for field, x in group.params.items()}
@@ -373,7 +394,10 @@ def outside(setup: Setup) -> str | None:
 
 
 def overlapping(setup: Setup) -> str | None:
-    """Trap 12: hard contacts that start in penetration and separate at a limited speed."""
+    """Returns a warning if hard contacts start in penetration (trap 12).
+
+    Such contacts separate at a limited speed, the parameter `recovery`.
+    """
     rows = bound_rows(setup)
     contacts = [g for g in setup.system.bounds if isinstance(g, Contacts) and g.law is not Rope]
     if rows is None or not contacts:
@@ -409,7 +433,7 @@ def _gaps(system: System, state: State) -> Array:
 
 
 def _limited(setup: Setup) -> list[tuple[Bounds, np.ndarray]]:
-    """Returns the groups of joint limits, each with its joint coordinate values (elements,)."""
+    """Returns the groups of joint limits, each with the values of its coordinates, (elements,)."""
     groups = [g for g in setup.system.bounds if isinstance(g, Bounds) and g.law is Limit]
     if not groups:
         return []
@@ -441,8 +465,8 @@ TRAPS: dict[str, tuple[str, Callable[[Setup], str | None]]] = {
 def _counted(method: Method) -> list[tuple[object, str, int, int]]:
     """Returns the iterative parts of a method, with their numbers of iterations.
 
-    Each entry is (part, name of the field with the number of iterations, that number, a number that
-    usually suffices).
+    Each entry has the part, the name of its field with the number of iterations, this number, and
+    a number of iterations that usually suffices.
     """
     counts: list[tuple[object, str, int, int]] = []
     if isinstance(method.solver, RankSafe):
@@ -457,7 +481,10 @@ def _counted(method: Method) -> list[tuple[object, str, int, int]]:
 
 
 def _linear(setup: Setup) -> bool:
-    """Returns True if the method corrects an initial violation by one linear step."""
+    """Returns True if the method corrects an initial violation by one linear step.
+
+    Methods that project positions do so with one iteration; feedback does so with a large gain.
+    """
     stabilizer = setup.method.stabilizer
     if "position" in stabilizer.corrects:
         return getattr(stabilizer, "iterations", 1) == 1
@@ -476,12 +503,22 @@ def _taken(setup: Setup) -> str:
 
 
 def _names(setup: Setup, rows: list[int]) -> str:
-    """Returns a text of the constraint names of given unit-length rows, each name once."""
+    """Lists the names of the constraints that have the given rows, each name once, as text.
+
+    Args:
+        setup: the scene, its state and the method.
+        rows: indices of unit-length rows.
+    """
     return ", ".join(dict.fromkeys(setup.unit.owners[i][0] for i in rows))
 
 
 def _numbered(setup: Setup, rows: list[int]) -> str:
-    """Returns a text of the constraint names of given unit-length rows, with row indices."""
+    """Lists the given rows by constraint as text, such as "hinge[0, 2], weld[5]".
+
+    Args:
+        setup: the scene, its state and the method.
+        rows: indices of unit-length rows. The text has the index of each within its constraint.
+    """
     numbers: dict[str, list[str]] = {}
     for i in rows:
         name, row = setup.unit.owners[i]

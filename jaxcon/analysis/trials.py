@@ -29,7 +29,7 @@ from jaxcon.system.state import State
 PARTS = 10
 """The least number of parts of a horizon, except with a policy.
 
-If an array of controls has more rows than that, each row has a part of its own. With a policy, each
+If an array of controls has more rows than this, each row has a part of its own. With a policy, each
 interval `hold` is a part.
 """
 
@@ -264,7 +264,7 @@ def along(
     count: Array,
     parts: int,
 ) -> tuple[State, Array]:
-    """Simulates all parts of a horizon. Returns the states at their ends and the largest |φ|.
+    """Simulates all parts of a horizon.
 
     Args:
         system: the system.
@@ -276,6 +276,10 @@ def along(
         h: step size, () [s].
         count: number of steps per part, ().
         parts: number of parts.
+
+    Returns:
+        The states at the ends of the parts, with a leading axis of parts; and the largest |φ| over
+        all steps, ().
     """
 
     def part(carry: tuple[State, Array], row: PyTree) -> tuple[tuple[State, Array], State]:

@@ -65,7 +65,9 @@ def work(system: System, method: Method, state: State, control: PyTree = None) -
 def seconds(
     system: System, method: Method, state: State, control: PyTree = None, batch: int = 1
 ) -> float:
-    """Measures the time of a step per world of a batch [s], the median of five runs.
+    """Measures the time of one step of a batch, divided by the number of worlds [s].
+
+    The result is the median of five runs.
 
     Args:
         system: the system of a built scene, or a `jc.GeneralizedSystem`.

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jaxcon.protocols import System
 
 SHARE = 1e-3
-"""The smallest violation reported as unmet, as a share of the largest violation."""
+"""The smallest violation that `Assembly.unmet` reports, as a share of the largest violation."""
 
 
 @pytree
@@ -69,10 +69,13 @@ class Assembly:
 
     @property
     def unmet(self) -> dict[str, tuple[float, float]]:
-        """‖φ‖ and ‖φ̇‖ by name, for constraints that could not be met; one world, outside jit."""
+        """The violations (‖φ‖, ‖φ̇‖) by name, of the constraints that could not be met.
+
+        For one world, outside jit.
+        """
         allowed = np.asarray(self.tolerance)
         position, velocity = np.abs(self.violation.position), np.abs(self.violation.velocity)
-        # violations far below the largest come from rounding, or follow from the largest
+        # a violation far below the largest one comes from rounding, or is a consequence of it
         bounds = [
             max(a, SHARE * np.max(x, initial=0))
             for a, x in zip(allowed, (position, velocity), strict=True)
@@ -149,8 +152,8 @@ def assemble(
         system: a `BodySystem` or `GeneralizedSystem`.
         q: rough positions, (n_q,); or a `State`, whose velocity, time and memory are kept.
         v: rough velocities, (n_v,); the state's velocities, or zero, unless given.
-        hold: what does not move: names of bodies, indices in v (`system.layout.v(name)`), or a mask
-            (n_v,).
+        hold: the bodies or velocities that do not move: names of bodies, indices in v
+            (`system.layout.v(name)`), or a mask (n_v,).
         time: t, () [s]; the state's time, or 0, unless given.
         tolerance: the largest |φ| and |φ̇| that count as zero; (1 + max |q|) ε^⅔ and
             (1 + max |v|) ε^⅔ unless given, with ε the spacing of floating-point numbers.
@@ -172,7 +175,14 @@ def assemble(
 def _assemble(
     system: System, start: State, tolerance: Array | None, *, held: tuple[int, ...]
 ) -> Assembly:
-    """Finds the nearest state for checked arguments; see `assemble`."""
+    """Computes the result of `assemble`, for arguments that are already checked.
+
+    Args:
+        system: the system.
+        start: the state from which the search starts.
+        tolerance: the largest |φ| and |φ̇| that count as zero, (); None for the default.
+        held: the indices in v of velocities that do not move.
+    """
     free = np.setdiff1d(np.arange(start.v.shape[0]), held)
     allowed = jnp.stack(
         [numerics.negligible(x) if tolerance is None else tolerance for x in (start.q, start.v)]
@@ -187,7 +197,7 @@ def _assemble(
         best = nearest.polish(problem.surface, y, limit)
         better = met & jnp.all(jnp.abs(problem.surface(best)) <= limit)
         y = jnp.where(better, best, y)
-    # a failed world gets constants from here on, since its derivative may be infinite
+    # in a failed world, derivatives may be infinite: its system and start become constants
     system, start = jax.tree.map(lambda x, y: jnp.where(met, x, y), (system, start), constant)
     problem = _Problem(system, start, free)
     y = nearest.implicit(problem.surface, y) if problem.rows else y
@@ -204,7 +214,7 @@ def _assemble(
 class _Problem:
     """The constraint equations φ(y) = 0 in scaled displacements y of the free coordinates.
 
-    y = Lᵀ d with the displacement d and M = L Lᵀ, so that ‖y‖² = dᵀ M d.
+    With the displacement d and the mass matrix M = L Lᵀ, y = Lᵀ d, so that ‖y‖² = dᵀ M d.
 
     Attributes:
         rows: the number of rows.
@@ -225,7 +235,7 @@ class _Problem:
         return self.system.retract(self.start.q, step)
 
     def surface(self, y: Array) -> Array:
-        """Returns the scaled φ at scaled displacements y."""
+        """Returns φ(y), each row multiplied by its `scale`, at scaled displacements y."""
         q, rest = self.displaced(y), jnp.zeros_like(self.start.v)
         return self.scale * linearize(self.system, q, rest, self.start.instant).residual
 
@@ -233,9 +243,10 @@ class _Problem:
 def _nearest_velocity(
     system: System, q: Array, v: Array, t: Doubled | Scalar, free: np.ndarray
 ) -> tuple[Array, Array]:
-    """Returns the velocities with φ̇ = 0 nearest to v, and a mask of stuck rows, (n_c,).
+    """Finds the velocities nearest to v, in the metric of M, that satisfy φ̇ = 0.
 
-    A row is stuck if no free velocity changes it.
+    Returns the velocities, (n_v,), and a mask of the stuck rows, (n_c,). A row is stuck if no free
+    velocity changes it.
 
     Args:
         system: the system.
@@ -258,7 +269,7 @@ def _nearest_velocity(
 
 
 def _weighted(jacobian: Array, factor: Array) -> Array:
-    """Returns J L⁻ᵀ, the Jacobian in scaled displacements.
+    """Returns J L⁻ᵀ, the Jacobian with respect to scaled displacements y = Lᵀ d.
 
     Args:
         jacobian: J, (n_c, n).
@@ -268,7 +279,7 @@ def _weighted(jacobian: Array, factor: Array) -> Array:
 
 
 def _unweighted(y: Array, factor: Array) -> Array:
-    """Returns L⁻ᵀ y: undoes the scaling y = Lᵀ d of a displacement or velocity d.
+    """Returns the displacement or velocity d = L⁻ᵀ y, which undoes the scaling y = Lᵀ d.
 
     Args:
         y: the scaled displacement or velocity, (n,).
@@ -316,7 +327,16 @@ def _start(
 def _held(
     system: System, hold: str | Sequence[Any] | np.ndarray | Array, n_v: int
 ) -> tuple[int, ...]:
-    """Returns the indices in v of held velocities, in ascending order."""
+    """Returns the indices in v of the velocities that do not move, in ascending order.
+
+    Args:
+        system: the system.
+        hold: the argument of `assemble`: names of bodies, indices in v, or a mask.
+        n_v: the number of velocities.
+
+    Raises:
+        ValueError: `hold` is traced, has an unknown name or index, or holds all velocities.
+    """
     if not checks.is_concrete(hold):
         raise ValueError("assemble: what is held is structure and cannot be traced.")
     parts = [hold] if isinstance(hold, str) else hold

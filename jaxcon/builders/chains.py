@@ -21,7 +21,7 @@ NEWTON = 200
 
 @dataclass(frozen=True)
 class Chain:
-    """The names of a rope's or rod's bodies and elements, in order from its start.
+    """The names of the bodies and elements of a rope or rod, in order from its start.
 
     Attributes:
         bodies: particles of a rope, links of a rod.
@@ -95,15 +95,25 @@ def hanging(
 
 
 def _known(what: str, x: PyTree, shape: tuple[int, ...] | None = None, **limits: Any) -> np.ndarray:
-    """Checks that an argument is concrete; returns it as an array of numbers."""
+    """Checks an argument of `hanging`, which must be concrete; returns it as a NumPy array.
+
+    Args:
+        what: the name of the argument, for error messages.
+        x: its value.
+        shape: the required shape; None for any shape.
+        limits: bounds on the value; see `checks.check`.
+    """
     return np.asarray(checks.check("hanging", what, x, shape, **limits), float)
 
 
 def _tensions(gap: np.ndarray, step: float, links: int) -> np.ndarray:
-    """Returns the tensions (H, V + i) of the links by Newton's method, (links, 2).
+    """Returns the tensions of the links of a hanging chain, (links, 2), by Newton's method.
+
+    The tension of link i is (H, V + i), with a horizontal and an upward component, in units of the
+    weight at a joint.
 
     Args:
-        gap: horizontal and vertical distance of the ends, (2,) [m].
+        gap: the horizontal and the vertical distance between the ends, (2,) [m].
         step: the length of a link [m].
         links: the number of links.
     """
@@ -210,7 +220,8 @@ def rod(
 ) -> Chain:
     """Adds a rod: rigid links between points, on revolute joints in the plane, spherical in space.
 
-    The links' x axes lie along the rod; in space their frames follow it without twist.
+    The x axes of the links lie along the rod. In space, the frames of the links follow the rod
+    without twist.
 
     Args:
         scene: the scene to which the rod is added.
@@ -245,7 +256,7 @@ def rod(
     _, points = _points(scene, label, points)
     gaps = np.diff(points, axis=0)
     lengths = np.linalg.norm(gaps, axis=1)
-    angles = np.unwrap(np.arctan2(gaps[:, 1], gaps[:, 0]))  # without jumps of 2π
+    angles = np.unwrap(np.arctan2(gaps[:, 1], gaps[:, 0]))  # successive angles do not jump by 2π
     turns = angles if scene.dim == 2 else _frames(gaps / lengths[:, None])
     links = [f"{name}.{i}" for i in range(len(lengths))]
     for i, link in enumerate(links):
@@ -274,7 +285,20 @@ def rod(
 
 
 def _points(scene: Scene, owner: str, points: Any) -> tuple[Any, Any]:
-    """Checks points; returns the module for them (NumPy, or jax.numpy if traced) and the points."""
+    """Checks the points of a rope or rod.
+
+    Args:
+        scene: the scene, with the dimension and the dtype.
+        owner: the name of the rope or rod, for error messages.
+        points: the user's points, (links + 1, dim) [m].
+
+    Returns:
+        The module for computations with the points: NumPy, or jax.numpy if they are traced.
+        The points as an array of this module.
+
+    Raises:
+        ValueError: the points have a wrong shape, or two successive points are at one place.
+    """
     xp = np if checks.is_concrete(points) else jnp
     given = checks.check(owner, "points", points)
     points = checks.real(owner, "points", points, scene.dtype, np.shape(given))
@@ -297,7 +321,14 @@ def _points(scene: Scene, owner: str, points: Any) -> tuple[Any, Any]:
 
 
 def _frames(tangents: np.ndarray) -> np.ndarray:
-    """Returns quaternions that turn the x axis to the tangents, by shortest turns between links."""
+    """Returns the orientations of the links of a rod without twist, as quaternions, (links, 4).
+
+    The x axis of each link lies along its tangent. The frame of a link follows from the frame of
+    the link before by the shortest turn between their tangents.
+
+    Args:
+        tangents: the unit tangents of the links, (links, 3).
+    """
     result = []
     turn, before = np.array([1.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
     for t in tangents:
@@ -308,12 +339,12 @@ def _frames(tangents: np.ndarray) -> np.ndarray:
 
 
 def _shortest(u: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """Returns the quaternion of the shortest turn from unit vector u to unit vector w.
+    """Returns the quaternion, (4,), of the shortest turn from unit vector u to unit vector w.
 
-    It is proportional to (1 + u·w, u × w).
+    The quaternion is proportional to (1 + u·w, u × w).
     """
     half = np.append(1 + u @ w, np.cross(u, w))
-    if half[0] < 1e-12:  # opposite: half a turn about any normal
+    if half[0] < 1e-12:  # w = −u: half a turn about any normal of u
         normal = np.cross(u, np.eye(3)[np.argmin(np.abs(u))])
         half = np.append(0.0, normal)
     return half / np.linalg.norm(half)

@@ -1,4 +1,4 @@
-"""Groups elements of one class that act on coordinates of the same groups of joints."""
+"""Groups the elements that act on joint coordinates, by their class and their groups of joints."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class CoordinateElements:
                     )
                 if turns and element.counts:
                     counting.setdefault((group, name), set()).add(index)
-        counted, self.turns = [], 0  # the number of counted angles
+        counted, self.turns = [], 0  # `turns` is the number of counted angles
         for (group, name), indices in counting.items():
             counters = tuple(range(self.turns, self.turns + len(indices)))
             counted.append(JointCoordinate(group, tuple(sorted(indices)), name, counters))
@@ -117,8 +117,11 @@ class CoordinateElements:
         """Groups elements of one class whose coordinates belong to the same groups of joints.
 
         Yields:
-            The fields of `Elements`; the coordinates; for each coordinate, the indices in `places`
-            of the bodies of its joint; and the starts of the control channels.
+            A tuple of four items for each group:
+            the fields of `Elements`, with `places`, the places of all bodies of the joints;
+            the coordinates on which an element acts, each a `JointCoordinate` of all elements;
+            for each coordinate, the indices in `places` of the bodies of its joint;
+            the start of each element's control channel, or () for elements without control.
         """
         groups: dict[Any, list[Any]] = {}
         for element in elements:
@@ -153,9 +156,14 @@ class CoordinateElements:
     def _places(
         self, columns: tuple[Iterable[End], ...]
     ) -> tuple[tuple[Place, ...], tuple[tuple[int, ...], ...]]:
-        """Returns the places of all bodies without repetition, and their indices by coordinate.
+        """Finds the places of all bodies of the joints on which equal elements act.
 
-        The indices of a coordinate name the places of its joint's bodies.
+        Args:
+            columns: for each coordinate on which an element acts, this coordinate of each element.
+
+        Returns:
+            The places, without repetition; and for each coordinate, the indices in them of the
+            places of its joint's bodies.
         """
         places: list[Place] = []
         sides = []
@@ -167,7 +175,11 @@ class CoordinateElements:
         return tuple(places), tuple(sides)
 
     def _ends(self, element: OnCoordinates, where: dict[str, tuple[int, int]]) -> tuple[End, ...]:
-        """Returns the coordinates on which an element acts.
+        """Finds the joint coordinates on which an element acts.
+
+        Args:
+            element: the element, which names joints and coordinates.
+            where: the group of each joint and its index in the group, by joint name.
 
         Raises:
             ValueError: a coordinate is unknown or coupled with itself, or a prescribed or coupled

@@ -29,7 +29,7 @@ def GeneralizedSystem(  # noqa: N802
         constraints: `Holonomic` and `Inequality` with `function(q, t, params)`, `VelocityLevel`
             with `function(q, v, t, params)`.
         params: θ, any pytree of arrays: leaves of the system.
-        potential: `potential(q, t, params)` → () [J], for `energy`; optional.
+        potential: `potential(q, t, params)` → () [J], which `energy` adds; optional.
 
     Returns:
         The system; `jc.init(system, method, q, v)` checks it and makes a state.

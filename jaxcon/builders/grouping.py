@@ -1,4 +1,4 @@
-"""Groups elements of one class on bodies of the same kinds."""
+"""Groups the elements of a scene by their class and by the kinds of bodies on which they act."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def lay_out(
 
 
 class Gather:
-    """Finds and checks the bodies of elements, and groups equal elements.
+    """Finds and checks the bodies of the elements of a scene, and groups equal elements.
 
     Args:
         dim: 2 or 3.
@@ -136,7 +136,7 @@ class Gather:
     def bounds(self) -> list[Any]:
         """Returns the groups of inequality constraints.
 
-        They act along joints, between bodies, or come from users' functions.
+        Bounds of joint coordinates come first, then contacts between bodies, then users' functions.
         """
         pairs = [e for e in self._of(BetweenBodies) if not isinstance(e, Joint | ForceElement)]
         touches = [Contacts(*group) for group in self._gather(pairs)]
@@ -167,13 +167,13 @@ class Gather:
         return [element for element in self.elements if isinstance(element, classes)]
 
     def _moving(self, element: UserFunction) -> tuple[Place, ...]:
-        """Returns the places of a user's element whose bodies have coordinates."""
+        """Returns the places of the bodies of a user's element, without fixed bodies."""
         return tuple(place for place in self._places(element) if place.group is not None)
 
     def _places(
         self, element: UserFunction | PrescribedMomentum | CustomForce
     ) -> tuple[Place, ...]:
-        """Checks the bodies of a user's element; returns their places.
+        """Checks the bodies of a user's element; returns one `Place` for each body.
 
         Raises:
             ValueError: the bodies are not a tuple of names, or a body is unknown.
@@ -186,7 +186,10 @@ class Gather:
         return tuple(self._place((name,)) for name in element.bodies)
 
     def _params(self, element: UserFunction | CustomForce | Drive | PointOnCurve) -> PyTree:
-        """Returns the user's parameters of an element, floating ones in the dtype of the scene."""
+        """Returns the user's parameters of an element as arrays.
+
+        Numbers and floating arrays get the dtype of the scene; other arrays keep their dtype.
+        """
 
         def convert(x: Scalar) -> Array:
             array = jnp.asarray(x)
@@ -199,10 +202,10 @@ class Gather:
         return jax.tree.map(convert, element.params)
 
     def _gather(self, elements: list[Any]) -> list[tuple[Any, ...]]:
-        """Groups elements of one kind on bodies of the same groups.
+        """Checks elements, and groups those of one kind whose bodies are in the same groups.
 
         Returns:
-            The fields of `Elements` for each group.
+            The values of the fields of `Elements`, as a tuple for each group of elements.
         """
         groups: dict[Any, list[Any]] = {}
         for element in elements:
@@ -224,7 +227,11 @@ class Gather:
         return result
 
     def _place(self, names: tuple[str, ...]) -> Place:
-        """Returns the place of bodies of one group, given by their names."""
+        """Returns the `Place` of bodies, one for each element.
+
+        Args:
+            names: the names of the bodies; all in one group, or all fixed to the world.
+        """
         if names[0] not in self.layout.places:
             return Place(None, (), names)
         groups, indices = zip(*(self.layout.locate(name) for name in names), strict=True)
@@ -260,5 +267,5 @@ class Gather:
 
 
 def _bare(description: UserFunction | CustomForce | Drive) -> Any:
-    """Returns the element without its params: static and hashable."""
+    """Returns a copy of a user's element without its params, which is static and hashable."""
     return dataclasses.replace(description, params=None)

@@ -53,10 +53,11 @@ class Resolved:
 
 
 def resolve(body: BodyInput, dim: int, dtype: DType) -> Resolved:
-    """Checks the user's description of a body, and finds its principal frame.
+    """Checks the user's description of a body, and converts it to the principal frame.
 
     Raises:
-        ValueError: a wrong shape or dtype, or a mass or inertia that is not positive.
+        ValueError: a shape or dtype is wrong, a mass or inertia is not positive, or a fixed body
+            has a mass, inertia or velocity.
     """
     motion = _motion(body, dim, dtype)
     moving = (body.mass, body.inertia, body.velocity, body.angular_velocity)
@@ -84,7 +85,7 @@ def resolve(body: BodyInput, dim: int, dtype: DType) -> Resolved:
 
 
 def _motion(body: BodyInput, dim: int, dtype: DType) -> Motion:
-    """Checks the motion of the user's frame at assembly, and returns it."""
+    """Checks the user's pose and velocity of a body; returns the motion of the user's frame."""
     zero = (0.0,) * dim
     spin_shape = () if dim == 2 else (3,)
 
@@ -109,5 +110,5 @@ def _motion(body: BodyInput, dim: int, dtype: DType) -> Motion:
 
 
 def _label(body: BodyInput) -> str:
-    """Returns the kind and name of the body, for error messages."""
+    """Returns a text such as "body 'rod'" or "particle 'bob'", for error messages."""
     return f"{'body' if body.rigid else 'particle'} '{body.name}'"

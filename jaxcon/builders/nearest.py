@@ -22,7 +22,8 @@ Surface = Callable[[Array], Array]
 Descent = tuple[Array, Array, tuple[Array, Array], Array, Array, Array]
 """The loop state of `_descend`.
 
-It has the step count, y, (c, J), the damping, ‖c‖ at the start, and True if c became smaller.
+It consists of the step count, y, (c, J) at y, the damping, ‖c‖ at the start, and True if the last
+step made ‖c‖ smaller.
 """
 
 ATTEMPTS = 4
@@ -34,25 +35,29 @@ POLISHINGS = 40
 STIFFNESS = 10.0
 """The penalty parameter ρ of the augmented Lagrangian, for rows of length one."""
 CURVATURE = 1e-3
-"""The lower bound that a step assumes on the curvature of ½ ‖y‖² along the surface."""
+"""The smallest curvature of ½ ‖y‖² along the surface with which a Newton step is computed."""
 
 
 def cutoff(dtype: DType) -> float:
-    """Returns the ratio to the largest singular value below which a value counts as zero."""
+    """Returns the cutoff below which singular values, relative to the largest, count as zero."""
     return 1e-9 if dtype == np.float64 else 1e-4
 
 
 def pseudoinverse(matrix: Array) -> Array:
-    """Returns J⁺ (n, m) of a matrix J (m, n), by its singular values above the cutoff."""
+    """Returns the pseudo-inverse J⁺, (n, m), of a matrix J, (m, n).
+
+    Singular values up to the `cutoff` count as zero.
+    """
     return jnp.linalg.pinv(matrix, rtol=cutoff(matrix.dtype))
 
 
 def restore(surface: Surface, start: Array, tolerance: Array) -> tuple[Array, Array]:
-    """Finds a point with |c| ≤ tolerance, or else returns the point with the least ‖c‖ found.
+    """Finds a point y on a surface c(y) = 0, to within a tolerance.
 
+    If |c| ≤ tolerance is not reached, the result is the point with the least ‖c‖ that was found.
     ‖c‖ may be stationary at a symmetric start, such as a linkage drawn as one line. If the first
-    attempt ends off the surface, further attempts start from random points, at a distance of about
-    |c| from `start`.
+    attempt ends off the surface, further attempts start from random points. Their distance from
+    `start` is about the largest |c| that is left.
 
     Args:
         surface: the function c, (n,) → (m,).
@@ -72,7 +77,7 @@ def restore(surface: Surface, start: Array, tolerance: Array) -> tuple[Array, Ar
         k, best, c = state
         kicked = start + kicks[k] * jnp.max(jnp.abs(c))
         candidate, left = _descend(surface, jnp.where(k == 0, start, kicked), tolerance)
-        closer = left @ left < c @ c  # False for NaN
+        closer = left @ left < c @ c  # False if either is NaN
         return k + 1, jnp.where(closer, candidate, best), jnp.where(closer, left, c)
 
     unknown = jnp.full_like(tolerance, jnp.inf)
@@ -82,12 +87,20 @@ def restore(surface: Surface, start: Array, tolerance: Array) -> tuple[Array, Ar
 
 
 def _descend(surface: Surface, start: Array, tolerance: Array) -> tuple[Array, Array]:
-    """Minimizes ‖c‖ by Levenberg–Marquardt steps; returns y (n,) and c (m,).
+    """Minimizes ‖c(y)‖ by Levenberg–Marquardt steps.
 
     A step is p = −Jᵀ (J Jᵀ + μ)⁻¹ c, with the damping μ in proportion to ‖c‖. Convergence is
-    quadratic, also for rows that are redundant on the surface. Steps continue below the tolerance
-    while they help, since near the surface redundant rows still look independent. The first round
-    only evaluates the start, so that c and J occur once in the program.
+    quadratic, even if rows of c are redundant on the surface. Steps continue below the tolerance as
+    long as they reduce ‖c‖, since redundant rows still look independent near the surface. The first
+    round of the loop only evaluates c and J at the start, so that they occur once in the program.
+
+    Args:
+        surface: the function c, (n,) → (m,).
+        start: the first y, (n,).
+        tolerance: the largest |c| that counts as zero, (m,).
+
+    Returns:
+        The last point y, (n,), and c(y), (m,).
 
     References:
         Yamashita and Fukushima, On the rate of convergence of the Levenberg–Marquardt method,
@@ -106,7 +119,7 @@ def _descend(surface: Surface, start: Array, tolerance: Array) -> tuple[Array, A
         down = j.T @ jax.scipy.linalg.solve(j @ j.T + μ * unit, c, assume_a="pos")
         new = jnp.where(k == 0, y, y - down)
         seen = _value_and_jacobian(surface, new)
-        better = seen[0] @ seen[0] < c @ c  # False for NaN
+        better = seen[0] @ seen[0] < c @ c  # False if either is NaN
         y, seen = jax.tree.map(lambda a, b: jnp.where(better, a, b), (new, seen), (y, (c, j)))
         size = jnp.where(k == 0, numerics.norm(seen[0]), size)
         return k + 1, y, seen, damping * jnp.where(better, 0.25, 8.0), size, better
@@ -133,14 +146,18 @@ def _value_and_jacobian(surface: Surface, y: Array) -> tuple[Array, Array]:
 
 
 def tangent(surface: Surface, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Computes a Newton step for the equations of the nearest point, y = Jᵀλ and c = 0.
+    """Computes a Newton step toward the point of a surface c(y) = 0 that is nearest to 0.
 
-    The step t along the surface satisfies P W P t = −P (y + W n), with W = 1 − Σ λᵢ ∇²cᵢ and P the
-    projector on the tangent space. The eigenvalues of P W P are made positive, so that t is a
-    descent direction.
+    The equations of this point are y = Jᵀλ and c = 0. The step n leads to the surface, and the step
+    t along it. t satisfies P W P t = −P (y + W n), with W = 1 − Σ λᵢ ∇²cᵢ and P the projector on
+    the tangent space. The eigenvalues of P W P are made positive, so that t is a descent direction.
+
+    Args:
+        surface: the function c, (n,) → (m,).
+        y: the current point, (n,).
 
     Returns:
-        c, the multipliers λ = J⁺ᵀ y, the step n = −J⁺ c to the surface, and the step t along it.
+        c(y), (m,); the multipliers λ = J⁺ᵀ y, (m,); the step n = −J⁺ c, (n,); and the step t, (n,).
     """
     c, j = _value_and_jacobian(surface, y)
     inverse = pseudoinverse(j)
@@ -157,10 +174,15 @@ def tangent(surface: Surface, y: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def polish(surface: Surface, start: Array, tolerance: Array) -> Array:
-    """Returns the point of the surface nearest to 0, from a start on the surface.
+    """Finds the point of a surface c(y) = 0 that is nearest to 0, by Newton's method.
 
     If a step does not lower the augmented Lagrangian ½ ‖y‖² − λᵀc + ½ ρ ‖c‖², its part along the
     surface is halved. Near the solution every full step is accepted.
+
+    Args:
+        surface: the function c, (n,) → (m,).
+        start: a point on the surface, (n,).
+        tolerance: the largest |c| that counts as zero, (m,).
 
     References:
         Nocedal and Wright, Numerical Optimization (2006), sections 15.4 and 18.3.
@@ -194,10 +216,15 @@ def polish(surface: Surface, start: Array, tolerance: Array) -> Array:
 
 
 def implicit(surface: Surface, y: Array) -> Array:
-    """Returns y unchanged, with the derivative of the nearest point: y − Jᵀλ = 0, c(y) = 0.
+    """Returns y unchanged, but with the derivative of the point of a surface nearest to 0.
 
-    Derivatives are exact to every order, by `lax.custom_root`. If a change makes redundant rows
+    The nearest point satisfies y − Jᵀλ = 0 and c(y) = 0, where J is the Jacobian of c. Derivatives
+    are exact to every order, by `lax.custom_root`. If a change of parameters makes redundant rows
     contradict each other, the derivative is that of the least-squares solution.
+
+    Args:
+        surface: the function c, (n,) → (m,).
+        y: the nearest point, (n,), from `polish`.
     """
     n = len(y)
 

@@ -31,11 +31,11 @@ from jaxcon.system.layout import WORLD
 from jaxcon.system.state import MethodMemory, State
 
 ORIENTATIONS = ("angle", "quaternion", "orientation", "rotation", "attitude", "quat")
-"""Names of arguments that a user may try for the orientation of a body."""
+"""Names of arguments by which a user may try to give the orientation of a body."""
 
 
 def _dtype(given: Any) -> Any:
-    """Returns the dtype of a scene.
+    """Checks the dtype of a scene, and returns it; None gives JAX's default floating dtype.
 
     Raises:
         ValueError: the dtype is neither float32 nor float64.
@@ -52,15 +52,19 @@ def _dtype(given: Any) -> Any:
 
 @functools.cache
 def _with_options(cls: type, base: type[Element]) -> type:
-    """Returns a subclass of a user's class and of `base`, which gives it default options."""
+    """Returns a class that derives from a user's class and from `base`.
+
+    It inherits the default options of elements from `base`.
+    """
     return type(cls.__name__, (cls, base), {"__module__": cls.__module__, "__doc__": cls.__doc__})
 
 
 def completed(element: Any) -> Element:
-    """Copies an element; the class of the copy also derives from `Joint` or `ForceElement`.
+    """Copies a user's element; the class of the copy also derives from `Joint` or `ForceElement`.
 
-    This gives default options to a user's class that does not derive from `Element`. The copy is a
-    `Joint` if the element has a method `rows`, and a `ForceElement` if it has a method `forces`.
+    The copy thus has the default options of elements, even if the user's class does not derive from
+    `Element`. The copy is a `Joint` if the element has a method `rows`, and a `ForceElement` if it
+    has a method `forces`.
 
     Raises:
         TypeError: the element is neither a joint nor a force.
@@ -295,13 +299,13 @@ class Scene:
     def _refuse(
         self, owner: str, method: Callable[..., None], unknown: dict[str, Any], turned: str
     ) -> None:
-        """Refuses keyword arguments that a method does not have.
+        """Raises an error if a method was called with keyword arguments that it does not have.
 
         Args:
             owner: the body to be added, for error messages.
             method: the method that adds it.
             unknown: the arguments by name.
-            turned: a hint for arguments that mean an orientation.
+            turned: the hint for an unknown argument that seems to mean an orientation.
 
         Raises:
             TypeError: `unknown` is not empty; the message lists the names that the method takes.

@@ -27,7 +27,7 @@ from jaxcon.system.state import Energy, State, checked_system
 
 @pytree
 class Vakonomic:
-    """A system under the variational equations; `vakonomic` makes one.
+    """A system that moves by the variational (vakonomic) equations; `vakonomic` makes one.
 
     In the physical (d'Alembert) equations the constraint forces of ψ = A v + b = 0 do no virtual
     work. The variational equations instead make ∫ L + μ·ψ dt stationary, as if the rows belonged to
@@ -36,11 +36,11 @@ class Vakonomic:
         M a = f + J_hᵀλ − Aᵀμ̇ + Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v p,       A a = −γ,
 
     where J_h has the rows of position constraints φ(q, t) = 0, and γ is the part of ψ̇ without a.
-    d/dt is the rate along the motion, and ad*_v p is p_ω × ω for bodies in space and zero
-    elsewhere. This is the physical saddle system with one more force and with μ̇ = −λ. The force is
-    the curvature dθ(·, v) of the form θ = μ·A, with terms of explicit time dependence. If ψ is the
-    rate of a φ, the force vanishes for every μ; the variational and the physical motion are then
-    equal. Rows with a φ stay physical.
+    d/dt is the rate along the motion. ad*_v p is p_ω × ω for bodies in space and zero elsewhere.
+    This is the physical saddle system with one more force and with μ̇ = −λ. The force is the
+    curvature dθ(·, v) of the form θ = μ·A, with terms of explicit time dependence. If ψ is the rate
+    of a φ, the force vanishes for every μ; the variational and the physical motion are then equal.
+    Rows with a φ therefore keep the physical equations.
 
     The velocities of this system are (v, μ): the physical velocities, then one μ for each row
     without a φ. Its positions are the physical positions. It is stepped, batched and differentiated
@@ -61,12 +61,15 @@ class Vakonomic:
 
     @property
     def layout(self) -> None:
-        """None, since μ belongs to no body."""
+        """None: the velocities have no names, because the multipliers μ belong to no body."""
         return
 
     @property
     def free(self) -> np.ndarray:
-        """The numbers of the rows with a multiplier μ, which are the rows without a φ."""
+        """The numbers of the rows that do not derive from a position constraint φ = 0.
+
+        Each of these rows has a multiplier μ.
+        """
         return np.asarray(self.rows.free)
 
     def physical(self, state: State) -> State:
@@ -98,7 +101,11 @@ class Vakonomic:
         return self.system.forces
 
     def check(self, q: Array) -> None:
-        """Checks numbers of the physical system that depend on q, (n_q,)."""
+        """Checks numbers of the physical system that depend on q, such as its mass matrix.
+
+        Args:
+            q: positions, (n_q,).
+        """
         self.system.check(q)
 
     def columns(self, place: Place) -> Columns:
@@ -112,16 +119,16 @@ class Vakonomic:
 
     @property
     def bounds(self) -> tuple[Any, ...]:
-        """The groups of inequality constraints: none."""
+        """An empty tuple, because the system has no inequality constraints."""
         return ()
 
     def with_params(self, changes: PyTree) -> Self:
-        """Returns the system with other parameters of the physical system."""
+        """Returns the system with changed parameters of the physical system."""
         return dataclasses.replace(self, system=self.system.with_params(changes))
 
     @property
     def turns(self) -> Array | tuple[()]:
-        """The expected angles of the counted joint coordinates, (n,) [rad]."""
+        """The expected angles of the joint coordinates whose turns are counted, (n,) [rad]."""
         return self.system.turns
 
     @property
@@ -130,7 +137,12 @@ class Vakonomic:
         return self.system.counted
 
     def with_turns(self, turns: Array | tuple[()], remainder: Array | tuple[()] = ()) -> Self:
-        """Returns the system with other expected angles `turns` and rounding errors `remainder`."""
+        """Returns the system with other expected joint angles and rounding errors.
+
+        Args:
+            turns: the expected angles of joint coordinates whose turns are counted, (n,) [rad].
+            remainder: the rounding errors of angles in q; () for none.
+        """
         return dataclasses.replace(self, system=self.system.with_turns(turns, remainder))
 
     def no_remainder(self, dtype: DType) -> Array | tuple[()]:
@@ -138,61 +150,115 @@ class Vakonomic:
         return self.system.no_remainder(dtype)
 
     def unwind(self, q: Array) -> tuple[Self, Array]:
-        """Moves whole turns of angles in the plane from q to the system; returns both."""
+        """Moves whole turns of angles in the plane from q to the system.
+
+        Returns:
+            The system, which stores the turns; and q, whose angles have no whole turns.
+        """
         system, q = self.system.unwind(q)
         return dataclasses.replace(self, system=system), q
 
     def rewind(self, q: Array, after: Array) -> tuple[Array, Array | tuple[()]]:
-        """Returns coordinates with whole turns after a step, and the angles' rounding errors."""
+        """Restores the whole turns of angles after a step.
+
+        Args:
+            q: positions at the start of the step, with whole turns, (n_q,).
+            after: positions at the end of the step, computed without whole turns, (n_q,).
+
+        Returns:
+            The positions at the end of the step, with whole turns, (n_q,); and the rounding errors
+            of their angles, or () if turns are not removed.
+        """
         return self.system.rewind(q, after)
 
     def count(self, q: Array, v: Array, t: Doubled | Scalar) -> Array | tuple[()]:
-        """Returns the angles of the counted joint coordinates, (n,) [rad]."""
+        """Returns the angles of the joint coordinates whose turns are counted, (n,) [rad].
+
+        The angles include whole turns.
+        """
         return self.system.count(q, self._split(v)[0], t)
 
     def expect(
         self, here: Snapshot, end: Array, dt: Array, within: bool
     ) -> tuple[Array | tuple[()], Array]:
-        """Returns the expected angles after a step, and a bound on their error, () [rad]."""
+        """Predicts the angles of joint coordinates whose turns are counted, after a step.
+
+        Args:
+            here: the snapshot at the start of the step.
+            end: v after the step, (n_v,).
+            dt: h, () [s].
+            within: True if angles are also read inside the step.
+
+        Returns:
+            The expected angles, (n,) [rad], and a bound on their error, () [rad].
+        """
         return self.system.expect(here, self._split(end)[0], dt, within)
 
     @property
     def n_v(self) -> int:
-        """The number of velocities, multipliers μ included."""
+        """The number of velocities (v, μ), which include the multipliers μ."""
         return self.system.n_v + len(self.free)
 
     def sizes(self, n_q: int) -> tuple[int, int]:
-        """Returns the numbers of positions and velocities of a state, multipliers μ included."""
+        """Returns the numbers of positions and of velocities of a state.
+
+        The multipliers μ count as velocities.
+
+        Args:
+            n_q: the length of q.
+        """
         positions, velocities = self.system.sizes(n_q)
         return positions, velocities + len(self.free)
 
     def snapshot(self, q: Array, v: Array, t: Doubled | Scalar) -> Snapshot:
-        """Returns the physical system at one instant, as a `Snapshot`."""
+        """Returns the `Snapshot` of the physical system at one instant.
+
+        Args:
+            q: positions, (n_q,).
+            v: the velocities (v, μ), (n_v,).
+            t: time, () [s].
+        """
         return self.system.snapshot(q, self._split(v)[0], t)
 
     def mass(self, q: Array) -> Mass:
-        """Returns the mass matrix M of the physical system, with 1 on the diagonal for each μ."""
+        """Returns the mass matrix of (v, μ): M of the physical system, and 1 for each μ."""
         mass, ones = self.system.mass(q), jnp.ones(len(self.free), q.dtype)
         if isinstance(mass, Diagonal):
             return Diagonal(jnp.concatenate([mass.values, ones]))
         return Full(jax.scipy.linalg.block_diag(mass.values, jnp.diag(ones)))
 
     def force(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
-        """Returns the physical force f plus the curvature force, and zero for μ, (n_v,)."""
+        """Returns the generalized force on (v, μ), (n_v,).
+
+        It is the physical force f plus the curvature force for v, and zero for μ.
+        """
         v, μ = self._split(v)
         f = self.system.force(q, v, t, control)
         return jnp.concatenate([f + self.curvature(q, v, t, μ), jnp.zeros_like(μ)])
 
     def applied(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
-        """Returns `force` without the gyroscopic force of the physical system, (n_v,)."""
+        """Returns the generalized force on (v, μ) without the gyroscopic force, (n_v,).
+
+        It includes the curvature force for v, and is zero for μ.
+        """
         v, μ = self._split(v)
         f = self.system.applied(q, v, t, control)
         return jnp.concatenate([f + self.curvature(q, v, t, μ), jnp.zeros_like(μ)])
 
     def curvature(self, q: Array, v: Array, t: Doubled | Scalar, μ: Array) -> Array:
-        """Returns the curvature force Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v Aᵀμ, (n_v,).
+        """Returns the curvature force, by which variational and physical equations differ.
 
-        The class docstring defines its terms.
+        The force is Nᵀ ∂(μ·ψ)/∂q − (dAᵀ/dt) μ + ad*_v Aᵀμ, for velocity-level rows ψ = A v + b = 0
+        and q̇ = N(q) v; see the class docstring.
+
+        Args:
+            q: positions, (n_q,).
+            v: the n_v velocities of the physical system, without μ.
+            t: time, () [s].
+            μ: the multipliers, one for each velocity-level row.
+
+        Returns:
+            The force on the velocities of the physical system, (n_v,).
         """
         system, weights = self.system, jnp.zeros(self.rows.size, q.dtype)
         weights = weights.at[self.free].set(μ)
@@ -208,17 +274,22 @@ class Vakonomic:
         return pull - ṗ + system.coadjoint(q, v, p)
 
     def complete(self, solution: Solution) -> Solution:
-        """Appends the rates μ̇ = −λ to the accelerations of a solution."""
+        """Replaces the accelerations of μ in a solution by the rates μ̇ = −λ."""
         a, _ = self._split(solution.acceleration)
         rates = -solution.multipliers[self.free]
         return solution._replace(acceleration=jnp.concatenate([a, rates]))
 
     def kinematics(self, q: Array, v: Array) -> Array:
-        """Returns q̇ of the physical system, (n_q,)."""
+        """Returns the rates q̇ of the positions, (n_q,); they do not depend on μ."""
         return self.system.kinematics(q, self._split(v)[0])
 
     def retract(self, q: Array, step: Array) -> Array:
-        """Returns the positions q ⊕ Δ after a step Δ of the physical velocities, (n_q,)."""
+        """Returns the positions q ⊕ Δ after a step Δ = h v, (n_q,).
+
+        Args:
+            q: positions, (n_q,).
+            step: (Δ, change of μ), (n_v,); the change of μ is ignored.
+        """
         return self.system.retract(q, self._split(step)[0])
 
     @property
@@ -232,54 +303,110 @@ class Vakonomic:
         return self.system.turns_in_space
 
     def coadjoint(self, q: Array, v: Array, p: Array) -> Array:
-        """Returns the rate ad*_v p of a momentum p due to turning bodies, with zero for μ."""
+        """Returns the rate ad*_v p of a momentum p in frames that turn with the bodies, (n_v,).
+
+        The rate is p_ω × ω for the angular part p_ω of a body in space, and zero for μ.
+
+        Args:
+            q: positions, (n_q,).
+            v: the velocities (v, μ), (n_v,).
+            p: the momentum in body frames, (n_v,).
+        """
         (v, μ), (p, _) = self._split(v), self._split(p)
         return jnp.concatenate([self.system.coadjoint(q, v, p), jnp.zeros_like(μ)])
 
     def kick(
         self, q: Array, v: Array, acceleration: Array, dt: Array, small: bool = False
     ) -> Array:
-        """Returns the physical velocities after a step h, and the multipliers μ + h μ̇, (n_v,)."""
+        """Returns the velocities (v, μ) after a step h, (n_v,).
+
+        The multipliers become μ + h μ̇. For bodies in space, the free rotation within the step is
+        integrated separately.
+
+        Args:
+            q: positions, (n_q,).
+            v: the velocities (v, μ) before the step, (n_v,).
+            acceleration: the accelerations (a, μ̇) at q and v, (n_v,).
+            dt: h, (1,) [s].
+            small: True for a cheaper rule, for bodies that turn by far less than a radian.
+        """
         (v, μ), (a, rate) = self._split(v), self._split(acceleration)
         return jnp.concatenate([self.system.kick(q, v, a, dt, small), μ + dt * rate])
 
     def gyroscopic_acceleration(self, q: Array, v: Array) -> Array:
-        """Returns the gyroscopic acceleration of the physical system, and zero for μ̇, (n_v,)."""
+        """Returns the accelerations of bodies on which no forces act, (n_v,), and zero for μ."""
         v, μ = self._split(v)
         return jnp.concatenate([self.system.gyroscopic_acceleration(q, v), jnp.zeros_like(μ)])
 
     def rotate(self, q: Array, v: Array, dt: Array) -> Array:
-        """Returns the physical velocities after a free rotation, and μ unchanged, (n_v,)."""
+        """Returns the velocities (v, μ) after a free rotation of the bodies over h, (n_v,).
+
+        The multipliers μ are unchanged.
+
+        Args:
+            q: positions, (n_q,).
+            v: the velocities (v, μ), (n_v,).
+            dt: h, (1,) [s].
+        """
         v, μ = self._split(v)
         return jnp.concatenate([self.system.rotate(q, v, dt), μ])
 
     def in_turned_frames(self, q: Array, step: Array, p: Array) -> Array:
-        """Returns a velocity change p in turned body frames; its part for μ stays, (n_v,)."""
+        """Converts a velocity change to body frames that have turned by a step Δ, (n_v,).
+
+        The part of the change for μ stays as it is.
+
+        Args:
+            q: positions, (n_q,).
+            step: Δ, (n_v,).
+            p: the velocity change in the body frames before the turn, (n_v,).
+        """
         (step, _), (p, rest) = self._split(step), self._split(p)
         return jnp.concatenate([self.system.in_turned_frames(q, step, p), rest])
 
     def squared_turn(self, q: Array, v: Array, before: Array, rows: Rows, dt: Array) -> Array:
-        """Returns the square of the largest turn of a body or rod in a step, () [rad²]."""
+        """Returns the square of the largest turn of a body or rod in a step, () [rad²].
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities of the step, (n_v,).
+            before: velocities at which the rows were computed, (n_v,).
+            rows: the constraint rows.
+            dt: h, (1,) [s].
+        """
         v, before = self._split(v)[0], self._split(before)[0]
         return self.system.squared_turn(q, v, before, rows, dt)
 
     def squared_turns(
         self, v: Array, before: Array, rows: Rows, dt: Array, whole: bool = False
     ) -> Array:
-        """Returns the squared largest turn of the arms and axes of each row, (n_c,) [rad²]."""
+        """Returns for each row the square of the largest turn of its arms and axes, (n_c,) [rad²].
+
+        Args:
+            v: velocities of the step, (n_v,).
+            before: velocities at which the rows were computed, (n_v,).
+            rows: the constraint rows.
+            dt: h, (1,) [s].
+            whole: True to include rotation about an arm or axis, which does not turn it.
+        """
         v, before = self._split(v)[0], self._split(before)[0]
         return self.system.squared_turns(v, before, rows, dt, whole)
 
     def carry(self, q: Array, step: Array, p: Array) -> Array:
-        """Returns (dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum p after a step Δ, seen from the step's start.
+        """Returns (dexp⁻¹_Δ)ᵀ p, (n_v,): a momentum after a step Δ, pulled back to its start.
 
         The part of p for μ is unchanged.
+
+        Args:
+            q: positions, (n_q,).
+            step: Δ = h v, (n_v,).
+            p: the momentum, (n_v,).
         """
         (step, _), (p, rest) = self._split(step), self._split(p)
         return jnp.concatenate([self.system.carry(q, step, p), rest])
 
     def extent(self, q: Array) -> Array:
-        """Returns the largest position coordinate of the physical system, () [m]."""
+        """Returns the largest absolute value of a position coordinate, () [m]."""
         return self.system.extent(q)
 
     def normalize(self, q: Array) -> Array:
@@ -287,15 +414,18 @@ class Vakonomic:
         return self.system.normalize(q)
 
     def energy(self, q: Array, v: Array, t: Doubled | Scalar) -> Energy:
-        """Returns the energy of the physical system [J]; μ adds none if ψ is homogeneous in v."""
+        """Returns the energy of the physical system [J].
+
+        If ψ is homogeneous in v, the multipliers μ add no energy.
+        """
         return self.system.energy(q, self._split(v)[0], t)
 
     def kinetic_energy(self, q: Array, v: Array) -> Array:
-        """Returns ½ vᵀMv of the physical system, () [J]."""
+        """Returns the kinetic energy ½ vᵀMv of the physical system, () [J]."""
         return self.system.kinetic_energy(q, self._split(v)[0])
 
     def motion(self, name: str, q: Array, v: Array) -> Motion:
-        """Returns the motion of a body's user frame, as arrays."""
+        """Returns the motion of a body in the frame that the user gave it, as arrays."""
         return self.system.motion(name, q, self._split(v)[0])
 
     def _split(self, v: Array) -> tuple[Array, Array]:
@@ -310,9 +440,9 @@ def vakonomic(
     """Replaces the physical equations by the variational ones, for all velocity-level rows.
 
     Velocity-level rows ψ = 0 are the rows that do not derive from a position constraint φ = 0. The
-    variational equations describe optimal control, where rows restrict the possible motions. A
-    wheel or a skate obeys the physical equations instead. A motion needs initial multipliers μ
-    besides q and v.
+    variational equations describe optimal control, where the rows restrict the choice of motions. A
+    wheel or a skate obeys the physical equations instead. A variational motion needs initial
+    multipliers μ, besides q and v.
 
     Args:
         system: a `BodySystem` or `GeneralizedSystem`.

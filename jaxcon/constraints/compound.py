@@ -37,7 +37,7 @@ DEPENDENT = 1e-6
 
 @dataclass(frozen=True)
 class Freedoms(Element):
-    """The rows and coordinates of compound joints, by their numbers of slides and hinges.
+    """The rows and coordinates of compound joints with given numbers of slides and hinges.
 
     Attributes:
         slides, hinges: the numbers of slides and of hinges, at most three each.
@@ -141,7 +141,12 @@ class Compound(Joint):
         return self.kind.coordinates
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the point in both frames, the axes, and directions that measure the coordinates.
+        """Returns the numbers of the joint by field.
+
+        They are the point in the frames of both bodies, and for slides the directions along which
+        travels are measured, with the normals of the slides. For hinges, they are the hinge axes
+        and, for one or two hinges, the directions from which the angles are measured. A joint with
+        neither hinges nor `ball` has the orientation of b in a.
 
         Raises:
             ValueError: there are more than three axes, or they are linearly dependent.
@@ -162,10 +167,11 @@ class Compound(Joint):
         return params if self.ball else params | {"orientation": relative_orientation(a, b)}
 
     def _travels(self, slides: list[Array], a: Pose) -> dict[str, Array]:
-        """Returns directions that measure travels along the slides s_j, and normals of the slides.
+        """Returns the dual basis and the normals of the slides s_j, in the frame of a.
 
-        The directions d_i are the dual basis of the slides in their span: d_i·s_j = δ_ij. The
-        normals are unit vectors normal to that span. All are in the frame of a.
+        The vectors d_i of the dual basis lie in the span of the slides, and d_i·s_j = δ_ij. For a
+        displacement x in this span, d_i·x is the travel along s_i. The normals are unit vectors
+        normal to the span.
         """
         if not slides:
             return {}
@@ -202,7 +208,11 @@ class Compound(Joint):
 
 
 def attach_two(axes: list[Array], a: Pose, b: Pose) -> dict[str, Array]:
-    """Returns both hinge axes, and directions in each body that measure the hinge angles."""
+    """Returns both hinge axes n and m, n·m, and the directions from which angles are measured.
+
+    The first axis and its directions are in the frame of a, the second axis and its directions in
+    the frame of b.
+    """
     n, m = axes
     n_across, m_across = m - jnp.dot(n, m) * n, n - jnp.dot(n, m) * m
     n_across, m_across = n_across / numerics.norm(n_across), m_across / numerics.norm(m_across)
@@ -264,7 +274,7 @@ def three_angles(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
 
 
 def _angles(p: dict[str, Any], a: JointFrame, b: JointFrame) -> Any:
-    """Returns the angles (θ₁, θ₂, θ₃), the current axes n₁, n₂, n₃, and the angular velocity ω_a.
+    """Returns the hinge angles (θ₁, θ₂, θ₃), the current axes n₁, n₂, n₃, and ω_a of body a.
 
     Here hᵢ are the axes at assembly. n₁·n₃ = h₁·Exp(h₂ θ₂) h₃ gives θ₂. Seen from a, n₃ has then
     turned from Exp(h₂ θ₂) h₃ by θ₁ about n₁. Seen from b, n₁ has turned from Exp(−h₂ θ₂) h₁ by −θ₃

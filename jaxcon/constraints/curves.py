@@ -99,7 +99,7 @@ class Curves(Joints):
         return super().get(i) | {"params": self.given}
 
     def set(self, changes: Mapping[str, Any]) -> Curves:
-        """Returns the joint with changed numbers; `changes` has them by name and field."""
+        """Returns the joint with changed numbers; `changes` is {name: {field: value}}."""
         fields = dict(changes.get(self.law.name, {}))
         given = fields.pop("params", self.given)
         return dataclasses.replace(super().set({self.law.name: fields}), given=given)

@@ -157,7 +157,12 @@ class CustomOnCoordinates(Custom):
     """A user's constraint on generalized coordinates; its function gets the system's params."""
 
     def problem(self, snapshot: Snapshot) -> tuple[Any, Any, Any, Any]:
-        """Returns q and v as lists of one array, q̇ = v, and the function as call(q, v, t)."""
+        """Returns (q, v, kinematics, call) for generalized coordinates.
+
+        Returns:
+            The lists [q] and [v], the function kinematics(q, v) → v, and the function call(q, v,
+            t), which calls the user's function with the system's params; v is None for φ(q, t).
+        """
         params = snapshot.system.params
 
         def call(q: list[Array], v: list[Array] | None, t: Array) -> Array:
@@ -172,7 +177,14 @@ class CustomOnBodies(Custom):
     """A user's constraint on the poses or motions of named bodies, which may be fixed."""
 
     def problem(self, snapshot: Snapshot) -> tuple[Any, Any, Any, Any]:
-        """Returns q and v of each moving body, q̇ = N(q) v, and the function as call(q, v, t)."""
+        """Returns (q, v, kinematics, call) for the named bodies that can move.
+
+        Returns:
+            A list with the q of each moving body; a list with the v of each; the function
+            kinematics(q, v), which returns a list of q̇ = N(q) v; and the function call(q, v, t).
+            The latter calls the user's function with the motions of all named bodies, or with
+            their poses if v is None.
+        """
         layout = snapshot.system.layout
         moving = [name for name in self.law.bodies if name in layout.places]
         kinds = [layout.groups[layout.locate(name)[0]].kind for name in moving]
@@ -264,5 +276,5 @@ def _affine(group: Custom, snapshot: Snapshot) -> bool:
 
 
 def _lanes(row: Array) -> Vector:
-    """Returns the entries along the first axis, components or rows, as lanes of one element."""
+    """Returns a Vector of lanes of one element, one for each entry along the first axis."""
     return Vector(*(x[None] for x in row))

@@ -143,7 +143,11 @@ class Revolute(Joint):
     coordinates = MappingProxyType({"angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the point in both frames, the axis, and directions that measure the angle."""
+        """Returns the point in the frames of both bodies, and references of the angle.
+
+        In space, the references are the axis in the frame of a, and two directions normal to it in
+        the frame of each body. In the plane, the reference is the angle of b in a at assembly.
+        """
         points = anchors(self, a, b)
         if a.position.shape == (2,):
             return points | {"angle": b.orientation - a.orientation}
@@ -192,7 +196,7 @@ class Prismatic(Joint):
     coordinates = MappingProxyType({"travel": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the point in both frames, axis and normals in a, and b's orientation in a."""
+        """Returns the point in both frames, and the axis, its normals and b's orientation in a."""
         orientation = relative_orientation(a, b)
         return anchors(self, a, b) | axes_in(self, a) | {"orientation": orientation}
 
@@ -233,7 +237,10 @@ def axes_in_both(joint: Joint, a: Pose, b: Pose) -> dict[str, Array]:
 
 
 def on_axis(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
-    """Returns the rows u·(p_b − p_a) = 0, for the joint's points p and normals u of its axis."""
+    """Returns the rows u·(p_b − p_a) = 0.
+
+    p_a and p_b are the joint's points, u the directions normal to its axis.
+    """
     points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
     normals = [p[side] for side in ("first_a", "second_a") if side in p]
     return [primitives.travel(a.direction(u), *points) for u in normals]
@@ -259,8 +266,8 @@ def anchors(joint: Any, a: Pose, b: Pose) -> dict[str, Array]:
     """Returns the joint's point in the frames of both bodies, as `anchor_a` and `anchor_b`.
 
     Args:
-        joint: a joint whose field `point` is (dim,) [m], world frame; None for the position of the
-            second body.
+        joint: a joint whose field `point` is (dim,) [m], world frame, or None for the position of
+            the second body.
         a: pose of the first body at assembly.
         b: pose of the second body at assembly.
     """
@@ -313,11 +320,11 @@ def normals(n: Array) -> list[Array]:
 
 
 def unit(joint: Joint, what: str, pose: Pose) -> Array:
-    """Returns the direction in a field of a joint, as a unit vector in the world frame.
+    """Reads a direction from a field of a joint; returns it as a unit vector, world frame.
 
     Args:
         joint: the joint.
-        what: name of the field, a direction (3,) in the world frame.
+        what: name of the field, a direction (dim,) in the world frame.
         pose: pose of the body that has the direction.
 
     Raises:

@@ -64,13 +64,16 @@ class PointOnLine(Joint):
     coordinates = MappingProxyType({"travel": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the point in the frames of both bodies, and the axis with its normals in a."""
+        """Returns the point in the frames of both bodies, and the axis and its normals in a."""
         check_oriented(self, a)
         return anchors(self, a, b) | axes_in(self, a)
 
     @staticmethod
     def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
-        """Returns the rows u·(p_b − p_a) = 0, for the directions u normal to the line."""
+        """Returns the rows u·(p_b − p_a) = 0, for the directions u normal to the line.
+
+        p_a is a point of the line, and p_b the point of b.
+        """
         return on_axis(p, a, b)
 
     coordinate = Prismatic.coordinate
@@ -99,13 +102,16 @@ class PointOnPlane(Joint):
     coordinates = MappingProxyType({"x": "m", "y": "m"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the point in the frames of both bodies, and the normal with its tangents in a."""
+        """Returns the point in both frames, and the normal and the tangents of the plane in a."""
         check_oriented(self, a)
         return anchors(self, a, b) | axes_in(self, a)
 
     @staticmethod
     def rows(p: dict[str, Any], a: JointFrame, b: JointFrame) -> list[Row]:
-        """Returns the row n·(p_b − p_a) = 0, with the normal n of the plane."""
+        """Returns the row n·(p_b − p_a) = 0.
+
+        n is the normal of the plane, p_a a point of the plane, and p_b the point of b.
+        """
         points = a.point(p["anchor_a"]), b.point(p["anchor_b"])
         return [primitives.travel(a.direction(p["axis"]), *points)]
 
@@ -251,7 +257,7 @@ class Planar(Parallel):
     coordinates = MappingProxyType({"x": "m", "y": "m", "angle": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the point in both frames, the normal in a, and its tangents in both frames."""
+        """Returns point and tangents of the plane in both body frames, and its normal in a."""
         return anchors(self, a, b) | Parallel.attach(self, a, b)
 
     @staticmethod
@@ -312,7 +318,10 @@ class RevoluteSpherical(Joint):
     ranges = POSITIVE_LENGTH
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the rod's ends in their bodies' frames, axis and rod in a, and the length."""
+        """Returns the rod's ends in their bodies' frames, its length, and three directions in a.
+
+        The directions are the hinge axis, the rod at assembly, and the normal of both.
+        """
         check_oriented(self, a)
         n = unit(self, "axis", a)
         hinge, ball = own_point(self, "hinge", self.hinge, a), own_point(self, "ball", self.ball, b)
@@ -387,9 +396,10 @@ class Universal(Joint):
     coordinates = MappingProxyType({"angle_a": "rad", "angle_b": "rad"})
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the point in both frames, the axes, and directions that measure the angles.
+        """Returns the point in both frames, both axes, and the reference directions of the angles.
 
-        Each axis and its directions are in the frame of the body in which the axis turns.
+        The first axis and the two directions from which its angle is measured are in the frame of
+        a, the second axis and its two directions in the frame of b.
         """
         n_a, n_b = unit(self, "axis_a", a), unit(self, "axis_b", b)
         check_perpendicular(self, n_a, n_b)

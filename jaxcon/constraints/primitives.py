@@ -215,9 +215,10 @@ def _rate(e: Vector, ω_a: Vector, ω_b: Vector) -> Vector:
 
 
 def turn(first: Direction, second: Direction, pointer: Direction) -> Row:
-    """Returns the angle of a direction of b, the pointer, in the plane of two directions of a.
+    """Returns the row of the angle from `first` to `pointer`, in [−π, π].
 
-    The two directions of a are perpendicular; the angle from the first lies in [−π, π].
+    The pointer is a direction of b. `first` and `second` are perpendicular directions of a. The
+    angle is measured in their plane, and positive from `first` towards `second`.
     """
     return bearing(angle_between(first, pointer), angle_between(second, pointer))
 

@@ -61,7 +61,8 @@ class UnitRows:
     def within(self, x: Array, low: float, high: float) -> np.ndarray:
         """Projects an array onto combinations of rows with singular values in (low, high].
 
-        Combinations with singular values in (−1, 0] are linear dependences: no motion changes them.
+        The range (−1, 0] selects the linear dependences of the rows: combinations that no motion
+        changes.
 
         Args:
             x: one number for each row of J, (n_c,).

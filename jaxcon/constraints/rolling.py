@@ -264,9 +264,9 @@ def no_slip(
 def lowest(n: Direction, e: Direction, r: Lane) -> tuple[Row, Vector, Vector]:
     """Returns the depth r σ of a disc's lowest point below its center, and the arm to that point.
 
-    The depth is a row; the arm ρ = −r s [m] comes with its rate ρ̇. Here κ = n·e and σ = ‖n × e‖.
-    From σ² = 1 − κ² follow σ σ̇ = −κ κ̇ and σ σ̈ = −κ̇² − κ κ̈ − σ̇². From σ s = n − κ e follows ṡ.
-    At σ = 0 all results are zero.
+    The depth is a row; the arm ρ = −r s [m] comes with its rate ρ̇. Here κ = n·e, σ = ‖n × e‖ and
+    s = (n − κ e)/σ. From σ² = 1 − κ² follow σ σ̇ = −κ κ̇ and σ σ̈ = −κ̇² − κ κ̈ − σ̇². The
+    derivative of σ s = n − κ e gives ṡ. At σ = 0 all results are zero.
 
     Args:
         n: the normal of the plane.

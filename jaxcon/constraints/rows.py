@@ -264,7 +264,7 @@ class Rows:
         return dataclasses.replace(self, rate=rate)
 
     def only(self, kept: np.ndarray) -> Rows:
-        """Returns the rows with each row outside a mask replaced by the trivial equation λ = b.
+        """Keeps the rows in a mask; every other row becomes the trivial equation λ = b.
 
         Args:
             kept: the mask of the rows that stay, (n_c,).
@@ -388,7 +388,7 @@ def layout_of(system: System, q: Array, v: Array, t: Doubled | Scalar) -> RowLay
 
 
 def _flat(groups: list[tuple[Constraint, list[Row]]], field: str, like: Array) -> Array:
-    """Concatenates one field of all rows, in their order, to an array (n_c,); None is zero."""
+    """Concatenates one field of all rows, in order, to an array (n_c,); None counts as zero."""
     lanes = []
     for group, rows in groups:
         shape = (len(group.names), *like.shape[1:])

@@ -9,11 +9,11 @@ from jaxcon.core.typing import Array
 
 
 def restitution_gain(rows: BoundRows, e: Array, dt: Array) -> Array:
-    """Returns the increase of the target u* by restitution, (n,).
+    """Returns the amount by which restitution raises the target velocity u* of each row, (n,).
 
     Args:
-        rows: the inequality rows. A row whose gap closes within dt gets the target −e φ̇ if that is
-            larger.
+        rows: the inequality rows. A row whose gap closes within dt gets the target −e φ̇, where φ̇ is
+            its rate, if this exceeds its previous target.
         e: coefficient of restitution, (n,); negative for rows that do not bounce.
         dt: step size h, () [s].
     """

@@ -42,7 +42,7 @@ from jaxcon.linear import gauss_jordan, roots
 
 @dataclass(frozen=True)
 class FrictionDisc:
-    """The rows of consecutive contacts that are bounded by their normal forces.
+    """The friction, rolling or spinning rows of consecutive contacts, with the law ‖λ_t‖ ≤ μ λ_n.
 
     Attributes:
         first, count: the index of the first contact, and the number of contacts.
@@ -60,7 +60,7 @@ class FrictionDisc:
 
 @dataclass(frozen=True)
 class RowCounts:
-    """The numbers of inequality rows by law, and the order of rows that they determine.
+    """The number of inequality rows of each law; these numbers determine the order of the rows.
 
     Attributes:
         single, boxes, contacts: the numbers of one-sided rows, boxes, and contacts.
@@ -116,13 +116,13 @@ class RowCounts:
         return jnp.concatenate([parts.single, parts.box, parts.normal, *rows])
 
     def under_normals(self, flags: RowsByLaw) -> Array:
-        """Returns flags (n,) in which a disc row is False if its contact's normal is False."""
+        """Joins flags by law, (n,); a disc row is False, too, if its contact's normal is False."""
         sets = zip(self.discs, flags.discs, strict=True)
         discs = tuple(Vector(*(y & disc.of(flags.normal) for y in x)) for disc, x in sets)
         return self.join(flags._replace(discs=discs))
 
     def by_contact(self, x: Array) -> Array:
-        """Returns an array (n, …) in which disc rows repeat the entries of their normals."""
+        """Replaces the entries of disc rows, (n, …), by the entries of their contacts' normals."""
         parts = self.split(x)
         sets = zip(self.discs, parts.discs, strict=True)
         discs = tuple(y.map(lambda _, d=disc: d.of(parts.normal)) for disc, y in sets)
@@ -145,7 +145,7 @@ class RowCounts:
 
 
 class RowsByLaw(NamedTuple):
-    """The parts of an array by law: (single,), (boxes,), (contacts,), and a Vector per disc."""
+    """An array over rows, split by law: (single,), (boxes,), (contacts,), and a Vector per disc."""
 
     single: Array
     box: Array
@@ -246,8 +246,8 @@ class Bounded:
     def diagonal(self) -> Array:
         """Returns g, (n,), the change of a row's velocity by a unit of its own multiplier.
 
-        The normal and the tangents of a contact share a value. The rolling rows of a contact share
-        another value, since their unit is different; so do its spinning rows.
+        The normal and the tangents of a contact share a value. Its rolling rows, whose unit is
+        different, share a second value, and its spinning rows a third.
         """
         diagonal = gauss_jordan.diagonal(self.matrix)
         joint = self.kinds.largest(diagonal)
@@ -275,7 +275,7 @@ def laws(
         scale: scale g of the velocities, (n,); see `Bounded.diagonal`.
         multipliers: multipliers λ, (n,).
         velocity: velocities minus their targets, u − u*, (n,).
-        live: lower and upper bounds, and μ.
+        live: bounds of the boxes, and the coefficient μ of each disc; see `Limits`.
         width: width of the smoothed corners of P, (1,) [m/s, rad/s]; None for sharp corners.
     """
     lower, upper, coefficients = live
@@ -324,13 +324,14 @@ def implicit_multipliers(
     live: Limits,
     width: Scalar | None,
 ) -> Array:
-    """Returns λ with its derivative, by implicit differentiation of the laws.
+    """Returns the solution λ, made differentiable by implicit differentiation of the laws.
 
     Args:
-        problem: the problem with constant numbers; its `slope` is the matrix of the derivative.
+        problem: the problem, with constants as its numbers; the derivative solves a linear system
+            with the matrix `slope`.
         multipliers: solution λ of the problem, (n,).
         velocity: function of λ that returns u − u*, differentiable in its closed-over values.
-        live: lower and upper bounds and μ, differentiable.
+        live: bounds of the boxes, and the coefficient μ of each disc, differentiable.
         width: width of the smoothed corners of the laws [m/s, rad/s]; None for sharp corners.
     """
     kinds, scale = problem.kinds, problem.diagonal()

@@ -63,7 +63,7 @@ class BoxContact(BetweenBodies):
     in_b = point_sets.AXES
 
     def attach(self, a: Pose, b: Pose, own_a: Pose, own_b: Pose) -> dict[str, Array]:
-        """Returns the plane in the frame of a, the box in the frame of b, and the material."""
+        """Returns the plane in a's frame, the box in b's frame, and the material parameters."""
         owner, dtype = label(self), b.position.dtype
         size = checks.real(owner, "size", self.size, dtype, b.position.shape, above=0)
         if b.orientation is None:
@@ -78,5 +78,8 @@ class BoxContact(BetweenBodies):
     def bounds(
         p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
     ) -> tuple[list[Row], dict[str, Any]]:
-        """Returns the contact rows of each corner, whose gap is n·(p_b − p_a)."""
+        """Returns the contact rows of each corner, and further fields of their `BoundSet`.
+
+        The gap is n·(p_b − p_a), with the plane's normal n and point p_a, and the corner p_b.
+        """
         return PlaneContact.bounds(p | {"radius": 0.0}, a, b, dt)

@@ -53,14 +53,19 @@ class PathPoint(NamedTuple):
 
 
 class Target(NamedTuple):
-    """The target products τ of pairs of numbers, (1,), and of cones by disc, (contacts,)."""
+    """The target τ of the complementary products.
+
+    Attributes:
+        plain: τ of the pairs of scalars, (1,).
+        cone: τ of the cones of each disc, (contacts,).
+    """
 
     plain: Array
     cone: tuple[Array, ...]
 
 
 class Cone(NamedTuple):
-    """The variables of a disc in the cone: λ_n, y = λ_t/μ, and their duals ψ and w = μ u_t."""
+    """The cone variables of a disc: λ_n and y = λ_t/μ, and their duals ψ and w = μ u_t."""
 
     normal: Array
     tail: Vector
@@ -112,7 +117,12 @@ def center(problem: Bounded) -> PathPoint:
 
 
 def products(kinds: RowCounts, point: PathPoint) -> tuple[list[Array], list[Array]]:
-    """Returns the complementary products λ u of pairs of numbers, and of cones by disc."""
+    """Returns the complementary products at a point of the path.
+
+    Returns:
+        The products of pairs of scalars: of one-sided rows, of the lower and the upper bounds of
+        boxes, and of normals. The products λ_n ψ + y·w of the cones, one array for each disc.
+    """
     x = point.primal
     numbers = [
         x.single * point.single,
@@ -136,7 +146,7 @@ def unmet(problem: Bounded, point: PathPoint) -> Array:
 
 
 def stiffness(problem: Bounded, point: PathPoint) -> Array:
-    """Returns D = −∂u/∂λ, (n, n), the derivative for constant complementary products."""
+    """Returns D = −∂u/∂λ, (n, n), where u changes with λ at constant complementary products."""
     kinds, x = problem.kinds, point.primal
     boxes = point.low / point.below + point.high / point.above
     diagonal = jnp.concatenate([point.single / x.single, boxes, point.normal / x.normal])
@@ -154,7 +164,12 @@ def stiffness(problem: Bounded, point: PathPoint) -> Array:
 
 
 def _assembled(blocks: dict[tuple[int, int], Array], n: int) -> Array:
-    """Returns the matrix (n, n) of diagonal blocks, given by their first row and column."""
+    """Assembles a matrix (n, n) from diagonal blocks.
+
+    Args:
+        blocks: the diagonal of each block, by the block's first row and first column.
+        n: the number of rows.
+    """
     rows = []
     for row in sorted({row for row, _ in blocks}):
         entries = sorted(
@@ -170,12 +185,12 @@ def _assembled(blocks: dict[tuple[int, int], Array], n: int) -> Array:
 
 
 def _nothing(like: Array, columns: int) -> Array:
-    """Returns zeros (n, columns, …) that fill a row beside a diagonal block of n rows."""
+    """Returns a zero block (rows, columns, …), with the rows and batch axes of `like`."""
     return jnp.zeros((len(like), columns, *like.shape[1:]), like.dtype)
 
 
 def complementarity_step(kinds: RowCounts, point: PathPoint, aim: Target) -> RowsByLaw:
-    """Returns the change of u at constant λ for which all products meet the target, by law."""
+    """Returns the change of u, by law, that brings all products to the target at constant λ."""
     x, τ = point.primal, aim.plain
     low, high = point.below, point.above
     box = (τ - low * point.low) / low - (τ - high * point.high) / high
@@ -186,7 +201,7 @@ def complementarity_step(kinds: RowCounts, point: PathPoint, aim: Target) -> Row
 
 
 def _slip_change(cone: Cone, head: Array) -> Vector:
-    """Returns the change of the slip w = μ u_t that makes the cone product (head, 0)."""
+    """Returns the change of the slip w = μ u_t that, at constant λ, makes the product (head, 0)."""
     across = cone.slip * cone.normal + cone.tail * cone.head
     left = (head - _product(cone)) / cone.normal
     return _through(cone, -across - cone.tail * left)
@@ -228,7 +243,7 @@ def moved(
 
 
 def _slip_rate(cone: Cone, normal: Array, tail: Vector) -> Vector:
-    """Returns the change of the slip w = μ u_t at a constant cone product.
+    """Returns the change of the slip w = μ u_t that keeps the cone product, for a change of λ.
 
     Args:
         cone: the current variables of the cone.
@@ -254,10 +269,10 @@ def _on_diagonal(x: Array) -> Array:
 
 
 def _zero(x: Vector) -> Vector:
-    """Returns a zero vector of the same shape."""
+    """Returns a zero vector with the shape of x."""
     return x.map(jnp.zeros_like)
 
 
 def _axis(x: Vector, i: int) -> Vector:
-    """Returns the i-th unit vector of the same shape."""
+    """Returns the i-th unit vector with the shape of x."""
     return Vector(*(jnp.ones_like(c) if j == i else jnp.zeros_like(c) for j, c in enumerate(x)))

@@ -65,14 +65,17 @@ class Rope(BetweenBodies):
     ranges = POSITIVE_LENGTH
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the end points in the body frames, the length, and the stop's parameters."""
+        """Returns the rope's ends in the body frames, its length, and its parameters as a stop."""
         return stretched(self, a, b) | stop(self, a.position.dtype)
 
     @staticmethod
     def bounds(
         p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
     ) -> tuple[list[Row], dict[str, Any]]:
-        """Returns the one-sided row with the gap l − ‖p_b − p_a‖."""
+        """Returns the one-sided row of each rope, and further fields of its `BoundSet`.
+
+        The gap is l − ‖p_b − p_a‖, with the end points p_a, p_b and the length l.
+        """
         row = distance(a.point(p["anchor_a"]), b.point(p["anchor_b"]), p["length"])
         pulls = tuple(-pull for pull in row.pulls)
         slack, fields = one_sided(p, Row(-row.value, -row.rate, 0.0, pulls), dt)
@@ -123,7 +126,7 @@ class PlaneContact(BetweenBodies):
     optional = MATERIAL
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the plane in the frame of a, the balls in the frame of b, and the material."""
+        """Returns the plane in a's frame, the balls in b's frame, and the material parameters."""
         radius = checks.real(label(self), "radius", self.radius, b.position.dtype, least=0)
         ball = {"anchor_b": own_points(self, "center", self.center, b), "radius": radius}
         return plane(self, a) | ball | material(self, a, b)
@@ -134,7 +137,11 @@ class PlaneContact(BetweenBodies):
     def bounds(
         p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
     ) -> tuple[list[Row], dict[str, Any]]:
-        """Returns the contact rows of each ball, whose gap is n·(p_b − p_a) − r."""
+        """Returns the contact rows of each ball, and further fields of their `BoundSet`.
+
+        The gap is n·(p_b − p_a) − r, with the plane's normal n and point p_a, and the ball's center
+        p_b and radius r.
+        """
         n = a.direction(p["normal"]).position
         center = b.point(p["anchor_b"]).position
         gap = n.dot(center - a.point(p["anchor_a"]).position) - p["radius"]
@@ -183,7 +190,7 @@ class CapsuleContact(BetweenBodies):
     optional = MATERIAL
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the capsules in the frames of their bodies, and the material.
+        """Returns the capsules in the frames of their bodies, and the material parameters.
 
         Raises:
             ValueError: both radii are the number 0; segments without thickness never overlap.
@@ -211,7 +218,11 @@ class CapsuleContact(BetweenBodies):
     def bounds(
         p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
     ) -> tuple[list[Row], dict[str, Any]]:
-        """Returns the contact rows; the gap is ‖x_b − x_a‖ − r_a − r_b at the closest points."""
+        """Returns the contact rows of two capsules, and further fields of their `BoundSet`.
+
+        The gap is ‖x_b − x_a‖ − r_a − r_b, with the closest points x_a, x_b of the two axes and the
+        radii r_a, r_b.
+        """
         ends = [
             f.point(p[f"{e}_{s}"]).position
             for f, s in ((a, "a"), (b, "b"))
@@ -221,7 +232,7 @@ class CapsuleContact(BetweenBodies):
         apart, radii = x_b - x_a, p["radius_a"] + p["radius_b"]
         length = numerics.norm(apart)
         resolved = length > rounding_of(ends, x_a, x_b, radii)
-        if len(apart) == 2:  # axes that cross in the plane meet
+        if len(apart) == 2:  # crossing axes in the plane intersect
             resolved &= ~crossing
         # if the axes u and w cross between their ends, u × w has the direction of x_b − x_a, with
         # less rounding error
@@ -230,7 +241,7 @@ class CapsuleContact(BetweenBodies):
         aside = aside * jnp.where(resolved & (aside.dot(apart) < 0), -1.0, 1.0)
         n = apart * numerics.safe_divide(1.0, length)
         n = Vector(*(jnp.where(across_both, y, x) for x, y in zip(n, aside, strict=True)))
-        # where the axes meet, the norm has no derivative; the gap then changes along n
+        # where the axes intersect, the norm has no derivative; the gap then changes along n
         gap = jnp.where(across_both, n.dot(apart), length) - radii
         middle = x_a + n * (p["radius_a"] + gap / 2)
         return contact_rows(p, Touch(gap, n, middle, a, b), dt)
@@ -241,7 +252,13 @@ class Contacts(Ranged):
     """A group of ropes or contacts of the class `law`, between bodies of the same kinds."""
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
-        """Checks the changed numbers of an element by its class, then by `check_ranges`."""
+        """Checks the parameters of one element by its class and by `check_ranges`.
+
+        Args:
+            name: name of the element, for errors.
+            numbers: the parameters by field.
+            dtype: dtype of the scene, in which they are compared.
+        """
         self.law.check_numbers(name, numbers, dtype)
         super().check_numbers(name, numbers, dtype)
 

@@ -63,7 +63,9 @@ def default_contact_solver(system: System, q: Array, v: Array) -> ContactSolver:
 def first_multipliers(
     system: System, q: Array, v: Array, solver: ContactSolver | None = None
 ) -> PyTree:
-    """Returns zeros (n,), from which a warm-started solver begins; () if it has no warm start.
+    """Returns the initial multipliers λ of a warm-started solver, zeros (n,).
+
+    The result is () if the solver has no warm start, or the system no inequality constraints.
 
     Args:
         system: any system.

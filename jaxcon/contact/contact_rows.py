@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jaxcon.constraints.primitives import JointFrame
 
 MATERIAL = ("friction", "rolling", "spinning", "restitution")
-"""Fields of contacts that make no rows and no parameter if they are the Python number 0."""
+"""The fields of contacts that add no rows and no parameter if they are the Python number 0."""
 
 
 class Touch(NamedTuple):
@@ -77,7 +77,7 @@ def contact_rows(p: dict[str, Any], touch: Touch, dt: Array) -> tuple[list[Row],
 
 
 def turning(a: JointFrame, b: JointFrame, u: Vector) -> Row:
-    """Returns the row u·(ω_b − ω_a) of a relative angular velocity; in the plane ω_b − ω_a."""
+    """Returns the row of the relative angular velocity u·(ω_b − ω_a), or ω_b − ω_a in the plane."""
     if len(u) == 2:
         pulls = a.turn(-1.0), b.turn(1.0)
         return Row(0.0, b.omega - a.omega, 0.0, pulls, holonomic=False)
@@ -86,7 +86,7 @@ def turning(a: JointFrame, b: JointFrame, u: Vector) -> Row:
 
 
 def row_along(a: Point, b: Point, u: Vector, gap: Lane | None = None) -> Row:
-    """Returns the row u·(ṗ_b − ṗ_a) of the relative velocity of two points along u."""
+    """Returns the row u·(ṗ_b − ṗ_a), the relative velocity of two points along u, with φ = gap."""
     rate = u.dot(b.velocity - a.velocity)
     pulls = (-a.pull(u), b.pull(u))
     return Row(0.0 if gap is None else gap, rate, 0.0, pulls, holonomic=gap is not None)

@@ -99,13 +99,13 @@ def pivots(problem: Bounded) -> Pivots:
 
 
 def _across(matrix: Array, start: int, count: int) -> Array:
-    """Returns the entry of G between the two disc rows of each contact, (count,)."""
+    """Returns the off-diagonal entry of G for the two disc rows of each contact, (count,)."""
     block = matrix[start : start + count, start + count : start + 2 * count]
     return gauss_jordan.diagonal(block)
 
 
 def sweep(problem: Bounded, multipliers: Array, pivot: Pivots | None = None) -> Array:
-    """Solves each row and each contact once, with all other rows fixed."""
+    """Returns λ after one sweep: each row and contact solved once, with all other rows fixed."""
     pivot = pivots(problem) if pivot is None else pivot
     x = _contacts(problem, _rows(problem, multipliers, pivot), pivot)
     for i in range(len(problem.kinds.turning)):
@@ -114,7 +114,7 @@ def sweep(problem: Bounded, multipliers: Array, pivot: Pivots | None = None) -> 
 
 
 def _rows(problem: Bounded, multipliers: Array, pivot: Pivots) -> Array:
-    """Solves one-sided rows and boxes one after another."""
+    """Returns λ with one-sided rows and boxes solved one after another."""
     if not problem.kinds.normal:
         return multipliers
 
@@ -126,7 +126,7 @@ def _rows(problem: Bounded, multipliers: Array, pivot: Pivots) -> Array:
 
 
 def _contacts(problem: Bounded, multipliers: Array, pivot: Pivots) -> Array:
-    """Solves contacts one after another: the normal, then the tangents with the new λ_n."""
+    """Returns λ with contacts solved in turn: the normal, then the tangents with the new λ_n."""
     kinds = problem.kinds
     if not kinds.contacts:
         return multipliers
@@ -144,7 +144,14 @@ def _contacts(problem: Bounded, multipliers: Array, pivot: Pivots) -> Array:
 
 
 def _turning(problem: Bounded, which: int, multipliers: Array, pivot: Pivots) -> Array:
-    """Solves the rolling or spinning resistance of contacts, one contact after another."""
+    """Returns λ with a disc of rolling or spinning resistance solved, contact by contact.
+
+    Args:
+        problem: the problem u = G λ + c with bounds on λ.
+        which: index of the disc in `kinds.turning`.
+        multipliers: multipliers λ, (n,).
+        pivot: the pivots of the problem.
+    """
     kinds = problem.kinds
     disc, start, most = kinds.turning[which], kinds.starts[1 + which], problem.resistance[which]
 
@@ -158,7 +165,15 @@ def _turning(problem: Bounded, which: int, multipliers: Array, pivot: Pivots) ->
 
 
 def _disc(rows: list[Any], slips: list[Array], pivot: Array, radius: Array, x: Array) -> Array:
-    """Returns λ with the rows of one contact in a disc solved, and all other rows fixed."""
+    """Returns λ with the disc rows of one contact solved, and all other rows fixed.
+
+    Args:
+        rows: the indices of these disc rows in λ.
+        slips: the velocities u of the disc rows.
+        pivot: the larger eigenvalue of the block of G of the disc rows.
+        radius: the bound μ λ_n on the norm of the multipliers of the disc rows.
+        x: multipliers λ, (n,).
+    """
     tangent = Vector(*(at(x, j) - u / pivot for j, u in zip(rows, slips, strict=True)))
     for j, y in zip(rows, onto_disc(tangent, radius), strict=True):
         x = put(x, y, j)

@@ -26,7 +26,11 @@ if TYPE_CHECKING:
     from jaxcon.constraints.primitives import JointFrame
 
 STRAIGHT = 0.1
-"""The sine of the angle below which the line from a surface to a point counts as normal to it."""
+"""The tolerance of the search for the nearest point: the sine of an angle.
+
+The angle is between the surface normal and the line from the surface point to the given point. It
+is zero at the exact nearest point.
+"""
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ class HeightFieldContact(BetweenBodies):
     optional = MATERIAL
 
     def attach(self, a: Pose, b: Pose, own_a: Pose, own_b: Pose) -> dict[str, Array]:
-        """Returns the field in the frame of a, the balls in the frame of b, and the material.
+        """Returns the field in a's frame, the balls in b's frame, and the material parameters.
 
         Raises:
             ValueError: a field has a wrong shape, or a number is out of range.
@@ -121,9 +125,10 @@ class HeightFieldContact(BetweenBodies):
     def bounds(
         p: dict[str, Any], a: JointFrame, b: JointFrame, dt: Array
     ) -> tuple[list[Row], dict[str, Any]]:
-        """Returns the contact rows of each ball, whose gap is n·(c − x) − r.
+        """Returns the contact rows of each ball, and further fields of their `BoundSet`.
 
-        c is the center of the ball, x the nearest point of the surface and n its normal there.
+        The gap is n·(c − x) − r, with center c and radius r of the ball. x is the nearest point of
+        the surface, and n the normal there.
         """
         center = b.point(p["anchor_b"]).position
         axes = [a.direction(p[name]).position for name in point_sets.AXES[: len(center)]]
@@ -147,9 +152,9 @@ def surface(p: dict[str, Any], like: Lane) -> Surface:
 def above(ground: Surface, point: Vector) -> tuple[Lane, Vector]:
     """Returns the distance of a point from the ground, and the normal at the nearest point.
 
-    High above rough ground the search for the nearest point may not converge. The distance from the
-    last iterate is then returned, an upper bound. It is positive if the point is above the ground
-    vertically below it, and negative otherwise.
+    High above rough ground the search for the nearest point may not converge. The result is
+    then the distance to the last iterate, an upper bound. It is positive if the point is higher
+    than the ground at its horizontal position, and negative otherwise.
     """
     place = ground.nearest(point)
     shape = ground.at(place)

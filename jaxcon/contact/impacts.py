@@ -7,13 +7,13 @@ move on with other accelerations a⁺. At the end of a step h, with the remainin
     q_end = q ⊕ (h v + h² a⁻/2) ⊕ (r Δv + r² (a⁺ − a⁻)/2 − r² ω × Δω/2).
 
 The derivatives of the terms in r with respect to τ are the extra terms of a saltation matrix. They
-cover every velocity that an impulse changes, also along tangents and through joints: it is v⁻
-before τ and v⁺ after it.
+hold for every velocity that an impulse changes, also along tangents and through joints: such a
+velocity is v⁻ before the impact and v⁺ after it.
 
 After an impact without rebound, φ̇ = 0. The sign of φ̈ = J a⁺ + J̇ v⁺ then decides if the contact
 opens: contact forces obey 0 ≤ λ ⊥ φ̈ ≥ 0 and Coulomb's law. For example, the end of a rod that
-turns fast lifts off at once. In a plain step, the rows that can have impacts also include J̇ v.
-The next step therefore comes to the same decision, however long the remaining time r is.
+turns fast lifts off at once. In plain steps, too, the acceleration of rows that can have
+impacts includes J̇ v. The next step therefore comes to the same decision, for any remaining time r.
 
 The impulse is computed at the configuration of the impact q* = q ⊕ (τ v + τ² a⁻/2), not at the
 start of the step. Otherwise the direction of the impulse would depend on τ if the normal turns
@@ -58,9 +58,10 @@ SLOW = 2
 
 
 class Seen(NamedTuple):
-    """The label of an observation of impacts in `notices`.
+    """The label of the observations by which a step reports its impacts to `notices`.
 
-    The values of the observation are the masks of hits and of bounces, (n,), the time, and h.
+    An observation has the mask of the rows that hit, (n,), the mask of the rows that bounce, (n,),
+    the time, and the step size h.
 
     Attributes:
         layout: assignment of rows to elements.
@@ -88,7 +89,7 @@ class Found(NamedTuple):
 
 
 class Laws(Protocol):
-    """The functions of the dynamics that an impact uses, whichever solver finds the multipliers."""
+    """The protocol by which an impact calls the dynamics, independent of the contact solver."""
 
     def rows(self, q: Array, v: Array, t: Doubled | Array) -> BoundRows:
         """Returns the inequality rows at a state."""
@@ -101,7 +102,16 @@ class Laws(Protocol):
     def find(
         self, q: Array, v: Array, t: Doubled | Array, rows: BoundRows, acts: Array, lasts: Array
     ) -> Found:
-        """Returns impulses of the active rows in an impact, or forces in a step if `lasts`, ()."""
+        """Solves for the response to the active rows: an impact, or the forces of a step.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+            rows: the inequality rows, with their targets.
+            acts: mask of the active rows, (n,).
+            lasts: True for the forces of a step, False for the impulses of an impact, ().
+        """
         ...
 
 
@@ -173,7 +183,7 @@ def candidates(rows: BoundRows, free: Array, dt: Array) -> Array:
 
 
 def slowest(rows: BoundRows, change: Array) -> Array:
-    """Returns the speed below which a row counts as at rest, (1,)."""
+    """Returns the rounding error of the rows' speeds, below which a row counts as at rest, (1,)."""
     numbers = jnp.finfo(rows.rate.dtype)
     size = jnp.maximum(jnp.abs(rows.rate), jnp.abs(change))
     rounding = ROUNDING * float(numbers.eps) * jnp.max(size, axis=0, keepdims=True)
@@ -272,7 +282,7 @@ def leaving_speeds(
 
 
 def at_start(rows: BoundRows, change: Array, lag: float) -> Array:
-    """Returns φ̇ at the start of the step, (n,), if velocities belong to the time lag · h before it.
+    """Returns φ̇ at the start of the step, (n,), from velocities at the time lag · h before it.
 
     Only forces change φ̇ between these two times, since `rows.rate` = J v already uses J at the
     start of the step.
@@ -286,10 +296,10 @@ def at_impact(
 ) -> tuple[BoundRows, Array]:
     """Returns the rows with their targets for an impact, and a mask of the active rows, (n,).
 
-    Hitting rows leave with e |φ̇|, or stay closed if they are slow. The targets of other rows let
-    them close their gap within a step, so the impact does not push them apart. Where `lasts`, (),
-    is True, the result is for the motion after the impact: rows have the targets of a step and do
-    not bounce.
+    Hitting rows leave with e |φ̇|, or stay closed if they are slow. The targets of other rows allow
+    their gaps to close within a step, so the impact does not push these bodies apart. Where
+    `lasts`, (), is True, the result is for the motion after the impact: rows have the targets of a
+    step and do not bounce.
     """
     ends, hits = mask(rows.ends, rows), arrivals.hits
     hard = mask(rows.hard, rows)
@@ -354,8 +364,8 @@ def doubt(rows: BoundRows, shares: str | None, some: bool) -> str | None:
 
     Args:
         rows: inequality rows; only their static fields are read.
-        shares: name of a solver with which a landing takes two steps, see `landing`; None for other
-            solvers.
+        shares: name of the contact solver if it splits a landing between two steps, see `landing`;
+            None for other solvers.
         some: True if the solver leaves rows out.
     """
     reasons = []
@@ -398,8 +408,9 @@ class Impact:
         laws: functions of the dynamics.
         system: system of bodies or generalized coordinates.
         q, v, t: the state at the start of the step.
-        rows: inequality rows at that state, for the stop that acts, with their restitution.
-        stops: inequality rows with both stops of a joint.
+        rows: inequality rows at that state, with their restitution. A joint with two stops has the
+            row of the stop that acts.
+        stops: inequality rows at that state, with the gaps of both stops of a joint.
         may: mask of the `candidates`, (n,).
         acceleration: acceleration a⁻ before the impact, (n_v,).
         multipliers, joints: forces λ of inequality rows, (n,), and of equality rows, (n_c,), before

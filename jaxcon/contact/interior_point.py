@@ -110,7 +110,7 @@ def target(problem: Bounded, point: PathPoint, share: Array) -> Target:
 
 
 def least(problem: Bounded, point: PathPoint) -> tuple[float, list[Array]]:
-    """Returns the smallest products that rounding allows, of pairs of numbers and of cones.
+    """Returns the smallest products that rounding allows: of pairs of scalars, and of each cone.
 
     Near the boundary of a cone two numbers nearly cancel, so the smallest product of a cone is much
     larger.
@@ -158,7 +158,11 @@ def iterate(problem: Bounded, point: PathPoint) -> PathPoint:
 
 
 def reach(kinds: RowCounts, point: PathPoint, step: PathPoint) -> Array:
-    """Returns the fraction of a step up to the boundary, at most 1/NEAREST, for each world."""
+    """Returns the fraction of a step at which it reaches the boundary, for each world.
+
+    Beyond the boundary, a variable is negative or outside of its cone. The result is at most
+    1/NEAREST.
+    """
     x, d = point.primal, step.primal
     pairs = [
         (x.single, d.single),

@@ -45,16 +45,22 @@ class Ranged(Elements):
 
     @property
     def numbers(self) -> Mapping[str, Any]:
-        """The parameters by field."""
+        """The parameters of the elements, by field."""
         return self.params
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
-        """Checks the parameters of one element, given by field."""
+        """Checks that the parameters of one element are in their valid ranges.
+
+        Args:
+            name: name of the element, for errors.
+            numbers: the parameters by field.
+            dtype: dtype of the scene, in which they are compared.
+        """
         check_ranges(name, numbers, dtype)
 
 
 def check_ranges(owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
-    """Checks the parameters of one element with inequality rows, by field; skips traced values.
+    """Checks the parameters of an element with inequality rows; skips traced values.
 
     Args:
         owner: first words of errors.
@@ -168,7 +174,10 @@ class Limit(OnJoint):
 
     @staticmethod
     def bounds(p: dict[str, Any], row: Row, u: Lane, dt: Array) -> Any:
-        """Returns the one-sided row of the nearer stop, with the farther stop's gap as `far`."""
+        """Returns the one-sided row of the nearer stop, and further fields of its `BoundSet`.
+
+        The field `far` is the gap of the farther stop.
+        """
         below, above = row.value - p["lower"], p["upper"] - row.value
         near = below < above
         side = direction = jnp.where(near, 1.0, -1.0).astype(jnp.result_type(row.value))
@@ -271,7 +280,10 @@ class RateLimit(OnJoint):
 
     @staticmethod
     def bounds(p: dict[str, Any], row: Row, u: Lane, dt: Array) -> Any:
-        """Returns the one-sided row −|θ̇| ≥ −r for the largest rate r, by direction of motion."""
+        """Returns the one-sided row −|θ̇| ≥ −r, where r is the largest rate.
+
+        |θ̇| is θ̇ or −θ̇, by the direction of motion at the start of the step.
+        """
         side = jnp.where(row.rate > 0, -1.0, 1.0).astype(jnp.result_type(row.rate))
         pulls = tuple(pull * side for pull in row.pulls)
         limited = Row(0.0, side * row.rate, 0.0, pulls, holonomic=False)
@@ -361,7 +373,7 @@ def one_sided(p: dict[str, Any], row: Row, dt: Array) -> tuple[Row, dict[str, An
     # is open, spring and damper act only on the part of the motion beyond the stop, u + φ/h
     k = not_negative(p["stiffness"])
     both = h * k + not_negative(p["damping"])
-    # with k = c = 0 there is no stop; above this threshold the derivative of 1/both is finite
+    # k = c = 0 means no stop; so do tiny values, at which the derivative of 1/both may overflow
     both = jnp.where(both > float(jnp.finfo(both.dtype).tiny) ** (1 / 3), both, 0)
     behind = numerics.safe_divide(-k * row.value, both)
     soft = jnp.where(both > 0, jnp.where(row.value > 0, closing, behind), 0)
@@ -451,7 +463,7 @@ class OneSided:
         return {"params": self.params} | numbers
 
     def set(self: Any, changes: Mapping[str, Any]) -> Any:
-        """Returns the group with changed parameters; `changes` has them by name and field."""
+        """Returns the group with changed parameters; `changes` is {name: {field: value}}."""
         fields, name = dict(changes.get(self.law.name, {})), self.law.name
         params = fields.pop("params", self.params)
         new = {k: replace_at(f"{name}.{k}", self.numbers[k], 0, x) for k, x in fields.items()}

@@ -73,7 +73,7 @@ class ActiveSet(checks.Checked, ContactSolver):
         self.solver.check()
 
     def solve(self, problem: Bounded, start: Array) -> Array:
-        """Returns the multipliers λ, (n,), of a problem of the chosen rows."""
+        """Returns the multipliers λ, (n,), of a problem that has only the chosen rows."""
         return self.solver.solve(problem, start)
 
     def leaves_out(self, kinds: RowCounts) -> bool:
@@ -82,7 +82,11 @@ class ActiveSet(checks.Checked, ContactSolver):
         return any(most is not None and most < count for most, count in pairs)
 
     def choose(self, kinds: RowCounts, distance: Array) -> RowChoice:
-        """Chooses the rows to solve, by their distance from becoming active, (n,).
+        """Chooses the one-sided rows and contacts nearest to becoming active, and all other rows.
+
+        Args:
+            kinds: numbers of rows by law.
+            distance: distance of each row from becoming active, (n,).
 
         Raises:
             ValueError: contacts are limited in a scene with rolling or spinning resistance.
@@ -122,7 +126,7 @@ class RowChoice:
         return jnp.take_along_axis(x, self.rows, axis=0)
 
     def contacts(self, x: Array) -> Array:
-        """Returns the entries (k, …) of an array (contacts, …) for the chosen contacts."""
+        """Selects the chosen contacts from an array of all contacts, (contacts, …)."""
         normals = self.kinds.split(self.rows).normal - self.whole.normal
         return jnp.take_along_axis(x, normals, axis=0)
 
@@ -131,7 +135,7 @@ class RowChoice:
         return jnp.sum(jnp.where(self.places(), x[None], 0), axis=1)
 
     def places(self) -> Array:
-        """Returns a mask, (n, k, …), that is True where row n is the k-th chosen row."""
+        """Returns a mask, (n, k, …), that is True at (i, j) if row i is the j-th chosen row."""
         indices = jnp.arange(self.whole.size, dtype=self.rows.dtype)
         return self.rows[None] == indices.reshape(-1, *(1,) * self.rows.ndim)
 

@@ -76,7 +76,7 @@ class Sliding:
     def of(
         cls, rows: BoundRows, open_: Array, gap_curvature: Array, rounding: Array, dt: Array
     ) -> Sliding:
-        """Returns the sliding of closed contacts; slow slip counts as no slip."""
+        """Returns speed and direction of the slip of closed contacts; slow slip counts as zero."""
         kinds, near = rows.kinds, rows.gap <= jnp.maximum(gap_curvature, rounding[None])
         slip, speeds = kinds.split(rows.rate).discs[0], kinds.split(gap_curvature).normal
         speed = numerics.norm(slip)
@@ -88,7 +88,7 @@ class Sliding:
     def clearance(self, rows: BoundRows, multipliers: Array) -> Array:
         """Returns the slip left at the end of a part, (contacts,); negative if slip has ended.
 
-        The result is d·u − v₀ (1 + d·λ_t/μλ_n), where d is the direction of the slip and v₀ its
+        The result is d·u − v₀ (1 + d·λ_t/(μ λ_n)), where d is the direction of the slip and v₀ its
         speed. It crosses zero when the slip ends. The second term is nonzero for friction below its
         bound, and makes the slope continuous.
         """
@@ -120,7 +120,7 @@ class ContactForecast:
     sliding: Sliding | None = None
 
     def watched(self, dt: Array) -> ContactForecast:
-        """Returns the forecast with the slips of sliding contacts appended to the gaps."""
+        """Returns the forecast with a further row for each contact; its gap is h times the slip."""
         if self.sliding is None:
             return self
         speed = self.sliding.speed

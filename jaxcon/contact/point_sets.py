@@ -100,7 +100,7 @@ def own_frame(
 
 
 def given_points(p: dict[str, Any]) -> Vector | None:
-    """Returns the points of elements as lanes (element, k); None if they have one point each."""
+    """Returns the points of elements as lanes (element, k); None if each element has one point."""
     if not isinstance(p["anchor_b"], Grid):
         return None
     points = p["anchor_b"].values

@@ -50,7 +50,7 @@ def polished(problem: Bounded, multipliers: Array, rounds: int) -> Array:
         return Tried(x, residual, jnp.abs(residual * scale))
 
     zero, near = tried(jnp.zeros_like(multipliers)), tried(multipliers)
-    # start at zero if rounding makes λ worse than that
+    # start at λ = 0 if its residual is smaller, since rounding may spoil the given λ
     start = chosen((near.worst < zero.worst)[None], near, zero)
     terms = problem.matrix * start.multipliers[None]
     terms = jnp.sum(jnp.abs(terms), axis=1) + jnp.abs(problem.offset)

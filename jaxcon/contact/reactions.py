@@ -52,8 +52,8 @@ class ContactProblem:
         bare: diagonal of J_b M⁻¹ J_bᵀ, (n,), the inverse mass of each row without equality rows.
         acts: mask of the active rows, (n,). Tangents have the entry of their normal. None if all
             rows are active.
-        answers: accelerations a by the forces of `_probing`, (n_v, k, …), a constant; None if not
-            computed.
+        answers: accelerations a under the forces of `_probing`, (n_v, k, …), a constant; None
+            if not computed.
         share: factor s of J̇_b v: ½ if the velocities at the end of a step belong to its middle,
             else 1.
     """
@@ -114,9 +114,9 @@ class ContactProblem:
         return dataclasses.replace(self, start=accelerations[:, 0], answers=accelerations[:, 1:])
 
     def _facing(self) -> ContactProblem:
-        """Returns the problem with the opposite stop where a step without λ would pass that stop.
+        """Replaces a stop by the opposite stop if a step with λ = 0 would pass the opposite stop.
 
-        Replacing a stop by the opposite one changes only the sign of its row.
+        In the Jacobian, this changes only the sign of the row.
         """
         if self.rows.far is None:
             return self
@@ -127,11 +127,14 @@ class ContactProblem:
         return dataclasses.replace(self, rows=rows, answers=answers)
 
     def _by_velocities(self) -> bool:
-        """Returns True if `_probing` has one force per velocity, as rows outnumber velocities."""
+        """Returns True if `_probing` has one force per velocity, False if it has one per row.
+
+        It has one per velocity if rows outnumber velocities and J is not `Gathered`.
+        """
         return isinstance(self.rows.jacobian, Jacobian) and len(self.start) < len(self.bare)
 
     def _probing(self) -> Array:
-        """Returns the force of a unit of each λ, or unit forces on each velocity, (n_v, k, …)."""
+        """Returns the forces of unit multipliers, or unit forces on each velocity, (n_v, k, …)."""
         if not self._by_velocities():
             return jax.lax.stop_gradient(self.rows.jacobian).columns(self.rows.rate)
         unit = gauss_jordan.identity(self.start)
@@ -218,7 +221,7 @@ class ContactProblem:
         """Returns a mask of the rows that are active and movable, (n,).
 
         The equality rows may make a row immovable up to rounding, for example a row between two
-        points of one body. No λ changes whether its law holds, so it is left out.
+        points of one body. No λ can change the velocity of such a row, so it is left out.
         """
         diagonal = gauss_jordan.diagonal(matrix)
         rounding = 64 * float(jnp.finfo(matrix.dtype).eps) * self.dt[None] * self.bare

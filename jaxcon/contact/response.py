@@ -190,7 +190,7 @@ class Response:
             exists = jax.lax.stop_gradient(jnp.all(jnp.isfinite(rate(end, dt)), axis=0))
             end, elapsed = jnp.where(exists[None], end, q), jnp.where(exists, dt, 0)
         change = rate(end, elapsed) - rows.rate
-        agree = local * change > 0  # false where J̇ v is not a number
+        agree = local * change > 0  # False where J̇ v is NaN
         smaller = jnp.where(agree & (jnp.abs(local) < jnp.abs(change)), local, change)
         value = jnp.where(agree, smaller, 0)
         ends = rows.kinds.by_contact(impacts.mask(rows.ends, rows))
@@ -212,7 +212,7 @@ class Response:
     def find(
         self, dynamics: Dynamics, point: Point, rows: BoundRows, acts: Array, lasts: Array | bool
     ) -> tuple[Solution, Reactions]:
-        """Solves for the response to the active rows: to an impact, or in a step if `lasts`.
+        """Solves for the response to the active rows: an impact, or a step where `lasts` is True.
 
         An impact has a velocity change Δv and impulses Λ_e and Λ. A step has an acceleration a and
         forces λ_e and λ. Only the rows in the mask `acts` are active. Λ_e and λ_e belong to the
@@ -277,7 +277,7 @@ def _observed(
 def _struck(
     impact: impacts.Impact, solution: Solution, reactions: Reactions, dt: Array
 ) -> tuple[Solution, Reactions]:
-    """Adds the impacts of the step to its results: their jump, and their mean forces."""
+    """Adds the jump and the mean forces of a step's impacts to its solution and reactions."""
     jump, struck, lost = impact.outcome()
     λ, joints = (
         x + numerics.safe_divide(impulse, dt[None])
@@ -298,7 +298,7 @@ def _struck(
 
 
 def lost_impacts(code: Array, lost: Array | None) -> Array:
-    """Returns the status, or LOST_IMPACTS where impacts are lost and nothing else failed, ()."""
+    """Returns the status code; LOST_IMPACTS if impacts are lost and nothing else has failed, ()."""
     if lost is None:
         return code
     note = jnp.where(lost, status.Status.LOST_IMPACTS, status.Status.OK)
@@ -307,7 +307,7 @@ def lost_impacts(code: Array, lost: Array | None) -> Array:
 
 @pytree
 class _Laws:
-    """Implements `impacts.Laws` by the dynamics of a step."""
+    """Implements the protocol `impacts.Laws` with the dynamics of a step."""
 
     dynamics: Dynamics
 
@@ -328,7 +328,16 @@ class _Laws:
         acts: Array,
         lasts: Array,
     ) -> impacts.Found:
-        """Returns impulses of the active rows in an impact, or forces in a step if `lasts`, ()."""
+        """Solves for the response to the active rows: an impact, or the forces of a step.
+
+        Args:
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            t: time, () [s].
+            rows: the inequality rows, with their targets.
+            acts: mask of the active rows, (n,).
+            lasts: True for the forces of a step, False for the impulses of an impact, ().
+        """
         solution, reactions = self._response.find(self.dynamics, (q, v, t), rows, acts, lasts)
         a, joints, _ = solution
         return impacts.Found(a, reactions.multipliers, joints, reactions.residual, reactions.kept)

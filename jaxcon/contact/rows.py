@@ -191,7 +191,7 @@ class BoundSet(NamedTuple):
 
     @property
     def hard(self) -> bool:
-        """True if the rows respond to impacts: not for friction, motors and soft stops."""
+        """True if the rows respond to impacts; False for joint friction, motors and soft stops."""
         return self.law != "box" and isinstance(self.compliance, float)
 
 
@@ -312,7 +312,7 @@ class BoundRows:
         return jax.lax.stop_gradient((self.far >= 0) & (dt[None] * free > self.far))
 
     def facing(self, second: Array, dt: Array) -> BoundRows:
-        """Returns the rows with the second stop in place of the first where a mask (n,) is set."""
+        """Replaces the first stop by the second one in the rows of the mask `second`, (n,)."""
         assert self.far is not None
         gap, sign = jnp.where(second, self.far, 0), jnp.where(second, -1, 1).astype(dt.dtype)
         return dataclasses.replace(
@@ -420,7 +420,7 @@ def _lands(system: System, pairs: list[tuple[tuple[str, ...], BoundSet]]) -> tup
         return ()
     names: list[str] = []
     for group, (element_names, rows) in zip(system.bounds, pairs, strict=True):
-        # the coordinate of a joint does not depend on where its bodies are
+        # rows on joint coordinates do not count: they do not depend on where the bodies are
         on_joint = group.coordinate is not None
         if on_joint or not (rows.hard and rows.rows[0].holonomic) or rows.restitution is not None:
             continue
@@ -431,7 +431,11 @@ def _lands(system: System, pairs: list[tuple[tuple[str, ...], BoundSet]]) -> tup
 
 
 class _Column:
-    """The first rows of all elements, or the i-th tangent, rolling or spinning row of contacts."""
+    """Consecutive inequality rows with the same role in their elements.
+
+    These are the first rows of all elements, or the i-th tangents of all contacts, or the i-th
+    rolling or spinning rows of all contacts that have them.
+    """
 
     def __init__(self, members: list[tuple[BoundSet, int, Row]], like: Array) -> None:
         self.members, self.like = members, like
@@ -447,7 +451,7 @@ class _Column:
         )
 
     def place(self, bound_set: BoundSet) -> int | None:
-        """Returns the first row of a set in this column; None if the set has no row in it."""
+        """Returns the index of a set's first row in this column; None if there is no such row."""
         place = 0
         for member, size, _ in self.members:
             if member is bound_set:
@@ -504,7 +508,7 @@ def _kinds(sets: list[BoundSet], sizes: list[int]) -> RowCounts:
 
 
 def _by_row(flags: list[bool], sizes: list[int], kinds: RowCounts) -> tuple[bool, ...]:
-    """Expands one flag for each set to one for each row; all rows of discs get False."""
+    """Repeats the flag of each set for each of its elements; the rows of discs get False."""
     first = [flag for flag, k in zip(flags, sizes, strict=True) for _ in range(k)]
     return (*first, *(False,) * (kinds.size - len(first)))
 
@@ -567,7 +571,8 @@ def has_ends(
 def rows_beside_contact(jacobian: Jacobian, bounds: BoundRows, multipliers: Array) -> Array | None:
     """Marks the equality rows in whose island a joint limit or a contact is active.
 
-    Joint friction and velocity-limited motors do not count.
+    An island is a set of rows and velocities that are coupled to each other. Joint friction and
+    velocity-limited motors do not count.
 
     Args:
         jacobian: the Jacobian of the equality rows, (n_c, n_v).

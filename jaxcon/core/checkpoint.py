@@ -26,7 +26,7 @@ def path(file: str | Path, owner: str) -> Path:
 
     Args:
         file: the path that the user gave.
-        owner: the function that takes it, for errors.
+        owner: the name of the function that takes the path, for error messages.
 
     Raises:
         ValueError: no file can be written there.
@@ -44,7 +44,7 @@ def path(file: str | Path, owner: str) -> Path:
         os.lstat(file.with_name(file.name + PART))
     except FileNotFoundError:
         return file
-    except (OSError, ValueError) as error:  # too long a name, or a zero byte in it
+    except (OSError, ValueError) as error:  # the name is too long, or has a zero byte
         raise ValueError(
             f"{owner}: checkpoint {checks.shortened(str(file))} is no path: {error.args[-1]}."
         ) from error
@@ -52,11 +52,13 @@ def path(file: str | Path, owner: str) -> Path:
 
 
 def write(file: Path, about: Mapping[str, Any], contents: PyTree) -> None:
-    """Writes a checkpoint atomically: after a crash, the file is complete, either old or new.
+    """Writes a checkpoint atomically.
+
+    If the process crashes meanwhile, the file has either all of the old or all of the new contents.
 
     Args:
         file: the path of the checkpoint.
-        about: a description of the search, which `read` compares.
+        about: a description of the search, which `read` compares with its own.
         contents: the pytree whose leaves are written.
     """
     arrays: dict[str, Any] = {
@@ -79,11 +81,11 @@ def read(file: Path, like: T, about: Mapping[str, Any], owner: str) -> T:
         like: a pytree with the structure and dtypes of the result; NumPy arrays in it may have
             another length than the stored arrays.
         about: the description of the search, which must equal the stored one.
-        owner: the function that reads, for errors.
+        owner: the name of the function that reads the file, for error messages.
 
     Raises:
-        ValueError: the file is no checkpoint, or the checkpoint of another search; the message
-            names the differences.
+        ValueError: the file is no checkpoint, or belongs to another search; the message then names
+            the differences.
     """
     try:
         with np.load(file, allow_pickle=False) as stored:
@@ -111,12 +113,12 @@ def digest(*parts: str | Scalar) -> str:
 
 
 def numbers(x: Scalar) -> np.ndarray:
-    """Converts a leaf to a NumPy array; a random key to its key data."""
+    """Converts a leaf to a NumPy array; random keys are converted to their key data."""
     return np.asarray(jax.random.key_data(x) if _is_key(x) else x)
 
 
 def _restored(stored: np.ndarray, like: np.ndarray | Array) -> np.ndarray | Array:
-    """Converts a stored array to a leaf of the type of `like`."""
+    """Converts a stored array to a NumPy array, JAX array or random key, of the type of `like`."""
     if isinstance(like, np.ndarray):
         return stored
     if _is_key(like):

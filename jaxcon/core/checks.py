@@ -71,7 +71,7 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        """Calls `check`.
+        """Checks the fields by `check`, after the constructor has set them.
 
         Raises:
             ValueError: a field is out of range.
@@ -84,20 +84,20 @@ class Checked:
             _constructing.reset(token)
 
     def check(self) -> None:
-        """Checks the fields; by default, does nothing. Subclasses override it."""
+        """Checks the fields. Subclasses override this method, which does nothing here."""
 
 
 def derives(owner: str, what: str, value: object, protocol: type) -> None:
-    """Checks that the class of a user's part derives from a protocol of `jc.extend`.
+    """Checks that a user's part of a method, such as a solver, derives from its protocol.
 
     Args:
-        owner: the class that takes the part, for errors.
-        what: the name of its argument, for errors.
+        owner: the class that takes the part, for error messages.
+        what: the name of the argument for the part, for error messages.
         value: the part.
-        protocol: the protocol, whose methods have defaults.
+        protocol: the protocol, a class of `jc.extend` with defaults for most methods.
 
     Raises:
-        TypeError: the class does not derive from the protocol.
+        TypeError: the class of the part does not derive from the protocol.
     """
     if protocol not in type(value).__mro__:
         raise TypeError(
@@ -121,7 +121,7 @@ def chosen_dtype(*trees: PyTree) -> np.dtype:
 
 
 def plain_zero(x: PyTree) -> bool:
-    """Returns True for the Python number 0; terms with this factor are not compiled."""
+    """Returns True if x is the Python number 0; callers then leave out terms with the factor x."""
     return isinstance(x, int | float) and not isinstance(x, bool) and x == 0
 
 
@@ -136,8 +136,8 @@ def real(
     """Checks a value of the user, and returns it as a real array of the scene's dtype.
 
     Args:
-        owner: the class or function that takes the value, for errors.
-        what: the name of the argument, for errors.
+        owner: the class or function that takes the value, for error messages.
+        what: the name of the argument, for error messages.
         x: the user's value.
         dtype: the dtype of the scene.
         shape: the required shape.
@@ -173,8 +173,8 @@ def check(
     """Checks that x is a real number or array of a given shape and, if concrete, within bounds.
 
     Args:
-        owner: the class or function that takes the value, for errors.
-        what: the name of the argument, for errors.
+        owner: the class or function that takes the value, for error messages.
+        what: the name of the argument, for error messages.
         x: the user's value.
         shape: the required shape; None for any shape.
         dtype: a dtype whose range must contain the numbers; None for no such limit.
@@ -185,7 +185,7 @@ def check(
         optional: True to allow None.
 
     Returns:
-        The numbers as an array; a JAX array or None unchanged.
+        The numbers as an array; a JAX array or None is returned unchanged.
 
     Raises:
         ValueError: x is not real, has another shape, or has a value out of range.
@@ -217,7 +217,7 @@ def check(
 
 
 def _limits(above: float, least: float, most: float, finite: bool) -> str:
-    """Describes the allowed range of values in words, for messages."""
+    """Describes the range that the bounds of `check` allow, in words, for error messages."""
     ending = " and finite" if finite else ""
     if above > -np.inf and most < np.inf:
         return f"be above {above:g} and at most {most:g}"
@@ -231,13 +231,15 @@ def _limits(above: float, least: float, most: float, finite: bool) -> str:
 
 
 def _numbers(owner: str, what: str, x: PyTree, wanted: str = "real numbers") -> Any:
-    """Converts a value of the user to a real array: a JAX array if x is or contains one.
+    """Converts a value of the user to an array of real numbers.
+
+    The result is a JAX array if x is or contains a JAX array, otherwise a NumPy array.
 
     Args:
-        owner: the class or function that takes the value, for errors.
-        what: the name of the argument, for errors.
+        owner: the class or function that takes the value, for error messages.
+        what: the name of the argument, for error messages.
         x: the user's value.
-        wanted: the expected kind of value in words, for errors.
+        wanted: the expected kind of value in words, for error messages.
 
     Raises:
         ValueError: x is not real, or is a ragged list.
@@ -256,10 +258,12 @@ def _numbers(owner: str, what: str, x: PyTree, wanted: str = "real numbers") -> 
 
 
 def _from_host(owner: str, what: str, x: PyTree, wanted: str) -> Any:
-    """Converts lists, NumPy arrays and Python numbers to an array; x is not a JAX array.
+    """Converts a list, NumPy array or Python number to an array.
+
+    The result is a JAX array if a list contains one, otherwise a NumPy array.
 
     Raises:
-        ValueError: the input is not numeric, ragged, or out of the range of floats.
+        ValueError: x is not numeric, is ragged, or exceeds the range of floats.
     """
     leaves = jax.tree.leaves(x) if isinstance(x, list | tuple) else [x]
     wrong = next((y for y in leaves if isinstance(y, bool | np.bool_)), None)
@@ -270,7 +274,7 @@ def _from_host(owner: str, what: str, x: PyTree, wanted: str) -> Any:
             return jnp.asarray(x)
         if isinstance(x, np.ma.MaskedArray):
             x = np.ma.filled(x.astype(float), np.nan)
-        with warnings.catch_warnings():  # older versions of NumPy only warn of ragged lists
+        with warnings.catch_warnings():  # older versions of NumPy only warn about ragged lists
             warnings.simplefilter("error")
             array = np.asarray(x)
         integers = array.dtype == object and all(type(y) is int for y in array.ravel())
@@ -291,8 +295,8 @@ def components(owner: str, **given: tuple[Any, tuple[int, ...]]) -> list[Any]:
     Values are not read, so traced arrays are accepted.
 
     Args:
-        owner: the function that takes the arguments, for errors.
-        given: for each argument name, the value and the required sizes of its first axes.
+        owner: the function that takes the arguments, for error messages.
+        given: by argument name, a pair: the value, and the required sizes of its first axes.
 
     Raises:
         ValueError: a value is not real, has other sizes, or the further axes of the arguments do
@@ -328,7 +332,7 @@ def shortened(x: Any) -> str:
 
 
 def clipped(text: str) -> str:
-    """Cuts a text after `LONG` characters."""
+    """Cuts a text after `LONG` characters, and marks the cut by an ellipsis."""
     return text if len(text) <= LONG else f"{text[:LONG]}…"
 
 
@@ -345,7 +349,9 @@ def numerals(x: Any) -> str:
 
 
 def _shown(values: np.ndarray, good: np.ndarray) -> str:
-    """Formats a whole array if it is small, otherwise its first invalid entry and the index.
+    """Formats an array for error messages: all of it, or only its first invalid entry.
+
+    Arrays of more than `FEW` entries are not shown as a whole.
 
     Args:
         values: the array.
@@ -384,10 +390,10 @@ def flag(owner: str, what: str, x: PyTree) -> None:
 
 
 def nonzero(owner: str, what: str, x: PyTree, dtype: DType = np.float64) -> None:
-    """Checks that a number or vector is finite and not zero in a dtype.
+    """Checks that a number or vector is finite and not zero, after conversion to a dtype.
 
-    The squared length of a vector must not underflow to a subnormal number of the dtype, so that
-    the vector can be divided by its length.
+    To divide a vector by its length, its squared length must not be a subnormal number of the
+    dtype.
 
     Raises:
         ValueError: the value is zero, not finite or not numeric.
@@ -420,7 +426,7 @@ def radians(owner: str, what: str, x: Scalar) -> None:
 
 
 def recorded(owner: str, what: str, x: Scalar) -> Any:
-    """Checks recorded data of the user; returns it with NaN in place of masked entries.
+    """Checks that recorded data of the user are real; returns them with NaN for masked entries.
 
     Raises:
         ValueError: the data are not real.
@@ -441,14 +447,14 @@ def takes(
     """Checks that a user's function accepts as many positional arguments as a call will pass.
 
     Args:
-        owner: the function that takes the user's function, for errors.
-        what: the name of the argument, for errors.
+        owner: the function that takes the user's function, for error messages.
+        what: the name of the argument, for error messages.
         function: the user's function.
-        given: the names of the arguments that the call passes, for errors.
-        why: the reason for these arguments, for errors.
+        given: the names of the arguments that the call passes, for error messages.
+        why: the reason why the call passes these arguments, for error messages.
 
     Raises:
-        TypeError: `function` is no function, or takes other arguments.
+        TypeError: `function` is no function, or does not accept these arguments.
     """
     if not callable(function):
         raise TypeError(f"{owner}: {what} must be a function of {given[0]}, got {function!r}.")

@@ -22,8 +22,9 @@ def hoist_closure(
 
     Returns:
         A function (constants, *args) → function(*args), which can also be differentiated with
-        respect to the constants; the constants, that is, all arrays that `function` closes over,
-        traced or not; and the shapes of the result.
+        respect to the constants.
+        The list of constants: all arrays that `function` closes over, traced or not.
+        The shapes and dtypes of the result.
     """
     closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
     jaxpr, structure = closed.jaxpr, jax.tree.structure(shapes)

@@ -1,7 +1,7 @@
 """Double-float arithmetic: a number is stored as the unevaluated sum of two floats.
 
 Near 1e5 s, float32 resolves time only to 8 ms. A time stored as the sum of two float32 has 48 bits
-instead of 24, and so has the phase of a motion that is computed from it.
+instead of 24. The phase of a motion that is computed from this time has 48 bits, too.
 
 XLA does not reassociate sums, but a CPU may contract a product and a sum into one rounding (FMA).
 Products are therefore computed from factors that are split into halves of their bits. The products
@@ -39,7 +39,7 @@ TWO_PI = (6.283185307179586, 2.4492935982947064e-16, -5.989539619436679e-33)
 class Doubled:
     """A double-float number high + low, where `high` is the float nearest to the sum.
 
-    Derivatives are those of exact arithmetic; the tangent of `high` contains them.
+    Derivatives are those of exact arithmetic. They are stored in the tangent of `high`.
 
     Attributes:
         high: the rounded number, any shape.
@@ -91,7 +91,7 @@ class Doubled:
 
     @property
     def value(self) -> Array:
-        """The sum of both parts as a float: equal to `high`, but with the tangent of the sum."""
+        """The number as a float, high + low: equal to `high`, but with the tangents of both."""
         return self.high + self.low
 
     @property
@@ -123,7 +123,7 @@ Operand: TypeAlias = Doubled | Tangent | Scalar
 
 
 def rounded(x: Operand) -> Any:
-    """Returns the float nearest to an operand; a plain number is returned unchanged."""
+    """Returns `high` of a `Doubled` or `Tangent`, and any other operand unchanged."""
     return x.high if isinstance(x, Doubled | Tangent) else x
 
 
@@ -139,7 +139,7 @@ def two_pi(dtype: DType) -> tuple[float, ...]:
 
 @jax.custom_jvp
 def _carry(x: Array, like: Array) -> Array:
-    """Returns x, with the derivative of `like` in place of its own."""
+    """Returns x, with the derivative of `like` in place of the derivative of x."""
     return x
 
 
@@ -149,7 +149,13 @@ def _(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Arra
 
 
 def _carrying(large: Array, small: Array, like: Array) -> Doubled:
-    """Adds a large and a small float exactly (Dekker); the derivative is that of `like`."""
+    """Returns large + small without rounding (Dekker), with the derivative of `like`.
+
+    Args:
+        large: a float, at least as large as `small` in magnitude.
+        small: a float.
+        like: a float with the derivative of the sum.
+    """
     high = large + small
     return Doubled(_carry(high, like), small - (high - large))
 
@@ -188,8 +194,8 @@ def evaluate(function: Callable[..., Array], x: Doubled, *args: PyTree) -> Doubl
     Branches, loops, called functions and complex numbers are supported. Arguments of sines, cosines
     and complex exponentials are first reduced to [−π, π]. `rem`, `floor`, `ceil` and `round` apply
     to the sum of both floats. Every other operation f is linearized: f(high) + f′(high) low.
-    Conditions use the rounded number. Double-float results can overflow earlier than floats; the
-    function is then evaluated at the rounded number.
+    Conditions use the rounded number `high`. Double-float results can overflow earlier than floats;
+    the result is then function(high, *args), in plain floats.
 
     Args:
         function: a pure function that returns an array.
@@ -204,10 +210,10 @@ def evaluate(function: Callable[..., Array], x: Doubled, *args: PyTree) -> Doubl
 
 
 def rounding_operations(function: Callable[..., Array], x: Doubled, *args: PyTree) -> list[str]:
-    """Returns the names of primitives for which `evaluate` loses the double-float precision.
+    """Returns the names of primitives in a function for which `evaluate` loses precision.
 
-    These are primitives, such as `cumsum`, that contain large sums or products, but are linearized
-    as a whole.
+    Primitives such as `cumsum` contain large sums or products. `evaluate` linearizes them as a
+    whole, so the sums and products are rounded like plain floats.
 
     Args:
         function: a pure function that returns an array.
@@ -248,7 +254,7 @@ class Evaluation:
         return [read(x) for x in jaxpr.outvars]
 
     def _apply(self, jaxpr: Jaxpr, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
-        """Evaluates one equation of a jaxpr, with plain arrays, `Doubled` or tangents as inputs."""
+        """Evaluates one equation of a jaxpr; inputs are plain arrays, `Doubled` or `Tangent`."""
         name, params = equation.primitive.name, equation.params
         if not any(isinstance(x, Doubled | Tangent) for x in inputs):
             return apply_equation(jaxpr, equation, inputs)
@@ -285,7 +291,7 @@ class Evaluation:
         return list(map(_doubled, self.run(closed.jaxpr, closed.consts, inputs)))
 
     def _cond(self, params: Mapping[str, Any], inputs: list[Any]) -> list[Any]:
-        """Evaluates `lax.cond` and `lax.switch`; the branch index comes from rounded numbers."""
+        """Evaluates `lax.cond` and `lax.switch`; rounded numbers determine the branch index."""
         branches = [functools.partial(self._closed, branch) for branch in params["branches"]]
         return jax.lax.switch(inputs[0], branches, inputs[1:])
 
@@ -303,7 +309,7 @@ class Evaluation:
         return [*carry, *stacked]
 
     def _while(self, params: Mapping[str, Any], inputs: list[Any]) -> list[Any]:
-        """Evaluates `lax.while_loop`; the condition uses rounded numbers."""
+        """Evaluates `lax.while_loop`; rounded numbers determine when the loop ends."""
         first, last = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
 
         def goes_on(carry: list[Any]) -> Any:
@@ -354,7 +360,7 @@ FLOW: dict[str, Callable[[Evaluation, Mapping[str, Any], list[Any]], list[Any]]]
     "scan": Evaluation._scan,
     "while": Evaluation._while,
 }
-"""The evaluation of each primitive for branches and loops."""
+"""The method of `Evaluation` for each primitive with branches or loops."""
 
 ROUNDING = frozenset({"cumsum", "cumprod", "reduce_prod", "conv_general_dilated", "fft"})
 """Primitives with large sums or products that are linearized as a whole, and lose precision."""
@@ -379,9 +385,14 @@ def _doubled(x: Operand) -> Any:
 
 
 def _tangent(x: Doubled | Array, change: Operand) -> Any:
-    """Returns the tangent of a result x in the form that `jax.custom_jvp` needs.
+    """Converts the derivative of a result to the tangent type that `jax.custom_jvp` needs.
 
-    The derivative is in the tangent of `high`; the tangent of `low` is zero.
+    The tangent of a `Doubled` has the derivative in `high`, and zero in `low`. An integer or
+    boolean has a tangent of dtype float0.
+
+    Args:
+        x: the result.
+        change: the derivative of x.
     """
     if not isinstance(x, Doubled):
         return np.zeros(jnp.shape(x), jax.dtypes.float0)
@@ -390,7 +401,7 @@ def _tangent(x: Doubled | Array, change: Operand) -> Any:
 
 
 def _linearized(jaxpr: Jaxpr, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
-    """Evaluates an equation with operation f by linearization: f(high) + f′(high) low."""
+    """Evaluates one equation by linearization of its operation f: f(high) + f′(high) low."""
     where = [i for i, x in enumerate(inputs) if isinstance(x, Doubled)]
 
     def function(*highs: Array) -> list[Any]:
@@ -408,11 +419,11 @@ def _linearized(jaxpr: Jaxpr, equation: JaxprEqn, inputs: list[Any]) -> list[Any
 
 
 def _sum(x: Doubled, axes: Sequence[int]) -> Doubled:
-    """Sums an array over axes, by pairwise summation."""
+    """Returns the sums of an array over some of its axes, by pairwise summation."""
     for axis in sorted(axes, reverse=True):
         x = jax.tree.map(lambda part, axis=axis: jnp.moveaxis(part, axis, 0), x)
         while x.high.shape[0] > 1:
-            # a row of zeros makes the number of rows even
+            # a row of zeros is appended if the number of rows is odd
             x = jax.tree.map(
                 lambda part: jnp.concatenate([part, jnp.zeros_like(part[: len(part) % 2])]), x
             )
@@ -431,7 +442,14 @@ def _dot(
     missing = [batch + free[0] + i for i in range(free[1])], [batch + i for i in range(free[0])]
 
     def arranged(side: int, part: Array) -> Array:
-        """Transposes one operand to axes (batch, free of x, free of y, contracted)."""
+        """Transposes an operand to (batch axes, axes of x, axes of y, contracted axes).
+
+        Axes of the other operand have size 1.
+
+        Args:
+            side: 0 for the operand x, 1 for y.
+            part: `high` or `low` of the operand.
+        """
         fixed = (*batched[side], *contracted[side])
         free_axes = [i for i in range(part.ndim) if i not in fixed]
         return jnp.expand_dims(
@@ -482,7 +500,10 @@ def _power(x: Doubled, exponent: int) -> Doubled:
 
 
 def _remainder(x: Doubled, y: Doubled) -> Doubled:
-    """Evaluates `jax.lax.rem`: x minus a multiple of y, with the sign of x and less than |y|."""
+    """Evaluates `jax.lax.rem`: subtracts a multiple of y from x.
+
+    The result has the sign of x, and its magnitude is less than |y|.
+    """
     derivative = jax.lax.rem(x.value, y.value)
     x, y = jax.lax.stop_gradient((x, y))
     rest = jax.lax.rem(x.high, y.high)
@@ -510,7 +531,7 @@ def _floor(x: Doubled) -> Doubled:
 
 
 def _rounded_to_whole(x: Doubled, ties: jax.lax.RoundingMethod) -> Doubled:
-    """Rounds x to the nearest integer; `ties` is the rule for numbers halfway between integers."""
+    """Rounds x to the nearest integer, and numbers halfway between integers by the rule `ties`."""
     x = jax.lax.stop_gradient(x)
     whole, below = jax.lax.round(x.high, ties), jnp.floor(x.high)
     halfway = (x.high - below == 0.5) & (x.low != 0)
@@ -530,4 +551,4 @@ RULES: dict[str, Callable[..., Doubled]] = {
     "floor": _floor,
     "ceil": lambda x: -_floor(-x),
 }
-"""The double-float function of each primitive that is evaluated without linearization."""
+"""The functions that evaluate primitives in double-float arithmetic, without linearization."""

@@ -39,7 +39,7 @@ def hashed(tree: PyTree) -> int:
 def _kind(x: PyTree) -> Any:
     """Returns the type and properties of a leaf, without reading array values from a device.
 
-    Host numbers are represented by their value, and a tracer by its identity.
+    A number that is not an array is represented by its value, and a tracer by its identity.
     """
     if isinstance(x, Tracer):
         return Tracer, id(x)
@@ -53,12 +53,12 @@ def _kind(x: PyTree) -> Any:
 
 
 def _same_bits(x: PyTree, y: PyTree) -> bool:
-    """Returns True if two leaves of equal kind have equal bits."""
+    """Returns True if two leaves have equal bits, given that their `_kind` is equal."""
     if not isinstance(x, np.ndarray | jax.Array):
-        return True  # the kind contains the value
+        return True  # `_kind` has compared the values
     if isinstance(x, jax.Array) and isinstance(y, jax.Array):
         if jnp.issubdtype(x.dtype, jax.dtypes.extended):
             x, y = jax.random.key_data(x), jax.random.key_data(y)
         if not (x.is_fully_addressable and y.is_fully_addressable):
-            return False  # a part is on devices of another process
+            return False  # parts on devices of other processes cannot be read
     return np.asarray(x).tobytes() == np.asarray(y).tobytes()

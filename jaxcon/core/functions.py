@@ -19,11 +19,11 @@ UNKNOWN = (ConcretizationTypeError, TracerArrayConversionError, TracerIntegerCon
 
 
 def call(owner: str, what: str, function: Callable[..., Any], *args: PyTree) -> Any:
-    """Calls a user's function, function(*args), and explains errors about traced values.
+    """Returns function(*args) for a user's function, and explains errors about traced values.
 
     Args:
-        owner: the caller, for errors.
-        what: the role of the function, for errors.
+        owner: the caller, for error messages.
+        what: the role of the function, for error messages.
         function: the user's function.
         args: the arguments of the function.
 

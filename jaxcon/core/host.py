@@ -158,4 +158,4 @@ STRUCTURAL: dict[str, Callable[..., Any]] = {
     "squeeze": lambda params, x: np.squeeze(x, tuple(params["dimensions"])),
     "transpose": lambda params, x: np.transpose(x, params["permutation"]),
 }
-"""A function (params, *inputs) for each primitive that moves or reduces array entries."""
+"""The NumPy function (params, *inputs) of each primitive that moves or reduces array entries."""

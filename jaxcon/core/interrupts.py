@@ -24,7 +24,7 @@ def progress_bar(show: bool | None, unit: str = "step", **options: Any) -> Any:
         unit: the name of one iteration, such as "step".
         options: further arguments of `tqdm`.
     """
-    with warnings.catch_warnings():  # without ipywidgets a notebook falls back to a text bar
+    with warnings.catch_warnings():  # without ipywidgets, tqdm warns and shows a text bar
         warnings.simplefilter("ignore", TqdmWarning)
         from tqdm.auto import tqdm
     return tqdm(unit=unit, disable=None if show is None else not show, **options)

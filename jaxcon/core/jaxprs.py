@@ -20,7 +20,7 @@ CALLS = {
     "checkpoint": "jaxpr",
     "remat2": "jaxpr",
 }
-"""Primitives that only call a function, with the parameter that contains the function's jaxpr."""
+"""Primitives that only call a function, and the name of their parameter for its jaxpr."""
 
 
 def called(equation: JaxprEqn) -> Any:
@@ -39,10 +39,10 @@ def called(equation: JaxprEqn) -> Any:
 
 
 def each(function: Callable[[Any], Any], xs: PyTree) -> Any:
-    """Returns `jax.vmap(function)(xs)`, also for functions that contain a `lax.custom_root`.
+    """Returns `jax.vmap(function)(xs)`, even if the function contains a `lax.custom_root`.
 
     In branches of `lax.cond`, JAX 0.11 vectorizes `custom_root` to a primitive without a
-    derivative. With that version, `jax.lax.map` is used instead.
+    derivative. With that version, `each` uses `jax.lax.map` instead.
     """
     if jax.__version_info__[:2] == (0, 11):
         return jax.lax.map(function, xs)
@@ -53,7 +53,7 @@ def without_unused(jaxpr: Jaxpr, wanted: Sequence[bool] | None = None) -> Any:
     """Removes unwanted results and unused equations from an open jaxpr.
 
     Args:
-        jaxpr: the open jaxpr; the result has all its arguments.
+        jaxpr: the open jaxpr. The returned jaxpr keeps all arguments, even unused ones.
         wanted: True for each result to keep; None for all.
     """
     chosen = [True] * len(jaxpr.outvars) if wanted is None else list(wanted)

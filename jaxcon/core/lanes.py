@@ -22,7 +22,7 @@ from jaxcon.core.typing import Array, Lane, Scalar, T
 
 
 def _is(x: Lane, number: int) -> bool:
-    """Returns True if x is a Python number with this value, not an array."""
+    """Returns True if x is a Python number with the value `number`, and not an array."""
     return isinstance(x, int | float) and x == number
 
 
@@ -68,7 +68,10 @@ def total(terms: Iterable[Lane]) -> Lane:
 @exportable
 @jax.tree_util.register_pytree_node_class
 class Vector:
-    """A vector whose components are lanes (see this module), such as `Vector(x, y, z)`."""
+    """A vector such as `Vector(x, y, z)`, whose components are lanes.
+
+    A lane is an array over bodies or worlds, or a number known when tracing.
+    """
 
     __slots__ = ("components",)
 
@@ -86,9 +89,13 @@ class Vector:
 
     @classmethod
     def of_rows(cls, x: Array, start: int, components: int, elements: int) -> Vector:
-        """Splits consecutive rows of an array into the components of a vector, (element, …) each.
+        """Returns a vector whose components are consecutive slices of an array, (element, …) each.
 
-        Rows of the first component start at row `start`; rows of further components follow.
+        Args:
+            x: the array, (row, …).
+            start: the first row of the first component; the other components follow.
+            components: the number of components.
+            elements: the number of rows of each component.
         """
         # one split, since its transpose is one concatenation; slices give a sum of padded arrays
         rest = len(x) - start - components * elements
@@ -110,7 +117,7 @@ class Vector:
         return total(times(x, y) for x, y in zip(self, other, strict=True))
 
     def cross(self, other: Vector) -> Any:
-        """Returns x × y: a Vector in space, the scalar component along the normal in the plane."""
+        """Returns x × y: a Vector in space; in the plane, only the component along the normal."""
         if len(self) == 2:
             (a, b), (c, d) = self, other
             return minus(times(a, d), times(b, c))
@@ -130,7 +137,7 @@ class Vector:
         """Rebuilds the vector from its children."""
         return cls(*children)
 
-    def __iter__(self) -> Iterator[Any]:  # lanes; rows of a Matrix
+    def __iter__(self) -> Iterator[Any]:  # yields lanes, or the rows of a Matrix
         return iter(self.components)
 
     def __len__(self) -> int:
@@ -198,7 +205,7 @@ GATHERED = 16
 
 
 def take(x: Lane, indices: tuple[int, ...]) -> Lane:
-    """Returns x[indices] along the first axis; a Python number unchanged.
+    """Returns x[indices], along the first axis; a Python number is returned unchanged.
 
     The cheapest operation is used: x itself, a strided slice, a few slices, or a gather.
     """
@@ -219,11 +226,11 @@ def take(x: Lane, indices: tuple[int, ...]) -> Lane:
 
 
 def side_by_side(rows: Sequence[tuple[Lane, int]]) -> Lane:
-    """Concatenates single rows of lanes (element, …) into one lane.
+    """Concatenates chosen rows of one or more lanes (element, …) into one lane.
 
     Args:
-        rows: for each row of the result, the lane and the index of the row in it. A Python number
-            in place of the lane gives a row of equal entries.
+        rows: for each row of the result, a pair: a lane, and the index of the row in that lane. A
+            Python number in place of a lane fills the row with this number.
     """
     parts: list[tuple[Lane, int]] = []
     for _, members in itertools.groupby(rows, key=lambda row: id(row[0])):
@@ -241,7 +248,10 @@ def side_by_side(rows: Sequence[tuple[Lane, int]]) -> Lane:
 
 
 PIECES = 8
-"""The largest number of runs of bodies for which `collect` uses slices instead of gathers."""
+"""The largest number of runs for which `collect` uses slices instead of gathers.
+
+A run is a sequence of consecutive bodies whose contributions are consecutive, too.
+"""
 
 
 def collect(terms: Sequence[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
@@ -268,7 +278,7 @@ def collect(terms: Sequence[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
         i for i in range(bodies) if not i or sources[i] != [(t, e + 1) for t, e in sources[i - 1]]
     ]
     if len(starts) > PIECES:
-        # one gather for each term of the sums, from one array of all terms, padded by zeros
+        # the k-th terms of all bodies are one gather from the array of all terms, padded by zeros
         rows = [jnp.broadcast_to(x, (x.shape[0], *shape)) for _, x in arrays]
         every = jnp.concatenate([*rows, jnp.zeros((1, *shape), rows[0].dtype)])
         first = np.cumsum([0, *(len(x) for x in rows)])
@@ -286,9 +296,9 @@ def collect(terms: Sequence[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
 
 
 def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Lets a function of vectors also take arrays whose first axis enumerates components.
+    """Lets a function of Vectors also take arrays whose first axis enumerates components.
 
-    If all arguments are arrays, the result is an array; otherwise it is a Vector.
+    A result that is a Vector becomes an array, too, if all arguments are arrays.
     """
 
     @functools.wraps(function)
@@ -303,9 +313,7 @@ def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def add_rhs_axis(tree: T, worlds: int) -> T:
-    """Inserts an axis of size 1 before the batch axes, so that lanes broadcast over many vectors.
-
-    The new axis enumerates right-hand sides.
+    """Inserts an axis of size 1 before the batch axes, to broadcast over many right-hand sides.
 
     Args:
         tree: a tree of arrays with trailing batch axes; scalars are unchanged.

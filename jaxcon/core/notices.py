@@ -25,7 +25,7 @@ _observations: list[Any] = []
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))
 def when_differentiated(x: Array, message: str) -> Array:
-    """Returns x, and gives a warning with the message when a derivative through x is traced."""
+    """Returns x; gives a warning with this message when JAX traces a derivative through x."""
     return x
 
 
@@ -36,7 +36,7 @@ def _(message: str, primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
 
 
 def tell(message: str) -> None:
-    """Gives a warning once per process; within the context `collected`, only records it."""
+    """Gives a warning, but only once per process; within `collected`, records it instead."""
     messages = _collected.get()
     if messages is not None:
         if message not in messages:
@@ -66,8 +66,8 @@ def is_observing() -> bool:
 def observed() -> Iterator[list[Any]]:
     """Collects the observations of programs that are traced and run within this context.
 
-    XLA metadata is part of the key of JAX's trace cache. Cached programs are therefore traced again
-    in this context, and stay in the cache unchanged.
+    The context sets XLA metadata, which is part of the key of JAX's trace cache. Programs are
+    therefore traced anew in this context, and their earlier traces stay in the cache unchanged.
     """
     _observations.clear()
     token = _observing.set(True)
@@ -79,16 +79,16 @@ def observed() -> Iterator[list[Any]]:
 
 
 def observe(x: Array, kind: Hashable, happens: Array, *values: Array) -> Array:
-    """Returns x, and reports the values to the host if `happens` is True anywhere.
+    """Returns x; within the context `observed`, also reports values to the host at run time.
 
-    The observation is the tuple (kind, happens, *values). Outside of the context `observed`,
-    nothing is added to the traced program.
+    If `happens` is True anywhere, the tuple (kind, happens, *values) is added to the observations.
+    Outside of the context, nothing is added to the traced program.
 
     Args:
         x: an array with one axis before the batch axes.
         kind: a label of the observation.
-        happens: a mask with the trailing axes of x.
-        values: arrays with the trailing axes of x.
+        happens: a mask, whose last axes are the batch axes of x.
+        values: arrays, whose last axes are the batch axes of x.
     """
     if not _observing.get():
         return x

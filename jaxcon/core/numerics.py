@@ -51,7 +51,7 @@ def safe_arctan2(y: Lane, x: Lane) -> Array:
 
 
 def negligible(x: Array) -> Array:
-    """Returns the tolerance ε^⅔ (1 + max |x|) of an iteration for x (n, …), one for each world.
+    """Returns a tolerance for iterations on x, (n, …): ε^⅔ (1 + max |x|), one for each world.
 
     ε is the machine precision.
     """
@@ -66,9 +66,10 @@ def wrap(angle: Lane) -> Array:
 
 
 TERMS = {32: 6, 64: 11}
-"""The number of terms of the power series of cos r and sin r / r in r², for 32- and 64-bit floats.
+"""The number of terms after the first in the power series of cos r and sin r / r in r².
 
-The first omitted term is below half a unit in the last place for r up to π/2.
+The keys are the sizes of a float in bits. The first omitted term is below half a unit in the last
+place for r up to π/2.
 """
 
 

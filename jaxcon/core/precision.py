@@ -12,7 +12,7 @@ from jaxcon.core.typing import T
 
 
 def precision(dtype: DTypeLike) -> AbstractContextManager[Any]:
-    """Returns a context that enables float64 if `dtype` is float64, and disables it otherwise."""
+    """Returns a context in which float64 is enabled in JAX if and only if `dtype` is float64."""
     return jax.enable_x64(np.dtype(dtype) == np.float64)
 
 

@@ -74,7 +74,7 @@ def exportable(cls: type[T], rebuilt: Callable[..., T] | None = None) -> type[T]
     name = f"{cls.__module__}.{cls.__qualname__}"
     if (
         not name.startswith("jaxcon.") or name in _WRITTEN
-    ):  # registered before its module was reloaded
+    ):  # a class is registered already if its module was reloaded
         return cls
     _WRITTEN.add(name)
     if issubclass(cls, tuple):
@@ -97,7 +97,7 @@ def _hash(self: Any) -> int:
 
 
 def unshared(tree: T, *others: PyTree) -> T:
-    """Copies each array of a tree that occurs twice in it, or also in another tree.
+    """Copies each array of a tree that occurs more than once in the tree, or in another tree, too.
 
     This makes the tree safe to donate: JAX frees donated arrays even if they are used elsewhere.
     """
@@ -128,17 +128,17 @@ class LeafPartition:
 
     @classmethod
     def of(cls, tree: PyTree) -> "LeafPartition":
-        """Partitions the leaves of a tree, arrays or their shapes, into real and other ones."""
+        """Partitions the leaves of a tree, which are arrays or `jax.ShapeDtypeStruct`s."""
         leaves, structure = jax.tree.flatten(tree)
         return cls(
             structure, tuple(jnp.issubdtype(jnp.result_type(x), jnp.inexact) for x in leaves)
         )
 
     def among(self, chosen: Iterable[bool]) -> "LeafPartition":
-        """Returns a partition in which only some of the real leaves count as real.
+        """Returns a partition with fewer differentiable leaves.
 
         Args:
-            chosen: for each real leaf, True if it stays real.
+            chosen: for each leaf that is real here, True if it stays real in the result.
         """
         flags = iter(chosen)
         return LeafPartition(self.structure, tuple(flag and next(flags) for flag in self.real))

@@ -20,7 +20,7 @@ from jaxcon.core.typing import Array
 
 
 def somewhere(flags: Array) -> Array:
-    """Returns True if a flag is set in any world on this device, ().
+    """Returns True if the flag of any world on this device is set, ().
 
     The result has no derivative. Under `jax.vmap`, each mapped array of flags has its own result.
 
@@ -42,7 +42,7 @@ def _any(flags: Array) -> Array:
 
 _by_device = custom_partitioning(_any)
 _by_device.def_partition(
-    # each device reads its own flags alone
+    # each device reads only its own flags
     lambda mesh, args, result: (
         mesh,
         _any,
@@ -50,7 +50,7 @@ _by_device.def_partition(
         (args[0].sharding,),
     ),
     infer_sharding_from_operands=lambda mesh, args, result: NamedSharding(mesh, PartitionSpec()),
-    # all axes of the flags are reduced, in Einstein notation
+    # a rule in Einstein notation, such as "i0 i1 -> ": all axes of the flags are reduced
     sharding_rule=lambda mesh, args, results: (
         " ".join(f"i{k}" for k in range(len(args[0].shape))) + " -> "
     ),
@@ -59,17 +59,21 @@ _by_device.def_partition(
 
 @functools.cache
 def asking() -> ClosedJaxpr:
-    """Returns a jaxpr with custom partitioning, as a parameter of primitives that lower to it.
+    """Returns a jaxpr that contains the custom partitioning of `somewhere`.
 
-    A program with a custom partitioning must know its devices when it is lowered. JAX therefore
-    searches the jaxpr and the parameters of its primitives for custom partitionings. Without this
-    parameter, JAX would miss a partitioning that a primitive introduces only when it is lowered.
+    It is passed as a parameter to each primitive whose lowering may use this partitioning. A
+    program with a custom partitioning must know its devices when it is lowered. JAX therefore
+    searches the program, and the parameters of its primitives, for custom partitionings. Without
+    the parameter, JAX would miss a partitioning that only the lowering introduces.
     """
     return jax.make_jaxpr(_by_device)(np.zeros(1, bool))
 
 
 def _batched(args: Sequence[Array], axes: Sequence[int], *, asks: ClosedJaxpr) -> tuple[Array, int]:
-    """Implements `jax.vmap`: returns one flag for each mapped array, reduced over all devices."""
+    """The batching rule of `somewhere`: returns one flag for each array of flags of the batch.
+
+    Unlike `somewhere` itself, it combines the flags of all devices.
+    """
     (flags,), (axis,) = args, axes
     return jnp.any(jnp.moveaxis(flags, axis, 0), axis=tuple(range(1, flags.ndim))), 0
 

@@ -31,7 +31,10 @@ def decoded(text: bytes) -> Any:
 
 
 def _written(x: Any) -> Any:
-    """Converts static data to JSON values: numbers and strings unchanged, others as {kind: …}."""
+    """Converts static data to JSON values.
+
+    Numbers and strings are unchanged; other objects become dicts such as {"name": "module:name"}.
+    """
     if x is None or type(x) in (bool, int, float, str):
         return x
     if isinstance(x, Enum):

@@ -42,7 +42,7 @@ class Status(IntEnum):
 
 
 _CONFLICT, _RELAXED = int(Status.CONFLICT), int(Status.RELAXED)
-"""Codes as plain integers, because JAX without jit promotes an array and a `Status` to int64."""
+"""Codes as plain integers: outside jit, JAX promotes an array and a `Status` to int64."""
 
 REPAIRS = (Status.ROLLED_BACK, Status.PROJECTED, Status.RELAXED)
 """The codes of steps that a `Recovery` repaired."""
@@ -84,9 +84,10 @@ class SimulationError(RuntimeError):
 
 
 def failed(code: Array) -> Array:
-    """Returns True for each failed world; failed worlds keep their last finite state.
+    """Returns a mask of the failed worlds, given the status code of each world.
 
-    Unknown status codes count as failures.
+    Failed worlds stop and keep their last finite state. Codes that `Status` does not have count as
+    failures, too.
     """
     return (code != 0) & ((code < _CONFLICT) | (code > _RELAXED))
 

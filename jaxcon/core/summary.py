@@ -14,25 +14,25 @@ Index: TypeAlias = int | slice | Array | np.ndarray | tuple[int | slice | Array 
 """An index into the leading axes of a tree."""
 
 SHOWN = 6
-"""The largest number of names that a list shows; further names are only counted."""
+"""The largest number of names that `listed` shows; further names are only counted."""
 
 
 def listed(
     names: Sequence[str], shown: int = SHOWN, rest: Callable[[int], str] = "{} more".format
 ) -> str:
-    """Joins names by commas; a long list is cut to the first names and the number of the rest.
+    """Joins names by commas; of a long list, shows the first names and counts the others.
 
     Args:
         names: the names.
         shown: the largest number of names in the text.
-        rest: function number of other names → text.
+        rest: a function from the number of names that are not shown to a text.
     """
     text = ", ".join(names[:shown])
     return text if len(names) <= shown else f"{text} and {rest(len(names) - shown)}"
 
 
 def table(title: str, rows: Iterable[tuple[str, str]]) -> str:
-    """Formats a title and rows of two aligned columns; leaves out rows whose text is empty."""
+    """Formats a title and rows of two aligned columns; leaves out rows without a second text."""
     full = [(left, right) for left, right in rows if right]
     width = max((len(left) for left, _ in full), default=0)
     return "\n".join([title, *(f"  {left:<{width}}  {right}" for left, right in full)])
@@ -57,7 +57,7 @@ def shape(x: Array) -> str:
 
 
 def readable(x: PyTree) -> bool:
-    """Returns True if all values are concrete, and on devices of this process."""
+    """Returns True if all values of x are concrete, and stored on devices of this process."""
     return checks.is_concrete(x) and getattr(x, "is_fully_addressable", True)
 
 
@@ -74,7 +74,7 @@ def span(x: Array, unit: str = "") -> str:
 
 
 def codes(x: Array) -> str:
-    """Describes status codes by name, and for a batch with the number of worlds of each code."""
+    """Describes status codes by name; for several codes, adds the number of worlds of each."""
     if not isinstance(x, jax.Array | np.ndarray | np.generic | int) or not readable(x):
         return shape(x)
     counts = zip(*np.unique(np.asarray(x), return_counts=True), strict=True)
@@ -93,7 +93,7 @@ class Stacked:
         raise NotImplementedError
 
     def __bool__(self) -> bool:
-        """Returns True, whatever the length of the leading axis."""
+        """Returns True, even if the length of the leading axis is 0."""
         return True
 
     def __len__(self) -> int:

@@ -17,7 +17,7 @@ T = TypeVar("T")
 """The type of an argument, often a pytree, whose structure equals that of the result."""
 
 Number = TypeVar("Number", float, jax.Array)
-"""Either Python floats known at trace time, or arrays."""
+"""The type of a number: either a Python float known at trace time, or a JAX array."""
 
 Array: TypeAlias = jax.Array
 

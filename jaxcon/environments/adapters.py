@@ -82,12 +82,17 @@ def check_no_horizon(options: dict[str, Any]) -> None:
 
 
 def time_limit(steps: int | None, default: int | None) -> int | None:
-    """Returns the horizon of an environment for Gymnasium's `max_episode_steps`.
+    """Converts Gymnasium's `max_episode_steps` to the horizon of an environment.
 
-    None gives the default of the task, and −1 gives None, which means no limit.
+    Args:
+        steps: the value of `max_episode_steps`: None for the default, −1 for no limit.
+        default: the horizon of the task.
+
+    Returns:
+        The number of actions after which an episode is truncated; None for no limit.
 
     Raises:
-        ValueError: `steps` is not a whole number from 1.
+        ValueError: `steps` is neither None nor −1 nor a whole number from 1.
     """
     if steps is None:
         return default

@@ -120,8 +120,8 @@ def restart(
     """Starts a new episode in the chosen copies.
 
     Shapes are static, so initial states are computed for a fixed number of copies. That number is
-    zero if no copy is chosen. Otherwise, it is the smallest share of `RESTART_SHARES` that is large
-    enough.
+    zero if no copy is chosen. Otherwise, it is the smallest number given by `RESTART_SHARES` that
+    is at least the number of chosen copies.
 
     Args:
         environment: the environment given to `begin`.
@@ -136,7 +136,7 @@ def restart(
     old = copies.episode, copies.world
 
     def restarted(size: int) -> tuple[Episode, Any]:
-        # index[i] is the i-th copy to restart, counted from 0; n if there are not so many
+        # index[i] is the i-th copy to restart, from i = 0; n if fewer copies restart
         index = jnp.searchsorted(
             jnp.cumsum(chosen), jnp.arange(1, size + 1), method="scan_unrolled"
         )
@@ -153,7 +153,7 @@ def restart(
 def _start(
     environment: Environment, keys: Array, randomize: Randomize | None
 ) -> tuple[Episode, Any]:
-    """Returns a new episode for each key, and its environment if copies are randomized."""
+    """Returns a new episode for each key, with its environment, or () if all copies share one."""
 
     def start(key: Array) -> tuple[Episode, Any]:
         if randomize is None:
@@ -189,9 +189,9 @@ def simulate(environment: Environment, copies: Copies, actions: Array) -> Episod
 
 
 def chunk_size(count: int, most: int) -> int | None:
-    """Returns the largest divisor of `count` in (most/4, most].
+    """Returns the number of copies in a chunk: the largest divisor of `count` in (most/4, most].
 
-    None means that all copies run in one batch.
+    Returns None, for one batch of all copies, if `count` is at most `most` or has no such divisor.
     """
     if count <= most:
         return None
@@ -211,7 +211,7 @@ def over(
     function: Callable[..., T],
     *args: Array | Episode,
 ) -> T:
-    """Maps a function over all copies, each with its environment.
+    """Calls a function for each copy, with the environment and the episode of the copy.
 
     Args:
         environment: the environment that copies share unless they are randomized.

@@ -23,11 +23,11 @@ OWNER = "vary and jitter"
 
 
 def decay(t: Scalar, initial: Number, time: Number) -> Array:
-    """Returns exponentially decaying noise, σ(t) = σ₀ exp(−t/τ).
+    """Returns the size of noise that decays exponentially, σ(t) = σ₀ exp(−t/τ).
 
     Args:
         t: training progress in any unit, (…).
-        initial: σ₀, the initial noise.
+        initial: σ₀, the size of the noise at t = 0.
         time: τ, the decay time, in the unit of t.
 
     Raises:
@@ -40,7 +40,7 @@ def decay(t: Scalar, initial: Number, time: Number) -> Array:
 
 
 def warm_up(episode: Scalar, begin: Number, end: Number, least: Number = 0.1) -> Array:
-    """Returns the strength of a constraint by episode: `least`, then a ramp to 1.
+    """Returns the strength of a constraint: `least` in early episodes, then a ramp to 1.
 
     Args:
         episode: the number of finished episodes, (…).
@@ -110,7 +110,7 @@ def with_stiffness(
 def vary(
     environment: Environment, key: Array, shares: Mapping[str, Mapping[str, Number]]
 ) -> Environment:
-    """Randomizes parameters: multiplies each by 1 + u, with u uniform within ± a share.
+    """Multiplies parameters by 1 + u, with u drawn uniformly between −share and share.
 
     Args:
         environment: the environment; `environment.system.params` lists its parameters.

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 Number: TypeAlias = Array | float
-"""A number or array for arithmetic with arrays, which may be traced."""
+"""A float or an array, possibly traced, that can be added to and multiplied by arrays."""
 
 Option: TypeAlias = Scalar | Sequence[Scalar] | Method | DType | None
 """An option of a task's `build`: a number, a sequence of numbers, a method or a dtype."""
@@ -59,8 +59,8 @@ class Episode:
         goal: the target that the task drew for this episode; () for none.
         steps: the number of actions taken, ().
         key: the JAX key for the next draws of this episode.
-        violation: the largest constraint violation |φ|, () [m or rad], among the starts of all
-            steps of the last action.
+        violation: the largest constraint violation |φ| during the last action, () [m or rad],
+            evaluated at the start of each step.
     """
 
     state: State
@@ -132,7 +132,7 @@ class Environment:
     def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
         """Returns the view of a rendered image, by default `frame`.
 
-        Its width and height must be those of `frame`, because all images of a task share a canvas.
+        The view must be as wide and as high as `frame`: all images of a task share a canvas.
 
         Args:
             episode: the episode that is drawn.
@@ -167,13 +167,13 @@ class Environment:
         raise NotImplementedError
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """Returns the reward of an action within −1 to 1, ().
+        """Returns the reward of an action, ().
 
         Rewards lie between 0 and 1, except for `HalfCheetah`, which has Gymnasium's reward.
 
         Args:
             before: the episode before the action.
-            action: (number of actions,).
+            action: (number of actions,), each within −1 to 1.
             after: the episode after the action.
         """
         raise NotImplementedError
@@ -238,7 +238,7 @@ class Environment:
         """Returns the action as an array, clipped to −1 to 1.
 
         Raises:
-            ValueError: its shape does not match `actions`.
+            ValueError: the action does not have one component for each name in `actions`.
         """
         action = jnp.asarray(action).astype(self.dtype)
         if action.shape != (len(self.actions),):
@@ -309,11 +309,11 @@ def near(x: Array, scale: float) -> Array:
 
 def spread(key: Array, size: float, shape: tuple[int, ...], dtype: DType) -> Array:
     """Draws an array of uniform random numbers between −size and size."""
-    # drawn flat and reshaped: under vmap, XLA draws two rows of two at a third of the speed of four
+    # drawn flat, then reshaped: under vmap, XLA draws shape (2, 2) three times slower than (4,)
     return jax.random.uniform(key, (math.prod(shape),), dtype, -size, size).reshape(shape)
 
 
 def angle_channels(name: str, most: float) -> tuple[Channel, ...]:
-    """Returns the channels of an angle: cosine, sine and rate, which is within ± `most`."""
+    """Returns the channels of an angle: its cosine, its sine, and its rate within ± `most`."""
     direction = [Channel(f"{f} of {name}", "1", -1.0, 1.0) for f in ("cosine", "sine")]
     return (*direction, Channel(f"rate of {name}", "rad/s", -most, most))

@@ -36,7 +36,7 @@ def feasible_action(
     limits: Callable[[Episode], Array],
     noise: Array | float = 0.0,
 ) -> Array:
-    """Returns the action nearest to the desired action plus noise that satisfies the limits.
+    """Returns the action within limits that is nearest to the desired action plus noise.
 
     The limits c apply to the episode after the action, and are linearized at the desired action. If
     no action satisfies all of them, their violations are minimized by least squares, each scaled by
@@ -127,9 +127,10 @@ def project(x: Array, rows: Array, bounds: Array) -> Array:
 def residual(
     point: ExploredPoint, x: Array, rows: Array, bounds: Array, soft: float, μ: float | Array
 ) -> ExploredPoint:
-    """Returns the residuals of the optimality conditions as an `ExploredPoint`.
+    """Returns the residuals of the optimality conditions at a point, as an `ExploredPoint`.
 
-    They are stationarity, complementarity λ s = μ, and the rows s = h − G a + δ λ, with `soft` = δ.
+    The conditions are a − x + Gᵀλ = 0 (stationarity), λ s = μ (complementarity) and
+    s = h − G a + δ λ. Here G is `rows`, h is `bounds` and δ is `soft`.
     """
     a, λ, s = point
     return ExploredPoint(a - x + rows.T @ λ, λ * s - μ, s - bounds + rows @ a - soft * λ)

@@ -38,7 +38,7 @@ class FunctionalEnv(FuncEnv):
         return self.environment
 
     def initial(self, rng: Array, params: Environment | None = None) -> Episode:
-        """Starts an episode."""
+        """Starts an episode, with `rng` as its JAX key."""
         return self._chosen(params).reset(rng)
 
     def transition(
@@ -48,7 +48,7 @@ class FunctionalEnv(FuncEnv):
         return self._chosen(params).transition(state, action)
 
     def observation(self, state: Episode, rng: Array, params: Environment | None = None) -> Array:
-        """Returns the observation of an episode."""
+        """Returns the observation of an episode. `rng` is not used."""
         return self._chosen(params).observe(state)
 
     def reward(
@@ -59,26 +59,26 @@ class FunctionalEnv(FuncEnv):
         rng: Array,
         params: Environment | None = None,
     ) -> Array:
-        """Returns the reward of an action."""
+        """Returns the reward of the action that led to `next_state`. `rng` is not used."""
         return self._chosen(params).judge(state, action, next_state)[0]
 
     def terminal(self, state: Episode, rng: Array, params: Environment | None = None) -> Array:
-        """Returns True if the task has ended or the simulation diverged."""
+        """Returns True if the task has ended or the simulation diverged. `rng` is not used."""
         environment = self._chosen(params)
         return environment.terminal(state) | environment.info(state)["diverged"]
 
     def state_info(self, state: Episode, params: Environment | None = None) -> dict[str, Array]:
-        """Returns `diverged`, the status code and the constraint violation."""
+        """Returns `diverged`, the status code and the constraint violation of the last action."""
         return self._chosen(params).info(state)
 
     def transition_info(
         self, state: Episode, action: Scalar, next_state: Episode, params: Environment | None = None
     ) -> dict[str, Array]:
-        """Returns `diverged`, the status code and the constraint violation after an action."""
+        """Returns `diverged`, the status code and the constraint violation of `next_state`."""
         return self._chosen(params).info(next_state)
 
     def render_init(self, params: Environment | None = None, **kwargs: Option) -> FigureCanvasAgg:
-        """Creates a canvas for images."""
+        """Creates the canvas on which `render_image` draws."""
         return render.canvas(self._chosen(params))
 
     def render_image(

@@ -77,7 +77,7 @@ class GymnasiumEnv(gymnasium.Env):
         """Starts an episode. After a seed, the sequence of episodes is reproducible.
 
         Args:
-            seed: seeds the random generator; None continues with it.
+            seed: seed of the random generator; None continues its sequence of random numbers.
             options: None or empty; there are no options.
 
         Raises:

@@ -90,7 +90,7 @@ class Layered(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of the low-level task in images."""
+        """The view of images of the low-level task, (left, right) and (bottom, top) [m]."""
         return self.task.frame
 
     def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -127,10 +127,10 @@ class Layered(Environment):
         return dataclasses.replace(last, steps=episode.steps + 1, violation=jnp.max(worst))
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """Returns the reward of the low-level task over the time of a target.
+        """Returns the reward of the low-level task over the time for which a target is held.
 
-        The low-level reward also depends on a low-level action. This is the action that the
-        controller chooses at the end of the target.
+        The low-level reward also needs a low-level action. It gets the action that the controller
+        chooses at the end of that time.
         """
         low_level = self.below.allowed(self.controller(self.below, after, action))
         return dataclasses.replace(self.below, skip=self.skip).reward(before, low_level, after)

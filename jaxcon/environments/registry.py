@@ -58,7 +58,7 @@ def make(task: str | Environment, **options: Option) -> Environment:
     except TypeError as error:
         names = ", ".join(signature.parameters)
         raise TypeError(f"task {task}: {error}; its options are {names}.") from error
-    # only sizes, masses, forces and steps have numbers as defaults; a task checks the others
+    # options with a number as default are sizes, masses, forces and steps; tasks check the others
     values: dict[str, Any] = options
     for name, x in values.items():
         default = signature.parameters[name].default if name in signature.parameters else None

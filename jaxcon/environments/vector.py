@@ -69,10 +69,10 @@ def _restart(
 def _per_device(
     function: Callable[[Any, Any], Any], mesh: Mesh | None
 ) -> Callable[[Any, Any], Any]:
-    """Returns a function that runs function(environment, batch) on each device for its shard.
+    """Returns a function that calls `function` on each device, with the device's shard of a batch.
 
-    Devices do not wait for each other. A device restarts copies only if some copies on it are
-    finished.
+    Both functions take (environment, batch). Devices do not wait for each other. A device restarts
+    copies only if some copies on it are finished.
     """
     return function if mesh is None else over_devices(function, mesh)
 
@@ -146,7 +146,7 @@ class GymnasiumVectorEnv(VectorEnv):
         """Starts an episode in every copy, or in the copies that `options["reset_mask"]` selects.
 
         Args:
-            seed: seeds the random generator of the copies that are reset; None continues with it.
+            seed: seed of the new episodes; None continues the sequence of random numbers.
             options: `reset_mask`, a boolean array (n,); or None.
 
         Raises:
@@ -170,7 +170,7 @@ class GymnasiumVectorEnv(VectorEnv):
         super().reset(seed=seed)  # after the checks: a refused mask does not seed the generator
         if seed is not None:  # otherwise each copy continues with its own key
             key = adapters.key_from(self.np_random)
-            # the keys that `begin` derives, so that a seed gives a copy the same start either way
+            # keys as in `begin`: a seed gives a copy equal starts in a full and in a masked reset
             keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(self.num_envs))
             keys = jnp.where(chosen[:, None], keys, running.episode.key)
             episode = dataclasses.replace(running.episode, key=keys)

@@ -99,7 +99,7 @@ class EveryStep(Adjoint):
         return path.scan()
 
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """Returns the number of kept states by level: one level, with one state per step."""
+        """Returns (steps,): a single level of checkpoints, which keeps one state for each step."""
         return (steps,)
 
 
@@ -131,7 +131,10 @@ class Checkpoints(Adjoint):
         return path.scan(self.sizes(path.steps, path.start))
 
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """Returns the number of kept states by level; the last level keeps one state per step."""
+        """Returns the number of states that each level of checkpoints keeps, outermost first.
+
+        The last level keeps one state for each step of its segment.
+        """
         return kept(steps, self.sizes(steps, state))
 
     def sizes(self, steps: int, state: State) -> tuple[int, ...]:
@@ -193,7 +196,7 @@ class Truncated(Adjoint):
         return self.within.scan(dataclasses.replace(path, step=step))
 
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """Returns the number of kept states of each level, by `within.kept`."""
+        """Returns the number of states that the adjoint `within` keeps, by level."""
         return self.within.kept(steps, state)
 
 
@@ -223,7 +226,7 @@ class Discounted(Adjoint):
         return self.within.scan(dataclasses.replace(path, step=step))
 
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """Returns the number of kept states of each level, by `within.kept`."""
+        """Returns the number of states that the adjoint `within` keeps, by level."""
         return self.within.kept(steps, state)
 
 

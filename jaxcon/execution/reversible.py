@@ -65,7 +65,10 @@ class Reversible(Adjoint):
         return _Walk(path, self._size(path.steps)).run() if path.steps else path.scan()
 
     def kept(self, steps: int, state: State) -> tuple[int, ...]:
-        """Returns the number of kept states by level: at segment ends, then within one step."""
+        """Returns the number of kept states at segment ends, and within a step.
+
+        The second number is 1: the state before the step that the reverse pass differentiates.
+        """
         return _count(steps, self._size(steps)), min(steps, 1)
 
     def _size(self, steps: int) -> int:
@@ -73,7 +76,7 @@ class Reversible(Adjoint):
 
 
 def _count(steps: int, size: int) -> int:
-    """Counts kept states: after the first step, then after every `size` steps and at the end."""
+    """Counts kept states: after the first step, after every further `size` steps, at the end."""
     return 1 + -(-(steps - 1) // size) if steps else 0
 
 
@@ -112,14 +115,22 @@ class _Walk:
         return self._merged(self.results, *results)
 
     def begin(self, *given: Any) -> tuple[Any, Any]:
-        """Forward rule of the custom VJP. Returns the results, and residuals for `backwards`."""
+        """Forward rule of the custom VJP. Returns the results, and data for `backwards`."""
         real, rest = (jax.tree.map(lambda x: x.value, x, is_leaf=_is_primal) for x in given)
         moved = jax.tree.map(lambda x: x.perturbed, given[0], is_leaf=_is_primal)
         results, kept = self.forwards(real, rest)
         return results, (_Moved(tuple(map(tuple, moved))), real, rest, kept)
 
     def forwards(self, real: Any, rest: Any) -> tuple[Any, Any]:
-        """Runs the rollout. Returns its results as (real leaves, others), and the kept states."""
+        """Runs the rollout. Returns its results and the kept states.
+
+        The results are split in two: the floating leaves and the other leaves, each as a list for
+        the final state and a list for the record.
+
+        Args:
+            real: the floating leaves of the constants, the initial state and the inputs.
+            rest: their other leaves, and the constants of `back`.
+        """
         (of_step, of_record), start, inputs = self._merged(self.parts, real, rest[0])
         count = _count(self.path.steps, self.size)
         room = jax.tree.map(lambda x: jnp.zeros((count, *x.shape), x.dtype), start)
@@ -139,7 +150,12 @@ class _Walk:
         return tuple(map(list, zip(*pairs, strict=True))), kept
 
     def backwards(self, residuals: Any, cotangents: Any) -> tuple[Any, None]:
-        """Reverse rule of the custom VJP. Returns the cotangents of all perturbed real leaves."""
+        """Reverse rule of the custom VJP.
+
+        Returns:
+            The cotangents of the floating leaves of the constants, the initial state and the
+            inputs; and None for the arguments without a derivative.
+        """
         moved, real, rest, kept = residuals
         constants, start, inputs = self._merged(self.parts, real, rest[0])
         of_numbers, _, of_inputs = parts = moved.parts(self.parts)
@@ -219,20 +235,24 @@ class _Walk:
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class _Moved:
-    """Marks the real leaves of (constants, start, inputs) that have tangents."""
+    """Marks the floating leaves of (constants, start, inputs) that have tangents.
+
+    Attributes:
+        flags: for constants, start and inputs a tuple each, with True for a leaf with a tangent.
+    """
 
     flags: tuple[tuple[bool, ...], ...]
 
     def parts(self, of: tuple[LeafPartition, ...]) -> tuple[LeafPartition, ...]:
-        """Returns the partitions in which only leaves with tangents count as real.
+        """Returns the partitions in which only leaves with tangents count as differentiable.
 
-        Every real leaf of the state counts: after the first step all of them may have tangents.
+        Every floating leaf of the state counts: after the first step all may have tangents.
         """
         flags = self.flags[0], (True,) * len(self.flags[1]), self.flags[2]
         return tuple(parts.among(chosen) for parts, chosen in zip(of, flags, strict=True))
 
     def spread(self, found: Any) -> list[list[Any]]:
-        """Returns cotangents of all real leaves; None for leaves without a tangent."""
+        """Returns cotangents of all floating leaves, with None for leaves without a tangent."""
         constants, start, inputs = map(iter, found)
         return [
             [next(constants) if flag else None for flag in self.flags[0]],
@@ -254,7 +274,7 @@ def _zeros(shape: tuple[int, ...], dtype: Any) -> Array:
 
 
 def _row(x: Any, place: Array) -> Array:
-    """Returns the entry `place` along the first axis; zeros for a symbolic zero."""
+    """Returns the entry of x at the index `place` of the first axis; zeros for a symbolic zero."""
     if _is_zero(x):
         return _zeros(x.aval.shape[1:], x.aval.dtype)
     return jax.lax.dynamic_index_in_dim(x, place, keepdims=False)

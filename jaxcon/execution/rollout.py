@@ -118,7 +118,7 @@ def rollout(
 
 
 def _recorded(record: Record, system: System) -> Record:
-    """Wraps a user's record function: errors name it, and it gets an info with the system."""
+    """Wraps a user's record function: errors name it, and its `info` also has the system."""
 
     def recorded(state: State, info: StepInfo) -> PyTree:
         return functions.tree(
@@ -173,7 +173,7 @@ def _integer(what: str, number: SupportsIndex, least: int = 1) -> int:
 
 
 def _rows(controls: PyTree, steps: int, dtype: DType) -> Any:
-    """Returns the controls as arrays with one row per step, with dtypes as from `controls_in`."""
+    """Returns the controls as arrays with one row per step, cast by `controls_in`."""
 
     def checked(x: Scalar) -> Array:
         try:

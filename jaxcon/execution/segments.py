@@ -50,7 +50,9 @@ def _divisors(n: int) -> list[int]:
 
 
 def kept(steps: int, sizes: Sequence[int]) -> tuple[int, ...]:
-    """Returns the largest number of kept states by level; the last level keeps one per step.
+    """Returns the largest number of states that each level of checkpoints keeps, outermost first.
+
+    The last level keeps one state for each step of its segment.
 
     Args:
         steps: number of steps.

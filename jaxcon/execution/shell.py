@@ -72,7 +72,7 @@ def masked_step(
 
 
 def _freeze(state: State, tried: Attempted) -> tuple[tuple[State, StepInfo], Array]:
-    """Resets failed worlds to the state before the step. Returns (state, info) and the status."""
+    """Resets failed worlds to `state`, as before the step. Returns ((state, info), status)."""
     (new, info), code = tried
     sticky = status.first(state.status, code)
     healthy = ~status.failed(sticky)

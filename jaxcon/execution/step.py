@@ -79,7 +79,7 @@ def _checked(
 def _reported(
     result: tuple[State, StepInfo], system: System, state: State, control: PyTree
 ) -> tuple[State, StepInfo]:
-    """Adds state, control and system to an info.
+    """Adds state, control and system to the info of a step. Returns the new state and the info.
 
     This happens outside of the compiled step, so that a rollout carries state, control and system
     only if it records them.
@@ -97,7 +97,7 @@ def with_origin(info: Info, system: System) -> Info:
 
 
 def undo(system: System, method: Method, state: State, control: PyTree, dt: Scalar) -> State:
-    """Returns the state before a step of h, by a step of −h of a symmetric integrator.
+    """Undoes a step of h: steps back by −h from `state`, with a symmetric integrator.
 
     The `turns` of the result are extrapolated back from the end of the step, so they differ from
     the original ones. Both are within half a turn of the true angles, so the same whole turns are
@@ -118,7 +118,7 @@ class SolutionAt(Solution):
         violation: φ and φ̇ by constraint.
         reactions: forces of limits, friction and contact; None in a scene without them.
         control: control u.
-        origin: see `StepInfo.origin`.
+        origin: the system, for `jc.wrench`; see `StepInfo.origin`.
     """
 
     state: Any = None
@@ -137,7 +137,7 @@ class SolutionAt(Solution):
         reactions: Reactions | None = None,
         control: PyTree = None,
     ) -> SolutionAt:
-        """Makes the solution at a state."""
+        """Makes a solution from its fields; `origin` is None at first."""
         solution = super().__new__(cls, acceleration, multipliers, status)
         solution.state, solution.violation = state, violation
         solution.reactions, solution.control = reactions, control
@@ -153,12 +153,15 @@ class SolutionAt(Solution):
         return self.state, self.violation, self.reactions, self.control
 
     def tree_flatten(self) -> Any:
-        """Returns the children: a, λ, status, and the fields from `state` to `control`."""
+        """Returns (children, None), since there is no static data.
+
+        The children are a, λ, status, and the fields from `state` to `control`.
+        """
         return (*self, *self._place()), None
 
     @classmethod
     def tree_unflatten(cls, _: None, children: tuple[Any, ...]) -> SolutionAt:
-        """Rebuilds the solution from its children."""
+        """Rebuilds the solution from its children, without `origin`."""
         return cls(*children)
 
 
@@ -197,7 +200,7 @@ def forward_dynamics(
 def forward_dynamics_for(
     owner: str, system: System, state: State, control: PyTree, method: Method, dt: Scalar
 ) -> SolutionAt:
-    """Implements `forward_dynamics`; errors name `owner`, the public function called."""
+    """Implements `forward_dynamics`; errors name `owner`, the public function that was called."""
     control = check_step(system, method, state, control, owner)
     with checks.without_waiting():
         h = checks.real(owner, "dt", dt, state.q.dtype, least=0)

@@ -66,7 +66,7 @@ def check_step(
 
 
 def idle(system: System, control: PyTree) -> PyTree:
-    """Returns the control; if it is None although motors need a control, returns zeros."""
+    """Returns the control, or zeros if it is None although motors need a control."""
     layout = system.layout
     if layout is None or control is not None or not _motors(system):
         return control

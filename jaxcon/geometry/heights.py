@@ -30,10 +30,10 @@ from jaxcon.core.typing import Array
 from jaxcon.staging.worlds import expand_like, per_world
 
 LEAST = 4
-"""The number of grid heights along each axis that determine h at one place."""
+"""The number of grid heights along each axis from which h is interpolated at one place."""
 
 NEWTON = 12
-"""The number of Newton steps for the nearest point; on smooth ground, four usually suffice."""
+"""The number of Newton steps to find a nearest point; on smooth ground, four usually suffice."""
 
 
 class Shape(NamedTuple):
@@ -68,13 +68,13 @@ class _Search(NamedTuple):
 
 @dataclass(frozen=True)
 class Surface:
-    """Height fields over rectangles, one for each entry of a lane.
+    """Height fields over rectangles, for the entries of a lane such as contacts with the ground.
 
-    Several entries, such as contacts with the same ground, may share one height field.
+    Several entries may share one height field.
 
     Attributes:
         heights: the grid heights, (surface, n_x, n_y) in space and (surface, n_x) in the plane [m].
-        owner: the index of the surface for each lane entry.
+        owner: for each lane entry, the index of its height field in `heights`.
         size: the edges of the rectangle, lanes [m]; its center is the origin.
     """
 
@@ -153,10 +153,10 @@ class Surface:
         return end - (rest - jax.lax.stop_gradient(rest))
 
     def _window(self, starts: list[Array]) -> Array:
-        """Returns the four heights along each axis that surround each lane entry, (4, …, lane).
+        """Returns the grid heights around each lane entry: (4, lane), or (4, 4, lane) in space.
 
         Args:
-            starts: the index of the first of the four heights along each axis, lanes.
+            starts: for each axis, the index of the first of the four heights, a lane.
         """
         axes = len(starts)
 
@@ -173,7 +173,7 @@ class Surface:
 
 
 def _weights(u: Array, count: int) -> tuple[Array, tuple[Vector, Vector, Vector]]:
-    """Returns the interpolation weights along one axis.
+    """Returns the weights of the four grid heights around a place, along one axis.
 
     Args:
         u: the coordinate in grid steps.
@@ -194,9 +194,10 @@ def _weights(u: Array, count: int) -> tuple[Array, tuple[Vector, Vector, Vector]
 
 
 def _cubics(t: Array) -> tuple[Vector, Vector, Vector]:
-    """Returns the interior weights w and their derivatives w′ and w″ at the cell position t.
+    """Returns the four interpolation weights w in the interior, and their derivatives w′ and w″.
 
-    The four weights belong to the heights at positions −1, 0, 1 and 2 in grid steps.
+    Args:
+        t: the position in a cell, from 0 to 1. The weights belong to the heights at −1, 0, 1 and 2.
     """
     square = t * t
     value = (
@@ -211,9 +212,11 @@ def _cubics(t: Array) -> tuple[Vector, Vector, Vector]:
 
 
 def _at_edges(w: Vector, first: Array, last: Array) -> Vector:
-    """Returns the four weights, with the missing height at an edge replaced by extrapolation.
+    """Converts interior weights to the weights of four heights inside the grid.
 
-    The missing height is 3h₀ − 3h₁ + h₂, from the three heights nearest to the edge.
+    In a cell at an edge, one of the four heights would lie outside the grid. It is extrapolated as
+    3h₀ − 3h₁ + h₂ from the three heights nearest to the edge, which receive its weight. The fourth
+    height inside the grid has the weight 0.
 
     Args:
         w: the interior weights.
@@ -228,22 +231,30 @@ def _at_edges(w: Vector, first: Array, last: Array) -> Vector:
 
 
 def _square(shape: Shape, place: Vector, point: Vector) -> Array:
-    """Returns the squared distance ‖x − X‖² + (h − Z)² of a surface point from a point (X, Z)."""
+    """Returns the squared distance ‖x − X‖² + (h − Z)² between (x, h) and (X, Z).
+
+    Args:
+        shape: the surface at x, of which the height h is used.
+        place: x.
+        point: (X, Z).
+    """
     aside, off = place - Vector(*point[:-1]), shape.height - point[-1]
     return total(x * x for x in aside) + off * off
 
 
 def _newton(shape: Shape, place: Vector, point: Vector, at: Shape | None = None) -> Vector:
-    """Returns the Newton step H⁻¹ g that minimizes half the squared distance to a point (X, Z).
+    """Returns the Newton step H⁻¹ g, to be subtracted from x, toward the nearest surface point.
 
-    The gradient is g = x − X + (h − Z) ∇h, and the Hessian is H = 1 + ∇h ∇hᵀ + (h − Z) ∇²h. If H is
-    not positive definite, its last term is left out.
+    The step minimizes half the squared distance of the surface point at x from a point (X, Z). The
+    gradient is g = x − X + (h − Z) ∇h, and the Hessian is H = 1 + ∇h ∇hᵀ + (h − Z) ∇²h. If H is
+    not clearly positive definite, its last term is left out.
 
     Args:
-        shape: the surface at x, for g.
+        shape: the surface at x, from which g is computed.
         place: x.
         point: (X, Z).
-        at: the surface at x for H, if H must be constant under differentiation; None for `shape`.
+        at: the surface at x, constant under differentiation, from which H is computed; None to
+            compute H from `shape`, too.
     """
     off = shape.height - point[-1]
     right = place - Vector(*point[:-1]) + shape.slope * off

@@ -148,7 +148,7 @@ def from_tensor(
     center: Scalar | Sequence[Scalar] | None = None,
     owner: str = "inertia",
 ) -> Inertia:
-    """The inertia given by a full inertia tensor about the center of mass.
+    """The inertia of a body whose full inertia tensor about the center of mass is known.
 
     The tensor is diagonalized. Derivatives exist also if principal moments coincide (see
     `principal_axes`). Their relative error is then 1e-6 in float64. In float32, derivatives with
@@ -220,7 +220,7 @@ def log_cholesky(body: Inertia) -> Array:
 
     Args:
         body: an inertia that satisfies the triangle inequality strictly. A flat body, for which one
-            moment is the sum of the other two, has no parameters.
+            moment is the sum of the other two, has no such parameters.
     """
     moments = jnp.asarray(body.moments, jnp.result_type(float, *body.moments))
     axes = jnp.eye(4, dtype=moments.dtype)[0] if body.axes is None else body.axes
@@ -261,7 +261,7 @@ def _principal_axes_jvp(
 ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     moments, axes = principal_axes(*primals)
     (d_tensor,) = tangents
-    # moves the ascending moments apart, by at least ε^0.45 of the largest moment
+    # moves ascending moments apart, to a distance of at least ε^0.45 of the largest moment
     least = float(jnp.finfo(moments.dtype).eps) ** APART * jnp.max(jnp.abs(moments))
     first, second, third = moments
     second = jnp.maximum(second, first + least)
@@ -273,7 +273,12 @@ def _principal_axes_jvp(
 
 
 def _check(solid: str, **values: PyTree) -> None:
-    """Checks that the mass and the lengths of a solid are positive."""
+    """Checks that the mass and the lengths of a solid are positive.
+
+    Args:
+        solid: the name of the solid, for error messages.
+        values: the mass and the lengths by argument name; `size` has three lengths.
+    """
     for what, value in values.items():
         checks.check(solid, what, value, (3,) if what == "size" else (), above=0)
 

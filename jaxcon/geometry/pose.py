@@ -73,10 +73,10 @@ class Pose:
         return world if self.orientation is None else self.rotation.T @ world
 
     def then(self, other: Pose) -> Pose:
-        """Composes this pose with a pose relative to this frame; returns the resulting world pose.
+        """Returns the world pose of another frame, whose pose relative to this frame is given.
 
         Args:
-            other: the pose of another frame in this frame. An orientation of None means no
+            other: the pose of the other frame in this frame. An orientation of None means no
                 rotation.
         """
         position, turn = self.point(other.position), self.orientation
@@ -97,14 +97,14 @@ class Pose:
 
 @pytree
 class WorldPose(Pose):
-    """The pose of a frame fixed to the world, whose local points are given in the world frame."""
+    """The pose of a frame fixed to the world; users give its local points in the world frame."""
 
     def local_point(self, world: Array) -> Array:
-        """Returns the world point unchanged."""
+        """Returns the point unchanged: local points of this frame are world points."""
         return world
 
     def local_direction(self, world: Array) -> Array:
-        """Returns the world direction unchanged."""
+        """Returns the direction unchanged: local directions of this frame are world directions."""
         return world
 
 
@@ -128,7 +128,7 @@ class Motion(Pose):
         return Pose(self.position, self.orientation)
 
     def seen_from(self, offset: Pose | None) -> Motion:
-        """Returns the motion of another frame fixed to the same body.
+        """Returns the motion of another frame that is fixed to the same body.
 
         Args:
             offset: the pose of the other frame in the body frame; None for the body frame itself.

@@ -49,8 +49,8 @@ IDENTITY = Vector(1.0, 0.0, 0.0, 0.0)
 def _of_components(*sizes: int) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Returns a decorator that lets a function of Vectors also accept arrays.
 
-    The decorated function checks the arrays. It raises a ValueError if an array has a wrong shape,
-    or contains no real numbers.
+    The decorated function checks arrays. It raises a ValueError if an array has a wrong shape or
+    its numbers are not real.
 
     Args:
         sizes: the number of components of each argument.
@@ -255,7 +255,7 @@ def from_matrix(r: Array) -> Array:
 
 
 def split(q: Components) -> tuple[Lane, Vector]:
-    """Returns the scalar part and the vector part of a quaternion.
+    """Splits a quaternion into its scalar part w and its vector part (x, y, z).
 
     Args:
         q: a `Vector` of 4 lanes.

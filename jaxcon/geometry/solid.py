@@ -64,7 +64,7 @@ def resolve_inertia(
 def _about_z(moments: Array, axes: Array | None) -> Array:
     """Returns the moment of inertia about the z axis of the body's own frame, () [kg m²].
 
-    With principal moments I and principal axes A it is (A diag(I) Aᵀ)_zz.
+    With principal moments I and principal axes A, this moment is (A diag(I) Aᵀ)_zz.
 
     Args:
         moments: I, (3,) [kg m²].
@@ -78,6 +78,11 @@ def _about_z(moments: Array, axes: Array | None) -> Array:
 
 def resolve_mass(owner: str, mass: PyTree, dtype: DType) -> Array:
     """Converts the mass argument of a body to an array, () [kg].
+
+    Args:
+        owner: the first words of errors, such as "body 'rod'".
+        mass: the user's value, () [kg].
+        dtype: the dtype of the scene.
 
     Raises:
         ValueError: the mass is None or not positive.

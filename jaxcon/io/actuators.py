@@ -127,8 +127,8 @@ def _law(
 def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     """Returns the force range of an actuator, (2,); None if there are no limits.
 
-    The force is taken before multiplication by the gear ratio. The range respects the limits of the
-    actuator and of its joint.
+    It is the range of the actuator's force before multiplication by the gear ratio. It respects the
+    limits of the actuator and of its joint.
 
     Raises:
         NotImplementedError: the joint limits the sum of several actuators.

@@ -54,7 +54,7 @@ class Compiled:
         self.mujoco.mj_kinematics(self.model, self.data)
 
     def _compile(self, source: Source) -> Any:
-        """Compiles the source to an `MjModel`; for its errors see `Compiled`."""
+        """Compiles the source to an `MjModel`; raises the errors that `Compiled` lists."""
         model = self.mujoco.MjModel
         if isinstance(source, model):
             return source
@@ -119,7 +119,14 @@ class Names:
         self.taken = {"world", "gravity"}
 
     def take(self, name: str, kind: str) -> str:
-        """Reserves and returns a unique name: if it is taken, appends the kind, then a number."""
+        """Reserves a unique name and returns it.
+
+        If the wanted name is taken, the kind is appended, and then a number if necessary.
+
+        Args:
+            name: the wanted name.
+            kind: the kind of the object, such as "joint".
+        """
         free, n = name, 1
         while free in self.taken:
             free, n = f"{name} {kind}" + f" {n}" * (n > 1), n + 1

@@ -47,7 +47,9 @@ def _on_plane(
 
 
 def _balls(compiled: Compiled, geom: int) -> tuple[np.ndarray, float]:
-    """Returns the spheres by which a geom touches a plane: a sphere, capsule ends, box corners.
+    """Returns the spheres by which a geom touches a plane.
+
+    They are the sphere itself, the two ends of a capsule, or the eight corners of a box.
 
     Returns:
         The centers of the spheres in the world frame, (n, 3) [m], and their common radius [m]; 0

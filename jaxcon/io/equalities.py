@@ -26,9 +26,9 @@ from jaxcon.system.elements import own_point
 
 @dataclass(frozen=True)
 class Connected(Coincident):
-    """A constraint that makes two body points coincide (connect), even if apart at assembly.
+    """A constraint that makes a point of one body coincide with a point of another (connect).
 
-    The inherited `point` is the point of the first body.
+    The points may be apart at assembly. The inherited `point` is the point of the first body.
 
     Attributes:
         point_b: the point of the second body in the world frame at assembly, (3,) [m].
@@ -44,9 +44,9 @@ class Connected(Coincident):
 
 @dataclass(frozen=True)
 class Welded(Fixed):
-    """A constraint that makes two body frames coincide (weld), even if apart at assembly.
+    """A constraint that makes a frame of one body coincide with a frame of another (weld).
 
-    The inherited `point` is the point of the first body.
+    The frames may be apart at assembly. The inherited `point` is the point of the first body.
 
     Attributes:
         point_b: the point of the second body in the world frame at assembly, (3,) [m].
@@ -58,7 +58,14 @@ class Welded(Fixed):
     turn: Scalar | None = None
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns both points in their body frames, and the required orientation of b in a."""
+        """Returns both points, each in the frame of its body, and the required orientation.
+
+        The orientation is that of the second body relative to the first.
+
+        Args:
+            a: the pose of the first body at assembly.
+            b: the pose of the second body at assembly.
+        """
         end = own_point(self, "point_b", self.point_b, b)
         turn = jnp.asarray(self.turn, b.position.dtype)
         turned = Pose(b.position, quaternion.multiply(turn, b.orientation))
@@ -108,7 +115,8 @@ def _coupling(
 ) -> Drive | PolynomialCoupling:
     """Builds the coupling y − y₀ = Σ cₖ (x − x₀)ᵏ of two joint coordinates x and y.
 
-    If the constraint names only one joint, its coordinate y is held at y₀ + c₀.
+    x₀ and y₀ are the values in the reference pose. If the constraint names only one joint, its
+    coordinate y is held at y₀ + c₀.
     """
     m = compiled.model
     first, second, coefficients = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i, :5]

@@ -101,7 +101,10 @@ class Tree:
         def move(
             frames: tuple[Array, Array], inputs: tuple[Array, ...]
         ) -> tuple[tuple[Array, Array], None]:
-            """Computes frame i from frame `base`, by a translation and a rotation in that frame."""
+            """Sets frame i to frame `base`, translated and rotated; a step of the scan.
+
+            The translation and the rotation are given in frame `base`.
+            """
             i, base, step, turn = inputs
             positions, orientations = frames
             above = Pose(positions[base], orientations[base])
@@ -211,9 +214,10 @@ class Tree:
         return _flat(self, system.layout, system.offsets, qpos, qvel)
 
     def turns_of(self, system: BodySystem, qpos: Array) -> Array | tuple[()]:
-        """Returns the joint angles at qpos whose whole turns a `State` counts, (n,) [rad].
+        """Returns the angles at qpos of the joints whose whole turns a `State` counts, (n,) [rad].
 
-        The result is the empty tuple if no angle is counted.
+        Angles are measured from the reference pose. The result is the empty tuple if the turns of
+        no joint are counted.
         """
         if not system.counted:
             return ()
@@ -326,8 +330,8 @@ def _flat(
     Args:
         tree: the kinematic tree of the model.
         layout: the layout of the system.
-        offsets: the frame of each link in the principal frame of its body, by name; links without
-            an entry have equal frames.
+        offsets: the frame of each link in the principal frame of its body, by name. For links
+            without an entry, both frames are equal.
         qpos: MuJoCo's positions, (nq,).
         qvel: MuJoCo's velocities, (nv,).
     """

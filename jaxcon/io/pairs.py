@@ -35,7 +35,10 @@ class GeomPair(NamedTuple):
 
 
 def pairs(compiled: Compiled) -> list[GeomPair]:
-    """Returns the explicitly listed pairs, then the pairs that pass the collision filters."""
+    """Returns all pairs of geoms that need a contact.
+
+    The pairs that the model lists explicitly come first, then the pairs that pass MuJoCo's filters.
+    """
     if compiled.disabled("contact", "constraint"):
         return []
     margins = Margins(compiled)
@@ -105,10 +108,15 @@ def _filtered(compiled: Compiled, margins: Margins) -> Iterator[GeomPair]:
 
 
 def _combined(compiled: Compiled, ends: tuple[int, int], margins: Margins) -> GeomPair:
-    """Returns the pair with its combined contact parameters.
+    """Combines the contact parameters of two geoms as MuJoCo does.
 
     Condim and friction come from the geom of higher priority. At equal priority, the larger values
     of both geoms are used.
+
+    Args:
+        compiled: the model.
+        ends: MuJoCo's ids of both geoms, in the order of `_ordered`.
+        margins: the rule for the distance at which contact begins.
     """
     m, geoms = compiled.model, list(ends)
     highest = m.geom_priority[geoms].max()
@@ -150,7 +158,12 @@ class Margins:
         return float(self.together(margin) - self.by_gap * self.together(gap))
 
     def of_pair(self, margin: float, gap: float) -> float:
-        """Returns the distance [m] at which contact of an explicitly listed pair begins."""
+        """Returns the distance [m] at which contact of an explicitly listed pair begins.
+
+        Args:
+            margin: the margin of the pair [m].
+            gap: the gap of the pair [m].
+        """
         return float(margin - self.by_gap * gap)
 
 

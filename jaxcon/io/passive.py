@@ -85,7 +85,8 @@ def _along(
 def _limit(compiled: Compiled, joint: LinkJoint, at: Coordinate, names: Names) -> Iterator[Limit]:
     """Yields the limit of a hinge or slide, if it has one.
 
-    The hard limit of the scene acts at the margin, where MuJoCo's soft limit begins to push.
+    The range of the scene's hard limit is smaller by MuJoCo's margin at both ends, since MuJoCo's
+    soft limit begins to push there.
     """
     m = compiled.model
     if compiled.disabled("limit", "constraint") or not m.jnt_limited[joint.id]:

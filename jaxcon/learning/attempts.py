@@ -33,14 +33,17 @@ PROGRAM = "the simulation, another option, or the version of jax"
 
 
 class End(NamedTuple):
-    """The final fit from one start, and its noise factor: residuals are divided by `noise`."""
+    """The final fit from one start, and the factor `noise` that divides its data residuals."""
 
     fit: Fit
     noise: float
 
     @property
     def cost(self) -> float:
-        """The cost ½ ‖r‖² of the residuals r in their original units, without the noise factor."""
+        """The final cost ½ ‖r‖², multiplied by `noise`².
+
+        Costs of starts with different `noise` can thus be compared.
+        """
         return float(self.noise**2 * self.fit.costs[-1])
 
     @property
@@ -63,8 +66,8 @@ class Attempt:
     weight of the gaps depends on the noise. Without nodes there is one decade.
 
     The longer the recording of an oscillation, the more local minima the fit has. If the residuals
-    of a fit without nodes exceed their noise, a second fit begins at `begin`. It covers longer and
-    longer parts of the recording. The better of both fits is the result.
+    of a fit without nodes exceed the noise of the data, a second fit begins at `begin`. It covers
+    longer and longer parts of the recording. The better of the two fits is the result.
 
     Attributes:
         problem: the least-squares problem of the recording.
@@ -93,7 +96,10 @@ class Attempt:
     horizon: int = 0
 
     def run(self) -> Generator[Point, Values, End]:
-        """Runs the search as a generator: yields points, and is sent residuals r and Jacobians J.
+        """Runs the search as a generator, so that several searches can be evaluated in one batch.
+
+        It repeatedly yields a point, and is sent the residuals r and their Jacobian J at that
+        point. Finally, it returns an `End`.
 
         Raises:
             ValueError: r or J is not finite at the start.
@@ -157,11 +163,11 @@ class Attempt:
     def _fitted(
         self, progress: FitProgress | None, horizon: float = 1.0, tie: float = 0.0
     ) -> Generator[Point, Values, Fit]:
-        """Fits the first part of the recording.
+        """Fits the recording from its beginning to the time `horizon`.
 
         Args:
             progress: the state from which the fit starts or resumes.
-            horizon: length of the part, as a share of the recording's duration.
+            horizon: end of the fitted part, as a share of the recording's duration.
             tie: weight of a prior on the parameters z: adds the residuals tie · (z − begin).
         """
         assert progress is not None
@@ -207,7 +213,7 @@ class Attempt:
         self.widths = tuple(widths)
 
     def _narrow(self, fit: Fit) -> None:
-        """Prepares the next fit, with smaller gaps. Estimates the noise if the user gave none."""
+        """Prepares the next fit: allows smaller gaps, and estimates noise that was not given."""
         if self._estimated:
             problem, width = self.problem, self.widths[self.decade]
             left = remaining(problem, fit, problem.condensed(fit.jacobian, width), self.noise)
@@ -225,7 +231,7 @@ class Attempt:
     def contents(self) -> dict[str, np.ndarray]:
         """The state of the search as arrays for a checkpoint.
 
-        z is empty before the start is evaluated.
+        The unknowns, entry "z", are an empty array before the start is evaluated.
         """
         fields = {name: getattr(self, name) for name in ("widths", "noise", "decade", "horizon")}
         fields |= _contents(self.progress)
@@ -241,12 +247,20 @@ class Attempt:
 
 
 def _contents(progress: FitProgress | None) -> dict[str, np.ndarray | float | tuple | str]:
-    """Returns the fields of a `FitProgress` for a checkpoint; for None, an empty z."""
+    """Returns the fields of a `FitProgress` for a checkpoint.
+
+    None is stored as a `FitProgress` whose array of unknowns, z, is empty.
+    """
     return dataclasses.asdict(progress or FitProgress(np.zeros(0)))
 
 
 def _restored(contents: dict[str, np.ndarray], prefix: str = "") -> FitProgress | None:
-    """Returns the `FitProgress` stored in a checkpoint; None if its z is empty."""
+    """Returns the `FitProgress` stored in a checkpoint; None if its array of unknowns is empty.
+
+    Args:
+        contents: the arrays of the checkpoint, by name.
+        prefix: the text before the name of each field of the `FitProgress`.
+    """
     z, damping, costs, stopped = (
         contents[prefix + field.name] for field in dataclasses.fields(FitProgress)
     )
@@ -256,7 +270,7 @@ def _restored(contents: dict[str, np.ndarray], prefix: str = "") -> FitProgress 
 
 
 def remaining(problem: Stretches, fit: Fit, J: np.ndarray, noise: float) -> float:
-    """Returns the noise estimated from the residuals of a fit, divided by the fit's noise factor.
+    """Returns the ratio of the noise seen in the residuals of a fit to the noise that it assumed.
 
     It is NaN if no degree of freedom is left.
 
@@ -292,7 +306,7 @@ def searched(
     """
 
     def evaluate(points: dict[int, Point]) -> dict[int, Values]:
-        """Returns (r, J) at the points of all running searches."""
+        """Returns (r, J) at the point of each running search, by index of the search."""
         filler = next(iter(points.values()))  # keeps the batch size when searches end
         values = problem.evaluate([points.get(i, filler) for i in range(len(attempts))])
         return {i: values[i] for i in points}
@@ -325,7 +339,7 @@ def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Calla
     written: list[int] = []
 
     def save() -> None:
-        """Writes the checkpoint, if any search has made progress."""
+        """Writes the checkpoint, if any search has made progress since the last write."""
         state = [id(attempt.progress) for attempt in attempts]
         if state != written:
             files.write(file, about, [attempt.contents for attempt in attempts])
@@ -335,7 +349,7 @@ def remembered(problem: Stretches, attempts: list[Attempt], file: Path) -> Calla
 
 
 def _about(problem: Stretches, attempts: list[Attempt]) -> dict[str, object]:
-    """Returns the settings in which a search and its checkpoint must agree, by description."""
+    """Returns {description: value} for the settings that a search and its checkpoint must share."""
     first, space = attempts[0], problem.space
     limits: PyTree = [*space.low, *space.high]
     numbers = [np.asarray(x) for x in jax.tree.leaves(problem.seen)]

@@ -33,7 +33,9 @@ class Secants:
         return cls(empty, empty)
 
     def add(self, step: Array, change: Array, slope: Array) -> Secants:
-        """Adds a pair, if the loss is convex along s and y exceeds rounding errors.
+        """Returns the pairs with the pair (s, y) of a step added, if it is reliable.
+
+        It is unreliable if the loss is not convex along s, or if y may be a mere rounding error.
 
         Args:
             step: the step s, (n,).
@@ -54,11 +56,11 @@ class Secants:
     def newton_step(self, slope: Array, free: Array) -> Array:
         """Returns the quasi-Newton step −H⁻¹ g in the free coordinates, (n,); NaN without pairs.
 
-        H is the Hessian of the loss, approximated by secant pairs, and g its gradient.
+        H is the Hessian of the loss, approximated by secant pairs. g is the gradient of the loss.
 
         Uses the two-loop recursion of L-BFGS. The initial inverse Hessian is diagonal, with entries
-        Σ |s y| / Σ y² over all pairs. Unlike a multiple of the identity, it adapts to the units of
-        each coordinate.
+        Σ |s y| / Σ y² over all pairs. Unlike a multiple of the identity, this matrix adapts to the
+        units of each coordinate.
 
         Args:
             slope: the gradient g, (n,).
@@ -74,7 +76,11 @@ class Secants:
         pairs = (s, y, rho)
 
         def backward(d: Array, pair: tuple[Array, ...]) -> tuple[Array, Array]:
-            """First loop of the L-BFGS recursion: removes a multiple of y from d.
+            """First loop of the L-BFGS recursion: subtracts ρ (sᵀd) y from d, with ρ = 1 / (sᵀy).
+
+            Args:
+                d: the vector that the recursion updates, (n,).
+                pair: (s, y, ρ).
 
             Returns:
                 The new d, and the weight ρ sᵀd.
@@ -84,7 +90,12 @@ class Secants:
             return d - weight * y, weight
 
         def forward(d: Array, pair: tuple[Array, ...]) -> tuple[Array, None]:
-            """Second loop of the L-BFGS recursion: adds a multiple of s to d."""
+            """Second loop of the L-BFGS recursion: adds (w − ρ yᵀd) s to d, with ρ = 1 / (sᵀy).
+
+            Args:
+                d: the vector that the recursion updates, (n,).
+                pair: (s, y, ρ, w), with the weight w from the first loop.
+            """
             s, y, rho, weight = pair
             return d + (weight - rho * (y @ d)) * s, None
 
@@ -96,9 +107,10 @@ class Secants:
 
     @staticmethod
     def _diagonal(s: Array, y: Array, valid: Array) -> Array:
-        """Returns the initial diagonal of the inverse Hessian H⁻¹, (n,).
+        """Returns the initial diagonal Σ |s y| / Σ y² of the inverse Hessian H⁻¹, (n,).
 
-        Coordinates whose gradient did not change get the mean over all coordinates.
+        The sums are over the valid pairs. Coordinates whose gradient did not change get the ratio
+        of the sums over all coordinates.
         """
         s, y = (jnp.where(valid[:, None], x, 0) for x in (s, y))
         products, squares = jnp.abs(s * y), y * y

@@ -195,7 +195,7 @@ class Descent:
             return value, (aux, jnp.zeros((), jnp.int32))
 
         def sample(y: tuple[Array, ...], key: Array) -> tuple[tuple[Array, PyTree], Array]:
-            """Returns (loss, aux) of one sample, and its status."""
+            """Returns (loss, aux) of one sample, and a status: OK if the loss is finite."""
             value, aux = self._loss(self.space.decode(y), key)
             good = jnp.isfinite(value)
             return (value, aux), jnp.where(good, Status.OK, Status.NON_FINITE).astype(jnp.int32)
@@ -222,7 +222,7 @@ class Descent:
             length: number of steps of the chunk.
 
         Returns:
-            The state after the chunk, and the losses by step, (length,). NaN for steps not taken.
+            The state after the chunk; and the loss by step, (length,), NaN for steps not taken.
         """
 
         def advance(search: Search, _: None) -> tuple[Search, Array]:
@@ -305,10 +305,13 @@ class Descent:
     def leave(
         self, search: Search, loss: Array, slope: tuple[Array, ...], key: Array | None
     ) -> AcceptedPoint:
-        """Calls the optimizer. Returns the point from which it steps, with its step.
+        """Calls the optimizer for the next step.
 
-        An optimizer of optax steps from the current point. The default optimizer may step from the
-        best point.
+        A transformation of optax steps from the current point. The default optimizer may step from
+        the best point.
+
+        Returns:
+            The point from which the optimizer steps, with the step.
         """
         update: Any  # optax has its own types
         memory: Any = search.origin.memory
@@ -351,17 +354,17 @@ class Descent:
 
     @staticmethod
     def accept(search: Search, loss: Array, good: Array) -> Search:
-        """Updates the first and the highest accepted loss with this loss, if `good` is True."""
+        """Updates the first and the highest accepted loss with `loss`, if `good` is True."""
         first = jnp.where(good & ~search.accepted, loss, search.first)
         highest = jnp.where(good, jnp.maximum(loss, search.highest), search.highest)
         return dataclasses.replace(search, first=first, highest=highest)
 
     @staticmethod
     def learned(search: Search, secants: Secants, slope: tuple[Array, ...]) -> Secants:
-        """Adds the secant pair of the step from the origin to the current point.
+        """Adds the secant pair of the step from the last accepted point to the current point.
 
         Args:
-            search: the state of the search, with the origin and the current point y.
+            search: the state of the search, with the accepted point `origin` and the current y.
             secants: the secant pairs so far.
             slope: gradient of the loss at the current point.
         """
@@ -379,7 +382,10 @@ class Descent:
         x, back = flat(y)
 
         def push(tangent: Array) -> tuple[Array, Array, tuple[PyTree, Array]]:
-            """Returns the loss, its derivative along a tangent, and the extras."""
+            """Returns the loss, its derivative along `tangent`, and the extras of the loss.
+
+            The extras are the auxiliary output and the number of non-finite samples.
+            """
             return jax.jvp(lambda y: self.evaluate(back(y), key), (x,), (tangent,), has_aux=True)
 
         value, slope, extras = jax.vmap(push, out_axes=(None, 0, None))(
@@ -388,7 +394,11 @@ class Descent:
         return (value, extras), back(slope)
 
     def judge(self, search: Search, point: Best) -> Search:
-        """Updates the best point and the mark with a new point. Stops a search without progress."""
+        """Updates the best point with a new point, and stops a search without progress.
+
+        Progress means fewer non-finite samples at the best point, or a loss that is lower than
+        `mark` by more than the tolerance. The lower loss is then the new `mark`.
+        """
         fewer = point.lost < search.best.lost
         less = (point.lost == search.best.lost) & (point.loss < search.best.loss)
         best = where_tree(jnp.isfinite(point.loss) & (fewer | less), point, search.best)

@@ -30,7 +30,7 @@ from jaxcon.learning.starts import check_key, scattered
 from jaxcon.learning.stretches import Stretches
 
 VAGUE = 1.0
-"""The standard deviation of relative change above which a direction counts as undetermined."""
+"""A direction is undetermined if its standard deviation, in relative change, is at least this."""
 
 ALIKE = 1e-2
 """The relative difference of costs below which two starts count as equally good."""
@@ -112,7 +112,10 @@ class Identified:
 
     @property
     def untold(self) -> list[dict[str, float]]:
-        """The directions that the data do not determine: their components by parameter name."""
+        """The directions that the data do not determine, each as {parameter name: component}.
+
+        Components of at most 0.05 are left out.
+        """
         rows = self.directions[self.singular_values <= 1 / VAGUE]
         return [
             {name: float(x) for name, x in zip(self.names, row, strict=True) if abs(x) > 0.05}
@@ -334,7 +337,7 @@ def _stopped(problem: Stretches, end: End) -> str:
 def _errors(space: Space, y: tuple[Array, ...], deviations: np.ndarray) -> PyTree:
     """Returns standard deviations in the structure of the parameters.
 
-    For a positive parameter x, they are converted by dx = x d(log x).
+    The search coordinate of a positive parameter x is log x, so its deviation is multiplied by x.
 
     Args:
         space: map between parameters and search coordinates.

@@ -10,8 +10,8 @@ from jaxcon.learning.least_squares import Fit, Precision
 def noise_left(fit: Fit, rows: int, observed: int, precision: Precision) -> float:
     """Returns the root mean square residual per degree of freedom; NaN if no freedom is left.
 
-    The number of degrees of freedom is the number of data minus the trace, over the data rows, of
-    the projection onto the columns of J. Columns of unknowns on a bound are left out.
+    The number of degrees of freedom is the number of data minus Σ Pᵢᵢ over the data rows i. P is
+    the projection onto the columns of J, without the columns of unknowns on a bound.
 
     Args:
         fit: a fit whose residuals are data rows, followed by continuity rows.
@@ -27,10 +27,10 @@ def noise_left(fit: Fit, rows: int, observed: int, precision: Precision) -> floa
 def singular_directions(
     J: np.ndarray, others: np.ndarray, unit: np.ndarray, precision: Precision
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns singular values and directions of ∂r/∂x, while other unknowns y are free.
+    """Computes how well residuals r determine unknowns x, while other unknowns y are free.
 
-    r are the residuals, and x the unknowns of interest. The columns of ∂r/∂y are projected out of
-    ∂r/∂x.
+    The result is a singular value decomposition of ∂r/∂x · unit, after the columns of ∂r/∂y have
+    been projected out of ∂r/∂x.
 
     Args:
         J: the Jacobian ∂r/∂x, (m, n).
@@ -39,8 +39,8 @@ def singular_directions(
         precision: floating-point precision of r.
 
     Returns:
-        Singular values of J · unit, (n,), 0 for directions that r does not determine; and the
-        directions, as rows of length 1, (n, n).
+        The singular values, (n,), 0 for directions that r does not determine; and the directions
+        in x / unit, as rows of length 1, (n, n).
     """
     n, D = J.shape[1], precision.scale(J)
     U, *_ = precision.reached(others)

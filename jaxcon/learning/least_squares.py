@@ -33,7 +33,7 @@ EVERY_STEP = "every step was taken before it converged"
 START = 1e-3
 """The initial Levenberg–Marquardt damping μ."""
 FAINT = 8
-"""The norm below which a column of the Jacobian counts as zero, in rounding errors of the data."""
+"""The norm up to which a column of the Jacobian counts as zero, relative to the rounding error."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Precision:
         return self.tolerance**2 * self.size
 
     def scale(self, J: np.ndarray) -> np.ndarray:
-        """Returns the norms D of the columns of J, (n,); infinite for mere rounding errors."""
+        """Returns the norms D of the columns of J, (n,). A column of rounding errors has norm ∞."""
         norms = np.sqrt(np.sum(J * J, axis=0))
         return np.where(norms > FAINT * self.rounding, norms, np.inf)
 
@@ -172,7 +172,14 @@ def _step(
     reach: np.ndarray | float,
     precision: Precision,
 ) -> Generator[np.ndarray, Values, tuple[FitProgress, np.ndarray, np.ndarray]]:
-    """Takes a step, with more and more damping until it lowers ½ ‖r‖². Returns (progress, r, J)."""
+    """Takes one step of a fit: increases the damping until the step lowers ½ ‖r‖².
+
+    This is a generator. It yields each point that it tries, and is sent (r, J) at that point.
+
+    Returns:
+        The progress after the step, with r and J at the new point. If no step lowers ½ ‖r‖²,
+        the point, r and J are unchanged, and the progress has a reason to stop.
+    """
     z, damping = progress.z, progress.damping
     within = np.maximum(limits[0], z - reach), np.minimum(limits[1], z + reach)
     move = _steps(z, r, J, _free(z, r, J, limits), precision)
@@ -248,7 +255,7 @@ def side_by_side(
 
 
 def _broke(result: FitOutcome | BaseException) -> bool:
-    """Returns True if an interrupt or a machine error stopped the search."""
+    """Returns True if an interrupt or a machine error stopped the search with this result."""
     return (
         isinstance(result, STOP_EXCEPTIONS) if isinstance(result, BaseException) else result.broken
     )
@@ -277,7 +284,11 @@ def _free(
 def _negligible(
     step: np.ndarray, z: np.ndarray, r: np.ndarray, J: np.ndarray, precision: Precision
 ) -> bool:
-    """Returns True if a step changes r, or both the unknowns and the predictions, negligibly."""
+    """Returns True if a step is too short to matter, by its predicted change J · step of r.
+
+    Either this change is small relative to r, or within rounding errors. Or the step is small
+    relative to z, and the change is small relative to the data.
+    """
     effect, tolerance = float(np.linalg.norm(J @ step)), precision.tolerance
     short = bool(np.all(np.abs(step) <= tolerance * (1 + np.abs(z))))
     unseen = effect <= max(tolerance * float(np.linalg.norm(r)), precision.rounding)

@@ -65,7 +65,7 @@ class Space:
         )
 
     def fill(self, leaves: Iterable[Array]) -> Any:
-        """Returns the parameters with given values of the searched leaves."""
+        """Returns the tree of parameters, made of the searched `leaves` and the constant leaves."""
         free = iter(leaves)
         whole = [next(free) if f is None else f for f in self.fixed]
         return jax.tree.unflatten(self.structure, whole)
@@ -113,7 +113,7 @@ class Space:
 
 
 def flat(y: T) -> tuple[Array, Callable[[Array], T]]:
-    """Concatenates a tree to one array in the widest dtype. Also returns the inverse map."""
+    """Returns the leaves of a tree as one array in the widest dtype, and the inverse function."""
     with jax.numpy_dtype_promotion("standard"):  # leaves may have several precisions
         return ravel_pytree(y)
 

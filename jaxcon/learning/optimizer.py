@@ -121,13 +121,15 @@ def adam_then_newton(space: Space, steps: int) -> SearchAware:
 
 
 def _radius(memory: OptimizerMemory, away: Array, judged: Array) -> Array:
-    """Updates the trust radius after a step.
+    """Returns the trust radius after a step.
+
+    After a step that did not lower the loss, it is half the length of that step. After a step that
+    lowered the loss and was limited by the radius, it is doubled.
 
     Args:
         memory: the state before the step.
         away: distance from the current point to the best one, (); 0 if the step lowered the loss.
-        judged: mask, (): True if the step was a quasi-Newton step; otherwise the radius does not
-            change.
+        judged: True if the step was a quasi-Newton step, (); otherwise the radius does not change.
     """
     cut = memory.length > CUT * memory.radius
     wider = jnp.where(cut, 2 * memory.radius, memory.radius)

@@ -21,7 +21,7 @@ def scattered(
     key: Array | None,
     owner: str,
 ) -> tuple[Array, ...]:
-    """Returns a start and random starts around it, with a first axis of starts.
+    """Returns the user's start and random starts around it, stacked along a first axis.
 
     Args:
         space: search coordinates of the parameters, with their bounds.

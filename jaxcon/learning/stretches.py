@@ -140,13 +140,13 @@ class Stretches:
 
     @property
     def rounding(self) -> float:
-        """The typical rounding error of one datum."""
+        """The typical rounding error of data / noise: ε times the root mean square."""
         spacing = float(jnp.finfo(self.scale.dtype).eps)
         return spacing * self.size / max(self.observed, 1) ** 0.5
 
     @property
     def least(self) -> float:
-        """The typical rounding error of one datum; 1 if all data are 0."""
+        """The least noise factor that an estimate may give: `rounding`, or 1 if all data are 0."""
         return self.rounding or 1.0
 
     def typical(self, residual: np.ndarray) -> float:
@@ -191,9 +191,10 @@ class Stretches:
         return size / self.size if size > self.precision(np.inf).tolerance * self.size else 0.0
 
     def excess(self, residual: np.ndarray) -> float:
-        """Returns the ratio of the root mean square data residual to its noise, `scatter`.
+        """Returns the root mean square data residual, divided by the noise in the residuals.
 
-        It is NaN if the noise is unknown.
+        The noise is the standard deviation that `scatter` returns. The result is NaN if the noise
+        is unknown.
         """
         r = residual[: residual.size - self.gaps]
         return float(np.linalg.norm(r)) / max(self.observed, 1) ** 0.5 / self.scatter(residual)
@@ -229,7 +230,13 @@ class Stretches:
         return Precision(tolerance, float(np.hypot(self.size / noise, ends)))
 
     def data_precision(self, noise: float) -> Precision:
-        """Returns the precision of the data residuals alone, for a `condensed` Jacobian."""
+        """Returns the floating-point precision of the data residuals alone, without the gaps.
+
+        It applies to a Jacobian that was transformed by `condensed`.
+
+        Args:
+            noise: factor by which the noise of the data is multiplied.
+        """
         return dataclasses.replace(self.precision(np.inf), size=self.size / noise)
 
     def condensed(self, J: np.ndarray, continuity: float) -> np.ndarray:
@@ -245,7 +252,7 @@ class Stretches:
         unchanged.
 
         Args:
-            J: Jacobian of all residuals by parameters and nodes, (m, p + stretches · n).
+            J: Jacobian of residuals with respect to parameters and nodes, (m, p + stretches · n).
             continuity: standard deviation by which the gaps in J are divided.
         """
         p, (stretches, n) = self.scale.size, self.nodes.shape
@@ -321,7 +328,7 @@ class Stretches:
 
         # compiled for each problem, since variables that `simulate` closes over may have changed
         def linearize(x: Array, data: PyTree, noise: PyTree) -> tuple[Pair, Pair]:
-            """Returns (data residuals, end state) of one segment, and their Jacobians by x."""
+            """Returns (data residuals, end state) of one segment, and their Jacobians ∂/∂x."""
 
             def push(tangent: Array) -> tuple[Pair, Pair]:
                 """Returns data residuals and end state, and their derivatives along a tangent."""
@@ -332,7 +339,13 @@ class Stretches:
         return jax.jit(jax.vmap(jax.vmap(linearize), (0, None, None)))
 
     def _stretch(self, x: Array, data: PyTree, noise: PyTree) -> Pair:
-        """Simulates one segment. Returns its data residuals and its end state, as arrays."""
+        """Simulates one segment. Returns its data residuals and its end state, as arrays.
+
+        Args:
+            x: the parameters and the initial state of the segment, (p + n,).
+            data: the data of the segment.
+            noise: the standard deviations of the data.
+        """
         p = self.scale.size
         params, end = self.space.decode(self.space.split(x[:p] * self.scale)), ()
         if self.given is None:
@@ -375,7 +388,7 @@ class Stretches:
 
 
 def _scatters(residuals: list[np.ndarray]) -> list[float]:
-    """Estimates noise from differences between neighbors along each axis but the first.
+    """Estimates noise from differences of neighboring residuals, along each axis but the first.
 
     Axes with fewer than `NEIGHBORS` differences are left out.
 
@@ -396,7 +409,9 @@ def _scatters(residuals: list[np.ndarray]) -> list[float]:
 
 
 def _placed(by_r: np.ndarray, by_end: np.ndarray, p: int) -> np.ndarray:
-    """Assembles the Jacobian of all data residuals, then all end states, by parameters and nodes.
+    """Assembles the Jacobian of all data residuals and end states from Jacobians of stretches.
+
+    Its rows are data residuals, then end states. Its columns are parameters, then nodes.
 
     Args:
         by_r: ∂r/∂(parameters, node) of each stretch, (stretches, m, p + n).

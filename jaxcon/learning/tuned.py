@@ -227,9 +227,11 @@ def _size(y: Array, start: Array, log: bool) -> np.ndarray | float:
 
 
 def _pace(history: np.ndarray) -> tuple[float, float]:
-    """Returns `pace` and `late` of an `Outlook`: how fast the lowest loss decreased at the end.
+    """Returns how fast the lowest loss decreased: `pace` and `late` of an `Outlook`.
 
-    Both are NaN for fewer than four finite losses.
+    `pace` is the average decrease per step over the last steps. `late` is the share of the total
+    decrease that the second half of the steps achieved. Both are NaN for fewer than four finite
+    losses.
 
     Args:
         history: losses by step.

@@ -226,7 +226,7 @@ def _loop(
                 shown.update(taken)
                 shown.set_postfix(best=f"{float(jnp.min(search.best.loss)):.4g}", refresh=False)
                 if not (fresh or np.any(np.isfinite(history))):
-                    break  # no start is finite, and repeating a step from it changes nothing
+                    break  # no start has a finite loss, and repeating a step would give none
     except STOP_EXCEPTIONS as error:
         if not course[1].size:
             raise  # no earlier result would be lost
@@ -242,9 +242,9 @@ def _running(search: Search, steps: int) -> np.ndarray:
 def _about(
     space: Space, starts: tuple[Array, ...], key: Array | None, chunk: int, rate: int | None
 ) -> dict[str, object]:
-    """Returns the settings in which a search and its checkpoint must agree, by description.
+    """Returns {description: value} for the settings that a search and its checkpoint must share.
 
-    The compiled program, which must agree too, is not included.
+    The compiled program must be equal, too, but is not included.
 
     Args:
         space: map between parameters and search coordinates.

@@ -25,10 +25,15 @@ def freeze(tree: T) -> T:
 
 
 def ldl(a: Block, least: list[Lane] | None = None) -> Block:
-    """Factors A = L D Lᵀ, given the lower triangle of a symmetric matrix A.
+    """Factors A = L D Lᵀ, where L is unit lower triangular and D is diagonal.
 
-    The result has L below the diagonal and D⁻¹ on it. `least` holds one bound for each pivot: a row
-    whose pivot is not above its bound is left out, with D⁻¹ = 0.
+    Args:
+        a: the lower triangle of a symmetric matrix A.
+        least: a bound for each pivot in D; None for no bounds. A row whose pivot is not above its
+            bound is left out of the factorization, by setting its D⁻¹ to 0.
+
+    Returns:
+        The entries of L below the diagonal, and of D⁻¹ on the diagonal.
     """
     factor: Block = []
     for j, row in enumerate(a):
@@ -47,7 +52,7 @@ def ldl(a: Block, least: list[Lane] | None = None) -> Block:
 
 
 def forward(factor: Block, b: list[Lane]) -> list[Lane]:
-    """Substitutes forward: returns L⁻¹ b for the factor L of `ldl` and a right-hand side b."""
+    """Returns L⁻¹ b by forward substitution, for the factor L of `ldl` and a vector b."""
     y: list[Lane] = []
     for row, value in zip(factor, b, strict=True):
         y.append(minus(value, total(times(x, z) for x, z in zip(row, y, strict=False))))
@@ -55,7 +60,7 @@ def forward(factor: Block, b: list[Lane]) -> list[Lane]:
 
 
 def backward(factor: Block, y: list[Lane]) -> list[Lane]:
-    """Substitutes backward: returns L⁻ᵀ y for the factor L of `ldl`."""
+    """Returns L⁻ᵀ y by backward substitution, for the factor L of `ldl` and a vector y."""
     x = list(y)
     for i in reversed(range(len(y))):
         x[i] = minus(x[i], total(times(factor[k][i], x[k]) for k in range(i + 1, len(y))))
@@ -63,7 +68,7 @@ def backward(factor: Block, y: list[Lane]) -> list[Lane]:
 
 
 def scale(factor: Block, y: list[Lane]) -> list[Lane]:
-    """Returns D⁻¹ y for the pivots D of `ldl`."""
+    """Returns D⁻¹ y, for the diagonal matrix D of pivots from `ldl` and a vector y."""
     return [times(value, row[-1]) for value, row in zip(y, factor, strict=True)]
 
 
@@ -86,7 +91,7 @@ def product(a: Rows, b: Rows, lower: bool = False) -> Block:
 
 
 def zero(rows: int, columns: int | None = None) -> Block:
-    """Returns a zero matrix; without `columns`, the lower triangle of a square zero matrix."""
+    """Returns a zero matrix, or the lower triangle of a square one if `columns` is None."""
     return [[0.0] * (r + 1 if columns is None else columns) for r in range(rows)]
 
 

@@ -23,7 +23,10 @@ from jaxcon.protocols import Solver
 Operator = Callable[[Array], Array]
 
 CONTRADICTING = 1e-2
-"""The residual above which redundant rows count as contradictory, relative to b and J M⁻¹ f."""
+"""The residual above which redundant rows count as contradictory.
+
+It is relative to the size of b and J M⁻¹ f.
+"""
 
 
 @pytree
@@ -35,21 +38,20 @@ class ConjugateGradients(checks.Checked, Solver):
     Compile time does not depend on the number of equal constraints. If M is not diagonal, A is
     dense, and `Schur` solves the system.
 
-    The number of iterations grows with the square root of the condition number of A. It is small if
-    few joints lie between each body and the ground. A chain of n links takes more than n
+    The number of iterations grows with the square root of the condition number of A. Few iterations
+    suffice if few joints lie between each body and the ground. A chain of n links takes more than n
     iterations, and `Sparse` is then faster.
 
     The algorithm is the method of conjugate residuals: it minimizes the residual in the norm of the
     preconditioner. If redundant rows are consistent, λ is the solution of least norm. Constraint
     drift and rounding, amplified by the feedback of the stabilizer, make redundant rows slightly
-    inconsistent. λ is then the least-squares solution of least norm. The status is CONFLICT, for
-    rows that contradict each other, if the residual exceeds 1% of the size of b and J M⁻¹ f, plus
-    rounding.
+    inconsistent. λ is then the least-squares solution of least norm. The status is CONFLICT if rows
+    contradict each other: if the residual exceeds 1% of the size of b and J M⁻¹ f, plus rounding.
 
     The status is NOT_CONVERGED if the residual is neither below the tolerance nor minimal. It is
     SINGULAR if M is not positive definite.
 
-    The solution is differentiated implicitly, by a second solve with as many iterations.
+    The solution is differentiated implicitly, by a second solve with the same number of iterations.
 
     Attributes:
         tikhonov: ε of a regularized system (A + ε diag A) λ = b − J M⁻¹ f, or None; see `Sparse`.
@@ -73,14 +75,18 @@ class ConjugateGradients(checks.Checked, Solver):
         """Checks the regularization, the tolerance and the number of iterations.
 
         Raises:
-            ValueError: one of these is out of range.
+            ValueError: `tikhonov`, `tolerance` or `iterations` is out of range.
         """
         checks.check("ConjugateGradients", "tikhonov", self.tikhonov, (), least=0, optional=True)
         checks.count("ConjugateGradients", "iterations", self.iterations)
         checks.check("ConjugateGradients", "tolerance", self.tolerance, (), least=0, optional=True)
 
     def factor(self, system: Saddle) -> Factored:
-        """Prepares the preconditioner; returns a function (f, b) → `Solution`."""
+        """Prepares the preconditioner for repeated solves.
+
+        Returns:
+            A function (f, b) → `Solution`, for forces f, (n_v,), and targets b, (n_c,).
+        """
         if not system.target.size:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
@@ -134,7 +140,7 @@ def descend(
     The iteration of a world stops when ‖r‖ reaches the tolerance, or when ‖r‖ is minimal. If ‖r‖ is
     minimal, r has no part in the range of A, and z lies in the null space of A. The component of x
     along z is then an error, proportional to ‖r‖ and to the condition number. Removing this
-    component leaves the x of least norm in P.
+    component leaves the x with the least norm xᵀP x.
 
     Args:
         a: x → A x, symmetric and positive semidefinite.
@@ -146,8 +152,9 @@ def descend(
             heavy loads, and the test for a minimal ‖r‖ is skipped.
 
     Returns:
-        x (n_c, …) and a tuple: r (n_c, …); True for each world whose tolerance is reached; and True
-        for each world whose ‖r‖ is minimal but above the tolerance.
+        x: the solution, (n_c, …).
+        A tuple of three arrays: the residual r, (n_c, …); a mask of the worlds whose ‖r‖ reached
+        the tolerance; and a mask of the worlds whose ‖r‖ is minimal, but above the tolerance.
 
     References:
         Saad, Iterative Methods for Sparse Linear Systems (2003), algorithm 6.20.
@@ -162,9 +169,16 @@ def descend(
         return jnp.sum(x * y, axis=0)
 
     def is_least(size: Array, z: Array, az: Array, paz: Array) -> Array:
-        """Returns True where ‖r‖ is minimal: ‖A P⁻¹ r‖ is small, or zᵀA z is at rounding level.
+        """Returns a mask of the worlds whose residual r has its minimal norm ‖r‖² = rᵀP⁻¹ r.
 
-        ‖A P⁻¹ r‖² and zᵀA z are compared with ‖r‖² = `size`.
+        The gradient A z, with z = P⁻¹ r, is then small compared with ‖r‖, or zᵀA z is at the level
+        of rounding errors.
+
+        Args:
+            size: ‖r‖².
+            z: P⁻¹ r.
+            az: A z.
+            paz: P⁻¹ A z.
         """
         flat = dot(az, paz) <= zero * zero * size
         return flat | (dot(z, az) <= 16 * float(information.eps) * size)
@@ -201,9 +215,14 @@ def descend(
 def block_jacobi(jacobian: Jacobian, inverse_mass: Array, compliance: Array | None) -> Operator:
     """Returns the block Jacobi preconditioner r → P⁻¹ r.
 
-    P is the block diagonal of A, with one block for each constraint. Each diagonal entry is raised
-    by the factor 1 + √eps, so that blocks with dependent rows stay invertible. The diagonal entry
-    of an empty row is set to 1.
+    P is the block diagonal of A = J M⁻¹ Jᵀ + C, with one block for each constraint. Each diagonal
+    entry is multiplied by 1 + √eps, so that blocks with dependent rows stay invertible. The
+    diagonal entry of a row of zeros is set to 1.
+
+    Args:
+        jacobian: J.
+        inverse_mass: the diagonal of M⁻¹, (n_v,).
+        compliance: the diagonal of C, (n_c,); None if C is zero.
     """
     shapes = {block.start: block.shape for block in jacobian.blocks}
     diagonal = diagonal_blocks(jacobian, weighted(jacobian, inverse_mass), compliance)
@@ -216,7 +235,7 @@ def block_jacobi(jacobian: Jacobian, inverse_mass: Array, compliance: Array | No
     }
 
     def solve(r: Array) -> Array:
-        """Returns P⁻¹ r, (n_c,), by substitution in the factored blocks."""
+        """Returns P⁻¹ r, (n_c,), by substitution in the factored blocks of P."""
         parts: list[Lane] = []
         for start, factor in factors.items():
             right = list(Vector.of_rows(r, start, *shapes[start]))

@@ -16,7 +16,7 @@ class Delassus:
 
     Attributes:
         compliance: the diagonal of C, (n_c,), plus ε diag A if a regularization ε is given; None
-            where both are absent.
+            if C is zero and no ε is given.
         matrices: J, the diagonal of M⁻¹, and `compliance`, all constant under differentiation.
     """
 
@@ -41,7 +41,7 @@ class Delassus:
 
 
 def weighted(jacobian: Jacobian, inverse_mass: Array) -> list[Block]:
-    """Returns J M⁻¹, one block for each block of J, for a diagonal M⁻¹ (n_v,)."""
+    """Returns the blocks of J M⁻¹, one for each block of J; `inverse_mass` is diag M⁻¹, (n_v,)."""
     weights = [block.columns.take(inverse_mass) for block in jacobian.blocks]
     return [
         [[times(x, w) for x, w in zip(row, weight, strict=True)] for row in block.value]
@@ -59,7 +59,7 @@ def diagonal_blocks(
     Args:
         jacobian: J.
         rows: J M⁻¹, from `weighted`.
-        compliance: the diagonal of C, (n_c,); None where C is zero.
+        compliance: the diagonal of C, (n_c,); None if C is zero.
     """
     diagonal: dict[int, Block] = {}
     for block, row in zip(jacobian.blocks, rows, strict=True):
@@ -74,7 +74,7 @@ def diagonal_blocks(
 
 
 def diagonal(jacobian: Jacobian, inverse_mass: Array) -> Array:
-    """Returns the diagonal of J M⁻¹ Jᵀ, (n_c,), for a diagonal M⁻¹ (n_v,)."""
+    """Returns the diagonal of J M⁻¹ Jᵀ, (n_c,); `inverse_mass` is diag M⁻¹, (n_v,)."""
     weights = (block.columns.take(inverse_mass) for block in jacobian.blocks)
     squares = (
         [total(times(w, times(x, x)) for x, w in zip(row, ws, strict=True)) for row in block.value]

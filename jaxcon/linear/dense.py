@@ -23,12 +23,16 @@ class Dense(Solver):
     """
 
     def factor(self, system: Saddle) -> Factored:
-        """Factors K; returns a function (f, b) → `Solution`."""
+        """Factors the saddle matrix K = [[M, −Jᵀ], [J, C]] for repeated solves.
+
+        Returns:
+            A function (f, b) → `Solution`, for forces f, (n_v,), and targets b, (n_c,).
+        """
         return factor_per_world(_factor, _solve, system)
 
 
 def _factor(system: Saddle) -> lu.Factored:
-    """Factors the saddle matrix K of one world."""
+    """Factors the saddle matrix K = [[M, −Jᵀ], [J, C]] of one world."""
     j, mass, c = system.jacobian.dense(), system.mass, system.compliance
     compliance = jnp.zeros(len(j), j.dtype) if c is None else c
     inertia = jnp.where(mass.diagonal > 0, mass.diagonal, 1)
@@ -39,6 +43,6 @@ def _factor(system: Saddle) -> lu.Factored:
 
 
 def _solve(factored: lu.Factored, force: Array, target: Array) -> Solution:
-    """Solves K (a, λ) = (f, b) for one world."""
+    """Solves K (a, λ) = (f, b) of one world, for a factored saddle matrix K."""
     solution, n = factored.solve(jnp.concatenate([force, target])), len(force)
     return Solution(solution[:n], solution[n:], judge(solution, factored.singular))

@@ -27,14 +27,14 @@ class Effort:
 
 
 def structure_of(jacobian: Jacobian) -> Structure:
-    """Returns the structure of a Jacobian; its arrays may be abstract (shapes without values)."""
+    """Returns the structure of a Jacobian, whose arrays may be abstract (without values)."""
     return tuple((b.start, b.shape[0], b.columns) for b in jacobian.blocks)
 
 
 def clique(structure: Structure) -> int:
-    """Returns the largest number of rows that touch one body.
+    """Returns the largest number of constraint rows that touch one body.
 
-    These rows form a clique in the graph of A, since all constraints of a body are neighbors.
+    The constraints of a body form a clique in the graph of A = J M⁻¹ Jᵀ: all are neighbors.
     """
     rows: dict[tuple[int, int], int] = {}
     for _, size, columns in structure:
@@ -58,15 +58,20 @@ def elimination(
         structure: the structure of J.
         order: the elimination order, "runs" or "levels"; see `Sparse`.
         solves: the number of substitutions with one factorization.
-        most: the limit on instructions. The result is None if the elimination of the rows that
-            touch one body already exceeds this limit; these rows are eliminated one block after
-            another.
+        most: the limit on instructions. The result is None if the constraints of a single body
+            already exceed this limit. They are all coupled to each other, so they are eliminated
+            one after another.
     """
 
     def factor(m: float, r: float) -> float:
-        """Returns the operations that eliminate a node of m rows, with r rows of later neighbors.
+        """Returns the number of operations that eliminate a constraint p with m rows.
 
-        They compute LDLᵀ of the node, A_qp L⁻ᵀ for the neighbors q, and the neighbors' updates.
+        Let q be the constraints that are coupled to p and eliminated later. The operations factor
+        A_pp = L D Lᵀ, compute A_qp L⁻ᵀ for all q, and update the blocks between them.
+
+        Args:
+            m: the number of rows of p.
+            r: the total number of rows of all q.
         """
         return m**3 / 3 + m * m * r + m * r * (r + 1)
 
@@ -99,7 +104,7 @@ def schur(n_v: int, n_c: int, full: bool, solves: int = 1, elsewhere: float = 30
         n_c: the number of rows of J.
         full: True if M is a full matrix, which must be factored as well.
         solves: the number of substitutions with one factorization.
-        elsewhere: the number of instructions that does not depend on the sizes.
+        elsewhere: the number of instructions, which does not depend on n_v and n_c.
     """
     mass = n_v**3 / 3 + 2 * n_v * n_v * (n_c + 2 * solves) if full else float(n_v * n_c)
     form = 2.0 * n_c * n_c * n_v + n_c**3 / 3
@@ -114,7 +119,7 @@ def saddle(n_v: int, n_c: int, solves: int = 1, elsewhere: float = 20.0) -> Effo
         n_v: the number of velocities.
         n_c: the number of rows of J.
         solves: the number of substitutions with one factorization.
-        elsewhere: the number of instructions that does not depend on the sizes.
+        elsewhere: the number of instructions, which does not depend on n_v and n_c.
     """
     n = n_v + n_c
     return Effort(2 * n**3 / 3 + 2.0 * solves * n * n, elsewhere, float(n * n))

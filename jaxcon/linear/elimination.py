@@ -33,12 +33,17 @@ class Pieces:
         self.pieces: dict[Any, list[tuple[Block, int]]] = {}
 
     def add(self, keys: Iterable[Key], block: Block) -> None:
-        """Adds a piece to each key: element i of the lanes (element, …) goes to the i-th key."""
+        """Adds a piece to the block at each key.
+
+        Args:
+            keys: the keys.
+            block: the pieces as lanes (key, …): entry i of each lane belongs to the i-th key.
+        """
         for i, key in enumerate(keys):
             self.pieces.setdefault(key, []).append((block, i))
 
     def sum(self, keys: Iterable[Key]) -> Block:
-        """Returns the blocks at the given keys as lanes (key, …); an empty list if all are zero."""
+        """Returns the blocks at the given keys, as lanes (key, …), or [] if all are zero."""
         total: Block = []
         for pieces in itertools.zip_longest(*(self.pieces.get(key, ()) for key in keys)):
             shape = next(piece[0] for piece in pieces if piece is not None)
@@ -67,12 +72,13 @@ class Elimination:
     the lanes, and the nodes of a run in a loop.
 
     Without earlier rows, the pivot D_r of row r would be its diagonal entry A_rr. If D_r is at most
-    `rounding` times A_rr, row r is a linear combination of earlier rows. `leaves_out` skips such
-    dependent rows.
+    `rounding` times A_rr, row r is a linear combination of earlier rows. Such dependent rows are
+    left out if `leaves_out` is True.
 
     Attributes:
-        margin: positive for each world without dependent rows: the least of all D_r⁻¹ and all
-            1 − rounding A_rr D_r⁻¹. It needs no division and detects negative pivots, too.
+        margin: a number for each world, which is positive if no rows are dependent. It is the least
+            of all D_r⁻¹ and all 1 − rounding A_rr D_r⁻¹. It needs no further division, and is
+            negative for negative pivots, too.
         finite: True for each world whose A is finite.
     """
 
@@ -121,9 +127,10 @@ class Elimination:
         )
 
     def _batch(self, step: EliminationBatch) -> tuple[Down, Back]:
-        """Eliminates independent nodes at once.
+        """Eliminates the nodes of a batch, which are not neighbors, all at once.
 
-        Returns two functions: their forward and their backward substitution.
+        Returns:
+            The function of forward substitution, `down`, and of backward substitution, `back`.
         """
         diagonal = [(p, p) for p in step.nodes]
         whole = self._entries(diagonal)
@@ -136,9 +143,15 @@ class Elimination:
             self.updates.add(zip(step.slots[i], step.slots[j], strict=True), product)
 
         def down(b: Pieces, taken: Pieces) -> Lanes:
-            """Substitutes forward: y_p = L⁻¹ b_p and b_q −= H_q y_p; returns D⁻¹ y_p.
+            """Substitutes forward: y_p = L⁻¹ b_p for each node p of the batch.
 
-            `taken` accumulates the sums of H_q y_p, which are subtracted from b later.
+            Args:
+                b: the right-hand sides.
+                taken: the sums to subtract from b at each node. This function reads those at the
+                    nodes p, and adds H_q y_p at their later neighbors q.
+
+            Returns:
+                D⁻¹ y_p as lanes (node, …).
             """
             y = blocks.forward(factor, _less(b.sum(step.nodes), taken.sum(step.nodes))[0])
             for slot, gain in zip(step.slots, gains, strict=True):
@@ -146,7 +159,12 @@ class Elimination:
             return blocks.scale(factor, y)
 
         def back(y: Lanes, x: Pieces) -> None:
-            """Substitutes backward: adds x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q) to the solution x."""
+            """Substitutes backward: x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q) for each node p of the batch.
+
+            Args:
+                y: D⁻¹ y_p, from `down`.
+                x: the solution, known at the later neighbors q; this function adds x_p to it.
+            """
             for slot, gain in zip(step.slots, gains, strict=True):
                 pull = blocks.apply(blocks.transpose(gain), x.sum(slot)[0])
                 y = [minus(a, c) for a, c in zip(y, pull, strict=True)]
@@ -155,10 +173,12 @@ class Elimination:
         return down, back
 
     def _run(self, step: EliminationRun) -> tuple[Down, Back]:
-        """Eliminates the nodes of a run in a loop.
+        """Eliminates the nodes of a run in a loop, one node in each iteration.
 
-        The carry holds the updates of the next node and of the border nodes. Returns two functions:
-        the forward and the backward substitution of the run.
+        The loop carries the updates of the next node and of the border nodes.
+
+        Returns:
+            The function of forward substitution, `down`, and of backward substitution, `back`.
         """
         nodes, first, later = step.ascending, step.nodes[0], (step.parent, *step.border)
         others = [None if p == first else p for p in nodes]
@@ -196,7 +216,19 @@ class Elimination:
             self.updates.add([(later[i], later[j])], jax.tree.map(lambda x: x[None], product))
 
         def down(b: Pieces, taken: Pieces) -> Lanes:
-            """Substitutes forward along a run; the carry is H_q y_p of next and border nodes."""
+            """Substitutes forward along the run: y_p = L⁻¹ b_p for each node p, in a loop.
+
+            The loop carries H_q y_p of the next node q, and the sums of H_q y_p of each border
+            node q.
+
+            Args:
+                b: the right-hand sides.
+                taken: the sums to subtract from b at each node. This function reads those at the
+                    nodes of the run, and adds the carried sums at the end of the loop.
+
+            Returns:
+                D⁻¹ y_p as lanes (node, …).
+            """
 
             def eliminate(carry: list[Lanes], right: Lanes, k: Array) -> tuple[list[Lanes], Lanes]:
                 factor, gain = row_of((factors, gains), k)
@@ -216,7 +248,14 @@ class Elimination:
             return y
 
         def back(y: Lanes, x: Pieces) -> None:
-            """Substitutes backward along the run; the carry is the solution of the next node."""
+            """Substitutes backward along the run: x_p = L⁻ᵀ (D⁻¹ y_p − Σ H_qᵀ x_q) for each node p.
+
+            The loop carries the solution x_q of the node that was eliminated after p.
+
+            Args:
+                y: D⁻¹ y_p, from `down`.
+                x: the solution, known after the run and at its border; this function adds all x_p.
+            """
             border = [_first(x.sum([g])[0]) for g in step.border]
 
             def substitute(following: Lanes, right: Lanes, k: Array) -> tuple[Lanes, Lanes]:
@@ -238,28 +277,39 @@ class Elimination:
         return [EliminationNode(start, element, size) for element in range(count)]
 
     def _entries(self, pairs: Sequence[tuple[EliminationNode, EliminationNode]]) -> Block:
-        """Returns the blocks A_qp of node pairs (q, p), as they are before any elimination."""
+        """Returns the blocks A_qp of node pairs (q, p), without the updates by eliminations."""
         q, p = pairs[0]
         return self.entries.sum(pairs) or blocks.zero(q.size, p.size)
 
     def _spread(self, tree: T, count: int) -> T:
-        """Broadcasts all lanes of a tree to (count, …), with the batch axes last."""
+        """Broadcasts all lanes of a tree to shape (count, …), where … are the batch axes."""
         shape = (count, *self.batch)
         return jax.tree.map(lambda x: jnp.broadcast_to(jnp.asarray(x, self.dtype), shape), tree)
 
     def _least(self, whole: Block) -> Lanes | None:
-        """Returns the bound for each pivot below which a row is left out; None to keep all rows."""
+        """Returns the bounds of the pivots for `blocks.ldl`; None if no row may be left out.
+
+        Args:
+            whole: the diagonal blocks A_pp, without updates by eliminations.
+        """
         return [self.rounding * a[-1] for a in whole] if self.leaves_out else None
 
     def _margin(self, whole: Block, factor: Block) -> Lane:
-        """Returns the independence margin of the given nodes; see the attribute `margin`."""
+        """Returns the least of all D_r⁻¹ and 1 − rounding A_rr D_r⁻¹ of each node.
+
+        The result is positive for nodes without dependent rows.
+
+        Args:
+            whole: the diagonal blocks A_pp of the nodes, without updates by eliminations.
+            factor: L and D⁻¹ of the pivot blocks.
+        """
         inverse = [row[-1] for row in factor]
         rests = [1 - self.rounding * a[-1] * x for a, x in zip(whole, inverse, strict=True)]
         return functools.reduce(jnp.minimum, [*inverse, *rests])
 
 
 def _less(block: Block, taken: Block) -> Block:
-    """Returns the difference A − B of two blocks, where an empty B is zero."""
+    """Returns the difference of two blocks, `block` − `taken`; an empty `taken` counts as zero."""
     return blocks.subtract(block, taken) if taken else block
 
 
@@ -273,8 +323,8 @@ def _eliminate(
         sides: the blocks A_qp of the later neighbors q.
 
     Returns:
-        The couplings H_q = A_qp L⁻ᵀ D⁻¹ of all q, and the products H_q D H_rᵀ, keyed by (q, r) with
-        r ≤ q.
+        The couplings H_q = A_qp L⁻ᵀ D⁻¹, in the order of `sides`; and the updates H_q D H_rᵀ, keyed
+        by the positions (q, r) in `sides`, with r ≤ q.
     """
     halves = [[blocks.forward(factor, row) for row in side] for side in sides]
     gains = [[blocks.scale(factor, row) for row in half] for half in halves]
@@ -296,7 +346,7 @@ def _along(
             new rows of this node.
         carry: the initial carry.
         rows: a tree of arrays (node, …), in ascending order of the nodes' elements.
-        down: True for the order of elimination, False for the reverse order.
+        down: True to visit the nodes in the order of elimination, False in reverse order.
 
     Returns:
         The final carry and the new rows.

@@ -19,8 +19,8 @@ A matrix of this size exceeds the fastest cache: memory traffic costs more than 
 def inverse(matrix: Array) -> Array:
     """Returns A⁻¹ (n, n, …) by Gauss–Jordan elimination in place, without pivoting.
 
-    All leading principal blocks of A must be regular. This holds for positive definite matrices,
-    also with the diagonal blocks that complementarity conditions add.
+    All leading principal blocks of A must be regular. Positive definite matrices satisfy this, even
+    after complementarity conditions have added their diagonal blocks.
     """
     n = len(matrix)
     place = jnp.arange(n).reshape(-1, *(1,) * (matrix.ndim - 2))
@@ -28,7 +28,13 @@ def inverse(matrix: Array) -> Array:
     def exchange(rows: Array, i: Index, k: Index) -> Array:
         """Solves equation k of A x = b for x_k, so that x_k and b_k exchange places.
 
-        Updates only the given rows of A; row k of A is row i of `rows`.
+        Args:
+            rows: the rows of A to update; they include row k.
+            i: the position of row k in `rows`.
+            k: the number of the equation.
+
+        Returns:
+            The updated rows.
         """
         row, column, here = at(rows, i), at(rows, k, 1), place == k
         pivot = 1 / at(row, k)
@@ -36,7 +42,16 @@ def inverse(matrix: Array) -> Array:
         return put(jnp.where(here[None], 0, rows) - column[:, None] * scaled[None], scaled, i)
 
     def exchange_block(matrix: Array, first: Index, count: int) -> Array:
-        """Returns A after exchanging x_k and b_k for `count` rows k, from row `first` on."""
+        """Solves equations of A x = b for x_k, so that x_k and b_k exchange places.
+
+        Args:
+            matrix: A.
+            first: the first of the equations k.
+            count: the number of consecutive equations.
+
+        Returns:
+            The matrix of the system after all exchanges.
+        """
         rows = jax.lax.dynamic_slice_in_dim(matrix, first, count, 0)
         # a loop, because XLA would recompute unrolled code for every row of the matrix
         rows = jax.lax.fori_loop(0, count, lambda i, a: exchange(a, i, first + i), rows)
@@ -73,7 +88,11 @@ def apply(matrix: Array, x: Array) -> Array:
 
 
 def identity(like: Array) -> Array:
-    """Returns the identity matrix (n, n, 1, …), which broadcasts with an array `like` (n, …)."""
+    """Returns the identity matrix, (n, n, 1, …), with an axis of size 1 per batch axis of `like`.
+
+    Args:
+        like: an array (n, …) with the batch axes and the dtype.
+    """
     n = len(like)
     return jnp.eye(n, dtype=like.dtype).reshape(n, n, *(1,) * (like.ndim - 1))
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 N = TypeVar("N", bound=Hashable)
 HUB = 4
-"""A node is a hub if it has more than this many times the neighbors of the median node."""
+"""A node is a hub if it has more than `HUB` times as many neighbors as the median node."""
 
 
 def independent_sets(
@@ -22,9 +22,13 @@ def independent_sets(
     the smallest degree. Eliminating a node with two neighbors connects the two neighbors, so their
     degrees do not grow. So a chain of n nodes takes log₂ n rounds (cyclic reduction).
 
-    Hubs are eliminated after all other nodes, and do not count in the degrees of other nodes. A
-    constraint that touches every body would otherwise raise nearly all degrees above `degree`, and
-    a round would have only about two nodes.
+    Hubs, the nodes with by far the most neighbors, are eliminated after all other nodes. They do
+    not count in the degrees of other nodes. Otherwise a constraint that touches every body would
+    raise nearly all degrees above `degree`, and a round would have only about two nodes.
+
+    Args:
+        neighbors: the neighbors of each node.
+        degree: the largest degree of the nodes in a round, unless all nodes have a larger degree.
 
     Returns:
         The order, and the later neighbors of each node in that order, fill included.
@@ -59,8 +63,9 @@ def minimum_degree(
 
     Among nodes of equal degree, neighbors of the last eliminated node come first, so that chains
     are eliminated from one end to the other. Next come the nodes nearest to the ground. A chain
-    eliminated from the ground outward is well conditioned: each pivot is that of a joint to a fixed
-    body. Eliminated from the free end, a chain of n links has pivots that fall like 1/n³.
+    eliminated from the ground outward is well conditioned: each pivot equals that of a joint whose
+    inner body is fixed. Eliminated from the free end, a chain of n links has pivots that fall like
+    1/n³.
 
     Args:
         neighbors: the neighbors of each node.
@@ -94,7 +99,7 @@ def minimum_degree(
 
 
 def _eliminate(graph: dict[N, set[N]], node: N) -> set[N]:
-    """Removes a node from a graph in place and connects its neighbors; returns the neighbors."""
+    """Removes a node from a graph in place, connects its neighbors, and returns the neighbors."""
     around = graph.pop(node)
     for other in around:
         graph[other] |= around - {other}
@@ -103,7 +108,7 @@ def _eliminate(graph: dict[N, set[N]], node: N) -> set[N]:
 
 
 def _sorted(order: list[N], later: dict[N, set[N]]) -> dict[N, list[N]]:
-    """Sorts the later neighbors of each node by the order of elimination."""
+    """Returns the later neighbors of each node, sorted by the order of elimination."""
     position = {node: i for i, node in enumerate(order)}
     return {node: sorted(s, key=position.__getitem__) for node, s in later.items()}
 

@@ -8,7 +8,9 @@ from jaxcon.linear.jacobian import Jacobian
 
 
 def islands(jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the island number of each equality row, (n_c,), and of each velocity, (n_v,).
+    """Numbers the islands: sets of rows and velocities that are coupled to each other.
+
+    Returns the island number of each equality row, (n_c,), and of each velocity, (n_v,).
 
     Args:
         jacobian: the Jacobian of the equality rows, (n_c, n_v).
@@ -29,9 +31,10 @@ def islands(jacobian: Jacobian) -> tuple[np.ndarray, np.ndarray]:
 
 
 def largest_by_island(jacobian: Jacobian, x: Array) -> Array | None:
-    """Returns for each row the largest x among the rows of its island, (n_c, …).
+    """Returns for each equality row the largest x among the rows of its island, (n_c, …).
 
-    The result is None if there is only one island.
+    An island is a set of rows that are coupled through common velocities. The result is None if
+    there is only one island.
 
     Args:
         jacobian: the Jacobian of the equality rows, (n_c, n_v).

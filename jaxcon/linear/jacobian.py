@@ -19,7 +19,7 @@ from jaxcon.linear.gauss_jordan import identity
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of J that hold the velocities of the bodies of one Jacobian block.
+    """The columns of J that multiply the velocities of the bodies of one Jacobian block.
 
     Bodies with equal velocity components form a group. Component c of element i lies in column
     start + c · bodies + indices[i].
@@ -37,12 +37,16 @@ class Columns:
     indices: tuple[int, ...]
 
     def take(self, v: Array) -> Vector:
-        """Selects these velocities from v (n_v,), as a `Vector` of components (element,)."""
+        """Selects the velocities of these columns from v, (n_v,).
+
+        Returns:
+            A `Vector` over velocity components, whose components are arrays (element,).
+        """
         lanes = Vector.of_rows(v, self.start, self.components, self.bodies)
         return lanes.map(lambda lane: take(lane, self.indices))
 
     def index(self) -> np.ndarray:
-        """Returns the column numbers, (components, elements)."""
+        """Returns the column number of each velocity component, (components, elements)."""
         component = self.bodies * np.arange(self.components)[:, None]
         return self.start + component + np.asarray(self.indices)
 
@@ -117,7 +121,11 @@ class Jacobian:
         return sorted(groups.items())
 
     def map(self, function: Callable[[Block], Iterable[Vector]]) -> Jacobian:
-        """Returns J with new entries; `function` maps each block to its new rows."""
+        """Returns J with new entries of its blocks.
+
+        Args:
+            function: block → its new rows, one `Vector` for each row of a constraint.
+        """
         return dataclasses.replace(
             self,
             blocks=tuple(dataclasses.replace(x, value=tuple(function(x))) for x in self.blocks),
@@ -156,15 +164,15 @@ class Jacobian:
         return self.pulls(jnp.broadcast_to(identity(like), (len(like), *like.shape)))
 
     def pulls(self, multipliers: Array) -> Array:
-        """Returns Jᵀ λ (n_v, k, …) for k vectors of multipliers λ (n_c, k, …)."""
+        """Returns the products Jᵀ λ, (n_v, k, …), with k multiplier vectors λ, (n_c, k, …)."""
         return add_rhs_axis(self, multipliers.ndim - 2).transpose(multipliers)
 
     def each(self, v: Array) -> Array:
-        """Returns J v (n_c, k, …) for k velocity vectors v (n_v, k, …)."""
+        """Returns the products J v, (n_c, k, …), with k velocity vectors v, (n_v, k, …)."""
         return add_rhs_axis(self, v.ndim - 2).apply(v)
 
     def only(self, kept: np.ndarray, like: Array) -> Jacobian:
-        """Returns J with zeros in all rows outside of a mask.
+        """Returns J with zeros in all rows that a mask does not keep.
 
         Args:
             kept: a mask of the rows that keep their entries, (n_c,).
@@ -250,5 +258,5 @@ class Gathered:
         return jnp.broadcast_to(self.transposed, (len(self.transposed), *like.shape))
 
     def each(self, v: Array) -> Array:
-        """Returns J v (n, k, …) for k velocity vectors v (n_v, k, …)."""
+        """Returns the products J v, (n, k, …), with k velocity vectors v, (n_v, k, …)."""
         return jnp.sum(self.transposed[:, :, None] * v[:, None], axis=0)

@@ -29,7 +29,7 @@ class Factored:
     rounds: int = static(default=1)
 
     def solve(self, right: Array) -> Array:
-        """Returns K⁻¹ b, (n,); differentiated implicitly.
+        """Solves K x = b for x, (n,), with implicit differentiation.
 
         One round of refinement makes the error of each entry small relative to that entry. This
         gives, for example, an accurate acceleration for a light body beside a heavy rotor.
@@ -55,11 +55,12 @@ class Factored:
 def factor(
     matrix: Array, scale: Array, regularization: Array | None = None, rounds: int = 1
 ) -> Factored:
-    """Factors S K S; the scale S on both sides makes pivots comparable across units.
+    """Computes the LU decomposition of S K S, for a matrix K and a diagonal scale S.
 
-    If K may be singular, K + R is factored instead, with a diagonal regularization R. Refinement is
-    then the proximal iteration x ← x + (K + R)⁻¹ (b − K x). Each round multiplies the error along
-    an eigenvector of K by the share of R in K + R. Along the null space of K, x stays zero up to
+    The scale on both sides makes pivots with different units comparable. If K may be singular,
+    K + R is factored in place of K, with a diagonal regularization R. Refinement is then the
+    proximal iteration x ← x + (K + R)⁻¹ (b − K x). Each round multiplies the error along an
+    eigenvector of K by the share of R in K + R. Along the null space of K, x stays zero up to
     rounding.
 
     Args:

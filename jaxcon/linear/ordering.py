@@ -15,7 +15,7 @@ from jaxcon.linear.jacobian import Columns
 
 ORDERS = ("runs", "levels")
 RUN = 6
-"""The smallest number of successive equal nodes for which a loop is better than unrolled code."""
+"""The smallest number of successive equal nodes that are eliminated in a loop."""
 Structure = tuple[tuple[int, int, Columns], ...]
 """The structure of J: (first row, rows per element, columns) for each Jacobian block."""
 
@@ -156,8 +156,8 @@ def plan(structure: Structure, run: int = RUN, order: str = "runs") -> Plan:
 
 
 def _couplings(structure: Structure) -> list[BlockCoupling]:
-    """Returns the couplings of A, one for each pair of Jacobian blocks with common bodies."""
-    touching: dict[tuple[int, int], list[tuple[int, int]]] = {}  # (block, element) of a body
+    """Returns the off-diagonal blocks of A, by pairs of Jacobian blocks with common bodies."""
+    touching: dict[tuple[int, int], list[tuple[int, int]]] = {}  # body: all (block, element)
     pairs: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for b, (_, _, columns) in enumerate(structure):
         for element, body in enumerate(columns.indices):
@@ -187,8 +187,9 @@ def _steps(
 ) -> list[EliminationBatch | EliminationRun]:
     """Splits the elimination order into runs and single nodes.
 
-    A run is a sequence of consecutive elements of one group, each coupled to the next one in the
-    same way, with the same border.
+    A run is a sequence of consecutive elements of one group. Each is coupled to the next element by
+    the same coupling blocks. All of them have the same border: the later neighbors besides the next
+    element.
 
     Args:
         order: the nodes in the order of elimination.
@@ -199,14 +200,19 @@ def _steps(
     """
 
     def link(k: int) -> tuple[int, list[tuple[int, bool]] | None]:
-        """Returns the element stride and the couplings from node k to the next node."""
+        """Describes how the k-th node of the order is linked to the next node.
+
+        Returns:
+            The difference of their element numbers, and their coupling blocks; None for no block.
+        """
         node, following = order[k : k + 2]
         return following.element - node.element, kinds.get((following, node))
 
     def continues(i: int, j: int) -> bool:
-        """Returns True if a run from node i to node j continues with the node after j.
+        """Returns True if a run of the nodes i to j can be extended by the node after j.
 
-        That node must be the next element of the same group, with equal border and couplings.
+        Node j must have the next element of its group as its next neighbor, and the border and
+        coupling blocks of node i.
         """
         node, following = order[j : j + 2]
         same = later[node] == [following, *later[order[i]][1:]] and node.group == following.group
@@ -230,11 +236,11 @@ def _steps(
 def _at_once(
     steps: list[EliminationBatch | EliminationRun],
 ) -> list[EliminationBatch | EliminationRun]:
-    """Merges equal, independent nodes into one step.
+    """Merges steps of single nodes that can be eliminated at once.
 
     A step depends on all earlier steps that update its nodes. Its level is the length of the
-    longest chain of such dependencies. Single nodes merge if their levels, groups and neighbor
-    sizes are equal.
+    longest chain of such dependencies. Steps of single nodes are merged if they have the same level
+    and group, and later neighbors of the same sizes. Runs are not merged.
     """
     waits: dict[EliminationNode, int] = {}
     levels: dict[tuple[Hashable, ...], list[EliminationBatch | EliminationRun]] = {}

@@ -79,14 +79,15 @@ class Lexicographic(checks.Checked, Solver):
 
     Higher levels may leave no freedom to a lower level, as for an arm at the end of its reach. Then
     J_k N loses rank while the target b_k stays, and S_k⁺ grows without bound. Below the highest
-    level, S_k⁺ is therefore damped: two eliminations apply three rounds of (S² + μ²)⁻¹ S each to
-    the residual. Along an eigenvector of the scaled S_k with eigenvalue σ, the fraction
-    (μ² / (σ² + μ²))⁶ of the target is not met.
+    level, S_k⁺ is therefore replaced by three rounds of a damped iteration, with the approximate
+    inverse (S² + μ²)⁻¹ S. The system is solved twice, the second time for the residual. Along an
+    eigenvector of the scaled S_k with eigenvalue σ, the fraction (μ² / (σ² + μ²))⁶ of the target is
+    not met.
 
     The highest level is not damped: the mechanism passes singular positions, and no lower level
-    disturbs it. A damped intermediate level yields slightly to the levels below it. Where its rows
-    are at angles around √μ to rows of higher levels, its error is a few hundredths of the targets
-    of the lower levels.
+    disturbs it. A damped intermediate level yields slightly to the levels below it. If its rows are
+    at angles around √μ to rows of higher levels, its error is a few hundredths of the targets of
+    the lower levels.
 
     Rows with a compliance, such as rows of rotors and soft constraints, can always be satisfied.
     The status is CONFLICT if the rows of one level contradict each other. A level that cannot be
@@ -124,14 +125,17 @@ class Lexicographic(checks.Checked, Solver):
         """Checks the cutoff, the damping and the conflict threshold.
 
         Raises:
-            ValueError: one of them is negative or no number, or `cutoff` or `damping` is infinite.
+            ValueError: a value is negative or no number, or `cutoff` or `damping` is infinite.
         """
         for what in ("cutoff", "damping", "conflict"):
             x, finite = getattr(self, what), what != "conflict"
             checks.check("Priority", what, x, (), least=0, finite=finite, optional=True)
 
     def factor(self, system: Saddle) -> Factored:
-        """Factors A level by level; returns a function (f, b) → `Solution`.
+        """Factors A = J M⁻¹ Jᵀ + C level by level, for repeated solves.
+
+        Returns:
+            A function (f, b) → `Solution`, for forces f, (n_v,), and targets b, (n_c,).
 
         Raises:
             ValueError: a pattern matches no constraint, or rows have no names.
@@ -165,10 +169,10 @@ class Lexicographic(checks.Checked, Solver):
 
 
 class Pivot(NamedTuple):
-    """One level of the block elimination.
+    """One priority level in the block elimination of A = J M⁻¹ Jᵀ + C.
 
     Attributes:
-        inverse: S⁺, the pseudo-inverse of the pivot block; damped below the highest level.
+        inverse: S⁺, the pseudo-inverse of the pivot block S; damped below the highest level.
         coupling: S⁺ times the block of A that couples the level to the levels below it.
         own: A A⁺ of the diagonal block A of this level: the projector onto the right-hand sides
             that the rows of the level can satisfy together.
@@ -228,7 +232,7 @@ def _solve(
     (mass, j, a, scale, pivots), order = factored, np.concatenate(parts)
 
     def substitute(right: Array) -> Array:
-        """Solves A λ = r: eliminates from the highest level down, then substitutes back up."""
+        """Solves A λ = r, by elimination from the highest level down and back substitution."""
         answers = []
         for pivot in pivots:
             n = len(pivot.inverse)
@@ -277,7 +281,7 @@ def pseudoinverse(matrix: Array, cutoff: Array) -> Array:
 
 @jax.custom_jvp
 def resolvent(matrix: Array, cutoff: Array, damping: Array) -> tuple[Array, Array, Array]:
-    """Returns the parts of the resolvent Z = (A + iμ)⁻¹ = E − iN, and A⁺, (n, n) each.
+    """Returns E and N of the resolvent Z = (A + iμ)⁻¹ = E − iN, and A⁺, (n, n) each.
 
     A is symmetric and positive semidefinite, E = A (A² + μ²)⁻¹ and N = μ (A² + μ²)⁻¹. Eigenvalues
     of A up to the cutoff count as zero: their eigenvectors contribute nothing to E, N and A⁺. The
@@ -309,7 +313,7 @@ def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> Any:
     turn = p @ change @ (jnp.eye(len(p), dtype=p.dtype) - p @ matrix)
 
     def turned(x: Array) -> Array:
-        """Returns the term Z A⁺ dA Q + Q dA A⁺ Z of the derivative, for x in place of Z."""
+        """Returns X A⁺ dA Q + Q dA A⁺ X for a symmetric matrix X; see `resolvent`."""
         return x @ turn + (x @ turn).T
 
     de = n @ change @ n - e @ change @ e + turned(e) - 2 * e @ n * dμ

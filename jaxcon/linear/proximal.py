@@ -29,8 +29,8 @@ class RankSafe(checks.Checked, Solver):
     along an eigenvector of the scaled A with eigenvalue σ is (ε / (σ + ε))ᵏ. All rounds share one
     factorization.
 
-    Independent rows are not regularized noticeably. Consistent dependent rows do not change the
-    acceleration, and λ has the least norm in the scaled rows. At singular positions, λ stays
+    The regularization of independent rows is negligible. Consistent dependent rows do not change
+    the acceleration, and λ has the least norm in the scaled rows. At singular positions, λ stays
     finite. Contradictory rows are solved by least squares, with status CONFLICT. The gradient is
     that of the iteration, with W held constant. A scene without closed loops is solved directly.
 
@@ -81,10 +81,13 @@ class RankSafe(checks.Checked, Solver):
         self.solver.check()
 
     def factor(self, system: Saddle) -> Factored:
-        """Factors the system; returns a function (f, b) → `Solution`.
+        """Factors the system for repeated solves.
 
-        With `Sparse` and a diagonal M, all worlds are first solved directly. The iteration runs
-        only if some world has dependent rows, and only changes the solutions of such worlds.
+        With `Sparse` and a diagonal M, all worlds are first solved directly. The proximal iteration
+        runs only if some world has dependent rows, and only changes the solutions of such worlds.
+
+        Returns:
+            A function (f, b) → `Solution`, for forces f, (n_v,), and targets b, (n_c,).
         """
         if not system.target.size or not (system.loops or self.always):
             return self.solver.factor(system)
@@ -95,7 +98,7 @@ class RankSafe(checks.Checked, Solver):
 
         def solve(force: Array, target: Array) -> Solution:
             solution = direct(force, target)
-            # failed worlds count as settled: they must not make the whole batch iterate
+            # failed worlds need no iteration: they must not make the whole batch iterate
             settled = independent | failed(solution.status)
             return jax.lax.cond(
                 everywhere(settled),
@@ -106,10 +109,13 @@ class RankSafe(checks.Checked, Solver):
         return solve
 
     def _iterated(self, system: Saddle) -> Factored:
-        """Prepares the proximal iteration; returns a function (f, b) → `Solution`.
+        """Prepares the proximal iteration for repeated solves.
 
-        The iteration runs twice. A least-squares residual would contribute 1/ε times itself to λ.
-        The second run therefore subtracts the residual of the first run from b.
+        The iteration runs twice. If rows contradict each other, a residual remains, and its 1/ε
+        multiple enters λ. The second run therefore subtracts the residual of the first run from b.
+
+        Returns:
+            A function (f, b) → `Solution`, for forces f, (n_v,), and targets b, (n_c,).
         """
         dtype = system.target.dtype
         share = 1e-9 if jnp.finfo(dtype).bits == 64 else 1e-5
@@ -169,7 +175,12 @@ def proximal(
 
 
 def scaled(system: Saddle, floor: Scalar) -> Array:
-    """Returns the weights of `row_weights`, (n_c,), constant under differentiation."""
+    """Returns the proximal weight of each row, (n_c,), constant under differentiation.
+
+    Args:
+        system: the saddle system.
+        floor: the lower bound on the length of a row; see `row_weights`.
+    """
     return jax.lax.stop_gradient(row_weights(system, floor))
 
 
@@ -208,8 +219,9 @@ def conflicts(
     """Returns the status of each world: CONFLICT if a residual is too large, otherwise OK.
 
     The limit on the residual is its rounding error plus `share` times the size of b and J M⁻¹ f. If
-    `system.noise` is None, the rounding error is estimated from the terms of J M⁻¹ f. The terms are
-    taken before they cancel: gravity does not load a joint between bodies that fall together.
+    `system.noise` is None, the rounding error is estimated from the sum of the absolute terms of
+    J M⁻¹ f. The terms may cancel, as gravity does in a joint between bodies that fall together, but
+    their rounding errors do not.
 
     Args:
         system: the saddle system.
@@ -217,8 +229,8 @@ def conflicts(
         target: b, (n_c,).
         left: the residual b − J a − C λ, (n_c,).
         length: the scale of each row, (n_c,).
-        share: the allowed residual relative to b and J M⁻¹ f; one number for all worlds, or one for
-            each world.
+        share: the allowed residual relative to the size of b and J M⁻¹ f; one number for all
+            worlds, or one for each world.
     """
     free = system.mass.solve(force)
     terms = jnp.abs(target) + jnp.abs(system.jacobian.apply(free))
@@ -232,7 +244,7 @@ def conflicts(
 
 
 def remainder(system: Saddle, target: Array, solution: Solution) -> Array:
-    """Returns the residual b − J a − C λ, (n_c,), for a target b and a solution a, λ."""
+    """Returns the residual b − J a − C λ, (n_c,), of a solution (a, λ) for a target b."""
     moved = system.jacobian.apply(solution.acceleration)
     if system.compliance is not None:
         moved = moved + system.compliance * solution.multipliers

@@ -24,11 +24,12 @@ def implicit(
 ) -> tuple[Array, Any]:
     """Finds a root x of f(x) = 0, with implicit derivatives of every order.
 
-    The tangent equation f′(x) ẋ = y is solved iteratively, by ẋ ← ẋ + P (y − f′(x) ẋ), and its
-    transpose likewise. This converges like the iteration x ← x − P f(x) near the root.
+    The tangent equation f′(x) ẋ = y is solved iteratively, by ẋ ← ẋ + P (y − f′(x) ẋ). The
+    transposed equation is solved in the same way, with Pᵀ. Both converge like the iteration
+    x ← x − P f(x) near the root.
 
     JAX assigns a tangent, possibly zero, to every number that f closes over. If the derivative of f
-    with respect to such a number is infinite, like that of 1/h² at h = 0, a zero tangent gives NaN.
+    with respect to such a number is infinite, as for 1/h² at h = 0, even a zero tangent gives NaN.
     Compute such factors outside of f. If they have no meaningful derivative, stop their gradient
     inside f.
 
@@ -40,8 +41,8 @@ def implicit(
         inverse: the preconditioner y → P y, an approximation of f′(x)⁻¹ y.
         transposed: the transposed preconditioner y → Pᵀ y.
         leading: the number of leading entries of x that are tested for convergence; None for all.
-        prepared: a function that returns `inverse` and `transposed`, called only if a derivative is
-            taken; None to use the two arguments.
+        prepared: a function () → (P, Pᵀ) that is called only if a derivative is taken; None to use
+            the arguments `inverse` and `transposed`.
 
     Returns:
         The root and the auxiliary results.
@@ -84,7 +85,7 @@ def refine(
     spacing = 4 * float(jnp.finfo(x.dtype).eps)
 
     def goes(x: Array, step: Array) -> Array:
-        """Returns a mask of the worlds that have not converged."""
+        """Returns a mask of the worlds whose last step is above the level of rounding."""
         size, moved = (jnp.max(jnp.abs(y[:leading]), axis=0, initial=0) for y in (x, step))
         return (moved > spacing * size + rounding) & ~jnp.asarray(stopped)
 

@@ -68,7 +68,7 @@ class Full:
 
     @property
     def factor(self) -> Array:
-        """The Cholesky factor of M, constant under differentiation; NaN if M is not definite."""
+        """The Cholesky factor of M, without derivative; NaN if M is not positive definite."""
         return jnp.linalg.cholesky(jax.lax.stop_gradient(self.values), symmetrize_input=False)
 
     @property
@@ -150,11 +150,11 @@ class Solution(NamedTuple):
 
 
 Factored = Callable[[Array, Array], Solution]
-"""A function (f, b) → `Solution`, for a factored system with fixed M, J and C."""
+"""A function (f, b) → `Solution` that solves a factored system with fixed M, J and C."""
 
 
 def free_motion(system: Saddle) -> Factored:
-    """Returns a function (f, b) → `Solution` with a = M⁻¹ f, for a system without constraints.
+    """Returns a function (f, b) → `Solution` that computes a = M⁻¹ f, without constraints.
 
     Args:
         system: the saddle system, of which only M is used.
@@ -171,7 +171,7 @@ def free_motion(system: Saddle) -> Factored:
 def factor_per_world(
     factor: Callable[..., Any], solve: Callable[..., Solution], system: Saddle, *args: Any
 ) -> Factored:
-    """Vectorizes a factorization and a substitution of one world over a batch.
+    """Factors a batch of saddle systems by functions that are written for one world.
 
     Args:
         factor: (system, *args) → the factorization, a pytree.
@@ -190,9 +190,9 @@ def factor_per_world(
 
 
 def judge(x: Array, singular: Array | None = None) -> Array:
-    """Returns the status: SINGULAR where `singular` is set, otherwise NON_FINITE or OK.
+    """Returns the status of each world: SINGULAR, NON_FINITE or OK.
 
-    NON_FINITE marks worlds whose solution has a NaN or infinite entry.
+    A world is NON_FINITE if its solution has a NaN or infinite entry. SINGULAR takes precedence.
 
     Args:
         x: the solution, such as a, (n,).

@@ -40,7 +40,11 @@ class Schur(checks.Checked, Solver):
         checks.check("Schur", "tikhonov", self.tikhonov, (), least=0, optional=True)
 
     def factor(self, system: Saddle) -> Factored:
-        """Factors A; returns a function (f, b) → `Solution`."""
+        """Factors A = J M⁻¹ Jᵀ + C for repeated solves.
+
+        Returns:
+            A function (f, b) → `Solution`, for forces f, (n_v,), and targets b, (n_c,).
+        """
         return factor_per_world(_factor, _solve, system, self.tikhonov)
 
 
@@ -49,7 +53,12 @@ Complement = tuple[Mass, Array, Array, Array, Array]
 
 
 def _factor(system: Saddle, tikhonov: Scalar | None) -> Complement:
-    """Factors the Schur complement A of one world."""
+    """Computes and factors the Schur complement A = J M⁻¹ Jᵀ + C of one world.
+
+    Args:
+        system: the saddle system.
+        tikhonov: ε, to factor A + ε diag A instead; None for no regularization.
+    """
     j = system.jacobian.dense()
     a = delassus(system.mass, j, system.compliance)
     rounding = a.shape[0] * float(jnp.finfo(a.dtype).eps) if tikhonov is None else 0.0
@@ -57,15 +66,21 @@ def _factor(system: Saddle, tikhonov: Scalar | None) -> Complement:
         share = jnp.asarray(tikhonov).astype(a.dtype)
         a = a + jnp.diag(jax.lax.stop_gradient(share * jnp.diagonal(a)))
     factor = jnp.linalg.cholesky(jax.lax.stop_gradient(a), symmetrize_input=False)
-    # a squared pivot divided by its diagonal entry is the part of a row that is independent of
-    # earlier rows: 1 for an orthogonal row, rounding for a dependent row
+    # pivot² / A_rr is the share of row r that is independent of earlier rows: 1 if it is orthogonal
+    # to them, and at most rounding if it depends on them
     dependent = ~jnp.all(jnp.diagonal(factor) ** 2 / jnp.diagonal(a) > rounding)
     dependent = dependent & jnp.all(jnp.isfinite(a))
     return system.mass, j, a, factor, dependent | system.mass.singular
 
 
 def _solve(complement: Complement, force: Array, target: Array) -> Solution:
-    """Solves the factored system of one world."""
+    """Solves A λ = b − J M⁻¹ f and M a = f + Jᵀλ of one world, for a factored A.
+
+    Args:
+        complement: the result of `_factor`.
+        force: f, (n_v,).
+        target: b, (n_c,).
+    """
     mass, j, a, factor, singular = complement
     free = mass.solve(force)
     multipliers = jax.lax.custom_linear_solve(

@@ -59,7 +59,7 @@ class Sparse(checks.Checked, Solver):
         """Checks the regularization, the run length and the elimination order.
 
         Raises:
-            ValueError: `tikhonov` or `run` is out of range, or `order` is not known.
+            ValueError: `tikhonov` or `run` is out of range, or `order` is unknown.
         """
         checks.check("Sparse", "tikhonov", self.tikhonov, (), least=0, optional=True)
         checks.count("Sparse", "run", self.run)
@@ -69,7 +69,11 @@ class Sparse(checks.Checked, Solver):
             )
 
     def factor(self, system: Saddle) -> Factored:
-        """Factors A; returns a function (f, b) → `Solution`."""
+        """Factors A = J M⁻¹ Jᵀ + C for repeated solves.
+
+        Returns:
+            A function (f, b) → `Solution`, for forces f, (n_v,), and targets b, (n_c,).
+        """
         if not system.target.size:
             return free_motion(system)
         if not isinstance(system.mass, Diagonal):
@@ -89,7 +93,7 @@ class Sparse(checks.Checked, Solver):
             leaves_out: True to leave dependent rows out; False to give status SINGULAR.
 
         Returns:
-            A function (f, b) → `Solution`, and True if all rows are independent, ().
+            A function (f, b) → `Solution`; and True for each world whose rows are independent, ().
         """
         j, delassus = system.jacobian, Delassus(system, self.tikhonov)
         plan = ordering.plan(structure_of(j), self.run, self.order or suits_device())

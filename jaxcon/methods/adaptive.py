@@ -56,7 +56,10 @@ class AdaptiveBaumgarte(Baumgarte):
         check_gains(owner, {"least": 0, "most": 1}, optional=False, floor=self.floor)
 
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
-        """Returns the rows with the target b of J a + C λ = b, and `noise` for the unscaled β₀."""
+        """Returns the rows with the target b of J a + C λ = b, for the scaled gains.
+
+        The rounding error `noise` of b is computed with the unscaled β₀, so it is an upper bound.
+        """
         return super().constraint_equations(weakened(rows, self.scale(rows)), memory, dt)
 
     def scale(self, rows: Rows) -> Array:
@@ -100,6 +103,8 @@ class SlidingWindowBaumgarte(checks.Checked, Stabilizer):
         τ = (E₂ − E₁)/(E₁ + E₂ + δ²)      trend: E₁, E₂ are mean φ² of the older and newer half
         o = 1 − ‖Σ (φ, δ)‖ / Σ ‖(φ, δ)‖   oscillation: 0 for φ of one sign, 1 for balanced signs
 
+    The sums Σ run over the window.
+
     A growing violation raises β. An oscillating violation lowers β and brings α up to β. Otherwise
     β returns to the rate. τ and o are smooth for δ > 0, and 0 if φ is far below δ. The ratio α/β
     stays between ζ and 1, and β/rate between 1/`reach` and `reach`. β also stays below `margin` ·
@@ -112,7 +117,7 @@ class SlidingWindowBaumgarte(checks.Checked, Stabilizer):
         rate: β at the start [1/s]: a number, an array by row, or a mapping by constraint. If None,
             the integrator's default β, but at most a quarter of the limit.
         damping_ratio: smallest ratio ζ = α/β, from ½ to 1.
-        speed: the largest change η of ln β in a step by trend or oscillation.
+        speed: the largest change η of ln β that a trend or an oscillation causes in one step.
         recovery: decay r of u: a step reduces u by η r u.
         reach: largest factor between β and `rate`: β stays between rate/reach and rate·reach.
         noise: noise level δ, below which φ counts as zero [unit of φ].
@@ -160,11 +165,19 @@ class SlidingWindowBaumgarte(checks.Checked, Stabilizer):
         return History(window, zeros, zeros, jnp.zeros((), q.dtype))
 
     def resolve(self, gains: tuple[Scalar, Scalar]) -> SlidingWindowBaumgarte:
-        """Returns the stabilizer with (α, β) as its `fallback`, unless it already has one."""
+        """Returns the stabilizer with `fallback` set to (α, β) [1/s], unless it is already set."""
         return self if self.fallback is not None else dataclasses.replace(self, fallback=gains)
 
     def cap_gains(self, stable_rate: Callable[[float], Scalar]) -> SlidingWindowBaumgarte:
-        """Returns the stabilizer with a limit, and a default rate of at most a quarter of it."""
+        """Returns the stabilizer with its limit on β and its initial β set.
+
+        A missing `limit` becomes the largest stable β. The default β in `fallback` is reduced to at
+        most a quarter of the limit. It also replaces a missing `rate`.
+
+        Args:
+            stable_rate: function of the smallest damping ratio α/β; returns the largest stable β
+                [1/s].
+        """
         limit: Any = stable_rate(LEAST_RATIO) if self.limit is None else self.limit
         default = jnp.minimum(self.fallback[1], limit / 4)
         rate = default if self.rate is None else self.rate
@@ -200,7 +213,7 @@ class SlidingWindowBaumgarte(checks.Checked, Stabilizer):
         return rate, (margin * limit)[None]
 
     def advance(self, rows: Rows, memory: History, dt: Array) -> History:
-        """Returns the history after a step that began with these rows, with updated gains."""
+        """Appends φ of the rows at the start of a step to the window, and updates the gains."""
         numbers = self.noise, self.reach, self.recovery, self.speed
         δ, reach, r, η = (jnp.asarray(x, rows.bias.dtype)[None] for x in numbers)
         residuals = jnp.concatenate([memory.residuals[1:], rows.residual[None]])
@@ -217,7 +230,11 @@ class SlidingWindowBaumgarte(checks.Checked, Stabilizer):
 
 
 def trend_and_oscillation(residuals: Array, noise: Array) -> tuple[Array, Array]:
-    """Returns the trend τ and the oscillation o of each row over a window, (n_c,) each.
+    """Returns the trend τ and the oscillation o of each row over a window of steps, (n_c,) each.
+
+    τ compares the mean φ² of the older and the newer half of the window: it is 0 for no change, and
+    near 1 for strong growth. o is 0 if φ keeps its sign, and near 1 if positive and negative φ
+    cancel.
 
     Args:
         residuals: residuals φ, the newest last, (window, n_c).

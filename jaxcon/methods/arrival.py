@@ -23,12 +23,14 @@ End = TypeVar("End")
 class Bracket(NamedTuple):
     """A time interval in which a gap closes, for each world.
 
+    Times are counted from the start of the part of the step.
+
     Attributes:
         happens: True where a gap closes within the part of the step, ().
         low, high: times before and after the closing, ().
         here: estimate of the closing time, ().
-        before, gap: the time of the last evaluation, and the smallest gap of an open row at that
-            time, ().
+        before, gap: the time at which gaps were last evaluated, and the smallest gap of an open row
+            at that time, ().
         row: the index of the row with this smallest gap, ().
     """
 
@@ -43,15 +45,17 @@ class Bracket(NamedTuple):
 
 @dataclass(frozen=True)
 class ArrivalSearch:
-    """Finds the first time at which the gap of an open row closes.
+    """Finds the first time in a part of a step at which the gap of an open row closes.
+
+    A row is open if it does not rest in contact at the start of the part.
 
     Attributes:
-        gaps: function of a length s that returns the gaps φ after a part of the step of this
-            length, (n,).
-        forecast: forecast of the rows at the start of the part.
-        length: the largest length s, ().
+        gaps: function s → the gaps φ, (n,), at the time s after the start of the part.
+        forecast: gaps and rates of the rows at the start of the part.
+        length: the length of the part, the largest s, ().
         wanted: mask of the worlds to search, ().
-        tries: number of evaluations of `gaps` after the first, which is at the end of the part.
+        tries: the largest number of evaluations of `gaps` after the first one, which is at the end
+            of the part.
     """
 
     gaps: Callable[[Array], Array]
@@ -61,7 +65,10 @@ class ArrivalSearch:
     tries: int
 
     def run(self) -> Bracket:
-        """Returns the bracket of each world; if no gap closes, it ends at the end of the part."""
+        """Returns the final bracket of each world, with the estimate of the closing time.
+
+        In worlds in which no gap closes, the estimate is the end of the part.
+        """
         zero, none = jnp.zeros_like(self.length), jnp.zeros(self.wanted.shape, bool)
         row = jnp.zeros(self.wanted.shape, jnp.int32)
         unknown = Bracket(none, zero, self.length, self.length, self.length, zero + jnp.inf, row)
@@ -79,14 +86,22 @@ class ArrivalSearch:
         return jax.lax.scan(once, unknown, jnp.arange(self.tries + 1) == 0)[0]
 
     def _off(self, bracket: Bracket) -> Array:
-        """Returns True where the smallest gap exceeds the rounding error, ()."""
+        """Returns True for each world whose search must go on, ().
+
+        In such a world a gap closes, but the smallest gap at the last evaluation is not zero to
+        rounding.
+        """
         return bracket.happens & (jnp.abs(bracket.gap) > self.forecast.rounding / 16)
 
     def _at_end(self, ends: Array) -> Bracket:
-        """Returns the first bracket, from the gaps at the end of the part, (n,).
+        """Returns the first bracket, from the gaps at the end of the part.
 
-        Each row whose gap ends below zero would close at some time if its φ were a parabola in s.
-        The estimate is the earliest of these times.
+        A parabola φ(s) is fitted to each row whose gap is negative at the end. It has the gap and
+        rate of the row at the start, and the gap at the end. The estimate of the closing time is
+        the earliest zero of these parabolas. It is 0 if a gap is zero and closing at the start.
+
+        Args:
+            ends: the gaps at the end of the part, (n,); infinite for rows that are not open.
         """
         arriving, start, rate = self.forecast.arriving, self.forecast.gap, self.forecast.rate
         at_once = jnp.any(arriving, axis=0)
@@ -104,7 +119,15 @@ class ArrivalSearch:
         return Bracket(happens, jnp.zeros_like(here), self.length, here, self.length, gap, row)
 
     def _nearer(self, bracket: Bracket, gaps: Array) -> Bracket:
-        """Returns the bracket narrowed by one evaluation, and its next estimate."""
+        """Returns the bracket narrowed by the gaps at its estimate, with a new estimate.
+
+        The new estimate is the zero of the secant through the last two gaps. If this zero lies
+        outside of the bracket, the new estimate is the middle of the bracket.
+
+        Args:
+            bracket: the bracket so far.
+            gaps: the gaps at the time `bracket.here`, (n,); infinite for rows that are not open.
+        """
         here, (gap, row) = bracket.here, nearest(gaps)
         low = jnp.where(gap > 0, here, bracket.low)
         high = jnp.where(gap > 0, bracket.high, here)
@@ -116,15 +139,15 @@ class ArrivalSearch:
 
 
 def nearest(gaps: Array) -> tuple[Array, Array]:
-    """Returns the smallest gap over the rows and the index of its row, for each world."""
+    """Returns the smallest of the gaps (n,) and the index of its row, for each world."""
     return jnp.min(gaps, axis=0), jnp.argmin(gaps, axis=0).astype(jnp.int32)
 
 
 @dataclass(frozen=True)
 class Arrival(Generic[Start, End]):
-    """Evaluates a flow at the time s at which a gap closes, with the derivative of s.
+    """Evaluates y = F(x, s) at the time s at which a gap φ closes, with the derivative of s.
 
-    With y = F(x, s) and φ(x, y) = 0,
+    The derivatives follow from y = F(x, s) and φ(x, y) = 0:
 
         ẏ = ∂F ẋ + F′ ṡ,    ṡ = −Dφ(ẋ, ∂F ẋ)/Dφ(0, F′),    ∂F = ∂F/∂x,  F′ = ∂F/∂s,
 
@@ -132,15 +155,15 @@ class Arrival(Generic[Start, End]):
     is at most `least`, as at a grazing contact, s has no derivative, and ṡ is set to zero.
 
     Attributes:
-        flow: function F(x, s) → y, for each world.
-        gap: gap φ(x, y) → ().
+        flow: function (x, s) → y = F(x, s), for each world.
+        gap: function (x, y) → the gap φ, ().
     """
 
     flow: Callable[[Start, Array], End]
     gap: Callable[[Start, End], Array]
 
     def __call__(self, x: Start, time: Array, closes: Array, least: Array) -> tuple[End, Array]:
-        """Evaluates the flow; returns (y, s).
+        """Returns y = F(x, s) and s, both with derivatives.
 
         Args:
             x: argument x of the flow.
@@ -169,7 +192,10 @@ class Arrival(Generic[Start, End]):
             late = -numerics.safe_divide(φ̇, jnp.where(steep, closing, 0))
 
             def along(ẏ: Array, slope: Array) -> Array:
-                """Returns the tangent ẏ + F′ ṡ of the flow's result; integer leaves keep float0."""
+                """Returns the tangent of one leaf of y: `ẏ` plus `slope` times the change of s.
+
+                Integer leaves have tangents of dtype float0, which stay as they are.
+                """
                 return ẏ if ẏ.dtype == jax.dtypes.float0 else ẏ + slope * expand_like(late, slope)
 
             return (y, s), (jax.tree.map(along, ẏ, slope), ṡ + late)

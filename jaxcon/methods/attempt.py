@@ -27,10 +27,9 @@ def attempt(
     dt: Array,
     part: StepPart | None = None,
 ) -> tuple[tuple[State, StepInfo], Array]:
-    """Makes a step, or a part of it. Returns (new state, info) and the status of this step alone.
+    """Makes a step, or a part of it, with angles reduced by whole turns.
 
-    The step computes with angles reduced by whole turns, since small floating-point numbers are
-    more accurate.
+    Reduced angles have smaller rounding errors. The new state has its whole turns again.
 
     Args:
         system: the system to step.
@@ -39,6 +38,9 @@ def attempt(
         control: control input u, as arrays.
         dt: step size h, () [s].
         part: the part to advance if the step is split at impacts; None for the whole step.
+
+    Returns:
+        ((new state, info of the step), status of this step alone).
     """
     turning, q = with_turns(system, state.turns, state.angle_remainder).unwind(state.q)
     start = dataclasses.replace(state, q=q)
@@ -58,7 +60,7 @@ def attempt(
 
 
 def _rewound(system: System, given: State, after: State) -> State:
-    """Returns the state after a step with its whole turns restored.
+    """Returns the state after a step, with whole turns added to its angles.
 
     Args:
         system: the system of both states.

@@ -19,7 +19,10 @@ from jaxcon.protocols import Solver, Stabilizer, System
 from jaxcon.system.state import State
 
 SHARE = 5e-4
-"""The largest noise β² ε of rising default feedback, as a fraction of a constraint's Σ|γ_i|."""
+"""The largest rounding noise β² ε that `RisingBaumgarte` allows.
+
+It is a fraction of Σ|γ_i| over the rows of a constraint.
+"""
 
 
 @pytree
@@ -27,7 +30,7 @@ class Unstabilized(checks.Checked, Stabilizer):
     """No feedback, b = −γ: constraints hold at acceleration level only, and errors grow."""
 
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
-        """Returns the rows with the target b = −γ of J a + C λ = b."""
+        """Returns the rows with the target b = −γ of J a + C λ = b, where φ̈ = J a + γ."""
         return rows.with_target(-rows.bias)
 
 
@@ -47,8 +50,8 @@ class Baumgarte(checks.Checked, Stabilizer):
     in place of φ̇, where q⁻ and φ⁻ are q and φ one step before. The reason: v leads from q⁻ to q,
     so it belongs to the time h/2 before q. At that time the rate of the constraint is p. Feedback
     of φ̇ would drive φ̇ to zero although it should be ½hγ. This would do work on the motion: energy
-    would grow in proportion to h, and φ would have an error of h²γ/2. Velocity-level rows are fed
-    back at q itself.
+    would grow in proportion to h, and φ would have an error of h²γ/2. The feedback of
+    velocity-level rows acts on ψ at q itself.
 
     Default gains suit the integrator at the step size in use. For semi-implicit Euler they are
     proportional to 1/h. For Runge–Kutta methods they have a bound that does not depend on h. The
@@ -108,22 +111,25 @@ class Baumgarte(checks.Checked, Stabilizer):
         return type(self) is Baumgarte and self.alpha is self.beta is self.fallback is None
 
     def rising(self, limit: Scalar) -> Baumgarte:
-        """Returns a `RisingBaumgarte` if all gains are defaults; otherwise returns itself."""
+        """Returns `RisingBaumgarte(limit=limit)` if no gain is given; otherwise returns itself."""
         return RisingBaumgarte(limit=limit) if self.is_default else self
 
     def steady(self, gains: tuple[Scalar, Scalar]) -> Baumgarte:
-        """Returns the stabilizer with default gains (α, β) [1/s]; given gains do not change."""
+        """Returns a copy with `fallback` = (α, β) [1/s] if no gain is given; otherwise itself."""
         return dataclasses.replace(self, fallback=gains) if self.is_default else self
 
     def resolve(self, gains: tuple[Scalar, Scalar]) -> Self:
-        """Returns the stabilizer with (α, β) [1/s] for gains that are not given."""
+        """Returns the stabilizer with each missing gain replaced by its default.
+
+        The defaults are the field `fallback` if it is set, otherwise `gains`, (α, β) [1/s].
+        """
         fallback = gains if self.fallback is None else self.fallback
         alpha = fallback[0] if self.alpha is None else self.alpha
         beta = fallback[1] if self.beta is None else self.beta
         return dataclasses.replace(self, alpha=alpha, beta=beta, fallback=fallback)
 
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
-        """Returns the rows with the target b of J a + C λ = b, and the rounding error of b."""
+        """Returns the rows with the target b = −γ − 2α φ̇ − β² φ, and the rounding error of b."""
         alpha, beta = self.gains(rows)
         noise = 64 * float(jnp.finfo(rows.bias.dtype).eps) * beta * beta
         b = -rows.bias - 2 * alpha * rows.rate - beta * beta * rows.residual
@@ -137,12 +143,13 @@ class Baumgarte(checks.Checked, Stabilizer):
 
 @pytree
 class RisingBaumgarte(Baumgarte):
-    """Default gains, limited by rounding errors, that rise if constraints accelerate fast.
+    """Feedback with small default gains, which rise if constraints accelerate fast.
 
-    The rounding error ε of φ [m] causes a spurious acceleration β² ε. β rises until this
-    acceleration is 5e-4 of Σ|γ_i| over the rows of the constraint. If a body turns at ω [rad/s], γ
-    is ω² times the lever arm. If β were only a few times ω, errors of the steps would add up, and
-    energy would drift by percents.
+    The rounding error ε of φ [m] causes a spurious acceleration β² ε. The default β is therefore
+    small for slow motions. It rises until the spurious acceleration is 5e-4 of Σ|γ_i| over the rows
+    of the constraint, where γ is the part of φ̈ without accelerations. If a body turns at
+    ω [rad/s], γ is ω² times the lever arm. If β were only a few times ω, errors of the steps would
+    add up, and energy would drift by percents.
 
     Attributes:
         limit: the largest β [1/s].
@@ -164,8 +171,7 @@ class RisingBaumgarte(Baumgarte):
 class Wrapper(Stabilizer):
     """A stabilizer around an inner one, to which it forwards all methods that it does not override.
 
-    `completes` is not forwarded: it assumes the constraint forces for b = −γ, which a wrapper with
-    constraint equations of its own changes.
+    `completes` is not forwarded. It presumes the target b = −γ, but a wrapper may choose another b.
 
     Attributes:
         inner_field: name of the field that has the inner stabilizer.
@@ -192,18 +198,18 @@ class Wrapper(Stabilizer):
 
     @property
     def remembers(self) -> bool:
-        """True if the stabilizer or its inner one has a memory."""
+        """True if this stabilizer or the inner one has a memory."""
         return type(self).init is not Wrapper.init or self.inner.remembers
 
     def solve(
         self, solver: Solver, rows: Rows, memory: Any, dt: Array, system: Saddle
     ) -> Solution | None:
-        """Returns the inner stabilizer's solution; None if the method's solver is to be used."""
+        """Returns the solution by the inner stabilizer; None to use the solver of the method."""
         return self.inner.solve(solver, rows, memory, dt, system)
 
     @property
     def solves(self) -> bool:
-        """True if the stabilizer or its inner one solves the saddle system by itself."""
+        """True if this stabilizer or the inner one solves the saddle system by itself."""
         return type(self).solve is not Wrapper.solve or self.inner.solves
 
     def correct(
@@ -224,28 +230,33 @@ class Wrapper(Stabilizer):
         return self.inner.corrects
 
     def resolve(self, gains: tuple[Scalar, Scalar]) -> Self:
-        """Returns the stabilizer with (α, β) [1/s] for gains that the inner one does not give."""
+        """Returns a copy whose inner stabilizer has (α, β) [1/s] in place of missing gains."""
         return self.with_inner(self.inner.resolve(gains))
 
     def rising(self, limit: Scalar) -> Self:
-        """Returns the stabilizer with inner default gains that rise up to β = limit [1/s]."""
+        """Returns a copy whose inner default gains may rise up to β = limit [1/s]."""
         return self.with_inner(self.inner.rising(limit))
 
     def steady(self, gains: tuple[Scalar, Scalar]) -> Self:
-        """Returns the stabilizer with inner default gains (α, β) [1/s], which do not rise."""
+        """Returns a copy whose inner default gains are (α, β) [1/s] and do not rise."""
         return self.with_inner(self.inner.steady(gains))
 
     def cap_gains(self, stable_rate: Callable[[float], Scalar]) -> Self:
-        """Returns the stabilizer with inner rates β of at most stable_rate(smallest α/β) [1/s]."""
+        """Returns a copy whose inner stabilizer has gains below the largest stable β.
+
+        Args:
+            stable_rate: function of the smallest damping ratio α/β of the gains; returns the
+                largest stable β [1/s].
+        """
         return self.with_inner(self.inner.cap_gains(stable_rate))
 
     def with_inner(self, inner: Stabilizer) -> Self:
-        """Returns the stabilizer with another inner stabilizer."""
+        """Returns a copy with another inner stabilizer."""
         return dataclasses.replace(self, **{self.inner_field: inner})
 
 
 def weakened(rows: Rows, factor: Array) -> Rows:
-    """Returns the rows with r² φ and r φ̇: feedback then acts as if its gains were r α and r β.
+    """Returns the rows with φ scaled by r² and φ̇ by r: feedback then has the gains r α and r β.
 
     Args:
         rows: the linearized constraints, with φ, φ̇, J and γ.
@@ -274,6 +285,6 @@ def check_stabilizer(owner: str, what: str, part: Any) -> None:
 
 
 def asks_nothing(stabilizer: Stabilizer) -> bool:
-    """Returns True for a stabilizer without gains, which integrators like RATTLE accept."""
+    """Returns True if a stabilizer has no gains, so that integrators like RATTLE accept it."""
     default = type(stabilizer) is Baumgarte and stabilizer.alpha is stabilizer.beta is None
     return default or type(stabilizer) is Unstabilized

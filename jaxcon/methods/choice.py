@@ -30,7 +30,10 @@ PROGRAM = 30_000
 HELD = 4e9
 """The most memory that the matrices of all worlds may need [B]."""
 SURE = 20.0
-"""Elimination is taken up to this multiple of the cost of iterations, which may not converge."""
+"""The largest cost of elimination, as a multiple of the cost of iterations.
+
+Elimination is preferred up to this cost, since iterations may not converge.
+"""
 LONG = 80
 """The largest length of text that `brief` prints; a longer part is printed as its class."""
 
@@ -66,7 +69,7 @@ class Facts:
         dependent: the number of linearly dependent rows in this state; None if not tested.
         diagonal: True if M is diagonal.
         structure: sparsity of J.
-        bounded: the number of inequality rows; each needs a solve with the factors.
+        bounded: the number of inequality rows; each needs one more solve with the factored matrix.
     """
 
     rows: int
@@ -112,7 +115,14 @@ def choose(
 
 
 def look(system: System, state: State, dependent: int | None = None) -> Facts:
-    """Returns the properties of a system at a state; `dependent` is tested unless it is given."""
+    """Returns the properties of a system on which the choice of a solver depends.
+
+    Args:
+        system: the system.
+        state: the state of one world, not traced.
+        dependent: the number of linearly dependent rows in this state. If None, rows are counted
+            for systems without loops and with at most `LOOKED` rows.
+    """
     rows: Rows = jax.eval_shape(linearize, system, state.q, state.v, state.instant)
     layout = rows.layout
     if dependent is None and not layout.loops and 0 < layout.size <= LOOKED:
@@ -131,7 +141,12 @@ def look(system: System, state: State, dependent: int | None = None) -> Facts:
 
 
 def weigh(facts: Facts, order: str) -> dict[str, Effort]:
-    """Returns the effort of each applicable solver, by its name."""
+    """Estimates the effort of each solver that can be used; returns it by the solver's name.
+
+    Args:
+        facts: properties of the system.
+        order: the order of elimination, "runs" or "levels".
+    """
     solves, efforts = 1 + facts.bounded, {}
     n_v, n_c = facts.velocities, facts.rows
     if facts.diagonal:
@@ -149,13 +164,13 @@ def weigh(facts: Facts, order: str) -> dict[str, Effort]:
 def _inner(
     facts: Facts, efforts: dict[str, Effort], width: int, order: str | None, place: str
 ) -> tuple[Solver, str]:
-    """Returns the solver for linearly independent rows, and the reason for it in words.
+    """Returns the solver that suits linearly independent rows, and the reason in words.
 
     Args:
         facts: properties of the system.
         efforts: effort of each solver, by its name.
         width: memory of one number per world, summed over all worlds [B].
-        order: the order of elimination, "runs" or "levels"; None for the one that suits the device.
+        order: the order of elimination, "runs" or "levels"; None for the device's default.
         place: the platform: "cpu", "gpu" or "tpu".
     """
     swept = efforts.get("ConjugateGradients")
@@ -188,7 +203,12 @@ def _inner(
 
 
 def _safe(facts: Facts, inner: Solver) -> tuple[Solver, str]:
-    """Returns the solver for rows that may be linearly dependent, and the reason for it."""
+    """Returns `inner`, wrapped in `RankSafe` if dependent rows need it, and the reason in words.
+
+    Args:
+        facts: properties of the system.
+        inner: the solver that suits linearly independent rows.
+    """
     rows = several(facts.rows, "row")
     count = "" if facts.dependent is None else f", and {facts.dependent or 'none'} do here"
     if not facts.loops and not facts.dependent:
@@ -217,7 +237,10 @@ def innermost(solver: Solver) -> Solver:
 
 
 def brief(part: object) -> str:
-    """Returns a part of a method as Python code without defaults; if too long, only its class."""
+    """Returns a part of a method as Python code, without arguments that are defaults.
+
+    If the code is too long or has traced numbers, only the class is named: `Class(…)`.
+    """
     name = f"{type(part).__name__}(…)"
     if not dataclasses.is_dataclass(part) or not checks.is_concrete(cast(Any, part)):
         return checks.shortened(part) if isinstance(part, int | float) else name

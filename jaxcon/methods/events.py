@@ -52,7 +52,7 @@ class Impacts:
 
 @pytree
 class Events(checks.Checked):
-    """Splits a step at the time of an impact with a hard stop, rope or contact.
+    """Splits a step at the time of an impact on a hard stop, rope or contact.
 
     A row is open if its gap is not closed at the start of the step. Let F(x, s) be the method's
     step of length s in which open rows do not act. The step is split at the first time s* at which
@@ -60,18 +60,19 @@ class Events(checks.Checked):
 
         φ(F(x, s*)) = 0,    x⁺ = x⁻ ⊕ M⁻¹Jᵀ Λ(x⁻),  x⁻ = F(x, s*),    then F(x⁺, h − s*)
 
-    An impact takes no time. Its impulses Λ obey the laws of plain stepping for all touching rows at
-    once: φ̇⁺ ≥ −e φ̇⁻, friction, and a cap on energy. Joints respond by impulses. In this way a
-    step keeps the order of its integrator across an impact.
+    Here x is the state, and ⊕ adds a change of velocity. An impact takes no time. Its impulses Λ
+    obey the laws of a step without `Events`, for all touching rows at once: φ̇⁺ ≥ −e φ̇⁻ with the
+    coefficient of restitution e, friction, and a cap on energy. Joints respond by impulses. In this
+    way a step keeps the order of its integrator across an impact.
 
     The derivative of a step includes the derivative of the impact time, ∂s* = −∂φ/φ̇, by implicit
-    differentiation: the term of a saltation matrix. First derivatives are exact for the computed
-    step if φ̇ is more than a rounding error. At a grazing contact the time has no derivative, and
-    zero is used. Second derivatives through an impact are finite, but wrong.
+    differentiation. This is the term that a saltation matrix adds. First derivatives are exact for
+    the computed step if φ̇ is more than a rounding error. At a grazing contact the time has no
+    derivative, and zero is used. Second derivatives through an impact are finite, but wrong.
 
-    After `splits` impacts, the remaining time is advanced by a plain step. If a joint would cross
-    the whole range between two elastic stops in this time, the world ends with the status
-    `LOST_IMPACTS`.
+    After `splits` impacts, the remaining time is advanced by a plain step, without a split. If a
+    joint would cross the whole range between two elastic stops in this time, the world ends with
+    the status `LOST_IMPACTS`.
 
     Rows at rest act as in plain steps. A row is at rest if its gap is at most ½ h² |J||a| and its
     speed at most ½ h |J||a|, the changes that accelerations cause in a step. A ball that bounces
@@ -103,7 +104,7 @@ class Events(checks.Checked):
     slips: bool = static(default=False)
 
     def check(self) -> None:
-        """Checks the numbers of splits and iterations, and the flag.
+        """Checks `splits`, `iterations` and `slips`.
 
         Raises:
             ValueError: `splits` or `iterations` is not a positive integer, or `slips` is not a
@@ -116,7 +117,7 @@ class Events(checks.Checked):
     def attempt(
         self, system: System, method: Method, state: State, control: PyTree, dt: Array
     ) -> tuple[tuple[State, StepInfo], Array]:
-        """Makes a step, split at impacts. Returns (new state, info) and the status of this step.
+        """Makes a step that is split at impacts.
 
         Args:
             system: the system to step.
@@ -124,6 +125,9 @@ class Events(checks.Checked):
             state: state at the start of the step.
             control: control input u, as arrays.
             dt: step size h, () [s].
+
+        Returns:
+            ((new state, info of the step), status of this step alone).
         """
         if not has_ends(with_turns(system, state.turns), state.q, state.v, state.time, control, dt):
             return attempt(system, method, state, control, dt)
@@ -162,7 +166,13 @@ class Events(checks.Checked):
 
 
 class EventImpact(NamedTuple):
-    """One impact: True if it happened, its time [s] and the index of its row, () each."""
+    """The impact that may end a part of a step.
+
+    Attributes:
+        happened: True if an impact ended the part, ().
+        time: time of the end of the part, () [s].
+        row: index of the row whose closing gap caused the impact, (); 0 without an impact.
+    """
 
     happened: Array
     time: Array
@@ -170,7 +180,12 @@ class EventImpact(NamedTuple):
 
 
 class Impulses(NamedTuple):
-    """Impulses ∫λ dt of inequality rows, (n,), with `residual` and `kept` of `Reactions`."""
+    """Impulses of inequality rows during a part of a step, or in an impact.
+
+    Attributes:
+        multipliers: impulses ∫λ dt, (n,) [N s, N m s].
+        residual, kept, direction: the fields of `Reactions` with these names.
+    """
 
     multipliers: Array
     residual: Array
@@ -179,11 +194,11 @@ class Impulses(NamedTuple):
 
 
 class Passed(NamedTuple):
-    """The result of advancing by a part of a step.
+    """The result of a part of a step.
 
     Attributes:
         state: state at the end of the part.
-        seen: `StepInfo` at the start of the part.
+        seen: `StepInfo` at the start of the part, without reactions.
         code: status of the part.
         impulses: impulses of the inequality rows during the part.
     """
@@ -217,7 +232,7 @@ class SplitProgress(NamedTuple):
     direction: Array | None
 
     def beyond(self, impulses: Impulses) -> SplitProgress:
-        """Returns the progress with the impulses of another part or impact added."""
+        """Returns the progress with the impulses of one more part or impact added."""
         direction = impulses.direction
         if direction is not None and self.direction is not None:
             direction = jnp.where(impulses.multipliers == 0, self.direction, direction)
@@ -245,12 +260,12 @@ class World:
 
     @property
     def events(self) -> Events:
-        """The options of the split."""
+        """The options by which the step is split: `Method.events`."""
         assert self.method.events is not None
         return self.method.events
 
     def part(self, state: State, part: StepPart) -> Passed:
-        """Advances by a part of the step; the result has the memory after the whole step."""
+        """Advances a state by a part of the step, but its memory by the whole step."""
         (new, info), code = attempt(self.system, self.method, state, self.control, self.dt, part)
         reactions = info.reactions
         impulses = Impulses(
@@ -262,7 +277,7 @@ class World:
         return Passed(new, dataclasses.replace(info, reactions=None), code, impulses)
 
     def rows(self, state: State) -> BoundRows:
-        """Returns the inequality rows at a state."""
+        """Returns the inequality rows, linearized at a state."""
         system = with_turns(self.system, state.turns, state.angle_remainder)
         here = state.q, state.v, state.instant
         return linearize_bounds(system, *here, self.control, self.dt)
@@ -275,13 +290,17 @@ class World:
         return dynamics, dynamics.contact
 
     def forecast(self, state: State) -> ContactForecast:
-        """Forecasts the inequality rows from a state on."""
+        """Returns the gaps and rates at a state from which later impacts are predicted."""
         dynamics, response = self.dynamics(state)
         free = response.without(dynamics, state.q, state.v, state.instant)
         return forecast(self.rows(state), free, state.q, self.dt, self.events.slips)
 
     def clearances(self, forecast: ContactForecast, passed: Passed) -> Array:
-        """Returns the gaps (n,), then h times the slips (contacts,), at the end of a part."""
+        """Returns the numbers at the end of a part whose zeros end it: gaps and slips.
+
+        The gaps of all rows, (n,), come first. If the end of sliding is predicted, h times the
+        remaining slip of each contact is appended, (contacts,).
+        """
         rows = self.rows(passed.state)
         if forecast.sliding is None:
             return rows.gap
@@ -291,7 +310,17 @@ class World:
     def go(
         self, progress: SplitProgress, awaited: Array
     ) -> tuple[SplitProgress, tuple[StepInfo, EventImpact]]:
-        """Advances to the next impact if `awaited` is True, otherwise to the end of the step."""
+        """Advances to the next impact if `awaited` is True, otherwise to the end of the step.
+
+        Worlds that have finished the step do not change.
+
+        Args:
+            progress: the progress of the step so far.
+            awaited: True if another impact may split the step, ().
+
+        Returns:
+            The new progress; and a pair (info at the start of the part, impact that ends it).
+        """
         state, active = progress.state, progress.active
         length = jnp.where(active, progress.left, self.dt / 2)  # unused, but valid, if finished
         still, at, most = jax.lax.stop_gradient((self, state, length))
@@ -330,7 +359,7 @@ Given = tuple[World, State, ContactForecast, Array, Array]
 
 
 def flow(given: Given, s: Array) -> Passed:
-    """Returns F(x, s), the result of advancing by a part of the step of length s."""
+    """Returns F(x, s) for x = `given`: the result of a part of the step of length s."""
     world, state, forecast, awaited, _ = given
     return world.part(state, StepPart(s, forecast.open, awaited))
 
@@ -343,7 +372,7 @@ def gap_of(given: Given, passed: Passed) -> Array:
 
 
 def chosen(row: Array, like: Array) -> Array:
-    """Returns a mask, (n,), that is True at the row with the given index."""
+    """Returns a mask of the n rows of `like` that is True at the index `row`, (n,)."""
     rows = jnp.arange(len(like), dtype=row.dtype)
     return rows.reshape(-1, *(1,) * row.ndim) == row[None]
 
@@ -351,7 +380,7 @@ def chosen(row: Array, like: Array) -> Array:
 def strike(
     world: World, state: State, struck: ImpactSet, direction: Array | None
 ) -> tuple[Array, Impulses]:
-    """Returns the velocity change Δv of an impact, (n_v,), and its impulses."""
+    """Returns the velocity change Δv, (n_v,), and the impulses of an impact on rows `struck`."""
     dynamics, response = world.dynamics(state)
     jump, reactions = response.impact(dynamics, state.q, state.v, state.instant, struck)
     return jump, Impulses(
@@ -362,6 +391,6 @@ def strike(
 def no_strike(
     world: World, state: State, struck: ImpactSet, direction: Array | None
 ) -> tuple[Array, Impulses]:
-    """Returns a zero velocity change, (n_v,), and zero impulses, if there is no impact."""
+    """Replaces `strike` if there is no impact: returns Δv = 0, (n_v,), and zero impulses."""
     none, zero = jnp.zeros_like(struck.forecast.gap), jnp.zeros_like(state.time)
     return jnp.zeros_like(state.v), Impulses(none, zero, zero + 1, direction)

@@ -99,7 +99,11 @@ def rows_of(layout: RowLayout, names: Iterable[str]) -> np.ndarray:
 
 
 def named(gain: Gain | None, layout: RowLayout, owner: str) -> np.ndarray:
-    """Returns a mask of the rows that a gain applies to, (n_c,); without names, all but rotors."""
+    """Returns a mask of the rows that a gain applies to, (n_c,).
+
+    A mapping applies to the constraints that it names. Any other gain applies to all rows except
+    those of rotors.
+    """
     if not isinstance(gain, Mapping):
         return layout.holds
     matches = keyed(gain, layout.names, owner).values()
@@ -107,17 +111,17 @@ def named(gain: Gain | None, layout: RowLayout, owner: str) -> np.ndarray:
 
 
 def column(mask: np.ndarray, rows: Rows) -> np.ndarray:
-    """Returns a mask of rows, (n_c,), with singleton axes appended for the batch."""
+    """Returns a mask of rows, (n_c,), with an axis of size 1 appended for each batch axis."""
     return mask.reshape(-1, *(1,) * (rows.bias.ndim - 1))
 
 
 def zeros_by_row(system: System, q: Array, v: Array) -> Array:
-    """Returns a zero for each equality row of a system, (n_c,)."""
+    """Returns zeros, one for each equality row of a system, (n_c,)."""
     return jnp.zeros(layout_of(system, q, v, jnp.zeros((), q.dtype)).size, q.dtype)
 
 
 def sums(x: Array, layout: RowLayout) -> Array:
-    """Returns Σ x_i over the rows of each constraint, repeated for each of its rows, (n_c,)."""
+    """Returns, for each row, the sum of x over all rows of its constraint, (n_c,)."""
     lanes: list[Array] = []
     place = 0
     while place < len(layout.entries):
@@ -128,7 +132,7 @@ def sums(x: Array, layout: RowLayout) -> Array:
 
 
 def squares(x: Array, layout: RowLayout) -> Array:
-    """Returns ‖x‖² over the rows of each constraint, repeated for each of its rows, (n_c,).
+    """Returns, for each row, the sum of x² over all rows of its constraint, (n_c,).
 
     The result is smooth at x = 0.
     """

@@ -1,7 +1,8 @@
 """Generalized-α: an implicit second-order integrator for stiff forces and extreme mass ratios.
 
-The equations φ = 0 and ψ = 0 of a step are divided by κβh² and κγh with κ = ∂a⁺/∂v̇⁺, so that their
-residuals are accelerations. For every h, Newton's matrix then has the form of a saddle system,
+The equations φ = 0 and ψ = 0 of a step are divided by κβh² and κγh, so that their residuals are
+accelerations. Here β and γ are coefficients of the integrator, a is the averaged acceleration, and
+κ = ∂a⁺/∂v̇⁺. For every h, Newton's matrix then has the form of a saddle system,
 
     [ M − κγh ∂f/∂v − κβh² ∂(f + Jᵀλ)/∂q   −Jᵀ ]
     [ J                                      C ],
@@ -72,7 +73,12 @@ class LastStep:
 
 
 class Scheme(NamedTuple):
-    """The coefficients of a step of length h, each with a leading singleton axis, (1, …)."""
+    """The coefficients of a step of length h, each with a leading axis of size 1, (1, …).
+
+    Attributes:
+        alpha_m, alpha_f, beta, gamma: the coefficients α_m, α_f, β and γ of Chung and Hulbert.
+        dt: the step size h [s].
+    """
 
     alpha_m: Array
     alpha_f: Array
@@ -82,7 +88,7 @@ class Scheme(NamedTuple):
 
     @classmethod
     def of(cls, rho: Array, dt: Array) -> Scheme:
-        """Returns the coefficients with spectral radius ρ at infinite frequency.
+        """Returns the coefficients for which the spectral radius at infinite frequency is ρ.
 
         Among all schemes with this ρ, these coefficients damp low frequencies the least.
 
@@ -96,7 +102,7 @@ class Scheme(NamedTuple):
 
     @property
     def share(self) -> Array:
-        """The factor κ = ∂a⁺/∂v̇⁺ of the averaged acceleration a."""
+        """The derivative κ = ∂a⁺/∂v̇⁺ of the averaged acceleration a⁺ by the acceleration v̇⁺."""
         return (1 - self.alpha_f) / (1 - self.alpha_m)
 
     @property
@@ -210,7 +216,11 @@ class GeneralizedAlpha(checks.Checked, Integrator):
         healthy = jnp.zeros_like(state.status)
 
         def first_step() -> tuple[LastStep, Array]:
-            """Returns the memory and a status; at the first step, by solving the saddle system."""
+            """Returns the memory at the start of the step, and a status.
+
+            A world in its first step has no memory: its a and λ solve the saddle system. Any other
+            world keeps its memory, with the status OK.
+            """
             (a, λ, code), _ = dynamics(state.q, state.v, state.instant)
             fresh = LastStep(a, a, λ, memory.started)
             return where_tree(memory.started, (memory, healthy), (fresh, code))
@@ -258,7 +268,10 @@ class GeneralizedAlpha(checks.Checked, Integrator):
         return Advanced((q, v, t), solution._replace(status=code), rows, new, ends=True)
 
     def _softness(self, dynamics: Dynamics, state: State, rows: Rows) -> Array | None:
-        """Returns the regularization ε W, (n_c,), zero for rows with compliance; None for none."""
+        """Returns the diagonal ε W of the regularization, (n_c,), zero for rows with compliance.
+
+        It is None if rows cannot be linearly dependent and `tikhonov` is not given.
+        """
         if self.tikhonov is None and not rows.layout.loops:
             return None
         dtype = rows.bias.dtype
@@ -299,7 +312,7 @@ class Equations:
         return x[:n], x[n:]
 
     def end(self, acceleration: Array) -> tuple[Array, Array, Array]:
-        """Returns the averaged accelerations a⁺, q⁺ and v⁺ for accelerations v̇⁺."""
+        """Returns a⁺, q⁺ and v⁺ for accelerations v̇⁺; a⁺ is the averaged acceleration."""
         s, last, state = self.scheme, self.last, self.state
         lag = s.alpha_f * last.acceleration - s.alpha_m * last.average
         a = s.share * acceleration + lag / (1 - s.alpha_m)
@@ -310,8 +323,9 @@ class Equations:
     def __call__(self, x: Array) -> Array:
         """Returns the residual r(x), (n_v + n_c,).
 
-        The last n_c entries are φ/κβh² for holonomic rows, ψ/κγh for velocity-level rows, and J v̇⁺
-        + C λ⁺ + γ for rows with compliance.
+        The first n_v entries are M v̇⁺ − f − Jᵀλ⁺. The last n_c entries depend on the kind of row:
+        φ/κβh² for holonomic rows, ψ/κγh for velocity-level rows. For rows with compliance they are
+        J v̇⁺ + C λ⁺ plus the part of φ̈ without accelerations.
         """
         system, (acceleration, multipliers) = self.dynamics.system, self.split(x)
         _, q, v = self.end(acceleration)
@@ -331,12 +345,13 @@ class Equations:
 def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
     """Solves r(x) = 0 by Newton's method, with implicit differentiation.
 
-    If rows may be linearly dependent, Newton's matrix K is singular. Then K + R is factored, with R
-    = ε W on the rows of constraints. First r(x) + R λ = 0 is solved. Its λ is unique, has the least
-    norm, and does not depend on the guess, but φ has the error κβh² R λ. The last iterations
-    continue to r(x) = 0 by proximal rounds, see `lu.factor`. Each round multiplies the error along
-    an eigenvector of the scaled J M⁻¹ Jᵀ by ε/(σ + ε), where σ is the eigenvalue. If σ = 0, a round
-    adds only rounding errors. Derivatives are those of r(x) = 0, by the same rounds.
+    If rows may be linearly dependent, Newton's matrix K is singular. Then K + R is factored. On the
+    rows of constraints R = ε W, where W is the diagonal of J M⁻¹ Jᵀ. First r(x) + R λ = 0 is
+    solved. Its λ is unique, has the least norm, and does not depend on the guess, but φ has the
+    error κβh² R λ. The last iterations continue to r(x) = 0 by proximal rounds, see `lu.factor`.
+    Each round multiplies the error along an eigenvector of the scaled J M⁻¹ Jᵀ by ε/(σ + ε), where
+    σ is the eigenvalue. If σ = 0, a round adds only rounding errors. Derivatives are those of
+    r(x) = 0, and also use proximal rounds.
 
     Args:
         equations: the residual r and its initial guess.
@@ -392,8 +407,9 @@ def _solve(
 ) -> tuple[Array, Array]:
     """Solves K x = r in one world; returns x, and True if K is singular.
 
-    If `yields` is 1, R is added to K. The rows of velocities are scaled by 1/√K_ii, and the rows of
-    constraints by their length in that scale.
+    If `yields` is 1, K + R takes the place of K. Otherwise K x = r is solved by `ROUNDS` proximal
+    rounds with the factors of K + R. Both sides of the matrix are scaled. The scale of a velocity
+    is 1/√K_ii. The scale of a constraint row is the inverse of the row's length in that scale.
 
     Args:
         columns: the matrix K by columns, (column, row).

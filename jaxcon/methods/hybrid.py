@@ -23,7 +23,12 @@ from jaxcon.system.state import State
 
 @exportable
 class HybridMemory(NamedTuple):
-    """The stabilizers of a `Hybrid`, or their memories (() for none), by range of the violation."""
+    """The three stabilizers of a `Hybrid`, or their memories.
+
+    Attributes:
+        small, middle, large: the stabilizer for small, medium or large violations, or its memory;
+            () for a stabilizer without memory.
+    """
 
     small: Any = ()
     middle: Any = ()
@@ -98,7 +103,7 @@ class Hybrid(checks.Checked, Stabilizer):
             raise ValueError(f"Hybrid: {what}={type(part).__name__} {reason}.")
 
     def _parts(self) -> HybridMemory:
-        """Returns the three stabilizers; `Unstabilized()` stands for large=None."""
+        """Returns the three stabilizers, with `Unstabilized()` in place of large=None."""
         return HybridMemory(
             self.small, self.middle, Unstabilized() if self.large is None else self.large
         )
@@ -110,7 +115,7 @@ class Hybrid(checks.Checked, Stabilizer):
         return dataclasses.replace(self, small=small, middle=middle, large=large)
 
     def resolve(self, gains: tuple[Scalar, Scalar]) -> Hybrid:
-        """Returns the stabilizer with (α, β) for gains that are not given, but at most 50/s.
+        """Returns a copy in which missing gains are replaced by (α, β), but by at most 50/s.
 
         Gains that remove an error in one step give the bodies a velocity. The springs, which act if
         φ is small, would only reverse that velocity.
@@ -119,11 +124,16 @@ class Hybrid(checks.Checked, Stabilizer):
         return self._with_parts(lambda part: part.resolve((alpha, beta)))
 
     def cap_gains(self, stable_rate: Callable[[float], Scalar]) -> Hybrid:
-        """Returns the stabilizer with all rates β of at most stable_rate(smallest α/β) [1/s]."""
+        """Returns a copy in which all gains are below the largest stable β.
+
+        Args:
+            stable_rate: function of the smallest damping ratio α/β of a stabilizer's gains; returns
+                the largest stable β [1/s].
+        """
         return self._with_parts(lambda part: part.cap_gains(stable_rate))
 
     def constraint_equations(self, rows: Rows, memory: HybridMemory, dt: Array) -> Rows:
-        """Returns the rows with the weighted means of b and of C of `small` and `middle`.
+        """Returns the rows with the weighted means of b and C over `small` and `middle`.
 
         Raises:
             ValueError: `small` or `middle` applies a force, or has a `solve` method of its own.
@@ -147,9 +157,10 @@ class Hybrid(checks.Checked, Stabilizer):
         return mixed.with_target(target)
 
     def beyond(self, square: Array) -> Array:
-        """Returns the weight x²ⁿ/(1 + x²ⁿ) for x², where x is a violation in units of a threshold.
+        """Returns the weight x²ⁿ/(1 + x²ⁿ) of a violation; `square` is x².
 
-        For x > 1 it is computed as 1/(1 + x⁻²ⁿ), since x²ⁿ may overflow.
+        x is the violation divided by its threshold. For x > 1 the weight is computed as
+        1/(1 + x⁻²ⁿ), since x²ⁿ may overflow.
         """
         near = square <= 1
         power = jnp.where(near, square, 1 / jnp.where(near, 1, square)) ** self.sharpness
@@ -188,7 +199,10 @@ class Hybrid(checks.Checked, Stabilizer):
         memory: HybridMemory,
         dt: Array,
     ) -> tuple[State, Array]:
-        """Returns the state moved by the weight w times the correction of `large`, and a status."""
+        """Returns the state moved by w times the correction of `large`, and a status.
+
+        The weight w rises smoothly from 0 to 1 with the norm of φ. It is ½ at `project_above`.
+        """
         if self.large is None:
             return state, jnp.zeros_like(state.status)
         new, code = self.large.correct(

@@ -70,11 +70,12 @@ class SemiImplicitEuler(checks.Checked, Integrator):
     belongs to the time of q.
 
     `newton_correction` removes the linearization error of φ by a second solve with the factors of
-    the step. It begins if a body or a rod turns by more than 0.038 rad in a step (0.025 rad if
-    bodies turn in space). It acts in full from 0.042 rad on (0.03 rad in space). Such a step takes
-    about 1.5 times as long. Without the correction, energy would grow with (h|ω|)³, and motions of
-    a radian in a few steps would end with status NON_FINITE. In the plane, islands on which a limit
-    or contact acts are not corrected. In space, `Projection()` replaces the correction.
+    the step. The correction begins if a body or a rod turns by more than 0.038 rad in a step (0.025
+    rad if bodies turn in space). It acts in full from 0.042 rad on (0.03 rad in space). A step with
+    it takes about 1.5 times as long. Without the correction, energy would grow with (h|ω|)³, and
+    motions of a radian in a few steps would end with status NON_FINITE. In the plane, islands
+    (bodies connected by constraints) on which a limit or contact acts are not corrected. In space,
+    `Projection()` replaces the correction.
 
     A rod (`Distance`) that turns too fast changes its length, although the status stays OK: by 0.1
     % at 0.5 rad a step, 7 % at 1 rad, 40 % at 1.4 rad. `Recovery(limit=…)` ends such a run with
@@ -112,11 +113,12 @@ class SemiImplicitEuler(checks.Checked, Integrator):
         """Advances a state by one step in a system whose bodies turn in space.
 
         Operator splitting treats the free rotation of bodies separately. A body with a one-sided
-        row instead uses v⁺ = v + h a, since the law of the row applies to this v⁺. The gyroscopic
-        part of its acceleration is then c (`coasting`), the mean over a step of free rotation.
+        row instead uses v⁺ = v + h a, since the law of the row applies to this v⁺. Its acceleration
+        a then includes c (`coasting`): the mean gyroscopic acceleration over a step of free
+        rotation, less its value at the start. For other bodies c is zero.
 
         If the stabilizer completes the step afterwards (`Projection()`), v belongs to the time of
-        q. With R, half a step of free rotation, and g, the gyroscopic part of a,
+        q. Let R be half a step of free rotation, and g the gyroscopic acceleration at the start:
 
             V = R(v + h (a − c − g)),   q⁺ = q ⊕ h V,   v⁺ = R(V).
 
@@ -124,7 +126,7 @@ class SemiImplicitEuler(checks.Checked, Integrator):
         a step later if J (a − c) − ½ J g + ½ γ = 0. The motion therefore uses the constraint forces
         with J a = −½ γ + J (½ g + c) − φ̇/h, and the projection of v adds the rest. The reported
         forces satisfy J a = −γ. If the motion used them, the projection of q would be O(h²), or
-        O(h) after a start with φ̇ ≠ 0, and its impulses would change R.
+        O(h) after a start with φ̇ ≠ 0, and the impulses of this projection would change R.
 
         Impacts treat v as half a step before q, as without a projection: the displacement is h V.
         """
@@ -176,9 +178,10 @@ class SemiImplicitEuler(checks.Checked, Integrator):
     def default_gains(self, dt: Array) -> tuple[Array, Array]:
         """Returns α = 1/(2h) and β = 1/h [1/s]: one step removes an error completely.
 
-        φ⁺ = φ + h p⁺ with p⁺ = p + h (J a + γ) vanishes if J a = −γ − p/h − φ/h². Both roots of the
-        error's recursion are then 0, as far from instability as possible. The step agrees with
-        SHAKE up to O(h³). Of all gains, these have the least energy drift.
+        Let p be the rate of φ half a step before q. Then φ⁺ = φ + h p⁺ with p⁺ = p + h (J a + γ)
+        vanishes if J a = −γ − p/h − φ/h². Both roots of the error's recursion are then 0, as far
+        from instability as possible. The step agrees with SHAKE up to O(h³). Of all gains, these
+        have the least energy drift.
 
         The multipliers contain β² times the rounding error of φ. β is therefore at most √(0.1/ε),
         where ε is the relative precision. The rounding error of a length of 1 m then causes at most
@@ -196,14 +199,18 @@ class SemiImplicitEuler(checks.Checked, Integrator):
     def growth(self, alpha: float, beta: float, dt: float) -> float:
         """Returns the growth factor of a constraint error (φ, p) in a step, a spectral radius.
 
-        The step is p⁺ = (1 − 2hα) p − hβ² φ and φ⁺ = φ + h p⁺.
+        p is the rate of φ half a step before. A step is p⁺ = (1 − 2hα) p − hβ² φ and φ⁺ = φ + h p⁺.
         """
         half = 1 - dt * alpha - (dt * beta) ** 2 / 2  # half the trace; the determinant is 1 − 2hα
         root = np.emath.sqrt(half**2 - (1 - 2 * dt * alpha))
         return float(max(abs(half + root), abs(half - root)))
 
     def error_map(self, alpha: Number, beta: Number, dt: Number) -> tuple[Pair, Pair, Pair]:
-        """Returns the error (φ, φ̇) after a step from φ = 1, from φ̇ = 1, and under φ̈ = 1."""
+        """Returns three errors (φ, φ̇) after a step with feedback.
+
+        The errors before the step are φ = 1, then φ̇ = 1, then zero. In the third case a
+        disturbance φ̈ = 1 acts during the step.
+        """
         rates = (-dt * beta * beta, 1 - 2 * dt * alpha, dt)
         first, second, held = ((dt * rate, rate) for rate in rates)
         return (1 + first[0], first[1]), second, held
@@ -218,13 +225,13 @@ def _with_jump(
     rows: Rows,
     dt: Array,
 ) -> Advanced:
-    """Returns the end of a step, with the changes by impacts added.
+    """Returns the end of a step, with the changes of q and v by impacts added.
 
     Args:
         system: the system to step.
         state: state at the start of the step.
         travel: displacement of the step without impacts, (n_v,).
-        v: velocity at its end without impacts, (n_v,).
+        v: velocity at the end of the step without impacts, (n_v,).
         solution: accelerations a and multipliers λ of the step.
         rows: linearized constraints at the start, with the jump by impacts.
         dt: step size h, () [s].
@@ -259,10 +266,10 @@ def newton_correction(
     weight 0, so rounding errors divided by h² do not affect them.
 
     The correction fades out if the arms and axes of a row turn by 1 to √2 rad. It also fades out if
-    its kinetic energy is ¼ to ½ of the motion's, as near a singular configuration. For such large
-    errors Newton steps are useless. A body in space may spin about its arm by 4 rad in a step. A
-    change Δω turns the end of such a body by dexp_{hω} Δω h; the correction is multiplied by the
-    inverse of this map.
+    its kinetic energy is ¼ to ½ of that of the motion, as near a singular configuration. For such
+    large errors Newton steps are useless. A body in space may spin about its arm by 4 rad in a
+    step. A change Δω turns the end of such a body by dexp_{hω} Δω h; the correction is multiplied
+    by the inverse of this map.
 
     The correction changes the velocities of friction and motor rows by e/h, so they miss their
     targets. For bodies in space, this holds for all inequality rows. In the plane, islands on which
@@ -454,7 +461,10 @@ class RungeKutta(checks.Checked, Integrator):
         return float(max(abs(self.amplify(dt * (sign * root - alpha))) for sign in (1, -1)))
 
     def error_map(self, alpha: Number, beta: Number, dt: Number) -> tuple[Pair, Pair, Pair]:
-        """Returns the error (φ, φ̇) after a step from φ = 1, from φ̇ = 1, and under φ̈ = 1.
+        """Returns three errors (φ, φ̇) after a step with feedback.
+
+        The errors before the step are φ = 1, then φ̇ = 1, then zero. In the third case a
+        disturbance φ̈ = 1 acts during the step.
 
         The error x = (φ, φ̇) obeys ẋ = A x + B w with a constant disturbance w. A step gives x⁺ =
         R(hA) x + h Q(hA) B w, where R(z) = 1 + z Q(z) is the stability polynomial.

@@ -178,9 +178,11 @@ class Method:
         return default_contact_solver(system, state.q, state.v)
 
     def known_at(self, dt: Scalar, dtype: DType) -> Method:
-        """Returns the method with the default gains of a known step size, unless they may rise.
+        """Returns the method with constant default gains if they cannot rise at this step size.
 
-        Gains that may rise (`RisingBaumgarte`) are instead computed in every step, row by row.
+        In float32, default gains may rise in fast motions (`RisingBaumgarte`). They are then
+        computed in every step, row by row. Above a certain step size they do not rise. If the step
+        size is known outside of traces and large enough, the gains are computed here, once.
 
         Args:
             dt: step size h as the user gave it, () [s].

@@ -58,21 +58,22 @@ class AugmentedLagrangian(checks.Checked, Wrapper):
     A round solves (A + W) λ⁺ = r + W λ with W = A_ii/stiffness. Here A is J M⁻¹ Jᵀ + C, and r is
     the right-hand side of A λ = r. The first round starts from the λ of the last step. Let σ be an
     eigenvalue of A in units of A_ii. Each round multiplies the error of λ along its eigenvector by
-    1/(1 + σ·stiffness). Each round solves a soft system, but λ converges to that of the rigid one.
-    Every round is solvable, even if rows are linearly dependent or a mechanism passes a singular
-    position. `stiffness` bounds the condition of the system. Rounds share one factorization. The λ
-    of the last step is a good guess, so one or two rounds are enough. The feedback chooses b.
+    1/(1 + σ·stiffness). Each round solves a soft system, but λ converges to the λ of the rigid
+    system. Every round is solvable, even if rows are linearly dependent or a mechanism passes a
+    singular position. `stiffness` bounds the condition of the system. Rounds share one
+    factorization. The λ of the last step is a good guess, so one or two rounds are enough. The
+    feedback chooses b.
 
     After k rounds, λ has followed a change of b by the fraction e = 1 − 1/(1 + σ·stiffness)ᵏ.
-    Feedback therefore lags by τ = h/e. With the whole of b, an error would obey
+    Feedback therefore lags by τ = h/e. Without a remedy, an error would obey
 
         τ φ⃛ + φ̈ + 2α φ̇ + g β² φ = 0, stable for τ g β² < 2α, with g = 1.
 
     With the default gains 2α = β = 1/h this needs e > 1. Errors with a small σ, as in chains of
-    some links, would grow. The part of b that is due to φ is therefore multiplied by the fraction
-    of it that one round from λ = 0 meets: g = σ·stiffness/(1 + σ·stiffness), or g² for k = 1. Then
-    τ g ≤ h/2 for small σ, and g is 1 for large σ. Steps are stable for every stiffness and σ if the
-    gains are stable for rigid rows.
+    some links, would grow. The part of b that depends on φ is therefore multiplied by g =
+    σ·stiffness/(1 + σ·stiffness), or by g² for k = 1. This is the fraction of it that one round
+    from λ = 0 satisfies. Then τ g ≤ h/2 for small σ, and g is 1 for large σ. Steps are stable for
+    every stiffness and σ if the gains are stable for rigid rows.
 
     Derivatives are those of the computed rounds. Rotors constrain nothing and are solved directly.
     Contradictory rows are satisfied in the least-squares sense. If the residual exceeds a quarter
@@ -115,7 +116,7 @@ class AugmentedLagrangian(checks.Checked, Wrapper):
     def solve(
         self, solver: Solver, rows: Rows, memory: Held, dt: Array, system: Saddle
     ) -> Solution:
-        """Solves for a and λ by a fixed number of iterations, from the λ of the last step."""
+        """Solves for a and λ in a fixed number of rounds, starting from the λ of the last step."""
 
         def target_of(residual: Array) -> Array:
             moved = dataclasses.replace(rows, residual=residual)
@@ -169,7 +170,7 @@ class AugmentedLagrangian(checks.Checked, Wrapper):
         return memory._replace(feedback=self.feedback.advance(rows, memory.feedback, dt))
 
     def remember(self, memory: Held, solution: Solution) -> Held:
-        """Returns the memory with the multipliers λ of this step's solution."""
+        """Returns the memory with the multipliers λ of the step just solved."""
         feedback = self.feedback.remember(memory.feedback, solution)
         return Held(solution.multipliers, feedback)
 

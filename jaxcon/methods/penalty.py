@@ -32,10 +32,10 @@ class Penalty(checks.Checked, Wrapper):
         J a + C λ = b,    C = 1/s,    b = −γ − φ̇/h − k φ/s,    s = h (d + h k)
 
     A single row is stable for every k and d. For k → ∞ it is the rigid constraint, with an error
-    that vanishes in one step. s is increased by ε/A_ii; ε is the relative precision and 1/A_ii the
-    effective mass of the row. With k = d = 0 a body is therefore free except for a damper that
-    removes the fraction ε of φ̇ in a step. At k = d = 0, the gradients with respect to k and d are
-    finite and equal those of the spring.
+    that vanishes in one step. s is increased by ε/A_ii, where ε is the relative precision. 1/A_ii
+    with A = J M⁻¹ Jᵀ is the effective mass of the row. With k = d = 0 a body is therefore free
+    except for a damper that removes the fraction ε of φ̇ in a step. At k = d = 0, the gradients
+    with respect to k and d are finite and equal those of the spring.
 
     Explicit springs apply λ as a force, computed from φ and φ̇ at the start of the step and at each
     stage. With semi-implicit Euler this is stable only for k < 4 m/h². Both kinds report λ.
@@ -73,11 +73,12 @@ class Penalty(checks.Checked, Wrapper):
         others: Stabilizer | None = None,
         implicit: bool = True,
     ) -> Penalty:
-        """Returns springs of angular frequency 1/T and damping ratio ζ, for each row alone.
+        """Returns springs with a time constant T in place of a stiffness.
 
-        The components of a vector, such as the three rows of a ball joint, share one stiffness. It
-        is computed from the mean over the components and does not depend on the orientation of the
-        world frame.
+        Each row alone would oscillate with the angular frequency 1/T and the damping ratio ζ. The
+        components of a vector, such as the three rows of a ball joint, share one stiffness. It is
+        computed from the mean of their inverse effective masses, so it does not depend on the
+        orientation of the world frame.
 
         Args:
             time: time constant T [s]: a number, an array by row or a mapping by constraint.
@@ -111,7 +112,7 @@ class Penalty(checks.Checked, Wrapper):
         check_stabilizer("Penalty", "others", self.others)
 
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
-        """Returns the rows with the target b; soft rows get a compliance or an explicit force."""
+        """Returns the rows with the target b; soft rows also get a compliance or a force."""
         hard = self.others.constraint_equations(rows, memory, dt)
         soft = self.soft(rows.layout)
         if not soft.any():

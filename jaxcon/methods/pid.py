@@ -61,12 +61,12 @@ class PID(checks.Checked, Stabilizer):
 
     @property
     def alpha(self) -> Gain | None:
-        """The equivalent Baumgarte gain α = K_d / 2 [1/s]."""
+        """The equivalent Baumgarte gain α = K_d / 2 [1/s]; None if K_d is not given."""
         return jax.tree.map(lambda x: x / 2, self.derivative)
 
     @property
     def beta(self) -> Gain | None:
-        """The equivalent Baumgarte gain β = √K_p [1/s]."""
+        """The equivalent Baumgarte gain β = √K_p [1/s]; None if K_p is not given."""
         return jax.tree.map(lambda x: x**0.5, self.proportional)
 
     def init(self, system: System, q: Array, v: Array) -> Array:
@@ -74,7 +74,10 @@ class PID(checks.Checked, Stabilizer):
         return zeros_by_row(system, q, v)
 
     def resolve(self, gains: tuple[Scalar, Scalar]) -> PID:
-        """Returns the controller with K_d = 2α and K_p = β² for gains that are not given."""
+        """Returns the controller with K_d = 2α and K_p = β² in place of missing gains.
+
+        (α, β) is the field `fallback` if it is set, otherwise `gains`.
+        """
         fallback: Any = gains if self.fallback is None else self.fallback
         proportional = fallback[1] ** 2 if self.proportional is None else self.proportional
         derivative = 2 * fallback[0] if self.derivative is None else self.derivative

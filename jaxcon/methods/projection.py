@@ -26,7 +26,10 @@ from jaxcon.system.state import State
 METRICS = ("mass", "euclidean")
 
 SMALL = 1e-3
-"""The fraction of kinetic energy below which a velocity correction turns with the bodies."""
+"""The energy of a velocity correction below which the correction turns with the bodies.
+
+It is given as a fraction of the kinetic energy of the motion.
+"""
 
 
 @pytree
@@ -91,8 +94,9 @@ class Projection(checks.Checked, Stabilizer):
     If not `coupled`, J₀ is the Jacobian at q*. Then q differs from the nearest point in the metric
     W by O(‖d‖²) along the constraint surface.
 
-    Redundant rows are linearly dependent on the constraint surface only. Off the surface, J(q*) has
-    a larger rank, so the projected point is ambiguous within O(‖d‖), and the solver determines it.
+    Redundant rows are linearly dependent only if q lies on the constraint surface. Elsewhere J(q*)
+    has a larger rank, so the projected point is ambiguous within O(‖d‖), and the solver determines
+    it.
 
     For bodies that turn in space, the torques J₀ᵀ μ are given in the body frames at the start of
     the step and turn with the bodies. With semi-implicit Euler and default options, a top may spin
@@ -158,15 +162,18 @@ class Projection(checks.Checked, Stabilizer):
             check_numbers(self, tolerance={"least": 0, "optional": True})
 
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
-        """Returns the rows with the target b = −γ of J a + C λ = b."""
+        """Returns the rows with the target b = −γ of J a + C λ = b, where φ̈ = J a + γ."""
         return rows.with_target(-rows.bias)
 
     def init(self, system: System, q: Array, v: Array) -> Array | tuple[()]:
-        """Returns the number of steps since the last projection, 0; () if every step has one."""
+        """Returns the count of steps since the last projection, 0; () if each step is projected."""
         return () if self.every == 1 else jnp.zeros((), jnp.int32)
 
     def advance(self, rows: Rows, memory: Array, dt: Array) -> Array:
-        """Returns the step count after one more step, modulo `every`."""
+        """Returns the count of steps after one more step, modulo `every`.
+
+        At 0 a projection is due. There is no count if every step is projected.
+        """
         return memory if self.every == 1 else (memory + 1) % self.every
 
     @property
@@ -176,12 +183,15 @@ class Projection(checks.Checked, Stabilizer):
 
     @property
     def completes(self) -> bool:
-        """True if each step projects both q and v, and adds d/h to v."""
+        """True if each step projects q and v, and `coupled` is set.
+
+        The displacement of q, divided by h, is then added to v.
+        """
         return self.every == 1 and self.coupled and self.position and self.velocity
 
     @property
     def remembers(self) -> bool:
-        """True if the memory is a step count."""
+        """True if not every step is projected, so that the memory counts steps."""
         return self.every != 1
 
     def correct(
@@ -259,7 +269,12 @@ class Projection(checks.Checked, Stabilizer):
         # The torques of J₀ᵀ μ are given in the body frames at the start of the step. Bodies turn by
         # h ω in the step, and by half of it until its middle, where W⁻¹ must be evaluated.
         def turned(d: Array, step: Array) -> Array:
-            """Returns the displacement W⁻¹ J₀ᵀ μ of bodies that have turned by a step, (n_v,)."""
+            """Returns W⁻¹ J₀ᵀ μ, (n_v,), after the bodies have turned by `step`.
+
+            Args:
+                d: W⁻¹ J₀ᵀ μ before the turn, (n_v,).
+                step: displacement h v whose rotations turn the bodies, (n_v,).
+            """
             return mass.solve(bodies.in_turned_frames(q, step, mass.apply(d)))
 
         def moved(d: Array) -> Array:
@@ -276,9 +291,9 @@ class Projection(checks.Checked, Stabilizer):
             return jnp.max(jnp.abs(x), axis=0, initial=0)
 
         def goes(left: Array, before: Array) -> Array:
-            """Returns True for each world whose iteration must go on.
+            """Returns True for each world whose iteration must go on, ().
 
-            That is a world above the tolerance `stays` whose error decreases or is above `fails`.
+            Its error is above the tolerance `stays`, and it either decreases or is above `fails`.
             """
             off = (left > stays) & ((left < before) | (left > fails))
             return off & ~status.failed(state.status)

@@ -26,20 +26,20 @@ from jaxcon.system.state import State
 class RATTLE(checks.Checked, Integrator):
     """RATTLE: a half kick by the forces, a drift on the constraints, and another half kick.
 
-    V is the velocity during the drift, p± = (dexp⁻¹_{±hV})ᵀ M V its momenta, and F the applied
-    force:
+    V is the velocity during the drift, and F the applied force. The momenta at the start and end of
+    the drift are p± = (dexp⁻¹_{±hV})ᵀ M V:
 
         p₊(V) = M v + (h/2) (F + Jᵀλ),   q⁺ = q ⊕ h V,   φ(q⁺, t + h) = 0,
         M v⁺ = p₋(V) + (h/2) (F⁺ + J⁺ᵀλ⁺),   J⁺ v⁺ + ∂φ⁺/∂t = 0.
 
-    For bodies that turn in space, (dexp⁻¹_{hΩ})ᵀ IΩ = IΩ + (h/2) Ω × IΩ + c h² Ω × (Ω × IΩ); for
-    all others p± = M V. The map from (q, v) to (q⁺, v⁺) derives from a discrete Lagrangian. It is
-    therefore symplectic, reversible and of second order, and the energy error stays bounded.
-    Momenta that belong to symmetries are conserved, and φ = 0 and φ̇ = 0 hold, up to rounding. A
-    body must turn by less than one whole turn a step.
+    For bodies that turn in space, (dexp⁻¹_{hΩ})ᵀ IΩ = IΩ + (h/2) Ω × IΩ + c h² Ω × (Ω × IΩ), where
+    c depends on h|Ω| only. For all other bodies p± = M V. The map from (q, v) to (q⁺, v⁺) derives
+    from a discrete Lagrangian. It is therefore symplectic, reversible and of second order, and the
+    energy error stays bounded. Momenta that belong to symmetries are conserved, and φ and φ̇ are
+    zero, up to rounding. A body must turn by less than one whole turn a step.
 
-    Quasi-Newton iterations find V and λ together with one factorization of [M, −Jᵀ; J, 0] at q.
-    Each iteration multiplies the error by about half of the angle by which bodies turn in a step.
+    Quasi-Newton iterations find V and λ, with one factorization of [M, −Jᵀ; J, 0] at q. Each
+    iteration multiplies the error by about half of the angle by which bodies turn in a step.
     Iterations end when the error is at rounding level. About five suffice for steps of 0.01 rad; a
     step of 1 rad needs all. If forces depend on velocities, fixed-point rounds find F⁺ = F(q⁺, v⁺).
     Each round multiplies the error by a factor proportional to h ∂F/∂v. A world in which iterations
@@ -125,7 +125,7 @@ class RATTLE(checks.Checked, Integrator):
         rounding = numerics.safe_divide(size, jnp.abs(dt))
 
         def residual(z: Array) -> Array:
-            """Returns the residual of the kick and of φ = 0, (n_v + n_c,), for z = (V, Λ)."""
+            """Returns the residual of the kick and of φ = 0, (n_v + n_c,); z = (V, Λ), Λ = hλ/2."""
             middle, mass = z[:n], system.mass(q)
             momentum = mass.apply(middle)
             turned = system.carry(q, h * middle, momentum) - momentum
@@ -141,12 +141,12 @@ class RATTLE(checks.Checked, Integrator):
             return jnp.concatenate(solve(y[:n], y[n:])[:2])
 
         def transposed(y: Array) -> Array:
-            """Solves Kᵀ x = y by Kᵀ = D K D, where D is diagonal with entries ±1."""
+            """Solves Kᵀ x = y for K = [M, −Jᵀ; J, 0], by Kᵀ = D K D with D = diag(I, −I)."""
             x, multipliers, _ = solve(y[:n], -y[n:])
             return jnp.concatenate([x, -multipliers])
 
         def iterate(function: Operator, z: Array) -> tuple[Array, Array]:
-            """Runs quasi-Newton iterations; returns z = (V, Λ) and the last change of V."""
+            """Runs quasi-Newton iterations from z = (V, Λ); returns z and the last change of V."""
             z, change = roots.refine(
                 lambda z: inverse(function(z)), z, self.iterations, rounding / 64, n, stopped
             )
@@ -167,9 +167,15 @@ class RATTLE(checks.Checked, Integrator):
     def _arrive(
         self, dynamics: Dynamics, state: State, middle: Array, dt: Array
     ) -> tuple[Array, Array]:
-        """Returns the end velocity v⁺ for a drift velocity V, and a status.
+        """Returns the velocity v⁺ at the end of a step, and a status.
 
-        The status is NOT_CONVERGED if φ is not zero at the end.
+        The status is NOT_CONVERGED if φ is not zero there.
+
+        Args:
+            dynamics: equations of motion of the step.
+            state: state at the start of the step.
+            middle: velocity V during the drift, (n_v,).
+            dt: step size h, () [s].
         """
         system, h, time = dynamics.system, dt[None], state.instant + dt
         q = system.retract(state.q, h * middle)

@@ -60,7 +60,7 @@ class Recovery(checks.Checked):
 
     `info.status` of each step reports the repair: ROLLED_BACK, PROJECTED, or RELAXED if the step
     was taken with r < 1. The status of the state keeps the first such report. Worlds of a batch are
-    independent of each other. The derivative of a step that was rolled back is that of the repair.
+    independent of each other. A step that was rolled back has the derivative of its repair.
 
     Attributes:
         limit: the largest valid |φ| over all rows [m, rad]; None for no limit.
@@ -136,7 +136,7 @@ class Recovery(checks.Checked):
         attempt: tuple[tuple[State, StepInfo], Array],
         dt: Array,
     ) -> tuple[tuple[State, StepInfo], Array]:
-        """Returns the result of a step, repaired if the step failed.
+        """Returns the result of a step, with failed worlds repaired.
 
         Args:
             system: system with the whole turns of the state.
@@ -146,7 +146,7 @@ class Recovery(checks.Checked):
             dt: step size h, () [s].
 
         Returns:
-            The attempt, with failed worlds repaired.
+            ((new state, info), status of the step), like `attempt`.
         """
         (new, info), code = attempt
         repairs, bad = MethodMemory(*state.memory).recovery, failed(code)
@@ -208,7 +208,7 @@ class Recovery(checks.Checked):
 
 @pytree
 class Relaxed(Wrapper):
-    """A stabilizer with all rates multiplied by r: the inner one gets r² φ and r φ̇.
+    """Multiplies all rates of an inner stabilizer by r: it gets r² φ and r φ̇ in place of φ and φ̇.
 
     Attributes:
         stabilizer: the inner stabilizer.
@@ -232,7 +232,10 @@ class Relaxed(Wrapper):
     def solve(
         self, solver: Solver, rows: Rows, memory: PyTree, dt: Array, system: Saddle
     ) -> Solution | None:
-        """Returns the inner stabilizer's solution, with decay rates [1/s] scaled by `factor`."""
+        """Returns the inner stabilizer's solution, with decay rates [1/s] scaled by `factor`.
+
+        It is None if the inner stabilizer leaves the solution to the solver.
+        """
         weak = weakened(rows, self.factor[None])
         return self.stabilizer.solve(solver, weak, memory, dt, system)
 

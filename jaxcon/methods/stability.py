@@ -30,10 +30,13 @@ if TYPE_CHECKING:
     from jaxcon.methods.method import Method
 
 MARGIN = 1e-9
-"""Growth of an error per step that counts as marginal, not as unstable."""
+"""The largest growth of an error per step that counts as marginal, not as unstable."""
 
 SLOW = 1e-3
-"""Growth of springs per step that counts as marginal: many explicit methods amplify slightly."""
+"""The largest growth of a spring's motion per step that counts as marginal, not as unstable.
+
+It is larger than `MARGIN`, since many explicit methods amplify vibrations slightly.
+"""
 
 
 def largest_stable_rate(integrator: Integrator, dt: float, damping_ratio: float = 1.0) -> float:
@@ -101,7 +104,7 @@ def stable_rate(integrator: Integrator, dt: Array, least_ratio: float) -> Any:
 def growth(
     integrator: Integrator, alpha: float, beta: float, integral: float, dt: float
 ) -> float | None:
-    """Returns the spectral radius of a step on (φ, φ̇, ∫φ), for gains α, β and K_i.
+    """Returns the spectral radius of the map of (φ, φ̇, ∫φ) by one step, for gains α, β and K_i.
 
     The result is None for an integrator whose `growth` returns None.
 
@@ -166,7 +169,7 @@ def default_gains(method: Method, dt: Array) -> tuple[Scalar, Scalar]:
 
 
 def parts(stabilizer: Stabilizer) -> list[Stabilizer]:
-    """Returns a stabilizer and all those inside it that choose the target b of J a + C λ = b."""
+    """Returns a stabilizer and all stabilizers nested in it that choose b of J a + C λ = b."""
     nested: tuple[Stabilizer, ...] = ()
     if isinstance(stabilizer, Wrapper):
         nested = (stabilizer.inner,)
@@ -240,7 +243,12 @@ def unstable_spring(
 
 
 def _sets(alpha: Gain, beta: Gain, integral: Gain) -> list[tuple[str, float, float, float]]:
-    """Returns every distinct set of feedback gains: its name, α, β and K_i."""
+    """Lists all distinct sets of feedback gains.
+
+    Returns:
+        For each set a tuple (suffix, α, β, K_i). The suffix names the constraint in messages, as in
+        " of 'hinge'". The list is empty if some gains are mappings and others arrays.
+    """
     gains = (alpha, beta, integral)
     named = [x for x in gains if isinstance(x, Mapping)]
     if named:

@@ -120,7 +120,7 @@ def angular_velocity(system: BodySystem, state: State, body: str) -> Array:
 
 
 def coordinate(system: BodySystem, state: State, joint: str, name: str | None = None) -> Array:
-    """Returns a joint coordinate, () [rad] or [m]; it is zero where the joint was assembled.
+    """Returns a joint coordinate, () [rad] or [m], which is zero in the pose of the built scene.
 
     In 3D, angles lie in [−π, π] unless whole turns are counted. Turns are counted for joints with a
     spring, servo, coupling or `jc.joints.TurnCounter`.
@@ -452,7 +452,7 @@ def _bodies_of(
 def _over_leading_axes(
     read: Callable[[StepInfo | SolutionAt], Array], info: StepInfo | SolutionAt
 ) -> Array:
-    """Applies a function of the info of one world to an info with leading axes, by vmap."""
+    """Applies `read`, a function of the info of one world, over all leading axes of an info."""
     for _ in info.status.shape:
         read = jax.vmap(read)
     return read(info)
@@ -472,7 +472,7 @@ def _check_info(info: StepInfo | SolutionAt, caller: str, arguments: str) -> Non
 
 
 def _row(system: BodySystem, state: State, joint: str, name: str | None, caller: str) -> Row:
-    """Evaluates a joint coordinate. Returns its value and rate; arguments as in `coordinate`."""
+    """Returns the value and rate of a joint coordinate. Messages name the function `caller`."""
     system = checked_system(system, state, f"jc.{caller}(system, s, joint)")
     where = coordinates.directory(system.constraints)
     end = coordinates.find(system.constraints, where, caller, joint, name)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from jaxcon.system.body_system import BodySystem, Snapshot
 
 Pull = tuple[Place, Vector]
-"""Bodies of one group, and the generalized force on each of them by lanes (element,)."""
+"""The bodies on one side of the elements, and the generalized force on each, lanes (element,)."""
 
 KINDS = ("constraints", "bounds", "forces")
 """The fields of a system that hold groups of elements."""
@@ -82,7 +82,10 @@ def wrench_in(
 
 
 def _sides(group: Any, layout: Layout) -> list[tuple[str, ...]]:
-    """Returns the names of the bodies on each side of a group, one for each element."""
+    """Returns the names of the bodies on each side of the elements of a group.
+
+    There is one tuple for each side, such as all first bodies, with one name for each element.
+    """
     if isinstance(group, CustomForces):  # forces on fixed bodies are not computed
         return [(body,) for body in group.law.bodies if body in layout.places]
     if isinstance(group, Custom):
@@ -97,9 +100,16 @@ def _sides(group: Any, layout: Layout) -> list[tuple[str, ...]]:
 
 @functools.lru_cache(maxsize=256)
 def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Array]]:
-    """Returns a function that computes the wrenches of one group, (d, element) by moving side.
+    """Returns a function that computes the wrenches of all elements of one group.
 
+    The function takes (system, state, control, multipliers, reactions, status). It returns one
+    array (d, element) for each side whose bodies move; d is the number of components of a wrench.
     In failed worlds, wrenches and their gradients are zero.
+
+    Args:
+        kind: the field of the system that holds the group, one of `KINDS`.
+        index: the index of the group in this field.
+        layout: the row numbers of each equality constraint.
     """
 
     def blocks(
@@ -151,7 +161,7 @@ def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Arra
 def _of_equalities(
     snapshot: Snapshot, group: Constraint, layout: RowLayout, multipliers: Array
 ) -> list[Pull]:
-    """Returns the generalized forces Jᵀλ of a group of constraints, for each moving side."""
+    """Returns the generalized forces Jᵀλ of constraints, for each side whose bodies move."""
     rows = group.rows(snapshot)
     λ = []
     if rows:  # a joint without rows, such as a Span, only measures a coordinate
@@ -162,7 +172,15 @@ def _of_equalities(
 
 
 def _of_inequalities(group: Any, rows: BoundSet, reactions: Reactions) -> list[Pull]:
-    """Returns Jᵀλ of a group for each moving side; sums over the contact points of an element."""
+    """Returns the generalized forces Jᵀλ of inequality rows, for each side whose bodies move.
+
+    The forces at all contact points of an element are added.
+
+    Args:
+        group: the group of inequality elements.
+        rows: the rows of the group.
+        reactions: the multipliers λ of all inequality rows of the system.
+    """
     points, every = rows.points or 1, (*rows.rows, *rows.rolls, *rows.spins)
     numbers = np.stack([reactions.layout.rows(name) for name in group.names])
     numbers = numbers.reshape(-1, len(every))
@@ -181,7 +199,13 @@ def _of_inequalities(group: Any, rows: BoundSet, reactions: Reactions) -> list[P
 
 
 def _sum(multipliers: list[Array], pulls: list[Vector]) -> Vector:
-    """Returns Σ λ_r J_r over rows, lanes (element,); an empty vector without rows."""
+    """Returns the generalized force Σ λ_r J_r, summed over rows r, as lanes (element,).
+
+    Args:
+        multipliers: λ_r of each row r, (element,).
+        pulls: the entries J_r of the Jacobian for each row r. If there are no rows, the result is
+            an empty vector.
+    """
     if not pulls:  # a joint without rows, such as a Span
         return Vector()
     rows = [[times(x, λ) for x in pull] for λ, pull in zip(multipliers, pulls, strict=True)]
@@ -190,7 +214,13 @@ def _sum(multipliers: list[Array], pulls: list[Vector]) -> Vector:
 
 
 def _wrenches(snapshot: Snapshot, pulls: list[Pull], anchor: Vector | None) -> Iterator[Array]:
-    """Yields (F, τ) of each side, (d, element), about anchors or, if None, centers of mass."""
+    """Yields the wrenches (F, τ) of all elements on each side, (d, element).
+
+    Args:
+        snapshot: the system at one instant.
+        pulls: the bodies and the generalized forces of each side.
+        anchor: the points about which torques are taken, world frame; None for the centers of mass.
+    """
     layout, like = snapshot.system.layout, snapshot.q[:1]
     dim = layout.dim
     for place, pull in pulls:

@@ -49,15 +49,16 @@ FEW = 64
 """The largest number of entries of a concrete array that becomes a constant of the program."""
 
 # Set while `TangentNative` traces a derivative, read by the custom JVP rule in `failure`. JAX calls
-# that rule from inside its tracing, with a fixed signature: no argument can carry the order.
+# that rule while it traces, with a fixed signature: no argument can carry the order.
 _ORDER = ContextVar("order", default=0)
 
 # Set while `TransposedNative` traces, read by `_stopped`. JAX calls transpose rules with a fixed
 # signature.
 _TRANSPOSED = ContextVar("transposed", default=False)
 
-# Set around the loop of a rollout, read in `call`. An argument instead would have to pass through
-# the adjoint's scan, which users may replace, and through reverse passes that JAX traces.
+# Set around the loop of a rollout, read in `call`. An argument in place of this variable would have
+# to pass through the adjoint's scan, which users may replace, and through reverse passes that JAX
+# traces.
 _CONSTANTS = ContextVar("constants", default=True)
 
 
@@ -97,33 +98,41 @@ class Native:
         self.among = functools.lru_cache(maxsize=64)(self._among)
 
     def __call__(self, *args: Array) -> list[Array]:
-        """Calls the function."""
+        """Calls the wrapped function directly, not through the primitive; returns its results."""
         return list(self.function(*args))
 
     def eager(self, *args: Array) -> list[Array]:
-        """Calls the function outside jit: compiled, unless jit is disabled."""
+        """Evaluates the function for a call outside jit: compiled, unless jit is disabled."""
         return self(*args) if jax.config.values["jax_disable_jit"] else self.compiled(*args)
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
-        """Returns shapes and dtypes of the results, by the trace that `_in_stages` reuses."""
+        """Returns the shapes and dtypes of the results, for arguments of these shapes.
+
+        The function is traced with a further last axis of size 1: a trace that `_in_stages` reuses.
+        """
         avals = self.traced(*(((*x.shape, 1), x.dtype) for x in args)).out_avals
         return [ShapedArray(y.shape[:-1], y.dtype) for y in avals]
 
     def traced(self, *avals: Aval) -> ClosedJaxpr:
-        """Returns the closed jaxpr for these shapes and dtypes, under JAX's current settings.
+        """Returns the closed jaxpr for arguments of these shapes and dtypes, from a cache.
 
-        The cache distinguishes settings, because operations keep the mesh and the default precision
-        under which they were traced.
+        JAX's current settings are part of the key of the cache, because operations keep the mesh
+        and the default precision under which they were traced.
         """
         mesh, real = jax.sharding.get_abstract_mesh(), jnp.result_type(float)
         return self.among((mesh, real, notices.is_observing()), *avals)
 
     def _among(self, settings: tuple[Any, ...], *avals: Aval) -> ClosedJaxpr:
-        """Returns `_traced(*avals)`; `settings` is only a part of the key of the cache."""
+        """Returns `_traced(*avals)`, and is cached by settings, shapes and dtypes.
+
+        Args:
+            settings: JAX's current settings, which are only a part of the key of the cache.
+            avals: shapes and dtypes of the arguments.
+        """
         return self._traced(*avals)
 
     def _traced(self, *avals: Aval) -> ClosedJaxpr:
-        """Returns the closed jaxpr for arguments of these shapes and dtypes.
+        """Traces the function for arguments of these shapes and dtypes; returns the closed jaxpr.
 
         Raises:
             TypeError: a user's function closes over a traced value, with respect to which the
@@ -143,7 +152,7 @@ class Native:
 class TangentNative(Native):
     """The tangent map of a native function: (x, ẋ) → tangents of the floating results.
 
-    x has all arguments. ẋ has the tangents of the arguments whose flag `moved` is True.
+    x are all arguments, and ẋ the tangents of the arguments whose flag `moved` is True.
     """
 
     def __init__(self, whole: Native, moved: tuple[bool, ...]) -> None:
@@ -152,7 +161,10 @@ class TangentNative(Native):
         self.places = [i for i, flag in enumerate(moved) if flag]
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
-        """Returns the shapes of the floating results, by the trace of the whole function."""
+        """Returns the shapes and dtypes of the tangents of the results, without a trace of them.
+
+        They are those of the floating results of the function itself, whose trace is cached.
+        """
         given: list[Any] = list(args[: self.count])
         for i, x in zip(self.places, args[self.count :], strict=True):
             shape = jnp.broadcast_shapes(x.shape, given[i].shape)
@@ -160,7 +172,7 @@ class TangentNative(Native):
         return list(filter(is_real, self.whole.shapes(given)))
 
     def _along(self, *args: Array) -> list[Array]:
-        """Evaluates the tangent map."""
+        """Returns the tangents of the floating results, for arguments (x, ẋ)."""
         primals, tangents = list(args[: self.count]), []
         for i, x in zip(self.places, args[self.count :], strict=True):
             shape = jnp.broadcast_shapes(x.shape, primals[i].shape)
@@ -177,13 +189,17 @@ class TangentNative(Native):
 
 
 class TransposedNative(Native):
-    """The transpose of a native function: (other arguments, ȳ) → cotangents of linear arguments.
+    """The transpose of a native function that is linear in some of its arguments.
+
+    It maps (the other arguments, cotangents ȳ of the results) to the cotangents of the linear
+    arguments.
 
     Attributes:
-        whole: the function.
+        whole: the native function.
         linear: for each argument, True if the function is linear in it.
-        avals: shapes and dtypes of the linear arguments, without batch axes that are added later.
-        rank: the number of axes of the first ȳ, without such batch axes.
+        avals: shapes and dtypes of the linear arguments, when the transpose was made. `vmap` may
+            add batch axes later.
+        rank: the number of axes of the first cotangent in ȳ, without batch axes added later.
     """
 
     def __init__(
@@ -194,21 +210,24 @@ class TransposedNative(Native):
         self.fixed = linear.count(False)
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
-        """Returns the shapes of the linear arguments."""
+        """Returns the shapes and dtypes of the cotangents of the linear arguments."""
         return [ShapedArray(x.shape, x.dtype) for x in self._arguments(args)]
 
     def _arguments(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
-        """Shapes and dtypes of the linear arguments."""
+        """Returns shapes and dtypes of the linear arguments, with the batch axes added later."""
         batch = self._batch(args)
         return [jax.ShapeDtypeStruct((*shape, *batch), dtype) for shape, dtype in self.avals]
 
     def _batch(self, args: Sequence[Array | ShapedArray]) -> tuple[int, ...]:
-        """The shape of the batch axes that were added."""
+        """Returns the shape of the batch axes that were added since the transpose was made."""
         added = args[self.fixed].ndim - self.rank
         return jnp.broadcast_shapes(*(x.shape[x.ndim - added :] for x in args))
 
     def _back(self, *args: Array) -> list[Array]:
-        """Evaluates the transpose."""
+        """Returns the cotangents of the linear arguments, for (other arguments, ȳ).
+
+        A cotangent has all batch axes, even for an argument that the worlds share.
+        """
         batch, given = self._batch(args), args[: self.fixed]
 
         def along(*xs: Array) -> list[Array]:
@@ -222,22 +241,27 @@ class TransposedNative(Native):
 
 
 class PartialNative(Native):
-    """A native function that returns some of the results of another, and reuses its trace."""
+    """A native function that returns only some results of another one, and reuses its trace.
+
+    Args:
+        whole: the other native function.
+        wanted: for each of its results, True to return it.
+    """
 
     def __init__(self, whole: Native, wanted: tuple[bool, ...]) -> None:
         super().__init__(self._chosen, whole.staged)
         self.whole, self.wanted = whole, wanted
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
-        """Returns the shapes of the wanted results."""
+        """Returns the shapes and dtypes of the wanted results."""
         return self._among_wanted(self.whole.shapes(args))
 
     def _chosen(self, *args: Array) -> list[Array]:
-        """Evaluates the wanted results."""
+        """Evaluates the whole function; returns the wanted results."""
         return self._among_wanted(self.whole(*args))
 
     def _among_wanted(self, results: Sequence[Any]) -> list[Any]:
-        """Selects the wanted results."""
+        """Returns the wanted ones among the results of the whole function."""
         return [y for y, flag in zip(results, self.wanted, strict=True) if flag]
 
     def _traced(self, *avals: Aval) -> ClosedJaxpr:
@@ -250,16 +274,16 @@ native_p.multiple_results = True
 
 
 def bound(args: Iterable[Any], fun: Native) -> list[Array]:
-    """Binds the primitive with a native function.
+    """Calls a native function through the primitive `native_p`; returns its results.
 
-    The parameter `asks` tells JAX that the function may contain conditions on worlds; see
-    `somewhere.asking`.
+    The parameter `asks` of the primitive tells JAX that the function may contain conditions on
+    worlds; see `somewhere.asking`.
     """
     return native_p.bind(*args, fun=fun, asks=asking())
 
 
 class Known(NamedTuple):
-    """An array that is a constant of the program, compared by value.
+    """An array that becomes a constant of the program; equal if shape, dtype and data are equal.
 
     Attributes:
         shape: the shape of the array.
@@ -272,13 +296,17 @@ class Known(NamedTuple):
     data: bytes
 
     def lanes(self, axes: int) -> Array:
-        """Returns the array with trailing axes of size 1 added, as a constant of the trace."""
+        """Returns the array as a constant of the trace.
+
+        Args:
+            axes: the number of axes of size 1 to add at the end.
+        """
         value = np.frombuffer(self.data, self.dtype).reshape((*self.shape, *(1,) * axes))
         return jax.lax.stop_gradient(jnp.asarray(value))
 
 
 def _known(x: Scalar) -> Known | None:
-    """Returns the value of a concrete array of at most `FEW` numbers; None for other leaves."""
+    """Returns x as a `Known` if it is concrete and has at most `FEW` numbers, otherwise None."""
     if isinstance(x, Tracer) or np.size(x) > FEW:
         return None
     dtype = jnp.result_type(x)
@@ -290,10 +318,11 @@ def _known(x: Scalar) -> Known | None:
 
 @contextmanager
 def as_it_is_called() -> Iterator[None]:
-    """Within this context, known values become constants only if the caller is itself traced.
+    """Keeps known values from becoming constants in a loop that is called outside `jit`.
 
-    JAX traces the body of a loop even if the loop is called outside `jit`. Known values then stay
-    arguments, so that calling the loop with other values does not compile it again.
+    JAX traces the body of a loop even if the loop itself is not traced. Within this context, known
+    values then stay arguments, so that another call with other values does not compile the loop
+    again. If the caller of the loop is traced, known values become constants as usual.
     """
     with during(_CONSTANTS, _CONSTANTS.get() and _is_tracing()):
         yield
@@ -311,14 +340,23 @@ def _native(
     known: tuple[Known | None, ...],
     staged: bool,
 ) -> tuple[Native, list[Any]]:
-    """Returns a native function of the leaves that are not `known`, and a list of one entry.
+    """Makes a native function of the leaves of some arguments, with known leaves as constants.
 
-    At least one leaf must not be known. The entry of the list becomes the tree structure of the
-    result during tracing, because the static data of a result may depend on shapes, such as the
-    number of rows.
+    Args:
+        function: a function of pytrees.
+        structure: the tree structure of its arguments.
+        shapes: the shape of each leaf.
+        known: the value of each known leaf, and None for other leaves, of which there must be one.
+        staged: True if the function may be cut into stages.
+
+    Returns:
+        The native function of the leaves that are not known.
+        A list whose only entry becomes the tree structure of the result when the function is
+        traced. It is not available before, because the static data of a result may depend on
+        shapes, such as the number of rows.
     """
-    # a primitive returns arrays only, and JAX traces it from its own rules. The structure is known
-    # once `flat` runs; `jax.eval_shape` would find it before, but trace the function twice
+    # a primitive returns arrays only, so `flat` stores the structure of the result in this list.
+    # `jax.eval_shape` would find it before, but trace the function twice
     result: list[Any] = [None]
 
     def flat(*given: Array) -> list[Array]:
@@ -334,7 +372,7 @@ def _native(
 
 _shared = functools.lru_cache(maxsize=256)(_native)
 _with_constants = functools.lru_cache(maxsize=64)(_native)
-"""`_native` with a separate cache, since each set of constant values makes another function."""
+"""`_native` with a cache of its own, in which each set of values of constants takes an entry."""
 
 
 def call(function: Callable[..., T], *args: PyTree, staged: bool = True) -> T:
@@ -363,7 +401,7 @@ def call(function: Callable[..., T], *args: PyTree, staged: bool = True) -> T:
     native, result = cached(function, structure, shapes, tuple(known), staged)
     arrays = [jnp.asarray(x) for x, value in zip(leaves, known, strict=True) if value is None]
     arrays = meshes.together(arrays)
-    arrays = bound(arrays, native)  # its trace fills `result`
+    arrays = bound(arrays, native)  # the trace of `native` sets result[0]
     return jax.tree.unflatten(result[0], arrays)
 
 
@@ -373,18 +411,18 @@ def is_real(x: Array | ShapedArray | jax.ShapeDtypeStruct) -> bool:
 
 
 def _abstract(*args: ShapedArray, fun: Native, asks: ClosedJaxpr) -> list[Any]:
-    """Returns the types of the results."""
+    """The abstract evaluation rule: returns the shapes, dtypes and placement of the results."""
     return meshes.typed(fun.shapes(args), args)
 
 
 def _batched(
     args: Sequence[Array], axes: Sequence[int | None], *, fun: Native, asks: ClosedJaxpr
 ) -> tuple[list[Array], list[int]]:
-    """The batching rule: the batch moves to the last axis."""
+    """The batching rule: moves the batch to the last axis of the arguments, and calls once."""
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
 
     def last(x: Array | float, axis: int | None) -> Array:
-        x = jnp.asarray(x)  # a constant of the trace may come as a Python number
+        x = jnp.asarray(x)  # a constant of the trace may be a Python number
         return x[..., None] if axis is None else jnp.moveaxis(x, axis, -1)
 
     results = bound(map(last, args, axes), fun)
@@ -395,7 +433,7 @@ def _batched(
 def _jvp(
     primals: Sequence[Array], tangents: Sequence[Array | ad.Zero], *, fun: Native, asks: ClosedJaxpr
 ) -> tuple[list[Array], list[Array | ad.Zero]]:
-    """The JVP rule: binds the tangent map."""
+    """The JVP rule: calls the function, and its tangent map as another native function."""
     results = bound(primals, fun)
     moved = tuple(type(x) is not ad.Zero for x in tangents)
     given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
@@ -412,7 +450,7 @@ def _transpose(
     fun: Native,
     asks: ClosedJaxpr,
 ) -> list[Array | None]:
-    """The transpose rule: binds the transposed map."""
+    """The transpose rule: calls the transpose of the function as another native function."""
     linear = tuple(ad.is_undefined_primal(x) for x in args)
     fixed = [x for x, flag in zip(args, linear, strict=True) if not flag]
     pairs = zip(args, linear, strict=True)
@@ -424,7 +462,7 @@ def _transpose(
 
 
 def _in_stages(*args: Array, fun: Native) -> list[Array]:
-    """Runs the function in stages, on arrays with a further last axis of size 1.
+    """Calls a native function in stages, on arrays with a further last axis of size 1.
 
     XLA lets LLVM unroll loops over the last axis of an array. Without the further axis, unrolling
     takes up to half of the compile time, and makes the vectorized code no faster.
@@ -442,7 +480,11 @@ def squeezed(*lanes: Array) -> list[Array]:
 
 
 def _lowered(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Makes a lowering rule from a function (*args, fun=) that sees only shapes and dtypes."""
+    """Makes a lowering rule for the primitive `native_p`.
+
+    Args:
+        function: (*args, fun=native function) → results. Types of args are without placement.
+    """
     rule = mlir.lower_fun(function, multiple_results=True)
 
     def lower(ctx: mlir.LoweringRuleContext, *args: Any, fun: Native, asks: ClosedJaxpr) -> Any:
@@ -455,7 +497,7 @@ def _lowered(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _stopped(cotangent: Array | ad.Zero, _: Array | ad.UndefinedPrimal) -> list[None]:
-    """The transpose rule of `stop_gradient` within native functions: zero.
+    """The transpose rule of `stop_gradient` within native functions: cotangents become zero.
 
     A batched `lax.cond` evaluates each branch in all worlds, and applies `stop_gradient` to the
     operands of worlds that take another branch, tangents included. JAX has no transpose rule for
@@ -476,10 +518,15 @@ def _stopped(cotangent: Array | ad.Zero, _: Array | ad.UndefinedPrimal) -> list[
 def _without_unused(
     wanted: list[bool], *context: bool | JaxprEqn
 ) -> tuple[list[bool], JaxprEqn | None]:
-    """The rule for dead code: removes unused results and the work for them.
+    """The rule for dead code elimination: removes unused results and the work for them.
 
-    The last argument is the equation. From JAX 0.12 on, an argument about references that are read
-    later precedes it; native functions have no references.
+    Args:
+        wanted: for each result, True if it is used.
+        context: the equation, as the last argument. From JAX 0.12 on, an argument about references
+            that are read later comes before it; native functions have no references.
+
+    Returns:
+        For each input, True if it is still used; and the new equation, or None if it is not needed.
     """
     equation: Any = context[-1]
     if not any(wanted):
@@ -498,7 +545,6 @@ batching.primitive_batchers[native_p] = _batched
 ad.primitive_jvps[native_p] = _jvp
 partial_eval.dce_rules[native_p] = _without_unused
 ad.primitive_transposes[native_p] = _transpose
-# JAX looks rules up by primitive in this one table, and a batched `lax.cond` inside a function
-# inserts `stop_gradient` where no code of ours can replace it. A rule of JAX itself takes
-# precedence
+# JAX looks up transpose rules in this table only, and a batched `lax.cond` inserts `stop_gradient`
+# where the library cannot replace it. If JAX gets a rule of its own, that rule takes precedence
 ad.primitive_transposes.setdefault(stop_gradient_p, _stopped)

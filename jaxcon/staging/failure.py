@@ -21,10 +21,10 @@ def mask_failed_gradients(function: Callable[..., T], args: PyTree) -> T:
     """Calls function(*args), with zero gradients through failed worlds.
 
     A forward `where` is not enough: the transpose of a NaN derivative multiplies a zero cotangent
-    by NaN. So tangents are masked on both sides of the linearized function, T ↦ P (f′ (P T)) with
-    P = 1 in healthy worlds and 0 in failed ones. The transpose is then masked on both sides, too:
-    healthy worlds alone contribute to gradients of parameters that worlds share. In second
-    derivatives, the derivative with respect to the point of linearization is masked as well.
+    by NaN. So tangents are masked on both sides of the linearized function, T ↦ P (f′ (P T)). Here
+    P is 1 in healthy worlds and 0 in failed ones. The transpose is then masked on both sides, too:
+    only healthy worlds contribute to gradients of parameters that worlds share. For second
+    derivatives, the derivative of f′ with respect to the arguments is masked as well.
 
     Args:
         function: a function that returns a pytree and the status of the world, ().
@@ -48,7 +48,7 @@ def mask_failed_gradients(function: Callable[..., T], args: PyTree) -> T:
         moving = parts.among(moved)
         batch = jax.eval_shape(call, *primals)[1].shape
         floats, others = primals
-        # values that worlds share must be masked for each world
+        # values that worlds share are broadcast, so that they can be masked in each world
         if batch_last.order() > 1:
             floats = guarded(broadcast_worlds(floats, batch), others)
         start, fixed = moving.split(parts.merge(floats, others))
@@ -65,19 +65,20 @@ def mask_failed_gradients(function: Callable[..., T], args: PyTree) -> T:
         healthy = ~failed(call(*jax.lax.stop_gradient(primals))[1])
         return guarded(*primals), _mask(healthy, tangents[0])
 
-    # symbolic zeros are left out: arrays of zeros cost work, and 1/h² may make them NaN
+    # zero tangents stay symbolic zeros: arrays of zeros cost work, and a factor such as 1/h² may
+    # make them NaN
     contained.defjvp(along, symbolic_zeros=True)
     return contained(*parts.split(args))
 
 
 def stop_failed(status: Array, tree: T) -> T:
-    """Stops the gradient of a tree in failed worlds."""
+    """Stops the gradient of a tree in the worlds whose status is a failure."""
     healthy = ~failed(status)
     return where_tree(healthy, tree, jax.lax.stop_gradient(tree))
 
 
 def _mask(healthy: Array, tangents: T) -> T:
-    """Zeros the tangents of failed worlds."""
+    """Sets the tangents of failed worlds to zero; `healthy` is a mask of the other worlds."""
 
     def mask(x: Array) -> Array:
         return x if x.dtype == jax.dtypes.float0 else jnp.where(expand_like(healthy, x), x, 0)

@@ -45,14 +45,14 @@ if TYPE_CHECKING:
     from jaxcon.staging.batch_last import Native
 
 WORTH = 3
-"""The smallest number of operations for which storing a shared value pays off."""
+"""The smallest number of operations to compute a shared value for which storing it pays off."""
 
 KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 """The attributes of calls that XLA must not inline."""
 
 
 def _names(text: str) -> frozenset[str]:
-    """Returns the words of a text."""
+    """Returns the set of the words of a text, such as names of primitives."""
     return frozenset(text.split())
 
 
@@ -60,38 +60,38 @@ MOVES = _names(
     "reshape squeeze expand_dims slice rev transpose broadcast_in_dim convert_element_type iota"
     " dynamic_slice"
 )
-"""Operations that only move data: kernels read their operands directly."""
+"""Primitives that only move data; kernels read their operands directly."""
 
 MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice")
-"""Primitives whose result has the entries of the operand at other positions."""
+"""Primitives whose result has the entries of its operand at other positions."""
 
 ARITHMETIC = _names(
     "add sub mul neg abs sign square integer_pow max min and or not xor eq ne lt le gt ge"
     " is_finite floor ceil round select_n add_any clamp nextafter"
 )
-"""Elementwise operations."""
+"""Cheap elementwise primitives."""
 
 COSTLY = _names(
     "div sqrt rsqrt pow exp log log1p expm1 sin cos tan tanh atan2 asin acos atan rem cbrt erf"
     " logistic exp2 sinh cosh asinh acosh atanh"
 )
-"""Elementwise operations that are always worth storing."""
+"""Costly elementwise primitives: a shared result is always worth storing."""
 
 OTHERS = _names(
     "concatenate dynamic_update_slice pad gather scan cond somewhere split stack unstack"
 )
-"""Operations that end a stage and may be part of a kernel."""
+"""Other primitives that may be part of a kernel; each is a step of its own, between stages."""
 
 
 LIGHT = 1.5e5
-"""The estimated cost below which a call is light; see `Stages.is_light` and `uninlined`.
+"""The estimated cost below which a call counts as light; see `Stages.is_light` and `uninlined`.
 
 XLA splits a computation among threads if it estimates a cost of 2e5 or more: ten for each byte read
 or written, one for each operation on a number, and two for each transcendental operation.
 """
 
 MOST = 130
-"""The largest number of steps in one kernel; compile time grows faster than a kernel's size."""
+"""The largest number of steps in a kernel, since compile time grows faster than its size."""
 
 FEW_PARTS = 8
 """Branches with loops stay out of kernels only if the program then has at most this many parts.
@@ -112,18 +112,19 @@ with the branch outside. The mean over all branches with loops of a program deci
 """
 
 Step = Operation | list[int]
-"""A single operation, or the values of a stage."""
+"""A step of a program: a single operation, or the numbers of the values that a stage computes."""
 
 
 def run_staged(
     function: Native, args: Sequence[Array], last: Callable[..., list[Array]] | None = None
 ) -> list[Array]:
-    """Runs a native function in stages.
+    """Calls a native function in stages; returns its results.
 
     Args:
         function: the native function.
         args: its arguments.
-        last: a further stage at the end, last(*results); None for none.
+        last: a function of the results that runs as one more stage, and whose results are returned
+            instead; None for none.
     """
     if not staged():
         return function(*args) if last is None else last(*function(*args))
@@ -138,17 +139,18 @@ def run_staged(
 
 
 def staged() -> bool:
-    """Returns True unless the environment turns staging off."""
+    """Returns True unless the environment variable JAXCON_STAGES turns staging off."""
     return os.environ.get("JAXCON_STAGES") != "off"
 
 
 class Stages:
-    """A program as a sequence of stages and of operations outside of stages.
+    """A program, cut into stages and single operations, and grouped into kernels.
 
     Attributes:
-        parts: for each part, its steps, and those of their values that later parts need. A part is
-            a kernel, or one step outside of kernels. A step is an operation, or the values that a
-            stage computes.
+        parts: the parts of the program, in order; a part is a kernel, or one step outside of
+            kernels. Each entry has the steps of the part, and the numbers of the values to keep,
+            which later parts or the results need. A step is a single operation, or the numbers of
+            the values that a stage computes.
     """
 
     def __init__(self, closed: ClosedJaxpr, apart: bool = False) -> None:
@@ -165,7 +167,7 @@ class Stages:
         self.parts = _with_results(self.program, _in_parts(steps))
 
     def __call__(self, *args: Array) -> list[Array]:
-        """Computes the results."""
+        """Runs all parts; returns the results of the program."""
         values: dict[int, Any] = dict(zip(self.program.inputs, args, strict=True))
         for steps, wanted in self.parts:
             if all(map(_fits, steps)):
@@ -180,7 +182,13 @@ class Stages:
         return len(self.parts) == 1 and all(map(_fits, self.parts[0][0]))
 
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
-        """Computes values, stage by stage."""
+        """Runs the steps of a part in order, and adds their results to `values`.
+
+        Args:
+            steps: the steps.
+            values: the values computed so far, by number.
+            wanted: not used, since all results of the steps are added; `_store` passes it.
+        """
         for step in steps:
             if isinstance(step, Operation) and step.name == "cond":
                 self._branch(step, values)
@@ -191,9 +199,14 @@ class Stages:
                 self._store_stage(values, step)
 
     def _store_stage(self, values: dict[int, Any], wanted: list[int]) -> None:
-        """Computes the values of a stage; each value that is light to compute gets its own call.
+        """Computes the values of a stage in calls that XLA does not inline.
 
-        A call with several results fills a table of their addresses, which costs more than a call.
+        Each value that is light to compute gets its own call, and all others share one call. A call
+        with several results fills a table of their addresses, which costs more than another call.
+
+        Args:
+            values: the values computed so far, by number; the new values are added.
+            wanted: the numbers of the values of the stage.
         """
         light = [
             x for x in wanted if self.is_light(values, [x]) and not self._may_overwrite(values, [x])
@@ -206,7 +219,14 @@ class Stages:
             self._store(values, others, self._evaluate, call)
 
     def _branch(self, step: Operation, values: dict[int, Any]) -> None:
-        """Computes the results of a condition; its branches compute operands not yet computed."""
+        """Computes the results of a conditional, and adds them to `values`.
+
+        Operands that are not computed so far are computed inside of the branches.
+
+        Args:
+            step: the conditional.
+            values: the values computed so far, by number.
+        """
         index, *operands = step.inputs
         read = [x for x in operands if not isinstance(x, Constant)]
         leaves, _ = self.program.between(values, read)
@@ -225,7 +245,7 @@ class Stages:
         values.update(zip(step.outputs, results, strict=True))
 
     def _evaluate(self, values: dict[int, Any], wanted: Sequence[int]) -> None:
-        """Computes values and stores them in `values`."""
+        """Computes the wanted values and all values they depend on, and adds them to `values`."""
         for x in wanted:
             self.program.evaluate(values, x)
 
@@ -236,7 +256,14 @@ class Stages:
         how: Callable[..., None],
         call: Callable[..., list[Array]],
     ) -> None:
-        """Computes the wanted values from known values, in one separate call."""
+        """Computes values in one call that XLA does not inline, and adds them to `values`.
+
+        Args:
+            values: the values computed so far, by number.
+            wanted: the numbers of the values to compute.
+            how: the function (values, wanted) that computes them inside of the call.
+            call: calls a function of arrays without inlining, such as `_stage` or `_kernel`.
+        """
         leaves, _ = self.program.between(values, wanted)
 
         def compute(*given: Array) -> list[Array]:
@@ -248,7 +275,12 @@ class Stages:
         values.update(zip(wanted, results, strict=True))
 
     def is_light(self, known: Container[int], wanted: list[int]) -> bool:
-        """Returns True if XLA does not split the computation of these values among threads."""
+        """Returns True if a computation is too cheap for XLA to split it among threads.
+
+        Args:
+            known: the numbers of the values computed so far.
+            wanted: the numbers of the values to compute from them.
+        """
         leaves, operations = self.program.between(known, wanted)
         sizes = self.program.sizes
         if not is_known([sizes[x] for x in (*leaves, *wanted)]):
@@ -259,9 +291,14 @@ class Stages:
         return cost < LIGHT
 
     def _may_overwrite(self, known: Container[int], wanted: list[int]) -> bool:
-        """Returns True if a result of a stage has the size of an operand whose data it moves.
+        """Returns True if XLA might overwrite an operand of a stage that is still needed.
 
-        XLA might then write the result in place of the operand; see `_stage_with_arguments`.
+        XLA may write a result of the stage in place of the operand. This does harm if the stage
+        moves the data of the operand, and both have the same size; see `_stage_with_arguments`.
+
+        Args:
+            known: the numbers of the values computed so far.
+            wanted: the numbers of the results of the stage.
         """
         sizes = {self.program.sizes[x] for x in wanted}
         operations = self.program.between(known, wanted)[1]
@@ -270,17 +307,21 @@ class Stages:
 
 
 def work(name: str) -> int:
-    """Returns an upper bound on the number of XLA operations of a primitive for each entry."""
+    """Returns a bound on the number of operations that XLA needs for each entry of a result.
+
+    Args:
+        name: the name of the primitive.
+    """
     return 32 if name in COSTLY or name in ("integer_pow", "nextafter") else 4
 
 
 def worth_storing(program: Program) -> set[int]:
-    """Returns the values to store: those that several kernels need and that are costly to compute.
+    """Returns the values that stages compute and store: shared values that are costly to compute.
 
-    A sweep backward over the operations selects values that two later kernels need, or that an
+    A sweep backward over the operations selects values that several later kernels need, or that an
     operation outside of kernels reads. A sweep forward drops values that are cheap to compute from
-    the other stored values. A row of an array that a loop changes in place is not cheap: a kernel
-    that reads it after the change would make the compiler copy the array.
+    the other stored values. A row of an array that a loop changes in place does not count as cheap:
+    if a kernel read it after the change, the compiler would have to copy the array.
     """
     stored, ends = _needed_twice(program)
     work: dict[int, frozenset[int]] = {}
@@ -296,15 +337,19 @@ def worth_storing(program: Program) -> set[int]:
         cheap = len(steps) < WORTH and op.name not in COSTLY
         if name in stored and name not in ends and cheap:
             stored.discard(name)
-        work[name] = steps if cheap else frozenset(list(steps)[:WORTH])  # more is not counted
+        work[name] = steps if cheap else frozenset(list(steps)[:WORTH])  # WORTH is enough
     return stored
 
 
 def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
-    """Returns the values that several kernels need, and the values that end a kernel.
+    """Finds the values to store because of where they are read.
 
-    A kernel ends at results of the program, and at values that an operation outside of kernels
-    reads, unless this operation is a condition whose branches can compute them.
+    Returns:
+        The values that several kernels need, or at which a kernel ends; without the results of
+        operations that only move data.
+        The values at which a kernel ends: the results of the program, and the values that an
+        operation outside of kernels reads. If the only reader is a conditional whose branches can
+        compute a value, the value does not count.
     """
     readers = program.readers()
     results = {x for x in program.outputs if not isinstance(x, Constant)}
@@ -326,17 +371,21 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
         if not moves and (len(needed) > 1 or name in needed):
             stored.add(name)
             needed = {name}
-        kernels[name] = set(sorted(needed)[:2])  # only more than one matters
+        kernels[name] = set(sorted(needed)[:2])  # two show that it is shared
     return stored, ends
 
 
 def _in_stages(program: Program, stored: set[int]) -> list[Step]:
-    """Returns the operations and stages in order.
+    """Orders the operations and stages of a program as steps.
 
-    A stored value joins the last stage, unless it depends on that stage or on a later operation.
+    A value to store joins the last stage, unless it depends on that stage or on a later step.
+
+    Args:
+        program: the program.
+        stored: the values that stages compute; see `worth_storing`.
     """
     steps: list[Any] = []
-    last = -1  # stage
+    last = -1  # the position of the last stage in `steps`
     made: dict[int, int] = {}
     for op in program.operations:
         after = max((made.get(x, -1) for x in op.inputs if not isinstance(x, Constant)), default=-1)
@@ -355,7 +404,10 @@ def _in_stages(program: Program, stored: set[int]) -> list[Step]:
 
 
 def _in_parts(steps: list[Step]) -> list[list[Step]]:
-    """Groups steps into kernels of even size; a step that fits no kernel is a part of its own."""
+    """Groups successive steps into parts: kernels of similar size, and single steps between them.
+
+    A step that no kernel may contain is a part of its own.
+    """
     # the size of kernels is chosen as if every step fitted into a kernel
     count = max(1, math.ceil(len(steps) / MOST))
     most = math.ceil(len(steps) / count)
@@ -369,7 +421,10 @@ def _in_parts(steps: list[Step]) -> list[list[Step]]:
 
 
 def _set_apart(steps: list[Step]) -> None:
-    """Keeps large branches with loops out of kernels, unless too many parts result."""
+    """Keeps branches with loops out of kernels, if they are large on average.
+
+    See `PER_OPERAND`. Nothing changes if the program would then have more than `FEW_PARTS` parts.
+    """
     ops = [x for x in steps if isinstance(x, Operation) and _fits(x) and _has_loop(x)]
     inside = sum(instructions(x.jaxpr) for op in ops for x in op.params["branches"])
     if inside <= PER_OPERAND * sum(len(op.inputs) for op in ops):
@@ -382,15 +437,17 @@ def _set_apart(steps: list[Step]) -> None:
 
 
 def _has_loop(op: Operation) -> bool:
-    """Returns True for a condition with a loop in a branch."""
+    """Returns True if an operation is a conditional with a loop in one of its branches."""
     branches = op.params["branches"] if op.name == "cond" else ()
     return any(not primitives(x.jaxpr).isdisjoint({"scan", "while"}) for x in branches)
 
 
 def _with_results(program: Program, parts: list[list[Step]]) -> list[tuple[list[Step], list[int]]]:
-    """Returns each part with those of its values that later parts or the results need.
+    """Finds the values of each part that later parts, or the results of the program, need.
 
-    Parts without such values or side effects are left out.
+    Returns:
+        Pairs (steps of a part, numbers of these values). Parts that have neither such values nor
+        side effects are left out.
     """
     made = [[x for step in part for x in _values(step)] for part in parts]
     known = {*program.inputs, *(x for part in made for x in part)}
@@ -411,12 +468,12 @@ def _operations(program: Program, step: Step) -> list[Operation]:
 
 
 def _acts(part: list[Step]) -> bool:
-    """Returns True for a part with side effects, such as printing."""
+    """Returns True if a part has side effects, such as printing."""
     return any(isinstance(step, Operation) and step.effects for step in part)
 
 
 def _values(step: Step) -> list[int]:
-    """Returns the values that a step computes."""
+    """Returns the numbers of the values that a step computes."""
     return step.outputs if isinstance(step, Operation) else step
 
 
@@ -426,24 +483,29 @@ def _fits(step: Step) -> bool:
 
 
 def _computes(op: Operation, name: int) -> bool:
-    """Returns True if the value is an operand that the branches of a condition can compute.
+    """Returns True if an operation is a conditional whose branches can compute an operand.
 
-    The index of the branch must be computed before.
+    They cannot compute the index of the branch, which must be known before.
+
+    Args:
+        op: the operation.
+        name: the number of the operand.
     """
     return op.name == "cond" and op.inputs[0] != name
 
 
 def _elementwise(op: Operation) -> bool:
-    """Returns True if an operation is fused into the kernels that read its result."""
+    """Returns True if XLA fuses an operation into the kernels that read its result."""
     return op.plain and (op.name in ARITHMETIC or op.name in MOVES or op.name in COSTLY)
 
 
 def _kernel(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
-    """Calls a function as one kernel.
+    """Calls a function that becomes one kernel; returns its results.
 
     XLA finds the buffers of a kernel by the operands of its instructions. It fails if an argument
-    is no operand: a constant, or an argument that no result depends on. The barrier hides
-    constants, and a call that does nothing makes all arguments operands.
+    of the kernel is no operand, because it is a constant or no result depends on it. Therefore a
+    barrier hides constants, and an inner call that only returns its arguments makes all of them
+    operands.
     """
 
     def kernel(*args: Array) -> list[Array]:
@@ -458,7 +520,13 @@ def _kernel(function: Callable[..., list[Array]], args: list[Array]) -> list[Arr
 def _stage(
     function: Callable[..., list[Array]], args: list[Array], light: bool = False
 ) -> list[Array]:
-    """Calls a function as a stage of a kernel."""
+    """Calls a function that becomes a stage of a kernel; returns its results.
+
+    Args:
+        function: a function of arrays.
+        args: its arguments.
+        light: True if the stage is too cheap for XLA to split it among threads.
+    """
 
     def stage(*args: Array) -> list[Array]:
         return function(*args)
@@ -467,10 +535,11 @@ def _stage(
 
 
 def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array]) -> list[Array]:
-    """Calls a function as a stage that also returns its arguments, so that none is overwritten.
+    """Calls a function as a stage, so that XLA does not overwrite its arguments.
 
-    XLA merges two equal arguments to one array. If one is read entry by entry, XLA writes a result
-    in its place, although the other is read at moved positions.
+    XLA merges two equal arguments to one array. If the first is read entry by entry, XLA may write
+    a result in its place. The second may be read at moved positions, and is then overwritten too
+    early. The stage therefore also returns its arguments, which are then dropped.
     """
     results = _stage(lambda *args: [*function(*args), *args], args)
     return results[: len(results) - len(args)]
@@ -479,16 +548,16 @@ def _stage_with_arguments(function: Callable[..., list[Array]], args: list[Array
 def uninlined(
     function: Callable[..., list[Array]], args: Sequence[Array], light: bool = False
 ) -> list[Array]:
-    """Calls a function without inlining by XLA.
+    """Calls a function of arrays that XLA does not inline; returns its results.
 
-    A call with a single result gets a second, unused result, which the barrier keeps. Otherwise XLA
-    would split a costly call among threads, which is not possible inside a kernel. Each result is a
-    buffer whose address every call of the kernel looks up, so light calls get no second result.
+    XLA would split a costly call with a single result among threads, which is not possible inside a
+    kernel. Such a call therefore gets a second, unused result, which a barrier keeps. Light calls
+    get no second result, because the kernel looks up the address of each result at each run.
 
     Args:
         function: a function of arrays.
         args: the arguments of the function.
-        light: True if the call is too cheap for XLA to split.
+        light: True if the call is too cheap for XLA to split it among threads.
     """
 
     @functools.wraps(function)
@@ -498,13 +567,17 @@ def uninlined(
 
     results, beside = jax.jit(call)(*args)
     first, *others = *results, *beside
-    # metadata of a result of a call apply to the call
+    # metadata that are set on a result of a call apply to the call
     barred = jax.lax.optimization_barrier([set_xla_metadata(first, **KERNEL), *others])
     return barred[: len(results)]
 
 
 def _settled_body(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, bool]:
-    """Returns the body of a loop or branch in stages, and True if all of it fits into a kernel."""
+    """Cuts the body of a loop or a branch into stages.
+
+    Returns:
+        The closed jaxpr of the body in stages, and True if one kernel may contain all of it.
+    """
     inputs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in closed.jaxpr.invars]
     stages = Stages(closed)
     plain = all(_fits(step) for steps, _ in stages.parts for step in steps)

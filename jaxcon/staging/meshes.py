@@ -20,7 +20,7 @@ from jaxcon.core.typing import Array, T
 
 
 def together(tree: T) -> T:
-    """Puts all arrays of a tree on the mesh in use, with equal sets of varying mesh axes.
+    """Puts all arrays of a tree on the current mesh, and lets them vary along the same mesh axes.
 
     The initial value of a loop needs this, since types must not change within a loop. The transpose
     of this operation is a sum over devices. If it is called outside of a loop, devices communicate
@@ -42,13 +42,13 @@ def together(tree: T) -> T:
 
 
 def _varies(aval: Any) -> frozenset[Any]:
-    """Returns the mesh axes along which an array varies; JAX 0.10 has renamed the attribute."""
+    """Returns the mesh axes along which an array of this type varies, in any version of JAX."""
     return aval.manual_axis_type.varying if hasattr(aval, "manual_axis_type") else aval.vma
 
 
 @contextmanager
 def apart() -> Iterator[None]:
-    """Makes explicit mesh axes automatic in this context: the compiler places all arrays."""
+    """Makes explicit mesh axes automatic in this context, so that the compiler places arrays."""
     mesh = jax.sharding.get_abstract_mesh()
     explicit = mesh.explicit_axes
     if not explicit:
@@ -61,15 +61,16 @@ def apart() -> Iterator[None]:
 
 
 def plain(aval: ShapedArray | jax.ShapeDtypeStruct) -> ShapedArray:
-    """Returns a type with a shape and a dtype, but no placement."""
+    """Returns the type of an array without its placement: only the shape and the dtype."""
     return ShapedArray(aval.shape, aval.dtype)
 
 
 def typed(results: Sequence[Any], args: Sequence[Any]) -> list[ShapedArray]:
     """Returns the types of the results of a native function, placed like its arguments.
 
-    Batch axes are last. A result axis is split along the explicit mesh axis by which an argument's
-    axis of equal size is split at the same place, counted from the last axis. All other axes are
+    An axis of a result is compared with axes of equal size at the same position in the arguments.
+    Positions count from the last axis, because batch axes are last. If one of these axes is split
+    along an explicit mesh axis, the axis of the result is split in the same way. All other axes are
     whole on each device.
 
     Args:

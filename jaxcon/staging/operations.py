@@ -33,14 +33,14 @@ def count(jaxpr: Jaxpr, branch: Branch = max) -> float:
 
     Args:
         jaxpr: the program.
-        branch: max or min, which computes the cost of a conditional from the costs of its branches.
+        branch: max or min, to count the costliest or the cheapest branch of a conditional.
     """
     values = Values(branch)
     return values.evaluate(jaxpr, [values.fresh() for _ in jaxpr.invars])[0]
 
 
 def instructions(jaxpr: Jaxpr) -> int:
-    """Returns the number of equations of a jaxpr and its inner jaxprs; loop bodies count once."""
+    """Returns the number of equations of a jaxpr, inner jaxprs included; loop bodies count once."""
     total = 0
     for equation in jaxpr.eqns:
         inner = list(inside(equation))
@@ -58,7 +58,7 @@ def primitives(jaxpr: Jaxpr) -> set[str]:
 
 
 class Values:
-    """Numbers the distinct values of a program.
+    """A numbering of the distinct values of a program, to count repeated computations only once.
 
     Two equations with the same primitive, parameters and inputs give the same values. The order of
     inputs does not matter for the primitives in `COMMUTING`. A loop is identified by the jaxpr of
@@ -66,7 +66,7 @@ class Values:
 
     Attributes:
         branch: see `count`.
-        known: the numbers of results, by primitive, inputs and parameters.
+        known: the numbers of results by primitive, numbers of inputs, and parameters.
     """
 
     def __init__(self, branch: Branch) -> None:
@@ -75,7 +75,7 @@ class Values:
         self.numbers = itertools.count()
 
     def fresh(self) -> int:
-        """Returns a new number, for a value that is not computed from others."""
+        """Returns a number that no value has so far."""
         return next(self.numbers)
 
     def evaluate(self, jaxpr: Jaxpr, given: list[int]) -> tuple[float, list[int]]:
@@ -105,6 +105,10 @@ class Values:
     def equation(self, equation: JaxprEqn, inputs: list[int]) -> tuple[float, list[int]]:
         """Counts the operations of an equation that have not been counted before.
 
+        Args:
+            equation: the equation.
+            inputs: the numbers that identify its inputs.
+
         Returns:
             The number of operations, and the numbers that identify the results.
         """
@@ -127,9 +131,16 @@ class Values:
 
 
 def called_by(equation: JaxprEqn, inputs: list[int]) -> tuple[Any, list[int]] | None:
-    """Returns the jaxpr that an equation merely calls, and its inputs; None for other equations.
+    """Returns the jaxpr that an equation calls once, without a loop or a branch.
 
     A linear solve calls its solver; the matrix of the solve is only needed for derivatives.
+
+    Args:
+        equation: the equation.
+        inputs: the numbers that identify its inputs.
+
+    Returns:
+        The jaxpr and the numbers of its inputs; None for other equations.
     """
     name, params = equation.primitive.name, equation.params
     if name == "custom_linear_solve":
@@ -143,7 +154,10 @@ def called_by(equation: JaxprEqn, inputs: list[int]) -> tuple[Any, list[int]] | 
 
 
 def parameters(equation: JaxprEqn) -> Any:
-    """Returns the parameters of an equation as a key; a new object if they cannot be hashed."""
+    """Returns a key for the parameters of an equation.
+
+    If they cannot be hashed, the key is a new object, which equals no other key.
+    """
     params = tuple(sorted(equation.params.items()))
     try:
         hash(params)
@@ -153,7 +167,14 @@ def parameters(equation: JaxprEqn) -> Any:
 
 
 def operations(equation: JaxprEqn, branch: Branch = max) -> float:
-    """Returns the operations of one equation; a loop of unknown length counts as one round."""
+    """Returns the number of arithmetic operations of one equation, inner jaxprs included.
+
+    A loop of unknown length counts as one round.
+
+    Args:
+        equation: the equation.
+        branch: max or min, to count the costliest or the cheapest branch of a conditional.
+    """
     name, params = equation.primitive.name, equation.params
     if name == "scan":
         return params["length"] * count(params["jaxpr"].jaxpr, branch)
@@ -164,9 +185,9 @@ def operations(equation: JaxprEqn, branch: Branch = max) -> float:
 
 
 def inside(equation: JaxprEqn) -> Iterator[Any]:
-    """Yields the jaxprs that an equation evaluates; none for a plain instruction."""
+    """Yields the inner jaxprs that an equation evaluates; nothing for a plain instruction."""
     name, params = equation.primitive.name, equation.params
-    if name == "custom_linear_solve":  # calls its solver; the matrix is only needed for derivatives
+    if name == "custom_linear_solve":  # its matrix is only needed for derivatives
         yield params["jaxprs"].solve.jaxpr
         return
     if name == "native":
@@ -186,7 +207,10 @@ def inside(equation: JaxprEqn) -> Iterator[Any]:
 
 
 def arithmetic(equation: JaxprEqn) -> float:
-    """Returns the number of arithmetic operations of one instruction, from its shapes."""
+    """Returns the number of arithmetic operations of an equation without inner jaxprs.
+
+    The number follows from the shapes of its operands and results.
+    """
     if not equation.outvars:
         return 0.0
     name = equation.primitive.name

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jaxcon.staging.batch_last import Native
 
 IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
-"""Primitives that return their arguments. XLA drops barriers, too, before it forms kernels."""
+"""Primitives that return their arguments. XLA removes even barriers before it forms kernels."""
 
 REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
     "reduce_sum": jax.lax.add,
@@ -31,26 +31,26 @@ REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
     "reduce_and": jax.lax.bitwise_and,
     "reduce_or": jax.lax.bitwise_or,
 }
-"""Reductions that `by_halves` replaces by elementwise operations, if they are over first axes."""
+"""The elementwise operation by which `by_halves` replaces each reduction over the first axes."""
 
 
 class Constant:
-    """A literal or a captured array as an operand of an operation."""
+    """An operand of an operation that is a literal or an array over which the function closes."""
 
     def __init__(self, value: Scalar) -> None:
         self.value = value
 
 
 Operand = int | Constant
-"""The number of a value, or a constant."""
+"""An operand of an operation: the number of a value, or a constant."""
 
 
 @dataclass
 class Operation:
-    """An instruction on numbered values.
+    """The application of a primitive to numbered values.
 
     Attributes:
-        inputs, outputs: operands and results.
+        inputs, outputs: the operands, and the numbers of the results.
         plain: True if a kernel may contain the operation; False for random keys, for side effects
             such as printing, and for loops and branches that do not fit into a kernel.
         effects: True if the operation has side effects.
@@ -69,7 +69,7 @@ class Operation:
         return self.primitive.name
 
     def __call__(self, operands: list[Any]) -> list[Any]:
-        """Binds the primitive; returns its results."""
+        """Applies the primitive to the values of the operands; returns its results."""
         results = self.primitive.bind(*operands, **self.params)
         return results if self.primitive.multiple_results else [results]
 
@@ -81,7 +81,7 @@ def traced(function: Native, args: Sequence[Any]) -> ClosedJaxpr:
 
 
 def evaluated(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """Returns the results of a closed jaxpr."""
+    """Evaluates a closed jaxpr; returns its results."""
     return jex.jaxpr_as_fun(closed)(*args)
 
 
@@ -112,7 +112,7 @@ class Program:
         self._known: dict[Any, list[int]] = {}
         self.sizes: dict[int, int] = {}
         self.bytes: dict[int, int] = {}
-        self._lengths: dict[int, list[Any]] = {}  # of operands of concatenations
+        self._lengths: dict[int, list[Any]] = {}  # of the operands of concatenations
         self.inputs = [self._new(x) for x in closed.jaxpr.invars]
         self.outputs = self._inline_closed(closed, list(self.inputs))
         self._read_parts()
@@ -129,7 +129,12 @@ class Program:
         return readers
 
     def evaluate(self, values: dict[int, Any], wanted: Operand) -> Any:
-        """Computes a value from known ones, and stores intermediate values in `values`."""
+        """Computes a value and returns it.
+
+        Args:
+            values: the values computed so far, by number. All values on the way are added.
+            wanted: the number of the value; of a constant, its own value is returned.
+        """
         if isinstance(wanted, Constant):
             return wanted.value
         todo = [wanted]
@@ -149,7 +154,15 @@ class Program:
     def between(
         self, known: Container[int], wanted: list[int]
     ) -> tuple[list[int], list[Operation]]:
-        """Returns the known values from which others are computed, and the operations to do so."""
+        """Finds the operations that compute wanted values from known values.
+
+        Args:
+            known: the numbers of the known values.
+            wanted: the numbers of the wanted values.
+
+        Returns:
+            The numbers of the known values that are needed, and the operations, in no fixed order.
+        """
         leaves: list[int] = []
         operations: list[Operation] = []
         seen: set[int] = set()
@@ -167,10 +180,10 @@ class Program:
         return leaves, operations
 
     def _read_parts(self) -> None:
-        """Lets slices of a concatenation read the operand in which they lie.
+        """Lets slices of a concatenation read the operand of the concatenation in which they lie.
 
-        This is done if every reader is a slice that lies in one operand. The concatenation is then
-        never stored.
+        This is only done if every operation that reads the concatenation is a slice within one
+        operand. The concatenation is then never stored.
         """
         readers, results = self.readers(), {x for x in self.outputs if isinstance(x, int)}
         for op in self.operations:
@@ -194,7 +207,11 @@ class Program:
         self.operations = operations[::-1]
 
     def _new(self, variable: Var) -> int:
-        """Numbers a new value."""
+        """Returns the number of a new value, and stores its size.
+
+        Args:
+            variable: the variable of the jaxpr, with shape and dtype.
+        """
         name = len(self.sizes)
         aval: Any = variable.aval
         self.sizes[name] = aval.size
@@ -202,7 +219,7 @@ class Program:
         return name
 
     def _inline_closed(self, jaxpr: Jaxpr | ClosedJaxpr, args: list[Operand]) -> list[Operand]:
-        """Appends the operations of a jaxpr; returns its results."""
+        """Appends the operations of a jaxpr to the program; returns its results as operands."""
         if isinstance(jaxpr, ClosedJaxpr):
             jaxpr, args = jaxpr.jaxpr, [*map(Constant, jaxpr.consts), *args]
         names = dict(zip([*jaxpr.constvars, *jaxpr.invars], args, strict=True))
@@ -216,7 +233,10 @@ class Program:
         return [read(x) for x in jaxpr.outvars]
 
     def _append(self, equation: JaxprEqn, args: list[Operand]) -> list[Operand]:
-        """Appends an equation, flattened where it calls a function; returns its results."""
+        """Appends an equation to the program; returns its results as operands.
+
+        If the equation calls a function, the operations of the function are appended instead.
+        """
         name, params = equation.primitive.name, equation.params
         operands: list[Any] = [x.aval for x in equation.invars]
         inner = called(equation)
@@ -244,7 +264,7 @@ class Program:
         if name == "scan":
             jaxpr, plain = self._inner(params["jaxpr"])
             return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain)
-        if name == "while":  # its condition is evaluated outside of kernels, maybe on all devices
+        if name == "while":  # its condition is outside of kernels, maybe on all devices
             body = self._inner(params["body_jaxpr"])[0]
             return self._emit(equation, params | {"body_jaxpr": body}, args, False)
         if name == "cond":
@@ -255,7 +275,16 @@ class Program:
     def _emit(
         self, equation: JaxprEqn, params: dict[str, Any], args: list[Operand], plain: bool
     ) -> list[Any]:
-        """Appends an operation, or reuses the results of an identical one."""
+        """Appends an operation; returns the numbers of its results.
+
+        If an identical operation was appended before, the numbers of its results are returned.
+
+        Args:
+            equation: the equation, which gives the primitive and the types.
+            params: the parameters of the operation.
+            args: the operands.
+            plain: False if a kernel must not contain the operation.
+        """
         primitive = equation.primitive
         key = _key(primitive, params, args)
         if key is not None and key in self._known:
@@ -279,9 +308,10 @@ class Program:
 def _part(
     reader: Operation, operands: list[Operand], lengths: list[Any], axis: int
 ) -> tuple[list[Operand], dict[str, Any]] | None:
-    """Returns the inputs and parameters with which a slice reads an operand of a concatenation.
+    """Converts a slice of a concatenation to a slice of one operand of the concatenation.
 
-    The result is None if the reader is no slice, or does not lie in one operand.
+    Returns the new inputs and parameters of the slice. The result is None if the reader is no
+    slice, or if the slice does not lie within one operand.
 
     Args:
         reader: an operation that reads the concatenation.
@@ -303,15 +333,21 @@ def _part(
 
 
 def _shifted(indices: Sequence[int], axis: int, by: int) -> tuple[int, ...]:
-    """Returns indices with the number `by` subtracted along one axis."""
+    """Returns the indices of all axes, with the number `by` subtracted from that of `axis`."""
     return tuple(i - by if a == axis else i for a, i in enumerate(indices))
 
 
 def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -> Array:
-    """Reduces the first axes by combining their halves until one entry is left.
+    """Reduces the first axes of an array, by combining its two halves until one entry is left.
 
-    For an odd number of entries, the middle entry belongs to both halves. A sum keeps the last
-    entry apart instead, because no entry may count twice.
+    For an odd number of entries, the middle entry belongs to both halves, which does not change a
+    maximum, for example. A sum, in which no entry may count twice, adds the last entry at the end
+    instead.
+
+    Args:
+        operation: the elementwise operation, such as `jax.lax.add`.
+        axes: the number of axes to reduce.
+        x: the array.
     """
     x = x.reshape((math.prod(x.shape[:axes]), *x.shape[axes:]))
     waiting: list[Array] = []
@@ -325,27 +361,31 @@ def by_halves(operation: Callable[[Array, Array], Array], axes: int, x: Array) -
 
 
 def slices(sizes: Sequence[int], axis: int, x: Array) -> list[Array]:
-    """Splits an array into slices of these sizes along an axis; kernels read through slices."""
+    """Splits an array into parts of these sizes along an axis, by slices.
+
+    Unlike the primitive `split`, slices do not store their results: kernels read through them.
+    """
     ends = itertools.accumulate(sizes)
     pairs = zip(ends, sizes, strict=True)
     return [jax.lax.slice_in_dim(x, end - size, end, axis=axis) for end, size in pairs]
 
 
 def _leading(axes: Sequence[int], shape: tuple[int, ...]) -> bool:
-    """Returns True if `axes` are the first axes in order, with known sizes that are not 0."""
+    """Returns True if `axes` are the first axes in order, and their sizes are known and not 0."""
     sizes = shape[: len(axes)]
     return tuple(axes) == tuple(range(len(axes))) and is_known(sizes) and all(sizes)
 
 
 def is_known(shape: Sequence[Any]) -> bool:
-    """Returns True if no size is symbolic; `jax.export.symbolic_shape` makes symbolic sizes."""
+    """Returns True if no size of a shape is symbolic, as from `jax.export.symbolic_shape`."""
     return all(isinstance(n, int) for n in shape)
 
 
 def _known_result(equation: JaxprEqn, args: list[Operand]) -> list[Operand] | None:
-    """Simplifies an operation that does not depend on all its operands; None if not possible.
+    """Returns the result of an equation that equals a constant or one of its operands, else None.
 
-    The compiler would simplify it as well, but only after `fusion` has chosen the values to store.
+    Examples are x⁰ and a selection by a constant. The compiler would also simplify such an
+    equation, but only after `fusion` has chosen the values to store.
     """
     if len(equation.outvars) != 1:
         return None
@@ -371,7 +411,10 @@ def _known_result(equation: JaxprEqn, args: list[Operand]) -> list[Operand] | No
 
 
 def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> Any:
-    """Returns a key that identical operations share; None if an operation cannot be compared."""
+    """Returns a key that is equal for identical operations; None for loops and branches.
+
+    It is also None if a parameter cannot be hashed.
+    """
     if primitive.name in ("scan", "while", "cond"):
         return None
     parts: list[Any] = []
@@ -382,7 +425,7 @@ def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> A
             value = np.asarray(x.value, jnp.result_type(x.value))
             parts.append((str(value.dtype), value.tobytes()))
         else:
-            parts.append((type(x.value).__name__, id(x.value)))  # kept alive by the operation
+            parts.append((type(x.value).__name__, id(x.value)))  # the operation keeps it alive
     key = (primitive, tuple(sorted(params.items(), key=lambda item: item[0])), tuple(parts))
     try:
         hash(key)
@@ -392,5 +435,5 @@ def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> A
 
 
 def _is_key(x: Any) -> bool:
-    """Returns True for random keys and other arrays of extended dtypes."""
+    """Returns True if x is a random key or another array of an extended dtype."""
     return jnp.issubdtype(getattr(x, "dtype", np.float32), jax.dtypes.extended)

@@ -17,15 +17,16 @@ from jaxcon.staging.program import is_known
 Args = TypeVar("Args")
 
 FEWEST, MOST_PARTS = 8, 8
-"""Chunks of `where_wanted`: the fewest worlds in a chunk, and the most chunks of a batch."""
+"""The fewest worlds in a chunk of `where_wanted`, and the most chunks of a batch."""
 
 
 def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
-    """Maps a function of one world over `rank` trailing batch axes.
+    """Returns a function that maps a function of one world over trailing batch axes.
 
     Args:
-        function: takes and returns pytrees of arrays without batch axes.
-        rank: the number of trailing batch axes, each of the batch's size or of size 1.
+        function: a function of pytrees of arrays without batch axes.
+        rank: the number of trailing batch axes. Each axis of an array has the size of the batch, or
+            size 1 if all worlds share the array.
     """
     if rank == 0:
         return function
@@ -53,13 +54,13 @@ def per_world(function: Callable[..., Any], rank: int) -> Callable[..., Any]:
 
 
 def batch_of(tree: PyTree, rank: int) -> tuple[int, ...]:
-    """Returns the shape of the `rank` trailing batch axes over all arrays of a tree."""
+    """Returns the shape of the batch: the last `rank` axes of all arrays, broadcast together."""
     shapes = (x.shape[x.ndim - rank :] for x in jax.tree.leaves(tree) if isinstance(x, jax.Array))
     return jnp.broadcast_shapes(*shapes)
 
 
 def broadcast_worlds(tree: T, batch: tuple[int, ...]) -> T:
-    """Broadcasts the arrays of a tree to the shape of the batch."""
+    """Broadcasts the trailing batch axes of all arrays of a tree to the shape of the batch."""
 
     def broadcast(x: Array) -> Array:
         return jnp.broadcast_to(x, (*x.shape[: x.ndim - len(batch)], *batch))
@@ -68,27 +69,32 @@ def broadcast_worlds(tree: T, batch: tuple[int, ...]) -> T:
 
 
 def where_tree(chosen: Array, x: T, y: T) -> T:
-    """Returns the tree x in the chosen worlds, and y in the others."""
+    """Returns a tree with the values of x in the chosen worlds, and of y in all other worlds."""
     return jax.tree.map(lambda a, b: jnp.where(expand_like(chosen, a), a, b), x, y)
 
 
 def expand_like(x: Array, like: Array) -> Array:
-    """Adds leading axes of size 1 to x (…), a value per world, to broadcast with `like` (n, …)."""
+    """Adds leading axes of size 1 to x, so that it has as many axes as `like`.
+
+    Args:
+        x: one value for each world, (…).
+        like: an array with further axes before the batch axes, such as (n, …).
+    """
     return x.reshape((1,) * (like.ndim - x.ndim) + x.shape)
 
 
 def where_wanted(wanted: Array, function: Callable[[Args], T], args: Args, others: T) -> T:
-    """Evaluates function(args) in the worlds where `wanted` is set; the others keep `others`.
+    """Returns function(args) in the worlds where `wanted` is True, and `others` elsewhere.
 
     If no world is wanted, the function is skipped. In a process with a single CPU device, the
-    wanted worlds are gathered and evaluated in chunks of an eighth of the batch, so that one world
-    does not cost a whole batch. The whole batch is evaluated in three cases: on accelerators, whose
-    time hardly depends on its size; on several devices, because gathering would move worlds
-    between them; and if the batch size is symbolic.
+    wanted worlds are gathered and evaluated in chunks of an eighth of the batch. A single wanted
+    world then does not cost a whole batch. The whole batch is evaluated in three cases: on
+    accelerators, whose time hardly depends on its size; on several devices, because gathering would
+    move worlds between them; and if the batch size is symbolic.
 
     Args:
         wanted: a boolean for each world, (…).
-        function: a function of a batch in which no world reads another.
+        function: a function of a batch, in which no world depends on another world.
         args: a pytree of arrays (n, …), of the batch's size along each trailing axis or of size 1.
         others: a pytree with the structure and shapes of the result; at least one leaf is floating.
 
@@ -106,9 +112,16 @@ def where_wanted(wanted: Array, function: Callable[[Args], T], args: Args, other
 
 
 def _gathered(wanted: Array, function: Callable[[Args], T], args: Args, like: T) -> T:
-    """Evaluates function(args) in chunks that hold the wanted worlds first.
+    """Evaluates function(args) in the wanted worlds, chunk by chunk.
 
-    The results of the other worlds are arbitrary.
+    The chunks take the wanted worlds first, and chunks without wanted worlds are skipped. The
+    results of worlds that are not wanted are arbitrary.
+
+    Args:
+        wanted: a boolean for each world, (…).
+        function: a function of a batch, in which no world depends on another world.
+        args: the arguments of the function.
+        like: a pytree with the structure and shapes of the result.
     """
     batch, count = wanted.shape, wanted.size
     size = max(FEWEST, -(-count // MOST_PARTS))
@@ -123,7 +136,7 @@ def _gathered(wanted: Array, function: Callable[[Args], T], args: Args, like: T)
         index = jax.lax.dynamic_slice(padded, (i * size,), (size,))
 
         def evaluated() -> Array:
-            # the loop copies each of its outputs in every iteration: one array is cheaper
+            # the loop copies each of its outputs in every iteration: one array is cheaper than many
             results = jax.tree.leaves(function(_gather_worlds(args, index, batch)))
             return jnp.concatenate([x.astype(real).reshape(-1, size) for x in results])
 
@@ -141,7 +154,16 @@ def _gathered(wanted: Array, function: Callable[[Args], T], args: Args, like: T)
 
 
 def _gather_worlds(tree: T, index: Array, batch: tuple[int, ...]) -> T:
-    """Gathers worlds by their index (k,) in the flattened batch; trailing axes become (k, 1, …)."""
+    """Gathers k worlds of a batch.
+
+    Args:
+        tree: a pytree of arrays with trailing batch axes.
+        index: the index of each gathered world in the flattened batch, (k,).
+        batch: the shape of the batch.
+
+    Returns:
+        The tree with the batch axes (k, 1, …). Arrays that all worlds share are unchanged.
+    """
     rank = len(batch)
 
     def gather(x: Array) -> Array:

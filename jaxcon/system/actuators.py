@@ -60,7 +60,7 @@ class JointForce(OnJoint):
 
     @classmethod
     def check_numbers(cls, owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
-        """Checks that stiffness and damping are not negative, and the order of ranges.
+        """Checks that stiffness and damping are not negative, and that ranges are not reversed.
 
         Args:
             owner: first words of errors.
@@ -310,7 +310,10 @@ class JointForces(Elements):
     starts: tuple[int, ...] = static(default=())
 
     def pulls(self, snapshot: Snapshot, control: Array | None) -> Pulls:
-        """Returns the generalized forces on the bodies of each side; u = 0 if control is None."""
+        """Returns the generalized forces on the bodies of each side.
+
+        If control is None, the control inputs are zero.
+        """
         coordinate = self.coordinate.read(snapshot)
         u: Lane = 0.0
         if self.starts and control is not None:

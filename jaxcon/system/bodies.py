@@ -62,7 +62,7 @@ class Particle:
         return zeros(self.n_v)
 
     def coadjoint(self, v: Vector, p: Vector) -> Vector:
-        """Returns the rate of a body-frame momentum p due to turning: zero, since v = q̇."""
+        """Returns zero, the rate of a momentum p due to turning axes: v = q̇ is along fixed axes."""
         return v.map(jnp.zeros_like)
 
     def carry(self, step: Vector, p: Vector) -> Vector:
@@ -86,7 +86,7 @@ class Particle:
     kick_little = kick
 
     def coast(self, v: Vector, moments: Moments, dt: Lane) -> Vector:
-        """Returns the mean gyroscopic acceleration less its initial value: zero, since v = q̇."""
+        """Returns zero: a body with v = q̇ has no gyroscopic acceleration."""
         return v.map(jnp.zeros_like)
 
     def motion(self, q: Array, v: Array) -> Motion:
@@ -255,7 +255,7 @@ class SpatialRigid(Particle):
         return Vector(*(Vector(*v[:3]) + Vector(*acceleration[:3]) * dt), *turned)
 
     def coast(self, v: Vector, moments: Moments, dt: Lane) -> Vector:
-        """Returns the mean gyroscopic acceleration of a free rotation, less its initial value."""
+        """Returns the mean minus the initial gyroscopic acceleration of a free rotation over h."""
         moments_, half = Vector.of(moments), dt / 2
         shares, ω = shares_of(moments_), Vector(*v[3:])
         turned = rotate_freely(ω, moments_, shares, half)

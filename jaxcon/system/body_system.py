@@ -38,7 +38,7 @@ STILL = 1e-9
 """A small relative speed of two particles [m/s] that keeps their turn rate finite in `bending`."""
 
 FARTHEST = 4.0
-"""The turn of a body in a step [rad] above which turns about every axis count.
+"""The turn of a body in a step [rad] above which `squared_turns` counts turns about all axes.
 
 After a turn near 2π the orientation no longer shows the direction of ω.
 """
@@ -204,7 +204,8 @@ class BodySystem:
 
         Args:
             q: coordinates at the start of the step, (n_q,).
-            after: coordinates at the end of the step, from q without whole turns, (n_q,).
+            after: coordinates at the end of the step, (n_q,); the step starts from q without whole
+                turns.
         """
         where = self.layout.angles
         if where is None or not coarse(q.dtype):
@@ -227,7 +228,7 @@ class BodySystem:
     def expect(
         self, here: Snapshot, end: Array, dt: Array, within: bool
     ) -> tuple[Array | tuple[()], Array]:
-        """Returns the expected angles after a step, and a bound on their error, () [rad].
+        """Returns the expected `counted` angles after a step, and a bound on their error, () [rad].
 
         Args:
             here: the snapshot at the start of the step.
@@ -241,10 +242,10 @@ class BodySystem:
         return turns, jnp.max(missed, axis=0)
 
     def _by_group(self, function: Callable[..., Vector], q: Array, *vectors: Array) -> Array:
-        """Concatenates `function(kind, properties, *velocities)` over all groups, (n_v,) or (n_q,).
+        """Applies a function to each group of bodies; concatenates the results, (n_v,) or (n_q,).
 
         Args:
-            function: takes a kind of body, the mass properties of a group, and Vectors of lanes.
+            function: (kind of body, mass properties, *vectors) → a Vector of lanes (body, …).
             q: positions, (n_q,).
             vectors: arrays (n_v,), each passed to the function as one Vector for each group.
         """
@@ -370,7 +371,7 @@ class BodySystem:
         return self._by_group(lambda kind, p, v: kind.rotate(v, p.moments, dt), q, v)
 
     def coast(self, q: Array, v: Array, dt: Array) -> Array:
-        """Returns the mean gyroscopic acceleration of a free rotation, less its initial value.
+        """Returns the mean minus the initial gyroscopic acceleration of a free rotation over h.
 
         Args:
             q: positions, (n_q,).
@@ -477,7 +478,7 @@ class BodySystem:
         return start not in rows.swings and sizes == {self.layout.dim}
 
     def complete(self, solution: Solution) -> Solution:
-        """Returns the solution of the saddle system unchanged: no accelerations follow from λ."""
+        """Returns the solution of the saddle system unchanged: it contains all accelerations."""
         return solution
 
     def sizes(self, n_q: int) -> tuple[int, int]:

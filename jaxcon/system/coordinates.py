@@ -123,7 +123,7 @@ def find(
 
     Args:
         groups: groups of joints.
-        where: the directory of the groups.
+        where: group and index of each joint, from `directory`.
         owner: class and name of the element that uses the coordinate, for error messages.
         joint: name of the joint.
         name: name of the coordinate; None for the only one.
@@ -149,16 +149,21 @@ def find(
 
 
 Counters = dict[tuple[int, str], dict[int, int]]
-"""The index in `State.turns` by joint, for each group of joints and coordinate name."""
+"""Maps (group of joints, coordinate name) to the index in `State.turns` of each joint."""
 
 
 def numbered(counted: tuple[JointCoordinate, ...]) -> Counters:
-    """Returns the index in `State.turns` by joint, for each (group, coordinate name)."""
+    """Maps each counted (group, coordinate name) to the index in `State.turns` of each joint."""
     return {(c.group, c.name): dict(zip(c.joints, c.counters, strict=True)) for c in counted}
 
 
 def at(counters: Counters, ends: Iterable[End]) -> JointCoordinate:
-    """Returns one coordinate of several joints of a group, with indices in `State.turns`."""
+    """Returns one coordinate of several joints of a group.
+
+    Args:
+        counters: the indices in `State.turns` of all counted coordinates.
+        ends: the coordinate of each joint; all have the same group and the same name.
+    """
     groups, joints, names = zip(*ends, strict=True)
     indices = counters.get((groups[0], names[0]), {})
     counted = tuple(indices[j] for j in joints if j in indices)
@@ -235,7 +240,7 @@ class OnJoint(OnCoordinates):
 
     @property
     def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
-        """The name of the joint and of its coordinate."""
+        """A single pair: the name of the joint and the name of its coordinate."""
         return ((self.joint, self.coordinate),)
 
 

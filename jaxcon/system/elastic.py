@@ -96,9 +96,9 @@ class Bending(ForceElement):
 
 
 def _stiffness_by_length(p: dict[str, Any]) -> Lane:
-    """Returns B / (s₁ + s₂), bending stiffness by length; NaN for an infinite length.
+    """Returns B / (s₁ + s₂), the bending stiffness divided by the length of both links.
 
-    NaN shows an infinite length, which would otherwise hide as a zero force.
+    The result is NaN for an infinite length, which would otherwise give a zero force unnoticed.
     """
     return p["stiffness"] / numerics.finite_or_nan(p["before"] + p["after"])
 
@@ -145,7 +145,9 @@ class Flexure(ForceElement):
         return (self.body_a, self.body_b)
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
-        """Returns the stiffnesses, and the directions of the second body when the joint is relaxed.
+        """Returns the stiffnesses and, if not `straight`, the directions bᵢ of the second body.
+
+        At assembly, bᵢ coincide with the principal axes of the first body.
 
         Raises:
             ValueError: a body is a particle.
@@ -193,7 +195,10 @@ class Flexure(ForceElement):
 
     @staticmethod
     def forces(p: dict[str, Any], a: BodyFrame, b: BodyFrame) -> tuple[Vector, Vector]:
-        """Returns the generalized forces on both bodies, κᵢ ∂(aᵢ·bᵢ) summed over the axes."""
+        """Returns the generalized forces on both bodies, the negative gradient of the energy.
+
+        With E = Σ κᵢ (1 − aᵢ·bᵢ), they are sums over the axes i: κᵢ times the gradient of aᵢ·bᵢ.
+        """
         pulls = [
             (u.pull(w.position) * k, w.pull(u.position) * k) for u, w, k in _directors(p, a, b)
         ]

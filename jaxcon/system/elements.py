@@ -1,4 +1,4 @@
-"""Equal elements side by side: the numbers of many joints or springs as lanes (element,)."""
+"""Batches of equal elements: the numbers of many joints or springs as lanes (element,)."""
 
 from __future__ import annotations
 
@@ -105,9 +105,9 @@ class BetweenBodies(Element):
 
 
 class Grid(NamedTuple):
-    """Numbers of elements that stay one array (element, …): points of a set, heights of a field.
+    """A field of many elements, kept as one array: contact points, or heights of a height field.
 
-    In a Vector, each number would be a separate lane.
+    A Vector would make a separate lane of each number.
 
     Attributes:
         values: the numbers, (element, …).
@@ -128,7 +128,7 @@ class Elements:
         params: the numbers by field: a lane (element,), a Vector of lanes, or a Grid.
         names: names of the elements.
         places: the bodies on which the elements act, one Place for each side.
-        law: the class of the elements, or its `kind`.
+        law: the class of the elements, or their common `kind`.
     """
 
     params: dict[str, Any]
@@ -175,7 +175,7 @@ class Elements:
         return {field: element_at(x, i) for field, x in self.params.items()}
 
     def set(self, changes: Mapping[str, Any]) -> Self:
-        """Returns the elements with changed numbers; `changes` has them by name and field."""
+        """Returns the elements with changed numbers; `changes` is {name: {field: value}}."""
         params = dict(self.params)
         for i, name in enumerate(self.names):
             given = changes.get(name, {})
@@ -189,7 +189,13 @@ class Elements:
         return dataclasses.replace(self, params=params)
 
     def check_numbers(self, name: str, numbers: Mapping[str, Any], dtype: DType) -> None:
-        """Checks the changed numbers of an element, given by field, by its class."""
+        """Checks the numbers of one element by the method `check_numbers` of its class.
+
+        Args:
+            name: name of the element, for errors.
+            numbers: the numbers by field.
+            dtype: dtype of the scene, in which they are compared.
+        """
         self.law.check_numbers(name, numbers, dtype)
 
     def select(self, indices: tuple[int, ...]) -> Self:
@@ -233,7 +239,7 @@ class UserElement:
         return {"params": self.params}
 
     def set(self, changes: Mapping[str, Any]) -> Self:
-        """Returns the element with changed parameters; `changes` has them by name and field."""
+        """Returns the element with changed parameters; `changes` is {name: {"params": value}}."""
         params = changes.get(self.law.name, {}).get("params", self.params)
         return dataclasses.replace(self, params=params)
 
@@ -293,7 +299,7 @@ def label(element: Named) -> str:
 
 
 def own_point(element: Named, what: str, point: PyTree, pose: Pose) -> Array:
-    """Returns a world point to attach to a body: `point`, or the body's position if it is None.
+    """Returns a checked point, world frame, or the body's position if `point` is None.
 
     Raises:
         ValueError: a wrong shape or dtype, a value that is not finite, or a point of a particle

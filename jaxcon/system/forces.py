@@ -257,7 +257,7 @@ class CustomForces(UserElement):
         given = (snapshot.system, self.params, snapshot.q, snapshot.v, snapshot.t, inputs)
         wrenches = per_world(self._wrenches, rank)(*given)
         for place, wrench, name in zip(self.places, wrenches, self.law.bodies, strict=True):
-            if place.group is None:  # the world takes up any force
+            if place.group is None:  # a force on the world has no effect
                 continue
             n, shape = snapshot.system.columns(place).components, wrench.shape
             if shape[: len(shape) - rank] != (n,):
@@ -292,7 +292,7 @@ class CustomForces(UserElement):
 
 
 def world_wrench(frame: BodyFrame, anchor: Vector | None, wrench: Vector) -> Vector:
-    """Returns the generalized force of a wrench (F, τ) in the world frame, with F at an anchor.
+    """Returns the generalized force of a wrench (F, τ), world frame, whose F acts at an anchor.
 
     Args:
         frame: the motion of the bodies.

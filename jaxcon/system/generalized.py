@@ -77,7 +77,7 @@ class GeneralizedCoordinates:
         return Snapshot(dataclasses.replace(self, size=v.shape[0]), q, v, t)
 
     forces = ()
-    """Empty: forces are the user's function."""
+    """Empty: the forces come from the user's function."""
 
     turns = counted = ()
     """Empty: generalized coordinates include whole turns."""
@@ -182,7 +182,7 @@ class GeneralizedCoordinates:
         return jnp.zeros_like(v)
 
     def complete(self, solution: Solution) -> Solution:
-        """Returns the solution of the saddle system unchanged."""
+        """Returns the solution of the saddle system unchanged: it contains all accelerations."""
         return solution
 
     def sizes(self, n_q: int) -> tuple[int, int]:

@@ -39,9 +39,9 @@ E = TypeVar("E")
 
 POINTS = {"anchor", "start", "end"}
 DIRECTIONS = {"axis", "first", "second", "normal", "travel", "edge"}
-"""The first words of field names for points (`POINTS`) and directions of bodies."""
+"""The first words of the names of fields with points (`POINTS`) or directions (`DIRECTIONS`)."""
 SIDES = {"b": 1, "c": 2}
-"""The index of the body in whose frame a field is, by the last word of the field's name.
+"""The index of the body whose frame a field uses, by the last word of the field's name.
 
 Other fields are in the frame of the first body, or of the second if `Element.in_b` names them.
 """
@@ -53,8 +53,8 @@ class Changed(NamedTuple):
     Attributes:
         mass, moments: new values [kg], [kg m²].
         offset: pose of the user's frame in the principal frame; None if they coincide.
-        shift: pose of the new principal frame in the old one; None if it stays in place. Without an
-            orientation if it does not turn.
+        shift: pose of the new principal frame in the old one; None if it stays in place. The pose
+            has no orientation if the frame does not turn.
     """
 
     mass: Array
@@ -76,7 +76,7 @@ class Shift(NamedTuple):
 
 
 def numbers(properties: MassProperties, i: int, offset: Pose | None) -> dict[str, Any]:
-    """Returns the inertial parameters of one body by name, in the form of `with_params`.
+    """Returns the inertial parameters of one body by name, as `with_params` takes them.
 
     Args:
         properties: mass properties of the group of the body.
@@ -227,7 +227,8 @@ def _placed(
         owner: first words of errors.
         solid: the new inertia, with a center and axes if its form has them.
         given: new values, by field.
-        default: center and axes for an `Inertia` without them; None to keep those of the body.
+        default: center and axes for an `Inertia` without them; None to keep the body's center and
+            axes.
 
     Raises:
         ValueError: axes given twice, or axes that are no quaternion.
@@ -299,7 +300,7 @@ def _moved(field: str, x: Numbers, sides: list[Shift | None], side: int) -> Numb
         field: name of the field.
         x: values of the field.
         sides: the shifts of the bodies on each side; None if they stay.
-        side: index of the side in whose frames the field is.
+        side: index of the side whose frames the field uses.
     """
     word = field.partition("_")[0]
     if word == "orientation":

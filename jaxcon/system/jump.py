@@ -23,7 +23,7 @@ class Jump:
 
 
 def with_jump(solution: Solution, jump: Jump | None, dt: Array) -> Solution:
-    """Returns the solution with the mean acceleration over a step of dt, impacts included."""
+    """Adds the velocity change of a jump, divided by dt, to the acceleration of a solution."""
     if jump is None:
         return solution
     a = solution.acceleration + numerics.safe_divide(jump.velocity, dt[None])

@@ -65,7 +65,7 @@ class Momentum(NamedTuple):
 
 
 def parts_of(snapshot: Snapshot, places: Iterable[Place]) -> list[BodiesOfKind]:
-    """Collects the bodies that some places name, grouped by kind; a place has one body."""
+    """Collects the bodies that some places name, grouped by kind; each place has one body."""
     chosen: dict[int, list[int]] = {}
     for place in places:
         assert place.group is not None

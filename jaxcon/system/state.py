@@ -27,7 +27,7 @@ UNSET: Any = object()
 
 @exportable
 class MethodMemory(NamedTuple):
-    """The memory of a method between steps, for each part of the method; () for a part without one.
+    """The memory of a method between steps, for each of its parts; () for a part without memory.
 
     Attributes:
         integrator: accelerations of the last step, for integrators that use them.
@@ -96,7 +96,7 @@ class State(Stacked):
         angle_remainder: Array | tuple[()] = (),
     ) -> None:
         if time_remainder is UNSET:
-            # if the fields are vmap axes or shardings instead of numbers, copy that of time
+            # if the fields are vmap axes or shardings instead of numbers, copy the entry of `time`
             time_remainder = time
             if isinstance(time, int | float | np.ndarray | np.generic):
                 time_remainder = 0 * time if isinstance(time, int | float) else np.zeros_like(time)
@@ -218,7 +218,7 @@ def _kind(x: Any) -> str:
 
 
 def with_turns(system: S, turns: Array | tuple[()], remainder: Array | tuple[()] = ()) -> S:
-    """Returns the system with the whole turns of a state.
+    """Returns the system with the expected angles (`turns`) of a state.
 
     Args:
         system: the system to which the state belongs.

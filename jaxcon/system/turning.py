@@ -27,9 +27,9 @@ from jaxcon.core.typing import Array, DType
 Arrays = tuple[Array, ...]
 
 DIGITS = 8
-"""The number of binary digits of the first two of the three floats that sum up to 2π.
+"""The number of binary digits in the first and in the second of three floats whose sum is 2π.
 
-The product of each with an integer up to 65 536 is exact in float32.
+The product of either with an integer up to 65 536 is exact in float32.
 """
 
 QUARTER = 4

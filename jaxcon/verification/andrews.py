@@ -84,7 +84,8 @@ def spring(q: jax.Array, p: dict[str, Any]) -> jax.Array:
 def loops(q: jax.Array, t: jax.Array, p: dict[str, Any]) -> jax.Array:
     """Returns the residuals of three loop closures, (6,) [m].
 
-    All three loops close at the common joint of the crank and the triangle arms.
+    The end of the crank chain, with the angles β and Θ, must coincide with the ends of
+    three other chains. Their angles are γ, then Φ and δ, then Ω and ε.
     """
     beta, theta, gamma, phi, delta, omega, epsilon = q
     x = p["rr"] * jnp.cos(beta) - p["d"] * jnp.cos(beta + theta)
@@ -103,7 +104,7 @@ def loops(q: jax.Array, t: jax.Array, p: dict[str, Any]) -> jax.Array:
 
 
 def andrews(method: jc.Method = RK4) -> tuple[GeneralizedCoordinates, jc.State]:
-    """Builds the mechanism at rest. Its parameters are leaves of the system, in SI units.
+    """Builds Andrews' mechanism at rest. Its parameters are leaves of the system, in SI units.
 
     Args:
         method: the method that will simulate the system.
@@ -123,13 +124,13 @@ def andrews(method: jc.Method = RK4) -> tuple[GeneralizedCoordinates, jc.State]:
 
 
 def andrews_squeezer() -> list[Check]:
-    """Checks the mechanism to t = 0.03 s: M(q) a = f(q, q̇) + Jᵀλ.
+    """Checks the motion of Andrews' mechanism, M(q) a = f(q, q̇) + Jᵀλ, up to t = 0.03 s.
 
     The multipliers of the reference have the opposite sign. The bound on q is eleven digits, as the
     reference demands. At 0.03 s, some rates are thousands of times smaller than the rate of the
     crank, and inherit its error through the loops. a and λ depend only on q and q̇. The bounds on
-    q̇, a and λ are therefore nine digits. At earlier times, errors are relative to the largest
-    component of each row. The published final state has 9.6 correct digits in q.
+    q̇, a and λ are therefore nine digits. At earlier times, their errors are relative to the largest
+    component of the row. The published final state has 9.6 correct digits in q.
     """
     case, data = "andrews_squeezer", references.load("ivp_andrews")
     rows, published = data["corrected_reference"]["rows"], data["published_reference_t0p03"]

@@ -23,8 +23,9 @@ def rates(system: BodySystem, q: jax.Array, v: jax.Array) -> jax.Array:
     """Returns lean rate, steer rate and spin of the rear wheel, (3,) [rad/s], at velocities v.
 
     All three are linear in v with constant coefficients. The lean rate is the angular velocity of
-    the frame about its own x axis. This neglects the pitch, which is of second order. The steering
-    axis has the same components in the axes of the frame and of the fork.
+    the frame about its own x axis. This neglects the pitch, which is of second order. The steer
+    rate is the difference between the angular velocities of fork and frame along the steering axis,
+    which has equal components in both body frames.
     """
     frame, fork, wheel = (
         system.motion(name, q, v).angular_velocity for name in ("frame", "fork", "rear_wheel")
@@ -48,10 +49,10 @@ def velocities(system: BodySystem, q: jax.Array, u: jax.Array) -> jax.Array:
 
 
 def tangents(system: BodySystem, state: jc.State) -> np.ndarray:
-    """Returns displacements (n_v, 2) for unit lean and unit steer.
+    """Returns displacements for a unit lean and a unit steer, as columns, (n_v, 2).
 
-    They preserve the holonomic constraints. Position, heading and wheel angles of the bicycle are
-    arbitrary.
+    They satisfy the linearized holonomic constraints. This leaves position, heading and wheel
+    angles of the bicycle free, so the displacements of least norm are returned.
     """
     rows = linearize(system, state.q, state.v, state.instant)
     held = np.asarray(rows.jacobian.dense())[rows.layout.holonomic]
@@ -64,12 +65,21 @@ def tangents(system: BodySystem, state: jc.State) -> np.ndarray:
 def linearized(
     system: BodySystem, state: jc.State, along: jax.Array, speed: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Returns the mass matrix M and the derivatives of the accelerations of lean and steer.
+    """Linearizes the nonlinear bicycle about upright motion at constant speed.
 
-    The derivatives are with respect to y = (lean, steer) and to ẏ, (2, 2) each. M = Bᵀ M_v B, with
-    the mass matrix M_v of the bodies. The columns of B are the velocities for unit rates of lean
-    and steer. The function places the nonlinear bicycle at q(y). Its velocities there satisfy the
-    constraints and have a given forward speed. The function then differentiates the accelerations.
+    For y = (lean, steer) and its rate ẏ, the bicycle is placed at q(y). Its velocities satisfy the
+    constraints and have the given forward speed. The accelerations ÿ(y, ẏ) of lean and steer are
+    then differentiated at y = ẏ = 0.
+
+    Args:
+        system: the bicycle.
+        state: its upright state.
+        along: displacements for a unit lean and a unit steer, from `tangents`, (n_v, 2).
+        speed: the forward speed, () [m/s].
+
+    Returns:
+        The mass matrix M, ∂ÿ/∂y and ∂ÿ/∂ẏ, (2, 2) each. M is Bᵀ M_v B, with the mass matrix M_v of
+        the bodies. The columns of B are the velocities for unit rates of lean and steer.
     """
 
     def accelerations(y: jax.Array, ẏ: jax.Array) -> jax.Array:

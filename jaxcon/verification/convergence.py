@@ -23,7 +23,7 @@ METHODS: dict[str, tuple[Callable[[], Integrator], int, tuple[int, ...]]] = {
     "Heun": (jc.integrators.Heun, 2, (400, 800, 1600, 3200)),
     "RK4": (jc.RK4, 4, (200, 400, 800, 1600)),
 }
-"""For each integrator: its class, its order, and numbers of steps per second."""
+"""For each integrator: its class, its order, and the numbers of steps per second of its runs."""
 
 
 def two_rods() -> tuple[BodySystem, jc.State]:

@@ -96,7 +96,7 @@ def loop(q: jax.Array, t: jax.Array, p: dict[str, Any]) -> jax.Array:
 
 
 def angular(bar: Linkage) -> tuple[GeneralizedCoordinates, jc.State]:
-    """Builds the linkage in three angles with one loop closure: 3 velocities, 2 constraint rows."""
+    """Builds the linkage from three angles and a loop closure: 3 velocities, 2 constraint rows."""
     params = {
         "lengths": jnp.asarray(bar.lengths),
         "masses": jnp.asarray(bar.masses),
@@ -125,7 +125,7 @@ def four_bar() -> list[Check]:
         checks.append(Check(case, f"{name}: one freedom, no row redundant", missing, 0.0))
         paths.append(sample(system, state, times, dt))
     plane, space, angles = (np.asarray(states.q) for states in paths)
-    params: Any = system.params  # parameters of the last model, which is in angles
+    params: Any = system.params  # of the last system in the loop, the model in angles
     middle = jax.vmap(middles, (0, None))(jnp.asarray(angles), params).swapaxes(1, 2)
     flat = plane.reshape(-1, 3, 3)  # x, y, θ of three bodies
     solid = space.reshape(-1, 7, 3)
@@ -143,7 +143,7 @@ def four_bar() -> list[Check]:
 def trapezoid() -> list[Check]:
     """Checks a hanging isosceles trapezoid of three equal links, in equilibrium and swinging.
 
-    The reference rotates about +y, which is clockwise in the xz plane. Its angles are therefore
+    Angles of the reference are about +y, which is clockwise in the xz plane. They are therefore
     negated. The error of the reference is 3e-10, and its values have ten decimals.
 
     References:

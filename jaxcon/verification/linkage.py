@@ -18,7 +18,7 @@ NAMES = ("crank", "coupler", "rocker")
 class Linkage:
     """A planar four-bar linkage: its geometry, masses and motion.
 
-    Crank, coupler and rocker are between fixed pivots at the origin and at (base, 0).
+    Crank, coupler and rocker form a chain from a fixed pivot at the origin to one at (base, 0).
 
     Attributes:
         lengths: the lengths of crank, coupler and rocker [m].

@@ -19,7 +19,7 @@ from jaxcon.verification.sampling import RK4, multipliers, run, sample
 
 
 def blade(body: jc.extend.Motion, t: jax.Array, offset: jax.Array) -> jax.Array:
-    """Returns the sideways velocity n · ẋ of a blade, which is zero, (1,) [m/s].
+    """Returns the residual n · ẋ, the sideways velocity of a blade, (1,) [m/s].
 
     The blade is at (−offset, 0) of the body, and n is its normal.
     """
@@ -88,7 +88,7 @@ def rolling(ball: jc.extend.Motion, t: jax.Array, params: tuple[jax.Array, jax.A
 
 
 def height(ball: jc.extend.Pose, t: jax.Array, radius: jax.Array) -> jax.Array:
-    """Returns z − r, the height of a ball of radius r above its plane, which is zero, (1,) [m]."""
+    """Returns z − r, the gap between a ball of radius r and the plane z = 0, (1,) [m]."""
     return (ball.position[2] - radius)[None]
 
 

@@ -14,7 +14,7 @@ from jaxcon.verification.sampling import multipliers, sample
 
 
 def turning_plane(bead: jc.extend.Pose, t: jax.Array, rate: jax.Array) -> jax.Array:
-    """Returns −x sin Ωt + y cos Ωt, the distance from a vertical plane, which is zero, (1,) [m].
+    """Returns −x sin Ωt + y cos Ωt, the distance of a bead from a vertical plane, (1,) [m].
 
     The plane rotates about z at the rate Ω.
     """

@@ -163,7 +163,7 @@ def vakonomic_knife_edge() -> list[Check]:
     case, data = "vakonomic_knife_edge", references.load("an_knife_edge_incline")
     p, pull = data["parameters"], data["parameters"]["g"] * np.sin(np.pi / 6)
     variational, state = jc.systems.vakonomic(*skate(p), {"blade": -0.1})
-    system = cast(System, variational)  # it delegates most methods to the system of the skate
+    system = cast(System, variational)  # `variational` delegates most methods to the skate
     method = jc.Method(butcher())  # order six, because the spin exceeds 18 rad/s
     states = sample(system, state, [0.5, 1.0, 2.0, 5.0], 2e-4, method)
     t, (x, _, angle) = np.asarray(states.time), np.asarray(states.q).T

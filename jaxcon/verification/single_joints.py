@@ -117,7 +117,7 @@ def motion(
 def reaction(
     system: BodySystem, state: jc.State, solution: SolutionAt, name: str, case: dict[str, Any]
 ) -> dict[str, jax.Array]:
-    """Returns force and torque of a joint on the ground; the torque is about the anchor there."""
+    """Returns the force and the torque of a joint on the ground, about the anchor on the ground."""
     joint = f"{name} joint"
     wrench = jc.wrench(solution, joint, jc.WORLD, system=system)
     anchor = jc.position(system, state, name, system.params[joint]["anchor_b"])
@@ -153,7 +153,15 @@ def turned(axis: str, degrees: float) -> np.ndarray:
 def hold(
     name: str, case: dict[str, Any], ground: np.ndarray, frame: np.ndarray, center: np.ndarray
 ) -> Iterable[Any]:
-    """Yields the joint of a case, and its spring if it has one."""
+    """Yields the joint of a case, and its spring if it has one.
+
+    Args:
+        name: the name of the body.
+        case: the data of the case.
+        ground: the anchor of the joint on the ground, (3,) [m].
+        frame: the axes of the body, and of most joints, as columns, (3, 3).
+        center: the center of mass of the body, (3,) [m].
+    """
     x, y, z = frame.T
     pair = (f"{name} joint", jc.WORLD, name)
     end = case.get("body_point")
@@ -189,7 +197,7 @@ def hardening_spring(
 ) -> jax.Array:
     """Returns the force and torque of a spring with tension 50 s + 10 |s| s + 5 ṡ, (6,).
 
-    s is the extension of the spring, which starts at a point on the ground [m].
+    s is the extension [m] of the spring, which connects the body to a point on the ground.
     """
     end = body.point(p["local"])
     rod = end - p["ground"]

@@ -51,7 +51,9 @@ def first_joint(system: BodySystem, state: jc.State) -> tuple[jax.Array, jax.Arr
 
 
 def n_four_bar(loops: int, step: float, bound: float) -> list[Check]:
-    """Checks that the linkage stays on the branch of parallelograms, by the top of its first rod.
+    """Checks that the linkage stays on the branch of parallelograms.
+
+    The motion of the top of its first rod is compared with the reference.
 
     References:
         IFToMM library of computational benchmark problems, A02; by elliptic functions.

@@ -90,7 +90,10 @@ class Decay:
         return jax.lax.fori_loop(0, steps, lambda _, x: self.once(x, alpha, beta, h), start)
 
     def once(self, start: jax.Array, alpha: jax.Array, beta: jax.Array, h: jax.Array) -> jax.Array:
-        """Returns (φ, φ̇) after one step. The particle also moves within the plane."""
+        """Returns (φ, φ̇) after one step from the given (φ, φ̇).
+
+        The particle also has a velocity along the plane.
+        """
         method = jc.Method(self.integrator, jc.Baumgarte(alpha, beta))
         across = jnp.array([0.5, 1.0, 0.0])
         state = dataclasses.replace(self.start, q=start[0] * NORMAL, v=start[1] * NORMAL + across)
@@ -98,7 +101,7 @@ class Decay:
         return jnp.stack([jnp.dot(NORMAL, state.q), jnp.dot(NORMAL, state.v)])
 
     def matrices(self, *gains: jax.Array) -> np.ndarray:
-        """Returns the matrices that one step multiplies (φ, φ̇) by, (gains, 2, 2).
+        """Returns the matrix A of a step (φ, φ̇)⁺ = A (φ, φ̇) for each set of gains, (gains, 2, 2).
 
         `gains` are α, β and the step size h, (gains,) each.
         """
@@ -154,8 +157,9 @@ def critical_limit() -> float:
 def feedback_limits() -> list[Check]:
     """Checks the largest stable rate of critically damped feedback for three integrators.
 
-    For a step size h, the limits of h·rate are 2, 2√2 − 2 and 2.7853. Errors decay just below a
-    limit and grow just above it. The library must warn just above a limit and not just below it.
+    For a step size h, the limits of h·rate are 2 for explicit Euler, 2√2 − 2 for semi-implicit
+    Euler and 2.7853 for RK4. Errors decay just below a limit and grow just above it. The library
+    must warn just above a limit and not just below it.
     """
     case, checks = "feedback_limits", []
     limits = (2.0, 2 * np.sqrt(2) - 2, critical_limit())

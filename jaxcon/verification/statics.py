@@ -43,10 +43,10 @@ def two_links() -> tuple[BodySystem, jc.State]:
 
 
 def static_reactions() -> list[Check]:
-    """Checks the wrenches of two joints at rest on both bodies, each in the axes of its body.
+    """Checks the wrenches of two joints at rest, on both bodies that each joint connects.
 
-    In the reference, the reaction of the first joint includes the torque of the drive that holds
-    it.
+    A wrench is in the axes of the body on which it acts. In the reference, the wrench of the first
+    joint includes the torque of the drive that holds it.
 
     References:
         Simbody, tests/GazeboReactionForce.cpp, after a test of Gazebo.
@@ -100,7 +100,7 @@ def tension() -> list[Check]:
 
 @functools.cache
 def mixed_scene() -> tuple[BodySystem, jc.State]:
-    """Builds bodies and a particle at rest in space, with joints of every kind."""
+    """Builds four bodies and a particle at rest in space, connected by five kinds of joints."""
     scene = jc.Scene(dim=3, gravity=(0.3, -0.2, -9.81))
     for i, name in enumerate("abcd"):
         half = 0.2 * i

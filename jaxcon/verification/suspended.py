@@ -12,7 +12,7 @@ from jaxcon.verification.sampling import RK4
 
 CASE = "hanging_chain"
 FINE = 2000
-"""The number of links of a chain that approximates a catenary; its sag has an error of 1/links²."""
+"""The number of links of a chain that approximates a catenary. Its sag is off by O(1/links²)."""
 
 
 def hanging_chain() -> list[Check]:

@@ -127,7 +127,7 @@ class CartPole(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of the whole track."""
+        """The view of images, (left, right) and (bottom, top) [m]: the whole track."""
         reach = 1.1 * float(np.sum(self.lengths))
         return (-TRACK, TRACK), (-max(reach, 1.2), max(reach, 1.2))
 

@@ -26,11 +26,15 @@ def spine(
 ) -> tuple[Array, Array]:
     """Returns the wrenches of the spine on the front and the rear half of the cat, (6,) each.
 
-    In the frame of the front half, muscles give the torque τ u about y and z. τ is the largest
-    torque and u the control. The elastic torque is −2 k s with stiffness k, where s = n tan β/2 for
-    a bend β about the axis n. For small β its size is k β. The damping torque is −c (s·ω) s, with
-    the bending rate ω. Without damping, muscles that act in phase with the bend would fold the
-    spine double. A bend of constant size that travels around the spine is not damped.
+    The torque on the rear half is the sum of the three torques below, in the frame of the front
+    half. The torque on the front half is its opposite.
+
+    Muscles exert the torque τ u about y and z, with the largest torque τ and the control u. The
+    elastic torque is −2 k s with stiffness k and s = n tan(β/2), for a bend β about the axis n. For
+    small β its size is k β. The damping torque is −c (s·ω) s with the bending rate ω.
+
+    Without damping, muscles that act in phase with the bend would fold the spine double. A bend of
+    constant size that travels around the spine is not damped.
     """
     relative = turn_between(front.orientation, rear.orientation)
     bending = jc.quaternion.rotate(relative, rear.angular_velocity) - front.angular_velocity
@@ -146,7 +150,10 @@ class CatRighting(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of the whole fall from the default height."""
+        """The view of images, (left, right) and (bottom, top) [m].
+
+        It shows the whole fall from the default height.
+        """
         return (-0.7, 0.7), (0.0, 1.9)
 
     def start(self, key: Array) -> tuple[jc.State, tuple[()]]:
@@ -216,7 +223,7 @@ class CatRighting(Environment):
         return jnp.concatenate([up, bend[1:], spin, bending[1:], fall])
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """Rewards feet that point down and a straight back, with little torque."""
+        """Returns a reward that is high for feet down, a straight back and little torque."""
         bend, _ = self.bend(after)
         straight = (1 + near(safe_sqrt(bend @ bend), 0.8)) / 2
         effort = (4 + near(safe_sqrt(jnp.mean(action**2)), 1.0)) / 5

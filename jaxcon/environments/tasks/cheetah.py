@@ -143,11 +143,14 @@ class HalfCheetah(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view around the initial position."""
+        """The view of images, (left, right) and (bottom, top) [m].
+
+        It shows the surroundings of the initial position.
+        """
         return (-2.0, 2.0), (-0.3, 1.7)
 
     def window(self, episode: Episode) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Returns the view around the current position."""
+        """Returns the view of an image: `frame`, shifted by the distance run so far."""
         (left, right), height = self.frame
         x = float(_drawn(self, episode)[1])
         return (x + left, x + right), height
@@ -201,7 +204,7 @@ class HalfCheetah(Environment):
 
 @jax.jit
 def _drawn(cheetah: HalfCheetah, episode: Episode) -> tuple[Array, Array]:
-    """Returns end points of the capsules (capsules, 2, 3) and distance run () [m]."""
+    """Returns the end points of the capsules, (capsules, 2, 3), and the distance run, () [m]."""
     system, state = cheetah.system, episode.state
     ends = [
         jnp.stack([jc.position(system, state, capsule.body, end) for end in capsule.ends])

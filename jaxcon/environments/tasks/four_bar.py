@@ -129,11 +129,14 @@ class FourBarTracking(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of all positions that the default linkage can reach."""
+        """The view of images, (left, right) and (bottom, top) [m].
+
+        It shows all positions that the default linkage can reach.
+        """
         return (-0.6, 1.9), (-0.9, 1.0)
 
     def start(self, key: Array) -> tuple[jc.State, CrankReference]:
-        """Draws a crank angle, at rest, and a reference that starts near it."""
+        """Draws an initial state at rest, and a reference that starts near its crank angle."""
         keys = jax.random.split(key, 6)
         low = jnp.asarray([-jnp.pi, -0.5, 2.0, 0.0, 1.0], self.dtype)
         high = jnp.asarray([jnp.pi, 0.5, 6.0, 2.0, 4.0], self.dtype)

@@ -23,7 +23,7 @@ DEPTH, LOW = 0.4, 0.2
 """The initial hip-to-foot distance, and the trunk height below which an episode terminates [m]."""
 SIDES = (("left", -1.0), ("right", 1.0))
 STOPS = (0.15, 1.75)
-"""The joint limits of a thigh: its outward angle from straight down [rad]."""
+"""The joint limits of a thigh: its least and largest outward angle from straight down [rad]."""
 SWEEPS = 30
 """Gauss–Seidel sweeps over the joint limits and the contact in a step."""
 
@@ -148,11 +148,14 @@ class FiveBarHopper(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of all places that an episode can reach."""
+        """The view of images, (left, right) and (bottom, top) [m].
+
+        It shows all places that the hopper can reach in an episode.
+        """
         return (-3.0, 3.0), (-0.2, 1.2)
 
     def start(self, key: Array) -> tuple[jc.State, Array]:
-        """Draws a state above the ground, at rest, and a desired velocity."""
+        """Draws an initial state, at rest above the ground, and a desired velocity."""
         keys = jax.random.split(key, 3)
         drop = jax.random.uniform(keys[0], (), self.dtype, 0.02, 0.1)
         speed = jax.random.uniform(keys[1], (), self.dtype, 0.4, 0.8)
@@ -203,7 +206,7 @@ class FiveBarHopper(Environment):
         return jnp.concatenate(parts)
 
     def reward(self, before: Episode, action: Array, after: Episode) -> Array:
-        """Rewards the desired velocity, with the foot off the ground and little torque."""
+        """Returns a reward for the desired velocity with the foot raised and little torque."""
         speed = jc.velocity(self.system, after.state, "trunk")[0]
         hop = (2 - near(self.clearance(after), 0.02)) / 2
         effort = (9 + near(safe_sqrt(jnp.mean(action**2)), 1.0)) / 10

@@ -115,11 +115,11 @@ class Parking(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of the whole lot."""
+        """The view of images, (left, right) and (bottom, top) [m]: the whole lot."""
         return (-LOT, LOT), (-LOT, LOT)
 
     def start(self, key: Array) -> tuple[jc.State, tuple[()]]:
-        """Draws a position and heading, at rest."""
+        """Draws an initial state at rest, with a random position and heading."""
         size = jnp.asarray((2.5, 2.5, jnp.pi), self.dtype)
         x, y, heading = spread(key, 1.0, (3,), self.dtype) * size
         ahead = AHEAD * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
@@ -129,7 +129,7 @@ class Parking(Environment):
     def motion(self, episode: Episode) -> tuple[Array, Array, Array, Array]:
         """Returns blade position (2,) [m], heading [rad], speed [m/s] and yaw rate [rad/s].
 
-        The speed is the velocity of the blade along itself.
+        The speed is the component of the blade's velocity along the blade.
         """
         sleigh, blade = (self.system, episode.state, "sleigh"), (-AHEAD, 0.0)
         heading = jc.orientation(*sleigh)

@@ -145,12 +145,15 @@ class RopeSwing(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of the whole swing below the suspension point."""
+        """The view of images, (left, right) and (bottom, top) [m].
+
+        It shows the whole swing below the suspension point.
+        """
         reach = 1.1 * float(len(self.links) * self.length + self.hold + self.stroke)
         return (-reach, reach), (-reach, 0.2)
 
     def start(self, key: Array) -> tuple[jc.State, Array]:
-        """Draws a rope angle to either side, at rest, and a desired height."""
+        """Draws an initial state at rest, with the rope tilted to a side, and a desired height."""
         side, angle, goal = jax.random.split(key, 3)
         sign = jnp.where(jax.random.bernoulli(side), 1, -1).astype(self.dtype)
         size = jax.random.uniform(angle, (), self.dtype, 0.1, 0.2)
@@ -161,7 +164,7 @@ class RopeSwing(Environment):
     def place(self, angle: Array) -> Array:
         """Returns positions (n_q,) of a straight rope at an angle [rad].
 
-        The body is at its position of assembly on the rope.
+        The body is at `hold` below the end of the rope, where it was at assembly.
         """
         layout, n = self.system.layout, len(self.links)
         along = jnp.stack([jnp.sin(angle), -jnp.cos(angle)])

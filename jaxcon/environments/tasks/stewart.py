@@ -23,7 +23,12 @@ LEGS = range(6)
 
 
 def ring(radius: float, apart: float) -> np.ndarray:
-    """Returns six points on a circle, in three pairs at angles ± `apart` [rad], (6, 3) [m]."""
+    """Returns three pairs of points on a circle, around directions 120° apart, (6, 3) [m].
+
+    Args:
+        radius: the radius of the circle [m].
+        apart: the angle between a point and the direction of its pair [rad].
+    """
     pair, side = np.arange(6) // 2, np.arange(6) % 2 * 2 - 1
     angle = pair * 2 * np.pi / 3 + side * apart
     return radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
@@ -137,13 +142,14 @@ class StewartBalancing(Environment):
 
     @property
     def frame(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """The view of the platform along y."""
+        """The view of images, (left, right) and (bottom, top) [m]: the platform, seen along y."""
         return (-1.0, 1.0), (-0.1, 1.4)
 
     def start(self, key: Array) -> tuple[jc.State, tuple[()]]:
-        """Draws a ball that rolls on the platform at home.
+        """Draws an initial state: the platform at home, with a ball that rolls on it.
 
-        For a velocity v, radius r and normal n, it rolls with the angular velocity ω = n × v/r.
+        A ball with velocity v and radius r has the angular velocity ω = n × v/r. n is the normal of
+        the plate.
         """
         place, velocity = jax.random.split(key)
         x, y = spread(place, 0.15, (2,), self.dtype)
