@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxcon as jc
@@ -241,3 +242,31 @@ def test_numbers_are_compared_as_the_scene_holds_them():
     scene.add(jc.joints.RollingSphere("roll", "a", "b", normal=(0.0, 0.0, 1.0), radius=1e-50))
     with pytest.raises(ValueError, match="radius must be positive"):
         scene.build()
+
+
+@pytest.mark.parametrize(
+    ("axis", "match"),
+    [
+        ((0.0, 0.0, 1e-25), "axis must have a length, got"),
+        ((0.0, 0.0, 1e20), "axis must have a length whose square is in the range of float32"),
+        ((0.0, 0.0, np.inf), "axis must be finite"),
+    ],
+)
+def test_an_axis_that_cannot_be_divided_by_its_length_is_refused(axis, match):
+    """In float32, squares of 1e-25 and 1e20 are zero and infinite; 1e10 and 1e-10 are in range."""
+    for good in (1e10, 1e-10):
+        scene = jc.Scene(dtype="float32")
+        scene.add_body("a", mass=1.0, inertia=(1.0, 1.0, 1.0))
+        scene.add(jc.Revolute("hinge", jc.WORLD, "a", (0.0, 0.0, 0.0), axis=(0.0, 0.0, good)))
+        scene.build()
+    scene.add(jc.Revolute("other", jc.WORLD, "a", (0.0, 0.0, 0.0), axis=axis))
+    with pytest.raises(ValueError, match=match):
+        scene.build()
+
+
+def test_a_restitution_of_one_plus_a_rounding_error_is_one_in_float32():
+    scene = jc.Scene(dim=2, dtype="float32")
+    scene.add_particle("ball", mass=1.0, position=(0.0, 1.0))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "ball", radius=0.1, restitution=0.5))
+    changed = scene.build()[0].with_params({"floor": {"restitution": 1.0000000000000002}})
+    assert changed.params["floor"]["restitution"] == 1.0

@@ -343,7 +343,7 @@ def unit_vector(joint: BetweenBodies, what: str, given: PyTree, pose: Pose) -> A
         ValueError: the vector has the wrong shape or length zero.
     """
     axis = checks.real(label(joint), what, given, pose.position.dtype, pose.position.shape)
-    checks.nonzero(label(joint), what, axis, axis.dtype)
+    checks.nonzero(label(joint), what, axis)
     return axis / numerics.norm(axis)
 
 

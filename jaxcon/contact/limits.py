@@ -74,7 +74,7 @@ def check_ranges(owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
         limit: Any = {"above": 0} if field in POSITIVE else {"least": 0}
         checks.check(owner, field, numbers[field], dtype=dtype, **limit)
     e = numbers.get("restitution", 0.0)
-    if checks.is_concrete(e) and e > 1:
+    if checks.is_concrete(e) and np.asarray(e, dtype) > 1:
         raise ValueError(f"{owner}: restitution must lie in 0 to 1, got {float(e):g}.")
     if "lower" in numbers:
         check_ends(owner, numbers["lower"], numbers["upper"], dtype)

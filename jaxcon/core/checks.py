@@ -389,23 +389,34 @@ def flag(owner: str, what: str, x: PyTree) -> None:
         raise ValueError(f"{owner}: {what} must be True or False, got {shortened(x)}.")
 
 
-def nonzero(owner: str, what: str, x: PyTree, dtype: DType = np.float64) -> None:
-    """Checks that a number or vector is finite and not zero, after conversion to a dtype.
+def nonzero(owner: str, what: str, x: PyTree, dtype: DType | None = None) -> None:
+    """Checks that a number or vector is finite and not zero, in a floating-point dtype.
 
-    To divide a vector by its length, its squared length must not be a subnormal number of the
-    dtype.
+    A vector is to be divided by its length. Its squared length must therefore neither overflow nor
+    be a subnormal number.
+
+    Args:
+        owner: the class or function that takes the value, for error messages.
+        what: the name of the argument, for error messages.
+        x: the value.
+        dtype: the dtype; None for that of a floating array, and float64 for other values.
 
     Raises:
         ValueError: the value is zero, not finite or not numeric.
     """
     values = _numbers(owner, what, x)
     if is_concrete(values):
-        values = np.asarray(values, dtype)
+        values = np.asarray(values)
+        if dtype is None:
+            dtype = values.dtype if values.dtype.kind == "f" else np.dtype(float)
+        values = values.astype(dtype)
         with np.errstate(over="ignore", under="ignore"):
             square = np.sum(values * values)
-        is_zero = square < np.finfo(dtype).tiny if values.ndim else values == 0
-        if not np.all(np.isfinite(values)) or is_zero:
+        good = values != 0 if not values.ndim else np.finfo(dtype).tiny <= square < np.inf
+        if not (good and np.all(np.isfinite(values))):
             wanted = "have a length" if values.ndim else "be finite and not zero"
+            if np.isinf(square) and np.all(np.isfinite(values)):
+                wanted = f"have a length whose square is in the range of {values.dtype.name}"
             raise ValueError(f"{owner}: {what} must {wanted}, got {numerals(values)}.")
 
 
