@@ -248,6 +248,7 @@ def test_numbers_are_compared_as_the_scene_holds_them():
     ("axis", "match"),
     [
         ((0.0, 0.0, 1e-25), "axis must have a length, got"),
+        ((8e-20, 8e-20, 8e-20), "axis must have a length, got"),
         ((0.0, 0.0, 1e20), "axis must have a length whose square is in the range of float32"),
         ((0.0, 0.0, np.inf), "axis must be finite"),
     ],

@@ -392,8 +392,8 @@ def flag(owner: str, what: str, x: PyTree) -> None:
 def nonzero(owner: str, what: str, x: PyTree, dtype: DType | None = None) -> None:
     """Checks that a number or vector is finite and not zero, in a floating-point dtype.
 
-    A vector is to be divided by its length. Its squared length must therefore neither overflow nor
-    be a subnormal number.
+    A vector is to be divided by its length. Its squared length must therefore not overflow. XLA
+    replaces subnormal squares by zero, so they must not matter in the squared length either.
 
     Args:
         owner: the class or function that takes the value, for error messages.
@@ -412,7 +412,8 @@ def nonzero(owner: str, what: str, x: PyTree, dtype: DType | None = None) -> Non
         values = values.astype(dtype)
         with np.errstate(over="ignore", under="ignore"):
             square = np.sum(values * values)
-        good = values != 0 if not values.ndim else np.finfo(dtype).tiny <= square < np.inf
+        least = np.finfo(dtype).tiny / np.finfo(dtype).eps
+        good = least <= square < np.inf if values.ndim else values != 0
         if not (good and np.all(np.isfinite(values))):
             wanted = "have a length" if values.ndim else "be finite and not zero"
             if np.isinf(square) and np.all(np.isfinite(values)):
