@@ -73,7 +73,7 @@ def position(
         point: a point in the body's frame, (dim,) [m]; by default the origin of the frame.
     """
     motion = _motion(system, state, body, "position")
-    return motion.position if point is None else motion.point(_local(motion, point, "position"))
+    return _position_of(motion, point, "position")
 
 
 def velocity(
@@ -88,11 +88,9 @@ def velocity(
         point: a point in the body's frame, (dim,) [m]; by default the origin of the frame.
     """
     motion = _motion(system, state, body, "velocity")
-    return (
-        motion.velocity
-        if point is None
-        else motion.point_velocity(_local(motion, point, "velocity"))
-    )
+    if point is None:
+        return motion.velocity
+    return motion.point_velocity(_local(motion, point, "velocity"))
 
 
 def orientation(system: BodySystem, state: State, body: str) -> Array:
@@ -345,11 +343,7 @@ def acceleration(
 
     def of_one(info: StepInfo | SolutionAt) -> Array:
         motion = _motion(bodies, info.state, body, "acceleration")
-        where = (
-            motion.position
-            if point is None
-            else motion.point(_local(motion, point, "acceleration"))
-        )
+        where = _position_of(motion, point, "acceleration")
         center = bodies.principal_motion(body, info.state.q, info.state.v)
         a = info.acceleration[bodies.layout.v(body)]
         if center.orientation is None:
@@ -478,6 +472,11 @@ def _row(system: BodySystem, state: State, joint: str, name: str | None, caller:
     end = coordinates.find(system.constraints, where, caller, joint, name)
     joint_coordinate = coordinates.at(coordinates.numbered(system.counted), [end])
     return joint_coordinate.read(system.snapshot(state.q, state.v, state.instant))
+
+
+def _position_of(motion: Motion, point: Scalar | Sequence[float] | None, caller: str) -> Array:
+    """Returns the position of a point in a body's frame, or of the frame's origin, (dim,) [m]."""
+    return motion.position if point is None else motion.point(_local(motion, point, caller))
 
 
 def _local(motion: Motion, point: Scalar | Sequence[float], caller: str) -> Array:
