@@ -394,10 +394,19 @@ QUICK: dict[str, tuple[tuple[str, ...], int, Any]] = {
 }
 """Elements, dimension and method of the small studies, by name."""
 
+OF_VELOCITIES = ("rolling", "knife edge", "momentum", "velocity level")
+"""Words in the names of joints with rows that hold velocities only, which `RATTLE` refuses."""
+
+HOLONOMIC = {
+    name: element
+    for name, element in {**JOINTS, **FORCES}.items()
+    if not any(word in name for word in OF_VELOCITIES)
+}
+
 SETS = {
     "plain": ({**JOINTS, **FORCES, **ENDS}, jc.Method()),
     "RK4": ({**JOINTS, **FORCES, **ENDS}, jc.Method(jc.RK4())),
-    "RATTLE": ({**JOINTS, **FORCES}, jc.Method(jc.integrators.RATTLE())),
+    "RATTLE": (HOLONOMIC, jc.Method(jc.integrators.RATTLE())),
     "generalized-α": ({**JOINTS, **FORCES}, jc.Method(jc.integrators.GeneralizedAlpha())),
     "sweeps": (ENDS, jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=8))),
     "nearest": (ENDS, jc.Method(contact_solver=jc.solvers.ActiveSet(stops=1))),

@@ -12,6 +12,7 @@ Systems: Scene, WORLD, GeneralizedSystem, from_mjcf, assemble.
 Parts: Revolute, Prismatic, Spherical, Fixed, Distance, Spring, Motor, Limit, PlaneContact.
 Methods: Method, SemiImplicitEuler, RK4, Baumgarte, Projection.
 Simulation: State, init, step, rollout, forward_dynamics.
+All cores of a CPU: use_all_cores, compiler_options.
 Readout: position, velocity, orientation, angular_velocity, coordinate, coordinate_rate, energy,
     momentum, angular_momentum, center_of_mass, violation.
 Forces: wrench, multipliers, reaction, acceleration, angular_acceleration.
@@ -72,6 +73,7 @@ from jaxcon.builders.scene import Scene
 from jaxcon.constraints.joints import Distance, Fixed, Prismatic, Revolute, Spherical
 from jaxcon.contact.contact import PlaneContact
 from jaxcon.contact.limits import Limit
+from jaxcon.core.cores import compiler_options, use_all_cores
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.execution.initialize import init
 from jaxcon.execution.rollout import rollout
@@ -173,6 +175,7 @@ __all__ = [
     "assemble",
     "center_of_mass",
     "check_gradients",
+    "compiler_options",
     "coordinate",
     "coordinate_rate",
     "energy",
@@ -191,6 +194,7 @@ __all__ = [
     "step",
     "tradeoff",
     "tune",
+    "use_all_cores",
     "velocity",
     "violation",
     "wrench",

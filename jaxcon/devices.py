@@ -1,9 +1,11 @@
 """Batches over several devices.
 
+Cores of a CPU: use_all_cores, compiler_options.
 Placement of a batch: shard.
 Functions over devices: over_devices.
 """
 
+from jaxcon.core.cores import compiler_options, use_all_cores
 from jaxcon.core.devices import over_devices, shard
 
 
@@ -13,6 +15,8 @@ def __dir__() -> list[str]:
 
 
 __all__ = [
+    "use_all_cores",
+    "compiler_options",
     "shard",
     "over_devices",
 ]

@@ -125,8 +125,8 @@ def uses(path):
 
 
 NOT_IN_THE_LIBRARY = ("jnp.float64", "jax.config.update", "jnp.einsum", "jnp.linalg.inv")
-MAY_USE = {"builders/scene.py": {"jnp.float64"}}
-"""The scene checks the dtype that a user gives."""
+MAY_USE = {"builders/scene.py": {"jnp.float64"}, "core/cores.py": {"jax.config.update"}}
+"""The scene checks the dtype that a user gives; `use_all_cores` sets the number of devices."""
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda p: str(p.relative_to(ROOT)))

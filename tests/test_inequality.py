@@ -221,3 +221,9 @@ def test_restitution_on_generalized_coordinates():
     value, slope = jax.jit(jax.value_and_grad(height))(0.8, 9.81)
     np.testing.assert_allclose(value, want, atol=3e-3)
     np.testing.assert_allclose(slope, speed * left, atol=6e-3)
+
+
+def test_a_function_without_rows_is_named():
+    element = jc.contacts.Inequality(lambda pose, t, params: jnp.zeros(0), ("ball",), "floor")
+    with pytest.raises(ValueError, match=r"Inequality 'floor': the function must return at least"):
+        ball(2, element)

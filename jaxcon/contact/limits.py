@@ -474,6 +474,11 @@ class OneSided:
         """Returns the inequality rows at one instant, with their targets for a step of dt."""
         value, rate, _, jacobian = self.linearized(snapshot)
         count = len(value)
+        if not count:
+            raise ValueError(
+                f"{label(self.law)}: the function must return at least one φ, an array (m,) with m"
+                " ≥ 1; it returned an empty array."
+            )
         pulls = tuple(Vector(*(block[:, i] for i in range(block.shape[1]))) for block in jacobian)
         row, fields = one_sided(self.numbers, Row(value, rate, 0.0, pulls), dt)
         places = tuple(spread_place(place, count) for place in self.places)

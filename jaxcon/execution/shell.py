@@ -64,11 +64,12 @@ def masked_step(
         system = with_turns(system, state.turns, state.angle_remainder)
         return _freeze(state, method.recovery.repair(system, method.solver, state, tried, dt))
 
+    batch = state.q.shape[1:]
     if method.recovery is None:
-        return mask_failed_gradients(frozen, args)[0]
+        return mask_failed_gradients(frozen, args, batch)[0]
     # two masks, since a rolled-back attempt may have a NaN derivative
-    tried = mask_failed_gradients(take, args)
-    return mask_failed_gradients(repaired, (system, method, state, tried, dt))[0]
+    tried = mask_failed_gradients(take, args, batch)
+    return mask_failed_gradients(repaired, (system, method, state, tried, dt), batch)[0]
 
 
 def _freeze(state: State, tried: Attempted) -> tuple[tuple[State, StepInfo], Array]:
@@ -107,4 +108,5 @@ def solve_at(
         reactions = None if rows.reactions is None else rows.reactions.without_jump()
         return (solution, rows.violation, reactions), solution.status
 
-    return mask_failed_gradients(solved, (system, method, state, control, dt))[0]
+    args = (system, method, state, control, dt)
+    return mask_failed_gradients(solved, args, state.q.shape[1:])[0]

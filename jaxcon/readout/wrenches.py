@@ -153,7 +153,7 @@ def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Arra
         batch = batch_of(given, state.q.ndim - 1)
         state, status = broadcast_worlds((state, status), batch)
         given = (status, system, state, control, multipliers, reactions)
-        return mask_failed_gradients(masked, given)[0]
+        return mask_failed_gradients(masked, given, batch)[0]
 
     return read
 

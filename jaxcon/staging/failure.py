@@ -17,7 +17,9 @@ from jaxcon.staging import batch_last
 from jaxcon.staging.worlds import broadcast_worlds, expand_like, where_tree
 
 
-def mask_failed_gradients(function: Callable[..., T], args: PyTree) -> T:
+def mask_failed_gradients(
+    function: Callable[..., T], args: PyTree, batch: tuple[int, ...] | None = None
+) -> T:
     """Calls function(*args), with zero gradients through failed worlds.
 
     A forward `where` is not enough: the transpose of a NaN derivative multiplies a zero cotangent
@@ -29,6 +31,8 @@ def mask_failed_gradients(function: Callable[..., T], args: PyTree) -> T:
     Args:
         function: a function that returns a pytree and the status of the world, ().
         args: the arguments of the function, a tuple of pytrees.
+        batch: the shape of the batch, which is the shape of the status; None to find it by one more
+            trace of the function.
 
     Returns:
         The result of the function.
@@ -46,15 +50,15 @@ def mask_failed_gradients(function: Callable[..., T], args: PyTree) -> T:
     ) -> Any:
         moved = [type(x) is not SymbolicZero for x in tangents[0]]
         moving = parts.among(moved)
-        batch = jax.eval_shape(call, *primals)[1].shape
+        worlds = jax.eval_shape(call, *primals)[1].shape if batch is None else batch
         floats, others = primals
         # values that worlds share are broadcast, so that they can be masked in each world
         if batch_last.order() > 1:
-            floats = guarded(broadcast_worlds(floats, batch), others)
+            floats = guarded(broadcast_worlds(floats, worlds), others)
         start, fixed = moving.split(parts.merge(floats, others))
         start, given = (
-            broadcast_worlds(start, batch),
-            broadcast_worlds(list(compress(tangents[0], moved)), batch),
+            broadcast_worlds(start, worlds),
+            broadcast_worlds(list(compress(tangents[0], moved)), worlds),
         )
         output, pushforward = jax.linearize(lambda x: function(*moving.merge(x, fixed)), start)
         healthy = ~failed(output[1])

@@ -47,6 +47,9 @@ if TYPE_CHECKING:
 WORTH = 3
 """The smallest number of operations to compute a shared value for which storing it pays off."""
 
+OFTEN = 4
+"""The number of reads from which on storing pays off for one operation on two whole arrays."""
+
 KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 """The attributes of calls that XLA must not inline."""
 
@@ -320,10 +323,12 @@ def worth_storing(program: Program) -> set[int]:
 
     A sweep backward over the operations selects values that several later kernels need, or that an
     operation outside of kernels reads. A sweep forward drops values that are cheap to compute from
-    the other stored values. A row of an array that a loop changes in place does not count as cheap:
-    if a kernel read it after the change, the compiler would have to copy the array.
+    the other stored values. An operation on two whole arrays does not count as cheap if its result
+    is read often. Neither does a row of an array that a loop changes in place: if a kernel read it
+    after the change, the compiler would have to copy the array.
     """
     stored, ends = _needed_twice(program)
+    read = _read_sizes(program)
     work: dict[int, frozenset[int]] = {}
     for op in filter(_elementwise, program.operations):
         (name,) = op.outputs
@@ -335,10 +340,42 @@ def worth_storing(program: Program) -> set[int]:
         elif op.name not in MOVES:
             steps |= {name}
         cheap = len(steps) < WORTH and op.name not in COSTLY
+        cheap = cheap and not _is_read_often(program, op, read[name])
         if name in stored and name not in ends and cheap:
             stored.discard(name)
         work[name] = steps if cheap else frozenset(list(steps)[:WORTH])  # WORTH is enough
     return stored
+
+
+def _is_read_often(program: Program, op: Operation, read: int) -> bool:
+    """Returns True if an operation combines arrays of its size, and its result is read often.
+
+    Args:
+        program: the program.
+        op: an operation with one result.
+        read: the number of entries of the result that are read; see `_read_sizes`.
+    """
+    size = program.sizes[op.outputs[0]]
+    if not is_known([read, size]) or read < OFTEN * size:
+        return False
+    operands = [x for x in op.inputs if not isinstance(x, Constant)]
+    return sum(program.sizes[x] == size for x in operands) > 1
+
+
+def _read_sizes(program: Program) -> dict[int, int]:
+    """Returns the number of entries of each value that elementwise operations read."""
+    readers = program.readers()
+    sizes: dict[int, int] = {}
+    for op in reversed(program.operations):
+        for x in op.outputs:
+            sizes[x] = sum(
+                sizes[reader.outputs[0]]
+                if reader.name in MOVES
+                else program.sizes[reader.outputs[0]]
+                for reader in readers.get(x, [])
+                if _elementwise(reader)
+            )
+    return sizes
 
 
 def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
@@ -551,8 +588,8 @@ def uninlined(
     """Calls a function of arrays that XLA does not inline; returns its results.
 
     XLA would split a costly call with a single result among threads, which is not possible inside a
-    kernel. Such a call therefore gets a second, unused result, which a barrier keeps. Light calls
-    get no second result, because the kernel looks up the address of each result at each run.
+    kernel. Such a call therefore returns its result twice, and a barrier keeps both. Light calls
+    return it once, because the kernel looks up the address of each result at each run.
 
     Args:
         function: a function of arrays.
@@ -563,7 +600,9 @@ def uninlined(
     @functools.wraps(function)
     def call(*args: Array) -> tuple[list[Array], list[Array]]:
         results = function(*args)
-        return results, [jnp.zeros((), bool)] if len(results) < 2 and not light else []
+        if not results:
+            return results, [jnp.zeros((), bool)]
+        return results, results if len(results) < 2 and not light else []
 
     results, beside = jax.jit(call)(*args)
     first, *others = *results, *beside
