@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 import jaxcon as jc
+from jaxcon.core.cores import cores
 
 ROOT = Path(__file__).parents[1]
 
@@ -129,15 +130,8 @@ def with_flags(flags: str) -> dict[str, str]:
     return os.environ | {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}".strip()}
 
 
-def cores() -> int:
-    """Returns the number of cores available to this process."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def use_all_cores() -> None:
-    """Gives JAX one device per core. Must be called before JAX is used."""
+    """Gives JAX one device per core, with XLA's own options. Must be called before JAX is used."""
     jax.config.update("jax_num_cpu_devices", cores())
 
 

@@ -48,12 +48,13 @@ def in_a_process(program, **variables):
 def test_each_core_is_a_device():
     one, two = (in_a_process(PROGRAM.replace("COUNT", str(n))) for n in (1, 2))
     assert one.returncode == two.returncode == 0, one.stderr + two.stderr
-    (head, *_), (after, numbers, *_) = one.stdout.splitlines(), two.stdout.splitlines()
-    assert head.split()[0] == "1"
-    assert after.split()[0] == "2"
+    flags, worlds = one.stdout.splitlines()
+    more_flags, more_worlds = two.stdout.splitlines()
+    assert flags.split()[0] == "1"
+    assert more_flags.split()[0] == "2"
     # the first two worlds of four are those of two
-    assert numbers.split()[:4] == one.stdout.splitlines()[1].split()
-    assert ("vector_width=512" in after) == (cores.widest() == 512)
+    assert more_worlds.split()[:4] == worlds.split()
+    assert ("vector_width=512" in more_flags) == (cores.widest() == 512)
 
 
 def test_flags_and_variables_of_the_user_stay():

@@ -6,14 +6,10 @@ import os
 import platform
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import jax
 
 from jaxcon.core import checks
-
-WIDTH = "xla_cpu_prefer_vector_width"
-"""XLA's option for the size of the vectors of a loop [bit], 256 unless it is set."""
 
 
 def widest() -> int:
@@ -27,13 +23,9 @@ def widest() -> int:
     return 512 if "avx512f" in flags and "avx512vl" in flags else 256
 
 
-def options() -> dict[str, Any]:
-    """Returns XLA's options with which steps run fastest on this machine."""
-    return {WIDTH: 512} if widest() == 512 else {}
-
-
-compiler_options = MappingProxyType(options())
-"""XLA's options with which steps run fastest, for `jax.jit(f, compiler_options={**these})`.
+# XLA's own default is 256
+compiler_options = MappingProxyType({"xla_cpu_prefer_vector_width": 512} if widest() == 512 else {})
+"""XLA's options with which steps run fastest: `jax.jit(f, compiler_options=jc.compiler_options)`.
 
 On a CPU with AVX-512, loops over worlds then use vectors of 512 bit, which XLA does not by default.
 Other machines need no options, and the mapping is empty.

@@ -99,8 +99,7 @@ class GymnasiumVectorEnv(VectorEnv):
             "Disabled" leaves it to `reset(options={"reset_mask": …})`.
         randomize: (environment, key) → the environment of a copy for one episode.
         devices: the number of devices over which the copies are sharded; it must divide `num_envs`.
-            On a CPU, `jax.config.update("jax_num_cpu_devices", 2)` before the first use of JAX
-            makes two devices.
+            On a CPU, `jc.use_all_cores(2)` before the first use of JAX makes two devices.
         options: options of the task's `build`.
 
     Raises:
@@ -270,7 +269,7 @@ def _mesh(devices: int, copies: int) -> Mesh | None:
     if not 1 <= devices <= len(available):
         raise ValueError(
             f"devices must be from 1 to the {len(available)} of JAX, got {devices}; on a CPU,"
-            ' jax.config.update("jax_num_cpu_devices", …) makes more, before JAX is used.'
+            " jc.use_all_cores(…) makes more, before JAX is used."
         )
     if copies % devices:
         raise ValueError(f"num_envs={copies} does not divide over {devices} devices.")
