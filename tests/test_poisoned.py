@@ -128,6 +128,30 @@ def test_a_failed_world_has_no_impacts():
     assert seen.times[1, 0] == np.inf
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize(("dtype", "largest"), [("float32", 4.2e9), ("float64", 3.4e38)])
+def test_a_velocity_whose_products_would_overflow_is_told(dim, dtype, largest):
+    """A motion has grown without bound long before its numbers are infinite."""
+    scene = jc.Scene(dim=dim, dtype=dtype)
+    axis = np.eye(dim)[0]
+    inertia = 1.0 if dim == 2 else np.ones(3)
+    scene.add_body("free", mass=1.0, inertia=inertia, position=0 * axis, velocity=axis)
+    system, state = scene.build()
+    method = jc.Method()
+
+    def one(speed):
+        moving = dataclasses.replace(state, v=speed * state.v)
+        return jc.rollout(system, method, moving, None, 1e-3, 2)[0].status
+
+    speeds = jnp.asarray([1.0, 0.9 * largest, 1.1 * largest, -1.1 * largest], dtype)
+    codes = jax.jit(jax.vmap(one))(speeds)
+    good, bad = jc.Status.OK, jc.Status.NON_FINITE
+    np.testing.assert_array_equal(codes, [good, good, bad, bad])
+    fast = dataclasses.replace(state, v=speeds[2] * state.v)
+    found = jc.analysis.find_first_failure(system, method, fast, None, 1e-3, 2)
+    assert "velocity of 'free'" in str(found)
+
+
 @pytest.mark.parametrize("field", ["before", "after"])
 @pytest.mark.parametrize("length", [np.inf, -np.inf])
 def test_an_infinite_length_of_bending_is_told(field, length):

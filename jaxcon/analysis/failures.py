@@ -206,7 +206,7 @@ def _look(
             return wrong, stage, code
     q, v, time = advanced.point
     new = at_instant(dataclasses.replace(state, q=q, v=v), reached(state, time, h))
-    wrong = [*findings.entries(system, "velocity", v), *findings.positions(system, q)]
+    wrong = [*findings.velocities(system, v), *findings.positions(system, q)]
     if wrong:
         return wrong, 0, Status.NON_FINITE
     return [findings.worst(watched.system, new)], 0, Status.VIOLATED

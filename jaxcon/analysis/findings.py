@@ -19,7 +19,7 @@ from jaxcon.core.doubled import Doubled
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.protocols import System
 from jaxcon.system.body_system import BodySystem
-from jaxcon.system.state import State
+from jaxcon.system.state import State, largest_speed
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def given(system: System, state: State, control: PyTree) -> Iterator[Finding]:
     Parameters that may be infinite, such as a missing stop of a `Limit`, are only checked for NaN.
     """
     yield from positions(system, state.q)
-    yield from entries(system, "velocity", state.v)
+    yield from velocities(system, state.v)
     channels = (("control", 0, None),) if system.layout is None else system.layout.controls
     for name, start, stop in channels:
         parts = [np.asarray(x)[start:stop] for x in jax.tree.leaves(control) if np.ndim(x)]
@@ -75,30 +75,43 @@ def positions(system: System, q: Array) -> Iterator[Finding]:
     return _infinite("position", q, layout and {name: layout.q(name) for name in layout.bodies})
 
 
-def entries(system: System, term: str, x: Array) -> Iterator[Finding]:
+def velocities(system: System, v: Array) -> Iterator[Finding]:
+    """Yields a finding for each body or coordinate with a velocity beyond `largest_speed`."""
+    return entries(system, "velocity", v, largest_speed(v.dtype))
+
+
+def entries(system: System, term: str, x: Array, largest: float = np.inf) -> Iterator[Finding]:
     """Yields a finding for each body or coordinate with a non-finite entry in an array (n_v,).
 
     Args:
         system: the system.
         term: name of the wrong term, as in `Finding`.
         x: the array to check, (n_v,).
+        largest: entries of a larger magnitude count as infinite.
     """
     layout = system.layout
-    return _infinite(term, x, layout and {name: layout.v(name) for name in layout.bodies})
+    places = layout and {name: layout.v(name) for name in layout.bodies}
+    return _infinite(term, x, places, largest)
 
 
-def _infinite(term: str, x: Array, places: dict[str, np.ndarray] | None) -> Iterator[Finding]:
+def _infinite(
+    term: str,
+    x: Array,
+    places: dict[str, np.ndarray] | None,
+    largest: float = np.inf,
+) -> Iterator[Finding]:
     """Yields a finding for each body or coordinate with a non-finite entry in an array.
 
     Args:
         term: name of the wrong term, as in `Finding`.
         x: the array to check, (n_q,) or (n_v,).
         places: indices into x for each body; None for generalized coordinates.
+        largest: entries of a larger magnitude count as infinite.
     """
     if places is None:
         places = {f"coordinate {i}": np.array([i]) for i in range(len(x))}
     for name, indices in places.items():
-        if not np.all(np.isfinite(x[indices])):
+        if not np.all(np.isfinite(x[indices]) & (np.abs(x[indices]) <= largest)):
             yield Finding(term, name, f"is {checks.numerals(x[indices])}")
 
 
