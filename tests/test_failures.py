@@ -63,7 +63,7 @@ def sicken(numbers, what):
     elif what == "singular at once":
         sick["until"][SICK] = 0.0
     elif what == "blow-up":
-        sick["stiffness"][SICK] = 1e30
+        sick["stiffness"][SICK] = 1e9
     return sick
 
 

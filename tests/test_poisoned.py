@@ -129,8 +129,8 @@ def test_a_failed_world_has_no_impacts():
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-@pytest.mark.parametrize(("dtype", "largest"), [("float32", 4.2e9), ("float64", 3.4e38)])
-def test_a_velocity_whose_products_would_overflow_is_told(dim, dtype, largest):
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_velocity_whose_products_would_overflow_is_told(dim, dtype):
     """A motion has grown without bound long before its numbers are infinite."""
     scene = jc.Scene(dim=dim, dtype=dtype)
     axis = np.eye(dim)[0]
@@ -143,7 +143,7 @@ def test_a_velocity_whose_products_would_overflow_is_told(dim, dtype, largest):
         moving = dataclasses.replace(state, v=speed * state.v)
         return jc.rollout(system, method, moving, None, 1e-3, 2)[0].status
 
-    speeds = jnp.asarray([1.0, 0.9 * largest, 1.1 * largest, -1.1 * largest], dtype)
+    speeds = jnp.asarray([1.0, 0.9e10, 1.1e10, -1.1e10], dtype)
     codes = jax.jit(jax.vmap(one))(speeds)
     good, bad = jc.Status.OK, jc.Status.NON_FINITE
     np.testing.assert_array_equal(codes, [good, good, bad, bad])

@@ -19,7 +19,7 @@ from jaxcon.core.doubled import Doubled
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.protocols import System
 from jaxcon.system.body_system import BodySystem
-from jaxcon.system.state import State, largest_speed
+from jaxcon.system.state import LARGEST_SPEED, State
 
 
 @dataclass(frozen=True)
@@ -76,8 +76,8 @@ def positions(system: System, q: Array) -> Iterator[Finding]:
 
 
 def velocities(system: System, v: Array) -> Iterator[Finding]:
-    """Yields a finding for each body or coordinate with a velocity beyond `largest_speed`."""
-    return entries(system, "velocity", v, largest_speed(v.dtype))
+    """Yields a finding for each body or coordinate with a velocity beyond `LARGEST_SPEED`."""
+    return entries(system, "velocity", v, LARGEST_SPEED)
 
 
 def entries(system: System, term: str, x: Array, largest: float = np.inf) -> Iterator[Finding]:

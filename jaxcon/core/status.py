@@ -16,8 +16,7 @@ class Status(IntEnum):
 
     Attributes:
         OK: no failure and no note.
-        NON_FINITE: a state, force or parameter is NaN or infinite, or velocities are beyond 4e9 in
-            float32, 4e38 in float64, where their products overflow.
+        NON_FINITE: a state, force or parameter is NaN or infinite, or velocities are beyond 1e10.
         SINGULAR: constraint rows are dependent, or the mass matrix is not positive definite.
         NOT_CONVERGED: an iteration did not reach its tolerance.
         VIOLATED: constraint errors stayed above the limit of a `Recovery`.
@@ -51,7 +50,7 @@ REPAIRS = (Status.ROLLED_BACK, Status.PROJECTED, Status.RELAXED)
 
 MEANING = {
     Status.NON_FINITE: "a state, force or parameter is NaN or infinite, or velocities are beyond"
-    " 4e9 (in float64 4e38); likely (a) a step too large for the fastest motion, (b) a NaN in the"
+    " 1e10; likely (a) a step too large for the fastest motion, (b) a NaN in the"
     " control or parameters, (c) an unstable gain, (d) a start far off the constraints under gains"
     " that are not gentle",
     Status.SINGULAR: "the constraint rows are dependent, or the mass matrix is not positive"

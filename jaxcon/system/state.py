@@ -16,6 +16,13 @@ from jaxcon.core.status import Status
 from jaxcon.core.summary import Stacked, codes, shape, span, table
 from jaxcon.core.typing import Array, Scalar
 
+LARGEST_SPEED = 1e10
+"""The velocity [m/s, rad/s] up to which a state counts as finite; a motion beyond has diverged.
+
+It is MuJoCo's `mjMAXVAL`, beyond which MuJoCo resets a simulation. Products of several velocities,
+as in a step and its derivatives, are then finite.
+"""
+
 if TYPE_CHECKING:
     from jaxcon.protocols import System
 
@@ -142,24 +149,14 @@ def at_instant(state: State, instant: Doubled) -> State:
     return dataclasses.replace(state, time=instant.high, time_remainder=instant.low)
 
 
-def largest_speed(dtype: jax.typing.DTypeLike) -> float:
-    """Returns the velocity up to which a state counts as finite: 4e9 in float32, 4e38 in float64.
-
-    It is the fourth or the eighth root of the largest number. A motion beyond it has grown without
-    bound. A step and its derivatives multiply velocities by each other, and would soon overflow.
-    """
-    power = 1 / 8 if jnp.finfo(dtype).bits == 64 else 1 / 4
-    return float(jnp.finfo(dtype).max) ** power
-
-
 def is_finite(state: State) -> Array:
     """Returns True if the positions of a world are finite and its velocities are in range, ().
 
-    The velocities must be finite, and their sum at most `largest_speed`.
+    The magnitudes of the velocities must add up to at most `LARGEST_SPEED`.
     """
     # 0 · x is NaN if x is not finite; one sum is faster than a test of each number
     positions = jnp.sum(0 * state.q, axis=0) == 0
-    return positions & (jnp.sum(jnp.abs(state.v), axis=0) <= largest_speed(state.v.dtype))
+    return positions & (jnp.sum(jnp.abs(state.v), axis=0) <= LARGEST_SPEED)
 
 
 def checked_system(system: S, state: State, call: str = "f(system, s)") -> S:
