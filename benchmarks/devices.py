@@ -101,7 +101,7 @@ def measure(name: str, batch: int, work: int, repeats: int = 5) -> Scaling:
     """Measures one scene on the devices of this process."""
     steps = max(10, work // batch)
     run, state = world(name, steps, jnp.float32)
-    inputs = jnp.float32(GAIN), jc.devices.shard(worlds(state, batch))
+    inputs = jnp.float32(GAIN), jc.shard(worlds(state, batch))
     rates, counts = [], []
     for function in (jax.vmap(run, in_axes=(None, 0)), mean(run)):
         compiled, _ = timing.compile_seconds(function, *inputs)

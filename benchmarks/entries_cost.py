@@ -97,6 +97,29 @@ def compile_time(quick: bool) -> list[Metric]:
     return metrics
 
 
+@entry("programs")
+def programs(quick: bool) -> list[Metric]:
+    """Counts the equations of rollouts and of their gradients, which compile times follow."""
+    from benchmarks import programs as study
+
+    return [
+        count(
+            f"{name}, {method}, {kind}, equations", _equations(name, method, kind), tolerance=1.02
+        )
+        for name in (study.SMALL if quick else study.SCENES)
+        for method in (["Euler"] if quick else study.METHODS)
+        for kind in study.PROGRAMS
+    ]
+
+
+def _equations(name: str, method: str, kind: str) -> int:
+    """Counts the equations of a program of a scene; see `programs.program`."""
+    from benchmarks import programs as study
+
+    function, states = study.program(name, method, kind, study.BATCH)
+    return study.equations(function, states)
+
+
 @entry("memory")
 def memory(quick: bool) -> list[Metric]:
     """Measures the temporary memory that XLA plans for gradients, by adjoint."""

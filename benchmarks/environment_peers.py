@@ -129,13 +129,13 @@ def brax(name: str, how: str, copies: int) -> Copies:
     env: Any = envs.get_environment(name, backend=how)
     wrapped = training.wrap(env, episode_length=1000)
     keys = jax.random.split(jax.random.PRNGKey(0), copies)  # the wrappers need old-style keys
-    state, key = [jc.devices.shard(jax.jit(wrapped.reset)(keys))], [jax.random.key(1)]
+    state, key = [jc.shard(jax.jit(wrapped.reset)(keys))], [jax.random.key(1)]
     shape, step = (copies, env.action_size), jax.jit(wrapped.step)
     draw = jax.jit(lambda k: jax.random.uniform(k, shape, minval=-1.0, maxval=1.0))
 
     def act() -> Any:
         key[0], draw_key = jax.random.split(key[0])
-        state[0] = step(state[0], jc.devices.shard(draw(draw_key)))
+        state[0] = step(state[0], jc.shard(draw(draw_key)))
         return state[0].obs
 
     return Copies(float(env.dt), round(float(env.dt / env.sys.opt.timestep)), act)

@@ -137,7 +137,7 @@ def use_all_cores() -> None:
 
 def over_devices(worlds: Any, batch: int) -> Any:
     """Shards a batch over all devices if its size is divisible by their number."""
-    return worlds if batch % jax.device_count() else jc.devices.shard(worlds)
+    return worlds if batch % jax.device_count() else jc.shard(worlds)
 
 
 def machine() -> dict[str, Any]:

@@ -78,7 +78,7 @@ def main() -> None:
     if given.coordinator:
         jax.distributed.initialize(given.coordinator, given.processes, given.process)
     lengths = scattered(given.worlds)
-    batch = jc.devices.shard(jnp.asarray(lengths))
+    batch = jc.shard(jnp.asarray(lengths))
     final, _ = jax.jit(jax.vmap(settle, in_axes=(None, 0)))(GUESS, batch)
     value, slope = jax.jit(jax.value_and_grad(loss))(GUESS, batch)
     found = tune(lengths, given.steps)

@@ -12,7 +12,7 @@ Systems: Scene, WORLD, GeneralizedSystem, from_mjcf, assemble.
 Parts: Revolute, Prismatic, Spherical, Fixed, Distance, Spring, Motor, Limit, PlaneContact.
 Methods: Method, SemiImplicitEuler, RK4, Baumgarte, Projection.
 Simulation: State, init, step, rollout, forward_dynamics.
-All cores of a CPU: use_all_cores, compiler_options.
+All cores of a CPU: use_all_cores, shard, compiler_options.
 Readout: position, velocity, orientation, angular_velocity, coordinate, coordinate_rate, energy,
     momentum, angular_momentum, center_of_mass, violation.
 Forces: wrench, multipliers, reaction, acceleration, angular_acceleration.
@@ -74,6 +74,7 @@ from jaxcon.constraints.joints import Distance, Fixed, Prismatic, Revolute, Sphe
 from jaxcon.contact.contact import PlaneContact
 from jaxcon.contact.limits import Limit
 from jaxcon.core.cores import compiler_options, use_all_cores
+from jaxcon.core.devices import shard
 from jaxcon.core.status import SimulationError, Status, raise_for_status
 from jaxcon.execution.initialize import init
 from jaxcon.execution.rollout import rollout
@@ -128,8 +129,8 @@ if not TYPE_CHECKING:  # otherwise type checkers would accept every name
         """Imports `environments` at its first use: the import registers tasks with Gymnasium.
 
         Raises:
-            AttributeError: the name does not exist; for a name from before 0.2.0, the message
-                gives the new name.
+            AttributeError: the name does not exist; for a name from before 0.2.0, or one that is in
+                a namespace, the message says where it is.
         """
         if name == "environments":
             return importlib.import_module("jaxcon.environments")
@@ -139,7 +140,9 @@ if not TYPE_CHECKING:  # otherwise type checkers would accept every name
                 f"{old} is {new} since 0.2.0: see the changelog. tools/rename.py of the repository"
                 " rewrites code."
             )
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        spaces = (x for x in __all__ if name in getattr(globals()[x], "__all__", ()))
+        place = next((f"; it is jc.{space}.{name}" for space in spaces), "")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{place}")
 
 
 def __dir__() -> list[str]:
@@ -191,6 +194,7 @@ __all__ = [
     "reaction",
     "report",
     "rollout",
+    "shard",
     "step",
     "tradeoff",
     "tune",

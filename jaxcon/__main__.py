@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import math
@@ -82,6 +83,10 @@ def run_demo(copies: int, seconds: float, picture: str) -> int:
     """Runs the demo: simulates linkages, tunes their gains and draws a picture. Returns 0."""
     os.environ.setdefault("MPLBACKEND", "Agg")
     from jaxcon import demo
+    from jaxcon.core.cores import use_all_cores
+
+    with contextlib.suppress(RuntimeError):  # a program that has used JAX keeps its devices
+        use_all_cores()
 
     demo.main(copies, seconds, picture)
     return 0

@@ -14,6 +14,8 @@ import numpy as np
 from tqdm import tqdm
 
 from jaxcon import scenes
+from jaxcon.core.cores import compiler_options
+from jaxcon.core.devices import shard
 from jaxcon.core.status import raise_for_status
 from jaxcon.core.typing import Array, DType
 from jaxcon.execution.initialize import init
@@ -100,7 +102,7 @@ def simulate(worlds: Worlds, seconds: float, chunks: int = 50) -> Simulation:
         return final, jnp.max(worst)
 
     begin = time.perf_counter()
-    compiled = jax.jit(jax.vmap(run)).lower(systems, states).compile()
+    compiled = jax.jit(jax.vmap(run)).lower(systems, states).compile(dict(compiler_options))
     compile_time = time.perf_counter() - begin
     start = jax.vmap(energy)(systems, states)
     worst, spent = [], 0.0
@@ -256,7 +258,7 @@ def validate(gains: Tuning, worlds: Worlds, seconds: float, windows: int = 100) 
 
         return rollout(system, method, start, None, dt, length * windows, record=record)
 
-    compiled = jax.jit(jax.vmap(run, (None, 0, 0)))
+    compiled = jax.jit(jax.vmap(run, (None, 0, 0)), compiler_options=dict(compiler_options))
     rms, worst = [], []
     for chosen in (gains.default, gains.tuned):
         final, (square, largest) = compiled(
@@ -280,7 +282,8 @@ def main(copies: int = 1024, seconds: float = 5.0, picture: str = "jaxcon.png") 
     """
     worlds = linkages(copies)
     print(f"{copies} crank-rocker four-bars, closed loops, h = {STEP * 1e3:g} ms, {seconds:g} s")
-    result = simulate(worlds, seconds)
+    divides = copies % jax.local_device_count() == 0
+    result = simulate(shard(worlds) if divides else worlds, seconds)
     print(f"  compiled in {result.compile_time:.1f} s on {jax.devices()[0].device_kind}")
     print(f"  {result.throughput:,.0f} environment-steps per second")
     print(f"  worst violation {result.violation.max():.2e} m")

@@ -31,7 +31,7 @@ def run(v):
     start = jc.init(system, jc.Method(), state.q, v)
     return jc.rollout(system, jc.Method(), start, None, 1e-3, 20)[0].q
 v = jnp.stack([state.v + 0.1 * i for i in range(2 * count)])
-split = jax.jit(jax.vmap(run))(jc.devices.shard(v))
+split = jax.jit(jax.vmap(run))(jc.shard(v))
 assert len(split.sharding.device_set) == count
 print(count, os.environ["XLA_FLAGS"])
 print(*[float(x).hex() for x in split.ravel()])

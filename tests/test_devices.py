@@ -81,7 +81,7 @@ def met(compiled):
 one, all = (jax.make_mesh((n,), ("x",)) for n in (1, 4))  # Explicit, as JAX makes them
 run, state = devices.world("four-bar", 5, jnp.float64)
 gain, batch = jnp.asarray(50.0), worlds(state, 8)
-apart = jc.devices.shard(batch)
+apart = jc.shard(batch)
 plain = jax.jit(jax.vmap(run, in_axes=(None, 0)))
 compiled = plain.lower(gain, apart).compile()
 assert met(compiled) == {}
@@ -117,7 +117,7 @@ system, start = scene.build()
 method = jc.Method(stabilizer=jc.Projection(), solver=jc.solvers.Sparse())  # until all are done
 start = jc.init(system, method, start.q, start.v)
 swing = jax.vmap(lambda s: jc.step(system, method, s, None, 1e-3)[0])
-apart = jc.devices.shard(worlds(start, 4))
+apart = jc.shard(worlds(start, 4))
 together = jax.jit(swing).lower(apart).compile()
 assert met(together) == {}
 alone = jax.jit(jc.devices.over_devices(lambda _, batch: swing(batch))).lower(0.0, apart).compile()
@@ -129,9 +129,9 @@ for name in ("chain-5", "four-bar"):
     built, start = mechanisms.find(name).build(jnp.float64)
     turning = dataclasses.replace(worlds(start, 8), v=9.0 * worlds(start, 8).v)
     go = jax.jit(jax.vmap(lambda s: jc.rollout(built, jc.Method(), s, None, 2e-3, 3)[0]))
-    compiled = go.lower(jc.devices.shard(turning)).compile()
+    compiled = go.lower(jc.shard(turning)).compile()
     assert met(compiled) == {}
-    same(compiled(jc.devices.shard(turning)), go(turning))
+    same(compiled(jc.shard(turning)), go(turning))
 
 def refused(words, function, *args, **own):
     try:
@@ -141,12 +141,12 @@ def refused(words, function, *args, **own):
     else:
         raise AssertionError(f"not refused: {words}")
 
-refused("10 worlds does not divide over 4 devices; take 12", jc.devices.shard, jnp.ones(10))
-refused("must be one of JAX, such as", jc.devices.shard, jnp.ones(4), jax.devices())
+refused("10 worlds does not divide over 4 devices; take 12", jc.shard, jnp.ones(10))
+refused("must be one of JAX, such as", jc.shard, jnp.ones(4), jax.devices())
 whole = jc.devices.over_devices(lambda p, x: x, all)
 refused("over_devices: a batch of 6", whole, 0.0, jnp.ones(6))
-refused("['t'] of the batch has no first axis", jc.devices.shard, {"t": 1.0, "x": jnp.ones(4)})
-refused("must have as many worlds, got", jc.devices.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})
+refused("['t'] of the batch has no first axis", jc.shard, {"t": 1.0, "x": jnp.ones(4)})
+refused("must have as many worlds, got", jc.shard, {"x": jnp.ones(4), "y": jnp.ones(8)})
 refused("samples=7 does not", jc.tune, loss, 0.0, samples=7, key=key, mesh=all)
 """
 

@@ -185,6 +185,25 @@ def test_the_guide_has_the_pages_that_the_readme_names_in_the_same_order():
         assert GUIDE[page].startswith(f"# {title}\n")
 
 
+def test_the_names_in_tables_of_the_guide_exist():
+    """`joints.Gear(…)` in a table is `jc.joints.Gear`, and a name without a prefix `jc.Name`."""
+    rows = [line for text in GUIDE.values() for line in text.splitlines() if line.startswith("|")]
+    spans = [span for row in rows for span in re.findall(r"`([^`]+)`", row)]
+    called = {name for span in spans for name in re.findall(r"([\w.]*\b[A-Z]\w+)\(", span)}
+    names = {name.removeprefix("jc.") for name in called}
+    assert len(names) > 80
+    absent = [n for n in names if not _exists(n)]
+    assert absent == []
+
+
+def _exists(name):
+    """Returns True if `jc.name` exists."""
+    try:
+        return look_up(f"jaxcon.{name}") is not None
+    except (ImportError, AttributeError):
+        return False
+
+
 def test_the_numbers_of_the_readme_are_those_that_were_measured():
     section = README.split("\n## Performance\n")[1].split("\n## ")[0]
     shown = re.findall(r"[\d.]+(?:e[+-]\d+)? (?:µs|M)\b", section)

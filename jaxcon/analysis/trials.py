@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core import checks
+from jaxcon.core.cores import compiler_options
 from jaxcon.core.precision import cast, precision
 from jaxcon.core.status import Status, failed
 from jaxcon.core.typing import Array, DType, PyTree
@@ -212,7 +213,7 @@ class Lowered:
 
     def compile(self) -> None:
         """Compiles the program, which takes seconds."""
-        self.program = self.lowered.compile()
+        self.program = self.lowered.compile(dict(compiler_options))
 
     def numbers(self, dt: float, count: int) -> tuple[Array, Array]:
         """Converts the step size h and the number of steps to arguments of the program."""

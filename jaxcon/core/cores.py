@@ -42,7 +42,7 @@ def cores() -> int:
 def use_all_cores(count: int | None = None) -> int:
     """Makes each core of the CPU a device of JAX; call it before anything else that uses JAX.
 
-    One program runs on one core. `jc.devices.shard(states)` then lays a batch over all cores, and
+    One program runs on one core. `jc.shard(states)` then lays a batch over all cores, and
     `jax.jit(jax.vmap(run))` simulates a part of it on each, without communication. The environments
     take `devices=count`.
 

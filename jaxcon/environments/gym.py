@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxcon.core.cores import compiler_options
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
 from jaxcon.environments import adapters, render
@@ -23,7 +24,10 @@ if TYPE_CHECKING:
 # the environment is an argument, so that environments of equal structure share a compiled program
 _reset = jax.jit(lambda environment, key: environment.reset(key))
 _look = jax.jit(lambda environment, episode: environment.look(episode))
-_step = jax.jit(lambda environment, episode, action: environment.step(episode, action))
+_step = jax.jit(
+    lambda environment, episode, action: environment.step(episode, action),
+    compiler_options=dict(compiler_options),
+)
 
 
 def register() -> None:

@@ -14,6 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from numpy.typing import ArrayLike
 
 from jaxcon.core import checks
+from jaxcon.core.cores import compiler_options
 from jaxcon.core.devices import over_devices, shard
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.environments import adapters, render
@@ -37,7 +38,12 @@ def _look(environment: Environment, copies: Copies, mesh: Mesh | None) -> Any:
 
 
 # the buffers of the old copies are donated to the new ones: this saves a tenth of a CartPole step
-@functools.partial(jax.jit, static_argnums=(3, 4, 5), donate_argnums=1)
+@functools.partial(
+    jax.jit,
+    static_argnums=(3, 4, 5),
+    donate_argnums=1,
+    compiler_options=dict(compiler_options),
+)
 def _advance(
     environment: Environment,
     copies: Copies,

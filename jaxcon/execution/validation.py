@@ -50,7 +50,7 @@ def check_step(
         control = _channels(owner, layout, control, state.q.dtype)
     if layout is not None and control is None and (waiting := _motors(system)):
         raise ValueError(
-            f"{owner}: control is None, but the motors {listed(waiting)} wait for one, an array"
+            f"{owner}: control is None, but {listed(waiting)} (motors) wait for one, an array"
             f" ({layout.n_u},); its channels (name, first, end) are"
             f" {list(layout.controls)}."
         )

@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jax.stages import Wrapped
 
 from jaxcon.core import checks, functions
+from jaxcon.core.cores import compiler_options
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.learning.least_squares import Precision, Values
 from jaxcon.learning.leaves import Space
@@ -336,7 +337,8 @@ class Stretches:
 
             return jax.vmap(push, out_axes=(None, -1))(jnp.eye(x.size, dtype=x.dtype))
 
-        return jax.jit(jax.vmap(jax.vmap(linearize), (0, None, None)))
+        many = jax.vmap(jax.vmap(linearize), (0, None, None))
+        return jax.jit(many, compiler_options=dict(compiler_options))
 
     def _stretch(self, x: Array, data: PyTree, noise: PyTree) -> Pair:
         """Simulates one segment. Returns its data residuals and its end state, as arrays.

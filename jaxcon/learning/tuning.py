@@ -17,6 +17,7 @@ from jax.stages import Wrapped
 
 from jaxcon.core import checkpoint as files
 from jaxcon.core import checks
+from jaxcon.core.cores import compiler_options
 from jaxcon.core.devices import gathered, over_devices
 from jaxcon.core.interrupts import STOP_EXCEPTIONS, describe_error, progress_bar
 from jaxcon.core.typing import Array, PyTree, Scalar
@@ -159,7 +160,7 @@ def tune(
         about[PROGRAM] = files.digest(lowered.as_text())
         course = files.read(file, course, about, "tune") if file.exists() else course
         save = functools.partial(files.write, file, about)
-    compiled = lowered.compile()
+    compiled = lowered.compile(dict(compiler_options))
 
     def advance(search: Search) -> tuple[Search, Array]:
         """Runs one chunk of steps, or the rest of an interrupted chunk."""
