@@ -5,6 +5,9 @@ operations is one loop over contiguous memory. Plain `jax.vmap` puts the batch f
 every instruction, so that small matrices are processed one by one. `call` wraps the function in a
 primitive whose batching rule passes the whole batch along the last axis.
 
+On GPUs, the lowering rule keeps this order in memory. XLA would otherwise store arrays as the
+caller does, batch first, and read them with strides or move them one by one.
+
 On CPUs, the lowering rule also cuts a function into stages. Without stages, XLA computes shared
 values again in each kernel that needs them: a chain of 5 links then runs at 0.054 instead of 2.9
 million steps a second (two cores, a batch in the hundreds). See `fusion`.
@@ -35,6 +38,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray, Tracer
+from jax.experimental.layout import Layout, with_layout_constraint
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive
 from jax.extend.core.primitives import stop_gradient_p
 from jax.interpreters import ad, batching, mlir, partial_eval
@@ -61,6 +65,10 @@ _TRANSPOSED = ContextVar("transposed", default=False)
 # to pass through the adjoint's scan, which users may replace, and through reverse passes that JAX
 # traces.
 _CONSTANTS = ContextVar("constants", default=True)
+
+# Set while the lowering rule for GPUs traces a native function, read by this rule. JAX calls it for
+# native functions within the function, with a fixed signature.
+_IN_ORDER = ContextVar("in order", default=False)
 
 
 def order() -> int:
@@ -492,6 +500,21 @@ def _in_stages(*args: Array, fun: Native) -> list[Array]:
     return fusion.run_staged(fun, lanes, squeezed)
 
 
+def _in_order(*args: Array, fun: Native) -> list[Array]:
+    """Calls a native function whose arguments and results lie in memory with the batch last."""
+    if _IN_ORDER.get():  # within another native function
+        return fun(*args)
+    with during(_IN_ORDER, True):
+        return list(map(_contiguous, fun(*map(_contiguous, args))))
+
+
+def _contiguous(x: Array) -> Array:
+    """Returns an array whose last axis is contiguous in memory."""
+    if x.ndim < 2 or x.shape[-1] == 1:
+        return x
+    return with_layout_constraint(x, Layout(major_to_minor=tuple(range(x.ndim))))
+
+
 def squeezed(*lanes: Array) -> list[Array]:
     """Removes the last axis, of size 1, from arrays."""
     return [jnp.squeeze(x, -1) for x in lanes]
@@ -559,6 +582,8 @@ native_p.def_impl(lambda *args, fun, asks: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
 mlir.register_lowering(native_p, _lowered(lambda *args, fun: fun(*args)))
 mlir.register_lowering(native_p, _lowered(_in_stages), platform="cpu")
+mlir.register_lowering(native_p, _lowered(_in_order), platform="cuda")
+mlir.register_lowering(native_p, _lowered(_in_order), platform="rocm")
 batching.primitive_batchers[native_p] = _batched
 ad.primitive_jvps[native_p] = _jvp
 partial_eval.dce_rules[native_p] = _without_unused
