@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
+from unittest import mock
 
 import jax
 import numpy as np
@@ -103,6 +104,8 @@ def is_available() -> bool:
 def count(function: Callable[..., Any], *args: Any) -> Kernels:
     """Compiles a function for an H100 and counts its kernels.
 
+    While it is traced, `jax.default_backend()` returns "gpu", as it would beside a GPU.
+
     Args:
         function: the function.
         args: its arguments, pytrees of arrays or of their shapes and dtypes.
@@ -113,7 +116,9 @@ def count(function: Callable[..., Any], *args: Any) -> Kernels:
     shapes = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(np.shape(x), x.dtype, sharding=place), args
     )
-    return Program(jax.jit(function).lower(*shapes).compile().as_text()).kernels()
+    with mock.patch.object(jax, "default_backend", return_value="gpu"):
+        lowered = jax.jit(function).lower(*shapes)
+    return Program(lowered.compile().as_text()).kernels()
 
 
 class Program:
