@@ -394,13 +394,13 @@ QUICK: dict[str, tuple[tuple[str, ...], int, Any]] = {
 }
 """Elements, dimension and method of the small studies, by name."""
 
-OF_VELOCITIES = ("rolling", "knife edge", "momentum", "velocity level")
-"""Words in the names of joints with rows that hold velocities only, which `RATTLE` refuses."""
+REFUSED = ("rolling", "knife edge", "momentum", "velocity level", "rotor")
+"""Words in the names of joints that `RATTLE` refuses: rows of velocities only, and rotors."""
 
 HOLONOMIC = {
     name: element
     for name, element in {**JOINTS, **FORCES}.items()
-    if not any(word in name for word in OF_VELOCITIES)
+    if not any(word in name for word in REFUSED)
 }
 
 SETS = {
