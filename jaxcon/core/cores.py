@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import jax
 
@@ -24,7 +26,9 @@ def widest() -> int:
 
 
 # XLA's own default is 256
-compiler_options = MappingProxyType({"xla_cpu_prefer_vector_width": 512} if widest() == 512 else {})
+compiler_options: Mapping[str, Any] = MappingProxyType(
+    {"xla_cpu_prefer_vector_width": 512} if widest() == 512 else {}
+)
 """XLA's options with which steps run fastest: `jax.jit(f, compiler_options=jc.compiler_options)`.
 
 On a CPU with AVX-512, loops over worlds then use vectors of 512 bit, which XLA does not by default.
