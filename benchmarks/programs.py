@@ -12,7 +12,7 @@ With `pip install "jax[cuda12]"`, the row of a rollout also has what one step be
 see `gpu_kernels`: kernels, bytes per world, and conditions that the host waits for. No GPU is
 needed.
 
-The counts depend on the version of JAX, and not on the machine.
+The number of equations depends on the version of JAX, and not on the machine.
 """
 
 from __future__ import annotations
@@ -26,13 +26,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
 
 import jaxcon as jc
 from benchmarks import gpu_kernels, mechanisms, timing
 from benchmarks.mjcf import DT
 from benchmarks.throughput import worlds
-from jaxcon.core.jaxprs import called
+from jaxcon.staging.operations import instructions
 
 SCENES = ("pendulum", "four-bar", "chain-5", "chain-10", "planar-chain-10", "stewart")
 SMALL = ("pendulum", "four-bar", "planar-chain-10")
@@ -73,35 +72,18 @@ def program(name: str, method: str, kind: str, batch: int) -> tuple[Callable[...
 
 def equations(function: Callable[..., Any], *args: Any) -> int:
     """Returns the number of equations of a function after tracing."""
-    return _equations(jax.make_jaxpr(function)(*args).jaxpr)
-
-
-def _equations(jaxpr: Jaxpr) -> int:
-    """Counts the equations of a jaxpr and of all jaxprs in it; a call itself does not count."""
-    total = 0
-    for equation in jaxpr.eqns:
-        params = equation.params
-        if equation.primitive.name == "native":
-            shapes = ((x.aval.shape, x.aval.dtype) for x in equation.invars)
-            inner = [params["fun"].traced(*shapes)]
-        elif equation.primitive.name == "custom_linear_solve":
-            inner = [params["jaxprs"].solve]
-        elif (function := called(equation)) is not None:
-            inner = [function]
-        else:
-            values = [x if isinstance(x, tuple | list) else [x] for x in params.values()]
-            inner = [x for xs in values for x in xs if isinstance(x, Jaxpr | ClosedJaxpr)]
-        total += sum(_equations(getattr(x, "jaxpr", x)) for x in inner) if inner else 1
-    return total
+    return instructions(jax.make_jaxpr(function)(*args).jaxpr)
 
 
 def measured(name: str, method: str, kind: str, batch: int) -> dict[str, Any]:
     """Compiles a program in this process; returns its counts and its compile time [s]."""
     function, states = program(name, method, kind, batch)
     compiled, seconds = timing.compile_seconds(function, states)
-    instructions = compiled.as_text().count(" = ")
-    count = equations(function, states)
-    return {"equations": count, "instructions": instructions, "seconds": seconds}
+    return {
+        "equations": equations(function, states),
+        "instructions": compiled.as_text().count(" = "),
+        "seconds": seconds,
+    }
 
 
 def on_gpu(name: str, method: str, batch: int) -> gpu_kernels.Kernels:

@@ -150,6 +150,9 @@ def test_a_velocity_whose_products_would_overflow_is_told(dim, dtype):
     fast = dataclasses.replace(state, v=speeds[2] * state.v)
     found = jc.analysis.find_first_failure(system, method, fast, None, 1e-3, 2)
     assert "velocity of 'free'" in str(found)
+    shared = dataclasses.replace(state, v=jnp.full_like(state.v, 0.6e10))  # 1.8e10 or more together
+    found = jc.analysis.find_first_failure(system, method, shared, None, 1e-3, 2)
+    assert "velocity of 'free'" in str(found)
 
 
 @pytest.mark.parametrize("field", ["before", "after"])

@@ -17,7 +17,7 @@ from jaxcon.core.summary import Stacked, codes, shape, span, table
 from jaxcon.core.typing import Array, Scalar
 
 LARGEST_SPEED = 1e10
-"""The velocity [m/s, rad/s] up to which a state counts as finite; a motion beyond has diverged.
+"""The sum of |v| [m/s, rad/s] up to which a state counts as finite; a motion beyond has diverged.
 
 It is MuJoCo's `mjMAXVAL`, beyond which MuJoCo resets a simulation. Products of several velocities,
 as in a step and its derivatives, are then finite.
