@@ -114,7 +114,7 @@ def test_a_motor_without_control_is_named():
         lambda: jc.rollout(system, jc.Method(), state, None, 1e-3, 2),
         lambda: jc.forward_dynamics(system, state, None, jc.Method(), 1e-3),
     ):
-        with pytest.raises(ValueError, match="None, but the motors motor, servo wait"):
+        with pytest.raises(ValueError, match=r"None, but motor, servo \(motors\) wait"):
             act()
 
 

@@ -78,7 +78,7 @@ def test_an_explicit_spring_is_stable_below_four_masses_by_the_square_of_the_ste
 
     below, above = largest(jnp.asarray([0.999, 1.001]))
     assert below < 4.0  # 0.1 at first; here the orbit is a long ellipse
-    assert not above < 1e10
+    assert above > 1e7  # it grows until its velocity makes the step fail
 
 
 @pytest.mark.parametrize(("share", "warned"), [(0.999, False), (1.001, True)])
