@@ -22,6 +22,7 @@ from jaxcon.methods.method import Method, check_method
 from jaxcon.methods.stability import warn_if_unstable
 from jaxcon.protocols import Adjoint, System
 from jaxcon.staging import batch_last
+from jaxcon.staging.chunks import by_world
 from jaxcon.staging.failure import mask_failed_gradients, stop_failed
 from jaxcon.staging.meshes import together
 from jaxcon.staging.operations import primitives
@@ -112,9 +113,22 @@ def rollout(
 
     reason = method.irreversible() if policy is None else FEEDBACK
     path = Path(one, _recorded(record, system), state, inputs, steps, every, reason or back)
-    with batch_last.as_it_is_called():
+
+    def run() -> tuple[State, Any]:
         final, trajectory = adjoint.scan(path)
-    return stop_failed(final.status, final), stop_failed(final.status, trajectory)
+        return stop_failed(final.status, final), stop_failed(final.status, trajectory)
+
+    with batch_last.as_it_is_called():
+        return by_world(run, chunk_size(state.v.size))
+
+
+def chunk_size(velocities: int) -> int:
+    """Returns the number of worlds whose steps a core of a CPU computes fastest, a power of 2.
+
+    Their states and the intermediate values of a step then fit its cache. Measured on an AMD EPYC:
+    512 for three velocities, 128 for thirty.
+    """
+    return int(np.clip(2 ** round(np.log2(4096 / max(velocities, 1))), 32, 512))
 
 
 def _recorded(record: Record, system: System) -> Record:

@@ -1,0 +1,591 @@
+"""Large batches in chunks that fit the cache of a CPU.
+
+A step of a thousand worlds reads and writes more numbers than the cache of a core holds, and then
+waits for memory. `by_world` wraps a function of one world, such as a rollout, in a primitive. If
+`vmap` maps it over many worlds, a CPU evaluates it for some of them at a time, from the first step
+to the last. Other devices evaluate all worlds at once.
+
+The primitive keeps the function of one world, and notes which arguments differ between worlds. Its
+derivatives are split into two functions of one world: one returns the results and the residuals,
+which are the values that the linear map needs, and the other is this linear map. Both are evaluated
+in chunks. So is the transpose of the linear map; gradients with respect to values that the worlds
+share are then sums over the worlds of a chunk, and over chunks.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir, partial_eval
+
+from jaxcon.core.jaxprs import without_unused
+from jaxcon.core.typing import Array, T
+from jaxcon.staging import batch_last
+from jaxcon.staging.operations import primitives
+from jaxcon.staging.program import is_known
+
+Flags = tuple[bool, ...]
+"""A truth value for each array of a list."""
+Axes = tuple[int | None, ...]
+"""The axis of worlds of each array of a list; None if worlds share the array."""
+
+
+class Batch(NamedTuple):
+    """The worlds that evaluate a function.
+
+    Attributes:
+        size: the number of worlds; None for one world, whose arrays have no axis of worlds.
+        axes: the axis of worlds of each argument.
+        out_axes: the axis of worlds of each result.
+    """
+
+    size: int | None
+    axes: Axes
+    out_axes: Axes
+
+
+class OneWorld:
+    """A function of one world: arrays → list of arrays. Compared by identity.
+
+    Attributes:
+        closed: the jaxpr of the function, without constants.
+        most: the number of worlds in a chunk.
+    """
+
+    def __init__(self, closed: ClosedJaxpr, most: int) -> None:
+        self.closed, self.most = closed, most
+        self.results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.out_avals]
+        self.arguments = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.in_avals]
+        self.split = functools.lru_cache(maxsize=16)(self._split)
+        self.transposed = functools.lru_cache(maxsize=16)(self._transposed)
+        self.part = functools.lru_cache(maxsize=16)(self._part)
+        self.differ = functools.lru_cache(maxsize=16)(self._differ)
+
+    def __call__(self, *args: Array) -> list[Array]:
+        """Evaluates the function in one world."""
+        return list(jaxpr_as_fun(self.closed)(*args))
+
+    def bound(self, batch: Batch, *args: Array) -> list[Array]:
+        """Evaluates the function through the primitive `worlds_p`."""
+        return worlds_p.bind(*args, fun=self, batch=batch, jaxpr=self.closed)
+
+    def over(self, size: int | None, axes: Axes) -> Batch:
+        """Returns the batch of `size` worlds with these axes of the arguments.
+
+        The axis of worlds of a result is the first one.
+        """
+        differ = self.differ(tuple(axis is not None for axis in axes))
+        return Batch(size, axes, tuple(0 if flag else None for flag in differ))
+
+    def vmapped(self, batch: Batch) -> Callable[..., list[Array]]:
+        """Returns the function of all worlds at once, outside of the primitive."""
+        if batch.size is None:
+            return self
+        out_axes = list(batch.out_axes)
+        return jax.vmap(self, in_axes=batch.axes, out_axes=out_axes, axis_size=batch.size)
+
+    def _differ(self, mapped: Flags) -> Flags:
+        """Returns a flag for each result: True if it depends on an argument that is mapped."""
+        jaxpr = self.closed.jaxpr
+        known = {x for x, flag in zip(jaxpr.invars, mapped, strict=True) if flag}
+
+        def differs(x: Any) -> bool:
+            return not isinstance(x, Literal) and x in known
+
+        for equation in jaxpr.eqns:
+            if any(map(differs, equation.invars)):
+                known.update(equation.outvars)
+        return tuple(map(differs, jaxpr.outvars))
+
+    def _split(self, moved: Flags) -> Split:
+        """Splits the derivative by the arguments whose flag in `moved` is True."""
+        count = len(self.results)
+        linear: list[ClosedJaxpr] = []
+
+        def forward(*args: Array) -> list[Array]:
+            def along(*moving: Array) -> tuple[list[Array], list[Array]]:
+                results = self(*merged(moved, moving, chosen(args, moved, False)))
+                return list(filter(batch_last.is_real, results)), results
+
+            _, pushforward, results = jax.linearize(along, *chosen(args, moved), has_aux=True)
+            linear.append(jax.make_jaxpr(pushforward)(*chosen(self.arguments, moved)))
+            return [*results, *linear[-1].consts]
+
+        jaxpr = jax.make_jaxpr(forward)(*self.arguments)
+        residuals = jaxpr.jaxpr.outvars[count:]
+        # residuals that are arguments need not be returned; shared ones would be copied
+        pool = [*jaxpr.jaxpr.invars, *jaxpr.jaxpr.outvars[:count]]
+        for x in residuals:
+            if isinstance(x, Literal) or x not in pool:
+                pool.append(x)
+        places = tuple(pool.index(x) for x in residuals)
+        outvars = pool[len(self.arguments) :]
+        open_jaxpr = jaxpr.jaxpr.replace(outvars=outvars)
+        return Split(
+            OneWorld(ClosedJaxpr(open_jaxpr, jaxpr.consts), self.most),
+            places,
+            OneWorld(without_constants(linear[-1]), self.most),
+        )
+
+    def _transposed(self, linear: Flags, given: Flags) -> OneWorld:
+        """Returns the transpose in one world: (other arguments, ȳ) → cotangents.
+
+        Args:
+            linear: for each argument, True if the function is linear in it.
+            given: for each result, True if its cotangent is given; the others are zero.
+        """
+        structs = [*chosen(self.arguments, linear, False), *chosen(self.results, given)]
+        back = functools.partial(pulled_back, self, self.arguments, linear, given)
+        return OneWorld(jax.make_jaxpr(back)(*structs), self.most)
+
+    def _part(self, wanted: Flags) -> OneWorld:
+        """Returns the function with the wanted results only."""
+        jaxpr = without_unused(self.closed.jaxpr, wanted)
+        return OneWorld(ClosedJaxpr(jaxpr, self.closed.consts), self.most)
+
+
+@dataclass(frozen=True)
+class Split:
+    """A derivative, split into two functions of one world.
+
+    Attributes:
+        forward: arguments → the results, and residuals.
+        places: the place of each residual among the arguments and results of `forward`.
+        linear: (residuals, tangents) → tangents of the floating results.
+    """
+
+    forward: OneWorld
+    places: tuple[int, ...]
+    linear: OneWorld
+
+
+def pulled_back(
+    function: Callable[..., Sequence[Array]],
+    arguments: Sequence[Any],
+    linear: Flags,
+    given: Flags,
+    *args: Array,
+) -> list[Array]:
+    """Returns the cotangents of the linear arguments of a function.
+
+    Args:
+        function: the function, of one world or of several.
+        arguments: shapes and dtypes of its arguments.
+        linear: for each argument, True if the function is linear in it.
+        given: for each result, True if its cotangent is given.
+        args: the other arguments, and the given cotangents.
+    """
+    fixed, cotangents = args[: linear.count(False)], args[linear.count(False) :]
+
+    def along(*moving: Array) -> list[Array]:
+        return list(chosen(function(*merged(linear, moving, fixed)), given))
+
+    moving = chosen(arguments, linear)
+    return list(jax.linear_transpose(along, *moving)(list(cotangents)))
+
+
+def chosen(xs: Sequence[T], flags: Sequence[bool], like: bool = True) -> tuple[T, ...]:
+    """Returns the entries whose flag is True; or False, if `like` is False."""
+    return tuple(x for x, flag in zip(xs, flags, strict=True) if flag is like)
+
+
+def merged(flags: Flags, first: Sequence[T], second: Sequence[T]) -> Iterator[T]:
+    """Merges two lists: takes the next of `first` for a flag that is True, else of `second`."""
+    some, others = iter(first), iter(second)
+    return (next(some) if flag else next(others) for flag in flags)
+
+
+def without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """Turns the constants of a jaxpr into its first arguments."""
+    jaxpr = closed.jaxpr
+    arguments = [*jaxpr.constvars, *jaxpr.invars]
+    return ClosedJaxpr(jaxpr.replace(constvars=[], invars=arguments), ())
+
+
+def by_world(function: Callable[[], T], most: int) -> T:
+    """Calls function(); if it is mapped over many worlds, a CPU evaluates them in chunks.
+
+    Functions with side effects or collectives are called as they are, as are functions on a mesh
+    with manual or explicit axes, and functions with a derivative rule that has no forward mode.
+
+    Args:
+        function: a function of the arrays that it closes over.
+        most: the number of worlds in a chunk.
+    """
+    mesh = jax.sharding.get_abstract_mesh()
+    if mesh.manual_axes or mesh.explicit_axes or jax.config.values["jax_disable_jit"]:
+        return function()
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)()
+    traced = any(isinstance(x, Tracer) for x in closed.consts)
+    if traced and "custom_vjp_call" in primitives(closed.jaxpr):
+        return function()
+    if not traced or closed.effects:
+        results = jaxpr_as_fun(closed)()
+    else:
+        fun = OneWorld(without_constants(closed), most)
+        results = fun.bound(fun.over(None, (None,) * len(closed.consts)), *closed.consts)
+    return jax.tree.unflatten(jax.tree.structure(shapes), results)
+
+
+class Pullback(NamedTuple):
+    """The transpose of a function that many worlds evaluate.
+
+    Its inputs are the arguments in which the function is not linear, and the given cotangents.
+
+    Attributes:
+        function: the function of one world.
+        linear: for each argument, True if the function is linear in it.
+        given: for each result, True if its cotangent is given; the others are zero.
+        batch: the worlds.
+    """
+
+    function: OneWorld
+    linear: Flags
+    given: Flags
+    batch: Batch
+
+    @property
+    def axes(self) -> Axes:
+        """The axis of worlds of each input."""
+        others = chosen(self.batch.axes, self.linear, False)
+        return others + chosen(self.batch.out_axes, self.given)
+
+    @property
+    def out_axes(self) -> Axes:
+        """The axis of worlds of each output; None for sums over worlds."""
+        return chosen(self.batch.axes, self.linear)
+
+    def bound(self, *args: Array) -> list[Array]:
+        """Evaluates the transpose through the primitive `pulled_p`."""
+        return pulled_p.bind(*args, pull=self, jaxpr=self.function.closed)
+
+    def results(self) -> list[Any]:
+        """Returns the shapes and dtypes of the outputs."""
+        arguments = chosen(self.function.arguments, self.linear)
+        return batched_types(arguments, self.batch.size, self.out_axes)
+
+    def vmapped(self, size: int | None) -> Callable[..., list[Array]]:
+        """Returns the transpose for `size` worlds at once, outside of the primitive."""
+        batch = self.batch._replace(size=size)
+        function = self.function.vmapped(batch)
+        arguments = batched_types(self.function.arguments, size, batch.axes)
+        return functools.partial(pulled_back, function, arguments, self.linear, self.given)
+
+    def world_by_world(self, *args: Array) -> list[Array]:
+        """Evaluates the transpose in each world by itself, then sums; this has derivatives."""
+        # a result that worlds share has one cotangent, which must not count in each world
+        count, size = self.linear.count(False), self.batch.size or 1
+        args = tuple(
+            x / size if i >= count and axis is None else x
+            for i, (x, axis) in enumerate(zip(args, self.axes, strict=True))
+        )
+        back = self.function.transposed(self.linear, self.given)
+        batch = back.over(size, self.axes)
+        results = zip(back.bound(batch, *args), batch.out_axes, strict=True)
+        each = [jnp.broadcast_to(y, (size, *y.shape)) if i is None else y for y, i in results]
+        return [
+            jnp.sum(y, axis=0) if axis is None else jnp.moveaxis(y, 0, axis)
+            for y, axis in zip(each, self.out_axes, strict=True)
+        ]
+
+
+def batched_types(types: Sequence[Any], size: int | None, axes: Axes) -> list[Any]:
+    """Adds an axis of worlds to the types that have one."""
+    return [
+        x
+        if axis is None or size is None
+        else jax.ShapeDtypeStruct((*x.shape[:axis], size, *x.shape[axis:]), x.dtype)
+        for x, axis in zip(types, axes, strict=True)
+    ]
+
+
+worlds_p, pulled_p = Primitive("worlds"), Primitive("pulled")
+worlds_p.multiple_results = pulled_p.multiple_results = True
+
+
+def _abstract(
+    *_: ShapedArray, fun: OneWorld, batch: Batch, jaxpr: ClosedJaxpr
+) -> list[ShapedArray]:
+    types = batched_types(fun.results, batch.size, batch.out_axes)
+    return [ShapedArray(x.shape, x.dtype) for x in types]
+
+
+def _batched(
+    args: Sequence[Array],
+    axes: Sequence[int | None],
+    *,
+    fun: OneWorld,
+    batch: Batch,
+    jaxpr: ClosedJaxpr,
+) -> tuple[list[Array], list[int | None]]:
+    """The batching rule: notes the axes of worlds. A second batch is mapped within the first."""
+    if batch.size is not None:
+        fun = nested(fun, batch)
+    size = next(x.shape[i] for x, i in zip(args, axes, strict=True) if i is not None)
+    several = fun.over(size, tuple(axes))
+    return fun.bound(several, *args), list(several.out_axes)
+
+
+@functools.lru_cache(maxsize=64)
+def nested(fun: OneWorld, batch: Batch) -> OneWorld:
+    """Returns the function of a batch as a function of one world."""
+    types = batched_types(fun.arguments, batch.size, batch.axes)
+    most = max(1, fun.most // (batch.size or 1))
+    return OneWorld(jax.make_jaxpr(fun.vmapped(batch))(*types), most)
+
+
+def _jvp(
+    primals: Sequence[Array],
+    tangents: Sequence[Array | ad.Zero],
+    *,
+    fun: OneWorld,
+    batch: Batch,
+    jaxpr: ClosedJaxpr,
+) -> tuple[list[Array], list[Array | ad.Zero]]:
+    """The JVP rule: evaluates the results and the residuals, and then the linear map."""
+    moved = tuple(type(x) is not ad.Zero for x in tangents)
+    split = fun.split(moved)
+    forward = split.forward.over(batch.size, batch.axes)
+    # as in the batch, where code that is not needed may be gone. Steps come before worlds in
+    # residuals, so that loops over steps store and read them as they are
+    extra = zip(split.forward.results, forward.out_axes, strict=True)
+    extra = [i if i is None else min(1, len(y.shape)) for y, i in extra][len(batch.out_axes) :]
+    forward = forward._replace(out_axes=(*batch.out_axes, *extra))
+    results = split.forward.bound(forward, *primals)
+    pool, axes = [*primals, *results], (*batch.axes, *forward.out_axes)
+    residuals = [pool[i] for i in split.places]
+    results = results[: len(fun.results)]
+    real = tuple(map(batch_last.is_real, results))
+    inputs = (*(axes[i] for i in split.places), *chosen(batch.axes, moved))
+    along = Batch(batch.size, inputs, chosen(batch.out_axes, real))
+    moving = iter(split.linear.bound(along, *residuals, *chosen(tangents, moved)))
+    return results, [
+        next(moving) if flag else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
+        for y, flag in zip(results, real, strict=True)
+    ]
+
+
+def _transpose(
+    cotangents: Sequence[Array | ad.Zero],
+    *args: Array | ad.UndefinedPrimal,
+    fun: OneWorld,
+    batch: Batch,
+    jaxpr: ClosedJaxpr,
+) -> list[Array | None]:
+    """The transpose rule: the linear map is transposed in all worlds of a chunk at once."""
+    linear = tuple(ad.is_undefined_primal(x) for x in args)
+    given = tuple(type(x) is not ad.Zero for x in cotangents)
+    if not any(given):
+        return [None] * len(args)
+    inputs = *chosen(args, linear, False), *chosen(cotangents, given)
+    if batch.size is None:
+        back = fun.transposed(linear, given)
+        results = iter(back.bound(back.over(None, (None,) * len(inputs)), *inputs))
+    else:
+        pull = Pullback(fun, linear, given, batch)
+        results = iter(pull.bound(*inputs))
+    return [next(results) if flag else None for flag in linear]
+
+
+def _without_unused(
+    wanted: list[bool], *context: bool | JaxprEqn
+) -> tuple[list[bool], JaxprEqn | None]:
+    """The rule for dead code elimination: removes unused results and the work for them."""
+    equation: Any = context[-1]
+    if not any(wanted):
+        return [False] * len(equation.invars), None
+    if all(wanted):
+        return [True] * len(equation.invars), equation
+    fun, batch = equation.params["fun"], equation.params["batch"]
+    batch = batch._replace(out_axes=chosen(batch.out_axes, wanted))
+    part = fun.part(tuple(wanted))
+    params = {"fun": part, "batch": batch, "jaxpr": part.closed}
+    outvars = list(chosen(equation.outvars, wanted))
+    return [True] * len(equation.invars), equation.replace(outvars=outvars, params=params)
+
+
+def _pulled_jvp(
+    primals: Sequence[Array],
+    tangents: Sequence[Array | ad.Zero],
+    *,
+    pull: Pullback,
+    jaxpr: ClosedJaxpr,
+) -> tuple[list[Array], list[Array]]:
+    """The JVP rule of a pullback: that of the transpose in each world."""
+    return jax.jvp(pull.world_by_world, primals, [ad.instantiate_zeros(x) for x in tangents])
+
+
+def _pulled_batched(
+    args: Sequence[Array], axes: Sequence[int | None], *, pull: Pullback, jaxpr: ClosedJaxpr
+) -> tuple[list[Array], list[int]]:
+    """The batching rule of a pullback: that of the transpose in each world."""
+    results = jax.vmap(pull.world_by_world, in_axes=tuple(axes))(*args)
+    return results, [0] * len(results)
+
+
+def _in_chunks(*args: Array, fun: OneWorld, batch: Batch, devices: int) -> list[Array]:
+    """Evaluates a function in chunks of worlds."""
+    lots = chunks(batch.size, fun.most, devices)
+    if lots is None:
+        return fun.vmapped(batch)(*args)
+    part = fun.vmapped(batch._replace(size=lots.size))
+    inputs, shared = lots.split_all(args, batch.axes)
+
+    def one(_: None, xs: list[Array]) -> tuple[None, list[Array]]:
+        return None, part(*merged(mapped(batch.axes), xs, shared))
+
+    _, results = jax.lax.scan(one, None, inputs)
+    axes = zip(results, batch.out_axes, strict=True)
+    return [y[0] if axis is None else lots.join(y, axis) for y, axis in axes]
+
+
+def _pulled_in_chunks(*args: Array, pull: Pullback, devices: int) -> list[Array]:
+    """Evaluates a pullback in chunks of worlds, and adds up what worlds share."""
+    lots = chunks(pull.batch.size, pull.function.most, devices)
+    if lots is None:
+        return pull.vmapped(pull.batch.size)(*args)
+    count, summed = pull.linear.count(False), tuple(i is None for i in pull.out_axes)
+    part = pull.vmapped(lots.size)
+    # copies of a world that fill the last chunk must not count: their cotangents are zero
+    fixed, others = lots.split_all(args[:count], pull.axes[:count])
+    given, once = lots.split_all(args[count:], pull.axes[count:], copies=False)
+
+    def one(sums: list[Array], xs: tuple[Array, list[Array], list[Array]]) -> Any:
+        i, fixed, given = xs
+        # a result that worlds share has one cotangent, which counts in the first chunk only
+        first = [jnp.where(i == 0, x, 0) for x in once]
+        inputs = (
+            *merged(mapped(pull.axes[:count]), fixed, others),
+            *merged(mapped(pull.axes[count:]), given, first),
+        )
+        results = part(*inputs)
+        sums = [x + y for x, y in zip(sums, chosen(results, summed), strict=True)]
+        return sums, list(chosen(results, summed, False))
+
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in chosen(pull.results(), summed)]
+    sums, results = jax.lax.scan(one, zeros, (jnp.arange(lots.count), fixed, given))
+    axes = zip(results, chosen(pull.out_axes, summed, False), strict=True)
+    return list(merged(summed, sums, [lots.join(y, axis) for y, axis in axes]))
+
+
+def mapped(axes: Axes) -> Flags:
+    """Returns a flag for each array: True if it has an axis of worlds."""
+    return tuple(axis is not None for axis in axes)
+
+
+class Chunks(NamedTuple):
+    """Chunks of a batch. Each has equal shares of the worlds of all devices.
+
+    Attributes:
+        worlds: the number of worlds of the batch.
+        count: the number of chunks.
+        share: the number of worlds of a device in a chunk.
+        devices: the number of devices.
+    """
+
+    worlds: int
+    count: int
+    share: int
+    devices: int
+
+    @property
+    def size(self) -> int:
+        """The number of worlds in a chunk."""
+        return self.devices * self.share
+
+    def split_all(
+        self, args: Sequence[Array], axes: Axes, copies: bool = True
+    ) -> tuple[list[Array], tuple[Array, ...]]:
+        """Splits the arrays that have an axis of worlds; returns them and the others."""
+        pairs = zip(args, axes, strict=True)
+        split = [self.split(x, axis, copies) for x, axis in pairs if axis is not None]
+        return split, chosen(args, mapped(axes), False)
+
+    def split(self, x: Array, axis: int, copies: bool = True) -> Array:
+        """Splits an array along its axis of worlds, and moves the axis of chunks to the front.
+
+        The last chunk is filled with copies of the last world; with zeros if `copies` is False.
+        """
+        if extra := self.count * self.size - self.worlds:
+            widths = [(0, extra if i == axis else 0) for i in range(x.ndim)]
+            x = jnp.pad(x, widths, mode="edge" if copies else "constant")
+        before, after = x.shape[:axis], x.shape[axis + 1 :]
+        x = x.reshape(*before, self.devices, self.count, self.share, *after)
+        return jnp.moveaxis(x, axis + 1, 0).reshape(self.count, *before, self.size, *after)
+
+    def join(self, y: Array, axis: int) -> Array:
+        """Joins the results of chunks, (chunk, …), along their axis of worlds."""
+        before, after = y.shape[1 : axis + 1], y.shape[axis + 2 :]
+        y = y.reshape(self.count, *before, self.devices, self.share, *after)
+        y = jnp.moveaxis(y, 0, axis + 1).reshape(*before, self.count * self.size, *after)
+        return jax.lax.slice_in_dim(y, 0, self.worlds, axis=axis)
+
+
+def chunks(worlds: int | None, most: int, devices: int) -> Chunks | None:
+    """Returns how a batch is cut into chunks; None if it is not.
+
+    Args:
+        worlds: the number of worlds, or None.
+        most: the largest number of worlds of a device in a chunk.
+        devices: the number of devices. A batch that does not divide among them is not cut.
+    """
+    if worlds is None or not is_known([worlds]) or worlds % devices:
+        return None
+    own = worlds // devices
+    if own <= most:
+        return None
+    count = -(-own // most)
+    share = -(-own // count)
+    if devices > 1 and count * share != own:  # copies would move worlds between devices
+        fitting = [k for k in range(share, max(1, most // 4), -1) if own % k == 0]
+        if not fitting:
+            return None
+        share, count = fitting[0], own // fitting[0]
+    return Chunks(worlds, count, share, devices)
+
+
+def _lower(
+    primitive: Primitive, at_once: Callable[..., Any], in_chunks: Callable[..., Any]
+) -> None:
+    """Registers the lowering rules of a primitive: in chunks on CPUs, at once elsewhere."""
+
+    def rule(ctx: mlir.LoweringRuleContext, *args: Any, jaxpr: ClosedJaxpr, **params: Any) -> Any:
+        # the devices over which the compiler may spread a batch
+        devices = getattr(ctx.module_context.axis_context, "num_devices", None) or 1
+        function = functools.partial(in_chunks, devices=devices)
+        return mlir.lower_fun(function, multiple_results=True)(ctx, *args, **params)
+
+    def whole(ctx: mlir.LoweringRuleContext, *args: Any, jaxpr: ClosedJaxpr, **params: Any) -> Any:
+        return mlir.lower_fun(at_once, multiple_results=True)(ctx, *args, **params)
+
+    mlir.register_lowering(primitive, whole)
+    mlir.register_lowering(primitive, rule, platform="cpu")
+
+
+_outside_jit = jax.jit(
+    lambda *args, fun, batch: fun.bound(batch, *args), static_argnames=("fun", "batch")
+)
+_pulled_outside_jit = jax.jit(lambda *args, pull: pull.bound(*args), static_argnames=("pull",))
+
+worlds_p.def_impl(lambda *args, fun, batch, jaxpr: _outside_jit(*args, fun=fun, batch=batch))
+worlds_p.def_abstract_eval(_abstract)
+batching.primitive_batchers[worlds_p] = _batched
+ad.primitive_jvps[worlds_p] = _jvp
+ad.primitive_transposes[worlds_p] = _transpose
+partial_eval.dce_rules[worlds_p] = _without_unused
+_lower(worlds_p, lambda *args, fun, batch: fun.vmapped(batch)(*args), _in_chunks)
+
+pulled_p.def_impl(lambda *args, pull, jaxpr: _pulled_outside_jit(*args, pull=pull))
+pulled_p.def_abstract_eval(
+    lambda *_, pull, jaxpr: [ShapedArray(x.shape, x.dtype) for x in pull.results()]
+)
+batching.primitive_batchers[pulled_p] = _pulled_batched
+ad.primitive_jvps[pulled_p] = _pulled_jvp
+_lower(pulled_p, lambda *args, pull: pull.vmapped(pull.batch.size)(*args), _pulled_in_chunks)
