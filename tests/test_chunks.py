@@ -1,13 +1,16 @@
 """Large batches are simulated in chunks of worlds, with the same values and derivatives."""
 
+import dataclasses
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tolerances import IDENTITY
+from tolerances import DIFFERENCE, IDENTITY
 
+import jaxcon as jc
+from jaxcon.execution import rollout
 from jaxcon.staging import chunks
 
 MOST = 4
@@ -25,7 +28,7 @@ def motion(x, shared, most=MOST):
 
         return jax.lax.scan(step, x, jnp.arange(STEPS) / STEPS)
 
-    return chunks.by_world(run, most) if most else run()
+    return chunks.by_world(run, most, (x, shared)) if most else run()
 
 
 def loss(x, shared, most=MOST):
@@ -111,3 +114,129 @@ def test_chunks_change_no_value_and_no_derivative(name, worlds):
             got,
             expected,
         )
+
+
+def pendulum():
+    scene = jc.Scene(dim=2)
+    scene.add_body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "rod", point=(0.0, 0.0)))
+    return scene.build()
+
+
+SYSTEM, STATE = pendulum()
+
+
+def cart():
+    scene = jc.Scene(dim=2)
+    scene.add_body("cart", mass=1.0, inertia=0.1, position=(0.0, 0.0))
+    scene.add(jc.Prismatic("rail", jc.WORLD, "cart", point=(0.0, 0.0), axis=(1.0, 0.0)))
+    scene.add(jc.Motor("push", "rail"))
+    return scene.build()
+
+
+CART = cart()
+
+
+def swung(speed, gain, steps=3):
+    """A pendulum that starts at a speed: its last state, and its angle after each step."""
+    start = dataclasses.replace(STATE, v=STATE.v * 0 + speed * jnp.asarray([0.0, 0.5, 1.0]))
+    system = SYSTEM.with_params({"gravity": gain * SYSTEM.params["gravity"]})
+    return jc.rollout(system, jc.Method(), start, None, 1e-3, steps, record=lambda s, _: s.q[2])
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Chunks of eight worlds."""
+    monkeypatch.setattr(rollout, "chunk_size", lambda velocities: 8)
+
+
+@pytest.mark.parametrize("worlds", [1, 7, 9, 30])
+def test_a_rollout_of_a_batch_is_that_of_its_worlds(few, worlds):
+    speeds, gains = jnp.linspace(-2.0, 2.0, worlds), jnp.linspace(0.5, 1.5, worlds)
+    run = jax.jit(jax.vmap(swung))
+
+    def loops(*args):
+        return run.lower(*args).as_text().count("stablehlo.while")
+
+    assert loops(speeds, gains) == loops(speeds[:8], gains[:8]) + (worlds > 8)
+    final, path = run(speeds, gains)
+    assert path.shape == (worlds, 3)
+    for i in (0, worlds - 1):
+        one, angles = jax.jit(swung)(speeds[i], gains[i])
+        np.testing.assert_allclose(final.q[i], one.q, IDENTITY, IDENTITY)
+        np.testing.assert_allclose(path[i], angles, IDENTITY, IDENTITY)
+
+
+def test_a_gradient_by_what_worlds_share_is_the_sum_of_their_gradients(few):
+    speeds = jnp.linspace(-2.0, 2.0, 19)
+
+    def angle(gain, speed):
+        return swung(speed, gain)[1][-1] ** 2
+
+    slopes = jax.jit(jax.vmap(jax.grad(angle), (None, 0)))(1.1, speeds)
+    whole = jax.jit(jax.grad(lambda g: jnp.sum(jax.vmap(angle, (None, 0))(g, speeds))))(1.1)
+    np.testing.assert_allclose(whole, jnp.sum(slopes), 1e2 * IDENTITY)
+    step = 1e-5
+    ends = [jnp.sum(jax.vmap(angle, (None, 0))(g, speeds)) for g in (1.1 - step, 1.1 + step)]
+    np.testing.assert_allclose(whole, (ends[1] - ends[0]) / (2 * step), DIFFERENCE)
+
+
+@pytest.mark.parametrize("worlds", [9, 26])
+def test_gradients_of_a_policy_and_of_each_world_do_not_depend_on_chunks(worlds, monkeypatch):
+    """The weights of the policy are shared; the start of each world is its own."""
+    speeds = jnp.linspace(-2.0, 2.0, worlds)
+
+    def end(weights, speed):
+        start = dataclasses.replace(CART[1], v=CART[1].v * 0 + speed * jnp.asarray([1.0, 0.0, 0.0]))
+
+        def policy(s):
+            return jnp.tanh(weights[0] * s.q[:1] + weights[1] * s.v[:1])
+
+        final, path = jc.rollout(
+            CART[0], jc.Method(), start, policy, 1e-2, 4, record=lambda s, _: s.q[0]
+        )
+        return final.q[0] ** 2 + jnp.sum(path * weights[0])
+
+    def loss(weights, speeds):
+        return jnp.sum(jax.vmap(end, (None, 0))(weights, speeds))
+
+    found = []
+    for most in (8, 1000):
+        monkeypatch.setattr(rollout, "chunk_size", lambda velocities, most=most: most)
+        found.append(jax.jit(jax.value_and_grad(loss, (0, 1)))(SHARED, speeds))
+        found[-1] += (jax.jit(jax.hessian(loss))(SHARED, speeds),)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, 1e2 * IDENTITY), *found)
+
+
+def test_functions_with_collectives_or_without_forward_mode_run_as_they_are():
+    def averaged(x):
+        def run():
+            return jax.lax.scan(lambda x, _: (jnp.sin(x - jax.lax.pmean(x, "all")), x), x, length=3)
+
+        return chunks.by_world(run, 4, x)
+
+    @jax.custom_vjp
+    def own(x):
+        return x**2
+
+    own.defvjp(lambda x: (x**2, x), lambda x, slope: (7.0 * x * slope,))
+
+    def squared(x):
+        return chunks.by_world(lambda: own(x), 4, x)
+
+    x = jnp.linspace(0.0, 1.0, 10)
+    expected = x
+    for _ in range(3):
+        expected = jnp.sin(expected - jnp.mean(expected))
+    found, _ = jax.jit(jax.vmap(averaged, axis_name="all"))(x)
+    np.testing.assert_allclose(found, expected, IDENTITY, IDENTITY)
+    np.testing.assert_allclose(jax.vmap(jax.grad(squared))(x), 7 * x, IDENTITY)
+
+
+def test_a_symbolic_batch_is_not_cut(few):
+    (size,) = jax.export.symbolic_shape("n")
+    shapes = [jax.ShapeDtypeStruct((size,), jnp.float64)] * 2
+    exported = jax.export.export(jax.jit(jax.vmap(swung)))(*shapes)
+    speeds, gains = jnp.linspace(-2.0, 2.0, 11), jnp.ones(11)
+    found, expected = exported.call(speeds, gains)[1], jax.vmap(swung)(speeds, gains)[1]
+    np.testing.assert_allclose(found, expected, IDENTITY, IDENTITY)

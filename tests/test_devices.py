@@ -133,6 +133,21 @@ for name in ("chain-5", "four-bar"):
     assert met(compiled) == {}
     same(compiled(jc.shard(turning)), go(turning))
 
+# chunks of worlds: a chunk has worlds of each device
+from jaxcon.execution import rollout
+run, state = devices.world("four-bar", 3, jnp.float64)
+batch = worlds(state, 40)
+expected = jax.jit(jax.vmap(run, in_axes=(None, 0)))(gain, batch)
+slope = jax.jit(devices.mean(run, one))(gain, batch)
+rollout.chunk_size = lambda velocities: 2
+for given, exchanged in ((jc.shard(batch), {}), (batch, {})):
+    compiled = jax.jit(jax.vmap(run, in_axes=(None, 0))).lower(gain, given).compile()
+    assert met(compiled) == exchanged
+    same(compiled(gain, given), expected)
+compiled = jax.jit(devices.mean(run)).lower(gain, jc.shard(batch)).compile()
+assert met(compiled) == {"all-reduce": 1}
+same(compiled(gain, jc.shard(batch)), slope)
+
 def refused(words, function, *args, **own):
     try:
         function(*args, **own)

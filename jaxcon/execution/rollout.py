@@ -119,7 +119,7 @@ def rollout(
         return stop_failed(final.status, final), stop_failed(final.status, trajectory)
 
     with batch_last.as_it_is_called():
-        return by_world(run, chunk_size(state.v.size))
+        return by_world(run, chunk_size(state.v.size), (system, state, inputs, dt))
 
 
 def chunk_size(velocities: int) -> int:

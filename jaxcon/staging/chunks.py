@@ -15,7 +15,9 @@ share are then sums over the worlds of a chunk, and over chunks.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -26,9 +28,9 @@ from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_
 from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core.jaxprs import without_unused
-from jaxcon.core.typing import Array, T
-from jaxcon.staging import batch_last
-from jaxcon.staging.operations import primitives
+from jaxcon.core.typing import Array, PyTree, T
+from jaxcon.staging import batch_last, meshes
+from jaxcon.staging.operations import inside
 from jaxcon.staging.program import is_known
 
 Flags = tuple[bool, ...]
@@ -209,22 +211,24 @@ def without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
     return ClosedJaxpr(jaxpr.replace(constvars=[], invars=arguments), ())
 
 
-def by_world(function: Callable[[], T], most: int) -> T:
+def by_world(function: Callable[[], T], most: int, near: PyTree) -> T:
     """Calls function(); if it is mapped over many worlds, a CPU evaluates them in chunks.
 
-    Functions with side effects or collectives are called as they are, as are functions on a mesh
-    with manual or explicit axes, and functions with a derivative rule that has no forward mode.
+    A function is called as it is if it is mapped over few worlds, has side effects or collectives,
+    has no forward mode (`jax.custom_vjp`), or if types tell where its arrays are placed.
 
     Args:
         function: a function of the arrays that it closes over.
         most: the number of worlds in a chunk.
+        near: arrays among those that it closes over.
     """
-    mesh = jax.sharding.get_abstract_mesh()
-    if mesh.manual_axes or mesh.explicit_axes or jax.config.values["jax_disable_jit"]:
+    apart = meshes.are_placed(near) or jax.config.values["jax_disable_jit"]
+    worlds = [1, *map(worlds_of, jax.tree.leaves(near))]
+    if apart or not is_known(worlds) or 1 < max(worlds) <= most:
         return function()
     closed, shapes = jax.make_jaxpr(function, return_shape=True)()
     traced = any(isinstance(x, Tracer) for x in closed.consts)
-    if traced and "custom_vjp_call" in primitives(closed.jaxpr):
+    if traced and (has_own_transpose(closed.jaxpr) or meshes.are_placed(closed.consts)):
         return function()
     if not traced or closed.effects:
         results = jaxpr_as_fun(closed)()
@@ -232,6 +236,44 @@ def by_world(function: Callable[[], T], most: int) -> T:
         fun = OneWorld(without_constants(closed), most)
         results = fun.bound(fun.over(None, (None,) * len(closed.consts)), *closed.consts)
     return jax.tree.unflatten(jax.tree.structure(shapes), results)
+
+
+def has_own_transpose(jaxpr: Any) -> bool:
+    """Returns True if a jaxpr calls a `jax.custom_vjp` outside of native functions."""
+    return any(
+        equation.primitive.name == "custom_vjp_call"
+        or any(map(has_own_transpose, inside(equation)))
+        for equation in jaxpr.eqns
+        if equation.primitive.name != "native"
+    )
+
+
+# Set by `worlds_of`, read by the batching rule of its primitive, which JAX calls with a fixed
+# signature
+_SIZES = ContextVar[list[int]]("sizes")
+
+
+def worlds_of(x: Any) -> int:
+    """Returns the number of worlds over which `vmap` maps an array at this place of the trace."""
+    if not isinstance(x, Tracer):
+        return 1
+    with batch_last.during(_SIZES, []):
+        same_p.bind(x)
+        return math.prod(_SIZES.get())
+
+
+def _same_batched(args: Sequence[Array], axes: Sequence[int]) -> tuple[Array, int]:
+    """The batching rule of `same_p`: notes the size of the batch."""
+    _SIZES.get().append(args[0].shape[axes[0]])
+    return same_p.bind(args[0]), axes[0]
+
+
+same_p = Primitive("same")
+same_p.def_impl(lambda x: x)
+same_p.def_abstract_eval(lambda x: x)
+batching.primitive_batchers[same_p] = _same_batched
+ad.deflinear2(same_p, lambda cotangent, _: [cotangent])
+mlir.register_lowering(same_p, lambda ctx, x: [x])
 
 
 class Pullback(NamedTuple):

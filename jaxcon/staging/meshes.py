@@ -16,7 +16,7 @@ import jax
 from jax.core import ShapedArray
 from jax.sharding import AxisType, PartitionSpec
 
-from jaxcon.core.typing import Array, T
+from jaxcon.core.typing import Array, PyTree, T
 
 
 def together(tree: T) -> T:
@@ -44,6 +44,16 @@ def together(tree: T) -> T:
 def _varies(aval: Any) -> frozenset[Any]:
     """Returns the mesh axes along which an array of this type varies, in any version of JAX."""
     return aval.manual_axis_type.varying if hasattr(aval, "manual_axis_type") else aval.vma
+
+
+def are_placed(tree: PyTree) -> bool:
+    """Returns True if types tell where arrays are: on an explicit mesh, or varying along an axis.
+
+    Within `jax.shard_map(…, check_vma=False)` types do not tell it.
+    """
+    if jax.sharding.get_abstract_mesh().explicit_axes:
+        return True
+    return any(_varies(jax.typeof(x)) for x in jax.tree.leaves(tree))
 
 
 @contextmanager
