@@ -10,6 +10,7 @@ import pytest
 from tolerances import DIFFERENCE, IDENTITY
 
 import jaxcon as jc
+from benchmarks import large_batches
 from jaxcon.execution import rollout
 from jaxcon.staging import chunks
 
@@ -240,3 +241,10 @@ def test_a_symbolic_batch_is_not_cut(few):
     speeds, gains = jnp.linspace(-2.0, 2.0, 11), jnp.ones(11)
     found, expected = exported.call(speeds, gains)[1], jax.vmap(swung)(speeds, gains)[1]
     np.testing.assert_allclose(found, expected, IDENTITY, IDENTITY)
+
+
+def test_the_study_of_large_batches_compares_with_chunks_by_hand():
+    found = large_batches.compare("pendulum", 32, sizes=(8, 16))
+    assert set(found.by_hand) == {8, 16}
+    assert found.ratio > 0
+    assert found.exchanges == {}

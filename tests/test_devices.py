@@ -147,6 +147,10 @@ for given, exchanged in ((jc.shard(batch), {}), (batch, {})):
 compiled = jax.jit(devices.mean(run)).lower(gain, jc.shard(batch)).compile()
 assert met(compiled) == {"all-reduce": 1}
 same(compiled(gain, jc.shard(batch)), slope)
+total = jax.jit(jax.grad(lambda g, s: jnp.mean(jax.vmap(run, in_axes=(None, 0))(g, s).q)))
+compiled = total.lower(gain, jc.shard(batch)).compile()
+assert met(compiled) == {"all-reduce": 1}
+same(compiled(gain, jc.shard(batch)), total(gain, batch))
 
 def refused(words, function, *args, **own):
     try:

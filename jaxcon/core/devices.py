@@ -46,7 +46,7 @@ def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Call
     Devices do not wait for each other, even in iterative solvers. The result can be jitted and
     differentiated. The gradient with respect to `shared` is summed on each device over the whole
     motion, and over devices once at the end. With `jit(grad(vmap(f)))` of a batch from `shard`,
-    devices would exchange the gradient in every step.
+    devices may exchange the gradient in every step.
 
         settled = jc.devices.over_devices(jax.vmap(settle, in_axes=(None, 0)))
         slope = jax.jit(jax.grad(lambda p, worlds: jnp.mean(settled(p, worlds))))

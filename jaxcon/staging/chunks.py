@@ -5,11 +5,11 @@ waits for memory. `by_world` wraps a function of one world, such as a rollout, i
 `vmap` maps it over many worlds, a CPU evaluates it for some of them at a time, from the first step
 to the last. Other devices evaluate all worlds at once.
 
-The primitive keeps the function of one world, and notes which arguments differ between worlds. Its
-derivatives are split into two functions of one world: one returns the results and the residuals,
-which are the values that the linear map needs, and the other is this linear map. Both are evaluated
-in chunks. So is the transpose of the linear map; gradients with respect to values that the worlds
-share are then sums over the worlds of a chunk, and over chunks.
+The primitive keeps the function of one world, and notes which arguments differ between worlds. In
+reverse mode, the derivative is split into two functions of one world: one returns the results and
+the residuals, which are the values that the linear map needs, and the other is this linear map.
+Both are evaluated in chunks. So is the transpose of the linear map; gradients with respect to
+values that the worlds share are then sums over the worlds of a chunk, and over chunks.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ class OneWorld:
         self.closed, self.most = closed, most
         self.results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.out_avals]
         self.arguments = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.in_avals]
+        self.tangent = functools.lru_cache(maxsize=16)(self._tangent)
         self.split = functools.lru_cache(maxsize=16)(self._split)
         self.transposed = functools.lru_cache(maxsize=16)(self._transposed)
         self.part = functools.lru_cache(maxsize=16)(self._part)
@@ -106,17 +107,38 @@ class OneWorld:
                 known.update(equation.outvars)
         return tuple(map(differs, jaxpr.outvars))
 
+    def _moving(self, moved: Flags, args: Sequence[Array]) -> Callable[..., Any]:
+        """Returns the function of the arguments whose flag in `moved` is True.
+
+        It returns the floating results, which have tangents, and all results.
+        """
+        fixed = chosen(args, moved, False)
+
+        def function(*moving: Array) -> tuple[list[Array], list[Array]]:
+            results = self(*merged(moved, moving, fixed))
+            return list(filter(batch_last.is_real, results)), results
+
+        return function
+
+    def _tangent(self, moved: Flags) -> OneWorld:
+        """Returns the tangent map: (arguments, tangents) → tangents of the floating results."""
+
+        def along(*args: Array) -> list[Array]:
+            primals, tangents = args[: len(moved)], args[len(moved) :]
+            function = self._moving(moved, primals)
+            return jax.jvp(function, chosen(primals, moved), tangents, has_aux=True)[1]
+
+        arguments = [*self.arguments, *chosen(self.arguments, moved)]
+        return OneWorld(jax.make_jaxpr(along)(*arguments), self.most)
+
     def _split(self, moved: Flags) -> Split:
         """Splits the derivative by the arguments whose flag in `moved` is True."""
         count = len(self.results)
         linear: list[ClosedJaxpr] = []
 
         def forward(*args: Array) -> list[Array]:
-            def along(*moving: Array) -> tuple[list[Array], list[Array]]:
-                results = self(*merged(moved, moving, chosen(args, moved, False)))
-                return list(filter(batch_last.is_real, results)), results
-
-            _, pushforward, results = jax.linearize(along, *chosen(args, moved), has_aux=True)
+            function = self._moving(moved, args)
+            _, pushforward, results = jax.linearize(function, *chosen(args, moved), has_aux=True)
             linear.append(jax.make_jaxpr(pushforward)(*chosen(self.arguments, moved)))
             return [*results, *linear[-1].consts]
 
@@ -385,38 +407,47 @@ def nested(fun: OneWorld, batch: Batch) -> OneWorld:
 
 def _jvp(
     primals: Sequence[Array],
-    tangents: Sequence[Array | ad.Zero],
+    tangents: Sequence[Any],
     *,
     fun: OneWorld,
     batch: Batch,
     jaxpr: ClosedJaxpr,
 ) -> tuple[list[Array], list[Array | ad.Zero]]:
-    """The JVP rule: evaluates the results and the residuals, and then the linear map."""
+    """The JVP rule: evaluates the results, and then the tangents.
+
+    In reverse mode, the first function also returns the residuals. In forward mode these would fill
+    the memory, so the tangent map evaluates the function once more, step by step.
+    """
     moved = tuple(type(x) is not ad.Zero for x in tangents)
-    split = fun.split(moved)
-    forward = split.forward.over(batch.size, batch.axes)
-    # as in the batch, where code that is not needed may be gone. Steps come before worlds in
-    # residuals, so that loops over steps store and read them as they are
-    extra = zip(split.forward.results, forward.out_axes, strict=True)
-    extra = [i if i is None else min(1, len(y.shape)) for y, i in extra][len(batch.out_axes) :]
-    forward = forward._replace(out_axes=(*batch.out_axes, *extra))
-    results = split.forward.bound(forward, *primals)
-    pool, axes = [*primals, *results], (*batch.axes, *forward.out_axes)
-    residuals = [pool[i] for i in split.places]
-    results = results[: len(fun.results)]
+    moving = chosen(tangents, moved)
+    if any(isinstance(x, partial_eval.JaxprTracer) for x in moving):
+        split = fun.split(moved)
+        forward = split.forward.over(batch.size, batch.axes)
+        # steps come before worlds in residuals, so that loops over steps store and read them as
+        # they are. Results are as in the batch, where code that is not needed may be gone
+        extra = zip(split.forward.results, forward.out_axes, strict=True)
+        extra = [i if i is None else min(1, len(y.shape)) for y, i in extra][len(fun.results) :]
+        forward = forward._replace(out_axes=(*batch.out_axes, *extra))
+        evaluated = split.forward.bound(forward, *primals)
+        pool, axes = [*primals, *evaluated], (*batch.axes, *forward.out_axes)
+        results, along = evaluated[: len(fun.results)], split.linear
+        inputs, places = [pool[i] for i in split.places], [axes[i] for i in split.places]
+    else:
+        results, along = fun.bound(batch, *primals), fun.tangent(moved)
+        inputs, places = primals, batch.axes
     real = tuple(map(batch_last.is_real, results))
-    inputs = (*(axes[i] for i in split.places), *chosen(batch.axes, moved))
-    along = Batch(batch.size, inputs, chosen(batch.out_axes, real))
-    moving = iter(split.linear.bound(along, *residuals, *chosen(tangents, moved)))
+    places = (*places, *chosen(batch.axes, moved))
+    linear = Batch(batch.size, places, chosen(batch.out_axes, real))
+    slopes = iter(along.bound(linear, *inputs, *moving))
     return results, [
-        next(moving) if flag else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
+        next(slopes) if flag else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
         for y, flag in zip(results, real, strict=True)
     ]
 
 
 def _transpose(
-    cotangents: Sequence[Array | ad.Zero],
-    *args: Array | ad.UndefinedPrimal,
+    cotangents: Sequence[Any],
+    *args: Any,
     fun: OneWorld,
     batch: Batch,
     jaxpr: ClosedJaxpr,
@@ -494,27 +525,58 @@ def _pulled_in_chunks(*args: Array, pull: Pullback, devices: int) -> list[Array]
     if lots is None:
         return pull.vmapped(pull.batch.size)(*args)
     count, summed = pull.linear.count(False), tuple(i is None for i in pull.out_axes)
-    part = pull.vmapped(lots.size)
     # copies of a world that fill the last chunk must not count: their cotangents are zero
     fixed, others = lots.split_all(args[:count], pull.axes[:count])
     given, once = lots.split_all(args[count:], pull.axes[count:], copies=False)
+    by_device = lots.devices > 1 and any(summed)
+    part = _on_each_device(pull, lots) if by_device else pull.vmapped(lots.size)
+    flags = mapped(pull.axes)
 
     def one(sums: list[Array], xs: tuple[Array, list[Array], list[Array]]) -> Any:
         i, fixed, given = xs
         # a result that worlds share has one cotangent, which counts in the first chunk only
         first = [jnp.where(i == 0, x, 0) for x in once]
-        inputs = (
-            *merged(mapped(pull.axes[:count]), fixed, others),
-            *merged(mapped(pull.axes[count:]), given, first),
-        )
-        results = part(*inputs)
+        results = part(*merged(flags, [*fixed, *given], [*others, *first]))
         sums = [x + y for x, y in zip(sums, chosen(results, summed), strict=True)]
         return sums, list(chosen(results, summed, False))
 
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in chosen(pull.results(), summed)]
-    sums, results = jax.lax.scan(one, zeros, (jnp.arange(lots.count), fixed, given))
-    axes = zip(results, chosen(pull.out_axes, summed, False), strict=True)
-    return list(merged(summed, sums, [lots.join(y, axis) for y, axis in axes]))
+    extra = (lots.devices,) if by_device else ()
+    zeros = [jnp.zeros(extra + x.shape, x.dtype) for x in chosen(pull.results(), summed)]
+    sums, results = jax.lax.scan(one, zeros, (jnp.arange(lots.parts), fixed, given))
+    if by_device:
+        sums = [jnp.sum(x, axis=0) for x in sums]
+    axes = [axis for axis in pull.out_axes if axis is not None]
+    return list(merged(summed, sums, list(map(lots.join, results, axes))))
+
+
+def _on_each_device(pull: Pullback, lots: Chunks) -> Callable[..., list[Array]]:
+    """Returns a pullback that adds up, on each device, what the worlds of this device share.
+
+    Its sums have a first axis of devices. Devices thus need not meet before the last chunk.
+    """
+    count = pull.linear.count(False)
+    axes = (*pull.axes[:count], *(0 if i is None else i for i in pull.axes[count:]))
+    out_axes = [0 if i is None else i for i in pull.out_axes]
+    every = jax.vmap(pull.vmapped(lots.share), in_axes=axes, out_axes=out_axes)
+    first = jnp.arange(lots.devices) == 0
+
+    def part(*args: Array) -> list[Array]:
+        inputs = [
+            x
+            if axis is None and i < count
+            # the cotangent of a result that worlds share counts on the first device only
+            else jnp.where(first.reshape(-1, *(1,) * x.ndim), x, 0)
+            if axis is None
+            else x.reshape(*x.shape[:axis], lots.devices, lots.share, *x.shape[axis + 1 :])
+            for i, (x, axis) in enumerate(zip(args, pull.axes, strict=True))
+        ]
+        pairs = zip(every(*inputs), pull.out_axes, strict=True)
+        return [
+            y if axis is None else y.reshape(*y.shape[:axis], lots.size, *y.shape[axis + 2 :])
+            for y, axis in pairs
+        ]
+
+    return part
 
 
 def mapped(axes: Axes) -> Flags:
@@ -527,13 +589,13 @@ class Chunks(NamedTuple):
 
     Attributes:
         worlds: the number of worlds of the batch.
-        count: the number of chunks.
+        parts: the number of chunks.
         share: the number of worlds of a device in a chunk.
         devices: the number of devices.
     """
 
     worlds: int
-    count: int
+    parts: int
     share: int
     devices: int
 
@@ -555,18 +617,18 @@ class Chunks(NamedTuple):
 
         The last chunk is filled with copies of the last world; with zeros if `copies` is False.
         """
-        if extra := self.count * self.size - self.worlds:
+        if extra := self.parts * self.size - self.worlds:
             widths = [(0, extra if i == axis else 0) for i in range(x.ndim)]
             x = jnp.pad(x, widths, mode="edge" if copies else "constant")
         before, after = x.shape[:axis], x.shape[axis + 1 :]
-        x = x.reshape(*before, self.devices, self.count, self.share, *after)
-        return jnp.moveaxis(x, axis + 1, 0).reshape(self.count, *before, self.size, *after)
+        x = x.reshape(*before, self.devices, self.parts, self.share, *after)
+        return jnp.moveaxis(x, axis + 1, 0).reshape(self.parts, *before, self.size, *after)
 
     def join(self, y: Array, axis: int) -> Array:
         """Joins the results of chunks, (chunk, …), along their axis of worlds."""
         before, after = y.shape[1 : axis + 1], y.shape[axis + 2 :]
-        y = y.reshape(self.count, *before, self.devices, self.share, *after)
-        y = jnp.moveaxis(y, 0, axis + 1).reshape(*before, self.count * self.size, *after)
+        y = y.reshape(self.parts, *before, self.devices, self.share, *after)
+        y = jnp.moveaxis(y, 0, axis + 1).reshape(*before, self.parts * self.size, *after)
         return jax.lax.slice_in_dim(y, 0, self.worlds, axis=axis)
 
 
