@@ -94,6 +94,9 @@ TRANSFORMED = {
             )[0]
         )
     )(a),
+    "scan, mapped": lambda x, a, most: jax.vmap(
+        lambda a: jax.lax.scan(lambda s, _: (loss(s, a, most), s), x[0], length=3)
+    )(jnp.outer(x, a)),
     "cond": lambda x, a, most: jax.grad(
         lambda a: jax.lax.cond(x[0] < 2, partial(total, most=most), lambda x, a: a[0], x, a)
     )(a),

@@ -272,21 +272,24 @@ def has_own_transpose(jaxpr: Any) -> bool:
 
 # Set by `worlds_of`, read by the batching rule of its primitive, which JAX calls with a fixed
 # signature
-_SIZES = ContextVar[list[int]]("sizes")
+_SIZES = ContextVar[list[int] | None]("sizes", default=None)
 
 
 def worlds_of(x: Any) -> int:
     """Returns the number of worlds over which `vmap` maps an array at this place of the trace."""
     if not isinstance(x, Tracer):
         return 1
-    with batch_last.during(_SIZES, []):
+    sizes: list[int] = []
+    with batch_last.during(_SIZES, sizes):
         same_p.bind(x)
-        return math.prod(_SIZES.get())
+    return math.prod(sizes)
 
 
 def _same_batched(args: Sequence[Array], axes: Sequence[int]) -> tuple[Array, int]:
-    """The batching rule of `same_p`: notes the size of the batch."""
-    _SIZES.get().append(args[0].shape[axes[0]])
+    """The batching rule of `same_p`: notes the size of the batch for `worlds_of`."""
+    sizes = _SIZES.get()
+    if sizes is not None:  # a program traced earlier may be mapped later
+        sizes.append(args[0].shape[axes[0]])
     return same_p.bind(args[0]), axes[0]
 
 
@@ -618,8 +621,10 @@ class Chunks(NamedTuple):
         The last chunk is filled with copies of the last world; with zeros if `copies` is False.
         """
         if extra := self.parts * self.size - self.worlds:
-            widths = [(0, extra if i == axis else 0) for i in range(x.ndim)]
-            x = jnp.pad(x, widths, mode="edge" if copies else "constant")
+            last = jax.lax.slice_in_dim(x, self.worlds - 1, self.worlds, axis=axis)
+            last = last if copies else jnp.zeros_like(last)
+            shape = (*x.shape[:axis], extra, *x.shape[axis + 1 :])
+            x = jnp.concatenate([x, jnp.broadcast_to(last, shape)], axis)
         before, after = x.shape[:axis], x.shape[axis + 1 :]
         x = x.reshape(*before, self.devices, self.parts, self.share, *after)
         return jnp.moveaxis(x, axis + 1, 0).reshape(self.parts, *before, self.size, *after)
