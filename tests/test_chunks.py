@@ -41,6 +41,21 @@ def total(x, shared, most=MOST):
     return jnp.sum(jax.vmap(partial(loss, most=most), (0, None))(x, shared))
 
 
+def worlds(x, shared, most):
+    return jax.vmap(lambda x: motion(x, shared, most)[0])(x)
+
+
+def stopped(x, shared, most):
+    """Loops on a result that has no tangent; this has a derivative in reverse mode."""
+
+    def run():
+        end, _ = motion(x, shared, 0)
+        return end, jax.lax.stop_gradient(end)
+
+    end, still = chunks.by_world(run, most, (x, shared)) if most else run()
+    return end * jax.lax.while_loop(lambda y: y < 1.0, lambda y: y + 0.3, still)
+
+
 def several(x, shared, most):
     """A batch of batches: the first has its own shared values, the second its own worlds."""
     return jax.vmap(lambda a: jax.vmap(lambda b: motion(b, a, most))(x))(
@@ -81,6 +96,18 @@ TRANSFORMED = {
     ),
     "grad(jvp)": lambda x, a, most: jax.grad(
         lambda a: jax.jvp(partial(total, most=most), (x, a), (x + 1, a - 1))[1]
+    )(a),
+    "jvp(grad)": lambda x, a, most: jax.jvp(
+        jax.grad(partial(total, most=most), (0, 1)), (x, a), (x + 1, a - 1)
+    ),
+    "grad by a cotangent": lambda x, a, most: jax.grad(
+        lambda c: jnp.sum(jax.vjp(partial(worlds, most=most), x, a)[1](c)[1] ** 2)
+    )(x**2),
+    "transpose of a vjp": lambda x, a, most: jax.linear_transpose(
+        lambda c: jax.vjp(partial(worlds, most=most), x, a)[1](c)[1], x
+    )(a),
+    "no tangent": lambda x, a, most: jax.grad(
+        lambda a: jnp.sum(jax.vmap(lambda x: stopped(x, a, most))(x))
     )(a),
     "checkpoint": lambda x, a, most: jax.grad(jax.checkpoint(partial(total, most=most)), (0, 1))(
         x, a
@@ -251,3 +278,17 @@ def test_the_study_of_large_batches_compares_with_chunks_by_hand():
     assert set(found.by_hand) == {8, 16}
     assert found.ratio > 0
     assert found.exchanges == {}
+
+
+def test_reverse_mode_keeps_residuals_and_forward_mode_does_not():
+    """Residuals are results of the first function, which JAX must ask for in reverse mode."""
+    x = jnp.linspace(-1.0, 1.0, 9)
+    programs = [
+        jax.make_jaxpr(jax.grad(total))(x, SHARED),
+        jax.make_jaxpr(lambda x: jax.jvp(total, (x, SHARED), (x, SHARED)))(x),
+    ]
+    results = [
+        [len(e.outvars) for e in p.jaxpr.eqns if e.primitive is chunks.worlds_p] for p in programs
+    ]
+    assert results[0][0] > 2
+    assert results[1] == [2, 2]  # values, and tangents

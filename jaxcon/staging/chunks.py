@@ -58,11 +58,11 @@ class OneWorld:
 
     Attributes:
         closed: the jaxpr of the function, without constants.
-        most: the number of worlds in a chunk.
+        chunk_size: the number of worlds in a chunk.
     """
 
-    def __init__(self, closed: ClosedJaxpr, most: int) -> None:
-        self.closed, self.most = closed, most
+    def __init__(self, closed: ClosedJaxpr, chunk_size: int) -> None:
+        self.closed, self.chunk_size = closed, chunk_size
         self.results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.out_avals]
         self.arguments = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.in_avals]
         self.tangent = functools.lru_cache(maxsize=16)(self._tangent)
@@ -70,6 +70,14 @@ class OneWorld:
         self.transposed = functools.lru_cache(maxsize=16)(self._transposed)
         self.part = functools.lru_cache(maxsize=16)(self._part)
         self.differ = functools.lru_cache(maxsize=16)(self._differ)
+        self.nested = functools.lru_cache(maxsize=16)(self._nested)
+        # for calls outside of `jit`; programs live as long as the function
+        self.compiled = jax.jit(
+            lambda *args, batch: self.bound(batch, *args), static_argnames="batch"
+        )
+        self.pullback = jax.jit(
+            lambda *args, masks: Pullback(self, *masks).bound(*args), static_argnames="masks"
+        )
 
     def __call__(self, *args: Array) -> list[Array]:
         """Evaluates the function in one world."""
@@ -110,7 +118,7 @@ class OneWorld:
     def _moving(self, moved: Flags, args: Sequence[Array]) -> Callable[..., Any]:
         """Returns the function of the arguments whose flag in `moved` is True.
 
-        It returns the floating results, which have tangents, and all results.
+        It returns the floating results, which may have tangents, and all results.
         """
         fixed = chosen(args, moved, False)
 
@@ -129,7 +137,7 @@ class OneWorld:
             return jax.jvp(function, chosen(primals, moved), tangents, has_aux=True)[1]
 
         arguments = [*self.arguments, *chosen(self.arguments, moved)]
-        return OneWorld(jax.make_jaxpr(along)(*arguments), self.most)
+        return OneWorld(jax.make_jaxpr(along)(*arguments), self.chunk_size)
 
     def _split(self, moved: Flags) -> Split:
         """Splits the derivative by the arguments whose flag in `moved` is True."""
@@ -153,9 +161,9 @@ class OneWorld:
         outvars = pool[len(self.arguments) :]
         open_jaxpr = jaxpr.jaxpr.replace(outvars=outvars)
         return Split(
-            OneWorld(ClosedJaxpr(open_jaxpr, jaxpr.consts), self.most),
+            OneWorld(ClosedJaxpr(open_jaxpr, jaxpr.consts), self.chunk_size),
             places,
-            OneWorld(without_constants(linear[-1]), self.most),
+            OneWorld(without_constants(linear[-1]), self.chunk_size),
         )
 
     def _transposed(self, linear: Flags, given: Flags) -> OneWorld:
@@ -166,13 +174,19 @@ class OneWorld:
             given: for each result, True if its cotangent is given; the others are zero.
         """
         structs = [*chosen(self.arguments, linear, False), *chosen(self.results, given)]
-        back = functools.partial(pulled_back, self, self.arguments, linear, given)
-        return OneWorld(jax.make_jaxpr(back)(*structs), self.most)
+        back = functools.partial(apply_pullback, self, self.arguments, linear, given)
+        return OneWorld(jax.make_jaxpr(back)(*structs), self.chunk_size)
+
+    def _nested(self, batch: Batch) -> OneWorld:
+        """Returns the function of a batch as a function of one world."""
+        types = batched_types(self.arguments, batch.size, batch.axes)
+        chunk_size = max(1, self.chunk_size // (batch.size or 1))
+        return OneWorld(jax.make_jaxpr(self.vmapped(batch))(*types), chunk_size)
 
     def _part(self, wanted: Flags) -> OneWorld:
         """Returns the function with the wanted results only."""
         jaxpr = without_unused(self.closed.jaxpr, wanted)
-        return OneWorld(ClosedJaxpr(jaxpr, self.closed.consts), self.most)
+        return OneWorld(ClosedJaxpr(jaxpr, self.closed.consts), self.chunk_size)
 
 
 @dataclass(frozen=True)
@@ -190,7 +204,7 @@ class Split:
     linear: OneWorld
 
 
-def pulled_back(
+def apply_pullback(
     function: Callable[..., Sequence[Array]],
     arguments: Sequence[Any],
     linear: Flags,
@@ -233,20 +247,22 @@ def without_constants(closed: ClosedJaxpr) -> ClosedJaxpr:
     return ClosedJaxpr(jaxpr.replace(constvars=[], invars=arguments), ())
 
 
-def by_world(function: Callable[[], T], most: int, near: PyTree) -> T:
+def by_world(function: Callable[[], T], chunk_size: int, probed: PyTree) -> T:
     """Calls function(); if it is mapped over many worlds, a CPU evaluates them in chunks.
 
-    A function is called as it is if it is mapped over few worlds, has side effects or collectives,
-    has no forward mode (`jax.custom_vjp`), or if types tell where its arrays are placed.
+    A function is called without chunks if it has side effects or collectives, if it contains a
+    `jax.custom_vjp`, which has no forward mode, or if types tell where its arrays are placed. It
+    may then be traced twice.
 
     Args:
         function: a function of the arrays that it closes over.
-        most: the number of worlds in a chunk.
-        near: arrays among those that it closes over.
+        chunk_size: the largest number of worlds in a chunk.
+        probed: arrays among those that it closes over. If `vmap` maps these over at most
+            `chunk_size` worlds, the function is called directly.
     """
-    apart = meshes.are_placed(near) or jax.config.values["jax_disable_jit"]
-    worlds = [1, *map(worlds_of, jax.tree.leaves(near))]
-    if apart or not is_known(worlds) or 1 < max(worlds) <= most:
+    apart = meshes.are_placed(probed) or jax.config.values["jax_disable_jit"]
+    worlds = worlds_of(probed)
+    if apart or not is_known([worlds]) or 1 < worlds <= chunk_size:
         return function()
     closed, shapes = jax.make_jaxpr(function, return_shape=True)()
     traced = any(isinstance(x, Tracer) for x in closed.consts)
@@ -255,7 +271,7 @@ def by_world(function: Callable[[], T], most: int, near: PyTree) -> T:
     if not traced or closed.effects:
         results = jaxpr_as_fun(closed)()
     else:
-        fun = OneWorld(without_constants(closed), most)
+        fun = OneWorld(without_constants(closed), chunk_size)
         results = fun.bound(fun.over(None, (None,) * len(closed.consts)), *closed.consts)
     return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
@@ -275,30 +291,42 @@ def has_own_transpose(jaxpr: Any) -> bool:
 _SIZES = ContextVar[list[int] | None]("sizes", default=None)
 
 
-def worlds_of(x: Any) -> int:
-    """Returns the number of worlds over which `vmap` maps an array at this place of the trace."""
-    if not isinstance(x, Tracer):
-        return 1
+def worlds_of(tree: PyTree) -> int:
+    """Returns the number of worlds over which `vmap` maps arrays at this place of the trace.
+
+    Nested calls of `vmap` count with the product of their sizes.
+    """
+    traced = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer)]
     sizes: list[int] = []
     with batch_last.during(_SIZES, sizes):
-        same_p.bind(x)
+        probe_p.bind(*traced)
     return math.prod(sizes)
 
 
-def _same_batched(args: Sequence[Array], axes: Sequence[int]) -> tuple[Array, int]:
-    """The batching rule of `same_p`: notes the size of the batch for `worlds_of`."""
+def _probe_batched(
+    args: Sequence[Array], axes: Sequence[int | None]
+) -> tuple[list[Array], Sequence[int | None]]:
+    """The batching rule of `probe_p`: notes the size of the batch for `worlds_of`."""
     sizes = _SIZES.get()
     if sizes is not None:  # a program traced earlier may be mapped later
-        sizes.append(args[0].shape[axes[0]])
-    return same_p.bind(args[0]), axes[0]
+        pairs = zip(args, axes, strict=True)
+        sizes.append(next(x.shape[i] for x, i in pairs if i is not None))
+    return probe_p.bind(*args), axes
 
 
-same_p = Primitive("same")
-same_p.def_impl(lambda x: x)
-same_p.def_abstract_eval(lambda x: x)
-batching.primitive_batchers[same_p] = _same_batched
-ad.deflinear2(same_p, lambda cotangent, _: [cotangent])
-mlir.register_lowering(same_p, lambda ctx, x: [x])
+def _probe_jvp(
+    primals: Sequence[Array], tangents: Sequence[Any]
+) -> tuple[list[Array], Sequence[Any]]:
+    return probe_p.bind(*primals), tangents
+
+
+probe_p = Primitive("probe")
+probe_p.multiple_results = True
+probe_p.def_impl(lambda *args: list(args))
+probe_p.def_abstract_eval(lambda *args: list(args))
+batching.primitive_batchers[probe_p] = _probe_batched
+ad.primitive_jvps[probe_p] = _probe_jvp
+mlir.register_lowering(probe_p, lambda ctx, *args: list(args))
 
 
 class Pullback(NamedTuple):
@@ -321,8 +349,8 @@ class Pullback(NamedTuple):
     @property
     def axes(self) -> Axes:
         """The axis of worlds of each input."""
-        others = chosen(self.batch.axes, self.linear, False)
-        return others + chosen(self.batch.out_axes, self.given)
+        fixed = chosen(self.batch.axes, self.linear, False)
+        return fixed + chosen(self.batch.out_axes, self.given)
 
     @property
     def out_axes(self) -> Axes:
@@ -330,8 +358,8 @@ class Pullback(NamedTuple):
         return chosen(self.batch.axes, self.linear)
 
     def bound(self, *args: Array) -> list[Array]:
-        """Evaluates the transpose through the primitive `pulled_p`."""
-        return pulled_p.bind(*args, pull=self, jaxpr=self.function.closed)
+        """Evaluates the transpose through the primitive `pullback_p`."""
+        return pullback_p.bind(*args, pull=self, jaxpr=self.function.closed)
 
     def results(self) -> list[Any]:
         """Returns the shapes and dtypes of the outputs."""
@@ -343,24 +371,7 @@ class Pullback(NamedTuple):
         batch = self.batch._replace(size=size)
         function = self.function.vmapped(batch)
         arguments = batched_types(self.function.arguments, size, batch.axes)
-        return functools.partial(pulled_back, function, arguments, self.linear, self.given)
-
-    def world_by_world(self, *args: Array) -> list[Array]:
-        """Evaluates the transpose in each world by itself, then sums; this has derivatives."""
-        # a result that worlds share has one cotangent, which must not count in each world
-        count, size = self.linear.count(False), self.batch.size or 1
-        args = tuple(
-            x / size if i >= count and axis is None else x
-            for i, (x, axis) in enumerate(zip(args, self.axes, strict=True))
-        )
-        back = self.function.transposed(self.linear, self.given)
-        batch = back.over(size, self.axes)
-        results = zip(back.bound(batch, *args), batch.out_axes, strict=True)
-        each = [jnp.broadcast_to(y, (size, *y.shape)) if i is None else y for y, i in results]
-        return [
-            jnp.sum(y, axis=0) if axis is None else jnp.moveaxis(y, 0, axis)
-            for y, axis in zip(each, self.out_axes, strict=True)
-        ]
+        return functools.partial(apply_pullback, function, arguments, self.linear, self.given)
 
 
 def batched_types(types: Sequence[Any], size: int | None, axes: Axes) -> list[Any]:
@@ -373,15 +384,16 @@ def batched_types(types: Sequence[Any], size: int | None, axes: Axes) -> list[An
     ]
 
 
-worlds_p, pulled_p = Primitive("worlds"), Primitive("pulled")
-worlds_p.multiple_results = pulled_p.multiple_results = True
+worlds_p, pullback_p = Primitive("worlds"), Primitive("pulled")
+worlds_p.multiple_results = pullback_p.multiple_results = True
 
 
 def _abstract(
     *_: ShapedArray, fun: OneWorld, batch: Batch, jaxpr: ClosedJaxpr
 ) -> list[ShapedArray]:
     types = batched_types(fun.results, batch.size, batch.out_axes)
-    return [ShapedArray(x.shape, x.dtype) for x in types]
+    weak = (x.weak_type for x in fun.closed.out_avals)
+    return [ShapedArray(x.shape, x.dtype, weak_type=y) for x, y in zip(types, weak, strict=True)]
 
 
 def _batched(
@@ -394,18 +406,10 @@ def _batched(
 ) -> tuple[list[Array], list[int | None]]:
     """The batching rule: notes the axes of worlds. A second batch is mapped within the first."""
     if batch.size is not None:
-        fun = nested(fun, batch)
+        fun = fun.nested(batch)
     size = next(x.shape[i] for x, i in zip(args, axes, strict=True) if i is not None)
     several = fun.over(size, tuple(axes))
     return fun.bound(several, *args), list(several.out_axes)
-
-
-@functools.lru_cache(maxsize=64)
-def nested(fun: OneWorld, batch: Batch) -> OneWorld:
-    """Returns the function of a batch as a function of one world."""
-    types = batched_types(fun.arguments, batch.size, batch.axes)
-    most = max(1, fun.most // (batch.size or 1))
-    return OneWorld(jax.make_jaxpr(fun.vmapped(batch))(*types), most)
 
 
 def _jvp(
@@ -438,14 +442,21 @@ def _jvp(
     else:
         results, along = fun.bound(batch, *primals), fun.tangent(moved)
         inputs, places = primals, batch.axes
+    # a result that depends on no tangent has none: JAX then accepts loops of unknown length on it
     real = tuple(map(batch_last.is_real, results))
+    depend = along.differ((False,) * len(inputs) + (True,) * len(moving))
+    sloped = tuple(merged(real, depend, [False] * len(real)))
+    along = along.part(depend)
     places = (*places, *chosen(batch.axes, moved))
-    linear = Batch(batch.size, places, chosen(batch.out_axes, real))
+    linear = Batch(batch.size, places, chosen(batch.out_axes, sloped))
     slopes = iter(along.bound(linear, *inputs, *moving))
-    return results, [
-        next(slopes) if flag else ad.Zero(ShapedArray(y.shape, jax.dtypes.float0))
-        for y, flag in zip(results, real, strict=True)
-    ]
+    pairs = zip(results, sloped, strict=True)
+    return results, [next(slopes) if flag else _no_tangent(y) for y, flag in pairs]
+
+
+def _no_tangent(x: Array) -> ad.Zero:
+    """Returns a symbolic zero for the tangent of an array."""
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
 
 
 def _transpose(
@@ -487,72 +498,92 @@ def _without_unused(
     return [True] * len(equation.invars), equation.replace(outvars=outvars, params=params)
 
 
-def _pulled_jvp(
-    primals: Sequence[Array],
-    tangents: Sequence[Array | ad.Zero],
-    *,
-    pull: Pullback,
-    jaxpr: ClosedJaxpr,
+def _pullback_jvp(
+    primals: Sequence[Array], tangents: Sequence[Any], *, pull: Pullback, jaxpr: ClosedJaxpr
 ) -> tuple[list[Array], list[Array]]:
-    """The JVP rule of a pullback: that of the transpose in each world."""
-    return jax.jvp(pull.world_by_world, primals, [ad.instantiate_zeros(x) for x in tangents])
+    """The JVP rule of a pullback, which evaluates all worlds at once.
+
+    Sums over worlds are contractions, which the derivative of one world after another would store
+    for each world.
+    """
+    given = tuple(map(ad.instantiate_zeros, tangents))
+    return jax.jvp(pull.vmapped(pull.batch.size), tuple(primals), given)
 
 
-def _pulled_batched(
+def _pullback_batched(
     args: Sequence[Array], axes: Sequence[int | None], *, pull: Pullback, jaxpr: ClosedJaxpr
 ) -> tuple[list[Array], list[int]]:
-    """The batching rule of a pullback: that of the transpose in each world."""
-    results = jax.vmap(pull.world_by_world, in_axes=tuple(axes))(*args)
+    """The batching rule of a pullback, which evaluates all worlds at once."""
+    results = jax.vmap(pull.vmapped(pull.batch.size), in_axes=tuple(axes))(*args)
     return results, [0] * len(results)
+
+
+def _pullback_transpose(
+    cotangents: Sequence[Any], *args: Any, pull: Pullback, jaxpr: ClosedJaxpr
+) -> list[Array | None]:
+    """The transpose rule of a pullback, whose transpose is the function itself."""
+    fixed = args[: pull.linear.count(False)]
+    tangents = list(map(ad.instantiate_zeros, cotangents))
+    results = pull.function.bound(pull.batch, *merged(pull.linear, tangents, fixed))
+    slopes = zip(args[len(fixed) :], chosen(results, pull.given), strict=True)
+    unknown = (y if ad.is_undefined_primal(x) else None for x, y in slopes)
+    return [*(None for _ in fixed), *unknown]
 
 
 def _in_chunks(*args: Array, fun: OneWorld, batch: Batch, devices: int) -> list[Array]:
     """Evaluates a function in chunks of worlds."""
-    lots = chunks(batch.size, fun.most, devices)
-    if lots is None:
+    plan = plan_chunks(batch.size, fun.chunk_size, devices)
+    if plan is None:
         return fun.vmapped(batch)(*args)
-    part = fun.vmapped(batch._replace(size=lots.size))
-    inputs, shared = lots.split_all(args, batch.axes)
+    differ = mapped(batch.out_axes)
+    axes = [axis for axis in batch.out_axes if axis is not None]
+    part = fun.part(differ).vmapped(Batch(plan.size, batch.axes, tuple(axes)))
+    inputs, shared = plan.split_all(args, batch.axes)
 
     def one(_: None, xs: list[Array]) -> tuple[None, list[Array]]:
         return None, part(*merged(mapped(batch.axes), xs, shared))
 
     _, results = jax.lax.scan(one, None, inputs)
-    axes = zip(results, batch.out_axes, strict=True)
-    return [y[0] if axis is None else lots.join(y, axis) for y, axis in axes]
+    unbatched: list[Array] = []
+    if not all(differ):  # results that depend on no world, from the values of the first one
+        pairs = zip(args, batch.axes, strict=True)
+        world = [x if i is None else jax.lax.index_in_dim(x, 0, i, False) for x, i in pairs]
+        unbatched = fun.part(tuple(not flag for flag in differ))(*world)
+    return list(merged(differ, list(map(plan.join, results, axes)), unbatched))
 
 
-def _pulled_in_chunks(*args: Array, pull: Pullback, devices: int) -> list[Array]:
+def _pullback_in_chunks(*args: Array, pull: Pullback, devices: int) -> list[Array]:
     """Evaluates a pullback in chunks of worlds, and adds up what worlds share."""
-    lots = chunks(pull.batch.size, pull.function.most, devices)
-    if lots is None:
+    plan = plan_chunks(pull.batch.size, pull.function.chunk_size, devices)
+    if plan is None:
         return pull.vmapped(pull.batch.size)(*args)
     count, summed = pull.linear.count(False), tuple(i is None for i in pull.out_axes)
-    # copies of a world that fill the last chunk must not count: their cotangents are zero
-    fixed, others = lots.split_all(args[:count], pull.axes[:count])
-    given, once = lots.split_all(args[count:], pull.axes[count:], copies=False)
-    by_device = lots.devices > 1 and any(summed)
-    part = _on_each_device(pull, lots) if by_device else pull.vmapped(lots.size)
+    # copies of a world that fill the last chunk must not count: their cotangents are zero, and so
+    # are their gradients, unless a derivative of the last world is infinite
+    fixed, shared = plan.split_all(args[:count], pull.axes[:count])
+    given, unbatched = plan.split_all(args[count:], pull.axes[count:], copies=False)
+    by_device = plan.devices > 1 and any(summed)
+    part = _on_each_device(pull, plan) if by_device else pull.vmapped(plan.size)
     flags = mapped(pull.axes)
 
     def one(sums: list[Array], xs: tuple[Array, list[Array], list[Array]]) -> Any:
         i, fixed, given = xs
         # a result that worlds share has one cotangent, which counts in the first chunk only
-        first = [jnp.where(i == 0, x, 0) for x in once]
-        results = part(*merged(flags, [*fixed, *given], [*others, *first]))
+        first = [jnp.where(i == 0, x, 0) for x in unbatched]
+        results = part(*merged(flags, [*fixed, *given], [*shared, *first]))
         sums = [x + y for x, y in zip(sums, chosen(results, summed), strict=True)]
         return sums, list(chosen(results, summed, False))
 
-    extra = (lots.devices,) if by_device else ()
+    extra = (plan.devices,) if by_device else ()
     zeros = [jnp.zeros(extra + x.shape, x.dtype) for x in chosen(pull.results(), summed)]
-    sums, results = jax.lax.scan(one, zeros, (jnp.arange(lots.parts), fixed, given))
+    sums, results = jax.lax.scan(one, zeros, (jnp.arange(plan.parts), fixed, given))
     if by_device:
         sums = [jnp.sum(x, axis=0) for x in sums]
     axes = [axis for axis in pull.out_axes if axis is not None]
-    return list(merged(summed, sums, list(map(lots.join, results, axes))))
+    return list(merged(summed, sums, list(map(plan.join, results, axes))))
 
 
-def _on_each_device(pull: Pullback, lots: Chunks) -> Callable[..., list[Array]]:
+def _on_each_device(pull: Pullback, plan: Chunks) -> Callable[..., list[Array]]:
     """Returns a pullback that adds up, on each device, what the worlds of this device share.
 
     Its sums have a first axis of devices. Devices thus need not meet before the last chunk.
@@ -560,8 +591,8 @@ def _on_each_device(pull: Pullback, lots: Chunks) -> Callable[..., list[Array]]:
     count = pull.linear.count(False)
     axes = (*pull.axes[:count], *(0 if i is None else i for i in pull.axes[count:]))
     out_axes = [0 if i is None else i for i in pull.out_axes]
-    every = jax.vmap(pull.vmapped(lots.share), in_axes=axes, out_axes=out_axes)
-    first = jnp.arange(lots.devices) == 0
+    every = jax.vmap(pull.vmapped(plan.share), in_axes=axes, out_axes=out_axes)
+    first = jnp.arange(plan.devices) == 0
 
     def part(*args: Array) -> list[Array]:
         inputs = [
@@ -570,12 +601,12 @@ def _on_each_device(pull: Pullback, lots: Chunks) -> Callable[..., list[Array]]:
             # the cotangent of a result that worlds share counts on the first device only
             else jnp.where(first.reshape(-1, *(1,) * x.ndim), x, 0)
             if axis is None
-            else x.reshape(*x.shape[:axis], lots.devices, lots.share, *x.shape[axis + 1 :])
+            else x.reshape(*x.shape[:axis], plan.devices, plan.share, *x.shape[axis + 1 :])
             for i, (x, axis) in enumerate(zip(args, pull.axes, strict=True))
         ]
         pairs = zip(every(*inputs), pull.out_axes, strict=True)
         return [
-            y if axis is None else y.reshape(*y.shape[:axis], lots.size, *y.shape[axis + 2 :])
+            y if axis is None else y.reshape(*y.shape[:axis], plan.size, *y.shape[axis + 2 :])
             for y, axis in pairs
         ]
 
@@ -637,23 +668,23 @@ class Chunks(NamedTuple):
         return jax.lax.slice_in_dim(y, 0, self.worlds, axis=axis)
 
 
-def chunks(worlds: int | None, most: int, devices: int) -> Chunks | None:
+def plan_chunks(worlds: int | None, chunk_size: int, devices: int) -> Chunks | None:
     """Returns how a batch is cut into chunks; None if it is not.
 
     Args:
         worlds: the number of worlds, or None.
-        most: the largest number of worlds of a device in a chunk.
+        chunk_size: the largest number of worlds of a device in a chunk.
         devices: the number of devices. A batch that does not divide among them is not cut.
     """
     if worlds is None or not is_known([worlds]) or worlds % devices:
         return None
     own = worlds // devices
-    if own <= most:
+    if own <= chunk_size:
         return None
-    count = -(-own // most)
+    count = -(-own // chunk_size)
     share = -(-own // count)
     if devices > 1 and count * share != own:  # copies would move worlds between devices
-        fitting = [k for k in range(share, max(1, most // 4), -1) if own % k == 0]
+        fitting = [k for k in range(share, max(1, chunk_size // 4), -1) if own % k == 0]
         if not fitting:
             return None
         share, count = fitting[0], own // fitting[0]
@@ -678,12 +709,7 @@ def _lower(
     mlir.register_lowering(primitive, rule, platform="cpu")
 
 
-_outside_jit = jax.jit(
-    lambda *args, fun, batch: fun.bound(batch, *args), static_argnames=("fun", "batch")
-)
-_pulled_outside_jit = jax.jit(lambda *args, pull: pull.bound(*args), static_argnames=("pull",))
-
-worlds_p.def_impl(lambda *args, fun, batch, jaxpr: _outside_jit(*args, fun=fun, batch=batch))
+worlds_p.def_impl(lambda *args, fun, batch, jaxpr: fun.compiled(*args, batch=batch))
 worlds_p.def_abstract_eval(_abstract)
 batching.primitive_batchers[worlds_p] = _batched
 ad.primitive_jvps[worlds_p] = _jvp
@@ -691,10 +717,11 @@ ad.primitive_transposes[worlds_p] = _transpose
 partial_eval.dce_rules[worlds_p] = _without_unused
 _lower(worlds_p, lambda *args, fun, batch: fun.vmapped(batch)(*args), _in_chunks)
 
-pulled_p.def_impl(lambda *args, pull, jaxpr: _pulled_outside_jit(*args, pull=pull))
-pulled_p.def_abstract_eval(
+pullback_p.def_impl(lambda *args, pull, jaxpr: pull.function.pullback(*args, masks=pull[1:]))
+pullback_p.def_abstract_eval(
     lambda *_, pull, jaxpr: [ShapedArray(x.shape, x.dtype) for x in pull.results()]
 )
-batching.primitive_batchers[pulled_p] = _pulled_batched
-ad.primitive_jvps[pulled_p] = _pulled_jvp
-_lower(pulled_p, lambda *args, pull: pull.vmapped(pull.batch.size)(*args), _pulled_in_chunks)
+batching.primitive_batchers[pullback_p] = _pullback_batched
+ad.primitive_jvps[pullback_p] = _pullback_jvp
+ad.primitive_transposes[pullback_p] = _pullback_transpose
+_lower(pullback_p, lambda *args, pull: pull.vmapped(pull.batch.size)(*args), _pullback_in_chunks)
