@@ -147,6 +147,23 @@ def operations(quick: bool) -> list[Metric]:
     return metrics
 
 
+@entry("large_batches")
+def large_batches(quick: bool) -> list[Metric]:
+    """Compares large batches of a plain program with chunks by hand, on the devices at hand."""
+    from benchmarks import large_batches as study
+
+    batches, sizes = ((2048,), (512,)) if quick else ((1024, 16384), study.SIZES)
+    metrics = []
+    for name in ("four-bar",) if quick else study.SCENES:
+        for batch in batches:
+            found = study.compare(name, batch, sizes=sizes)
+            title = f"{name}, {batch} worlds"
+            metrics.append(rate(f"{title}, world-steps", found.plain * 1e6))
+            metrics.append(Metric(f"{title}, over chunks by hand", found.ratio, tolerance=1.3))
+            metrics.append(count(f"{title}, exchanges", float(sum(found.exchanges.values()))))
+    return metrics
+
+
 @entry("gradients")
 def gradients(quick: bool) -> list[Metric]:
     """Measures cost of value and gradient relative to a rollout, and error of the gradient."""

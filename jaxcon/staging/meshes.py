@@ -53,7 +53,8 @@ def are_placed(tree: PyTree) -> bool:
     """
     if jax.sharding.get_abstract_mesh().explicit_axes:
         return True
-    return any(_varies(jax.typeof(x)) for x in jax.tree.leaves(tree))
+    arrays = (x for x in jax.tree.leaves(tree) if isinstance(x, jax.Array))
+    return any(_varies(jax.typeof(x)) for x in arrays)
 
 
 @contextmanager
