@@ -262,7 +262,7 @@ def by_world(function: Callable[[], T], chunk_size: int, probed: PyTree) -> T:
     """
     apart = meshes.are_placed(probed) or jax.config.values["jax_disable_jit"]
     worlds = worlds_of(probed)
-    if apart or not is_known([worlds]) or 1 < worlds <= chunk_size:
+    if apart or not is_known([worlds]) or 0 < worlds <= chunk_size:
         return function()
     closed, shapes = jax.make_jaxpr(function, return_shape=True)()
     traced = any(isinstance(x, Tracer) for x in closed.consts)
@@ -294,13 +294,13 @@ _SIZES = ContextVar[list[int] | None]("sizes", default=None)
 def worlds_of(tree: PyTree) -> int:
     """Returns the number of worlds over which `vmap` maps arrays at this place of the trace.
 
-    Nested calls of `vmap` count with the product of their sizes.
+    Nested calls of `vmap` count with the product of their sizes. Without `vmap` the number is 0.
     """
     traced = [x for x in jax.tree.leaves(tree) if isinstance(x, Tracer)]
     sizes: list[int] = []
     with batch_last.during(_SIZES, sizes):
         probe_p.bind(*traced)
-    return math.prod(sizes)
+    return math.prod(sizes) if sizes else 0
 
 
 def _probe_batched(
