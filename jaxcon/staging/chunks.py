@@ -185,6 +185,8 @@ class OneWorld:
 
     def _part(self, wanted: Flags) -> OneWorld:
         """Returns the function with the wanted results only."""
+        if all(wanted):  # itself, with what its caches hold
+            return self
         jaxpr = without_unused(self.closed.jaxpr, wanted)
         return OneWorld(ClosedJaxpr(jaxpr, self.closed.consts), self.chunk_size)
 
