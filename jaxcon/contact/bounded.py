@@ -206,20 +206,10 @@ class Bounded:
             width: width of the smoothed corners of the laws, (1,) [m/s, rad/s]; None for sharp
                 corners.
         """
-        scale = self.diagonal()
         live = (self.lower, self.upper, self.coefficients)
-        share = float(jnp.finfo(multipliers.dtype).eps) ** 0.75
-        identity = gauss_jordan.identity(multipliers)
-
-        def law(x: Array, u: Array) -> Array:
-            return laws(self.kinds, scale, x, u, live, width)
-
-        # a law depends only on the u of its own rows, so `vmap` can run over the columns of G
-        def along(direction: Array, column: Array) -> Array:
-            here = multipliers, velocity
-            return jax.jvp(law, here, (jnp.broadcast_to(direction, column.shape), column))[1]
-
-        return jax.vmap(along, (1, 1), 1)(identity, self.matrix) + share * identity
+        return law_slope(
+            self.kinds, self.diagonal(), multipliers, velocity, live, width, self.matrix
+        )
 
     def missed(self, multipliers: Array) -> Array:
         """Returns |residual| in units of velocity, (n,)."""
@@ -324,20 +314,43 @@ def implicit_multipliers(
     live: Limits,
     width: Scalar | None,
 ) -> Array:
+    """Returns the solution λ of a problem, made differentiable; see `implicit_solution`."""
+    here = problem.velocity(multipliers)
+    return implicit_solution(
+        problem.kinds,
+        problem.diagonal(),
+        multipliers,
+        here,
+        velocity,
+        live,
+        width,
+        lambda: problem.matrix,
+    )
+
+
+def implicit_solution(
+    kinds: RowCounts,
+    scale: Array,
+    multipliers: Array,
+    here: Array | None,
+    velocity: Callable[[Array], Array],
+    live: Limits,
+    width: Scalar | None,
+    matrix: Callable[[], Array],
+) -> Array:
     """Returns the solution λ, made differentiable by implicit differentiation of the laws.
 
     Args:
-        problem: the problem, with constants as its numbers; the derivative solves a linear system
-            with the matrix `slope`.
-        multipliers: solution λ of the problem, (n,).
+        kinds: numbers of rows by law.
+        scale: scale g of the velocities, (n,); see `Bounded.diagonal`.
+        multipliers: solution λ, (n,).
+        here: velocities u − u* of the solution, (n,), a constant; None to evaluate `velocity`.
         velocity: function of λ that returns u − u*, differentiable in its closed-over values.
         live: bounds of the boxes, and the coefficient μ of each disc, differentiable.
         width: width of the smoothed corners of the laws [m/s, rad/s]; None for sharp corners.
+        matrix: function that returns G, (n, n), called only if a derivative is taken.
     """
-    kinds, scale = problem.kinds, problem.diagonal()
     corner = None if width is None else jnp.asarray(width, scale.dtype)[None]
-
-    here = problem.velocity(multipliers)
 
     def law(x: Array) -> Array:
         # treat these as constants; stop their gradients inside this function, see `roots.implicit`
@@ -345,10 +358,14 @@ def implicit_multipliers(
         # use the value of u from which `prepared` computes the matrix: at the corner of a law,
         # rounding decides if a contact presses or opens, and residual and matrix must agree
         u = velocity(x)
-        return laws(kinds, fixed, x, there + (u - jax.lax.stop_gradient(u)), live, smooth)
+        u = u if there is None else there + (u - jax.lax.stop_gradient(u))
+        return laws(kinds, fixed, x, u, live, smooth)
 
     def prepared() -> tuple[roots.Operator, roots.Operator]:
-        inverse = gauss_jordan.inverse(problem.slope(multipliers, here, corner))
+        bounds = jax.lax.stop_gradient(live)
+        there = jax.lax.stop_gradient(velocity(multipliers)) if here is None else here
+        slope = law_slope(kinds, scale, multipliers, there, bounds, corner, matrix())
+        inverse = gauss_jordan.inverse(slope)
         return partial(gauss_jordan.apply, inverse), partial(
             gauss_jordan.apply, jnp.swapaxes(inverse, 0, 1)
         )
@@ -357,6 +374,30 @@ def implicit_multipliers(
         return x, None
 
     return roots.implicit(law, multipliers, iterate, ROUNDS, prepared=prepared)[0]
+
+
+def law_slope(
+    kinds: RowCounts,
+    scale: Array,
+    multipliers: Array,
+    velocity: Array,
+    live: Limits,
+    width: Array | None,
+    matrix: Array,
+) -> Array:
+    """Returns the slightly regularized Jacobian of `laws` by λ, (n, n), with u = G λ + c."""
+    share = float(jnp.finfo(multipliers.dtype).eps) ** 0.75
+    identity = gauss_jordan.identity(multipliers)
+
+    def law(x: Array, u: Array) -> Array:
+        return laws(kinds, scale, x, u, live, width)
+
+    # a law depends only on the u of its own rows, so `vmap` can run over the columns of G
+    def along(direction: Array, column: Array) -> Array:
+        here = multipliers, velocity
+        return jax.jvp(law, here, (jnp.broadcast_to(direction, column.shape), column))[1]
+
+    return jax.vmap(along, (1, 1), 1)(identity, matrix) + share * identity
 
 
 ROUNDS = 3

@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.contact.bounces import restitution_gain
-from jaxcon.contact.bounded import Bounded, implicit_multipliers
+from jaxcon.contact import newton
+from jaxcon.contact.bounded import Bounded, implicit_multipliers, implicit_solution
 from jaxcon.contact.nearest_rows import ActiveSet
+from jaxcon.contact.newton import BodySpace, Newton
 from jaxcon.contact.rows import BoundRows, Reactions
 from jaxcon.core import numerics
 from jaxcon.core.jaxprs import each
@@ -68,6 +70,7 @@ class ContactProblem:
     acts: Any = None
     answers: Array | None = None
     share: float = 1.0
+    place: Any = None
 
     @classmethod
     def of(
@@ -79,6 +82,7 @@ class ContactProblem:
         acts: Array | None = None,
         sifts: bool = False,
         share: float = 1.0,
+        place: Any = None,
     ) -> ContactProblem:
         """Returns the contact problem of a step, from the factors of its saddle system.
 
@@ -95,7 +99,10 @@ class ContactProblem:
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
         solve = factor(add_rhs_axis(saddle, saddle.force.ndim - 1))
         start = 0 * saddle.force
-        problem = cls(rows, solve, saddle, saddle.target, dt, start, bare, acts, share=share)
+        problem = cls(rows, solve, saddle, saddle.target, dt, start, bare, acts, None, share, place)
+        if place is not None:
+            first = problem.alone(saddle.force, saddle.target).acceleration
+            return dataclasses.replace(problem, start=jax.lax.stop_gradient(first))._facing()
         return (problem.without_immovable_rows() if sifts else problem._begun())._facing()
 
     def _begun(self) -> ContactProblem:
@@ -240,6 +247,8 @@ class ContactProblem:
         if isinstance(solver, ActiveSet):
             some = solver.leaves_out(self.rows.kinds)
             return self.nearest(solver, guess) if some else self.react(solver.solver, guess)
+        if isinstance(solver, Newton) and self.place is not None:
+            return self.react_in_bodies(solver, guess)
         rows = self.rows
         matrix = self.matrix()
         movable = self.movable(matrix)
@@ -264,6 +273,47 @@ class ContactProblem:
             live = (rows.lower, rows.upper, (rows.friction, *rows.resistance))
             left = problem.worst(solution)
             return implicit_multipliers(problem, solution, moved, live, solver.smoothing), left
+
+        if rows.restitution is None:
+            solution, left = met(rows.target)
+            ones = jnp.ones_like(left)
+            return Reactions(solution, rows.gap, left, ones, None, rows.layout, rows.direction)
+        gain = restitution_gain(rows, rows.restitution, self.dt)
+        (plain, bounced), left = each(met, jnp.stack([rows.target, rows.target + gain]))
+        without = self.velocity(jnp.zeros_like(gain))
+        share = self.cap_energy(without, plain, bounced - plain)
+        solution = plain + share[None] * (bounced - plain)
+        left = jnp.max(left, axis=0)
+        return Reactions(solution, rows.gap, left, share, None, rows.layout, rows.direction)
+
+    def react_in_bodies(self, solver: Newton, guess: Array | None) -> Reactions:
+        """Solves for λ by Newton's method for the velocities of the bodies."""
+        rows, free = self.rows, self.end_velocity(self.start)
+        space = BodySpace.of(*self.place, self.saddle, rows)
+        assert space is not None
+        start = jnp.zeros_like(free) if guess is None else jax.lax.stop_gradient(guess)
+        fixed = jax.lax.stop_gradient(rows)
+        live = (rows.lower, rows.upper, (rows.friction, *rows.resistance))
+
+        def met(wanted: Array) -> tuple[Array, Array]:
+            offset = jax.lax.stop_gradient(free - wanted)
+            solution, mass, movable, left = newton.multipliers(
+                space, fixed, offset, start, self.acts, self.bare, self.dt, solver
+            )
+            scale = self.dt[None] * mass
+
+            def moved(multipliers: Array) -> Array:
+                here = self.velocity(multipliers) + rows.compliance * multipliers - wanted
+                return jnp.where(movable, here, 0)
+
+            def matrix() -> Array:
+                soft = jnp.where(movable[None] & movable[:, None], self.matrix(), 0)
+                return soft + fixed.compliance[None] * gauss_jordan.identity(fixed.rate)
+
+            λ = implicit_solution(
+                rows.kinds, scale, solution, None, moved, live, solver.smoothing, matrix
+            )
+            return λ, jax.lax.stop_gradient(left)
 
         if rows.restitution is None:
             solution, left = met(rows.target)

@@ -19,6 +19,7 @@ from jaxcon.constraints.rows import Rows
 from jaxcon.contact import impacts
 from jaxcon.contact.limits import OneSided
 from jaxcon.contact.nearest_rows import ActiveSet
+from jaxcon.contact.newton import Newton, tree_below
 from jaxcon.contact.parts import ImpactSet, StepPart
 from jaxcon.contact.reactions import ContactProblem
 from jaxcon.contact.rows import BoundRows, Reactions, bound_rows, linearize_bounds
@@ -112,7 +113,7 @@ class Response:
             change = self.rate_change(dynamics, bounds, q, v, t)
             bounds = dataclasses.replace(bounds, rate_change=change)
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
-        impulse = self._impulse(dynamics, base, system, length, bounds.acts, share)
+        impulse = self._impulse(dynamics, (q, v), base, system, length, bounds.acts, share)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         seen, may = None, jnp.zeros_like(bounds.rate, bool)
         if lands:
@@ -226,7 +227,7 @@ class Response:
         force, target = (jnp.where(lasts, x, 0) for x in (system.force, system.target))
         system = dataclasses.replace(system, force=force, target=target)
         time = jnp.where(lasts, dt, jnp.ones_like(dt))
-        impulse = self._impulse(dynamics, rows, system, time, acts)
+        impulse = self._impulse(dynamics, point[:2], rows, system, time, acts)
         reactions = impulse.react(self.solver, None)
         solution = dynamics.system.complete(impulse.motion(reactions.multipliers))
         return solution, self._judged(impulse, reactions, solution.acceleration)
@@ -234,6 +235,7 @@ class Response:
     def _impulse(
         self,
         dynamics: Dynamics,
+        point: tuple[Array, Array],
         rows: BoundRows,
         system: Saddle,
         dt: Array,
@@ -242,8 +244,12 @@ class Response:
     ) -> ContactProblem:
         """Returns the contact problem, with factors for several right-hand sides at once."""
         solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
+        place = None
+        if isinstance(self.solver, Newton):
+            tree = tree_below(dynamics.system, system.jacobian, system.layout, rows.jacobian)
+            place = None if tree is None else (dynamics.system, *point)
         return ContactProblem.of(
-            rows, solver.factor, system, dt, acts, self._leaves_out(rows), share
+            rows, solver.factor, system, dt, acts, self._leaves_out(rows), share, place
         )
 
     def _judged(
