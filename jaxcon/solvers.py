@@ -2,13 +2,14 @@
 
 Linear systems: RankSafe, Sparse, Schur, Dense, ConjugateGradients.
 Levels of priority: Priority, Lexicographic.
-Inequality constraints: InteriorPoint, GaussSeidel, ActiveSet.
+Inequality constraints: Newton, InteriorPoint, GaussSeidel, ActiveSet.
 Results: Solution.
 """
 
 from jaxcon.contact.gauss_seidel import GaussSeidel
 from jaxcon.contact.interior_point import InteriorPoint
 from jaxcon.contact.nearest_rows import ActiveSet
+from jaxcon.contact.newton import Newton
 from jaxcon.linear.conjugate_gradients import ConjugateGradients
 from jaxcon.linear.dense import Dense
 from jaxcon.linear.priority import Lexicographic, Priority
@@ -31,6 +32,7 @@ __all__ = [
     "ConjugateGradients",
     "Priority",
     "Lexicographic",
+    "Newton",
     "InteriorPoint",
     "GaussSeidel",
     "ActiveSet",

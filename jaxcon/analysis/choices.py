@@ -12,6 +12,7 @@ from jaxcon.constraints.rank import UnitRows, dependent_rows, linearized
 from jaxcon.constraints.rows import layout_of
 from jaxcon.contact.contact_default import default_contact_solver
 from jaxcon.contact.gauss_seidel import GaussSeidel
+from jaxcon.contact.interior_point import InteriorPoint
 from jaxcon.core.precision import cast, precision
 from jaxcon.linear.proximal import RankSafe
 from jaxcon.linear.schur import Schur
@@ -84,7 +85,7 @@ def _pairs(system: System, reference: Reference) -> list[MethodParts]:
         split = ("RK4, Baumgarte, events", RK4(), feedback, contact, Events())
         methods[1:2] = [split, methods[1]]
         q, v = reference.points.q[0], reference.points.v[0]
-        if not isinstance(default_contact_solver(system, q, v), GaussSeidel):
+        if isinstance(default_contact_solver(system, q, v), InteriorPoint):
             name = "semi-implicit Euler, Baumgarte, sweeps"
             methods.insert(3, (name, SemiImplicitEuler(), feedback, GaussSeidel(), None))
     return methods

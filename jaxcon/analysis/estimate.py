@@ -16,6 +16,7 @@ from jaxcon.contact.bounded import RowCounts
 from jaxcon.contact.gauss_seidel import GaussSeidel
 from jaxcon.contact.interior_point import InteriorPoint
 from jaxcon.contact.nearest_rows import ActiveSet
+from jaxcon.contact.newton import Newton
 from jaxcon.contact.rows import kinds_of, linearize_at_rest
 from jaxcon.linear.conjugate_gradients import ConjugateGradients
 from jaxcon.methods.choice import Choice, innermost, words
@@ -23,6 +24,9 @@ from jaxcon.methods.method import Method
 from jaxcon.protocols import ContactSolver, Solver, System
 from jaxcon.staging.operations import count
 from jaxcon.system.state import State
+
+NEWTON_OPERATIONS = 120.0
+"""The number of operations a row in an iteration of `Newton`, the elimination included."""
 
 INTERIOR_POINT_ITERATIONS = 15
 """The assumed number of iterations of `InteriorPoint`."""
@@ -100,7 +104,7 @@ def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | N
     """Estimates the number of operations of a contact solver.
 
     Args:
-        solver: `InteriorPoint`, `GaussSeidel`, or an `ActiveSet` around one of them.
+        solver: `Newton`, `InteriorPoint`, `GaussSeidel`, or an `ActiveSet` around one of them.
         kinds: number of inequality rows of each law; None without inequality constraints.
     """
     if kinds is None:
@@ -109,6 +113,8 @@ def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | N
     inner = solver.solver if isinstance(solver, ActiveSet) else solver
     if isinstance(inner, GaussSeidel):  # a sweep is a matrix–vector product
         return inner.sweeps * (2.0 * rows * rows + 6.0 * rows)
+    if isinstance(inner, Newton):  # a row changes the inertia of its body
+        return inner.iterations * NEWTON_OPERATIONS * rows
     if isinstance(inner, InteriorPoint):  # an iteration inverts a matrix, and applies it twice
         return INTERIOR_POINT_ITERATIONS * (2.0 * rows**3 + 6.0 * rows * rows)
     return 0.0

@@ -292,7 +292,8 @@ def _slow_contact(setup: Setup) -> str | None:
             f"{problem} Take {nearest}, or GaussSeidel() where no light body carries heavy ones,"
             " since bodies may rest on each other here."
         )
-    return f"{problem} Leave out contact_solver=, which then is GaussSeidel(), or take {nearest}."
+    chosen = f"{type(default).__name__}()"
+    return f"{problem} Leave out contact_solver=, which then is {chosen}, or take {nearest}."
 
 
 def iterations(setup: Setup) -> str | None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxcon.constraints.rows import linearize
 from jaxcon.contact.gauss_seidel import GaussSeidel
 from jaxcon.contact.interior_point import InteriorPoint
+from jaxcon.contact.newton import Newton, tree_below
 from jaxcon.contact.rows import linearize_at_rest
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.linear.jacobian import Jacobian
@@ -57,7 +58,10 @@ def default_contact_solver(system: System, q: Array, v: Array) -> ContactSolver:
     if rows.kinds.size <= EXACT_UP_TO:
         return InteriorPoint()
     constraints = jax.eval_shape(linearize, system, q, v, jnp.zeros((1,) * (q.ndim - 1), q.dtype))
-    return InteriorPoint() if stacked(constraints.jacobian, rows.jacobian) else GaussSeidel()
+    if stacked(constraints.jacobian, rows.jacobian):
+        return InteriorPoint()
+    tree = tree_below(system, constraints.jacobian, constraints.layout, rows.jacobian)
+    return GaussSeidel() if tree is None else Newton()
 
 
 def first_multipliers(

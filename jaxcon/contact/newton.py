@@ -37,7 +37,16 @@ from jaxcon.core.lanes import Vector, collect, plus, take, times, total
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array, Lane
-from jaxcon.linear.articulated import Articulated, ByBranch, Frames, Lanes, Motions, picked, symmetric, widened
+from jaxcon.linear.articulated import (
+    Articulated,
+    ByBranch,
+    Frames,
+    Lanes,
+    Motions,
+    picked,
+    symmetric,
+    widened,
+)
 from jaxcon.linear.blocks import Block
 from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.saddle import Diagonal, Saddle
@@ -55,13 +64,14 @@ class Newton(checks.Checked, ContactSolver):
 
     Attributes:
         iterations: the largest number of iterations in a step.
-        tolerance: the violation of the laws at which a world is done [m/s, rad/s].
+        tolerance: the violation of the laws at which a world is done [m/s, rad/s]; None for 2e-6 in
+            single precision and 2e-13 in double precision.
         warm: True to start from the multipliers of the last step.
         smoothing: width of the smoothed corners of the laws, for the derivative only [m/s, rad/s].
     """
 
     iterations: int = static(default=12)
-    tolerance: float = static(default=2e-5)
+    tolerance: float | None = static(default=None)
     warm: bool = static(default=True)  # type: ignore[override]
     smoothing: Any = None
     exact = False  # type: ignore[assignment]
@@ -70,7 +80,14 @@ class Newton(checks.Checked, ContactSolver):
         """Checks the number of iterations, the tolerance, the warm start and the smoothing."""
         checks.count("Newton", "iterations", self.iterations)
         checks.flag("Newton", "warm", self.warm)
+        checks.check("Newton", "tolerance", self.tolerance, (), above=0, optional=True)
         checks.check("Newton", "smoothing", self.smoothing, (), least=0, optional=True)
+
+    def reached(self, dtype: Any) -> float:
+        """Returns the violation at which a world is done [m/s, rad/s]."""
+        if self.tolerance is not None:
+            return self.tolerance
+        return 2e-6 if jnp.finfo(dtype).eps > 1e-10 else 2e-13
 
     def solve(self, problem: Bounded, start: Array) -> Array:
         """Returns the multipliers λ, (n,), of a problem whose bodies form no tree, by sweeps."""
@@ -94,7 +111,9 @@ def tree_below(system: Any, joints: Jacobian, layout: Any, rows: Jacobian) -> Tr
     if type(group.kind) not in (SpatialRigid, PlanarRigid):
         return None
     soft = frozenset(
-        start for start, own in joints.by_rows() if not layout.holds[start : start + own[0].shape[0] * own[0].shape[1]].all()
+        start
+        for start, own in joints.by_rows()
+        if not layout.holds[start : start + own[0].shape[0] * own[0].shape[1]].all()
     )
     tree = tree_of(structure(joints), soft, len(group.names), group.kind.n_v)
     if tree is None:
@@ -177,7 +196,9 @@ class BodySpace(NamedTuple):
     order: np.ndarray
 
     @classmethod
-    def of(cls, system: Any, q: Array, v: Array, saddle: Saddle, rows: BoundRows) -> BodySpace | None:
+    def of(
+        cls, system: Any, q: Array, v: Array, saddle: Saddle, rows: BoundRows
+    ) -> BodySpace | None:
         """Returns the equations of a system; None if its bodies form no tree."""
         j = rows.jacobian
         if not isinstance(saddle.mass, Diagonal) or not isinstance(j, Jacobian):
@@ -223,11 +244,9 @@ class BodySpace(NamedTuple):
             else:
                 contacts[start] = places, lanes
         if contacts:
-            group, order = _sorted_contacts(rows.kinds, contacts, shape, q.dtype)
-            on_bodies.append(group)
-        rotors = [
-            [[0.0] * (r + 1) for r in range(b.freedom)] for b in tree.branches
-        ]
+            groups, order = _sorted_contacts(rows.kinds, contacts, shape, q.dtype)
+            on_bodies += groups
+        rotors = [[[0.0] * (r + 1) for r in range(b.freedom)] for b in tree.branches]
         holds = saddle.layout.holds
         for start, own in joints.by_rows():
             m = own[0].shape[1]
@@ -247,7 +266,9 @@ class BodySpace(NamedTuple):
             for start, pull in zip(group.starts, group.pulls, strict=True):
                 parts.append((start, len(group.places), pull.dot(v)))
         for row in self.on_joints:
-            z = _gathered(joints, row.joints, len(row.pulls), self.motions.tree, len(self.motions.shape))
+            z = _gathered(
+                joints, row.joints, len(row.pulls), self.motions.tree, len(self.motions.shape)
+            )
             parts.append((row.start, len(row.joints), total(map(times, row.pulls, z))))
         return _flat(parts, like)
 
@@ -275,12 +296,13 @@ class BodySpace(NamedTuple):
             for c, x in enumerate(row.pulls):
                 _to_branches(sums, c, row.joints, times(x, λ))
         joints = [
-            [collect(s, len(b.bodies)) for s in x]
-            for b, x in zip(tree.branches, sums, strict=True)
+            [collect(s, len(b.bodies)) for s in x] for b, x in zip(tree.branches, sums, strict=True)
         ]
         return bodies, joints
 
-    def stiffened(self, slope: Array, kinds: RowCounts, discs: list) -> tuple[list[Block], list[Block]]:
+    def stiffened(
+        self, slope: Array, kinds: RowCounts, discs: list
+    ) -> tuple[list[Block], list[Block]]:
         """Returns M + Jᵀ D J, as blocks of bodies and of joints by branch.
 
         Args:
@@ -295,17 +317,14 @@ class BodySpace(NamedTuple):
             m = len(group.places)
             terms = list(zip(group.pulls, group.slices(slope), strict=True))
             for disc, first, (b, t) in zip(kinds.discs, kinds.starts, discs, strict=False):
-                if not disc.count or not disc.rank or first not in group.starts:
+                inside = [first <= start < first + disc.count for start in group.starts]
+                if not disc.rank or True not in inside:
                     continue
-                k = group.starts.index(first)
-                tangents = group.pulls[k : k + disc.rank]
-                along = Vector(
-                    *(
-                        total(times(x[c], y) for x, y in zip(tangents, t, strict=True))
-                        for c in range(size)
-                    )
-                )
-                terms.append((along, -b))
+                k = inside.index(True)
+                own = slice(group.starts[k] - first, group.starts[k] - first + m)
+                pairs = list(zip(group.pulls[k : k + disc.rank], t, strict=True))
+                along = (total(times(x[c], y[own]) for x, y in pairs) for c in range(size))
+                terms.append((Vector(*along), -b[own]))
             weighted = [(x, x.map(lambda y, w=w: times(w, y))) for x, w in terms]
             lanes = [
                 total(times(x[r], y[c]) for x, y in weighted)
@@ -364,11 +383,24 @@ class BodySpace(NamedTuple):
         for row in self.on_joints:
             k = len(row.pulls)
             inverse = [[x for r in b for x in r] for b in ofjoints]
-            lanes = iter(_gathered(inverse, row.joints, k * (k + 1) // 2, self.motions.tree, len(self.motions.shape)))
+            lanes = iter(
+                _gathered(
+                    inverse,
+                    row.joints,
+                    k * (k + 1) // 2,
+                    self.motions.tree,
+                    len(self.motions.shape),
+                )
+            )
             block = [list(itertools.islice(lanes, r + 1)) for r in range(k)]
-            parts.append((row.start, len(row.joints), total(map(times, row.pulls, symmetric(block, row.pulls)))))
+            parts.append(
+                (
+                    row.start,
+                    len(row.joints),
+                    total(map(times, row.pulls, symmetric(block, row.pulls))),
+                )
+            )
         return _flat(parts, like), ofjoints
-
 
 
 def _flat(parts: list[tuple[int, int, Lane]], like: Array) -> Array:
@@ -421,8 +453,8 @@ def _sorted_contacts(
     contacts: dict[int, tuple[tuple[int, ...], list[Lane]]],
     shape: tuple[int, ...],
     dtype: Any,
-) -> tuple[BodyRows, np.ndarray]:
-    """Merges the rows of contacts, sorted by bodies.
+) -> tuple[list[BodyRows], np.ndarray]:
+    """Merges the rows of contacts that have the same kinds of rows, and sorts them by bodies.
 
     Returns:
         The rows, and the order of all rows; see `BodySpace`.
@@ -431,15 +463,36 @@ def _sorted_contacts(
     for disc, first in zip(kinds.discs, kinds.starts, strict=False):
         columns += [(first + r * disc.count, disc.first, disc.count) for r in range(disc.rank)]
     places = np.concatenate([contacts[k][0] for k in sorted(contacts) if k < kinds.starts[0]])
-    order, sort = np.arange(kinds.size), np.argsort(places, kind="stable")
-    starts, pulls = [], []
+    size = len(next(iter(contacts.values()))[1])
+    whole: list[list[Lane]] = []
     for start, _, count in columns:
-        own = [contacts[k] for k in sorted(contacts) if start <= k < start + count]
-        lanes = [jnp.concatenate([x[c] if not isinstance(x[c], float) else jnp.full((len(p), *shape), x[c], dtype) for p, x in own]) for c in range(len(own[0][1]))]
-        pulls.append(Vector(*(take(x, tuple(sort)) for x in lanes)))
-        order[start : start + count] = start + sort
-        starts.append(start)
-    return BodyRows(tuple(starts), tuple(places[sort].tolist()), pulls), order
+        own = [contacts[k][1] for k in sorted(contacts) if start <= k < start + count]
+        counts = [len(contacts[k][0]) for k in sorted(contacts) if start <= k < start + count]
+        whole.append(
+            [
+                jnp.concatenate(
+                    [
+                        jnp.broadcast_to(jnp.asarray(x[c], dtype), (n, *shape))
+                        for x, n in zip(own, counts, strict=True)
+                    ]
+                )
+                for c in range(size)
+            ]
+        )
+    order, groups = np.arange(kinds.size), []
+    ends = sorted({e for _, first, count in columns for e in (first, first + count)})
+    for low, high in itertools.pairwise(ends):
+        sort = low + np.argsort(places[low:high], kind="stable")
+        starts, pulls = [], []
+        for (start, first, count), lanes in zip(columns, whole, strict=True):
+            if first <= low and high <= first + count:
+                begin = start + low - first
+                order[begin : begin + high - low] = start - first + sort
+                indices = tuple((sort - first).tolist())
+                pulls.append(Vector(*(take(x, indices) for x in lanes)))
+                starts.append(begin)
+        groups.append(BodyRows(tuple(starts), tuple(places[sort].tolist()), pulls))
+    return groups, order
 
 
 def _part(x: Lane, start: int, count: int) -> Lane:
@@ -460,7 +513,8 @@ def _on_joints(motions: Motions, start: int, own: list) -> JointRows:
     counts = [b.shape[1] for b in own]
     picks = [(side, e) for e, (*_, side) in enumerate(found)]
     lanes = [
-        picked([b.value[0][c] for b in own], picks, counts, len(motions.shape)) for c in range(len(own[0].value[0]))
+        picked([b.value[0][c] for b in own], picks, counts, len(motions.shape))
+        for c in range(len(own[0].value[0]))
     ]
     w = motions.frames.at(places).pull(Vector(*lanes))
     joints = tuple((i, k) for i, k, _ in found)
@@ -470,7 +524,12 @@ def _on_joints(motions: Motions, start: int, own: list) -> JointRows:
         w.dot(
             Vector(
                 *(
-                    picked([x[c][a] if c < len(x) else 0.0 for x in motions.axes], joints, sizes, len(motions.shape))
+                    picked(
+                        [x[c][a] if c < len(x) else 0.0 for x in motions.axes],
+                        joints,
+                        sizes,
+                        len(motions.shape),
+                    )
                     for a in range(len(w))
                 )
             )
@@ -480,11 +539,14 @@ def _on_joints(motions: Motions, start: int, own: list) -> JointRows:
     return JointRows(start, joints, pulls)
 
 
-def _gathered(by_branch: ByBranch, joints: tuple[tuple[int, int], ...], k: int, tree: Tree, rank: int) -> Lanes:
+def _gathered(
+    by_branch: ByBranch, joints: tuple[tuple[int, int], ...], k: int, tree: Tree, rank: int
+) -> Lanes:
     """Returns the first k lanes of joints."""
     sizes = [len(b.bodies) for b in tree.branches]
     return [
-        picked([x[c] if c < len(x) else 0.0 for x in by_branch], joints, sizes, rank) for c in range(k)
+        picked([x[c] if c < len(x) else 0.0 for x in by_branch], joints, sizes, rank)
+        for c in range(k)
     ]
 
 
@@ -585,12 +647,14 @@ class Laws(NamedTuple):
 
     def slope(self, center: Array, velocity: Array) -> tuple[Array, list[tuple[Array, Vector]]]:
         """Returns −∂λ/∂u: its diagonal part a, (n,), and for each disc b and t of −b t tᵀ."""
-        stiff = self.acts / (self.regularization + self.compliance)
+        stiff = jnp.where(self.acts, 1 / (self.regularization + self.compliance), 0)
         x, here = self.kinds.split(self.ahead(center, velocity)), self.kinds.split(center)
         k = self.kinds.split(stiff)
         pressed = jnp.maximum(here.normal, 0)
         a_discs, others = [], []
-        for disc, μ, y, s in zip(self.kinds.discs, self.coefficients, x.discs, k.discs, strict=True):
+        for disc, μ, y, s in zip(
+            self.kinds.discs, self.coefficients, x.discs, k.discs, strict=True
+        ):
             if not len(y):
                 a_discs.append(y)
                 others.append((jnp.zeros(()), y))
@@ -643,10 +707,14 @@ def multipliers(
     kinds, motions = rows.kinds, space.motions
     tree, order = motions.tree, space.order
     sorts = (order != np.arange(len(order))).any()
-    friction, compliance = rows.friction, rows.compliance
+    friction, resistance, compliance = rows.friction, rows.resistance, rows.compliance
     if sorts:
         contacts = order[kinds.normal : kinds.normal + kinds.contacts] - kinds.normal
         friction = friction[contacts]
+        resistance = tuple(
+            x[contacts[disc.first : disc.first + disc.count] - disc.first]
+            for x, disc in zip(resistance, kinds.turning, strict=True)
+        )
         offset, start, bare, compliance = (x[order] for x in (offset, start, bare, compliance))
         acts = None if acts is None else acts[order]
     free = Articulated(motions, space.inertia, space.rotors)
@@ -665,7 +733,7 @@ def multipliers(
         jnp.where(movable, compliance / h, 0),
         h * rows.lower,
         h * rows.upper,
-        (friction, *rows.resistance),
+        (friction, *resistance),
         movable,
     )
     center = jnp.where(movable, h * start, 0)
@@ -675,7 +743,10 @@ def multipliers(
 
     def wide(x: ByBranch) -> ByBranch:
         return [
-            [jnp.broadcast_to(jnp.asarray(a, offset.dtype), (len(b.bodies), *motions.shape)) for a in lanes]
+            [
+                jnp.broadcast_to(jnp.asarray(a, offset.dtype), (len(b.bodies), *motions.shape))
+                for a in lanes
+            ]
             for b, lanes in zip(tree.branches, x, strict=True)
         ]
 
@@ -683,7 +754,10 @@ def multipliers(
 
     def forces(λ: Array, momentum: Any) -> tuple[ByBranch, ByBranch]:
         pairs = zip(space.pull(λ), momentum, strict=True)
-        return tuple([[a - m for a, m in zip(p, q, strict=True)] for p, q in zip(f, old, strict=True)] for f, old in pairs)  # type: ignore[return-value]
+        return tuple(
+            [[a - m for a, m in zip(p, q, strict=True)] for p, q in zip(f, old, strict=True)]
+            for f, old in pairs
+        )  # type: ignore[return-value]
 
     def judged(count: Array, u: Array, center: Array, momentum: Any) -> _State:
         λ = laws.project(center, u)
@@ -692,7 +766,7 @@ def multipliers(
         for lanes, own in zip(gradient, reach, strict=True):
             for g, v in zip(lanes, own, strict=True):
                 left = jnp.maximum(left, jnp.max(jnp.abs(g * v), axis=0))
-        return _State(count, u, center, λ, momentum, left > solver.tolerance, left[None])
+        return _State(count, u, center, λ, momentum, left > solver.reached(left.dtype), left[None])
 
     def iterate(state: _State) -> _State:
         count, u, center, λ, momentum, going, _ = state

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.contact.bounces import restitution_gain
 from jaxcon.contact import newton
+from jaxcon.contact.bounces import restitution_gain
 from jaxcon.contact.bounded import Bounded, implicit_multipliers, implicit_solution
 from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.newton import BodySpace, Newton

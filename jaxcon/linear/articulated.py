@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Matrix, Vector, collect, minus, plus, side_by_side, take, times, total
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.typing import Lane
 from jaxcon.linear import blocks
 from jaxcon.linear.blocks import Block
 from jaxcon.linear.jacobian import Jacobian
@@ -225,7 +225,8 @@ class Motions:
             n = len(self.tree.branches[i].bodies)
             own = [plus(x, collect(s, n)) for x, s in zip(forces[i], sums[i], strict=True)]
             result[i] = [
-                plus(axis.dot(Vector(*own)), g) for axis, g in zip(self.axes[i], joints[i], strict=True)
+                plus(axis.dot(Vector(*own)), g)
+                for axis, g in zip(self.axes[i], joints[i], strict=True)
             ]
             self.to_parents(i, own, sums)
         return result  # type: ignore[return-value]
@@ -245,7 +246,9 @@ def widened(x: Lane, count: int, rank: int) -> Lane:
     return jnp.broadcast_to(jnp.reshape(x, (-1, *shape)), (count, *shape))
 
 
-def picked(lanes: Sequence[Lane], picks: Sequence[tuple[int, int]], counts: Sequence[int], rank: int) -> Lane:
+def picked(
+    lanes: Sequence[Lane], picks: Sequence[tuple[int, int]], counts: Sequence[int], rank: int
+) -> Lane:
     """Returns chosen entries of several lanes side by side.
 
     Args:
@@ -258,9 +261,16 @@ def picked(lanes: Sequence[Lane], picks: Sequence[tuple[int, int]], counts: Sequ
         picks = picks[:1]
     wide = [widened(x, n, rank) for x, n in zip(lanes, counts, strict=True)]
     numbers = {wide[i] for i, _ in picks if isinstance(wide[i], int | float)}
-    if numbers and (len(numbers) > 1 or not all(isinstance(wide[i], int | float) for i, _ in picks)):
-        some = next((x for x in wide if not isinstance(x, int | float)), jnp.zeros((1,) * (1 + rank)))
-        wide = [jnp.full((n, *some.shape[1:]), x, some.dtype) if isinstance(x, int | float) else x for x, n in zip(wide, counts, strict=True)]
+    if numbers and (
+        len(numbers) > 1 or not all(isinstance(wide[i], int | float) for i, _ in picks)
+    ):
+        some = next(
+            (x for x in wide if not isinstance(x, int | float)), jnp.zeros((1,) * (1 + rank))
+        )
+        wide = [
+            jnp.full((n, *some.shape[1:]), x, some.dtype) if isinstance(x, int | float) else x
+            for x, n in zip(wide, counts, strict=True)
+        ]
     elif numbers:
         return numbers.pop()
     return side_by_side([(wide[i], k) for i, k in picks])
@@ -268,18 +278,20 @@ def picked(lanes: Sequence[Lane], picks: Sequence[tuple[int, int]], counts: Sequ
 
 def _combined(axes: Sequence[Vector], change: Sequence[Lane]) -> Lanes:
     """Returns Σ_c S_c q̇_c."""
-    return [
-        total(times(axis[i], x) for axis, x in zip(axes, change, strict=True))
-        for i in range(len(axes[0]))
-    ] if axes else []
+    return (
+        [
+            total(times(axis[i], x) for axis, x in zip(axes, change, strict=True))
+            for i in range(len(axes[0]))
+        ]
+        if axes
+        else []
+    )
 
 
 def symmetric(block: Block, x: Sequence[Lane]) -> Lanes:
     """Returns A x for a symmetric A, given by its lower triangle."""
     n = len(block)
-    return [
-        total(times(block[max(i, j)][min(i, j)], x[j]) for j in range(n)) for i in range(n)
-    ]
+    return [total(times(block[max(i, j)][min(i, j)], x[j]) for j in range(n)) for i in range(n)]
 
 
 class Articulated:
@@ -313,10 +325,7 @@ class Articulated:
             axes = motions.axes[i]
             pulled = [symmetric(block, axis) for axis in axes]
             pivot = [
-                [
-                    plus(Vector(*axis).dot(Vector(*pulled[c])), joints[i][r][c])
-                    for c in range(r + 1)
-                ]
+                [plus(Vector(*axis).dot(Vector(*pulled[c])), joints[i][r][c]) for c in range(r + 1)]
                 for r, axis in enumerate(axes)
             ]
             factor = blocks.ldl(pivot)
@@ -324,7 +333,10 @@ class Articulated:
             self.steps[i] = (pulled, factor, gains)
             if set(tree.branches[i].parents) != {WORLD}:
                 left = [
-                    minus(block[r][s], total(times(u[r], g[s]) for u, g in zip(pulled, gains, strict=True)))
+                    minus(
+                        block[r][s],
+                        total(times(u[r], g[s]) for u, g in zip(pulled, gains, strict=True)),
+                    )
                     for r in range(len(block))
                     for s in range(r + 1)
                 ]
@@ -368,7 +380,9 @@ class Articulated:
                 ]
             change.append(own)
             y = _combined(motions.axes[i], own) or [0.0] * len(forces[i])
-            moved.append(y if above is None else [plus(a, b) for a, b in zip(y, above, strict=True)])
+            moved.append(
+                y if above is None else [plus(a, b) for a, b in zip(y, above, strict=True)]
+            )
         return change, moved
 
     def mobility(self) -> tuple[list[Block], list[Block]]:
@@ -398,10 +412,7 @@ class Articulated:
                 above = [list(itertools.islice(lanes, r + 1)) for r in range(size)]
                 met = [symmetric(above, gain) for gain in gains]  # T = Ω_p X
                 joint = [
-                    [
-                        plus(joint[r][c], total(map(times, gains[r], met[c])))
-                        for c in range(r + 1)
-                    ]
+                    [plus(joint[r][c], total(map(times, gains[r], met[c]))) for c in range(r + 1)]
                     for r in range(k)
                 ]
                 body = _spanned(axes, joint, size)
@@ -431,7 +442,10 @@ def _solved_columns(factor: Block, columns: list[Lanes]) -> list[Lanes]:
 def _spanned(axes: Sequence[Vector], middle: Block, size: int) -> Block:
     """Returns the lower triangle of S A Sᵀ, for a symmetric A given by its lower triangle."""
     right = [
-        [total(times(middle[max(c, d)][min(c, d)], axes[d][i]) for d in range(len(axes))) for c in range(len(axes))]
+        [
+            total(times(middle[max(c, d)][min(c, d)], axes[d][i]) for d in range(len(axes)))
+            for c in range(len(axes))
+        ]
         for i in range(size)
     ]
     return [

@@ -67,11 +67,12 @@ class Method:
         recovery: `Recovery(…)`, which repairs failed steps. If None, a world whose step fails
             stops.
         contact_solver: solver of the inequality constraints (limits, friction, contact).
-            `InteriorPoint()` is exact, `GaussSeidel(…)` is cheap. `ActiveSet(…)` of either solves
-            only a few of many rows, those nearest to becoming active. If None, the solver is chosen
-            by the structure of the scene when the step is traced: `GaussSeidel()` for more than 24
-            rows on mechanisms that do not touch each other, such as robots on the floor, and
-            `InteriorPoint()` elsewhere. Scenes without inequality constraints compile no contact
+            `InteriorPoint()` is exact; `Newton(…)`, for trees of bodies, and `GaussSeidel(…)` are
+            cheap. `ActiveSet(…)` solves only a few of many rows, those nearest to becoming active.
+            If None, the solver is chosen by the structure of the scene when the step is traced.
+            Mechanisms with more than 24 rows that do not touch each other, such as robots on the
+            floor, take `Newton()`, or `GaussSeidel()` if they have closed loops or contacts between
+            their own bodies. Other scenes take `InteriorPoint()`. Scenes without inequality constraints compile no contact
             solver.
         events: `Events(…)`, which splits a step where a stop, rope or contact is hit. If None,
             steps are not split, and impacts are resolved within a step.
