@@ -55,7 +55,13 @@ from jaxcon.protocols import ContactSolver
 from jaxcon.system.bodies import PlanarRigid, SpatialRigid
 
 SHARE = 0.3
-"""R as a share of the inverse mass that a row meets."""
+"""R at the start, as a share of the inverse mass that a row meets."""
+
+EASE, LEAST = 0.5, 0.1
+"""The factor of R after each full step, and the least product of these factors.
+
+A large R decides soon which rows act. A small R then needs fewer iterations.
+"""
 
 
 @pytree
@@ -587,6 +593,7 @@ class _State(NamedTuple):
         momentum: M (v − v₀) of bodies and joints, by branch.
         going: True in worlds that are not done.
         left: the largest violation of the laws, as a velocity, (1,).
+        ease: the factor of R, (1,).
     """
 
     count: Array
@@ -596,6 +603,7 @@ class _State(NamedTuple):
     momentum: tuple[ByBranch, ByBranch]
     going: Array
     left: Array
+    ease: Array
 
 
 class Laws(NamedTuple):
@@ -617,6 +625,10 @@ class Laws(NamedTuple):
     upper: Array
     coefficients: tuple[Array, ...]
     acts: Array
+
+    def eased(self, factor: Array) -> Laws:
+        """Returns the laws with R multiplied by a factor, (1,)."""
+        return self._replace(regularization=factor * self.regularization)
 
     def ahead(self, center: Array, velocity: Array) -> Array:
         """Returns the multipliers before projection, (n,)."""
@@ -727,7 +739,7 @@ def multipliers(
     scale = jnp.where(movable, joint, 1)
     offset = jnp.where(movable, offset, 0)
     h = dt[None]
-    laws = Laws(
+    first_laws = Laws(
         kinds,
         SHARE * scale,
         jnp.where(movable, compliance / h, 0),
@@ -759,17 +771,21 @@ def multipliers(
             for f, old in pairs
         )  # type: ignore[return-value]
 
-    def judged(count: Array, u: Array, center: Array, momentum: Any) -> _State:
+    def judged(count: Array, u: Array, center: Array, momentum: Any, ease: Array) -> _State:
+        laws = first_laws.eased(ease)
         λ = laws.project(center, u)
         left = jnp.max(laws.regularization * jnp.abs(λ - center), axis=0)
         gradient = motions.gradient(*forces(λ, momentum))
         for lanes, own in zip(gradient, reach, strict=True):
             for g, v in zip(lanes, own, strict=True):
                 left = jnp.maximum(left, jnp.max(jnp.abs(g * v), axis=0))
-        return _State(count, u, center, λ, momentum, left > solver.reached(left.dtype), left[None])
+        return _State(
+            count, u, center, λ, momentum, left > solver.reached(left.dtype), left[None], ease
+        )
 
     def iterate(state: _State) -> _State:
-        count, u, center, λ, momentum, going, _ = state
+        count, u, center, λ, momentum, going, _, ease = state
+        laws = first_laws.eased(ease)
         diagonal, discs = laws.slope(center, u)
         factors = Articulated(motions, *space.stiffened(diagonal, kinds, discs))
         pulls = forces(λ, momentum)
@@ -789,7 +805,8 @@ def multipliers(
         momentum = jax.tree.map(lambda p, d: p + α[None] * d, momentum, tuple(map(wide, change)))
         new = laws.project(center, u)
         center = jnp.where((going & whole)[None], new, center)
-        after = judged(count + 1, u, center, momentum)
+        ease = jnp.where(whole, jnp.maximum(EASE * ease, LEAST), ease)
+        after = judged(count + 1, u, center, momentum, ease)
         # a world that is done keeps its λ
         return after._replace(
             multipliers=jnp.where(going[None], after.multipliers, λ), going=after.going & going
@@ -798,7 +815,8 @@ def multipliers(
     def goes(state: _State) -> Array:
         return (state.count < solver.iterations) & somewhere(state.going)
 
-    first_state = judged(jnp.zeros((), jnp.int32), velocity, center, momentum)
+    ones = jnp.ones_like(offset[:1])
+    first_state = judged(jnp.zeros((), jnp.int32), velocity, center, momentum, ones)
     last = jax.lax.while_loop(goes, iterate, first_state)
     found = (last.multipliers / h, scale, movable)
     if sorts:
