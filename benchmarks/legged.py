@@ -32,6 +32,7 @@ from jaxcon.contact.rows import count_bounds
 
 MODELS = ("hopper", "half_cheetah", "walker2d", "ant", "humanoid")
 BOUNDED = {
+    "Newton": jc.solvers.Newton(),
     "InteriorPoint": jc.solvers.InteriorPoint(),
     "GaussSeidel": jc.solvers.GaussSeidel(30),
     "ActiveSet": jc.solvers.ActiveSet(jc.solvers.GaussSeidel(30), contacts=8, stops=8),

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.rows import linearize
+from jaxcon.contact.body_space import tree_below
 from jaxcon.contact.gauss_seidel import GaussSeidel
 from jaxcon.contact.interior_point import InteriorPoint
-from jaxcon.contact.newton import Newton, tree_below
+from jaxcon.contact.newton import Newton
 from jaxcon.contact.rows import linearize_at_rest
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.linear.jacobian import Jacobian
@@ -60,7 +61,7 @@ def default_contact_solver(system: System, q: Array, v: Array) -> ContactSolver:
     constraints = jax.eval_shape(linearize, system, q, v, jnp.zeros((1,) * (q.ndim - 1), q.dtype))
     if stacked(constraints.jacobian, rows.jacobian):
         return InteriorPoint()
-    tree = tree_below(system, constraints.jacobian, constraints.layout, rows.jacobian)
+    tree = tree_below(system, constraints.jacobian, constraints.layout, rows)
     return GaussSeidel() if tree is None else Newton()
 
 

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.contact import newton
+from jaxcon.contact.body_space import BodySpace
 from jaxcon.contact.bounces import restitution_gain
 from jaxcon.contact.bounded import Bounded, implicit_multipliers, implicit_solution
 from jaxcon.contact.nearest_rows import ActiveSet
-from jaxcon.contact.newton import BodySpace, Newton
+from jaxcon.contact.newton import Newton
 from jaxcon.contact.rows import BoundRows, Reactions
 from jaxcon.core import numerics
 from jaxcon.core.jaxprs import each
@@ -58,6 +59,7 @@ class ContactProblem:
             if not computed.
         share: factor s of J̇_b v: ½ if the velocities at the end of a step belong to its middle,
             else 1.
+        place: the system, q and v if Newton's method for trees of bodies solves the problem.
     """
 
     rows: BoundRows
@@ -95,6 +97,8 @@ class ContactProblem:
             acts: mask of the active rows, (n,); None for all.
             sifts: True to make immovable rows inactive, which `nearest` needs.
             share: factor s of J̇_b v in u.
+            place: the system, q and v if Newton's method for trees of bodies solves the problem;
+                None otherwise.
         """
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
         solve = factor(add_rhs_axis(saddle, saddle.force.ndim - 1))
@@ -289,7 +293,8 @@ class ContactProblem:
     def react_in_bodies(self, solver: Newton, guess: Array | None) -> Reactions:
         """Solves for λ by Newton's method for the velocities of the bodies."""
         rows, free = self.rows, self.end_velocity(self.start)
-        space = BodySpace.of(*self.place, self.saddle, rows)
+        system, q, v = self.place
+        space = BodySpace.of(system, q, v, self.saddle, rows)
         assert space is not None
         start = jnp.zeros_like(free) if guess is None else jax.lax.stop_gradient(guess)
         fixed = jax.lax.stop_gradient(rows)
@@ -297,7 +302,7 @@ class ContactProblem:
 
         def met(wanted: Array) -> tuple[Array, Array]:
             offset = jax.lax.stop_gradient(free - wanted)
-            solution, mass, movable, left = newton.multipliers(
+            λ, mass, movable, left = newton.multipliers(
                 space, fixed, offset, start, self.acts, self.bare, self.dt, solver
             )
             scale = self.dt[None] * mass
@@ -310,10 +315,10 @@ class ContactProblem:
                 soft = jnp.where(movable[None] & movable[:, None], self.matrix(), 0)
                 return soft + fixed.compliance[None] * gauss_jordan.identity(fixed.rate)
 
-            λ = implicit_solution(
-                rows.kinds, scale, solution, None, moved, live, solver.smoothing, matrix
+            solution = implicit_solution(
+                rows.kinds, scale, λ, None, moved, live, solver.smoothing, matrix
             )
-            return λ, jax.lax.stop_gradient(left)
+            return solution, jax.lax.stop_gradient(left)
 
         if rows.restitution is None:
             solution, left = met(rows.target)

@@ -17,9 +17,10 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Rows
 from jaxcon.contact import impacts
+from jaxcon.contact.body_space import tree_below
 from jaxcon.contact.limits import OneSided
 from jaxcon.contact.nearest_rows import ActiveSet
-from jaxcon.contact.newton import Newton, tree_below
+from jaxcon.contact.newton import Newton
 from jaxcon.contact.parts import ImpactSet, StepPart
 from jaxcon.contact.reactions import ContactProblem
 from jaxcon.contact.rows import BoundRows, Reactions, bound_rows, linearize_bounds
@@ -246,7 +247,7 @@ class Response:
         solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
         place = None
         if isinstance(self.solver, Newton):
-            tree = tree_below(dynamics.system, system.jacobian, system.layout, rows.jacobian)
+            tree = tree_below(dynamics.system, system.jacobian, system.layout, rows)
             place = None if tree is None else (dynamics.system, *point)
         return ContactProblem.of(
             rows, solver.factor, system, dt, acts, self._leaves_out(rows), share, place

@@ -16,6 +16,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.core import numerics
@@ -144,6 +145,11 @@ class Motions:
     axes: list[list[Vector]]
     shape: tuple[int, ...]
 
+    @property
+    def size(self) -> int:
+        """The number of velocities of a body."""
+        return 6 if len(self.frames.arm) == 3 else 3
+
     @classmethod
     def of(cls, tree: Tree, frames: Frames, joints: Jacobian, shape: tuple[int, ...]) -> Motions:
         """Returns the motions, from the Jacobian of the equality rows."""
@@ -181,7 +187,7 @@ class Motions:
         """Returns the velocities of the bodies for joint velocities q̇, both by branch."""
         result: ByBranch = []
         for i, branch in enumerate(self.tree.branches):
-            own = _combined(self.axes[i], change[i])
+            own = _combined(self.axes[i], change[i]) or [0.0] * self.size
             if set(branch.parents) != {WORLD}:
                 above = self.gather(result, branch.parents)
                 own = [plus(x, y) for x, y in zip(own, above, strict=True)]
@@ -192,11 +198,16 @@ class Motions:
         """Returns the lanes of the bodies at given places; zero for `WORLD`."""
         count = len(by_branch)
         picks = [(count, 0) if p == WORLD else self.tree.branch_of(p) for p in places]
-        counts = [*(len(b.bodies) for b in self.tree.branches[:count]), 1]
+        counts = [*self.tree.sizes[:count], 1]
         return [
             picked([*(x[c] for x in by_branch), 0.0], picks, counts, len(self.shape))
             for c in range(len(by_branch[0]))
         ]
+
+    def at_joints(self, by_branch: ByBranch, joints: Sequence[tuple[int, int]], k: int) -> Lanes:
+        """Returns the first k lanes of chosen joints, given by branch and index."""
+        lanes = ([x[c] if c < len(x) else 0.0 for x in by_branch] for c in range(k))
+        return [picked(x, joints, self.tree.sizes, len(self.shape)) for x in lanes]
 
     def to_parents(self, i: int, lanes: Lanes, sums: list[list[list]]) -> None:
         """Adds the lanes of the bodies of branch i to those of their parents, in `sums`."""
@@ -218,7 +229,7 @@ class Motions:
         return jnp.broadcast_to(jnp.asarray(lane), (count, *self.shape))
 
     def gradient(self, forces: ByBranch, joints: ByBranch) -> ByBranch:
-        """Returns the generalized forces of forces on bodies and on joint coordinates, by branch."""
+        """Returns Nᵀ f + g for forces f on bodies and g along joints, by branch."""
         sums = [[[] for _ in x] for x in forces]
         result: list[Lanes | None] = [None] * len(forces)
         for i in reversed(range(len(forces))):
@@ -260,10 +271,9 @@ def picked(
     if len(set(picks)) == 1:  # broadcast
         picks = picks[:1]
     wide = [widened(x, n, rank) for x, n in zip(lanes, counts, strict=True)]
-    numbers = {wide[i] for i, _ in picks if isinstance(wide[i], int | float)}
-    if numbers and (
-        len(numbers) > 1 or not all(isinstance(wide[i], int | float) for i, _ in picks)
-    ):
+    chosen = [wide[i] for i, _ in picks]
+    numbers = {float(x) for x in chosen if isinstance(x, int | float)}
+    if numbers and (len(numbers) > 1 or any(isinstance(x, jax.Array) for x in chosen)):
         some = next(
             (x for x in wide if not isinstance(x, int | float)), jnp.zeros((1,) * (1 + rank))
         )
@@ -323,7 +333,7 @@ class Articulated:
             lanes = iter(own)
             block = [list(itertools.islice(lanes, r + 1)) for r in range(len(bodies[i]))]
             axes = motions.axes[i]
-            pulled = [symmetric(block, axis) for axis in axes]
+            pulled = [symmetric(block, [*axis]) for axis in axes]
             pivot = [
                 [plus(Vector(*axis).dot(Vector(*pulled[c])), joints[i][r][c]) for c in range(r + 1)]
                 for r, axis in enumerate(axes)
@@ -379,7 +389,7 @@ class Articulated:
                     for x, gain in zip(own, gains, strict=True)
                 ]
             change.append(own)
-            y = _combined(motions.axes[i], own) or [0.0] * len(forces[i])
+            y = _combined(motions.axes[i], own) or [0.0] * motions.size
             moved.append(
                 y if above is None else [plus(a, b) for a, b in zip(y, above, strict=True)]
             )
@@ -397,8 +407,8 @@ class Articulated:
         for i, branch in enumerate(tree.branches):
             pulled, factor, gains = self.steps[i]
             axes = motions.axes[i]
-            k, size = len(axes), len(motions.frames.arm) * 3 - 3
-            unit = [[1.0 if r == c else 0.0 for r in range(k)] for c in range(k)]
+            k, size = len(axes), motions.size
+            unit: list[Lanes] = [[1.0 if r == c else 0.0 for r in range(k)] for c in range(k)]
             inverse = [
                 blocks.backward(factor, blocks.scale(factor, blocks.forward(factor, u)))
                 for u in unit

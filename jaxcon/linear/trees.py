@@ -18,6 +18,9 @@ from jaxcon.linear.jacobian import Columns, Jacobian
 WORLD = -1
 """The place of the world, the parent of every root."""
 
+Structure = tuple[tuple[int, tuple[tuple[int, Columns], ...]], ...]
+"""The first row of each group of constraints, and the rows and columns of its blocks in J."""
+
 
 @dataclass(frozen=True)
 class Branch:
@@ -54,6 +57,11 @@ class Tree:
         """The place of the first body of each branch."""
         return tuple(np.cumsum([0, *(len(x.bodies) for x in self.branches)])[:-1].tolist())
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The number of bodies of each branch."""
+        return tuple(len(x.bodies) for x in self.branches)
+
     @functools.cached_property
     def places(self) -> dict[int, int]:
         """The place of each body."""
@@ -70,7 +78,7 @@ class Tree:
         return branch, place - self.starts[branch]
 
 
-def structure(jacobian: Jacobian) -> tuple[tuple[int, tuple[tuple[int, Columns], ...]], ...]:
+def structure(jacobian: Jacobian) -> Structure:
     """Returns the rows and columns of the blocks of J, without their entries."""
     return tuple(
         (start, tuple((block.shape[0], block.columns) for block in blocks))
@@ -80,7 +88,7 @@ def structure(jacobian: Jacobian) -> tuple[tuple[int, tuple[tuple[int, Columns],
 
 @functools.lru_cache(maxsize=256)
 def tree_of(
-    joints: tuple[tuple[int, tuple[tuple[int, Columns], ...]], ...],
+    joints: Structure,
     soft: frozenset[int],
     bodies: int,
     components: int,
@@ -100,23 +108,22 @@ def tree_of(
     for start, blocks in joints:
         if start in soft:
             continue
-        rows = blocks[0][0]
+        (rows, side), *_ = blocks
         if len(blocks) > 2 or rows > components:
             return None
-        for i in range(len(blocks[0][1].indices)):
+        for i in range(len(side.indices)):
             ends = [columns.indices[i] for _, columns in blocks]
             a, b = ends if len(ends) == 2 else (WORLD, ends[0])
             edges[a].append((b, start, i, rows))
             edges[b].append((a, start, i, rows))
     found: dict[int, tuple[int, int, int | None, int, int]] = {}
     used: set[tuple[int, int]] = set()
-    pending = [WORLD]
     for root in [WORLD, *range(bodies)]:
+        pending = [root]
         if root != WORLD:
             if root in found:
                 continue
             found[root] = (0, WORLD, None, 0, components)
-            pending = [root]
         while pending:
             here = pending.pop(0)
             depth = 0 if here == WORLD else found[here][0] + 1
@@ -131,7 +138,7 @@ def tree_of(
     groups: dict[tuple[int, int, int], list[int]] = defaultdict(list)
     for body, (depth, _, row, _, freedom) in sorted(found.items()):
         groups[depth, -1 if row is None else row, freedom].append(body)
-    order = sorted(groups.items())
+    order: list[tuple[tuple[int, int, int], list[int]]] = sorted(groups.items())
     places = {b: i for i, b in enumerate(b for _, members in order for b in members)}
     places[WORLD] = WORLD
     return Tree(
