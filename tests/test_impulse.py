@@ -66,4 +66,6 @@ def begun(system, method, state):
     rows = dynamics.linearize(*at)
     equations = dynamics.stabilizer.constraint_equations(rows, (), dt)
     problem = dynamics.assemble(equations, *at)
-    return dynamics.contact._impulse(dynamics, rows.inequalities, problem, dt, None)
+    return dynamics.contact._impulse(
+        dynamics, (state.q, state.v), rows.inequalities, problem, dt, None
+    )

@@ -172,7 +172,7 @@ class Laws(NamedTuple):
         ):
             if not len(y):
                 a_discs.append(y)
-                others.append((jnp.zeros(()), y))
+                others.append((pressed[:0], y))
                 continue
             length = numerics.norm(y)
             safe = jnp.where(length > 0, length, 1)
@@ -396,7 +396,7 @@ def _work(forces: ByBranch, velocities: ByBranch) -> Array:
         for x, y in zip(own, v, strict=True)
         if isinstance(x, jax.Array) and isinstance(y, jax.Array)
     ]
-    return functools.reduce(operator.add, works, jnp.zeros(()))
+    return functools.reduce(operator.add, works)
 
 
 FLAT, TRIES = 0.01, 4

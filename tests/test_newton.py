@@ -1,0 +1,249 @@
+"""Newton's method for inequality rows of trees of bodies, and its parts."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize, saddle
+from jaxcon.contact import newton
+from jaxcon.contact.body_space import BodySpace
+from jaxcon.contact.bounded import FrictionDisc, RowCounts
+from jaxcon.contact.contact_default import default_contact_solver
+from jaxcon.contact.rows import linearize_bounds
+from jaxcon.core.lanes import Vector
+from jaxcon.linear.articulated import Articulated, complement
+
+H = 2e-3
+SWEEPS = jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=400))
+NEWTON = jc.Method(contact_solver=jc.solvers.Newton(iterations=100))
+dims = pytest.mark.parametrize("dim", [2, 3])
+
+
+def biped(dim, dtype=jnp.float64):
+    """A trunk on two legs with stops, friction and rotors; feet that roll and slide on a floor."""
+
+    def at(x, z):
+        return (x, z) if dim == 2 else (x, 0.1 * x, z)
+
+    scene = jc.Scene(dim=dim, dtype=dtype)
+    moments = 0.03 if dim == 2 else (0.03, 0.04, 0.05)
+    scene.add_body("trunk", mass=3.0, inertia=moments, position=at(0.0, 0.42))
+    axis = {} if dim == 2 else {"axis": (0.0, 1.0, 0.0)}
+    for side, x in (("left", -0.15), ("right", 0.15)):
+        small = 2e-3 if dim == 2 else (2e-3, 2e-3, 1e-3)
+        scene.add_body(f"{side} thigh", mass=0.5, inertia=small, position=at(x, 0.32))
+        scene.add_body(f"{side} shin", mass=0.3, inertia=small, position=at(x, 0.12))
+        hip, knee = f"{side} hip", f"{side} knee"
+        scene.add(jc.Revolute(hip, "trunk", f"{side} thigh", point=at(x, 0.42), **axis))
+        scene.add(jc.Revolute(knee, f"{side} thigh", f"{side} shin", point=at(x, 0.22), **axis))
+        scene.add(jc.joints.Armature(f"{hip} rotor", hip, 0.004))
+        scene.add(jc.contacts.Limit(f"{hip} stop", hip, lower=-0.4, upper=0.5))
+        scene.add(jc.contacts.Limit(f"{knee} stop", knee, lower=-0.02, upper=1.5))
+        scene.add(jc.contacts.JointFriction(f"{knee} rub", knee, max_force=0.05))
+        spin = {} if dim == 2 else {"spinning": 1e-3}
+        foot = jc.PlaneContact(
+            f"{side} foot",
+            jc.WORLD,
+            f"{side} shin",
+            radius=0.02,
+            center=at(x, 0.02),
+            friction=0.6,
+            rolling=2e-3,
+            **spin,
+        )
+        scene.add(foot)
+        corners = np.array([at(1.4 * x, z) for z in (0.38, 0.42, 0.46)])
+        scene.add(jc.PlaneContact(f"{side} end", jc.WORLD, "trunk", center=corners, friction=0.3))
+    return scene.build()
+
+
+def begun(system, method, state, speed=1.0, seed=0):
+    """Returns a state with random velocities that the joints allow."""
+    random = np.random.default_rng(seed)
+    v = jnp.asarray(speed * random.normal(size=len(state.v)), state.v.dtype)
+    return jc.init(system, method, state.q, v)
+
+
+def space_of(system, state):
+    """Returns the equations in body space, dense matrices M, J, J_b of a world, and the rows."""
+    q, v, t = state.q, state.v, state.time
+    rows = linearize(system, q, v, t)
+    equations = saddle(system, q, rows, jnp.zeros_like(v), jnp.zeros_like(rows.bias))
+    bounds = linearize_bounds(system, q, v, t, None, jnp.asarray(H, q.dtype))
+    space = BodySpace.of(system, q, v, equations, bounds)
+    assert space is not None
+    hard = np.asarray(rows.layout.holds)
+    whole = np.asarray(rows.jacobian.dense())
+    joints, rotors = whole[hard], whole[~hard]
+    inertia = 1 / np.asarray(equations.compliance)[~hard]
+    mass = np.diag(np.asarray(equations.mass.values)) + rotors.T @ (inertia[:, None] * rotors)
+    return space, mass, joints, np.asarray(bounds.jacobian.dense()), bounds
+
+
+@dims
+def test_elimination_along_the_joints_is_that_of_dense_algebra(dim):
+    """N (Nᵀ (M + Jᵀ D J) N)⁻¹ Nᵀ Jᵀ λ and the inverse mass of each row, for random D and λ."""
+    system, state = biped(dim)
+    state = begun(system, SWEEPS, state)
+    space, mass, joints, rows, bounds = space_of(system, state)
+    _, sizes, basis = np.linalg.svd(joints)
+    basis = basis[np.sum(sizes > 1e-10) :].T
+    random, order = np.random.default_rng(1), space.order
+    slope, λ = random.uniform(0, 50, len(rows)), random.normal(size=len(rows))
+    none = [
+        (jnp.zeros(disc.count), Vector(*(jnp.zeros(disc.count),) * disc.rank))
+        for disc in bounds.kinds.discs
+    ]
+    stiff = space.stiffened(jnp.asarray(slope[order]), bounds.kinds, none)
+    z, y = Articulated(space.motions, *stiff).solve(*space.pull(jnp.asarray(λ[order])))
+    found = np.empty(len(rows))
+    found[order] = np.asarray(space.rows_of(y, z, jnp.zeros(len(rows))))
+    whole = basis.T @ (mass + rows.T @ (slope[:, None] * rows)) @ basis
+    expected = rows @ basis @ np.linalg.solve(whole, basis.T @ rows.T @ λ)
+    np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
+    free = Articulated(space.motions, space.inertia, space.rotors)
+    met = np.empty(len(rows))
+    met[order] = np.asarray(space.mobility(free, jnp.zeros(len(rows)))[0])
+    inverse = basis @ np.linalg.solve(basis.T @ mass @ basis, basis.T)
+    np.testing.assert_allclose(met, np.diag(rows @ inverse @ rows.T), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("rows", "size"), [(1, 3), (2, 3), (3, 6), (5, 6), (6, 6)])
+def test_the_complement_is_orthonormal_and_normal_to_the_rows(rows, size):
+    given = np.random.default_rng(rows).normal(size=(rows, size, 4))
+    basis = complement([Vector(*jnp.asarray(x)) for x in given], size)
+    columns = np.array([[np.broadcast_to(x, 4) for x in b] for b in basis]).reshape(-1, size, 4)
+    assert len(columns) == size - rows
+    for w in range(4):
+        np.testing.assert_allclose(columns[..., w] @ given[..., w].T, 0, atol=1e-13)
+        np.testing.assert_allclose(
+            columns[..., w] @ columns[..., w].T, np.eye(size - rows), atol=1e-13
+        )
+
+
+def test_the_slope_of_the_laws_is_their_derivative():
+    """D = −∂Λ/∂u for stops, boxes, sticking and sliding contacts, and rolling resistance."""
+    kinds = RowCounts(3, 3, 4, 2, (FrictionDisc(1, 2, 2),))
+    random = np.random.default_rng(2)
+
+    def one(n, low, high):
+        return jnp.asarray(random.uniform(low, high, n))
+
+    laws = newton.Laws(
+        kinds,
+        kinds.largest(one(kinds.size, 0.5, 2)),
+        jnp.asarray(np.r_[one(kinds.normal + 4, 0, 1), np.zeros(kinds.size - kinds.normal - 4)]),
+        one(3, -1, 0),
+        one(3, 0, 1),
+        (one(4, 0.2, 1.0), one(2, 0.1, 0.4)),
+        jnp.asarray(np.arange(kinds.size) != 1),
+    )
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        center = jnp.asarray(random.normal(size=kinds.size))
+        u = jnp.asarray(random.normal(size=kinds.size))
+        diagonal, discs = laws.slope(center, u)
+        matrix = np.diag(np.asarray(diagonal))
+        for disc, first, (b, t) in zip(kinds.discs, kinds.starts, discs, strict=False):
+            for i in range(disc.count):
+                own = [first + r * disc.count + i for r in range(disc.rank)]
+                along = np.array([x[i] for x in t])
+                matrix[np.ix_(own, own)] -= float(b[i]) * np.outer(along, along)
+        expected = -jax.jacobian(laws.project, 1)(center, u)
+        np.testing.assert_allclose(matrix, expected, atol=1e-12)
+
+
+@dims
+def test_a_fall_is_that_of_many_sweeps(dim):
+    """The two legs land, slide, roll and meet their stops.
+
+    The two differ by the drift φ of the joints, which the tree of bodies does not see.
+    """
+    system, state = biped(dim)
+    finals = []
+
+    def rolled(s, method, steps):
+        def record(s, info):
+            return s.v, info.reactions.multipliers
+
+        return jc.rollout(system, method, s, None, H, steps, record=record)
+
+    for method in (SWEEPS, NEWTON):
+        start = begun(system, method, state)
+        final, (v, λ) = jax.jit(rolled, static_argnums=(1, 2))(start, method, 150)
+        assert final.status == 0
+        finals.append((np.asarray(v), np.asarray(λ)))
+    (v, λ), (w, μ) = finals
+    assert (np.abs(λ) > 1e-6).any(axis=0).mean() > 0.4  # stops, joint friction and feet act
+    first = np.flatnonzero(np.abs(λ).max(axis=1))[0]
+    np.testing.assert_allclose(w[: first + 20], v[: first + 20], atol=2e-6)
+    np.testing.assert_allclose(w, v, atol=1e-4)
+
+
+@dims
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_batch_moves_like_its_worlds(dim, dtype):
+    system, state = biped(dim, dtype)
+    method = jc.Method(contact_solver=jc.solvers.Newton())
+    starts = [begun(system, method, state, seed=seed) for seed in range(5)]
+
+    def run(s):
+        return jc.rollout(system, method, s, None, H, 60, record=lambda s, i: None)[0]
+
+    together = jax.jit(jax.vmap(run))(jax.tree.map(lambda *x: jnp.stack(x), *starts))
+    assert (together.status == 0).all()
+    assert together.q.dtype == dtype
+    tight = 2e-3 if dtype == jnp.float32 else 1e-9
+    for i, start in enumerate(starts[:2]):
+        np.testing.assert_allclose(together.v[i], jax.jit(run)(start).v, atol=tight)
+
+
+@dims
+def test_gradients_are_those_of_many_sweeps(dim):
+    system, state = biped(dim)
+
+    def loss(scale, method):
+        start = begun(system, method, state, speed=1.0)
+        start = jc.init(system, method, start.q, scale * start.v)
+        final, _ = jc.rollout(system, method, start, None, H, 40, record=lambda s, i: None)
+        return jnp.sum(final.q**2)
+
+    swept, found = (jax.jit(jax.grad(loss), static_argnums=1)(1.0, m) for m in (SWEEPS, NEWTON))
+    np.testing.assert_allclose(found, swept, rtol=1e-6)
+
+
+def test_a_world_with_a_parameter_that_is_no_number_stops_alone():
+    system, state = biped(2)
+    state = begun(system, NEWTON, state)
+    states = jax.tree.map(lambda x: jnp.stack([x, x]), state)
+    broken = states.v.at[0, 0].set(jnp.nan)
+    states = dataclasses.replace(states, v=broken)
+    new = jax.jit(jax.vmap(lambda s: jc.step(system, NEWTON, s, None, H)[0]))(states)
+    assert new.status[0] != 0
+    assert new.status[1] == 0
+
+
+def test_it_is_the_default_for_robots_on_the_floor():
+    system, state = biped(3)
+    assert isinstance(default_contact_solver(system, state.q, state.v), jc.solvers.Newton)
+
+
+def test_contacts_between_limbs_take_sweeps():
+    """Then the result is that of `GaussSeidel`, whichever of the two is asked for."""
+    scene = jc.Scene(dim=3)
+    for i in range(2):
+        scene.add_body(f"{i}", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.3 * i))
+    scene.add(
+        jc.contacts.CapsuleContact("touch", "0", "1", radius_a=0.1, radius_b=0.1, friction=0.5)
+    )
+    system, state = scene.build()
+    ends = []
+    for solver in (jc.solvers.Newton(), jc.solvers.GaussSeidel()):
+        method = jc.Method(contact_solver=solver)
+        start = jc.init(system, method, state.q, state.v.at[8].set(-1.0))
+        ends.append(jc.rollout(system, method, start, None, H, 40, record=lambda s, i: None)[0].q)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-12)
