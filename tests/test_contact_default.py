@@ -39,7 +39,7 @@ def tower(top):
     return scene.build()
 
 
-def walker(joined):
+def walker(joined, limbs=True):
     """Fourteen feet on the floor, and a contact between two bodies, with or without a hinge.
 
     A contact within one mechanism is not a stack, because its joints carry the load.
@@ -49,9 +49,9 @@ def walker(joined):
     scene.add_body("leg", mass=1.0, inertia=0.1, position=(0.0, 0.5))
     if joined:
         scene.add(jc.Revolute("hip", "body", "leg", point=(0.0, 0.75)))
-    scene.add(
-        jc.contacts.CapsuleContact("limbs", "body", "leg", radius_a=0.1, radius_b=0.1, friction=0.3)
-    )
+    if limbs:
+        radii = {"radius_a": 0.1, "radius_b": 0.1}
+        scene.add(jc.contacts.CapsuleContact("limbs", "body", "leg", **radii, friction=0.3))
     for i in range(14):
         foot = (0.1 * i, 0.1)
         scene.add(jc.PlaneContact(f"foot{i}", jc.WORLD, "leg", radius=0.1, center=foot, friction=1))
@@ -63,6 +63,7 @@ SCENES = {
     "many": (lambda: grains(EXACT_UP_TO // 2 + 1), jc.solvers.GaussSeidel),
     "tower": (lambda: tower(1.0), jc.solvers.InteriorPoint),
     "walker": (lambda: walker(True), jc.solvers.GaussSeidel),
+    "feet": (lambda: walker(True, limbs=False), jc.solvers.Newton),
     "apart": (lambda: walker(False), jc.solvers.InteriorPoint),
 }
 
@@ -76,7 +77,7 @@ def test_the_default_is_chosen_by_structure(name):
     assert jc.Method().resolve(system, state).contact_solver.smoothing is None
     warm = jax.tree.leaves(state.memory)
     assert [x.shape for x in warm] == ([(count_bounds(system, state.q, state.v),)] * len(warm))
-    assert bool(warm) == (kind is jc.solvers.GaussSeidel)
+    assert bool(warm) == (kind is not jc.solvers.InteriorPoint)
     chosen = jc.Method(contact_solver=jc.solvers.GaussSeidel(7))
     assert chosen.resolve(system, state) is chosen
 

@@ -194,7 +194,7 @@ def test_a_report_compiles_nothing_of_the_scene(caplog):
     assert report.memory is report.work is report.probe is report.seconds is None
     assert report.degrees_of_freedom == 36 - 22
     assert "35 inequality rows" in report.warnings["dense"]
-    assert "GaussSeidel()" in report.warnings["dense"]
+    assert "Leave out contact_solver=, which then is Newton()" in report.warnings["dense"]
 
 
 @pytest.mark.parametrize(
@@ -203,7 +203,7 @@ def test_a_report_compiles_nothing_of_the_scene(caplog):
 def test_the_cost_by_structure_is_near_that_of_the_trace(solver):
     """The estimate has leading terms only and is right within a factor of 2.5."""
     system, state = crawler(12)
-    method = jc.Method(solver=solver)
+    method = jc.Method(solver=solver, contact_solver=jc.solvers.GaussSeidel())
     found = jc.report(system, state, method).cost
     assert found.contact_solver == "GaussSeidel()"
     counted = work(system, method, state).operations
@@ -219,6 +219,9 @@ def test_the_cost_of_few_rows_of_many():
     nearest = jc.solvers.ActiveSet(jc.solvers.GaussSeidel(10), contacts=8, stops=4)
     found = jc.report(system, state, jc.Method(contact_solver=nearest)).cost
     assert found.contact == 10 * (2 * 20**2 + 6 * 20)
+    default = jc.report(system, state, jc.Method()).cost
+    assert default.contact_solver == "Newton()"
+    assert default.contact == 12 * 35 * 30
     slow = jc.report(system, state, jc.Method(contact_solver=jc.solvers.InteriorPoint())).cost
     assert slow.contact == 15 * (2 * 35**3 + 6 * 35**2)
 

@@ -25,8 +25,8 @@ from jaxcon.protocols import ContactSolver, Solver, System
 from jaxcon.staging.operations import count
 from jaxcon.system.state import State
 
-NEWTON_OPERATIONS = 120.0
-"""The number of operations a row in an iteration of `Newton`, the elimination included."""
+NEWTON_OPERATIONS = {1: 30.0, 2: 120.0}
+"""The number of operations a row in an iteration of `Newton`, by the number of tangents."""
 
 INTERIOR_POINT_ITERATIONS = 15
 """The assumed number of iterations of `InteriorPoint`."""
@@ -114,7 +114,7 @@ def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | N
     if isinstance(inner, GaussSeidel):  # a sweep is a matrix–vector product
         return inner.sweeps * (2.0 * rows * rows + 6.0 * rows)
     if isinstance(inner, Newton):  # a row changes the inertia of its body
-        return inner.iterations * NEWTON_OPERATIONS * rows
+        return inner.iterations * rows * NEWTON_OPERATIONS[kinds.tangents or 2]
     if isinstance(inner, InteriorPoint):  # an iteration inverts a matrix, and applies it twice
         return INTERIOR_POINT_ITERATIONS * (2.0 * rows**3 + 6.0 * rows * rows)
     return 0.0

@@ -265,8 +265,8 @@ class Problem(NamedTuple):
         change = space.rows_of(dy, dz, state.velocity)
         change = jnp.where(laws.acts, change, 0)
         momentum = space.momentum(dy, dz)
-        first = -_work(bodies, dy) - _work(joints, dz)
-        square = _work(momentum[0], dy) + _work(momentum[1], dz)
+        first = -_work(bodies + joints, dy + dz)
+        square = _work(momentum[0] + momentum[1], dy + dz)
 
         def slope(α: Array) -> Array:
             new = laws.project(state.center, state.velocity + α[None] * change)
@@ -389,7 +389,7 @@ def _less(x: ByBranch, y: ByBranch) -> ByBranch:
 
 
 def _work(forces: ByBranch, velocities: ByBranch) -> Array:
-    """Returns Σ f·v over all bodies or joints, ()."""
+    """Returns Σ f·v over all lanes, ()."""
     works = [
         jnp.sum(x * y, axis=0)
         for own, v in zip(forces, velocities, strict=True)
