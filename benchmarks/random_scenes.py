@@ -10,7 +10,7 @@ at several step sizes in one batch. Each world is checked for:
     energy      gain below a tenth of the largest kinetic energy
     joints      |φ| below a hundredth of the size of the mechanism
     momentum    constant linear momentum of floating mechanisms, to rounding
-    batch       the first world moves alone as in the batch
+    batch       the first world that does not fail moves alone as in the batch
     derivative  forward and reverse mode agree and are finite
 
 The study prints the number of failures of each check and the failing scenes. The exit status is 1
@@ -186,12 +186,15 @@ def check(dim: int, seed: int, derivatives: bool = True, method: jc.Method | Non
     }
     if floats:
         by_world["momentum"] = (_drift(system, momentum[0], initial_momentum[0], scale), 1e-9)
-    single = jax.jit(run)(v[0], h[0])[0]
-    others = {"batch": (float(np.max(np.abs(single.q - final.q[0]))), 1e-6)}
+    failed = ~np.all([x <= bound for x, bound in by_world.values()], axis=0)
+    # rounding decides how a failing world ends, so the first one that does not fail is compared
+    k = int(np.argmin(failed))
+    single = jax.jit(run)(v[k], h[k])[0]
+    alone = np.nan_to_num(np.abs(single.q - final.q[k]), nan=np.inf)
+    others = {"batch": (0.0 if failed[k] else float(np.max(alone)), 1e-6)}
     if derivatives:
         others["derivative"] = (_modes_differ(system, method, state, v[0]), 1e-8)
     wrong = {name: x for name, (x, bound) in others.items() if not x <= bound}
-    failed = ~np.all([x <= bound for x, bound in by_world.values()], axis=0)
     too_long = np.zeros(len(worlds), bool)
     for i, v_start in enumerate(speeds):
         of_start = np.arange(len(worlds)) // len(SIZES) == i

@@ -67,5 +67,5 @@ def begun(system, method, state):
     equations = dynamics.stabilizer.constraint_equations(rows, (), dt)
     problem = dynamics.assemble(equations, *at)
     return dynamics.contact._impulse(
-        dynamics, (state.q, state.v), rows.inequalities, problem, dt, None
+        dynamics, (state.q, state.v), rows.inequalities, problem, dt, None, True
     )

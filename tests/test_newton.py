@@ -10,7 +10,7 @@ import pytest
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize, saddle
 from jaxcon.contact import newton
-from jaxcon.contact.body_space import BodySpace
+from jaxcon.contact.body_space import BodySpace, tree_below
 from jaxcon.contact.bounded import FrictionDisc, RowCounts
 from jaxcon.contact.contact_default import default_contact_solver
 from jaxcon.contact.rows import linearize_bounds
@@ -230,6 +230,42 @@ def test_a_world_with_a_parameter_that_is_no_number_stops_alone():
 def test_it_is_the_default_for_robots_on_the_floor():
     system, state = biped(3)
     assert isinstance(default_contact_solver(system, state.q, state.v), jc.solvers.Newton)
+
+
+def test_joints_that_a_penalty_makes_soft_take_sweeps():
+    system, state = biped(2)
+    penalty = jc.stabilizers.Penalty.from_time(0.01)
+    ends = []
+    for solver in (jc.solvers.Newton(), jc.solvers.GaussSeidel()):
+        method = jc.Method(stabilizer=penalty, contact_solver=solver)
+        start = begun(system, method, state)
+        ends.append(jc.rollout(system, method, start, None, H, 40, record=lambda s, i: None)[0].q)
+    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-12)
+
+
+def test_a_welded_body_and_separate_trees_move_as_by_sweeps():
+    """A joint without freedom, bodies of their own, and a body hinged to the world."""
+    scene = jc.Scene(dim=3)
+    moments = (0.02, 0.03, 0.04)
+    for i, x in enumerate((0.0, 1.0, 2.0, 3.0)):
+        scene.add_body(f"{i}", mass=1.0 + i, inertia=moments, position=(x, 0.0, 0.105))
+        corners = np.array([(x + a, b, 0.0) for a in (-0.1, 0.1) for b in (-0.1, 0.1)])
+        scene.add(jc.PlaneContact(f"floor {i}", jc.WORLD, f"{i}", center=corners, friction=0.4))
+    scene.add_body("load", mass=0.5, inertia=moments, position=(0.0, 0.0, 0.3))
+    scene.add(jc.joints.Fixed("weld", "0", "load"))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "3", point=(3.2, 0.0, 0.1), axis=(0.0, 1.0, 0.0)))
+    system, state = scene.build()
+    ends = []
+    for method in (SWEEPS, NEWTON):
+        v = state.v.at[:5].set(1.0).at[10:15].set(-0.2)
+        start = jc.init(system, method, state.q, v)
+        ends.append(jc.rollout(system, method, start, None, H, 60, record=lambda s, i: None)[0])
+        assert ends[-1].status == 0
+    np.testing.assert_allclose(ends[1].q, ends[0].q, atol=1e-6)
+    equations = linearize(system, state.q, state.v, state.time)
+    bounds = linearize_bounds(system, state.q, state.v, state.time, None, jnp.asarray(H))
+    tree = tree_below(system, equations.jacobian, equations.layout, bounds)
+    assert sorted(x.freedom for x in tree.branches) == [0, 1, 6]
 
 
 def test_contacts_between_limbs_take_sweeps():

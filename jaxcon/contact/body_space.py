@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.armature import Armatures
+from jaxcon.constraints.base import Joints
 from jaxcon.contact.bounded import RowCounts
 from jaxcon.contact.rows import BoundRows
 from jaxcon.core.lanes import Vector, collect, plus, take, times, total
@@ -36,6 +38,7 @@ from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.saddle import Diagonal, Saddle
 from jaxcon.linear.trees import WORLD, Tree, structure, tree_of
 from jaxcon.system.bodies import PlanarRigid, SpatialRigid
+from jaxcon.system.elements import UserElement
 from jaxcon.system.frames import SpatialFrame
 
 if TYPE_CHECKING:
@@ -53,13 +56,19 @@ def tree_below(system: System, joints: Jacobian, layout: RowLayout, rows: BoundR
         rows: the inequality rows.
 
     Returns:
-        The tree; None if there are particles, closed loops, constraints between more than two
-        bodies, or inequality rows between bodies that no joint connects.
+        The tree; None if there are particles, closed loops, constraints other than joints and
+        rotors, inequalities of user functions, or inequality rows between bodies that no joint
+        connects.
     """
     bounds = rows.jacobian
     if system.layout is None or not isinstance(bounds, Jacobian):
         return None
     if len(system.layout.groups) != 1 or layout.loops:
+        return None
+    # the rows of other constraints may depend on more than the relative motion of two bodies
+    if not all(isinstance(x, Joints | Armatures) for x in system.constraints):
+        return None
+    if any(isinstance(x, UserElement) for x in system.bounds):
         return None
     (group,) = system.layout.groups
     if not isinstance(group.kind, SpatialRigid | PlanarRigid):

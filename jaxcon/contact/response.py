@@ -114,7 +114,8 @@ class Response:
             change = self.rate_change(dynamics, bounds, q, v, t)
             bounds = dataclasses.replace(bounds, rate_change=change)
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
-        impulse = self._impulse(dynamics, (q, v), base, system, length, bounds.acts, share)
+        hard = system.compliance is rows.compliance
+        impulse = self._impulse(dynamics, (q, v), base, system, length, bounds.acts, hard, share)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         seen, may = None, jnp.zeros_like(bounds.rate, bool)
         if lands:
@@ -228,7 +229,8 @@ class Response:
         force, target = (jnp.where(lasts, x, 0) for x in (system.force, system.target))
         system = dataclasses.replace(system, force=force, target=target)
         time = jnp.where(lasts, dt, jnp.ones_like(dt))
-        impulse = self._impulse(dynamics, point[:2], rows, system, time, acts)
+        hard = system.compliance is linearized.compliance
+        impulse = self._impulse(dynamics, point[:2], rows, system, time, acts, hard)
         reactions = impulse.react(self.solver, None)
         solution = dynamics.system.complete(impulse.motion(reactions.multipliers))
         return solution, self._judged(impulse, reactions, solution.acceleration)
@@ -241,12 +243,17 @@ class Response:
         system: Saddle,
         dt: Array,
         acts: Array | None,
+        hard: bool,
         share: float = 1.0,
     ) -> ContactProblem:
-        """Returns the contact problem, with factors for several right-hand sides at once."""
+        """Returns the contact problem, with factors for several right-hand sides at once.
+
+        `hard` is False if the stabilizer has made joints compliant, as `Penalty` does. They then do
+        not allow the motions of a tree only.
+        """
         solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
         place = None
-        if isinstance(self.solver, Newton):
+        if isinstance(self.solver, Newton) and hard:
             tree = tree_below(dynamics.system, system.jacobian, system.layout, rows)
             place = None if tree is None else (dynamics.system, *point)
         return ContactProblem.of(
