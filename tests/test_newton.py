@@ -254,6 +254,7 @@ def test_a_welded_body_and_separate_trees_move_as_by_sweeps():
     scene.add_body("load", mass=0.5, inertia=moments, position=(0.0, 0.0, 0.3))
     scene.add(jc.joints.Fixed("weld", "0", "load"))
     scene.add(jc.Revolute("hinge", jc.WORLD, "3", point=(3.2, 0.0, 0.1), axis=(0.0, 1.0, 0.0)))
+    scene.add(jc.joints.Armature("rotor", "hinge", 0.05))
     system, state = scene.build()
     ends = []
     for method in (SWEEPS, NEWTON):
@@ -266,6 +267,18 @@ def test_a_welded_body_and_separate_trees_move_as_by_sweeps():
     bounds = linearize_bounds(system, state.q, state.v, state.time, None, jnp.asarray(H))
     tree = tree_below(system, equations.jacobian, equations.layout, bounds)
     assert sorted(x.freedom for x in tree.branches) == [0, 1, 6]
+
+
+def test_bodies_that_cannot_move_and_steps_of_no_length_have_finite_reactions():
+    scene = jc.Scene(dim=2)
+    scene.add_body("post", mass=1.0, inertia=0.1, position=(0.0, 0.1))
+    scene.add(jc.joints.Fixed("weld", jc.WORLD, "post"))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "post", radius=0.1, friction=0.5))
+    system, state = scene.build()
+    for h in (H, 0.0):
+        new, info = jc.step(system, NEWTON, jc.init(system, NEWTON, state.q, state.v), None, h)
+        assert new.status == 0
+        assert np.isfinite(info.reactions.residual)
 
 
 def test_contacts_between_limbs_take_sweeps():

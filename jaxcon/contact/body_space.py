@@ -21,7 +21,7 @@ from jaxcon.constraints.base import Joints
 from jaxcon.contact.bounded import RowCounts
 from jaxcon.contact.rows import BoundRows
 from jaxcon.core.lanes import Vector, collect, plus, take, times, total
-from jaxcon.core.typing import Array, Lane
+from jaxcon.core.typing import Array, DType, Lane
 from jaxcon.linear.articulated import (
     Articulated,
     ByBranch,
@@ -84,15 +84,23 @@ def tree_below(system: System, joints: Jacobian, layout: RowLayout, rows: BoundR
     if any(len(own) > 1 for start, own in bounds.by_rows() if start >= rows.kinds.normal):
         return None  # a contact between two bodies
     rotors = [own for start, own in joints.by_rows() if start in soft]
-    for own in [*(own for _, own in bounds.by_rows()), *rotors]:
-        if len(own) > 2 or (len(own) == 2 and _joint_places(tree, own) is None):
+    pairs = [own for _, own in bounds.by_rows() if len(own) > 1]
+    for own in [*pairs, *rotors]:
+        if len(own) > 2 or _joint_places(tree, own) is None:
             return None
     return tree
 
 
 def _joint_places(tree: Tree, own: Sequence[JacobianBlock]) -> list[tuple[int, int, int]] | None:
-    """Returns branch, index and side of the joint on which each element of two blocks acts."""
+    """Returns branch, index and side of the joint on which each element acts; None if on none."""
     found = []
+    if len(own) == 1:  # joints with the world
+        for a in own[0].columns.indices:
+            i, k = tree.branch_of(tree.places[a])
+            if tree.branches[i].parents[k] != WORLD or tree.branches[i].row is None:
+                return None
+            found.append((i, k, 0))
+        return found if len({tree.branches[i].freedom for i, *_ in found}) == 1 else None
     for a, b in zip(own[0].columns.indices, own[1].columns.indices, strict=True):
         pa, pb = tree.places[a], tree.places[b]
         if tree.parents[pb] == pa:
@@ -163,7 +171,7 @@ class BodySpace(NamedTuple):
     def of(
         cls, system: System, q: Array, v: Array, saddle: Saddle, rows: BoundRows
     ) -> BodySpace | None:
-        """Returns the equations of a system; None if its bodies form no tree."""
+        """Returns the equations; None if M is not diagonal, or the bodies form no tree."""
         j = rows.jacobian
         if not isinstance(saddle.mass, Diagonal) or not isinstance(j, Jacobian):
             return None
@@ -265,7 +273,7 @@ class BodySpace(NamedTuple):
         return bodies, joints
 
     def stiffened(
-        self, slope: Array, kinds: RowCounts, discs: list
+        self, slope: Array, kinds: RowCounts, discs: list[tuple[Array, Vector]]
     ) -> tuple[list[Block], list[Block]]:
         """Returns M + Jᵀ D J, as blocks of bodies and of joints by branch.
 
@@ -410,7 +418,7 @@ def _sorted_contacts(
     kinds: RowCounts,
     contacts: dict[int, tuple[tuple[int, ...], list[Lane]]],
     shape: tuple[int, ...],
-    dtype: Any,
+    dtype: DType,
 ) -> tuple[list[BodyRows], np.ndarray]:
     """Merges the rows of contacts that have the same kinds of rows, and sorts them by bodies.
 
@@ -471,7 +479,7 @@ def _on_joints(motions: Motions, start: int, own: Sequence[JacobianBlock]) -> Jo
     counts = [b.shape[1] for b in own]
     picks = [(side, e) for e, (*_, side) in enumerate(found)]
     lanes = [
-        picked([b.value[0][c] for b in own], picks, counts, len(motions.shape))
+        picked([b.value[0][c] for b in own], picks, counts, motions.like)
         for c in range(len(own[0].value[0]))
     ]
     w = motions.frames.at(places).pull(Vector(*lanes))
@@ -484,7 +492,7 @@ def _on_joints(motions: Motions, start: int, own: Sequence[JacobianBlock]) -> Jo
     return JointRows(start, joints, pulls)
 
 
-def _to_branches(sums: list, c: Any, joints: tuple[tuple[int, int], ...], lane: Lane) -> None:
+def _to_branches(sums: list, c: int, joints: tuple[tuple[int, int], ...], lane: Lane) -> None:
     """Adds a lane over joints to the sums of their branches."""
     if isinstance(lane, int | float) and lane == 0:
         return

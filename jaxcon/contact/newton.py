@@ -48,11 +48,12 @@ from jaxcon.protocols import ContactSolver
 SHARE = 0.3
 """R at the start, as a share of the inverse mass that a row meets."""
 
-EASE, LEAST = 0.5, 0.1
-"""The factor of R after each full step, and the least product of these factors.
+EASE = 0.5
+"""The factor of R after each full step: a large R decides soon which rows act, a small one then
+needs fewer iterations."""
 
-A large R decides soon which rows act. A small R then needs fewer iterations.
-"""
+LEAST = 0.1
+"""The least product of these factors."""
 
 
 @pytree
@@ -64,8 +65,9 @@ class Newton(checks.Checked, ContactSolver):
     the accuracy of 30 sweeps of `GaussSeidel`, in a fifth of the time for a quadruped of 83 rows.
     A fixed point satisfies Signorini's and Coulomb's laws without relaxation.
 
-    Scenes with closed loops, particles, or contacts between moving bodies are solved by
-    `GaussSeidel()` instead.
+    Scenes with closed loops, particles, constraints other than joints and rotors, compliant joints,
+    user inequalities, or contacts between moving bodies are solved by `GaussSeidel()` instead. So
+    is what an `ActiveSet` around this solver leaves.
 
     Attributes:
         iterations: the largest number of iterations in a step.
@@ -110,7 +112,7 @@ class Newton(checks.Checked, ContactSolver):
 
 
 class Laws(NamedTuple):
-    """The laws of the rows, with all numbers as impulses.
+    """The laws of the rows, for impulses Λ = h λ.
 
     Attributes:
         kinds: numbers of rows by law.
@@ -193,6 +195,10 @@ class Laws(NamedTuple):
         return diagonal, others
 
 
+Momentum = tuple[ByBranch, ByBranch]
+"""M N z of the bodies, and that of rotors on joints, by branch."""
+
+
 class State(NamedTuple):
     """The state of the iteration.
 
@@ -211,7 +217,7 @@ class State(NamedTuple):
     velocity: Array
     center: Array
     impulses: Array
-    momentum: tuple[ByBranch, ByBranch]
+    momentum: Momentum
     going: Array
     left: Array
     ease: Array
@@ -222,7 +228,7 @@ class Problem(NamedTuple):
 
     Attributes:
         space: the equations of motion and the inequality rows.
-        laws: the laws of the rows, with the largest R.
+        laws: the laws of the rows, with R before it is `eased`.
         reach: the inverse inertia that meets each joint velocity, by branch.
         tolerance: the violation at which a world is done [m/s, rad/s].
     """
@@ -232,13 +238,13 @@ class Problem(NamedTuple):
     reach: ByBranch
     tolerance: float
 
-    def forces(self, impulses: Array, momentum: Any) -> tuple[ByBranch, ByBranch]:
+    def forces(self, impulses: Array, momentum: Momentum) -> tuple[ByBranch, ByBranch]:
         """Returns Jᵀ Λ − M N z, minus the derivative of the objective, on bodies and on joints."""
         bodies, joints = self.space.pull(impulses)
         return _less(bodies, momentum[0]), _less(joints, momentum[1])
 
     def judged(
-        self, iteration: Array, velocity: Array, center: Array, momentum: Any, ease: Array
+        self, iteration: Array, velocity: Array, center: Array, momentum: Momentum, ease: Array
     ) -> State:
         """Returns the state with the impulses, and with the violation of the laws.
 
@@ -252,7 +258,7 @@ class Problem(NamedTuple):
         for own, inverse in zip(lacking, self.reach, strict=True):
             for g, x in zip(own, inverse, strict=True):
                 left = jnp.maximum(left, jnp.max(jnp.abs(g * x), axis=0))
-        going = ~(left <= self.tolerance)
+        going = left > self.tolerance  # False for NaN: `ContactProblem.judge` stops such a world
         return State(iteration, velocity, center, impulses, momentum, going, left[None], ease)
 
     def iterate(self, state: State) -> State:
@@ -265,8 +271,8 @@ class Problem(NamedTuple):
         change = space.rows_of(dy, dz, state.velocity)
         change = jnp.where(laws.acts, change, 0)
         momentum = space.momentum(dy, dz)
-        first = -_work(bodies + joints, dy + dz)
-        square = _work(momentum[0] + momentum[1], dy + dz)
+        first = -_work(bodies + joints, dy + dz, change)
+        square = _work(momentum[0] + momentum[1], dy + dz, change)
 
         def slope(α: Array) -> Array:
             new = laws.project(state.center, state.velocity + α[None] * change)
@@ -368,7 +374,8 @@ def multipliers(
     center = jnp.where(movable, h * start, 0)
     z, y = free.solve(*space.pull(center))
     velocity = jnp.where(movable, offset + space.rows_of(y, z, offset), 0)
-    momentum = tuple(map(problem.wide, space.momentum(y, z)))
+    bodies, joints = space.momentum(y, z)
+    momentum = problem.wide(bodies), problem.wide(joints)
     iteration, ones = jnp.zeros((), jnp.int32), jnp.ones_like(offset[:1])
 
     def goes(state: State) -> Array:
@@ -388,20 +395,22 @@ def _less(x: ByBranch, y: ByBranch) -> ByBranch:
     return [[a - b for a, b in zip(p, q, strict=True)] for p, q in zip(x, y, strict=True)]
 
 
-def _work(forces: ByBranch, velocities: ByBranch) -> Array:
-    """Returns Σ f·v over all lanes, ()."""
+def _work(forces: ByBranch, velocities: ByBranch, like: Array) -> Array:
+    """Returns Σ f·v over all lanes, (); Python numbers among them are zeros."""
     works = [
         jnp.sum(x * y, axis=0)
         for own, v in zip(forces, velocities, strict=True)
         for x, y in zip(own, v, strict=True)
         if isinstance(x, jax.Array) and isinstance(y, jax.Array)
     ]
-    return functools.reduce(operator.add, works)
+    return functools.reduce(operator.add, works, jnp.zeros(like.shape[1:], like.dtype))
 
 
-FLAT, TRIES = 0.01, 4
-"""The largest slope at the end of a full step, as a share of that at its start, and the number of
-shorter steps that are tried if the slope is larger."""
+FLAT = 0.01
+"""The largest slope at the end of a full step, as a share of the slope at its start."""
+
+TRIES = 4
+"""The number of shorter steps that are tried if the slope is larger."""
 
 
 def line_search(slope: Callable[[Array], Array], first: Array, going: Array) -> tuple[Array, Array]:

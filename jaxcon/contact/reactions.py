@@ -295,7 +295,7 @@ class ContactProblem:
             λ, mass, movable, _ = newton.multipliers(
                 space, fixed, offset, start, self.acts, self.bare, self.dt, solver
             )
-            scale = self.dt[None] * mass
+            scale = jnp.where(self.dt > 0, self.dt, 1)[None] * mass
 
             def moved(multipliers: Array) -> Array:
                 here = self.velocity(multipliers) + rows.compliance * multipliers - wanted

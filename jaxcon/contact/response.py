@@ -29,7 +29,7 @@ from jaxcon.core.doubled import Doubled, rounded
 from jaxcon.core.lanes import add_rhs_axis
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.linear.saddle import Saddle, Solution
+from jaxcon.linear.saddle import Diagonal, Saddle, Solution
 from jaxcon.protocols import ContactSolver
 
 if TYPE_CHECKING:
@@ -253,7 +253,7 @@ class Response:
         """
         solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
         place = None
-        if isinstance(self.solver, Newton) and hard:
+        if isinstance(self.solver, Newton) and hard and isinstance(system.mass, Diagonal):
             tree = tree_below(dynamics.system, system.jacobian, system.layout, rows)
             place = None if tree is None else (dynamics.system, *point)
         return ContactProblem.of(

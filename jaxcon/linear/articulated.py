@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Matrix, Vector, collect, minus, plus, side_by_side, take, times, total
-from jaxcon.core.typing import Lane
+from jaxcon.core.typing import Array, Lane
 from jaxcon.linear import blocks
 from jaxcon.linear.blocks import Block
 from jaxcon.linear.jacobian import Jacobian
@@ -110,7 +110,8 @@ def complement(rows: Sequence[Vector], size: int) -> list[Vector]:
         length = numerics.norm(Vector(*x))
         sign = jnp.where(jnp.asarray(x[0]) < 0, -1.0, 1.0).astype(length.dtype)
         normal = [plus(x[0], sign * length), *x[1:]]
-        share = 2 / total(times(y, y) for y in normal)
+        # the normal is zero only if a row is: then its world fails, and others must not
+        share = numerics.safe_divide(2.0, total(times(y, y) for y in normal))
         mirrors.append((normal, share))
         for other in columns[j + 1 :]:
             other[j:] = _mirrored(normal, share, other[j:])
@@ -173,7 +174,7 @@ class Motions:
                 here.pull(
                     Vector(
                         *(
-                            picked([b.value[r][c] for b in own], picks, counts, len(shape))
+                            picked([b.value[r][c] for b in own], picks, counts, frames.arm[0])
                             for c in range(size)
                         )
                     )
@@ -183,31 +184,28 @@ class Motions:
             axes.append(complement(rows, size))
         return cls(tree, frames, axes, shape)
 
-    def spread(self, change: ByBranch) -> ByBranch:
-        """Returns the velocities of the bodies for joint velocities q̇, both by branch."""
-        result: ByBranch = []
-        for i, branch in enumerate(self.tree.branches):
-            own = _combined(self.axes[i], change[i]) or [0.0] * self.size
-            if set(branch.parents) != {WORLD}:
-                above = self.gather(result, branch.parents)
-                own = [plus(x, y) for x, y in zip(own, above, strict=True)]
-            result.append(own)
-        return result
+    @property
+    def like(self) -> Array:
+        """A lane over all bodies, with the batch axes and the dtype of all others."""
+        return self.frames.arm[0]
 
     def gather(self, by_branch: ByBranch, places: tuple[int, ...]) -> Lanes:
-        """Returns the lanes of the bodies at given places; zero for `WORLD`."""
+        """Returns the lanes of the bodies at given places; zero for `WORLD`.
+
+        `by_branch` may end before the last branch, if it contains these places.
+        """
         count = len(by_branch)
         picks = [(count, 0) if p == WORLD else self.tree.branch_of(p) for p in places]
         counts = [*self.tree.sizes[:count], 1]
         return [
-            picked([*(x[c] for x in by_branch), 0.0], picks, counts, len(self.shape))
+            picked([*(x[c] for x in by_branch), 0.0], picks, counts, self.like)
             for c in range(len(by_branch[0]))
         ]
 
     def at_joints(self, by_branch: ByBranch, joints: Sequence[tuple[int, int]], k: int) -> Lanes:
         """Returns the first k lanes of chosen joints, given by branch and index."""
         lanes = ([x[c] if c < len(x) else 0.0 for x in by_branch] for c in range(k))
-        return [picked(x, joints, self.tree.sizes, len(self.shape)) for x in lanes]
+        return [picked(x, joints, self.tree.sizes, self.like) for x in lanes]
 
     def to_parents(self, i: int, lanes: Lanes, sums: list[list[list]]) -> None:
         """Adds the lanes of the bodies of branch i to those of their parents, in `sums`."""
@@ -219,10 +217,10 @@ class Motions:
         for branch, members in by_parent.items():
             indices, own = zip(*members, strict=True)
             for c, lane in enumerate(lanes):
-                wide = self._wide(lane, len(self.tree.branches[i].bodies))
+                wide = self.wide(lane, len(self.tree.branches[i].bodies))
                 sums[branch][c].append((indices, take(wide, own)))
 
-    def _wide(self, lane: Lane, count: int) -> Lane:
+    def wide(self, lane: Lane, count: int) -> Lane:
         """Broadcasts a lane to (count, …); the number 0 is left."""
         if isinstance(lane, int | float) and lane == 0:
             return lane
@@ -258,7 +256,7 @@ def widened(x: Lane, count: int, rank: int) -> Lane:
 
 
 def picked(
-    lanes: Sequence[Lane], picks: Sequence[tuple[int, int]], counts: Sequence[int], rank: int
+    lanes: Sequence[Lane], picks: Sequence[tuple[int, int]], counts: Sequence[int], like: Array
 ) -> Lane:
     """Returns chosen entries of several lanes side by side.
 
@@ -266,17 +264,15 @@ def picked(
         lanes: the lanes.
         picks: for each entry of the result, the lane and the index in it.
         counts: the number of elements of each lane.
-        rank: the number of axes of the batch.
+        like: a lane with the batch axes and the dtype of the result.
     """
     if len(set(picks)) == 1:  # broadcast
         picks = picks[:1]
-    wide = [widened(x, n, rank) for x, n in zip(lanes, counts, strict=True)]
+    wide = [widened(x, n, like.ndim - 1) for x, n in zip(lanes, counts, strict=True)]
     chosen = [wide[i] for i, _ in picks]
     numbers = {float(x) for x in chosen if isinstance(x, int | float)}
     if numbers and (len(numbers) > 1 or any(isinstance(x, jax.Array) for x in chosen)):
-        some = next(
-            (x for x in wide if not isinstance(x, int | float)), jnp.zeros((1,) * (1 + rank))
-        )
+        some = next((x for x in wide if isinstance(x, jax.Array)), like[:1])
         wide = [
             jnp.full((n, *some.shape[1:]), x, some.dtype) if isinstance(x, int | float) else x
             for x, n in zip(wide, counts, strict=True)
@@ -434,7 +430,7 @@ class Articulated:
                         )
                         body[r][s] = plus(body[r][s], minus(above[r][s], cross))
             n = len(branch.bodies)
-            ofbodies.append([[motions._wide(x, n) for x in row] for row in body])
+            ofbodies.append([[motions.wide(x, n) for x in row] for row in body])
             ofjoints.append(joint)
         return ofbodies, ofjoints
 

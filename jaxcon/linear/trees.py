@@ -102,7 +102,8 @@ def tree_of(
         components: the number of velocities of a body.
 
     Returns:
-        The tree; None if joints close a loop, act on more than two bodies, or fix too many rows.
+        The tree; None if joints close a loop, act on more than two bodies, or have more rows than a
+        body has velocities.
     """
     edges: dict[int, list[tuple[int, int, int, int]]] = defaultdict(list)
     for start, blocks in joints:
