@@ -94,24 +94,17 @@ def tree_below(system: System, joints: Jacobian, layout: RowLayout, rows: BoundR
 def _joint_places(tree: Tree, own: Sequence[JacobianBlock]) -> list[tuple[int, int, int]] | None:
     """Returns branch, index and side of the joint on which each element acts; None if on none."""
     found = []
-    if len(own) == 1:  # joints with the world
-        for a in own[0].columns.indices:
-            i, k = tree.branch_of(tree.places[a])
-            if tree.branches[i].parents[k] != WORLD or tree.branches[i].row is None:
-                return None
-            found.append((i, k, 0))
-        return found if len({tree.branches[i].freedom for i, *_ in found}) == 1 else None
-    for a, b in zip(own[0].columns.indices, own[1].columns.indices, strict=True):
-        pa, pb = tree.places[a], tree.places[b]
-        if tree.parents[pb] == pa:
-            found.append((*tree.branch_of(pb), 1))
-        elif tree.parents[pa] == pb:
-            found.append((*tree.branch_of(pa), 0))
-        else:
+    for ends in zip(*(block.columns.indices for block in own), strict=True):
+        places = [tree.places[body] for body in ends]
+        above = places[::-1] if len(places) == 2 else [WORLD]
+        side = next((k for k, p in enumerate(places) if tree.parents[p] == above[k]), None)
+        if side is None:
             return None
-    if len({tree.branches[i].freedom for i, *_ in found}) != 1:
-        return None
-    return found
+        branch, index = tree.branch_of(places[side])
+        if tree.branches[branch].row is None:  # a root without a joint
+            return None
+        found.append((branch, index, side))
+    return found if len({tree.branches[i].freedom for i, *_ in found}) == 1 else None
 
 
 @dataclass(frozen=True)

@@ -209,7 +209,6 @@ class State(NamedTuple):
         impulses: Λ, (n,).
         momentum: M N z of the bodies, and that of rotors, by branch.
         going: True in worlds that are not done, ().
-        left: the largest violation of the laws, as a velocity, (1,).
         ease: the factor of R, (1,).
     """
 
@@ -219,7 +218,6 @@ class State(NamedTuple):
     impulses: Array
     momentum: Momentum
     going: Array
-    left: Array
     ease: Array
 
 
@@ -246,7 +244,7 @@ class Problem(NamedTuple):
     def judged(
         self, iteration: Array, velocity: Array, center: Array, momentum: Momentum, ease: Array
     ) -> State:
-        """Returns the state with the impulses, and with the violation of the laws.
+        """Returns the state with its impulses; a world goes on while it violates the laws.
 
         The violation has two parts: R |Λ − Λ̂|, which vanishes at a fixed point, and the velocity
         by which the impulses that the equations of motion lack would change the joints.
@@ -259,7 +257,7 @@ class Problem(NamedTuple):
             for g, x in zip(own, inverse, strict=True):
                 left = jnp.maximum(left, jnp.max(jnp.abs(g * x), axis=0))
         going = left > self.tolerance  # False for NaN: `ContactProblem.judge` stops such a world
-        return State(iteration, velocity, center, impulses, momentum, going, left[None], ease)
+        return State(iteration, velocity, center, impulses, momentum, going, ease)
 
     def iterate(self, state: State) -> State:
         """Returns the state after a step of Newton's method."""
@@ -291,7 +289,6 @@ class Problem(NamedTuple):
         # a world that is done keeps its impulses
         return after._replace(
             impulses=jnp.where(going[None], after.impulses, state.impulses),
-            left=jnp.where(going, after.left, state.left),
             going=after.going & going,
         )
 
@@ -311,13 +308,11 @@ class Found(NamedTuple):
         multipliers: λ, (n,).
         mass: inverse mass g of each row; rows of a contact have their largest, (n,).
         movable: mask of the rows that act and can move, (n,).
-        left: the largest violation of the laws, as a velocity, ().
     """
 
     multipliers: Array
     mass: Array
     movable: Array
-    left: Array
 
 
 def multipliers(
@@ -383,10 +378,10 @@ def multipliers(
 
     first = problem.judged(iteration, velocity, center, momentum, ones)
     last = jax.lax.while_loop(goes, problem.iterate, first)
-    found = Found(numerics.safe_divide(last.impulses, h), mass, movable, last.left[0])
+    found = Found(numerics.safe_divide(last.impulses, h), mass, movable)
     if sorts:
         back = np.argsort(order)
-        found = Found(found.multipliers[back], found.mass[back], found.movable[back], found.left)
+        found = Found(found.multipliers[back], found.mass[back], found.movable[back])
     return found
 
 

@@ -292,7 +292,7 @@ class ContactProblem:
 
         def met(wanted: Array) -> tuple[Array, Array]:
             offset = jax.lax.stop_gradient(free - wanted)
-            λ, mass, movable, _ = newton.multipliers(
+            λ, mass, movable = newton.multipliers(
                 space, fixed, offset, start, self.acts, self.bare, self.dt, solver
             )
             scale = jnp.where(self.dt > 0, self.dt, 1)[None] * mass
