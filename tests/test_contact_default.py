@@ -62,7 +62,7 @@ SCENES = {
     "few": (lambda: grains(EXACT_UP_TO // 2), jc.solvers.InteriorPoint),
     "many": (lambda: grains(EXACT_UP_TO // 2 + 1), jc.solvers.GaussSeidel),
     "tower": (lambda: tower(1.0), jc.solvers.InteriorPoint),
-    "walker": (lambda: walker(True), jc.solvers.GaussSeidel),
+    "walker": (lambda: walker(True), jc.solvers.Newton),
     "feet": (lambda: walker(True, limbs=False), jc.solvers.Newton),
     "apart": (lambda: walker(False), jc.solvers.InteriorPoint),
 }

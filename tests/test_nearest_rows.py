@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
-from jaxcon.contact.reactions import probes
+from jaxcon.contact.bounded import probes
 
 DT = 2e-3
 

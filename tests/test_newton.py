@@ -1,6 +1,7 @@
 """Newton's method for inequality rows of trees of bodies, and its parts."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +11,11 @@ import pytest
 import jaxcon as jc
 from jaxcon.constraints.rows import linearize, saddle
 from jaxcon.contact import newton
+from jaxcon.contact.body_slope import inverses
 from jaxcon.contact.body_space import BodySpace, tree_below
-from jaxcon.contact.bounded import FrictionDisc, RowCounts
+from jaxcon.contact.bordered import Bordered, Directions
+from jaxcon.contact.bounded import FrictionDisc, RowCounts, laws
+from jaxcon.contact.contact_blocks import law_blocks
 from jaxcon.contact.contact_default import default_contact_solver
 from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
@@ -19,12 +23,16 @@ from jaxcon.linear.articulated import Articulated, complement
 
 H = 2e-3
 SWEEPS = jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=400))
-NEWTON = jc.Method(contact_solver=jc.solvers.Newton(iterations=100))
+NEWTON = jc.Method(contact_solver=jc.solvers.Newton(iterations=100, tolerance=1e-12))
 dims = pytest.mark.parametrize("dim", [2, 3])
 
 
-def biped(dim, dtype=jnp.float64):
-    """A trunk on two legs with stops, friction and rotors; feet that roll and slide on a floor."""
+def biped(dim, dtype=jnp.float64, limbs=False):
+    """A trunk on two legs with stops, friction and rotors; feet that roll and slide on a floor.
+
+    With `limbs`, the shins touch each other, too, with friction and rolling, and a rope and a
+    contact without friction connect thighs and trunk.
+    """
 
     def at(x, z):
         return (x, z) if dim == 2 else (x, 0.1 * x, z)
@@ -58,6 +66,15 @@ def biped(dim, dtype=jnp.float64):
         scene.add(foot)
         corners = np.array([at(1.4 * x, z) for z in (0.38, 0.42, 0.46)])
         scene.add(jc.PlaneContact(f"{side} end", jc.WORLD, "trunk", center=corners, friction=0.3))
+    if limbs:
+        between = jc.contacts.CapsuleContact
+        shins = {"radius_a": 0.13, "radius_b": 0.13, "friction": 0.5, "rolling": 1e-3}
+        for end, x in (("a", -0.15), ("b", 0.15)):
+            shins[f"segment_{end}"] = np.array([at(x, z) for z in (0.04, 0.2)])
+        scene.add(between("shins", "left shin", "right shin", **shins))
+        scene.add(between("knees", "left thigh", "right shin", radius_a=0.1, radius_b=0.1))
+        rope = {"point_a": at(-0.15, 0.32), "point_b": at(0.15, 0.32), "length": 0.31}
+        scene.add(jc.contacts.Rope("rope", "left thigh", "right thigh", **rope))
     return scene.build()
 
 
@@ -85,9 +102,10 @@ def space_of(system, state):
 
 
 @dims
-def test_elimination_along_the_joints_is_that_of_dense_algebra(dim):
+@pytest.mark.parametrize("limbs", [False, True])
+def test_elimination_along_the_joints_is_that_of_dense_algebra(dim, limbs):
     """N (Nᵀ (M + Jᵀ D J) N)⁻¹ Nᵀ Jᵀ λ and the inverse mass of each row, for random D and λ."""
-    system, state = biped(dim)
+    system, state = biped(dim, limbs=limbs)
     state = begun(system, SWEEPS, state)
     space, mass, joints, rows, bounds = space_of(system, state)
     _, sizes, basis = np.linalg.svd(joints)
@@ -99,7 +117,14 @@ def test_elimination_along_the_joints_is_that_of_dense_algebra(dim):
         for disc in bounds.kinds.discs
     ]
     stiff = space.stiffened(jnp.asarray(slope[order]), bounds.kinds, none)
-    z, y = Articulated(space.motions, *stiff).solve(*space.pull(jnp.asarray(λ[order])))
+    factors = Articulated(space.motions, *stiff)
+    between = np.ravel(space.between(jnp.zeros(len(rows))))
+    assert between.any() == limbs
+    if limbs:
+        d = jnp.asarray(slope[order])
+        terms = Directions.of(between, bounds.kinds, d, none)
+        factors = Bordered(space, factors, terms, space.pair_rows)
+    z, y = factors.solve(*space.pull(jnp.asarray(λ[order])))
     found = np.empty(len(rows))
     found[order] = np.asarray(space.rows_of(y, z, jnp.zeros(len(rows))))
     whole = basis.T @ (mass + rows.T @ (slope[:, None] * rows)) @ basis
@@ -109,7 +134,10 @@ def test_elimination_along_the_joints_is_that_of_dense_algebra(dim):
     met = np.empty(len(rows))
     met[order] = np.asarray(space.mobility(free, jnp.zeros(len(rows)))[0])
     inverse = basis @ np.linalg.solve(basis.T @ mass @ basis, basis.T)
-    np.testing.assert_allclose(met, np.diag(rows @ inverse @ rows.T), rtol=1e-9, atol=1e-12)
+    exact, pairs = np.diag(rows @ inverse @ rows.T), np.empty(len(rows), bool)
+    pairs[order] = between
+    np.testing.assert_allclose(met[~pairs], exact[~pairs], rtol=1e-9, atol=1e-12)
+    assert (met[pairs] > exact[pairs] / 2).all()  # g ≤ 2 (g₁ + g₂) for rows between two bodies
 
 
 @pytest.mark.parametrize(("rows", "size"), [(1, 3), (2, 3), (3, 6), (5, 6), (6, 6)])
@@ -157,13 +185,79 @@ def test_the_slope_of_the_laws_is_their_derivative():
         np.testing.assert_allclose(matrix, expected, atol=1e-12)
 
 
+def dense(blocks, n):
+    """Returns the matrix of contact blocks, (n, n)."""
+    return np.stack([np.asarray(blocks.apply(x)) for x in jnp.eye(n)], axis=1)
+
+
+def test_blocks_of_contacts_are_those_of_dense_algebra():
+    """A x, Aᵀ x, A⁻¹, A B and the derivatives of the laws, for all kinds of rows."""
+    kinds = RowCounts(2, 2, 4, 2, (FrictionDisc(1, 2, 2), FrictionDisc(1, 2, 1)))
+    n, random = kinds.size, np.random.default_rng(0)
+    scale = np.asarray(kinds.by_contact(jnp.asarray(random.uniform(1, 2, n))))
+    λ = jnp.asarray(random.normal(size=n) + 1)
+    u, live = (
+        jnp.asarray(random.normal(size=n)),
+        (jnp.asarray([-1.0, 0.0]), jnp.asarray([0.5, 2.0])),
+    )
+    live = (*live, tuple(jnp.asarray(random.uniform(0.1, 1, x.count)) for x in kinds.discs))
+    for width in (None, jnp.asarray([0.3])):
+        of_multipliers, of_velocity = law_blocks(kinds, scale, λ, u, live, width)
+        law = functools.partial(laws, kinds, scale, live=live, width=width)
+        jacobians = jax.jacobian(law, (0, 1))(λ, u)
+        e, f = dense(of_multipliers, n), dense(of_velocity, n)
+        np.testing.assert_allclose(e, jacobians[0], atol=1e-12)
+        np.testing.assert_allclose(f, jacobians[1], atol=1e-12)
+        weights = jnp.asarray(kinds.by_contact(jnp.asarray(random.uniform(1, 2, n))))
+        whole = of_multipliers.plus(of_velocity.scaled(weights), 0.1)
+        b = e + f * np.asarray(weights) + 0.1 * np.eye(n)
+        np.testing.assert_allclose(dense(whole, n), b, atol=1e-12)
+        pulled = np.stack([np.asarray(whole.pull(x)) for x in jnp.eye(n)], axis=1)
+        np.testing.assert_allclose(pulled, b.T, atol=1e-12)
+        np.testing.assert_allclose(dense(whole.inverse(), n), np.linalg.inv(b), atol=1e-10)
+        np.testing.assert_allclose(dense(whole @ of_multipliers, n), b @ e, atol=1e-12)
+        acts = random.random(n) < 0.5
+        np.testing.assert_allclose(dense(whole.masked(acts), n), acts[:, None] * b, atol=1e-12)
+
+
 @dims
-def test_a_fall_is_that_of_many_sweeps(dim):
-    """The two legs land, slide, roll and meet their stops.
+@pytest.mark.parametrize("limbs", [False, True])
+def test_the_slope_of_a_solution_is_inverted_along_the_joints(dim, limbs):
+    """(E + F (G + C + R))⁻¹ and its transpose, where contacts stick, slide and are open."""
+    system, state = biped(dim, limbs=limbs)
+    state = begun(system, SWEEPS, state)
+    space, mass, joints, rows, bounds = space_of(system, state)
+    kinds, n, random = bounds.kinds, len(rows), np.random.default_rng(2)
+    _, sizes, basis = np.linalg.svd(joints)
+    basis = basis[np.sum(sizes > 1e-10) :].T
+    g = H * rows @ basis @ np.linalg.solve(basis.T @ mass @ basis, basis.T @ rows.T)
+    scale = np.asarray(kinds.largest(jnp.asarray(np.maximum(np.diag(g), 1e-9))))
+    λ = jnp.asarray(np.where(random.random(n) < 0.3, 0, random.uniform(-1, 2, n)))
+    u = jnp.asarray(0.3 * scale * random.normal(size=n))
+    live = (bounds.lower, bounds.upper, (bounds.friction, *bounds.resistance))
+    compliance = np.where(np.arange(n) < kinds.starts[0], 0.1 * scale, 0)
+    movable = np.diag(g) > 1e-12
+    numbers = jnp.asarray(compliance), jnp.asarray(movable), jnp.asarray(H)
+    down, up = inverses(space, kinds, jnp.asarray(scale), *numbers, live, None, λ, u)
+    e, f = (dense(x, n) for x in law_blocks(kinds, jnp.asarray(scale), λ, u, live, None))
+    f = movable[:, None] * f
+    eps = np.finfo(float).eps
+    slope = e + f @ (g + np.diag(compliance + eps ** (1 / 3) * scale)) + eps**0.75 * np.eye(n)
+    assert np.linalg.matrix_rank(f) > 0.2 * n
+    right = random.normal(size=n)
+    for operator, matrix in ((down, slope), (up, slope.T)):
+        found = np.asarray(operator(jnp.asarray(right)))
+        np.testing.assert_allclose(matrix @ found, right, atol=1e-5 * np.abs(found).max())
+
+
+@dims
+@pytest.mark.parametrize("limbs", [False, True])
+def test_a_fall_is_that_of_many_sweeps(dim, limbs):
+    """The two legs land, slide, roll and meet their stops, and each other with `limbs`.
 
     The two differ by the drift φ of the joints, which the tree of bodies does not see.
     """
-    system, state = biped(dim)
+    system, state = biped(dim, limbs=limbs)
     finals = []
 
     def rolled(s, method, steps):
@@ -178,7 +272,7 @@ def test_a_fall_is_that_of_many_sweeps(dim):
         assert final.status == 0
         finals.append((np.asarray(v), np.asarray(λ)))
     (v, λ), (w, μ) = finals
-    assert (np.abs(λ) > 1e-6).any(axis=0).mean() > 0.4  # stops, joint friction and feet act
+    assert (np.abs(λ) > 1e-6).any(axis=0).mean() > 0.3  # stops, joint friction and feet act
     first = np.flatnonzero(np.abs(λ).max(axis=1))[0]
     np.testing.assert_allclose(w[: first + 20], v[: first + 20], atol=2e-6)
     np.testing.assert_allclose(w, v, atol=1e-4)
@@ -203,8 +297,9 @@ def test_a_batch_moves_like_its_worlds(dim, dtype):
 
 
 @dims
-def test_gradients_are_those_of_many_sweeps(dim):
-    system, state = biped(dim)
+@pytest.mark.parametrize("limbs", [False, True])
+def test_gradients_are_those_of_many_sweeps(dim, limbs):
+    system, state = biped(dim, limbs=limbs)
 
     def loss(scale, method):
         start = begun(system, method, state, speed=1.0)
@@ -281,18 +376,20 @@ def test_bodies_that_cannot_move_and_steps_of_no_length_have_finite_reactions():
         assert np.isfinite(info.reactions.residual)
 
 
-def test_contacts_between_limbs_take_sweeps():
-    """Then the result is that of `GaussSeidel`, whichever of the two is asked for."""
+def test_contacts_between_free_bodies_move_as_by_sweeps():
+    """Three balls in a row collide with friction: no joints, and each contact between two trees."""
     scene = jc.Scene(dim=3)
+    for i in range(3):
+        position = (0.02 * i, 0.0, 0.21 * i)
+        scene.add_body(f"{i}", mass=1.0 + i, inertia=(0.1, 0.1, 0.1), position=position)
     for i in range(2):
-        scene.add_body(f"{i}", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.3 * i))
-    scene.add(
-        jc.contacts.CapsuleContact("touch", "0", "1", radius_a=0.1, radius_b=0.1, friction=0.5)
-    )
+        touch = jc.contacts.CapsuleContact
+        radii = {"radius_a": 0.1, "radius_b": 0.1, "friction": 0.5}
+        scene.add(touch(f"touch {i}", f"{i}", f"{i + 1}", **radii))
     system, state = scene.build()
     ends = []
-    for solver in (jc.solvers.Newton(), jc.solvers.GaussSeidel()):
-        method = jc.Method(contact_solver=solver)
-        start = jc.init(system, method, state.q, state.v.at[8].set(-1.0))
-        ends.append(jc.rollout(system, method, start, None, H, 40, record=lambda s, i: None)[0].q)
-    np.testing.assert_allclose(ends[0], ends[1], rtol=1e-12)
+    for method in (SWEEPS, NEWTON):
+        start = jc.init(system, method, state.q, state.v.at[8].set(-1.0).at[0].set(0.3))
+        ends.append(jc.rollout(system, method, start, None, H, 60, record=lambda s, i: None)[0])
+    assert abs(ends[0].v[6]) > 0.1  # the impact passes through
+    np.testing.assert_allclose(ends[1].v, ends[0].v, atol=1e-6)

@@ -2,7 +2,8 @@
 
 A row that acts on a body and the world changes only the body's own 6×6 block of M + Jᵀ D J. A row
 on the coordinate of a joint changes only the joint's own block. `Articulated` then eliminates along
-the joints, and no matrix of all rows is formed.
+the joints, and no matrix of all rows is formed. Rows between two other bodies enter as a low-rank
+term; see `Bordered`.
 """
 
 from __future__ import annotations
@@ -57,8 +58,7 @@ def tree_below(system: System, joints: Jacobian, layout: RowLayout, rows: BoundR
 
     Returns:
         The tree; None if there are particles, closed loops, constraints other than joints and
-        rotors, inequalities of user functions, or inequality rows between bodies that no joint
-        connects.
+        rotors, inequalities of user functions, or inequality rows on more than two bodies.
     """
     bounds = rows.jacobian
     if system.layout is None or not isinstance(bounds, Jacobian):
@@ -81,13 +81,11 @@ def tree_below(system: System, joints: Jacobian, layout: RowLayout, rows: BoundR
     tree = tree_of(structure(joints), soft, len(group.names), group.kind.n_v)
     if tree is None:
         return None
-    if any(len(own) > 1 for start, own in bounds.by_rows() if start >= rows.kinds.normal):
-        return None  # a contact between two bodies
+    if any(len(own) > 2 for _, own in bounds.by_rows()):
+        return None
     rotors = [own for start, own in joints.by_rows() if start in soft]
-    pairs = [own for _, own in bounds.by_rows() if len(own) > 1]
-    for own in [*pairs, *rotors]:
-        if len(own) > 2 or _joint_places(tree, own) is None:
-            return None
+    if any(len(own) > 2 or _joint_places(tree, own) is None for own in rotors):
+        return None
     return tree
 
 
@@ -125,6 +123,28 @@ class BodyRows:
         """Returns the entries of each kind of row from an array over rows, (n,)."""
         return [x[start : start + len(self.places)] for start in self.starts]
 
+    def of(self, velocities: Array) -> list[tuple[int, Lane]]:
+        """Returns the first row of each kind, and its velocities J v, (element,).
+
+        Args:
+            velocities: the velocities v of all bodies, (lane, body, …).
+        """
+        v = Vector(*_repeated(velocities, self.places))
+        return [(s, pull.dot(v)) for s, pull in zip(self.starts, self.pulls, strict=True)]
+
+
+@dataclass(frozen=True)
+class PairRows:
+    """Inequality rows that act on two bodies each, at any place in the trees.
+
+    Attributes:
+        starts: the first row of each kind; see `BodyRows`.
+        sides: the rows as functions of the velocities of the first and of the second body.
+    """
+
+    starts: tuple[int, ...]
+    sides: tuple[BodyRows, ...]
+
 
 @dataclass(frozen=True)
 class JointRows:
@@ -148,7 +168,7 @@ class BodySpace(NamedTuple):
         motions: the motions that the joints allow.
         inertia: for each branch, the inertias of the bodies.
         rotors: for each branch, the inertias of rotors on joint coordinates, (k, k).
-        on_bodies, on_joints: the inequality rows.
+        on_bodies, on_joints, on_pairs: the inequality rows.
         order: for each row in the order of the solver, its index in the order of the system. The
             solver sorts contacts by bodies.
     """
@@ -158,6 +178,7 @@ class BodySpace(NamedTuple):
     rotors: list[Block]
     on_bodies: list[BodyRows]
     on_joints: list[JointRows]
+    on_pairs: list[PairRows]
     order: np.ndarray
 
     @classmethod
@@ -195,23 +216,26 @@ class BodySpace(NamedTuple):
             for b, start in zip(tree.branches, tree.starts, strict=True)
         ]
         order = np.arange(rows.kinds.size)
-        on_bodies: list[BodyRows] = []
+        groups: list[BodyRows | PairRows] = []
         on_joints: list[JointRows] = []
-        contacts: dict[int, tuple[tuple[int, ...], list[Lane]]] = {}
+        contacts: dict[int, list[Side]] = {}
         for start, own in bounds.by_rows():
-            if len(own) == 2:
+            single = start < rows.kinds.normal
+            if single and len(own) == 2 and _joint_places(tree, own) is not None:
                 on_joints.append(_on_joints(motions, start, own))
                 continue
-            places = tuple(tree.places[b] for b in own[0].columns.indices)
-            pull = frames.at(places).pull(own[0].value[0])
-            lanes = [widened(x, len(places), len(shape)) for x in pull]
-            if start < rows.kinds.normal:
-                on_bodies.append(BodyRows((start,), places, [Vector(*lanes)]))
+            sides: list[Side] = []
+            for block in own:
+                places = tuple(tree.places[b] for b in block.columns.indices)
+                pull = frames.at(places).pull(block.value[0])
+                sides.append((places, [widened(x, len(places), len(shape)) for x in pull]))
+            if single:
+                groups.append(_rows((start,), [(p, [Vector(*x)]) for p, x in sides]))
             else:
-                contacts[start] = places, lanes
+                contacts[start] = sides
         if contacts:
-            groups, order = _sorted_contacts(rows.kinds, contacts, shape, q.dtype)
-            on_bodies += groups
+            sorted_groups, order = _sorted_contacts(rows.kinds, contacts, shape, q.dtype)
+            groups += sorted_groups
         rotors: list[Block] = [[[0.0] * (r + 1) for r in range(b.freedom)] for b in tree.branches]
         holds = saddle.layout.holds
         for start, own in joints.by_rows():
@@ -222,16 +246,33 @@ class BodySpace(NamedTuple):
             weight = 1 / jax.lax.stop_gradient(saddle.compliance[start : start + m])
             row = _on_joints(motions, start, own)
             _add_outer(rotors, row, weight, tree)
-        return cls(motions, inertia, rotors, on_bodies, on_joints, order)
+        on_bodies = [x for x in groups if isinstance(x, BodyRows)]
+        on_pairs = [x for x in groups if isinstance(x, PairRows)]
+        return cls(motions, inertia, rotors, on_bodies, on_joints, on_pairs, order)
+
+    @property
+    def pair_rows(self) -> int:
+        """The number of rows between two bodies."""
+        return sum(len(x.starts) * len(x.sides[0].places) for x in self.on_pairs)
+
+    def between(self, like: Array) -> np.ndarray:
+        """Returns a mask of the rows between two bodies, (n, 1, …), with as many axes as `like`."""
+        mask = np.zeros(len(like), bool)
+        for pair in self.on_pairs:
+            for start in pair.starts:
+                mask[start : start + len(pair.sides[0].places)] = True
+        return mask.reshape(-1, *(1,) * (like.ndim - 1))
 
     def rows_of(self, bodies: ByBranch, joints: ByBranch, like: Array) -> Array:
         """Returns the velocities of all inequality rows, (n,)."""
         parts: list[tuple[int, int, Lane]] = []
         whole = self.stacked(bodies, like)
         for group in self.on_bodies:
-            v = Vector(*_repeated(whole, group.places))
-            for start, pull in zip(group.starts, group.pulls, strict=True):
-                parts.append((start, len(group.places), pull.dot(v)))
+            parts += [(s, len(group.places), x) for s, x in group.of(whole)]
+        for pair in self.on_pairs:
+            first, second = (side.of(whole) for side in pair.sides)
+            for (start, x), (_, y) in zip(first, second, strict=True):
+                parts.append((start, len(pair.sides[0].places), plus(x, y)))
         for row in self.on_joints:
             z = self.motions.at_joints(joints, row.joints, len(row.pulls))
             parts.append((row.start, len(row.joints), total(map(times, row.pulls, z))))
@@ -240,21 +281,8 @@ class BodySpace(NamedTuple):
     def pull(self, multipliers: Array) -> tuple[ByBranch, ByBranch]:
         """Returns the forces on bodies and joints, Jᵀ λ, by branch."""
         tree = self.motions.tree
-        n, size = len(tree.parents), len(self.inertia[0])
-        whole: Any = 0.0
-        for group in self.on_bodies:
-            λ = group.slices(multipliers)
-            lanes = [
-                total(times(x[c], y) for x, y in zip(group.pulls, λ, strict=True))
-                for c in range(size)
-            ]
-            whole = whole + _summed(_stack(lanes, len(group.places), multipliers), group.places, n)
-        bodies: ByBranch = [
-            [0.0] * size
-            if isinstance(whole, float)
-            else [whole[c, start : start + len(b.bodies)] for c in range(size)]
-            for b, start in zip(tree.branches, tree.starts, strict=True)
-        ]
+        sides = [side for pair in self.on_pairs for side in pair.sides]
+        bodies = self._forces([*self.on_bodies, *sides], multipliers)
         sums: list[list[list]] = [[[] for _ in range(b.freedom)] for b in tree.branches]
         for row in self.on_joints:
             λ = multipliers[row.start : row.start + len(row.joints)]
@@ -265,10 +293,33 @@ class BodySpace(NamedTuple):
         ]
         return bodies, joints
 
+    def pull_pairs(self, multipliers: Array) -> ByBranch:
+        """Returns the forces of `on_pairs` on bodies, Jᵀ λ, by branch."""
+        return self._forces([side for x in self.on_pairs for side in x.sides], multipliers)
+
+    def _forces(self, groups: Sequence[BodyRows], multipliers: Array) -> ByBranch:
+        """Returns the forces of some rows on bodies, Jᵀ λ, by branch."""
+        tree = self.motions.tree
+        n, size = len(tree.parents), len(self.inertia[0])
+        whole: Any = 0.0
+        for group in groups:
+            λ = group.slices(multipliers)
+            lanes = [
+                total(times(x[c], y) for x, y in zip(group.pulls, λ, strict=True))
+                for c in range(size)
+            ]
+            whole = whole + _summed(_stack(lanes, len(group.places), multipliers), group.places, n)
+        return [
+            [0.0] * size
+            if isinstance(whole, float)
+            else [whole[c, start : start + len(b.bodies)] for c in range(size)]
+            for b, start in zip(tree.branches, tree.starts, strict=True)
+        ]
+
     def stiffened(
         self, slope: Array, kinds: RowCounts, discs: list[tuple[Array, Vector]]
     ) -> tuple[list[Block], list[Block]]:
-        """Returns M + Jᵀ D J, as blocks of bodies and of joints by branch.
+        """Returns M + Jᵀ D J without `on_pairs`, as blocks of bodies and of joints by branch.
 
         Args:
             slope: the diagonal part of D, (n,).
@@ -334,19 +385,29 @@ class BodySpace(NamedTuple):
         )
 
     def mobility(self, factors: Articulated, like: Array) -> tuple[Array, list[Block]]:
-        """Returns the inverse mass of each row, (n,), and those of the joints."""
+        """Returns the inverse mass of each row, (n,), and those of the joints.
+
+        That of a row between two bodies is the sum of both, as if no joints connected them.
+        """
         ofbodies, ofjoints = factors.mobility()
         size = len(ofbodies[0])
         flat = [[x for row in b for x in row] for b in ofbodies]
         parts: list[tuple[int, int, Lane]] = []
         whole = self.stacked(flat, like)
-        for group in self.on_bodies:
+
+        def met(group: BodyRows) -> list[Lane]:
             lanes = iter(_repeated(whole, group.places))
             block: Block = [list(itertools.islice(lanes, r + 1)) for r in range(size)]
-            for start, pull in zip(group.starts, group.pulls, strict=True):
-                parts.append(
-                    (start, len(group.places), pull.dot(Vector(*symmetric(block, [*pull]))))
-                )
+            return [pull.dot(Vector(*symmetric(block, [*pull]))) for pull in group.pulls]
+
+        for group in self.on_bodies:
+            parts += [
+                (s, len(group.places), x) for s, x in zip(group.starts, met(group), strict=True)
+            ]
+        for pair in self.on_pairs:
+            first, second = pair.sides
+            for s, x, y in zip(pair.starts, met(first), met(second), strict=True):
+                parts.append((s, len(first.places), plus(x, y)))
         for row in self.on_joints:
             k = len(row.pulls)
             inverse = [[x for r in b for x in r] for b in ofjoints]
@@ -407,13 +468,28 @@ def _summed(x: Array, places: tuple[int, ...], n: int) -> Array:
     return jnp.concatenate([zero if y is None else y for y in sums], axis=1)
 
 
+Side = tuple[tuple[int, ...], list[Lane]]
+"""The places of the bodies of rows, and the rows as functions of these bodies' velocities."""
+
+
+def _rows(
+    starts: tuple[int, ...], sides: Sequence[tuple[tuple[int, ...], list[Vector]]]
+) -> BodyRows | PairRows:
+    """Returns rows on one body or two."""
+    each = tuple(BodyRows(starts, places, pulls) for places, pulls in sides)
+    return each[0] if len(each) == 1 else PairRows(starts, each)
+
+
 def _sorted_contacts(
-    kinds: RowCounts,
-    contacts: dict[int, tuple[tuple[int, ...], list[Lane]]],
-    shape: tuple[int, ...],
-    dtype: DType,
-) -> tuple[list[BodyRows], np.ndarray]:
+    kinds: RowCounts, contacts: dict[int, list[Side]], shape: tuple[int, ...], dtype: DType
+) -> tuple[list[BodyRows | PairRows], np.ndarray]:
     """Merges the rows of contacts that have the same kinds of rows, and sorts them by bodies.
+
+    Args:
+        kinds: the numbers of rows by law.
+        contacts: one or two sides of the rows that begin at each row.
+        shape: the shape of the batch.
+        dtype: the dtype of the rows.
 
     Returns:
         The rows, and the order of all rows; see `BodySpace`.
@@ -421,37 +497,44 @@ def _sorted_contacts(
     columns = [(kinds.normal, 0, kinds.contacts)]
     for disc, first in zip(kinds.discs, kinds.starts, strict=False):
         columns += [(first + r * disc.count, disc.first, disc.count) for r in range(disc.rank)]
-    places = np.concatenate([contacts[k][0] for k in sorted(contacts) if k < kinds.starts[0]])
-    size = len(next(iter(contacts.values()))[1])
-    whole: list[list[Lane]] = []
-    for start, _, count in columns:
-        own = [contacts[k][1] for k in sorted(contacts) if start <= k < start + count]
-        counts = [len(contacts[k][0]) for k in sorted(contacts) if start <= k < start + count]
-        whole.append(
-            [
-                jnp.concatenate(
-                    [
-                        jnp.broadcast_to(jnp.asarray(x[c], dtype), (n, *shape))
-                        for x, n in zip(own, counts, strict=True)
-                    ]
-                )
-                for c in range(size)
-            ]
-        )
+    starts = sorted(contacts)
+    ends = {e for _, first, count in columns for e in (first, first + count)}
+    normals = [start for start in starts if start < kinds.starts[0]]
+    for before, start in itertools.pairwise(normals):
+        if len(contacts[before]) != len(contacts[start]):
+            ends.add(start - kinds.normal)
     order, groups = np.arange(kinds.size), []
-    ends = sorted({e for _, first, count in columns for e in (first, first + count)})
-    for low, high in itertools.pairwise(ends):
-        sort = low + np.argsort(places[low:high], kind="stable")
-        starts, pulls = [], []
-        for (start, first, count), lanes in zip(columns, whole, strict=True):
-            if first <= low and high <= first + count:
-                begin = start + low - first
-                order[begin : begin + high - low] = start - first + sort
-                indices = tuple((sort - first).tolist())
-                pulls.append(Vector(*(take(x, indices) for x in lanes)))
-                starts.append(begin)
-        groups.append(BodyRows(tuple(starts), tuple(places[sort].tolist()), pulls))
+    for low, high in itertools.pairwise(sorted(ends)):
+        count = high - low
+
+        def of_rows(begin: int, count: int = count) -> list[list[Side]]:
+            return [contacts[s] for s in starts if begin <= s < begin + count]
+
+        own = of_rows(kinds.normal + low)
+        bodies = [[p for x in own for p in x[k][0]] for k in range(len(own[0]))]
+        sort = np.lexsort(bodies[::-1])
+        begins, pulls = [], [[] for _ in bodies]
+        for start, first, contained in columns:
+            if not (first <= low and high <= first + contained):
+                continue
+            begin = start + low - first
+            order[begin : begin + count] = begin + sort
+            for k, vectors in enumerate(pulls):
+                parts = [x[k] for x in of_rows(begin)]
+                lanes = (
+                    _joined([(x[c], len(p)) for p, x in parts], shape, dtype)
+                    for c in range(len(parts[0][1]))
+                )
+                vectors.append(Vector(*(take(x, tuple(sort.tolist())) for x in lanes)))
+            begins.append(begin)
+        places = [tuple(np.array(x)[sort].tolist()) for x in bodies]
+        groups.append(_rows(tuple(begins), list(zip(places, pulls, strict=True))))
     return groups, order
+
+
+def _joined(parts: list[tuple[Lane, int]], shape: tuple[int, ...], dtype: DType) -> Array:
+    """Returns lanes with the given numbers of elements as one lane."""
+    return jnp.concatenate([jnp.broadcast_to(jnp.asarray(x, dtype), (n, *shape)) for x, n in parts])
 
 
 def _part(x: Lane, start: int, count: int) -> Lane:

@@ -307,6 +307,10 @@ def onto_disc(
     return x * numerics.safe_divide(radius, radius + positive(length - radius, corner))
 
 
+Inverses = tuple[roots.Operator, roots.Operator]
+"""Approximate inverses of a matrix and of its transpose."""
+
+
 def implicit_multipliers(
     problem: Bounded,
     multipliers: Array,
@@ -315,17 +319,16 @@ def implicit_multipliers(
     width: Scalar | None,
 ) -> Array:
     """Returns the solution λ of a problem, made differentiable; see `implicit_solution`."""
-    here = problem.velocity(multipliers)
-    return implicit_solution(
-        problem.kinds,
-        problem.diagonal(),
-        multipliers,
-        here,
-        velocity,
-        live,
-        width,
-        lambda: problem.matrix,
-    )
+    here, kinds, scale = problem.velocity(multipliers), problem.kinds, problem.diagonal()
+
+    def inverses(bounds: Limits, corner: Array | None, u: Array) -> Inverses:
+        slope = law_slope(kinds, scale, multipliers, u, bounds, corner, problem.matrix)
+        inverse = gauss_jordan.inverse(slope)
+        return partial(gauss_jordan.apply, inverse), partial(
+            gauss_jordan.apply, jnp.swapaxes(inverse, 0, 1)
+        )
+
+    return implicit_solution(kinds, scale, multipliers, here, velocity, live, width, inverses)
 
 
 def implicit_solution(
@@ -336,7 +339,7 @@ def implicit_solution(
     velocity: Callable[[Array], Array],
     live: Limits,
     width: Scalar | None,
-    matrix: Callable[[], Array],
+    inverses: Callable[[Limits, Array | None, Array], Inverses],
 ) -> Array:
     """Returns the solution λ, made differentiable by implicit differentiation of the laws.
 
@@ -348,7 +351,9 @@ def implicit_solution(
         velocity: function of λ that returns u − u*, differentiable in its closed-over values.
         live: bounds of the boxes, and the coefficient μ of each disc, differentiable.
         width: width of the smoothed corners of the laws [m/s, rad/s]; None for sharp corners.
-        matrix: function that returns G, (n, n), called only if a derivative is taken.
+        inverses: function that returns approximate inverses of the derivative of the laws by λ, and
+            of its transpose, from constants: `live`, the width (1,), and u − u* of the solution. It
+            is called only if a derivative is taken.
     """
     corner = None if width is None else jnp.asarray(width, scale.dtype)[None]
 
@@ -361,14 +366,10 @@ def implicit_solution(
         u = u if there is None else there + (u - jax.lax.stop_gradient(u))
         return laws(kinds, fixed, x, u, live, smooth)
 
-    def prepared() -> tuple[roots.Operator, roots.Operator]:
+    def prepared() -> Inverses:
         bounds = jax.lax.stop_gradient(live)
         there = jax.lax.stop_gradient(velocity(multipliers)) if here is None else here
-        slope = law_slope(kinds, scale, multipliers, there, bounds, corner, matrix())
-        inverse = gauss_jordan.inverse(slope)
-        return partial(gauss_jordan.apply, inverse), partial(
-            gauss_jordan.apply, jnp.swapaxes(inverse, 0, 1)
-        )
+        return inverses(bounds, jax.lax.stop_gradient(corner), there)
 
     def iterate(_: roots.Operator, x: Array) -> tuple[Array, None]:
         return x, None
@@ -402,3 +403,12 @@ def law_slope(
 
 ROUNDS = 3
 """Rounds of iterative refinement of a derivative, whose matrix is inverted without pivoting."""
+
+
+def probes(like: Array) -> list[Array]:
+    """Returns two fixed vectors (n, …) of random numbers with both signs and sizes from 1 to 2."""
+    random = np.random.default_rng(0)
+    shape = (2, len(like), *(1,) * (like.ndim - 1))
+    return list(
+        jnp.asarray(random.choice([-1, 1], shape) * random.uniform(1, 2, shape), like.dtype)
+    )

@@ -10,12 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxcon.contact import newton
+from jaxcon.contact import body_slope, newton
 from jaxcon.contact.body_space import BodySpace
 from jaxcon.contact.bounces import restitution_gain
-from jaxcon.contact.bounded import Bounded, implicit_multipliers, implicit_solution, laws
+from jaxcon.contact.bounded import (
+    Bounded,
+    Inverses,
+    Limits,
+    implicit_multipliers,
+    implicit_solution,
+    laws,
+    probes,
+)
 from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.newton import Newton
 from jaxcon.contact.rows import BoundRows, Reactions
@@ -301,12 +308,12 @@ class ContactProblem:
                 here = self.velocity(multipliers) + rows.compliance * multipliers - wanted
                 return jnp.where(movable, here, 0)
 
-            def matrix() -> Array:
-                soft = jnp.where(movable[None] & movable[:, None], self.matrix(), 0)
-                return soft + fixed.compliance[None] * gauss_jordan.identity(fixed.rate)
+            def inverses(bounds: Limits, corner: Array | None, u: Array) -> Inverses:
+                numbers = scale, fixed.compliance, movable, self.dt
+                return body_slope.inverses(space, rows.kinds, *numbers, bounds, corner, λ, u)
 
             solution = implicit_solution(
-                rows.kinds, scale, λ, None, moved, live, solver.smoothing, matrix
+                rows.kinds, scale, λ, None, moved, live, solver.smoothing, inverses
             )
             # by the equations of the step, since joints that have drifted apart by φ differ from
             # those of the tree by φ; a program that does not return the residual leaves this out
@@ -398,12 +405,3 @@ class ContactProblem:
         few = 2 * room / jnp.where(gains & grows & (inner > 0), inner, 1)
         many = inner / jnp.where(gains & ~grows, 2 * square, 1)
         return jnp.where(gains, jnp.clip(jnp.where(grows, few, many), 0, 1), 1)
-
-
-def probes(like: Array) -> list[Array]:
-    """Returns two fixed vectors (n, …) of random numbers with both signs and sizes from 1 to 2."""
-    random = np.random.default_rng(0)
-    shape = (2, len(like), *(1,) * (like.ndim - 1))
-    return list(
-        jnp.asarray(random.choice([-1, 1], shape) * random.uniform(1, 2, shape), like.dtype)
-    )

@@ -189,6 +189,28 @@ class Motions:
         """A lane over all bodies, with the batch axes and the dtype of all others."""
         return self.frames.arm[0]
 
+    @property
+    def freedom(self) -> int:
+        """The number of joint velocities."""
+        return sum(len(b.bodies) * b.freedom for b in self.tree.branches)
+
+    def flat(self, joints: ByBranch) -> Array:
+        """Returns lanes over joints as one array, (joint velocity, …)."""
+        shape, dtype = self.shape, self.like.dtype
+        return jnp.concatenate(
+            [
+                jnp.broadcast_to(jnp.asarray(x, dtype), (len(b.bodies), *shape))
+                for b, lanes in zip(self.tree.branches, joints, strict=True)
+                for x in lanes
+            ]
+        )
+
+    def by_branch(self, x: Array) -> ByBranch:
+        """Splits an array (joint velocity, …) to lanes over joints; the inverse of `flat`."""
+        sizes = [len(b.bodies) for b in self.tree.branches for _ in range(b.freedom)]
+        lanes = iter(jax.lax.split(x, sizes))
+        return [list(itertools.islice(lanes, b.freedom)) for b in self.tree.branches]
+
     def gather(self, by_branch: ByBranch, places: tuple[int, ...]) -> Lanes:
         """Returns the lanes of the bodies at given places; zero for `WORLD`.
 
@@ -239,6 +261,17 @@ class Motions:
             ]
             self.to_parents(i, own, sums)
         return result  # type: ignore[return-value]
+
+    def velocities(self, joints: ByBranch) -> ByBranch:
+        """Returns the velocities N q̇ of the bodies for joint velocities q̇, by branch."""
+        moved: ByBranch = []
+        for i, branch in enumerate(self.tree.branches):
+            y = _combined(self.axes[i], joints[i]) or [0.0] * self.size
+            if set(branch.parents) != {WORLD}:
+                above = self.gather(moved, branch.parents)
+                y = [plus(a, b) for a, b in zip(y, above, strict=True)]
+            moved.append(y)
+        return moved
 
 
 def widened(x: Lane, count: int, rank: int) -> Lane:
