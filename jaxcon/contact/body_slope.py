@@ -23,7 +23,7 @@ from jaxcon.core.typing import Array
 from jaxcon.linear.articulated import Articulated
 from jaxcon.linear.roots import Operator
 
-RIDGE = 1 / 3
+RIDGE = 0.4
 """The exponent k of R = ε^k g. A smaller R needs fewer rounds of refinement, but then contacts that
 share their load lose digits to rounding."""
 
@@ -68,20 +68,20 @@ def inverses(
     most = space.pair_rows + kinds.contacts
     back = np.argsort(order)
 
-    def factors(transposed: bool) -> Bordered | Articulated:
-        tree = Articulated(space.motions, *space.stiffened(diagonal, kinds, discs))
-        if not most or not space.motions.freedom:
-            return tree
-        return Bordered(space, tree, directions, most, transposed)
+    tree = Articulated(space.motions, *space.stiffened(diagonal, kinds, discs))
+    solve = solve_transposed = tree.solve
+    if most and space.motions.freedom:
+        factors = Bordered(space, tree, directions, most)
+        solve, solve_transposed = factors.solve, factors.solve_transposed
 
     def down(right: Array) -> Array:
         x = inverse.apply(right[order])
-        z, y = factors(False).solve(*space.pull(h * x))
+        z, y = solve(*space.pull(h * x))
         return (x - slope.apply(space.rows_of(y, z, x)))[back]
 
     def up(right: Array) -> Array:
         r = right[order]
-        z, y = factors(True).solve(*space.pull(h * slope.pull(r)))
+        z, y = solve_transposed(*space.pull(h * slope.pull(r)))
         return inverse.pull(r - space.rows_of(y, z, r))[back]
 
     return down, up

@@ -142,7 +142,6 @@ class Bordered:
         factors: Articulated,
         directions: Directions,
         most: int,
-        transposed: bool = False,
     ) -> None:
         """Computes the terms of the active rows.
 
@@ -151,14 +150,12 @@ class Bordered:
             factors: the factors of T.
             directions: the other terms of D.
             most: the largest number of terms.
-            transposed: True for the factors of Hᵀ.
         """
         self.space, self.factors = space, factors
         motions, weight = space.motions, directions.weight
         symmetric = directions.columns is None
         n, active = len(weight), directions.active()
         numbers = jnp.arange(n, dtype=jnp.int32).reshape(-1, *(1,) * (weight.ndim - 1))
-        at_rest: ByBranch = [[0.0] * motions.size for _ in motions.tree.branches]
 
         def following(row: Array) -> Array:
             return jnp.min(jnp.where(active & (numbers > row[None]), numbers, n), axis=0)
@@ -178,10 +175,7 @@ class Bordered:
                 left = right * jnp.sum(here * weight, axis=0)[None]
             else:
                 left = along(directions.left(here))
-            if transposed:
-                left, right = right, left
-            z = motions.flat(factors.solve(at_rest, motions.by_branch(left))[0])
-            z = _reduced(terms, z)
+            z = _reduced(terms, self._along_joints(left))
             z = z / (1 + jnp.sum(right * z, axis=0))[None]
             new = (
                 jax.lax.dynamic_update_index_in_dim(old, x, terms.number, 0)
@@ -206,18 +200,40 @@ class Bordered:
         change = motions.by_branch(_reduced(self.terms, z))
         return change, motions.velocities(change)
 
+    def solve_transposed(self, forces: ByBranch, joints: ByBranch) -> tuple[ByBranch, ByBranch]:
+        """Returns q̇ = H⁻ᵀ (Nᵀ f + g), and the velocities y of the bodies; see `solve`."""
+        motions = self.space.motions
+        b = motions.flat(motions.gradient(forces, joints))
+        b = _reduced(self.terms, b, transposed=True)
+        change = motions.by_branch(self._along_joints(b))
+        return change, motions.velocities(change)
 
-def _reduced(terms: Terms, x: Array) -> Array:
-    """Returns H⁻¹ b for x = T⁻¹ b, with all terms of H that are known, (joint velocities,)."""
+    def _along_joints(self, force: Array) -> Array:
+        """Returns T⁻¹ g for forces g along the joints, (joint velocities,)."""
+        motions = self.space.motions
+        at_rest: ByBranch = [[0.0] * motions.size for _ in motions.tree.branches]
+        return motions.flat(self.factors.solve(at_rest, motions.by_branch(force))[0])
+
+
+def _reduced(terms: Terms, x: Array, transposed: bool = False) -> Array:
+    """Applies the factors I − s z rᵀ of all known terms to x, (joint velocities,).
+
+    H⁻¹ b is the result for x = T⁻¹ b. H⁻ᵀ b is T⁻¹ x for the result x of the transposed factors, in
+    reverse order, applied to b.
+    """
 
     def goes(s: Any) -> Array:
         return s[0] < terms.number
 
     def less(s: Any) -> Any:
         k, x = s
+        place = terms.number - 1 - k if transposed else k
         right, z = (
-            jax.lax.dynamic_index_in_dim(y, k, 0, keepdims=False) for y in (terms.right, terms.z)
+            jax.lax.dynamic_index_in_dim(y, place, 0, keepdims=False)
+            for y in (terms.right, terms.z)
         )
+        if transposed:
+            right, z = z, right
         return k + 1, x - z * jnp.sum(right * x, axis=0)[None]
 
     return jax.lax.while_loop(goes, less, (jnp.zeros((), jnp.int32), x))[1]

@@ -65,14 +65,15 @@ with further rows, it only takes more iterations."""
 class Newton(checks.Checked, ContactSolver):
     """Newton's method for the velocities of bodies that joints connect to trees.
 
-    Each body has its own stops and contacts, and one elimination along the joints gives an
-    iteration, so its cost is proportional to the number of rows. Four to twelve iterations reach
-    the accuracy of 30 sweeps of `GaussSeidel`, in a fifth of the time for a quadruped of 83 rows.
-    A fixed point satisfies Signorini's and Coulomb's laws without relaxation.
+    A row on one body, or on a joint, changes the inertia of that body or joint only, and one
+    elimination along the joints gives an iteration. Its cost is proportional to the number of rows.
+    A row between two other bodies, such as a contact between limbs, adds a term of rank one while
+    it acts. A fixed point satisfies Signorini's and Coulomb's laws without relaxation. The
+    derivative is that of the laws, with the same elimination.
 
     Scenes with closed loops, particles, constraints other than joints and rotors, compliant joints,
-    user inequalities, or contacts between moving bodies are solved by `GaussSeidel()` instead. So
-    is what an `ActiveSet` around this solver leaves.
+    or user inequalities are solved by `GaussSeidel()` instead. So is what an `ActiveSet` around
+    this solver leaves.
 
     Attributes:
         iterations: the largest number of iterations in a step.

@@ -27,8 +27,6 @@ NOISE, EFFORT = 0.1, 0.1
 """The size of the noise on initial states, and the factor of squared actions in the reward."""
 MOST = 1e6
 """The bound of observations in their units. Gymnasium requires a bound; no episode reaches it."""
-SWEEPS = 30
-"""Gauss–Seidel sweeps over the joint limits and contacts in a step."""
 HINGE = 3
 """The value of a hinge in MuJoCo's enumeration of joint types."""
 
@@ -100,7 +98,7 @@ class HalfCheetah(Environment):
             skip: the number of steps for which an action is held; by default an action takes 50 ms.
             horizon: the number of actions after which an episode is truncated; None for no limit.
             method: integrator, stabilizer and solvers; by default `jc.solvers.Sparse()`, with
-                `jc.solvers.GaussSeidel` for limits and contacts.
+                `jc.solvers.Newton` for limits and contacts.
             dtype: the floating dtype of the scene.
 
         Raises:
@@ -112,9 +110,7 @@ class HalfCheetah(Environment):
         imported = jc.from_mjcf(model, count_turns=True, dtype=dtype)
         h = float(model.opt.timestep if dt is None else dt)
         if method is None:
-            method = jc.Method(
-                solver=jc.solvers.Sparse(), contact_solver=jc.solvers.GaussSeidel(SWEEPS)
-            )
+            method = jc.Method(solver=jc.solvers.Sparse(), contact_solver=jc.solvers.Newton())
         return cls(
             imported.system,
             method,
