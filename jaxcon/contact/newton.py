@@ -368,9 +368,13 @@ def multipliers(
     if space.on_pairs:
         # `mobility` has only a bound for rows between two bodies
         length = jnp.sqrt(bare)
-        tests = [free.solve(*space.pull(numerics.safe_divide(z, length))) for z in probes(length)]
-        moved = (jnp.abs(space.rows_of(y, z, offset)) for z, y in tests)
-        largest = functools.reduce(jnp.maximum, moved)
+
+        def moved(z: Array) -> Array:
+            change, bodies = free.solve(*space.pull(z))
+            return jnp.abs(space.rows_of(bodies, change, z))
+
+        tests = jnp.stack([numerics.safe_divide(z, length) for z in probes(length)])
+        largest = jnp.max(jax.vmap(moved)(tests), axis=0)
         moves = largest > rounding * len(length) ** 0.5 * length
         movable = movable & (moves | ~space.between(offset))
     movable = movable if acts is None else movable & acts
