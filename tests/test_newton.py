@@ -279,9 +279,9 @@ def test_a_fall_is_that_of_many_sweeps(dim, limbs):
 
 
 @dims
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_a_batch_moves_like_its_worlds(dim, dtype):
-    system, state = biped(dim, dtype)
+@pytest.mark.parametrize(("dtype", "limbs"), [(jnp.float32, False), (jnp.float64, True)])
+def test_a_batch_moves_like_its_worlds(dim, dtype, limbs):
+    system, state = biped(dim, dtype, limbs)
     method = jc.Method(contact_solver=jc.solvers.Newton())
     starts = [begun(system, method, state, seed=seed) for seed in range(5)]
 
@@ -374,6 +374,48 @@ def test_bodies_that_cannot_move_and_steps_of_no_length_have_finite_reactions():
         new, info = jc.step(system, NEWTON, jc.init(system, NEWTON, state.q, state.v), None, h)
         assert new.status == 0
         assert np.isfinite(info.reactions.residual)
+
+
+def test_a_bounce_moves_all_bodies_of_a_mechanism():
+    """A foot bounces on the floor, and a hinge carries the impact to another body.
+
+    Neither `Newton` nor an `ActiveSet`, whose second foot is far away, solves for each row alone.
+    """
+    scene = jc.Scene(dim=2)
+    scene.add_body("a", mass=1.0, inertia=0.02, position=(0.0, 0.3))
+    scene.add_body("b", mass=1.0, inertia=0.02, position=(0.3, 0.3))
+    scene.add(jc.Revolute("hinge", "a", "b", point=(0.15, 0.3)))
+    for name, center in (("foot", (0.05, 0.105)), ("far", (0.0, 1.0))):
+        bouncy = {"radius": 0.1, "center": center, "friction": 0.3, "restitution": 0.4}
+        scene.add(jc.PlaneContact(name, jc.WORLD, "a", **bouncy))
+    system, state = scene.build()
+    some = jc.solvers.ActiveSet(jc.solvers.InteriorPoint(), contacts=1)
+    ends = []
+    for method in (SWEEPS, NEWTON, jc.Method(contact_solver=some)):
+        start = jc.init(system, method, state.q, state.v.at[2:4].set(-2.0))
+        ends.append(jc.rollout(system, method, start, None, H, 6, record=lambda s, i: None)[0])
+    assert abs(ends[0].v[5]) > 1  # the impact turns the body that does not touch the floor
+    for end in ends[1:]:
+        np.testing.assert_allclose(end.v, ends[0].v, atol=1e-9)
+
+
+def test_the_rows_of_a_disc_have_one_inverse_mass():
+    """An arm that turns about x cannot move its tip along x, but along the other tangent."""
+    scene = jc.Scene(dim=3)
+    scene.add_body("arm", mass=0.01, inertia=(1e-4, 1e-4, 1e-4), position=(0.0, 0.0, 0.1))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, -0.2, 0.1), axis=(1.0, 0.0, 0.0)))
+    scene.add(jc.joints.Armature("rotor", "hinge", 1e-4))
+    tip = {"center": (0.0, 0.2, 0.0), "friction": 0.5, "rolling": 1e-3}
+    scene.add(jc.PlaneContact("tip", jc.WORLD, "arm", **tip))
+    system, state = scene.build()
+    space, _, _, rows, bounds = space_of(system, state)
+    n, solver = len(rows), NEWTON.contact_solver
+    bare, h = jnp.sum(jnp.asarray(rows) ** 2, axis=1), jnp.asarray(H)
+    none = jnp.zeros(n)
+    _, mass, movable = newton.multipliers(space, bounds, none, none, None, bare, h, solver)
+    assert not movable.all()
+    for disc in bounds.kinds.split(mass).discs:
+        np.testing.assert_array_equal(disc[0], disc[1])
 
 
 def test_contacts_between_free_bodies_move_as_by_sweeps():

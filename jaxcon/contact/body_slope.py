@@ -5,7 +5,8 @@ is h J H⁻¹ Jᵀ, where H are the equations of motion of the bodies. With R > 
 
     (B + F G) x = r   ⟺   x = B⁻¹ r − D u,   u = J y,   (H + h Jᵀ D J) y = h Jᵀ B⁻¹ r,   D = B⁻¹ F.
 
-No matrix of all rows is formed. R makes B invertible; iterative refinement removes its effect.
+No matrix of all rows is formed. R makes B invertible. Each round of iterative refinement reduces
+its effect by R/(R + μ), where μ is the smallest eigenvalue of G other than zero.
 """
 
 from __future__ import annotations
@@ -62,7 +63,10 @@ def inverses(
     ahead = kinds.split((multipliers - velocity / scale)[order])
     inverse, slope = inverse.ordered(order), (inverse @ by_velocity).ordered(order)
     discs, diagonal = _principal(slope, ahead.discs)
-    columns = (h * slope.first).at[: kinds.starts[0]].set(0)
+    columns = slope.first.at[: kinds.starts[0]].set(0)
+    # rounding must not give a contact that sticks a term of its own
+    matters = jnp.abs(columns) > eps**0.5 * jnp.abs(kinds.by_contact(slope.first))
+    columns = h * jnp.where(matters, columns, 0)
     diagonal, discs = h * diagonal, [(h * b, t) for b, t in discs]
     directions = Directions.of(space.between(scale), kinds, diagonal, discs, columns)
     most = space.pair_rows + kinds.contacts

@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcon.contact.parts import mask
 from jaxcon.contact.rows import BoundLayout, BoundRows
@@ -200,7 +199,7 @@ def quotient(x: Array, y: Array) -> Array:
 
 
 def arrive(
-    rows: BoundRows, may: Array, change: Array, lag: float, dt: Array, response: Array | None
+    rows: BoundRows, may: Array, change: Array, lag: float, dt: Array, response: Array
 ) -> Arrivals:
     """Returns the rows that hit within the step, and their times.
 
@@ -211,8 +210,7 @@ def arrive(
         change: rate change h c over the step, (n,), with the forces of the other rows.
         lag: the delay of velocities behind positions, in units of h.
         dt: step size h, () [s].
-        response: derivative ∂a/∂λ, (n_v, n), whose nonzeros show which row changes which velocity;
-            None if unknown.
+        response: derivative ∂a/∂λ, (n_v, n), whose nonzeros show which row changes which velocity.
     """
     speed = -at_start(rows, change, lag)
     fast = may & (speed > 0)
@@ -228,17 +226,11 @@ def arrive(
     closing = speed - change * numerics.safe_divide(τ, dt[None])
     bounces = hits & (closing > SLOW * jnp.abs(change))
     all_hits, all_times = rows.kinds.by_contact(hits), rows.kinds.by_contact(τ)
-    if response is None:
-        # unequal weights, so that the forces of two rows on one body do not cancel
-        weights = (1 + np.arange(len(τ)) / len(τ)).reshape(-1, *(1,) * (τ.ndim - 1))
-        pulls = jnp.where(all_hits, jnp.asarray(weights, τ.dtype), 0)
-        moved, touched = all_hits[None], rows.jacobian.transpose(pulls) != 0
-    else:
-        rounding = ROUNDING * float(jnp.finfo(τ.dtype).eps)
-        size = jnp.max(jnp.abs(response), axis=0, keepdims=True)
-        moved = all_hits[None] & (jnp.abs(response) > rounding * size)
-        touched = jnp.any(moved, axis=1)
-        moved = jnp.where(touched[:, None], moved, all_hits[None])
+    rounding = ROUNDING * float(jnp.finfo(τ.dtype).eps)
+    size = jnp.max(jnp.abs(response), axis=0, keepdims=True)
+    moved = all_hits[None] & (jnp.abs(response) > rounding * size)
+    touched = jnp.any(moved, axis=1)
+    moved = jnp.where(touched[:, None], moved, all_hits[None])
     delays = jnp.where(moved, all_times[None], jnp.inf)
     leads = (moved & (delays == jnp.min(delays, axis=1, keepdims=True))).astype(τ.dtype)
     leads = leads / jnp.maximum(jnp.sum(leads, axis=1, keepdims=True), 1)
@@ -416,7 +408,7 @@ class Impact:
         multipliers, joints: forces λ of inequality rows, (n,), and of equality rows, (n_c,), before
             the impact.
         dt: step size h, () [s].
-        response: derivative ∂a/∂λ, (n_v, n); None if unknown.
+        response: derivative ∂a/∂λ, (n_v, n), or a mask of its nonzeros.
         lag: the delay of velocities behind positions, in units of h. If it is not 0, a body rotates
             once, by the sum of the displacements of the step and of the impact. If it is 0, the
             body rotates by the first, then by the second.
@@ -434,7 +426,7 @@ class Impact:
     multipliers: Array
     joints: Array
     dt: Array
-    response: Array | None
+    response: Array
     lag: float = static(default=0.0)
 
     def arrivals(self) -> Arrivals:

@@ -57,8 +57,8 @@ LEAST = 0.1
 """The least product of these factors."""
 
 TERMS = 24
-"""The largest number of rows between two bodies in Newton's matrix. The solution has all of them:
-with further rows, it only takes more iterations."""
+"""The largest number of rows between two bodies in Newton's matrix. Its steps are too long for
+further rows that act, which converge slowly or not at all; `info.reactions.residual` tells."""
 
 
 @pytree
@@ -68,8 +68,8 @@ class Newton(checks.Checked, ContactSolver):
     A row on one body, or on a joint, changes the inertia of that body or joint only, and one
     elimination along the joints gives an iteration. Its cost is proportional to the number of rows.
     A row between two other bodies, such as a contact between limbs, adds a term of rank one while
-    it acts. A fixed point satisfies Signorini's and Coulomb's laws without relaxation. The
-    derivative is that of the laws, with the same elimination.
+    it acts, and costs an elimination more. A fixed point satisfies Signorini's and Coulomb's laws
+    without relaxation. The derivative is that of the laws, with the same elimination.
 
     Scenes with closed loops, particles, constraints other than joints and rotors, compliant joints,
     or user inequalities are solved by `GaussSeidel()` instead. So is what an `ActiveSet` around
@@ -318,7 +318,8 @@ class Found(NamedTuple):
 
     Attributes:
         multipliers: λ, (n,).
-        mass: inverse mass g of each row; rows of a contact have their largest, (n,).
+        mass: inverse mass g of each row, (n,). Rows of a contact have their largest; 1 if none of
+            them can move.
         movable: mask of the rows that act and can move, (n,).
     """
 
@@ -374,12 +375,13 @@ def multipliers(
             return jnp.abs(space.rows_of(bodies, change, z))
 
         tests = jnp.stack([numerics.safe_divide(z, length) for z in probes(length)])
-        largest = jnp.max(jax.vmap(moved)(tests), axis=0)
-        moves = largest > rounding * len(length) ** 0.5 * length
+        fastest = jnp.max(jax.vmap(moved)(tests), axis=0)
+        moves = fastest > rounding * len(length) ** 0.5 * length
         movable = movable & (moves | ~space.between(offset))
     movable = movable if acts is None else movable & acts
     movable = kinds.under_normals(kinds.split(movable))
-    mass = jnp.where(movable, kinds.largest(jnp.where(movable, mass, 0)), 1)
+    largest = kinds.largest(jnp.where(movable, mass, 0))
+    mass = jnp.where(largest > 0, largest, 1)
     laws = Laws(
         kinds,
         SHARE * mass,

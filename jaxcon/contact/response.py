@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Rows
 from jaxcon.contact import impacts
@@ -23,12 +24,13 @@ from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.newton import Newton
 from jaxcon.contact.parts import ImpactSet, StepPart
 from jaxcon.contact.reactions import ContactProblem
-from jaxcon.contact.rows import BoundRows, Reactions, bound_rows, linearize_bounds
+from jaxcon.contact.rows import BoundRows, Reactions, bound_rows, linearize_bounds, reaches
 from jaxcon.core import notices, numerics, status
 from jaxcon.core.doubled import Doubled, rounded
 from jaxcon.core.lanes import add_rhs_axis
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.saddle import Diagonal, Saddle, Solution
 from jaxcon.protocols import ContactSolver
 
@@ -152,7 +154,7 @@ class Response:
                 joints=solution.multipliers,
                 lag=0.5 if delayed else 0.0,
                 dt=dt,
-                response=impulse.moved(),
+                response=_response(impulse, system),
             )
             if notices.is_observing():
                 arrivals = impact.arrivals()
@@ -309,6 +311,20 @@ def _struck(
     )
     code = lost_impacts(solution.status, lost)
     return solution._replace(multipliers=joints, status=code), reactions
+
+
+def _response(impulse: ContactProblem, system: Saddle) -> Array:
+    """Returns ∂a/∂λ, (n_v, n), or a mask of the entries that may differ from zero."""
+    moved = impulse.moved()
+    if moved is not None:
+        return moved
+    shape, dtype = impulse.start.shape, impulse.start.dtype
+    rows = impulse.rows.jacobian
+    mask = np.ones((shape[0], rows.shape[0]), bool)
+    if isinstance(system.mass, Diagonal) and isinstance(rows, Jacobian):
+        mask = reaches(system.jacobian, rows)
+    mask = jnp.asarray(mask.reshape(*mask.shape, *(1,) * (len(shape) - 1)), dtype)
+    return jnp.broadcast_to(mask, (*mask.shape[:2], *shape[1:]))
 
 
 def lost_impacts(code: Array, lost: Array | None) -> Array:

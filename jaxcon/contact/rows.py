@@ -568,6 +568,26 @@ def has_ends(
     return any(jax.eval_shape(linearize_bounds, system, q, v, t, control, dt).ends)
 
 
+def reaches(jacobian: Jacobian, bounds: Jacobian) -> np.ndarray:
+    """Marks the velocities that the multiplier of each inequality row may change.
+
+    These are all velocities of the islands on which the row acts. An island is a set of velocities
+    that equality rows couple.
+
+    Args:
+        jacobian: the Jacobian of the equality rows, (n_c, n_v); only its structure is read.
+        bounds: the Jacobian of the inequality rows, (n, n_v); only its structure is read.
+
+    Returns:
+        A mask, (n_v, n).
+    """
+    _, of_velocities = islands(jacobian)
+    acts = np.zeros((max(of_velocities, default=-1) + 1, bounds.shape[0]), bool)
+    rows, columns = nonzeros(bounds)
+    acts[of_velocities[columns], rows] = True
+    return acts[of_velocities]
+
+
 def rows_beside_contact(jacobian: Jacobian, bounds: BoundRows, multipliers: Array) -> Array | None:
     """Marks the equality rows in whose island a joint limit or a contact is active.
 

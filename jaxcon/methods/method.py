@@ -71,7 +71,8 @@ class Method:
             cheap. `ActiveSet(…)` solves only a few of many rows, those nearest to becoming active.
             If None, the solver is chosen by the structure of the scene when the step is traced.
             Mechanisms with more than 24 rows that do not touch each other, such as robots on the
-            floor, take `Newton()`, or `GaussSeidel()` if they have closed loops. Other scenes take
+            floor, take `Newton()`, or `GaussSeidel()` if they have closed loops, particles,
+            constraints other than joints and rotors, or user inequalities. Other scenes take
             `InteriorPoint()`. Scenes without inequality constraints compile no contact solver.
         events: `Events(…)`, which splits a step where a stop, rope or contact is hit. If None,
             steps are not split, and impacts are resolved within a step.
