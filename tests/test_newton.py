@@ -272,14 +272,17 @@ def test_a_fall_is_that_of_many_sweeps(dim, limbs):
         assert final.status == 0
         finals.append((np.asarray(v), np.asarray(λ)))
     (v, λ), (w, μ) = finals
-    assert (np.abs(λ) > 1e-6).any(axis=0).mean() > 0.3  # stops, joint friction and feet act
+    # stops, joint friction and feet act; few of the rows between limbs do
+    assert (np.abs(λ) > 1e-6).any(axis=0).mean() > (0.3 if limbs else 0.4)
     first = np.flatnonzero(np.abs(λ).max(axis=1))[0]
     np.testing.assert_allclose(w[: first + 20], v[: first + 20], atol=2e-6)
     np.testing.assert_allclose(w, v, atol=1e-4)
 
 
 @dims
-@pytest.mark.parametrize(("dtype", "limbs"), [(jnp.float32, False), (jnp.float64, True)])
+@pytest.mark.parametrize(
+    ("dtype", "limbs"), [(jnp.float32, False), (jnp.float64, False), (jnp.float64, True)]
+)
 def test_a_batch_moves_like_its_worlds(dim, dtype, limbs):
     system, state = biped(dim, dtype, limbs)
     method = jc.Method(contact_solver=jc.solvers.Newton())

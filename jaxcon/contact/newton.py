@@ -375,8 +375,7 @@ def multipliers(
             return jnp.abs(space.rows_of(bodies, change, z))
 
         tests = jnp.stack([numerics.safe_divide(z, length) for z in probes(length)])
-        fastest = jnp.max(jax.vmap(moved)(tests), axis=0)
-        moves = fastest > rounding * len(length) ** 0.5 * length
+        moves = jnp.max(jax.vmap(moved)(tests), axis=0) > rounding * len(length) ** 0.5 * length
         movable = movable & (moves | ~space.between(offset))
     movable = movable if acts is None else movable & acts
     movable = kinds.under_normals(kinds.split(movable))
