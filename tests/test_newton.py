@@ -12,14 +12,14 @@ import jaxcon as jc
 from jaxcon.constraints.rows import linearize, saddle
 from jaxcon.contact import newton
 from jaxcon.contact.body_slope import inverses
-from jaxcon.contact.body_space import BodySpace, tree_below
+from jaxcon.contact.body_space import BodySpace, tree_below, tree_equations
 from jaxcon.contact.bordered import Bordered, Directions
 from jaxcon.contact.bounded import FrictionDisc, RowCounts, laws
 from jaxcon.contact.contact_blocks import law_blocks
 from jaxcon.contact.contact_default import default_contact_solver
 from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
-from jaxcon.linear.articulated import Articulated, complement
+from jaxcon.linear.articulated import Articulated, Reflections
 
 H = 2e-3
 SWEEPS = jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=400))
@@ -91,8 +91,9 @@ def space_of(system, state):
     rows = linearize(system, q, v, t)
     equations = saddle(system, q, rows, jnp.zeros_like(v), jnp.zeros_like(rows.bias))
     bounds = linearize_bounds(system, q, v, t, None, jnp.asarray(H, q.dtype))
-    space = BodySpace.of(system, q, v, equations, bounds)
-    assert space is not None
+    tree = tree_below(system, equations.jacobian, equations.layout, bounds)
+    assert tree is not None
+    space = BodySpace.of(tree_equations(system, q, v, tree, equations), bounds)
     hard = np.asarray(rows.layout.holds)
     whole = np.asarray(rows.jacobian.dense())
     joints, rotors = whole[hard], whole[~hard]
@@ -130,7 +131,7 @@ def test_elimination_along_the_joints_is_that_of_dense_algebra(dim, limbs):
     whole = basis.T @ (mass + rows.T @ (slope[:, None] * rows)) @ basis
     expected = rows @ basis @ np.linalg.solve(whole, basis.T @ rows.T @ λ)
     np.testing.assert_allclose(found, expected, atol=1e-11 * np.abs(expected).max())
-    free = Articulated(space.motions, space.inertia, space.rotors)
+    free = space.equations.factors
     met = np.empty(len(rows))
     met[order] = np.asarray(space.mobility(free, jnp.zeros(len(rows)))[0])
     inverse = basis @ np.linalg.solve(basis.T @ mass @ basis, basis.T)
@@ -143,7 +144,7 @@ def test_elimination_along_the_joints_is_that_of_dense_algebra(dim, limbs):
 @pytest.mark.parametrize(("rows", "size"), [(1, 3), (2, 3), (3, 6), (5, 6), (6, 6)])
 def test_the_complement_is_orthonormal_and_normal_to_the_rows(rows, size):
     given = np.random.default_rng(rows).normal(size=(rows, size, 4))
-    basis = complement([Vector(*jnp.asarray(x)) for x in given], size)
+    basis = Reflections([Vector(*jnp.asarray(x)) for x in given], size).complement
     columns = np.array([[np.broadcast_to(x, 4) for x in b] for b in basis]).reshape(-1, size, 4)
     assert len(columns) == size - rows
     for w in range(4):

@@ -23,21 +23,12 @@ from jaxcon.contact.bounded import RowCounts
 from jaxcon.contact.rows import BoundRows
 from jaxcon.core.lanes import Vector, collect, plus, take, times, total
 from jaxcon.core.typing import Array, DType, Lane
-from jaxcon.linear.articulated import (
-    Articulated,
-    ByBranch,
-    Frames,
-    Lanes,
-    Motions,
-    picked,
-    symmetric,
-    widened,
-)
+from jaxcon.linear.articulated import Articulated, ByBranch, Lanes, Motions, symmetric, widened
 from jaxcon.linear.blocks import Block
-from jaxcon.linear.jacobian import Block as JacobianBlock
 from jaxcon.linear.jacobian import Jacobian
-from jaxcon.linear.saddle import Diagonal, Saddle
-from jaxcon.linear.trees import WORLD, Tree, structure, tree_of
+from jaxcon.linear.saddle import Saddle
+from jaxcon.linear.tree_equations import JointRows, TreeEquations, add_outer, joint_places
+from jaxcon.linear.trees import Tree, structure, tree_of
 from jaxcon.system.bodies import PlanarRigid, SpatialRigid
 from jaxcon.system.elements import UserElement
 from jaxcon.system.frames import SpatialFrame
@@ -84,25 +75,9 @@ def tree_below(system: System, joints: Jacobian, layout: RowLayout, rows: BoundR
     if any(len(own) > 2 for _, own in bounds.by_rows()):
         return None
     rotors = [own for start, own in joints.by_rows() if start in soft]
-    if any(len(own) > 2 or _joint_places(tree, own) is None for own in rotors):
+    if any(len(own) > 2 or joint_places(tree, own) is None for own in rotors):
         return None
     return tree
-
-
-def _joint_places(tree: Tree, own: Sequence[JacobianBlock]) -> list[tuple[int, int, int]] | None:
-    """Returns branch, index and side of the joint on which each element acts; None if on none."""
-    found = []
-    for ends in zip(*(block.columns.indices for block in own), strict=True):
-        places = [tree.places[body] for body in ends]
-        above = places[::-1] if len(places) == 2 else [WORLD]
-        side = next((k for k, p in enumerate(places) if tree.parents[p] == above[k]), None)
-        if side is None:
-            return None
-        branch, index = tree.branch_of(places[side])
-        if tree.branches[branch].row is None:  # a root without a joint
-            return None
-        found.append((branch, index, side))
-    return found if len({tree.branches[i].freedom for i, *_ in found}) == 1 else None
 
 
 @dataclass(frozen=True)
@@ -146,83 +121,59 @@ class PairRows:
     sides: tuple[BodyRows, ...]
 
 
-@dataclass(frozen=True)
-class JointRows:
-    """Inequality rows on the coordinates of joints.
+def tree_equations(system: System, q: Array, v: Array, tree: Tree, saddle: Saddle) -> TreeEquations:
+    """Returns the factored equations of motion of the trees of a system.
 
-    Attributes:
-        start: the first row.
-        joints: branch and index of the joint of each row.
-        pulls: the rows as functions of the joint's velocities, lanes (row, …).
+    Args:
+        system: the system, of which `tree_below` is the tree.
+        q: positions, (n_q,).
+        v: velocities, (n_v,).
+        tree: the tree.
+        saddle: the saddle system at q.
     """
-
-    start: int
-    joints: tuple[tuple[int, int], ...]
-    pulls: Lanes
+    assert system.layout is not None
+    (group,) = system.layout.groups
+    frame = group.kind.frame(*group.unpack(q, v))
+    rotation = frame.rotation if isinstance(frame, SpatialFrame) else None
+    return TreeEquations.of(tree, frame.position, rotation, group.v, saddle)
 
 
 class BodySpace(NamedTuple):
     """The equations of motion of trees of bodies, and inequality rows, in common coordinates.
 
     Attributes:
-        motions: the motions that the joints allow.
-        inertia: for each branch, the inertias of the bodies.
-        rotors: for each branch, the inertias of rotors on joint coordinates, (k, k).
+        equations: the equations of motion without inequality rows.
         on_bodies, on_joints, on_pairs: the inequality rows.
         order: for each row in the order of the solver, its index in the order of the system. The
             solver sorts contacts by bodies.
     """
 
-    motions: Motions
-    inertia: list[Block]
-    rotors: list[Block]
+    equations: TreeEquations
     on_bodies: list[BodyRows]
     on_joints: list[JointRows]
     on_pairs: list[PairRows]
     order: np.ndarray
 
+    @property
+    def motions(self) -> Motions:
+        """The motions that the joints allow."""
+        return self.equations.motions
+
     @classmethod
-    def of(
-        cls, system: System, q: Array, v: Array, saddle: Saddle, rows: BoundRows
-    ) -> BodySpace | None:
-        """Returns the equations; None if M is not diagonal, or the bodies form no tree."""
-        j = rows.jacobian
-        if not isinstance(saddle.mass, Diagonal) or not isinstance(j, Jacobian):
-            return None
-        tree = tree_below(system, saddle.jacobian, saddle.layout, rows)
-        if tree is None:
-            return None
-        assert system.layout is not None
-        (group,) = system.layout.groups
-        n = len(group.names)
-        members = tuple(b for x in tree.branches for b in x.bodies)
-        shape = q.shape[1:]
-        frame = group.kind.frame(*group.unpack(q, v))
-        roots: list[int] = []
-        for i, p in enumerate(tree.parents):
-            roots.append(i if p == WORLD else roots[p])
-        position = frame.position.map(lambda x: take(x, members))
-        arm = position.map(lambda x: x - take(x, tuple(roots)))
-        rotation = None
-        if isinstance(frame, SpatialFrame):
-            rotation = jax.tree.map(lambda x: take(x, members), frame.rotation)
-        frames = Frames(*jax.lax.stop_gradient((rotation, arm)))
-        mass = Vector.of_rows(saddle.mass.values, group.v, group.kind.n_v, n)
-        whole = frames.inertia(jax.lax.stop_gradient(mass.map(lambda x: take(x, members))))
-        joints, bounds = jax.lax.stop_gradient((saddle.jacobian, j))
-        motions = Motions.of(tree, frames, joints, shape)
-        inertia = [
-            [[_part(x, start, len(b.bodies)) for x in row] for row in whole]
-            for b, start in zip(tree.branches, tree.starts, strict=True)
-        ]
+    def of(cls, equations: TreeEquations, rows: BoundRows) -> BodySpace:
+        """Returns the equations with the inequality rows, of which J is a `Jacobian`."""
+        bounds = jax.lax.stop_gradient(rows.jacobian)
+        assert isinstance(bounds, Jacobian)
+        motions = equations.motions
+        tree, frames, shape, dtype = motions.tree, motions.frames, motions.shape, motions.like.dtype
         order = np.arange(rows.kinds.size)
         groups: list[BodyRows | PairRows] = []
         on_joints: list[JointRows] = []
         contacts: dict[int, list[Side]] = {}
         for start, own in bounds.by_rows():
             single = start < rows.kinds.normal
-            if single and len(own) == 2 and _joint_places(tree, own) is not None:
-                on_joints.append(_on_joints(motions, start, own))
+            if single and len(own) == 2 and joint_places(tree, own) is not None:
+                on_joints.append(JointRows.of(motions, start, own))
                 continue
             sides: list[Side] = []
             for block in own:
@@ -234,21 +185,11 @@ class BodySpace(NamedTuple):
             else:
                 contacts[start] = sides
         if contacts:
-            sorted_groups, order = _sorted_contacts(rows.kinds, contacts, shape, q.dtype)
+            sorted_groups, order = _sorted_contacts(rows.kinds, contacts, shape, dtype)
             groups += sorted_groups
-        rotors: list[Block] = [[[0.0] * (r + 1) for r in range(b.freedom)] for b in tree.branches]
-        holds = saddle.layout.holds
-        for start, own in joints.by_rows():
-            m = own[0].shape[1]
-            if holds[start]:
-                continue
-            assert saddle.compliance is not None
-            weight = 1 / jax.lax.stop_gradient(saddle.compliance[start : start + m])
-            row = _on_joints(motions, start, own)
-            _add_outer(rotors, row, weight, tree)
         on_bodies = [x for x in groups if isinstance(x, BodyRows)]
         on_pairs = [x for x in groups if isinstance(x, PairRows)]
-        return cls(motions, inertia, rotors, on_bodies, on_joints, on_pairs, order)
+        return cls(equations, on_bodies, on_joints, on_pairs, order)
 
     @property
     def pair_rows(self) -> int:
@@ -285,9 +226,7 @@ class BodySpace(NamedTuple):
         bodies = self._forces([*self.on_bodies, *sides], multipliers)
         sums: list[list[list]] = [[[] for _ in range(b.freedom)] for b in tree.branches]
         for row in self.on_joints:
-            λ = multipliers[row.start : row.start + len(row.joints)]
-            for c, x in enumerate(row.pulls):
-                _to_branches(sums, c, row.joints, times(x, λ))
+            row.add_forces(multipliers[row.start : row.start + len(row.joints)], sums)
         joints = [
             [collect(s, len(b.bodies)) for s in x] for b, x in zip(tree.branches, sums, strict=True)
         ]
@@ -300,7 +239,7 @@ class BodySpace(NamedTuple):
     def _forces(self, groups: Sequence[BodyRows], multipliers: Array) -> ByBranch:
         """Returns the forces of some rows on bodies, Jᵀ λ, by branch."""
         tree = self.motions.tree
-        n, size = len(tree.parents), len(self.inertia[0])
+        n, size = len(tree.parents), self.motions.size
         whole: Any = 0.0
         for group in groups:
             λ = group.slices(multipliers)
@@ -327,7 +266,7 @@ class BodySpace(NamedTuple):
             discs: for each disc, the part −b t tᵀ of D: b and t, lanes (contact, …).
         """
         tree = self.motions.tree
-        n, size = len(tree.parents), len(self.inertia[0])
+        n, size = len(tree.parents), self.motions.size
         whole: Any = 0.0
         for group in self.on_bodies:
             m = len(group.places)
@@ -349,7 +288,7 @@ class BodySpace(NamedTuple):
             ]
             whole = whole + _summed(_stack(lanes, m, slope), group.places, n)
         bodies = []
-        for b, start, block in zip(tree.branches, tree.starts, self.inertia, strict=True):
+        for b, start, block in zip(tree.branches, tree.starts, self.equations.inertia, strict=True):
             entries = itertools.count()
             bodies.append(
                 [
@@ -362,9 +301,9 @@ class BodySpace(NamedTuple):
                     for row in block
                 ]
             )
-        joints = [[list(row) for row in block] for block in self.rotors]
+        joints = [[list(row) for row in block] for block in self.equations.rotors]
         for row in self.on_joints:
-            _add_outer(joints, row, slope[row.start : row.start + len(row.joints)], tree)
+            add_outer(joints, row, slope[row.start : row.start + len(row.joints)], tree)
         return bodies, joints
 
     def stacked(self, by_branch: ByBranch, like: Array) -> Array:
@@ -380,8 +319,8 @@ class BodySpace(NamedTuple):
     def momentum(self, bodies: ByBranch, joints: ByBranch) -> tuple[ByBranch, ByBranch]:
         """Returns M y for velocities of bodies and joints."""
         return (
-            [symmetric(m, y) for m, y in zip(self.inertia, bodies, strict=True)],
-            [symmetric(m, z) for m, z in zip(self.rotors, joints, strict=True)],
+            [symmetric(m, y) for m, y in zip(self.equations.inertia, bodies, strict=True)],
+            [symmetric(m, z) for m, z in zip(self.equations.rotors, joints, strict=True)],
         )
 
     def mobility(self, factors: Articulated, like: Array) -> tuple[Array, list[Block]]:
@@ -535,60 +474,3 @@ def _sorted_contacts(
 def _joined(parts: list[tuple[Lane, int]], shape: tuple[int, ...], dtype: DType) -> Array:
     """Returns lanes with the given numbers of elements as one lane."""
     return jnp.concatenate([jnp.broadcast_to(jnp.asarray(x, dtype), (n, *shape)) for x, n in parts])
-
-
-def _part(x: Lane, start: int, count: int) -> Lane:
-    """Returns consecutive entries of a lane."""
-    if isinstance(x, int | float):
-        return x
-    if count == x.shape[0]:
-        return x
-    return jax.lax.slice_in_dim(x, start, start + count)
-
-
-def _on_joints(motions: Motions, start: int, own: Sequence[JacobianBlock]) -> JointRows:
-    """Returns rows of two blocks as functions of joint velocities."""
-    tree = motions.tree
-    found = _joint_places(tree, own)
-    assert found is not None
-    places = tuple(tree.starts[i] + k for i, k, _ in found)
-    counts = [b.shape[1] for b in own]
-    picks = [(side, e) for e, (*_, side) in enumerate(found)]
-    lanes = [
-        picked([b.value[0][c] for b in own], picks, counts, motions.like)
-        for c in range(len(own[0].value[0]))
-    ]
-    w = motions.frames.at(places).pull(Vector(*lanes))
-    joints = tuple((i, k) for i, k, _ in found)
-    freedom = tree.branches[joints[0][0]].freedom
-    pulls = []
-    for c in range(freedom):
-        axes: ByBranch = [list(x[c]) if c < len(x) else [0.0] * len(w) for x in motions.axes]
-        pulls.append(w.dot(Vector(*motions.at_joints(axes, joints, len(w)))))
-    return JointRows(start, joints, pulls)
-
-
-def _to_branches(sums: list, c: int, joints: tuple[tuple[int, int], ...], lane: Lane) -> None:
-    """Adds a lane over joints to the sums of their branches."""
-    if isinstance(lane, int | float) and lane == 0:
-        return
-    lane = widened(lane, len(joints), jnp.ndim(lane) - 1)
-    by_branch: dict[int, list[tuple[int, int]]] = {}
-    for e, (branch, index) in enumerate(joints):
-        by_branch.setdefault(branch, []).append((index, e))
-    for branch, members in by_branch.items():
-        indices, own = zip(*members, strict=True)
-        sums[branch][c].append((indices, take(lane, own)))
-
-
-def _add_outer(blocks: list[Block], row: JointRows, weight: Lane, tree: Tree) -> None:
-    """Adds weight · w wᵀ to the blocks of joints."""
-    k = len(row.pulls)
-    for r in range(k):
-        for s in range(r + 1):
-            sums: list[list[list]] = [[[]] for _ in blocks]
-            _to_branches(sums, 0, row.joints, times(weight, times(row.pulls[r], row.pulls[s])))
-            for i, own in enumerate(sums):
-                if own[0]:
-                    x = collect(own[0], len(tree.branches[i].bodies))
-                    blocks[i][r][s] = plus(blocks[i][r][s], x)

@@ -76,7 +76,8 @@ class Newton(checks.Checked, ContactSolver):
     this solver leaves.
 
     Attributes:
-        iterations: the largest number of iterations in a step.
+        iterations: the largest number of iterations in a step; None for 12 in single precision and
+            30 in double precision.
         tolerance: the violation of the laws at which a world is done [m/s, rad/s]; None for 5e-5 in
             single precision and 1e-8 in double precision. Rounding adds 64 ε |u|, where u is the
             fastest row.
@@ -89,7 +90,7 @@ class Newton(checks.Checked, ContactSolver):
         Carpentier, Le Lidec, Montaut, From Compliant to Rigid Contact Simulation, RSS (2024).
     """
 
-    iterations: int = static(default=12)
+    iterations: int | None = static(default=None)
     tolerance: float | None = static(default=None)
     warm: bool = static(default=True)  # type: ignore[override]
     smoothing: Any = None
@@ -99,19 +100,26 @@ class Newton(checks.Checked, ContactSolver):
         """Checks the numbers.
 
         Raises:
-            ValueError: `iterations` is not a positive integer, `warm` is not a bool, `tolerance` is
+            ValueError: `iterations` is not a positive integer or None, `warm` is not a bool, `tolerance` is
                 not positive, or `smoothing` is negative.
         """
-        checks.count("Newton", "iterations", self.iterations)
+        if self.iterations is not None:
+            checks.count("Newton", "iterations", self.iterations)
         checks.flag("Newton", "warm", self.warm)
         checks.check("Newton", "tolerance", self.tolerance, (), above=0, optional=True)
         checks.check("Newton", "smoothing", self.smoothing, (), least=0, optional=True)
+
+    def most(self, dtype: DType) -> int:
+        """Returns the largest number of iterations in a step."""
+        if self.iterations is not None:
+            return self.iterations
+        return 12 if jnp.finfo(dtype).bits <= 32 else 30
 
     def reached(self, dtype: DType) -> float:
         """Returns the violation at which a world is done [m/s, rad/s]."""
         if self.tolerance is not None:
             return self.tolerance
-        return 5e-5 if jnp.finfo(dtype).eps > 1e-10 else 1e-8
+        return 5e-5 if jnp.finfo(dtype).bits <= 32 else 1e-8
 
     def solve(self, problem: Bounded, start: Array) -> Array:
         """Returns the multipliers λ, (n,), of a problem whose bodies form no tree, by sweeps."""
@@ -361,7 +369,7 @@ def multipliers(
         )
         offset, start, bare, compliance = (x[order] for x in (offset, start, bare, compliance))
         acts = None if acts is None else acts[order]
-    free = Articulated(space.motions, space.inertia, space.rotors)
+    free = space.equations.factors
     mass, of_joints = space.mobility(free, offset)
     # the joints may make a row immovable, up to rounding
     rounding = 64 * float(jnp.finfo(offset.dtype).eps)
@@ -400,9 +408,10 @@ def multipliers(
     bodies, joints = space.momentum(y, z)
     momentum = problem.wide(bodies), problem.wide(joints)
     iteration, ones = jnp.zeros((), jnp.int32), jnp.ones_like(offset[:1])
+    most = solver.most(offset.dtype)
 
     def goes(state: State) -> Array:
-        return (state.iteration < solver.iterations) & somewhere(state.going)
+        return (state.iteration < most) & somewhere(state.going)
 
     first = problem.judged(iteration, velocity, center, momentum, ones)
     last = jax.lax.while_loop(goes, problem.iterate, first)

@@ -28,13 +28,13 @@ from jaxcon.contact.newton import Newton
 from jaxcon.contact.rows import BoundRows, Reactions
 from jaxcon.core import numerics
 from jaxcon.core.jaxprs import each
-from jaxcon.core.lanes import add_rhs_axis
 from jaxcon.core.status import Status
 from jaxcon.core.typing import Array
 from jaxcon.linear import gauss_jordan
 from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.proximal import own_diagonal
 from jaxcon.linear.saddle import Factored, Saddle, Solution
+from jaxcon.linear.tree_equations import TreeEquations
 
 if TYPE_CHECKING:
     from jaxcon.protocols import ContactSolver
@@ -66,7 +66,8 @@ class ContactProblem:
             if not computed.
         share: factor s of J̇_b v: ½ if the velocities at the end of a step belong to its middle,
             else 1.
-        place: the system, q and v if Newton's method for trees of bodies solves the problem.
+        equations: the equations of motion of the trees of bodies if Newton's method solves the
+            problem; None otherwise.
     """
 
     rows: BoundRows
@@ -79,39 +80,38 @@ class ContactProblem:
     acts: Any = None
     answers: Array | None = None
     share: float = 1.0
-    place: Any = None
+    equations: TreeEquations | None = None
 
     @classmethod
     def of(
         cls,
         rows: BoundRows,
-        factor: Callable[[Saddle], Factored],
+        solve: Factored,
         saddle: Saddle,
         dt: Array,
         acts: Array | None = None,
         sifts: bool = False,
         share: float = 1.0,
-        place: Any = None,
+        equations: TreeEquations | None = None,
     ) -> ContactProblem:
         """Returns the contact problem of a step, from the factors of its saddle system.
 
         Args:
             rows: inequality rows.
-            factor: function that factors a saddle system with an axis of right-hand sides; returns
-                the solver of f and b.
+            solve: solver of f and b, for many right-hand sides; see `add_rhs_axis`.
             saddle: saddle system of the step, with M, f and the equality rows.
             dt: step size h, () [s].
             acts: mask of the active rows, (n,); None for all.
             sifts: True to make immovable rows inactive, which `nearest` needs.
             share: factor s of J̇_b v in u.
-            place: the system, q and v if Newton's method for trees of bodies solves the problem;
-                None otherwise.
+            equations: the equations of motion of the trees of bodies if Newton's method solves the
+                problem; None otherwise.
         """
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
-        solve = factor(add_rhs_axis(saddle, saddle.force.ndim - 1))
         start = 0 * saddle.force
-        problem = cls(rows, solve, saddle, saddle.target, dt, start, bare, acts, None, share, place)
-        if place is not None:
+        target = saddle.target
+        problem = cls(rows, solve, saddle, target, dt, start, bare, acts, None, share, equations)
+        if equations is not None:
             first = problem.alone(saddle.force, saddle.target).acceleration
             return dataclasses.replace(problem, start=jax.lax.stop_gradient(first))._facing()
         return (problem.without_immovable_rows() if sifts else problem._begun())._facing()
@@ -258,8 +258,8 @@ class ContactProblem:
         if isinstance(solver, ActiveSet):
             some = solver.leaves_out(self.rows.kinds)
             return self.nearest(solver, guess) if some else self.react(solver.solver, guess)
-        if isinstance(solver, Newton) and self.place is not None:
-            return self.react_in_bodies(solver, guess)
+        if isinstance(solver, Newton) and self.equations is not None:
+            return self.react_in_bodies(solver, guess, self.equations)
         rows = self.rows
         matrix = self.matrix()
         movable = self.movable(matrix)
@@ -287,12 +287,12 @@ class ContactProblem:
 
         return self._with_restitution(met)
 
-    def react_in_bodies(self, solver: Newton, guess: Array | None) -> Reactions:
+    def react_in_bodies(
+        self, solver: Newton, guess: Array | None, equations: TreeEquations
+    ) -> Reactions:
         """Solves for λ by Newton's method for the velocities of the bodies."""
         rows, free = self.rows, self.end_velocity(self.start)
-        system, q, v = self.place
-        space = BodySpace.of(system, q, v, self.saddle, rows)
-        assert space is not None
+        space = BodySpace.of(equations, rows)
         start = jnp.zeros_like(free) if guess is None else jax.lax.stop_gradient(guess)
         fixed = jax.lax.stop_gradient(rows)
         live = (rows.lower, rows.upper, (rows.friction, *rows.resistance))

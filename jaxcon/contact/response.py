@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxcon.constraints.rows import Rows
 from jaxcon.contact import impacts
-from jaxcon.contact.body_space import tree_below
+from jaxcon.contact.body_space import tree_below, tree_equations
 from jaxcon.contact.limits import OneSided
 from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.newton import Newton
@@ -31,8 +31,10 @@ from jaxcon.core.lanes import add_rhs_axis
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.linear.jacobian import Jacobian
+from jaxcon.linear.proximal import RankSafe
 from jaxcon.linear.saddle import Diagonal, Saddle, Solution
-from jaxcon.protocols import ContactSolver
+from jaxcon.linear.sparse import Sparse
+from jaxcon.protocols import ContactSolver, Solver
 
 if TYPE_CHECKING:
     from jaxcon.step import Dynamics
@@ -253,13 +255,18 @@ class Response:
         `hard` is False if the stabilizer has made joints compliant, as `Penalty` does. They then do
         not allow the motions of a tree only.
         """
-        solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
-        place = None
+        equations = None
         if isinstance(self.solver, Newton) and hard and isinstance(system.mass, Diagonal):
             tree = tree_below(dynamics.system, system.jacobian, system.layout, rows)
-            place = None if tree is None else (dynamics.system, *point)
+            if tree is not None:
+                equations = tree_equations(dynamics.system, *point, tree, system)
+        if equations is not None and _is_plain(dynamics.solver) and system.target.size:
+            solve = equations.solver(system)
+        else:
+            solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
+            solve = solver.factor(add_rhs_axis(system, system.force.ndim - 1))
         return ContactProblem.of(
-            rows, solver.factor, system, dt, acts, self._leaves_out(rows), share, place
+            rows, solve, system, dt, acts, self._leaves_out(rows), share, equations
         )
 
     def _judged(
@@ -274,6 +281,13 @@ class Response:
     def _leaves_out(self, rows: BoundRows) -> bool:
         """Returns True if the solver leaves rows out."""
         return isinstance(self.solver, ActiveSet) and self.solver.leaves_out(rows.kinds)
+
+
+def _is_plain(solver: Solver) -> bool:
+    """Returns True if a solver has no options that change the solution of a tree of joints."""
+    if isinstance(solver, RankSafe):
+        return not solver.always and _is_plain(solver.solver)
+    return isinstance(solver, Sparse) and solver.tikhonov is None
 
 
 def _rows_at(dynamics: Dynamics, q: Array, v: Array, t: Doubled | Array) -> BoundRows:

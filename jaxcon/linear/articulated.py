@@ -24,6 +24,7 @@ from jaxcon.core.lanes import Matrix, Vector, collect, minus, plus, side_by_side
 from jaxcon.core.typing import Array, Lane
 from jaxcon.linear import blocks
 from jaxcon.linear.blocks import Block
+from jaxcon.linear.jacobian import Block as JacobianBlock
 from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.trees import WORLD, Tree
 
@@ -64,6 +65,20 @@ class Frames:
         linear = Vector(*row[:3])
         return Vector(*(self.rotation @ Vector(*row[3:]) + self.arm.cross(linear)), *linear)
 
+    def push(self, y: Vector) -> Vector:
+        """Returns velocities of centers and body axes for velocities in common coordinates.
+
+        This is the transpose of `pull`.
+        """
+        if self.rotation is None:
+            turning, linear = y[0], Vector(*y[1:])
+            x, z = self.arm
+            return Vector(
+                minus(linear[0], times(turning, z)), plus(linear[1], times(turning, x)), turning
+            )
+        turning, linear = Vector(*y[:3]), Vector(*y[3:])
+        return Vector(*(linear + turning.cross(self.arm)), *(self.rotation.T @ turning))
+
     def inertia(self, mass: Vector) -> Block:
         """Returns the lower triangle of the inertia in common coordinates.
 
@@ -93,41 +108,145 @@ class Frames:
         return block
 
 
-def complement(rows: Sequence[Vector], size: int) -> list[Vector]:
-    """Returns an orthonormal basis of the vectors normal to all rows, by Householder reflections.
+class Reflections:
+    """Householder's factorization Wᵀ = Q R of independent rows W; Q is a product of reflections.
 
-    Args:
-        rows: independent vectors with `size` components each.
-        size: the number of components.
+    The first columns of Q span the rows. The others, `complement`, are normal to all of them.
+
+    Attributes:
+        given: the rows.
+        complement: an orthonormal basis of the vectors normal to all rows.
+        dependent: mask of the worlds in which a row depends on the rows before it, (…), up to
+            rounding; None if there are no rows.
 
     References:
         Golub, Van Loan, Matrix Computations (2013), section 5.2.
     """
-    columns = [list(row) for row in rows]
-    mirrors: list[tuple[Lanes, Lane]] = []
-    for j, column in enumerate(columns):
-        x = column[j:]
-        length = numerics.norm(Vector(*x))
-        sign = jnp.where(jnp.asarray(x[0]) < 0, -1.0, 1.0).astype(length.dtype)
-        normal = [plus(x[0], sign * length), *x[1:]]
-        # the normal is zero only if a row is: then its world fails, and others must not
-        share = numerics.safe_divide(2.0, total(times(y, y) for y in normal))
-        mirrors.append((normal, share))
-        for other in columns[j + 1 :]:
-            other[j:] = _mirrored(normal, share, other[j:])
-    basis = []
-    for c in range(len(rows), size):
-        vector: Lanes = [1.0 if i == c else 0.0 for i in range(size)]
-        for j, (normal, share) in reversed(list(enumerate(mirrors))):
-            vector[j:] = _mirrored(normal, share, vector[j:])
-        basis.append(Vector(*vector))
-    return basis
+
+    def __init__(self, rows: Sequence[Vector], size: int) -> None:
+        """Factors the rows.
+
+        Args:
+            rows: vectors with `size` components each, at most `size` of them.
+            size: the number of components.
+        """
+        self.given = rows
+        self._columns = [list(row) for row in rows]  # above the diagonal: R
+        self._mirrors: list[tuple[Lanes, Lane]] = []
+        self._inverses: list[Array] = []  # 1/R_jj
+        self.dependent: Array | None = None
+        for j, column in enumerate(self._columns):
+            x = column[j:]
+            length = numerics.norm(Vector(*x))
+            least = size * float(jnp.finfo(length.dtype).eps)
+            dependent = length * length <= least * rows[j].dot(rows[j])
+            self.dependent = dependent if j == 0 else self.dependent | dependent
+            sign = jnp.where(jnp.asarray(x[0]) < 0, -1.0, 1.0).astype(length.dtype)
+            normal = [plus(x[0], sign * length), *x[1:]]
+            # the normal is zero only if a row is: then its world fails, and others must not
+            share = numerics.safe_divide(2.0, total(times(y, y) for y in normal))
+            self._mirrors.append((normal, share))
+            self._inverses.append(numerics.safe_divide(-sign, length))
+            for other in self._columns[j + 1 :]:
+                other[j:] = _mirrored(normal, share, other[j:])
+        units = range(len(rows), size)
+        self.complement = [
+            Vector(*self._reflected([1.0 if i == c else 0.0 for i in range(size)])) for c in units
+        ]
+        self._rest = size - len(rows)
+
+    def least(self, right: Sequence[Lane]) -> Vector:
+        """Returns the shortest x with W x = b, for b, (row,)."""
+        z: Lanes = []
+        for j, (b, inverse) in enumerate(zip(right, self._inverses, strict=True)):
+            known = total(times(self._columns[j][i], z[i]) for i in range(j))
+            z.append(times(minus(b, known), inverse))
+        return Vector(*self._reflected([*z, *(0.0,) * self._rest]))
+
+    def coefficients(self, x: Vector) -> Lanes:
+        """Returns the coefficients λ of the rows in x, with Wᵀ λ ≈ x."""
+        y = [*x]
+        for j, (normal, share) in enumerate(self._mirrors):
+            y[j:] = _mirrored(normal, share, y[j:])
+        count = len(self._mirrors)
+        λ: Lanes = [0.0] * count
+        for j in reversed(range(count)):
+            known = total(times(self._columns[k][j], λ[k]) for k in range(j + 1, count))
+            λ[j] = times(minus(y[j], known), self._inverses[j])
+        return λ
+
+    def _reflected(self, x: Lanes) -> Lanes:
+        """Returns Q x."""
+        for j, (normal, share) in reversed(list(enumerate(self._mirrors))):
+            x[j:] = _mirrored(normal, share, x[j:])
+        return x
 
 
 def _mirrored(normal: Lanes, share: Lane, x: Lanes) -> Lanes:
     """Returns x − share (normal·x) normal."""
     along = times(share, total(map(times, normal, x)))
     return [minus(y, times(along, n)) for y, n in zip(x, normal, strict=True)]
+
+
+@dataclass(frozen=True)
+class JointGroup:
+    """Joints of one class, whose rows hold the velocity of a child relative to its parent.
+
+    Attributes:
+        start: their first row in J.
+        children: the place of the child of each joint.
+        rows: the rows in common coordinates, as functions of the child's velocity.
+    """
+
+    start: int
+    children: tuple[int, ...]
+    rows: Reflections
+
+    @classmethod
+    def all_of(cls, tree: Tree, frames: Frames, joints: Jacobian) -> list[JointGroup]:
+        """Returns the joints of a tree, from the Jacobian of the equality rows."""
+        members: dict[int, dict[int, int]] = {}
+        for branch in tree.branches:
+            if branch.row is not None:
+                own = zip(branch.elements, branch.bodies, strict=True)
+                members.setdefault(branch.row, {}).update(own)
+        groups = []
+        for start, own in joints.by_rows():
+            if start not in members:  # a rotor
+                continue
+            children = tuple(tree.places[members[start][e]] for e in range(len(members[start])))
+            rows = rows_at(tree, frames, own, children)
+            groups.append(cls(start, children, Reflections(rows, len(rows[0]))))
+        return groups
+
+
+def rows_at(
+    tree: Tree, frames: Frames, own: Sequence[JacobianBlock], places: tuple[int, ...]
+) -> list[Vector]:
+    """Returns rows of J as functions of the velocity of one of their bodies, in common coordinates.
+
+    Args:
+        tree: the tree of the bodies.
+        frames: the bodies.
+        own: the blocks of the rows, one for each of their bodies.
+        places: the place of the body, for each element; it may be on different sides.
+    """
+    picks = [
+        (next(i for i, b in enumerate(own) if tree.places[b.columns.indices[e]] == place), e)
+        for e, place in enumerate(places)
+    ]
+    counts, here = [b.shape[1] for b in own], frames.at(places)
+    return [
+        here.pull(
+            Vector(
+                *(
+                    picked([b.value[r][c] for b in own], picks, counts, frames.arm[0])
+                    for c in range(len(row))
+                )
+            )
+        )
+        for r, row in enumerate(own[0].value)
+    ]
 
 
 @dataclass(frozen=True)
@@ -152,36 +271,19 @@ class Motions:
         return 6 if len(self.frames.arm) == 3 else 3
 
     @classmethod
-    def of(cls, tree: Tree, frames: Frames, joints: Jacobian, shape: tuple[int, ...]) -> Motions:
-        """Returns the motions, from the Jacobian of the equality rows."""
-        groups = dict(joints.by_rows())
+    def of(
+        cls, tree: Tree, frames: Frames, joints: Sequence[JointGroup], shape: tuple[int, ...]
+    ) -> Motions:
+        """Returns the motions that joints allow; bodies without a joint move freely."""
+        groups = {group.start: group for group in joints}
         axes, size = [], 3 if frames.rotation is None else 6
-        for branch, start in zip(tree.branches, tree.starts, strict=True):
+        for branch in tree.branches:
             if branch.row is None:
                 unit = [[1.0 if i == c else 0.0 for i in range(size)] for c in range(size)]
                 axes.append([Vector(*x) for x in unit])
                 continue
-            own = groups[branch.row]
-            here = frames.at(tuple(range(start, start + len(branch.bodies))))
-            # the child is on one side of all joints, or on different sides; both ends have the
-            # same rows up to their sign, and the sign does not change the complement
-            picks = [
-                (next(i for i, b in enumerate(own) if b.columns.indices[e] == body), e)
-                for body, e in zip(branch.bodies, branch.elements, strict=True)
-            ]
-            counts = [b.shape[1] for b in own]
-            rows = [
-                here.pull(
-                    Vector(
-                        *(
-                            picked([b.value[r][c] for b in own], picks, counts, frames.arm[0])
-                            for c in range(size)
-                        )
-                    )
-                )
-                for r in range(len(own[0].value))
-            ]
-            axes.append(complement(rows, size))
+            own = groups[branch.row].rows.complement
+            axes.append([x.map(lambda y, b=branch: take(y, b.elements)) for x in own])
         return cls(tree, frames, axes, shape)
 
     @property
@@ -250,23 +352,34 @@ class Motions:
 
     def gradient(self, forces: ByBranch, joints: ByBranch) -> ByBranch:
         """Returns Nᵀ f + g for forces f on bodies and g along joints, by branch."""
+        return [
+            [plus(axis.dot(Vector(*f)), g) for axis, g in zip(axes, own, strict=True)]
+            for axes, f, own in zip(self.axes, self.sums_to_roots(forces), joints, strict=True)
+        ]
+
+    def sums_to_roots(self, forces: ByBranch) -> ByBranch:
+        """Returns the forces on each body and all bodies that it carries, by branch."""
         sums = [[[] for _ in x] for x in forces]
-        result: list[Lanes | None] = [None] * len(forces)
+        result: list[Lanes] = [[] for _ in forces]
         for i in reversed(range(len(forces))):
             n = len(self.tree.branches[i].bodies)
-            own = [plus(x, collect(s, n)) for x, s in zip(forces[i], sums[i], strict=True)]
-            result[i] = [
-                plus(axis.dot(Vector(*own)), g)
-                for axis, g in zip(self.axes[i], joints[i], strict=True)
-            ]
-            self.to_parents(i, own, sums)
-        return result  # type: ignore[return-value]
+            result[i] = [plus(x, collect(s, n)) for x, s in zip(forces[i], sums[i], strict=True)]
+            self.to_parents(i, result[i], sums)
+        return result
 
     def velocities(self, joints: ByBranch) -> ByBranch:
         """Returns the velocities N q̇ of the bodies for joint velocities q̇, by branch."""
+        return self.sums_from_roots(
+            [
+                _combined(axes, own) or [0.0] * self.size
+                for axes, own in zip(self.axes, joints, strict=True)
+            ]
+        )
+
+    def sums_from_roots(self, relative: ByBranch) -> ByBranch:
+        """Returns the velocities of the bodies, from those relative to their parents, by branch."""
         moved: ByBranch = []
-        for i, branch in enumerate(self.tree.branches):
-            y = _combined(self.axes[i], joints[i]) or [0.0] * self.size
+        for branch, y in zip(self.tree.branches, relative, strict=True):
             if set(branch.parents) != {WORLD}:
                 above = self.gather(moved, branch.parents)
                 y = [plus(a, b) for a, b in zip(y, above, strict=True)]
