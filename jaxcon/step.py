@@ -324,7 +324,8 @@ class Solved(NamedTuple):
         solve_rows: function of b that returns the smallest a, in the metric of M, with J a + C λ =
             b. It uses the factors of the step and does not call `System.complete`. None if the
             stabilizer has its own `solve`.
-        one_sided_force: force of limits and contacts, (n_v,); None without inequality rows.
+        one_sided_force: force of limits and contacts, (n_v,), which may leave out their friction;
+            None without inequality rows.
         contact_force: force of all inequality rows, (n_v,); None without inequality rows.
     """
 

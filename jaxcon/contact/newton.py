@@ -100,8 +100,8 @@ class Newton(checks.Checked, ContactSolver):
         """Checks the numbers.
 
         Raises:
-            ValueError: `iterations` is not a positive integer or None, `warm` is not a bool, `tolerance` is
-                not positive, or `smoothing` is negative.
+            ValueError: `iterations` is not a positive integer or None, `warm` is not a bool,
+                `tolerance` is not positive, or `smoothing` is negative.
         """
         if self.iterations is not None:
             checks.count("Newton", "iterations", self.iterations)

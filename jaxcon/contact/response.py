@@ -138,7 +138,9 @@ class Response:
         jacobian = impulse.rows.jacobian
         force = jacobian.transpose(reactions.multipliers)
         ends = impacts.mask(bounds.ends, bounds)
-        one_sided = jacobian.transpose(jnp.where(ends, reactions.multipliers, 0))
+        one_sided = force  # of the same bodies, if friction acts only where a normal force does
+        if not all(bounds.ends[: bounds.kinds.normal + bounds.kinds.contacts]):
+            one_sided = jacobian.transpose(jnp.where(ends, reactions.multipliers, 0))
         if strikes:
             impact = impacts.Impact(
                 laws=_Laws(
