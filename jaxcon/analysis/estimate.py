@@ -16,7 +16,7 @@ from jaxcon.contact.bounded import RowCounts
 from jaxcon.contact.gauss_seidel import GaussSeidel
 from jaxcon.contact.interior_point import InteriorPoint
 from jaxcon.contact.nearest_rows import ActiveSet
-from jaxcon.contact.newton import Newton
+from jaxcon.contact.newton import ITERATIONS, Newton
 from jaxcon.contact.rows import kinds_of, linearize_at_rest
 from jaxcon.linear.conjugate_gradients import ConjugateGradients
 from jaxcon.methods.choice import Choice, innermost, words
@@ -114,7 +114,7 @@ def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | N
     if isinstance(inner, GaussSeidel):  # a sweep is a matrix–vector product
         return inner.sweeps * (2.0 * rows * rows + 6.0 * rows)
     if isinstance(inner, Newton):  # a row changes the inertia of its body
-        return inner.iterations * rows * NEWTON_OPERATIONS[kinds.tangents or 2]
+        return (inner.iterations or ITERATIONS) * rows * NEWTON_OPERATIONS[kinds.tangents or 2]
     if isinstance(inner, InteriorPoint):  # an iteration inverts a matrix, and applies it twice
         return INTERIOR_POINT_ITERATIONS * (2.0 * rows**3 + 6.0 * rows * rows)
     return 0.0

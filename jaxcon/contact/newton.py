@@ -61,6 +61,10 @@ TERMS = 24
 further rows that act, which converge slowly or not at all; `info.reactions.residual` tells."""
 
 
+ITERATIONS, ITERATIONS_IN_DOUBLE = 12, 30
+"""The default largest numbers of iterations in single and in double precision."""
+
+
 @pytree
 class Newton(checks.Checked, ContactSolver):
     """Newton's method for the velocities of bodies that joints connect to trees.
@@ -113,7 +117,7 @@ class Newton(checks.Checked, ContactSolver):
         """Returns the largest number of iterations in a step."""
         if self.iterations is not None:
             return self.iterations
-        return 12 if jnp.finfo(dtype).bits <= 32 else 30
+        return ITERATIONS if jnp.finfo(dtype).bits <= 32 else ITERATIONS_IN_DOUBLE
 
     def reached(self, dtype: DType) -> float:
         """Returns the violation at which a world is done [m/s, rad/s]."""

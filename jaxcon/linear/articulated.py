@@ -140,7 +140,7 @@ class Reflections:
             length = numerics.norm(Vector(*x))
             least = size * float(jnp.finfo(length.dtype).eps)
             dependent = length * length <= least * rows[j].dot(rows[j])
-            self.dependent = dependent if j == 0 else self.dependent | dependent
+            self.dependent = dependent if self.dependent is None else self.dependent | dependent
             sign = jnp.where(jnp.asarray(x[0]) < 0, -1.0, 1.0).astype(length.dtype)
             normal = [plus(x[0], sign * length), *x[1:]]
             # the normal is zero only if a row is: then its world fails, and others must not

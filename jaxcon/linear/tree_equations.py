@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.lanes import Vector, collect, minus, plus, take, times, total
+from jaxcon.core.lanes import Matrix, Vector, collect, minus, plus, take, times, total
 from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.typing import Array, Lane
 from jaxcon.linear.articulated import (
@@ -203,7 +203,7 @@ class TreeEquations:
 
     @classmethod
     def of(
-        cls, tree: Tree, position: Vector, rotation: Vector | None, column: int, saddle: Saddle
+        cls, tree: Tree, position: Vector, rotation: Matrix | None, column: int, saddle: Saddle
     ) -> TreeEquations:
         """Returns the equations of a saddle system, whose mass matrix is diagonal.
 
@@ -357,7 +357,7 @@ class TreeEquations:
             m = len(group.children)
             right = Vector.of_rows(target, group.start, size - len(group.rows.complement), m)
             least[group.start] = group.rows.least([*right])
-        shortest = [
+        shortest: ByBranch = [
             [0.0] * size if b.row is None else [take(x, b.elements) for x in least[b.row]]
             for b in tree.branches
         ]
