@@ -398,6 +398,9 @@ class Stabilizer(TreeNode, Protocol):
         """
         ...
 
+    reduces_errors: ClassVar[bool] = True
+    """False if errors φ of the constraints may grow without bound, as without feedback."""
+
     def solve(
         self, solver: Solver, rows: Rows, memory: Any, dt: Array, system: Saddle
     ) -> Solution | None:

@@ -272,3 +272,22 @@ def test_a_rollout_outside_jit_has_no_constants():
         caches = batch_last._shared, batch_last._with_constants
         made.append([x.cache_info().misses for x in caches])
     assert made[0] == made[1]
+
+
+def test_a_derivative_starts_its_iteration_from_the_solution():
+    """The factor of the tangent shows from which start the function is evaluated once more."""
+
+    def function(x, start):
+        return x * jax.lax.stop_gradient(start), start + 1
+
+    guess = (lambda args: args[1], lambda result: result[1])
+
+    def value(x, start):
+        return batch_last.call(function, x, start, guess=guess)[0]
+
+    x, start = jnp.asarray(2.0), jnp.asarray(3.0)
+    for transformed in (jax.grad(value), jax.jit(jax.grad(value))):
+        assert transformed(x, start) == 4.0
+    assert value(x, start) == 6.0
+    many = jax.vmap(jax.grad(value))(jnp.ones(3), jnp.arange(3.0))
+    np.testing.assert_allclose(many, np.arange(3.0) + 1)

@@ -16,8 +16,9 @@ from jaxcon.contact.bounded import RowCounts
 from jaxcon.contact.gauss_seidel import GaussSeidel
 from jaxcon.contact.interior_point import InteriorPoint
 from jaxcon.contact.nearest_rows import ActiveSet
-from jaxcon.contact.newton import ITERATIONS, Newton
+from jaxcon.contact.newton import Newton
 from jaxcon.contact.rows import kinds_of, linearize_at_rest
+from jaxcon.core.typing import DType
 from jaxcon.linear.conjugate_gradients import ConjugateGradients
 from jaxcon.methods.choice import Choice, innermost, words
 from jaxcon.methods.method import Method
@@ -75,7 +76,10 @@ def cost(system: System, method: Method, state: State, choice: Choice) -> Cost:
     """
     kinds = kinds_of(system, state.q, state.v)
     solver = method.contact_solver_for(system, state)
-    contact, named = contact_operations(solver, kinds), words(solver) if kinds else ""
+    contact, named = (
+        contact_operations(solver, kinds, state.q.dtype),
+        words(solver) if kinds else "",
+    )
     return Cost(_rows(system, state), _of_solver(method.solver, choice), contact, named)
 
 
@@ -100,12 +104,15 @@ def _of_solver(solver: Solver, choice: Choice) -> float | None:
     return share * effort_of_solver.operations
 
 
-def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | None) -> float:
+def contact_operations(
+    solver: ContactSolver | GaussSeidel, kinds: RowCounts | None, dtype: DType
+) -> float:
     """Estimates the number of operations of a contact solver.
 
     Args:
         solver: `Newton`, `InteriorPoint`, `GaussSeidel`, or an `ActiveSet` around one of them.
         kinds: number of inequality rows of each law; None without inequality constraints.
+        dtype: floating-point type of the scene.
     """
     if kinds is None:
         return 0.0
@@ -114,7 +121,7 @@ def contact_operations(solver: ContactSolver | GaussSeidel, kinds: RowCounts | N
     if isinstance(inner, GaussSeidel):  # a sweep is a matrix–vector product
         return inner.sweeps * (2.0 * rows * rows + 6.0 * rows)
     if isinstance(inner, Newton):  # a row changes the inertia of its body
-        return (inner.iterations or ITERATIONS) * rows * NEWTON_OPERATIONS[kinds.tangents or 2]
+        return inner.max_iterations(dtype) * rows * NEWTON_OPERATIONS[kinds.tangents or 2]
     if isinstance(inner, InteriorPoint):  # an iteration inverts a matrix, and applies it twice
         return INTERIOR_POINT_ITERATIONS * (2.0 * rows**3 + 6.0 * rows * rows)
     return 0.0

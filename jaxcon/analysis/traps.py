@@ -274,7 +274,7 @@ def _slow_contact(setup: Setup) -> str | None:
     if kinds is None or not isinstance(_inner(solver), InteriorPoint):
         return None
     rows = solved_rows(solver, kinds)
-    other = contact_operations(GaussSeidel(), kinds)
+    other = contact_operations(GaussSeidel(), kinds, setup.state.q.dtype)
     if rows <= EXACT_UP_TO or setup.cost.contact < DEARER * other:
         return None
     rest = setup.cost.operations - setup.cost.contact

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -24,7 +23,7 @@ from jaxcon.contact.rows import BoundRows
 from jaxcon.core.lanes import Vector, collect, plus, take, times, total
 from jaxcon.core.typing import Array, DType, Lane
 from jaxcon.linear.articulated import Articulated, ByBranch, Lanes, Motions, symmetric, widened
-from jaxcon.linear.blocks import Block
+from jaxcon.linear.blocks import Block, freeze
 from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.saddle import Saddle
 from jaxcon.linear.tree_equations import JointRows, TreeEquations, add_outer, joint_places
@@ -135,7 +134,8 @@ def tree_equations(system: System, q: Array, v: Array, tree: Tree, saddle: Saddl
     (group,) = system.layout.groups
     frame = group.kind.frame(*group.unpack(q, v))
     rotation = frame.rotation if isinstance(frame, SpatialFrame) else None
-    return TreeEquations.of(tree, frame.position, rotation, group.v, saddle)
+    assert group.v == 0
+    return TreeEquations.of(tree, frame.position, rotation, saddle)
 
 
 class BodySpace(NamedTuple):
@@ -162,7 +162,7 @@ class BodySpace(NamedTuple):
     @classmethod
     def of(cls, equations: TreeEquations, rows: BoundRows) -> BodySpace:
         """Returns the equations with the inequality rows, of which J is a `Jacobian`."""
-        bounds = jax.lax.stop_gradient(rows.jacobian)
+        bounds = freeze(rows.jacobian)
         assert isinstance(bounds, Jacobian)
         motions = equations.motions
         tree, frames, shape, dtype = motions.tree, motions.frames, motions.shape, motions.like.dtype

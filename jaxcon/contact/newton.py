@@ -75,10 +75,12 @@ class Newton(checks.Checked, ContactSolver):
     it acts, and costs an elimination more. A fixed point satisfies Signorini's and Coulomb's laws
     without relaxation. The derivative is that of the laws, with the same elimination.
 
-    Beside the solvers `RankSafe()` and `Sparse()` without options, the joints themselves are
-    eliminated along the tree, too (`TreeEquations`). In single precision, accelerations then err by
-    the order of the drift φ of the joints, relative to the arms of the bodies; in double precision
-    by φ².
+    If `Method.solver` is `RankSafe()` or `Sparse()` without regularization, it is not used: the
+    joints, too, are eliminated along the tree (`TreeEquations`). In single precision, accelerations
+    then err by the order of the drift φ of the joints, relative to the arms of the bodies, and in
+    double precision by φ². This also needs a stabilizer other than `Unstabilized()`, and in single
+    precision at most 12 joints between a body and the root of its tree. Joints must depend on the
+    relative motion of their bodies alone, as all joints of the library do.
 
     Scenes with closed loops, particles, constraints other than joints and rotors, compliant joints,
     or user inequalities are solved by `GaussSeidel()` instead. So is what an `ActiveSet` around
@@ -118,7 +120,7 @@ class Newton(checks.Checked, ContactSolver):
         checks.check("Newton", "tolerance", self.tolerance, (), above=0, optional=True)
         checks.check("Newton", "smoothing", self.smoothing, (), least=0, optional=True)
 
-    def most(self, dtype: DType) -> int:
+    def max_iterations(self, dtype: DType) -> int:
         """Returns the largest number of iterations in a step."""
         if self.iterations is not None:
             return self.iterations
@@ -417,7 +419,7 @@ def multipliers(
     bodies, joints = space.momentum(y, z)
     momentum = problem.wide(bodies), problem.wide(joints)
     iteration, ones = jnp.zeros((), jnp.int32), jnp.ones_like(offset[:1])
-    most = solver.most(offset.dtype)
+    most = solver.max_iterations(offset.dtype)
 
     def goes(state: State) -> Array:
         return (state.iteration < most) & somewhere(state.going)

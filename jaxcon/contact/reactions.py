@@ -53,8 +53,8 @@ class ContactProblem:
 
     Attributes:
         rows: inequality rows.
-        solve: function of (f, b) that returns a and λ_e, for many right-hand sides; see
-            `add_rhs_axis`.
+        solve: function of (f, b) that returns a and λ_e, for many right-hand sides (one, if there
+            are `equations`); see `add_rhs_axis`.
         saddle: saddle system of the step, with M, f and the equality rows.
         target: target b of the equality rows, (n_c,).
         dt: step size h, () [s]; 1 if λ are the impulses of an impact.
@@ -315,8 +315,8 @@ class ContactProblem:
             solution = implicit_solution(
                 rows.kinds, scale, λ, None, moved, live, solver.smoothing, inverses
             )
-            # by the equations of the step, since joints that have drifted apart by φ differ from
-            # those of the tree by φ; a program that does not return the residual leaves this out
+            # by the solver of the step, which in double precision knows the drift φ of the joints;
+            # a program that does not return the residual leaves this out
             missed = laws(rows.kinds, scale, λ, moved(λ), live) * scale
             left = jnp.max(jnp.abs(jnp.where(movable, missed, 0)), axis=0)
             return solution, jax.lax.stop_gradient(left)

@@ -34,6 +34,7 @@ from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.proximal import RankSafe
 from jaxcon.linear.saddle import Diagonal, Saddle, Solution
 from jaxcon.linear.sparse import Sparse
+from jaxcon.linear.trees import Tree
 from jaxcon.protocols import ContactSolver, Solver
 
 if TYPE_CHECKING:
@@ -137,9 +138,9 @@ class Response:
         reactions = self._judged(impulse, reactions, solution.acceleration)
         jacobian = impulse.rows.jacobian
         force = jacobian.transpose(reactions.multipliers)
-        ends = impacts.mask(bounds.ends, bounds)
-        one_sided = force  # of the same bodies, if friction acts only where a normal force does
+        one_sided = force  # its friction acts on the bodies on which its normal forces act
         if not all(bounds.ends[: bounds.kinds.normal + bounds.kinds.contacts]):
+            ends = impacts.mask(bounds.ends, bounds)
             one_sided = jacobian.transpose(jnp.where(ends, reactions.multipliers, 0))
         if strikes:
             impact = impacts.Impact(
@@ -252,8 +253,9 @@ class Response:
         hard: bool,
         share: float = 1.0,
     ) -> ContactProblem:
-        """Returns the contact problem, with factors for several right-hand sides at once.
+        """Returns the contact problem, with factors of the equality rows.
 
+        Beside Newton's method they are eliminated along the joints, if the solver has no options.
         `hard` is False if the stabilizer has made joints compliant, as `Penalty` does. They then do
         not allow the motions of a tree only.
         """
@@ -262,7 +264,7 @@ class Response:
             tree = tree_below(dynamics.system, system.jacobian, system.layout, rows)
             if tree is not None:
                 equations = tree_equations(dynamics.system, *point, tree, system)
-        if equations is not None and _is_plain(dynamics.solver) and system.target.size:
+        if equations is not None and _follows_tree(dynamics, equations.motions.tree, system):
             solve = equations.solver(system)
         else:
             solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
@@ -285,11 +287,26 @@ class Response:
         return isinstance(self.solver, ActiveSet) and self.solver.leaves_out(rows.kinds)
 
 
+DEPTH = 12
+"""The largest depth of a tree whose joints are eliminated along the tree in single precision.
+
+With arms from the root, rounding errors grow with the square of the depth.
+"""
+
+
+def _follows_tree(dynamics: Dynamics, tree: Tree, saddle: Saddle) -> bool:
+    """Returns True if the saddle system is solved by elimination along the joints of a tree."""
+    if not saddle.target.size or not dynamics.stabilizer.reduces_errors:
+        return False
+    deep = tree.depth > DEPTH and jnp.finfo(saddle.force.dtype).bits <= 32
+    return not deep and _is_plain(dynamics.solver)
+
+
 def _is_plain(solver: Solver) -> bool:
     """Returns True if a solver has no options that change the solution of a tree of joints."""
-    if isinstance(solver, RankSafe):
+    if type(solver) is RankSafe:
         return not solver.always and _is_plain(solver.solver)
-    return isinstance(solver, Sparse) and solver.tikhonov is None
+    return type(solver) is Sparse and solver.tikhonov is None
 
 
 def _rows_at(dynamics: Dynamics, q: Array, v: Array, t: Doubled | Array) -> BoundRows:

@@ -20,9 +20,19 @@ from jaxcon.methods.stability import warn_if_unstable
 from jaxcon.protocols import System
 from jaxcon.staging import batch_last
 from jaxcon.step import Origin, StepInfo, without_memory
-from jaxcon.system.state import State
+from jaxcon.system.state import MethodMemory, State
 
 Info = TypeVar("Info", bound="StepInfo | SolutionAt")
+
+
+def _contact_multipliers(state: State) -> Array | None:
+    """Returns the multipliers of limits and contacts in a state's memory; None without them."""
+    memory = MethodMemory(*state.memory)
+    return memory.contact_multipliers if memory.has_contact_multipliers else None
+
+
+GUESS = (lambda args: _contact_multipliers(args[2]), lambda new: _contact_multipliers(new[0]))
+"""A step starts its solver from the multipliers of the last step, and a derivative from its own."""
 
 
 def step(
@@ -54,7 +64,7 @@ def step(
     given = _checked("step", system, method, state, control, dt)
     with checks.without_waiting():  # dt as given, since an array made of it is traced under jit
         warn_if_unstable(method, dt, system, state)
-    return _reported(batch_last.call(masked_step, *given), system, state, given[3])
+    return _reported(batch_last.call(masked_step, *given, guess=GUESS), system, state, given[3])
 
 
 def step_quietly(
@@ -62,7 +72,7 @@ def step_quietly(
 ) -> tuple[State, StepInfo]:
     """Steps without a warning about unstable gains; errors name `owner`, a public function."""
     given = _checked(owner, system, method, state, control, dt)
-    return _reported(batch_last.call(masked_step, *given), system, state, given[3])
+    return _reported(batch_last.call(masked_step, *given, guess=GUESS), system, state, given[3])
 
 
 def _checked(

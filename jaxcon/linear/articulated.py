@@ -12,6 +12,7 @@ References:
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -135,11 +136,19 @@ class Reflections:
         self._mirrors: list[tuple[Lanes, Lane]] = []
         self._inverses: list[Array] = []  # 1/R_jj
         self.dependent: Array | None = None
+        squares = [row.dot(row) for row in rows]
+        # 1 + d² for arms d of the rows from the reference point, in units of length
+        linear = [Vector(*row[size // 2 :]) for row in rows]
+        reach = [numerics.safe_divide(x, y.dot(y)) for x, y in zip(squares, linear, strict=True)]
+        longest = functools.reduce(jnp.maximum, reach, 1.0)
         for j, column in enumerate(self._columns):
             x = column[j:]
             length = numerics.norm(Vector(*x))
-            least = size * float(jnp.finfo(length.dtype).eps)
-            dependent = length * length <= least * rows[j].dot(rows[j])
+            # what arms add to other rows makes this length shorter, up to 1/d of a row; this
+            # must not count as dependence
+            share = size * float(jnp.finfo(length.dtype).eps)
+            least = jnp.maximum(share / longest, share * share)
+            dependent = length * length <= least * squares[j]
             self.dependent = dependent if self.dependent is None else self.dependent | dependent
             sign = jnp.where(jnp.asarray(x[0]) < 0, -1.0, 1.0).astype(length.dtype)
             normal = [plus(x[0], sign * length), *x[1:]]
@@ -236,17 +245,16 @@ def rows_at(
         for e, place in enumerate(places)
     ]
     counts, here = [b.shape[1] for b in own], frames.at(places)
-    return [
-        here.pull(
-            Vector(
-                *(
-                    picked([b.value[r][c] for b in own], picks, counts, frames.arm[0])
-                    for c in range(len(row))
-                )
-            )
-        )
-        for r, row in enumerate(own[0].value)
-    ]
+    like = here.arm[0]
+
+    def pulled(r: int, size: int) -> Vector:
+        lanes = [[b.value[r][c] for b in own] for c in range(size)]
+        row = here.pull(Vector(*(picked(x, picks, counts, like) for x in lanes)))
+        if any(isinstance(x, jax.Array) for x in row):
+            return row
+        return row.map(lambda x: x if x == 0 else jnp.full_like(like, x))  # with a dtype
+
+    return [pulled(r, len(row)) for r, row in enumerate(own[0].value)]
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxcon.core.lanes import Matrix, Vector, collect, minus, plus, take, times, total
 from jaxcon.core.numerics import finite_or_nan
@@ -37,7 +36,7 @@ from jaxcon.linear.articulated import (
     symmetric,
     widened,
 )
-from jaxcon.linear.blocks import Block
+from jaxcon.linear.blocks import Block, freeze
 from jaxcon.linear.jacobian import Block as JacobianBlock
 from jaxcon.linear.saddle import Factored, Saddle, Solution, judge
 from jaxcon.linear.trees import WORLD, Tree
@@ -88,7 +87,10 @@ class JointRows:
 
 
 def joint_places(tree: Tree, own: Sequence[JacobianBlock]) -> list[tuple[int, int]] | None:
-    """Returns branch and index of the joint on which each element acts; None if one is on none."""
+    """Returns branch and index of the joint on which each element acts.
+
+    None if an element acts on no joint, or if the joints differ in freedom.
+    """
     found = []
     for ends in zip(*(block.columns.indices for block in own), strict=True):
         places = [tree.places[body] for body in ends]
@@ -161,16 +163,16 @@ class Drift:
         start: int,
         own: Sequence[JacobianBlock],
         children: Sequence[int],
-        held: Sequence[Vector],
+        child_rows: Sequence[Vector],
     ) -> Drift:
-        """Returns the drift of rows, of which `held` are W."""
+        """Returns the drift of rows, of which `child_rows` are W."""
         tree = motions.tree
         parents = tuple(tree.parents[k] for k in children)
         if len(own) == 1:
-            return cls(start, parents, None, len(held))
+            return cls(start, parents, None, len(child_rows))
         rows = rows_at(tree, motions.frames, own, parents)
-        drifted = [p + w for p, w in zip(rows, held, strict=True)]
-        return cls(start, parents, drifted, len(held))
+        drifted = [p + w for p, w in zip(rows, child_rows, strict=True)]
+        return cls(start, parents, drifted, len(child_rows))
 
 
 @dataclass(frozen=True)
@@ -182,28 +184,26 @@ class TreeEquations:
     Attributes:
         motions: the motions that the joints allow.
         joints: the joints, by their rows.
-        turning: the rotors.
-        drifts: the drift of all rows, in the order of J.
+        rotor_rows: the rotors.
+        drifts: the drift of all rows, in the order of J; empty in single precision.
         inertia: for each branch, the inertias K of the bodies.
         rotors: for each branch, the inertias D of rotors on joint coordinates, (k, k).
         factors: the factors of Nᵀ K N + D.
-        column: the first velocity of the bodies.
         compliance: the diagonal of C, (n_c,); None if C is zero.
     """
 
     motions: Motions
     joints: list[JointGroup]
-    turning: list[JointRows]
+    rotor_rows: list[JointRows]
     drifts: list[Drift]
     inertia: list[Block]
     rotors: list[Block]
     factors: Articulated
-    column: int
     compliance: Array | None
 
     @classmethod
     def of(
-        cls, tree: Tree, position: Vector, rotation: Matrix | None, column: int, saddle: Saddle
+        cls, tree: Tree, position: Vector, rotation: Matrix | None, saddle: Saddle
     ) -> TreeEquations:
         """Returns the equations of a saddle system, whose mass matrix is diagonal.
 
@@ -211,46 +211,45 @@ class TreeEquations:
             tree: the tree of the bodies.
             position: centers of the bodies, lanes (body, …) [m].
             rotation: rotation matrices, body to world, lanes (body, …); None in the plane.
-            column: the first velocity of the bodies.
             saddle: the saddle system.
         """
-        saddle, position, rotation = jax.lax.stop_gradient((saddle, position, rotation))
-        members = tuple(b for x in tree.branches for b in x.bodies)
+        saddle, position, rotation = freeze((saddle, position, rotation))
         roots: list[int] = []
         for i, p in enumerate(tree.parents):
             roots.append(i if p == WORLD else roots[p])
-        position = position.map(lambda x: take(x, members))
+        position = position.map(lambda x: take(x, tree.bodies))
         arm = position.map(lambda x: x - take(x, tuple(roots)))
         if rotation is not None:
-            rotation = jax.tree.map(lambda x: take(x, members), rotation)
+            rotation = jax.tree.map(lambda x: take(x, tree.bodies), rotation)
         frames = Frames(rotation, arm)
         joints = JointGroup.all_of(tree, frames, saddle.jacobian)
         motions = Motions.of(tree, frames, joints, saddle.force.shape[1:])
         # 0 for an infinite mass would silently fix a body that no joint fixes
         diagonal = finite_or_nan(saddle.mass.diagonal)
-        mass = Vector.of_rows(diagonal, column, motions.size, len(members))
-        whole = frames.inertia(mass.map(lambda x: take(x, members)))
+        mass = Vector.of_rows(diagonal, 0, motions.size, len(tree.bodies))
+        whole = frames.inertia(mass.map(lambda x: take(x, tree.bodies)))
         inertia = [
             [[part(x, start, len(b.bodies)) for x in row] for row in whole]
             for b, start in zip(tree.branches, tree.starts, strict=True)
         ]
         rotors: list[Block] = [[[0.0] * (r + 1) for r in range(b.freedom)] for b in tree.branches]
-        turning, drifts = [], []
+        rotor_rows, drifts = [], []
         groups = {group.start: group for group in joints}
         for start, own in saddle.jacobian.by_rows():
             if start in groups:
-                children, held = groups[start].children, groups[start].rows.given
+                children, rows = groups[start].children, groups[start].rows.given
             else:
                 assert saddle.compliance is not None
                 weight = 1 / saddle.compliance[start : start + own[0].shape[1]]
                 row = JointRows.of(motions, start, own)
                 add_outer(rotors, row, weight, tree)
-                turning.append(row)
-                children, held = [tree.starts[i] + k for i, k in row.joints], [row.relative]
-            drifts.append(Drift.of(motions, start, own, children, held))
+                rotor_rows.append(row)
+                children, rows = [tree.starts[i] + k for i, k in row.joints], [row.relative]
+            if jnp.finfo(saddle.force.dtype).bits == 64:
+                drifts.append(Drift.of(motions, start, own, children, rows))
         factors = Articulated(motions, inertia, rotors)
         c = saddle.compliance
-        return cls(motions, joints, turning, drifts, inertia, rotors, factors, column, c)
+        return cls(motions, joints, rotor_rows, drifts, inertia, rotors, factors, c)
 
     def solver(self, saddle: Saddle) -> Factored:
         """Returns a function (f, b) → `Solution`, for one right-hand side along the second axis.
@@ -260,20 +259,19 @@ class TreeEquations:
         Args:
             saddle: the saddle system of which these are the equations.
         """
-        j, compliance, dependent = saddle.jacobian, saddle.compliance, saddle.mass.singular
+        j, compliance, n = saddle.jacobian, saddle.compliance, len(saddle.force)
+        dependent = jnp.zeros(saddle.force.shape[1:], bool)
         for group in self.joints:
             if group.rows.dependent is not None:
                 dependent = dependent | jnp.any(group.rows.dependent, axis=0)
 
-        n = len(saddle.force)
-
         # one array, since JAX does not transpose a solve of which only a part is used
         def apply(x: Array) -> Array:
-            a, μ = x[:n], x[n:]
+            a, ν = x[:n], x[n:]
             moved = j.apply(a)
             if compliance is not None:
-                moved = moved - compliance * μ
-            return jnp.concatenate([saddle.mass.apply(a) + j.transpose(μ), moved])
+                moved = moved - compliance * ν
+            return jnp.concatenate([saddle.mass.apply(a) + j.transpose(ν), moved])
 
         def inverse(_: object, right: Array) -> Array:
             return jnp.concatenate(self.solve(right[:n], right[n:]))
@@ -282,9 +280,10 @@ class TreeEquations:
             assert force.shape[1] == target.shape[1] == 1
             right = jnp.concatenate([force[:, 0], target[:, 0]])
             x = jax.lax.custom_linear_solve(apply, right, inverse, symmetric=True)
-            a, μ = x[:n], x[n:]
-            code = judge(a, dependent & jnp.all(jnp.isfinite(a), axis=0))
-            return Solution(a[:, None], -μ[:, None], code[None])
+            a, ν = x[:n], x[n:]
+            dependent_only = dependent & jnp.all(jnp.isfinite(a), axis=0)
+            code = judge(a, saddle.mass.singular | dependent_only)
+            return Solution(a[:, None], -ν[:, None], code[None])
 
         return solve
 
@@ -292,7 +291,8 @@ class TreeEquations:
         """Returns a and −λ with M a − Jᵀλ = f and J a + C λ = b.
 
         If joints have drifted apart by φ, the error is of the order of φ, relative to the arms of
-        the bodies. In float64, a second round takes the drift into account, which reduces it to φ².
+        the bodies. In double precision, a second round takes the drift into account, which reduces
+        it to φ².
 
         Args:
             force: f, (n_v,).
@@ -300,22 +300,23 @@ class TreeEquations:
         """
         motions, tree = self.motions, self.motions.tree
         n = len(tree.parents)
-        members = tuple(b for x in tree.branches for b in x.bodies)
-        lanes = Vector.of_rows(force, self.column, motions.size, n)
-        applied = motions.frames.pull(lanes.map(lambda x: take(x, members)))
+        lanes = Vector.of_rows(force, 0, motions.size, n)
+        applied = motions.frames.pull(lanes.map(lambda x: take(x, tree.bodies)))
         shape = (n, *target.shape[1:])
         wrench = jnp.stack([jnp.broadcast_to(x, shape) for x in applied])
 
         def once(known: tuple[Array, Array]) -> tuple[Array, Array]:
             wrenches, targets = known
-            y, μ = self._closed(self._by_branch(Vector.of(wrench + wrenches)), target + targets)
-            return self._stacked(y, force), μ
+            y, ν = self._without_drift(
+                self._by_branch(Vector.of(wrench + wrenches)), target + targets
+            )
+            return self._stacked(y, force), ν
 
         none = jnp.zeros_like(wrench), jnp.zeros_like(target)
-        y, μ = once(none)
-        if jnp.finfo(force.dtype).bits == 64 and any(x.rows is not None for x in self.drifts):
-            y, μ = once(self._drifted(y, μ))
-        return self._velocity(y), μ
+        y, ν = once(none)
+        if any(x.rows is not None for x in self.drifts):
+            y, ν = once(self._drifted(y, ν))
+        return self._velocity(y), ν
 
     def _drifted(self, y: Array, multipliers: Array) -> tuple[Array, Array]:
         """Returns forces on the bodies (lane, body, …) and targets (n_c,) that make up for drift.
@@ -329,21 +330,21 @@ class TreeEquations:
         targets = []
         for drift in self.drifts:
             m = len(drift.parents)
-            μ = Vector.of_rows(multipliers, drift.start, drift.count, m)
+            ν = Vector.of_rows(multipliers, drift.start, drift.count, m)
             if drift.rows is None:
-                targets += [(jnp.zeros_like(x), m) for x in μ]
+                targets += [(jnp.zeros_like(x), m) for x in ν]
                 continue
             above = Vector(*(take(x, drift.parents) for x in Vector.of(y)))
             targets += [(-row.dot(above), m) for row in drift.rows]
             for c, terms in enumerate(sums):
-                force = total(-row[c] * x for row, x in zip(drift.rows, μ, strict=True))
+                force = total(times(-row[c], x) for row, x in zip(drift.rows, ν, strict=True))
                 terms.append((drift.parents, force))
         shape = y.shape[1:]
         forces = [jnp.broadcast_to(jnp.asarray(collect(x, n), y.dtype), shape) for x in sums]
         rows = [jnp.broadcast_to(x, (m, *shape[1:])) for x, m in targets]
         return jnp.stack(forces), jnp.concatenate(rows)
 
-    def _closed(self, f: ByBranch, target: Array) -> tuple[ByBranch, Array]:
+    def _without_drift(self, f: ByBranch, target: Array) -> tuple[ByBranch, Array]:
         """Returns the accelerations of the bodies and −λ, (n_c,), for joints without drift.
 
         Args:
@@ -364,7 +365,7 @@ class TreeEquations:
         start = motions.sums_from_roots(shortest)
         # −λ of rotors is (w (d + S q̇) − b)/C, with the shortest d and w of `JointRows.relative`
         sums: list[list[list]] = [[[] for _ in range(b.freedom)] for b in tree.branches]
-        for row in self.turning:
+        for row in self.rotor_rows:
             lacking = minus(self._target(row, target), self._rate(row, shortest))
             row.add_forces(times(self._stiffness(row), lacking), sums)
         along = [
@@ -423,7 +424,7 @@ class TreeEquations:
         """Returns velocities in common coordinates as those of centers and body axes, (n_v,)."""
         tree = self.motions.tree
         own = self.motions.frames.push(Vector.of(y))
-        back = tuple(np.argsort([b for x in tree.branches for b in x.bodies]).tolist())
+        back = tuple(tree.places[b] for b in range(len(tree.bodies)))
         return jnp.concatenate([take(x, back) for x in own])
 
     def _multipliers(
@@ -446,15 +447,15 @@ class TreeEquations:
         carried = motions.sums_to_roots(lacking)  # f − K y = −Wᵀ λ of a child and its descendants
         parts: list[tuple[int, Lanes, int]] = []
         of_rotors: list[list[list]] = [[[] for _ in range(motions.size)] for _ in tree.branches]
-        for row in self.turning:
+        for row in self.rotor_rows:
             free = plus(
                 self._rate(row, shortest),
                 total(map(times, row.pulls, motions.at_joints(joint, row.joints, len(row.pulls)))),
             )
-            μ = times(self._stiffness(row), minus(free, self._target(row, target)))
-            parts.append((row.start, [μ], len(row.joints)))
+            ν = times(self._stiffness(row), minus(free, self._target(row, target)))
+            parts.append((row.start, [ν], len(row.joints)))
             for c, x in enumerate(row.relative):
-                to_branches(of_rotors, c, row.joints, times(x, μ))
+                to_branches(of_rotors, c, row.joints, times(x, ν))
         for branch, own, more in zip(tree.branches, carried, of_rotors, strict=True):
             own[:] = [
                 minus(x, collect(s, len(branch.bodies))) for x, s in zip(own, more, strict=True)

@@ -53,6 +53,19 @@ class Tree:
     branches: tuple[Branch, ...]
 
     @functools.cached_property
+    def bodies(self) -> tuple[int, ...]:
+        """The bodies, in the order of the tree."""
+        return tuple(b for x in self.branches for b in x.bodies)
+
+    @functools.cached_property
+    def depth(self) -> int:
+        """The largest number of joints between a body and the root of its tree."""
+        depths: list[int] = []
+        for p in self.parents:
+            depths.append(0 if p == WORLD else depths[p] + 1)
+        return max(depths)
+
+    @functools.cached_property
     def starts(self) -> tuple[int, ...]:
         """The place of the first body of each branch."""
         return tuple(np.cumsum([0, *(len(x.bodies) for x in self.branches)])[:-1].tolist())
@@ -65,7 +78,7 @@ class Tree:
     @functools.cached_property
     def places(self) -> dict[int, int]:
         """The place of each body."""
-        return {b: i for i, b in enumerate(b for x in self.branches for b in x.bodies)}
+        return {b: i for i, b in enumerate(self.bodies)}
 
     @functools.cached_property
     def parents(self) -> tuple[int, ...]:

@@ -29,6 +29,8 @@ It is a fraction of Σ|γ_i| over the rows of a constraint.
 class Unstabilized(checks.Checked, Stabilizer):
     """No feedback, b = −γ: constraints hold at acceleration level only, and errors grow."""
 
+    reduces_errors: ClassVar[bool] = False
+
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
         """Returns the rows with the target b = −γ of J a + C λ = b, where φ̈ = J a + γ."""
         return rows.with_target(-rows.bias)

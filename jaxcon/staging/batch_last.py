@@ -105,6 +105,8 @@ def without_collections() -> Iterator[None]:
 
 Aval = tuple[tuple[int, ...], Any]
 """A shape and a dtype."""
+Guess = tuple[Callable[[Any], Array | None], Callable[[Any], Array | None]]
+"""The start of an iteration in the arguments of a function, and its solution in the result."""
 
 
 class Native:
@@ -113,10 +115,14 @@ class Native:
     Attributes:
         function: (arrays) → list of arrays.
         staged: True if the function and its derivatives may be cut into stages.
+        guess: the index of an argument that is only the start of an iteration, and of the result
+            from which the iteration would end at once; None if there is none, or before the
+            function is traced.
     """
 
     def __init__(self, function: Callable[..., Any], staged: bool = True) -> None:
         self.function, self.staged = function, staged
+        self.guess: tuple[int, int] | None = None
         self.compiled = jax.jit(lambda *args: bound(args, self))
         self.tangent = functools.lru_cache(maxsize=64)(functools.partial(TangentNative, self))
         self.transposed = functools.lru_cache(maxsize=64)(functools.partial(TransposedNative, self))
@@ -365,6 +371,7 @@ def _native(
     shapes: Sequence[tuple[int, ...]],
     known: tuple[Known | None, ...],
     staged: bool,
+    guess: Guess | None,
 ) -> tuple[Native, list[Any]]:
     """Makes a native function of the leaves of some arguments, with known leaves as constants.
 
@@ -374,6 +381,7 @@ def _native(
         shapes: the shape of each leaf.
         known: the value of each known leaf, and None for other leaves, of which there must be one.
         staged: True if the function may be cut into stages.
+        guess: see `call`.
 
     Returns:
         The native function of the leaves that are not known.
@@ -389,11 +397,21 @@ def _native(
         axes = given[0].ndim - len(next(s for s, x in zip(shapes, known, strict=True) if x is None))
         moving = iter(given)
         leaves = [next(moving) if x is None else x.lanes(axes) for x in known]
-        output = function(*jax.tree.unflatten(structure, leaves))
+        whole = jax.tree.unflatten(structure, leaves)
+        output = function(*whole)
         arrays, result[0] = jax.tree.flatten(output)
+        if guess is not None:
+            start, solution = _place(guess[0](whole), given), _place(guess[1](output), arrays)
+            native.guess = None if start is None or solution is None else (start, solution)
         return [jnp.asarray(x) for x in arrays]
 
-    return Native(flat, staged), result
+    native = Native(flat, staged)
+    return native, result
+
+
+def _place(x: Array | None, arrays: Sequence[Array]) -> int | None:
+    """Returns the index of an array in a list; None if it is not in the list, or None itself."""
+    return next((i for i, y in enumerate(arrays) if x is not None and y is x), None)
 
 
 _shared = functools.lru_cache(maxsize=256)(_native)
@@ -401,7 +419,9 @@ _with_constants = functools.lru_cache(maxsize=64)(_native)
 """`_native` with a cache of its own, in which each set of values of constants takes an entry."""
 
 
-def call(function: Callable[..., T], *args: PyTree, staged: bool = True) -> T:
+def call(
+    function: Callable[..., T], *args: PyTree, staged: bool = True, guess: Guess | None = None
+) -> T:
     """Calls function(*args); `vmap` calls it once, with the whole batch along the last axis.
 
     During tracing, small arrays with known values become constants of the function. The compiler
@@ -414,6 +434,10 @@ def call(function: Callable[..., T], *args: PyTree, staged: bool = True) -> T:
         args: pytrees of arrays.
         staged: True if the function may be cut into stages; False for users' functions, which may
             contain any operations.
+        guess: two functions that return an array or None. That of the arguments, a tuple, is only
+            the start of an iteration, on which the result does not depend; that of the result is a
+            start from which the iteration ends at once. A derivative, which evaluates the function
+            once more, takes it.
 
     Returns:
         The result of the function.
@@ -424,7 +448,7 @@ def call(function: Callable[..., T], *args: PyTree, staged: bool = True) -> T:
         known = [_known(x) for x in leaves]
     shapes = tuple(np.shape(x) for x in leaves)
     cached = _with_constants if any(x is not None for x in known) else _shared
-    native, result = cached(function, structure, shapes, tuple(known), staged)
+    native, result = cached(function, structure, shapes, tuple(known), staged, guess)
     arrays = [jnp.asarray(x) for x, value in zip(leaves, known, strict=True) if value is None]
     arrays = meshes.together(arrays)
     arrays = bound(arrays, native)  # the trace of `native` sets result[0]
@@ -459,8 +483,15 @@ def _batched(
 def _jvp(
     primals: Sequence[Array], tangents: Sequence[Array | ad.Zero], *, fun: Native, asks: ClosedJaxpr
 ) -> tuple[list[Array], list[Array | ad.Zero]]:
-    """The JVP rule: calls the function, and its tangent map as another native function."""
+    """The JVP rule: calls the function, and its tangent map as another native function.
+
+    The tangent map evaluates the function once more. Its iteration starts from the solution.
+    """
     results = bound(primals, fun)
+    if fun.guess is not None:
+        argument, solution = fun.guess
+        primals = list(primals)
+        primals[argument] = jax.lax.stop_gradient(results[solution])
     moved = tuple(type(x) is not ad.Zero for x in tangents)
     given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
     moving = iter(bound((*primals, *given), fun.tangent(moved)))

@@ -1,0 +1,195 @@
+"""The saddle system of trees of bodies, eliminated along the joints."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxcon as jc
+from jaxcon.constraints.rows import linearize, saddle
+from jaxcon.contact.body_space import tree_below, tree_equations
+from jaxcon.contact.rows import linearize_bounds
+from jaxcon.core.lanes import Vector
+from jaxcon.core.status import Status
+from jaxcon.linear.articulated import Reflections
+from jaxcon.linear.tree_equations import TreeEquations
+
+H = 2e-3
+dims = pytest.mark.parametrize("dim", [2, 3])
+
+
+def trees(dim, dtype=jnp.float64):
+    """Three trees with all that may differ: sides of joints, depths, welds, rotors, a free body."""
+
+    def at(x, z):
+        return (x, z) if dim == 2 else (x, 0.2 * x, z)
+
+    scene = jc.Scene(dim=dim, dtype=dtype)
+    moments = 0.03 if dim == 2 else (0.03, 0.04, 0.05)
+    for i in range(8):
+        place = at(0.4 * i, 0.5 + 0.1 * (i % 3))
+        scene.add_body(f"{i}", mass=1.0 + 0.3 * i, inertia=moments, position=place)
+    hinge = {} if dim == 2 else {"axis": (0.2, 1.0, 0.1)}
+    slide = {"axis": at(1.0, 0.3)}
+    scene.add(jc.Revolute("a", "0", "1", point=at(0.2, 0.6), **hinge))
+    scene.add(jc.Revolute("b", "2", "1", point=at(0.6, 0.5), **hinge))  # the child comes first
+    scene.add(jc.Revolute("c", "2", "3", point=at(1.0, 0.6), **hinge))
+    scene.add(jc.Prismatic("d", "4", "0", point=at(1.6, 0.5), **slide))
+    scene.add(jc.joints.Fixed("weld", "3", "5"))
+    scene.add(jc.Revolute("e", "6", jc.WORLD, point=at(2.2, 0.5), **hinge))
+    for i, joint in enumerate("abde"):
+        scene.add(jc.joints.Armature(f"rotor {joint}", joint, 0.05 + 0.1 * i))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "7", radius=0.1, friction=0.4))
+    return scene.build()
+
+
+def equations_of(system, q, v):
+    """Returns the saddle system with random right-hand sides, and its equations along the tree."""
+    random, t = np.random.default_rng(1), jnp.zeros((), q.dtype)
+    rows = linearize(system, q, v, t)
+    f, b = (jnp.asarray(random.normal(size=len(x)), q.dtype) for x in (v, rows.bias))
+    equations = saddle(system, q, rows, f, b)
+    bounds = linearize_bounds(system, q, v, t, None, jnp.asarray(H, q.dtype))
+    tree = tree_below(system, equations.jacobian, equations.layout, bounds)
+    assert tree is not None
+    return equations, tree_equations(system, q, v, tree, equations)
+
+
+def dense_solution(equations):
+    """Returns a and λ by dense algebra."""
+    m, j = np.asarray(equations.mass.dense()), np.asarray(equations.jacobian.dense())
+    n = len(m)
+    matrix = np.block([[m, -j.T], [j, np.diag(np.asarray(equations.compliance))]])
+    x = np.linalg.solve(matrix, np.r_[equations.force, equations.target])
+    return x[:n], x[n:]
+
+
+@dims
+def test_it_is_the_solution_of_dense_algebra(dim):
+    system, state = trees(dim)
+    equations, factored = equations_of(system, state.q, state.v)
+    f, b = equations.force[:, None], equations.target[:, None]
+    a, λ, status = factored.solver(equations)(f, b)
+    assert status == Status.OK
+    for found, expected in zip((a, λ), dense_solution(equations), strict=True):
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(found[:, 0], expected, rtol=0, atol=1e-13 * scale)
+
+
+@dims
+def test_a_drift_of_the_joints_leaves_an_error_of_its_square(dim):
+    system, state = trees(dim)
+    errors = []
+    for size in (1e-4, 1e-5):
+        shift = size * np.random.default_rng(0).normal(size=len(state.q))
+        q = system.normalize(state.q + jnp.asarray(shift))
+        equations, factored = equations_of(system, q, state.v)
+        a, _, _ = factored.solver(equations)(equations.force[:, None], equations.target[:, None])
+        expected = dense_solution(equations)[0]
+        errors.append(np.abs(a[:, 0] - expected).max() / np.abs(expected).max())
+    assert errors[0] < 1e-6
+    assert errors[1] < 2e-2 * errors[0]
+
+
+@dims
+def test_a_step_in_single_precision_is_that_of_dense_matrices(dim):
+    """Also where other numbers of the process are in double precision."""
+    system, state = trees(dim, jnp.float32)
+    ends = []
+    for solver in (jc.solvers.RankSafe(), jc.solvers.Dense()):
+        method = jc.Method(solver=solver, contact_solver=jc.solvers.Newton())
+        start = jc.init(system, method, state.q, state.v + 0.1)
+        new, info = jax.jit(jc.step)(system, method, start, None, H)
+        assert new.v.dtype == jnp.float32
+        assert new.status == 0
+        ends.append((new.v, info.multipliers))
+    np.testing.assert_allclose(ends[0][0], ends[1][0], atol=2e-5)
+    np.testing.assert_allclose(ends[0][1], ends[1][1], atol=2e-4 * np.abs(ends[1][1]).max())
+
+
+@dims
+def test_gradients_of_joint_forces_are_those_of_dense_matrices(dim):
+    """Of λ of joints and rotors, by positions and velocities."""
+    system, state = trees(dim)
+    grads = []
+    for solver in (jc.solvers.Sparse(), jc.solvers.Dense()):
+        method = jc.Method(solver=solver, contact_solver=jc.solvers.Newton())
+        start = jc.init(system, method, state.q, state.v + 0.3)
+
+        def loss(q, v, start=start, method=method):
+            moved = dataclasses.replace(start, q=q, v=v)
+            new, info = jc.step(system, method, moved, None, H)
+            weights = jnp.cos(jnp.arange(len(info.multipliers), dtype=q.dtype))
+            return weights @ info.multipliers + jnp.sum(new.v**2)
+
+        grads.append(jax.jit(jax.grad(loss, (0, 1)))(start.q, start.v))
+    for found, expected in zip(*grads, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("rows", "size"), [(1, 3), (2, 3), (5, 6), (6, 6)])
+def test_reflections_invert_the_rows(rows, size):
+    random = np.random.default_rng(rows)
+    given, b = random.normal(size=(rows, size, 3)), random.normal(size=(rows, 3))
+    factored = Reflections([Vector(*jnp.asarray(x)) for x in given], size)
+    assert not factored.dependent.any()
+    x = np.stack(factored.least([*jnp.asarray(b)]))
+    λ = random.normal(size=(rows, 3))
+    back = factored.coefficients(Vector(*jnp.asarray(np.einsum("rsw,rw->sw", given, λ))))
+    np.testing.assert_allclose(np.stack(back), λ, atol=1e-12)
+    for w in range(3):
+        expected = np.linalg.lstsq(given[..., w], b[:, w], rcond=None)[0]
+        np.testing.assert_allclose(x[:, w], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_only_dependent_rows_are_dependent_whatever_the_unit_of_length(unit):
+    """Rows of a hinge at (unit, 2 unit, 0) about the z axis, in single precision."""
+    x, y = unit, 2 * unit
+    rows = [(0, 0, -y, 1, 0, 0), (0, 0, x, 0, 1, 0), (y, -x, 0, 0, 0, 1), (1, 0, 0, 0, 0, 0)]
+    for last, expected in (((0, 1, 0, 0, 0, 0), False), ((1, 0, 0, 0, 0, 0), True)):
+        given = [Vector(*(jnp.full(1, c, jnp.float32) for c in row)) for row in (*rows, last)]
+        assert Reflections(given, 6).dependent.all() == expected
+
+
+def test_a_body_without_mass_is_singular():
+    for mass in (0.0, -1.0):
+        scene = jc.Scene(dim=2, dtype=jnp.float32)
+        scene.add_body("a", mass=1.0, inertia=0.1)
+        scene.add_body("b", mass=1.0, inertia=0.1, position=(1.0, 0.0))
+        scene.add(jc.Revolute("hinge", "a", "b", point=(0.5, 0.0)))
+        scene.add(jc.PlaneContact("floor", jc.WORLD, "a", radius=0.1))
+        system, state = scene.build()
+        method = jc.Method(contact_solver=jc.solvers.Newton())
+
+        def status(mass, system=system, method=method, state=state):
+            changed = system.with_params({"b": {"mass": mass}})
+            start = jc.init(system, method, state.q, state.v)
+            return jc.step(changed, method, start, None, H)[0].status
+
+        assert jax.jit(status)(jnp.float32(mass)) == Status.SINGULAR
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"solver": jc.solvers.Schur()},
+        {"solver": jc.solvers.Sparse(tikhonov=1e-8)},
+        {"solver": jc.solvers.RankSafe(always=True)},
+        {"stabilizer": jc.stabilizers.Unstabilized()},
+    ],
+)
+def test_other_solvers_and_motions_without_feedback_keep_their_factors(parts, monkeypatch):
+    def refused(*_):
+        raise AssertionError("the joints were eliminated along the tree")
+
+    monkeypatch.setattr(TreeEquations, "solver", refused)
+    system, state = trees(2)
+    method = jc.Method(contact_solver=jc.solvers.Newton(), **parts)
+    start = jc.init(system, method, state.q, state.v)
+    assert jc.step(system, method, start, None, H)[0].status == 0
+    other = jc.Method(contact_solver=jc.solvers.Newton(), integrator=jc.RK4())
+    with pytest.raises(AssertionError, match="along the tree"):
+        jc.step(system, other, start, None, H)
