@@ -398,8 +398,10 @@ class Stabilizer(TreeNode, Protocol):
         """
         ...
 
-    reduces_errors: ClassVar[bool] = True
-    """False if errors φ of the constraints may grow without bound, as without feedback."""
+    @property
+    def reduces_errors(self) -> bool:
+        """False if errors φ of the constraints may grow without bound, as without feedback."""
+        return True
 
     def solve(
         self, solver: Solver, rows: Rows, memory: Any, dt: Array, system: Saddle

@@ -180,7 +180,8 @@ def step(
     if state.memory:
         contact_λ = memory.contact_multipliers
         if reactions is not None and len(contact_λ) == len(reactions.multipliers):
-            contact_λ = reactions.multipliers
+            hit = reactions.lasting is not None
+            contact_λ = reactions.lasting if hit else reactions.multipliers
         parts = MethodMemory(advanced.memory, remembered, memory.recovery, contact_λ)
         new = dataclasses.replace(new, memory=parts)
     finite = jnp.where(is_finite(new), Status.OK, Status.NON_FINITE).astype(jnp.int32)

@@ -20,6 +20,7 @@ from jaxcon.contact.contact_default import default_contact_solver
 from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
 from jaxcon.linear.articulated import Articulated, Reflections
+from jaxcon.staging.batch_last import native_p
 
 H = 2e-3
 SWEEPS = jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=400))
@@ -439,3 +440,46 @@ def test_contacts_between_free_bodies_move_as_by_sweeps():
         ends.append(jc.rollout(system, method, start, None, H, 60, record=lambda s, i: None)[0])
     assert abs(ends[0].v[6]) > 0.1  # the impact passes through
     np.testing.assert_allclose(ends[1].v, ends[0].v, atol=1e-6)
+
+
+def test_after_an_impact_the_next_step_starts_without_its_impulse():
+    """A block slides to a stop with restitution, another rests on two feet beside it."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("block", mass=3.0, inertia=0.1, position=(0.0, 0.1))
+    feet = np.array([(-0.2, 0.0), (0.2, 0.0)])
+    scene.add(jc.PlaneContact("feet", jc.WORLD, "block", center=feet, friction=0.5))
+    scene.add_body("slider", mass=1.0, inertia=0.1, position=(0.0, 0.4))
+    scene.add(jc.Prismatic("rail", "block", "slider", point=(0.0, 0.4), axis=(1.0, 0.0)))
+    scene.add(jc.contacts.Limit("stop", "rail", upper=0.1, restitution=0.5))
+    system, state = scene.build()
+    method = jc.Method(contact_solver=jc.solvers.Newton(iterations=1))
+    calm = jc.Method(contact_solver=jc.solvers.Newton())
+    state = jc.init(system, calm, state.q, state.v.at[1].set(2.0))
+    step = jax.jit(jc.step)
+    hits = []
+    for _ in range(60):
+        state, info = step(system, calm, state, None, H)
+        hits.append(abs(float(info.reactions["stop"][0])))
+        if hits[-1] > 100:  # an impulse over h
+            break
+    assert hits[-1] > 100
+    λ = state.memory.contact_multipliers
+    assert np.abs(λ).max() < 50
+    _, info = step(system, method, state, None, H)
+    assert info.reactions.residual < 1e-2
+
+
+def test_a_derivative_of_newton_starts_from_its_solution_and_one_of_sweeps_does_not():
+    system, state = biped(2)
+
+    def natives(jaxpr):
+        for equation in jaxpr.eqns:
+            if equation.primitive is native_p:
+                yield equation.params["fun"]
+
+    for solver, expected in ((jc.solvers.Newton(), True), (jc.solvers.GaussSeidel(), False)):
+        method = jc.Method(contact_solver=solver)
+        start = jc.init(system, method, state.q, state.v)
+        closed = jax.make_jaxpr(lambda s, m=method: jc.step(system, m, s, None, H)[0])(start)
+        (native,) = natives(closed.jaxpr)
+        assert (native.guess is not None) == expected

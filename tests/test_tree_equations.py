@@ -154,6 +154,35 @@ def test_only_dependent_rows_are_dependent_whatever_the_unit_of_length(unit):
         assert Reflections(given, 6).dependent.all() == expected
 
 
+def test_rows_of_numbers_keep_the_dtype_of_the_others():
+    """An angular row before a linear one, in single precision beside double precision."""
+    rows = [Vector(1.0, 0.0, 0.0), Vector(jnp.ones(2, jnp.float32), 0.0, 1.0)]
+    factored = Reflections([row.map(jnp.float32) if i else row for i, row in enumerate(rows)], 3)
+    assert all(x.dtype == jnp.float32 for x in factored.least([jnp.ones(2, jnp.float32)] * 2))
+
+
+def test_deep_trees_in_single_precision_keep_their_factors(monkeypatch):
+    def refused(*_):
+        raise AssertionError("the joints were eliminated along the tree")
+
+    monkeypatch.setattr(TreeEquations, "solver", refused)
+    for links in (12, 14):
+        scene = jc.Scene(dim=2, dtype=jnp.float32)
+        for i in range(links):
+            scene.add_body(f"{i}", mass=1.0, inertia=0.1, position=(float(i), 0.2))
+            parent = str(i - 1) if i else jc.WORLD
+            scene.add(jc.Revolute(f"hinge {i}", parent, f"{i}", point=(i - 0.5, 0.2)))
+        scene.add(jc.PlaneContact("floor", jc.WORLD, "3", radius=0.1))
+        system, state = scene.build()
+        method = jc.Method(contact_solver=jc.solvers.Newton())
+        start = jc.init(system, method, state.q, state.v)
+        if links == 14:
+            assert jc.step(system, method, start, None, H)[0].status == 0
+            continue
+        with pytest.raises(AssertionError, match="along the tree"):
+            jc.step(system, method, start, None, H)
+
+
 def test_a_body_without_mass_is_singular():
     for mass in (0.0, -1.0):
         scene = jc.Scene(dim=2, dtype=jnp.float32)
@@ -179,6 +208,7 @@ def test_a_body_without_mass_is_singular():
         {"solver": jc.solvers.Sparse(tikhonov=1e-8)},
         {"solver": jc.solvers.RankSafe(always=True)},
         {"stabilizer": jc.stabilizers.Unstabilized()},
+        {"stabilizer": jc.stabilizers.Unstabilized(), "recovery": jc.stabilizers.Recovery()},
     ],
 )
 def test_other_solvers_and_motions_without_feedback_keep_their_factors(parts, monkeypatch):
@@ -191,5 +221,6 @@ def test_other_solvers_and_motions_without_feedback_keep_their_factors(parts, mo
     start = jc.init(system, method, state.q, state.v)
     assert jc.step(system, method, start, None, H)[0].status == 0
     other = jc.Method(contact_solver=jc.solvers.Newton(), integrator=jc.RK4())
+    start = jc.init(system, other, state.q, state.v)
     with pytest.raises(AssertionError, match="along the tree"):
         jc.step(system, other, start, None, H)

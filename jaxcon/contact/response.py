@@ -255,7 +255,8 @@ class Response:
     ) -> ContactProblem:
         """Returns the contact problem, with factors of the equality rows.
 
-        Beside Newton's method they are eliminated along the joints, if the solver has no options.
+        With Newton's method the equality rows are eliminated along the joints, unless the solver
+        has options.
         `hard` is False if the stabilizer has made joints compliant, as `Penalty` does. They then do
         not allow the motions of a tree only.
         """
@@ -338,6 +339,7 @@ def _struck(
     reactions = dataclasses.replace(
         reactions,
         multipliers=λ,
+        lasting=reactions.multipliers,
         residual=jnp.maximum(reactions.residual, struck.residual),
         kept=jnp.minimum(reactions.kept, struck.kept),
         jump=jump,

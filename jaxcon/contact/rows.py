@@ -107,6 +107,8 @@ class Reactions(Mapping[str, Array]):
             not possible, and after an integrator has applied it.
         layout: assignment of rows to elements.
         direction: the sign of the force λ of the stop that acted; see `BoundRows.direction`.
+        lasting: multipliers without the impulses of impacts, (n,), from which the next step starts;
+            None if impacts are not possible.
     """
 
     multipliers: Array
@@ -116,13 +118,14 @@ class Reactions(Mapping[str, Array]):
     jump: Any
     layout: BoundLayout = static()
     direction: Array | None = None
+    lasting: Array | None = None
     # a mapping compares its items, which are arrays without a single truth value
     __eq__ = object.__eq__
     __hash__ = object.__hash__  # type: ignore[assignment]
 
     def without_jump(self) -> Reactions:
-        """Returns the reactions without the jump, which an integrator has applied."""
-        return dataclasses.replace(self, jump=None)
+        """Returns the reactions without `jump` and `lasting`, which the step has used."""
+        return dataclasses.replace(self, jump=None, lasting=None)
 
     def __iter__(self) -> Iterator[str]:
         """Iterates over the names of the elements."""

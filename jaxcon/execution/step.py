@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import jax
 
 from jaxcon.constraints.rows import Violation
+from jaxcon.contact.newton import Newton
 from jaxcon.contact.rows import Reactions
 from jaxcon.core import checks
 from jaxcon.core.typing import Array, PyTree, Scalar
@@ -31,8 +32,19 @@ def _contact_multipliers(state: State) -> Array | None:
     return memory.contact_multipliers if memory.has_contact_multipliers else None
 
 
-GUESS = (lambda args: _contact_multipliers(args[2]), lambda new: _contact_multipliers(new[0]))
-"""A step starts its solver from the multipliers of the last step, and a derivative from its own."""
+def _start(args: tuple[System, Method, State, PyTree, Array]) -> Array | None:
+    """Returns the multipliers from which a step iterates until the laws are met; None otherwise."""
+    system, method, state, *_ = args
+    start = _contact_multipliers(state)
+    if start is None or not system.bounds or method.events is not None:
+        return None
+    solver = method.contact_solver_for(system, state)
+    return start if isinstance(solver, Newton) and solver.warm else None
+
+
+GUESS = (_start, lambda result: _contact_multipliers(result[0]))
+"""A step starts its contact solver from the multipliers of the last step; its derivative starts
+from those of the step."""
 
 
 def step(

@@ -136,6 +136,8 @@ class Reflections:
         self._mirrors: list[tuple[Lanes, Lane]] = []
         self._inverses: list[Array] = []  # 1/R_jj
         self.dependent: Array | None = None
+        arrays = (x for row in rows for x in row if isinstance(x, jax.Array))
+        dtype = next((x.dtype for x in arrays), None)
         squares = [row.dot(row) for row in rows]
         # 1 + d² for arms d of the rows from the reference point, in units of length
         linear = [Vector(*row[size // 2 :]) for row in rows]
@@ -143,7 +145,8 @@ class Reflections:
         longest = functools.reduce(jnp.maximum, reach, 1.0)
         for j, column in enumerate(self._columns):
             x = column[j:]
-            length = numerics.norm(Vector(*x))
+            # rows of Python numbers alone have no dtype of their own
+            length = jnp.asarray(numerics.norm(Vector(*x)), dtype)
             # what arms add to other rows makes this length shorter, up to 1/d of a row; this
             # must not count as dependence
             share = size * float(jnp.finfo(length.dtype).eps)

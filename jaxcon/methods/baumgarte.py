@@ -29,11 +29,14 @@ It is a fraction of Σ|γ_i| over the rows of a constraint.
 class Unstabilized(checks.Checked, Stabilizer):
     """No feedback, b = −γ: constraints hold at acceleration level only, and errors grow."""
 
-    reduces_errors: ClassVar[bool] = False
-
     def constraint_equations(self, rows: Rows, memory: PyTree, dt: Array) -> Rows:
         """Returns the rows with the target b = −γ of J a + C λ = b, where φ̈ = J a + γ."""
         return rows.with_target(-rows.bias)
+
+    @property
+    def reduces_errors(self) -> bool:
+        """False: errors grow."""
+        return False
 
 
 @pytree
@@ -225,6 +228,11 @@ class Wrapper(Stabilizer):
     ) -> tuple[State, Array]:
         """Returns the state corrected by the inner stabilizer, and a status."""
         return self.inner.correct(system, solver, before, state, memory, dt)
+
+    @property
+    def reduces_errors(self) -> bool:
+        """False if the inner stabilizer lets errors grow."""
+        return self.inner.reduces_errors
 
     @property
     def corrects(self) -> tuple[str, ...]:

@@ -21,8 +21,8 @@ parameter shared by all worlds is read once. The transpose of that broadcast is 
 The sum is right for `grad(vmap(f))`, and wrong for `vmap(grad(f))`. Therefore a batched transposed
 map returns one cotangent for each world, also for arguments that the worlds share.
 
-The reverse pass keeps only the arguments of each call. A call is a checkpoint, and its derivative
-evaluates the function once more.
+The reverse pass keeps only the arguments of each call, with the solution of an iteration in place
+of its start. A call is a checkpoint, and its derivative evaluates the function once more.
 """
 
 from __future__ import annotations
@@ -410,8 +410,9 @@ def _native(
 
 
 def _place(x: Array | None, arrays: Sequence[Array]) -> int | None:
-    """Returns the index of an array in a list; None if it is not in the list, or None itself."""
-    return next((i for i, y in enumerate(arrays) if x is not None and y is x), None)
+    """Returns the index of an array in a list; None if it is not there once, or None itself."""
+    places = [i for i, y in enumerate(arrays) if x is not None and y is x]
+    return places[0] if len(places) == 1 else None
 
 
 _shared = functools.lru_cache(maxsize=256)(_native)
@@ -434,10 +435,10 @@ def call(
         args: pytrees of arrays.
         staged: True if the function may be cut into stages; False for users' functions, which may
             contain any operations.
-        guess: two functions that return an array or None. That of the arguments, a tuple, is only
-            the start of an iteration, on which the result does not depend; that of the result is a
-            start from which the iteration ends at once. A derivative, which evaluates the function
-            once more, takes it.
+        guess: a pair of functions (arguments → start, result → solution), which may return None.
+            The function iterates from `start` until it reaches `solution`, and its result does not
+            depend on the start. A derivative, which evaluates the function once more, starts from
+            the solution.
 
     Returns:
         The result of the function.
@@ -491,7 +492,8 @@ def _jvp(
     if fun.guess is not None:
         argument, solution = fun.guess
         primals = list(primals)
-        primals[argument] = jax.lax.stop_gradient(results[solution])
+        dtype = primals[argument].dtype
+        primals[argument] = jax.lax.stop_gradient(results[solution]).astype(dtype)
     moved = tuple(type(x) is not ad.Zero for x in tangents)
     given = (x for x, flag in zip(tangents, moved, strict=True) if flag)
     moving = iter(bound((*primals, *given), fun.tangent(moved)))
