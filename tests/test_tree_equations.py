@@ -111,7 +111,7 @@ def test_a_step_in_single_precision_is_that_of_dense_matrices(dim):
 
 @dims
 def test_gradients_of_joint_forces_are_those_of_dense_matrices(dim):
-    """Of λ of joints and rotors, by positions and velocities."""
+    """λ of joints and rotors, and the new v, are differentiated by q and v."""
     system, state = trees(dim)
     grads = []
     for solver in (jc.solvers.Sparse(), jc.solvers.Dense()):

@@ -76,10 +76,8 @@ def cost(system: System, method: Method, state: State, choice: Choice) -> Cost:
     """
     kinds = kinds_of(system, state.q, state.v)
     solver = method.contact_solver_for(system, state)
-    contact, named = (
-        contact_operations(solver, kinds, state.q.dtype),
-        words(solver) if kinds else "",
-    )
+    contact = contact_operations(solver, kinds, state.q.dtype)
+    named = words(solver) if kinds else ""
     return Cost(_rows(system, state), _of_solver(method.solver, choice), contact, named)
 
 

@@ -305,17 +305,14 @@ class TreeEquations:
         shape = (n, *target.shape[1:])
         wrench = jnp.stack([jnp.broadcast_to(x, shape) for x in applied])
 
-        def once(known: tuple[Array, Array]) -> tuple[Array, Array]:
-            wrenches, targets = known
-            y, ν = self._without_drift(
-                self._by_branch(Vector.of(wrench + wrenches)), target + targets
-            )
+        def solved(wrench: Array, target: Array) -> tuple[Array, Array]:
+            y, ν = self._without_drift(self._by_branch(Vector.of(wrench)), target)
             return self._stacked(y, force), ν
 
-        none = jnp.zeros_like(wrench), jnp.zeros_like(target)
-        y, ν = once(none)
+        y, ν = solved(wrench, target)
         if any(x.rows is not None for x in self.drifts):
-            y, ν = once(self._drifted(y, ν))
+            wrenches, targets = self._drifted(y, ν)
+            y, ν = solved(wrench + wrenches, target + targets)
         return self._velocity(y), ν
 
     def _drifted(self, y: Array, multipliers: Array) -> tuple[Array, Array]:
