@@ -35,6 +35,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.joint_trees import tree_equations, tree_without_contact
 from jaxcon.constraints.rows import Rows, Violation, linearize, saddle
 from jaxcon.core import status
 from jaxcon.core.doubled import Doubled
@@ -42,7 +43,7 @@ from jaxcon.core.pytree import pytree
 from jaxcon.core.status import Status
 from jaxcon.core.summary import Stacked, codes, listed, shape, span, table
 from jaxcon.core.typing import Array, PyTree
-from jaxcon.linear.saddle import Saddle, Solution
+from jaxcon.linear.saddle import Factored, Saddle, Solution
 from jaxcon.protocols import Solver, Stabilizer, System
 from jaxcon.staging.worlds import where_tree
 from jaxcon.system.jump import with_jump
@@ -291,9 +292,26 @@ class Dynamics:
         solution = self.stabilizer.solve(self.solver, observed, self.memory, self.dt, system)
         if solution is not None:
             return Solved(self.system.complete(solution), rows)
-        factored = self.solver.factor(system)
+        hard = system.compliance is rows.compliance
+        factored = self.factor(system, q, v, hard)
         solution = self.system.complete(factored(system.force, system.target))
         return Solved(solution, rows, lambda b: factored(jnp.zeros_like(system.force), b))
+
+    def factor(self, system: Saddle, q: Array, v: Array, hard: bool) -> Factored:
+        """Factors the saddle system: along the joints of a robot, elsewhere by the solver.
+
+        Args:
+            system: the saddle system.
+            q: positions, (n_q,).
+            v: velocities, (n_v,).
+            hard: False if the stabilizer has made joints compliant, as `Penalty` does.
+        """
+        tree = None
+        if hard:
+            tree = tree_without_contact(self.system, self.solver, self.stabilizer, system)
+        if tree is None:
+            return self.solver.factor(system)
+        return tree_equations(self.system, q, v, tree, system).solver(system)
 
     def at_step_start(
         self, q: Array, v: Array, t: Doubled | Array

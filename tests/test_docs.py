@@ -60,7 +60,9 @@ def look_up(name):
     parts = name.split(".")
     here = importlib.import_module("jaxcon")
     for i, part in enumerate(parts[1:], 2):
-        here = getattr(here, part, None) or importlib.import_module(".".join(parts[:i]))
+        if not hasattr(here, part):
+            importlib.import_module(".".join(parts[:i]))
+        here = getattr(here, part)
     return here
 
 

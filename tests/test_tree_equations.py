@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
+from jaxcon.constraints.joint_trees import tree_equations
 from jaxcon.constraints.rows import linearize, saddle
-from jaxcon.contact.body_space import tree_below, tree_equations
+from jaxcon.contact.body_space import tree_below
 from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
 from jaxcon.core.status import Status
@@ -20,7 +21,7 @@ H = 2e-3
 dims = pytest.mark.parametrize("dim", [2, 3])
 
 
-def trees(dim, dtype=jnp.float64):
+def trees(dim, dtype=jnp.float64, contact=True):
     """Three trees with all that may differ: sides of joints, depths, welds, rotors, a free body."""
 
     def at(x, z):
@@ -41,7 +42,8 @@ def trees(dim, dtype=jnp.float64):
     scene.add(jc.Revolute("e", "6", jc.WORLD, point=at(2.2, 0.5), **hinge))
     for i, joint in enumerate("abde"):
         scene.add(jc.joints.Armature(f"rotor {joint}", joint, 0.05 + 0.1 * i))
-    scene.add(jc.PlaneContact("floor", jc.WORLD, "7", radius=0.1, friction=0.4))
+    if contact:
+        scene.add(jc.PlaneContact("floor", jc.WORLD, "7", radius=0.1, friction=0.4))
     return scene.build()
 
 
@@ -70,12 +72,11 @@ def dense_solution(equations):
 def test_it_is_the_solution_of_dense_algebra(dim):
     system, state = trees(dim)
     equations, factored = equations_of(system, state.q, state.v)
-    f, b = equations.force[:, None], equations.target[:, None]
-    a, λ, status = factored.solver(equations)(f, b)
+    a, λ, status = factored.solver(equations)(equations.force, equations.target)
     assert status == Status.OK
     for found, expected in zip((a, λ), dense_solution(equations), strict=True):
         scale = np.abs(expected).max()
-        np.testing.assert_allclose(found[:, 0], expected, rtol=0, atol=1e-13 * scale)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * scale)
 
 
 @dims
@@ -86,9 +87,9 @@ def test_a_drift_of_the_joints_leaves_an_error_of_its_square(dim):
         shift = size * np.random.default_rng(0).normal(size=len(state.q))
         q = system.normalize(state.q + jnp.asarray(shift))
         equations, factored = equations_of(system, q, state.v)
-        a, _, _ = factored.solver(equations)(equations.force[:, None], equations.target[:, None])
+        a, _, _ = factored.solver(equations)(equations.force, equations.target)
         expected = dense_solution(equations)[0]
-        errors.append(np.abs(a[:, 0] - expected).max() / np.abs(expected).max())
+        errors.append(np.abs(a - expected).max() / np.abs(expected).max())
     assert errors[0] < 1e-6
     assert errors[1] < 2e-2 * errors[0]
 
@@ -110,23 +111,106 @@ def test_a_step_in_single_precision_is_that_of_dense_matrices(dim):
 
 
 @dims
-def test_gradients_of_joint_forces_are_those_of_dense_matrices(dim):
+def test_gradients_of_joint_forces_are_differences(dim):
     """λ of joints and rotors, and the new v, are differentiated by q and v."""
     system, state = trees(dim)
-    grads = []
-    for solver in (jc.solvers.Sparse(), jc.solvers.Dense()):
-        method = jc.Method(solver=solver, contact_solver=jc.solvers.Newton())
-        start = jc.init(system, method, state.q, state.v + 0.3)
+    method = jc.Method(solver=jc.solvers.Sparse(), contact_solver=jc.solvers.Newton())
+    start = jc.init(system, method, state.q, state.v + 0.3)
 
-        def loss(q, v, start=start, method=method):
-            moved = dataclasses.replace(start, q=q, v=v)
-            new, info = jc.step(system, method, moved, None, H)
-            weights = jnp.cos(jnp.arange(len(info.multipliers), dtype=q.dtype))
-            return weights @ info.multipliers + jnp.sum(new.v**2)
+    def loss(x):
+        q, v = jnp.split(x, [len(start.q)])
+        new, info = jc.step(system, method, dataclasses.replace(start, q=q, v=v), None, H)
+        weights = jnp.cos(jnp.arange(len(info.multipliers), dtype=q.dtype))
+        return weights @ info.multipliers + jnp.sum(new.v**2)
 
-        grads.append(jax.jit(jax.grad(loss, (0, 1)))(start.q, start.v))
-    for found, expected in zip(*grads, strict=True):
-        np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+    both = jax.jit(jax.value_and_grad(loss))
+    x = jnp.concatenate([start.q, start.v])
+    gradient, eps = both(x)[1], 1e-5
+    for seed in range(4):
+        way = jnp.asarray(np.random.default_rng(seed).normal(size=len(x)))
+        (up, _), (down, _) = (both(x + sign * eps * way) for sign in (1, -1))
+        np.testing.assert_allclose(gradient @ way, (up - down) / (2 * eps), rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_robots_without_contact_move_as_by_dense_matrices(dtype, monkeypatch):
+    """Two worlds of a batch, by Runge and Kutta's method; λ and the new v."""
+    system, state = trees(3, dtype, contact=False)
+    factored, solver = [], TreeEquations.solver
+
+    def noted(equations, saddle):
+        factored.append(equations)
+        return solver(equations, saddle)
+
+    monkeypatch.setattr(TreeEquations, "solver", noted)
+    rows = linearize(system, state.q, state.v, state.time)
+    joints = np.asarray(rows.jacobian.dense(), float)[np.asarray(rows.layout.holds)]
+    speeds = np.random.default_rng(0).normal(size=(2, len(state.v)))
+    speeds = jnp.asarray(speeds - speeds @ np.linalg.pinv(joints) @ joints, dtype)  # held by joints
+    ends, used = [], []
+    for linear_solver in (jc.solvers.RankSafe(), jc.solvers.Dense()):
+        method = jc.Method(jc.RK4(), solver=linear_solver)
+
+        def stepped(v, method=method):
+            new, info = jc.step(system, method, dataclasses.replace(state, v=v), None, H)
+            return new.v, info.multipliers, new.status
+
+        *numbers, status = jax.jit(jax.vmap(stepped))(speeds)
+        assert (status == 0).all()
+        ends.append(numbers)
+        used.append(len(factored))
+    assert 0 < used[0] == used[1]  # by the first method alone
+    tight = 1e-4 if dtype == jnp.float32 else 1e-10
+    for found, expected in zip(*ends, strict=True):
+        np.testing.assert_allclose(found, expected, rtol=0, atol=tight * np.abs(expected).max())
+
+
+def hinges(count, rotor):
+    """A chain of hinges in space, of which the first may have a rotor."""
+    scene = jc.Scene(dim=3)
+    for i in range(count):
+        scene.add_body(f"{i}", mass=1.0, inertia=(0.1, 0.2, 0.3), position=(float(i), 0, 0))
+        parent = str(i - 1) if i else jc.WORLD
+        ends = {"point": (i - 0.5, 0, 0), "axis": (0, 1.0, 0.2 * i)}
+        scene.add(jc.Revolute(f"hinge {i}", parent, f"{i}", **ends))
+    if rotor:
+        scene.add(jc.joints.Armature("rotor", "hinge 0", 0.1))
+    return scene.build()
+
+
+def test_gradients_without_contact_are_differences():
+    system, state = hinges(2, rotor=True)
+
+    def loss(x):
+        q, v = jnp.split(x, [len(state.q)])
+        moved = dataclasses.replace(state, q=q, v=v)
+        new, info = jc.step(system, jc.Method(), moved, None, H)
+        weights = jnp.cos(jnp.arange(len(info.multipliers), dtype=q.dtype))
+        return weights @ info.multipliers + jnp.sum(new.v**2)
+
+    both = jax.jit(jax.value_and_grad(loss))
+    x = jnp.concatenate([state.q, state.v + 0.3])
+    gradient, eps = both(x)[1], 1e-5
+    for seed in range(3):
+        way = jnp.asarray(np.random.default_rng(seed).normal(size=len(x)))
+        (up, _), (down, _) = (both(x + sign * eps * way) for sign in (1, -1))
+        np.testing.assert_allclose(gradient @ way, (up - down) / (2 * eps), rtol=1e-6)
+
+
+def test_chains_and_planar_scenes_without_contact_keep_their_factors(monkeypatch):
+    def refused(*_):
+        raise AssertionError("the joints were eliminated along the tree")
+
+    monkeypatch.setattr(TreeEquations, "solver", refused)
+    system, state = trees(2, contact=False)
+    assert jc.step(system, jc.Method(), state, None, H)[0].status == 0
+    for rotor in (False, True):
+        system, state = hinges(3, rotor)
+        if not rotor:
+            assert jc.step(system, jc.Method(), state, None, H)[0].status == 0
+            continue
+        with pytest.raises(AssertionError, match="along the tree"):
+            jc.step(system, jc.Method(), state, None, H)
 
 
 @pytest.mark.parametrize(("rows", "size"), [(1, 3), (2, 3), (5, 6), (6, 6)])

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.constraints.armature import Armatures
-from jaxcon.constraints.base import Joints
+from jaxcon.constraints.joint_trees import tree_of_joints
 from jaxcon.contact.bounded import RowCounts
 from jaxcon.contact.rows import BoundRows
 from jaxcon.core.lanes import Vector, collect, plus, take, times, total
@@ -25,12 +24,9 @@ from jaxcon.core.typing import Array, DType, Lane
 from jaxcon.linear.articulated import Articulated, ByBranch, Lanes, Motions, symmetric, widened
 from jaxcon.linear.blocks import Block, freeze
 from jaxcon.linear.jacobian import Jacobian
-from jaxcon.linear.saddle import Saddle
 from jaxcon.linear.tree_equations import JointRows, TreeEquations, add_outer, joint_places
-from jaxcon.linear.trees import Tree, structure, tree_of
-from jaxcon.system.bodies import PlanarRigid, SpatialRigid
+from jaxcon.linear.trees import Tree
 from jaxcon.system.elements import UserElement
-from jaxcon.system.frames import SpatialFrame
 
 if TYPE_CHECKING:
     from jaxcon.constraints.rows import RowLayout
@@ -47,36 +43,15 @@ def tree_below(system: System, joints: Jacobian, layout: RowLayout, rows: BoundR
         rows: the inequality rows.
 
     Returns:
-        The tree; None if there are particles, closed loops, constraints other than joints and
-        rotors, inequalities of user functions, or inequality rows on more than two bodies.
+        The tree; None if there is no `tree_of_joints`, inequalities of user functions, or
+        inequality rows on more than two bodies.
     """
     bounds = rows.jacobian
-    if system.layout is None or not isinstance(bounds, Jacobian):
-        return None
-    if len(system.layout.groups) != 1 or layout.loops:
-        return None
-    # the rows of other constraints may depend on more than the relative motion of two bodies
-    if not all(isinstance(x, Joints | Armatures) for x in system.constraints):
+    if not isinstance(bounds, Jacobian) or any(len(own) > 2 for _, own in bounds.by_rows()):
         return None
     if any(isinstance(x, UserElement) for x in system.bounds):
         return None
-    (group,) = system.layout.groups
-    if not isinstance(group.kind, SpatialRigid | PlanarRigid):
-        return None
-    soft = frozenset(
-        start
-        for start, own in joints.by_rows()
-        if not layout.holds[start : start + own[0].shape[0] * own[0].shape[1]].all()
-    )
-    tree = tree_of(structure(joints), soft, len(group.names), group.kind.n_v)
-    if tree is None:
-        return None
-    if any(len(own) > 2 for _, own in bounds.by_rows()):
-        return None
-    rotors = [own for start, own in joints.by_rows() if start in soft]
-    if any(len(own) > 2 or joint_places(tree, own) is None for own in rotors):
-        return None
-    return tree
+    return tree_of_joints(system, joints, layout)
 
 
 @dataclass(frozen=True)
@@ -118,24 +93,6 @@ class PairRows:
 
     starts: tuple[int, ...]
     sides: tuple[BodyRows, ...]
-
-
-def tree_equations(system: System, q: Array, v: Array, tree: Tree, saddle: Saddle) -> TreeEquations:
-    """Returns the factored equations of motion of the trees of a system.
-
-    Args:
-        system: the system, of which `tree_below` is the tree.
-        q: positions, (n_q,).
-        v: velocities, (n_v,).
-        tree: the tree.
-        saddle: the saddle system at q.
-    """
-    assert system.layout is not None
-    (group,) = system.layout.groups
-    frame = group.kind.frame(*group.unpack(q, v))
-    rotation = frame.rotation if isinstance(frame, SpatialFrame) else None
-    assert group.v == 0
-    return TreeEquations.of(tree, frame.position, rotation, saddle)
 
 
 class BodySpace(NamedTuple):

@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.joint_trees import follows_tree, tree_equations
 from jaxcon.constraints.rows import Rows
 from jaxcon.contact import impacts
-from jaxcon.contact.body_space import tree_below, tree_equations
+from jaxcon.contact.body_space import tree_below
 from jaxcon.contact.limits import OneSided
 from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.newton import Newton
@@ -31,11 +32,8 @@ from jaxcon.core.lanes import add_rhs_axis
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.linear.jacobian import Jacobian
-from jaxcon.linear.proximal import RankSafe
-from jaxcon.linear.saddle import Diagonal, Saddle, Solution
-from jaxcon.linear.sparse import Sparse
-from jaxcon.linear.trees import Tree
-from jaxcon.protocols import ContactSolver, Solver
+from jaxcon.linear.saddle import Diagonal, Factored, Saddle, Solution
+from jaxcon.protocols import ContactSolver
 
 if TYPE_CHECKING:
     from jaxcon.step import Dynamics
@@ -265,8 +263,9 @@ class Response:
             tree = tree_below(dynamics.system, system.jacobian, system.layout, rows)
             if tree is not None:
                 equations = tree_equations(dynamics.system, *point, tree, system)
-        if equations is not None and _follows_tree(dynamics, equations.motions.tree, system):
-            solve = equations.solver(system)
+        parts = dynamics.solver, dynamics.stabilizer
+        if equations is not None and follows_tree(*parts, equations.motions.tree, system):
+            solve = _of_column(equations.solver(system))
         else:
             solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
             solve = solver.factor(add_rhs_axis(system, system.force.ndim - 1))
@@ -288,26 +287,15 @@ class Response:
         return isinstance(self.solver, ActiveSet) and self.solver.leaves_out(rows.kinds)
 
 
-DEPTH = 12
-"""The largest depth of a tree whose joints are eliminated along the tree in single precision.
+def _of_column(solve: Factored) -> Factored:
+    """Returns a solver of (n, …) as one of a single column, (n, 1, …)."""
 
-With arms from the root, rounding errors grow with the square of the depth.
-"""
+    def solve_column(force: Array, target: Array) -> Solution:
+        assert force.shape[1] == target.shape[1] == 1
+        a, λ, code = solve(force[:, 0], target[:, 0])
+        return Solution(a[:, None], λ[:, None], code[None])
 
-
-def _follows_tree(dynamics: Dynamics, tree: Tree, saddle: Saddle) -> bool:
-    """Returns True if the saddle system is solved by elimination along the joints of a tree."""
-    if not saddle.target.size or not dynamics.stabilizer.reduces_errors:
-        return False
-    deep = tree.depth > DEPTH and jnp.finfo(saddle.force.dtype).bits <= 32
-    return not deep and _is_plain(dynamics.solver)
-
-
-def _is_plain(solver: Solver) -> bool:
-    """Returns True if a solver has no options that change the solution of a tree of joints."""
-    if type(solver) is RankSafe:
-        return not solver.always and _is_plain(solver.solver)
-    return type(solver) is Sparse and solver.tikhonov is None
+    return solve_column
 
 
 def _rows_at(dynamics: Dynamics, q: Array, v: Array, t: Doubled | Array) -> BoundRows:

@@ -129,8 +129,9 @@ class MujocoModel:
         """Returns a suitable method for the model, by `jc.Method.auto` at `start`.
 
         `jc.Method.auto` chooses the linear solver. The contact solver is the default of
-        `jc.Method`: Gauss–Seidel sweeps for systems with many inequality rows. If you pass other
-        parts, initialize the state with `jc.init(system, method, state.q, state.v)`.
+        `jc.Method`: for robots with stops and contact, `Newton` where it can be used and
+        `GaussSeidel` elsewhere. If you pass other parts, initialize the state with
+        `jc.init(system, method, state.q, state.v)`.
 
         Args:
             parts: parts of the method that replace the defaults, such as `integrator=jc.RK4()`, and

@@ -252,9 +252,7 @@ class TreeEquations:
         return cls(motions, joints, rotor_rows, drifts, inertia, rotors, factors, c)
 
     def solver(self, saddle: Saddle) -> Factored:
-        """Returns a function (f, b) → `Solution`, for one right-hand side along the second axis.
-
-        The solution is differentiated implicitly.
+        """Returns a function (f, b) → `Solution`, which is differentiated implicitly.
 
         Args:
             saddle: the saddle system of which these are the equations.
@@ -277,13 +275,12 @@ class TreeEquations:
             return jnp.concatenate(self.solve(right[:n], right[n:]))
 
         def solve(force: Array, target: Array) -> Solution:
-            assert force.shape[1] == target.shape[1] == 1
-            right = jnp.concatenate([force[:, 0], target[:, 0]])
+            right = jnp.concatenate([force, target])
             x = jax.lax.custom_linear_solve(apply, right, inverse, symmetric=True)
             a, ν = x[:n], x[n:]
             dependent_only = dependent & jnp.all(jnp.isfinite(a), axis=0)
             code = judge(a, saddle.mass.singular | dependent_only)
-            return Solution(a[:, None], -ν[:, None], code[None])
+            return Solution(a, -ν, code)
 
         return solve
 

@@ -48,15 +48,29 @@ class JointCoordinate:
         The row has value, rate, bias (the part of the second derivative without accelerations), and
         pulls (∂rate/∂v by body).
         """
-        rows = snapshot.joint_rows.setdefault((self.group, self.joints), {})
-        if self.name not in rows:
-            group = snapshot.system.constraints[self.group]
-            rows |= group.select(self.joints).coordinate_rows(snapshot, self.name)
-        row = rows[self.name]
+        joints, row = self._read(snapshot)
+        if joints != self.joints:
+            places = tuple(map(joints.index, self.joints))
+            row = jax.tree.map(lambda x: take(x, places), row)
         if not self.counters:
             return row
         before = take(snapshot.system.turns, self.counters)
         return row._replace(value=before + numerics.wrap(row.value - before))
+
+    def _read(self, snapshot: Snapshot) -> tuple[tuple[int, ...], Row]:
+        """Returns the row without counted turns, for at least these joints, and its joints.
+
+        Rows are computed once for all elements that read the same joints, in any order, or some of
+        them.
+        """
+        for (index, joints), rows in snapshot.joint_rows.items():
+            if index == self.group and self.name in rows and {*self.joints} <= {*joints}:
+                return joints, rows[self.name]
+        joints = tuple(sorted({*self.joints}))
+        rows = snapshot.joint_rows.setdefault((self.group, joints), {})
+        group = snapshot.system.constraints[self.group]
+        rows |= group.select(joints).coordinate_rows(snapshot, self.name)
+        return joints, rows[self.name]
 
     def rate(self, snapshot: Snapshot, row: Row, v: Array) -> Lane:
         """Returns the rate θ̇ of the coordinate for other velocities at the same positions.
