@@ -131,9 +131,10 @@ def tree_without_contact(
 def _is_faster(tree: Tree, rotors: bool) -> bool:
     """Returns True if elimination along joints in space is faster than block elimination.
 
-    Measured in single precision with 128 worlds on one core, for robots of MuJoCo without stops and
-    contact: 1.7 (ant), 1.3 (half-cheetah), 1.4 to 1.9 (hopper) and 1.03 times as fast (humanoid);
-    without rotors, the ant 1.2 and the hopper 0.9 times, and a chain of five hinges 0.55 times.
+    Measured in single precision with 128 worlds, for robots of MuJoCo without stops and contact:
+    1.5 to 2.5 (ant), 1.3 to 1.9 (hopper), 1.1 to 1.3 (half-cheetah) and 1.03 to 1.2 times as fast
+    (humanoid); without rotors, the ant 1.2 and the hopper 0.9 times, and a chain of five hinges
+    0.55 times.
 
     Args:
         tree: the tree of the bodies.
