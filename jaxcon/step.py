@@ -36,7 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.joint_trees import tree_equations, tree_without_contact
-from jaxcon.constraints.rows import Rows, Violation, linearize, saddle
+from jaxcon.constraints.rows import Rows, Violation, keeps_rows, linearize, saddle
 from jaxcon.core import status
 from jaxcon.core.doubled import Doubled
 from jaxcon.core.pytree import pytree
@@ -292,7 +292,7 @@ class Dynamics:
         solution = self.stabilizer.solve(self.solver, observed, self.memory, self.dt, system)
         if solution is not None:
             return Solved(self.system.complete(solution), rows)
-        hard = system.compliance is rows.compliance
+        hard = keeps_rows(system, rows)
         factored = self.factor(system, q, v, hard)
         solution = self.system.complete(factored(system.force, system.target))
         return Solved(solution, rows, lambda b: factored(jnp.zeros_like(system.force), b))

@@ -6,8 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scenes
 
 import jaxcon as jc
+from jaxcon.constraints.base import Joints, blocks_of
 from jaxcon.constraints.joint_trees import tree_equations
 from jaxcon.constraints.rows import linearize, saddle
 from jaxcon.contact.body_space import tree_below
@@ -15,6 +17,7 @@ from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
 from jaxcon.core.status import Status
 from jaxcon.linear.articulated import Reflections
+from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.tree_equations import TreeEquations
 
 H = 2e-3
@@ -308,3 +311,95 @@ def test_other_solvers_and_motions_without_feedback_keep_their_factors(parts, mo
     start = jc.init(system, other, state.q, state.v)
     with pytest.raises(AssertionError, match="along the tree"):
         jc.step(system, other, start, None, H)
+
+
+SIDES = [*scenes.parts(2, "between"), *scenes.parts(3, "between")]
+
+
+@pytest.mark.parametrize("name", SIDES)
+def test_relative_joints_do_not_resist_a_common_motion(name):
+    built = scenes.build(name)
+    system, q = built.system, built.state.q
+    joints = [x for x in system.constraints if isinstance(x, Joints) and x.law.relative]
+    assert joints
+
+    def rates(v):
+        snapshot = system.snapshot(q, v, 0.0)
+        rows = [tuple(blocks_of(system, x.places, x.rows(snapshot), 0)) for x in joints]
+        shapes = [(x[0].shape[0] * x[0].shape[1], len(v)) for x in rows if x]
+        held = [x for x in rows if x]
+        return [Jacobian(*x).apply(v) for x in zip(held, shapes, strict=True)]
+
+    def common_motion():
+        frame = system.snapshot(q, built.off.v, 0.0).frames[0]
+        x, ẋ = frame.position, Vector(0.3, -0.5, 0.7)
+        if len(x) == 2:
+            return Vector(ẋ[0] - 0.9 * x[1], ẋ[1] + 0.9 * x[0], 0.9).stack().ravel()
+        ω = Vector(0.2, 0.9, -0.4)
+        return Vector(*(ẋ + ω.cross(x)), *(frame.rotation.T @ ω)).stack().ravel()
+
+    for any_rates, common in zip(rates(built.off.v), rates(common_motion()), strict=True):
+        assert np.abs(any_rates).max() > 1e-2
+        np.testing.assert_allclose(common, 0, atol=1e-12)
+
+
+@dataclasses.dataclass(frozen=True)
+class Counterweight(jc.extend.Joint):
+    """A joint of a user's own: as one body sinks, the other rises on the same vertical line."""
+
+    def attach(self, a, b):
+        return {"sum": a.position[2] + b.position[2], "anchor_a": 0 * a.position}
+
+    @staticmethod
+    def rows(p, a, b):
+        at_a, at_b = a.point(p["anchor_a"]), b.point(p["anchor_a"])
+        up = Vector(0.0, 0.0, 1.0)
+        height = jc.extend.Row(
+            at_a.position[2] + at_b.position[2] - p["sum"],
+            at_a.velocity[2] + at_b.velocity[2],
+            at_a.bias[2] + at_b.bias[2],
+            (at_a.pull(up), at_b.pull(up)),
+        )
+        return [*jc.extend.meet(at_a, at_b)[:2], height]
+
+
+@pytest.mark.parametrize("contact", [False, True])
+def test_joints_of_a_user_are_not_eliminated_along_the_tree(contact):
+    """Without contact and with `Newton`; a common motion of both bodies changes the rows."""
+    scene = jc.Scene(dim=3)
+    for i, x in enumerate((0.5, 2.0, 2.0)):
+        size = {"mass": 1.0 + i, "inertia": (0.03, 0.04, 0.05)}
+        scene.add_body(f"{i}", position=(x, 0.0, 1.0 + i), **size)
+    scene.add(jc.Revolute("hinge", jc.WORLD, "0", point=(0, 0, 1), axis=(0, 1, 0)))
+    scene.add(jc.joints.Armature("rotor", "hinge", 0.3))
+    scene.add(Counterweight("cable", "1", "2"))
+    if contact:
+        scene.add(jc.PlaneContact("floor", jc.WORLD, "0", radius=0.99999, friction=0.4))
+    system, state = scene.build()
+    ends = []
+    for solver in (jc.solvers.RankSafe(), jc.solvers.Dense()):
+        method = jc.Method(solver=solver, contact_solver=jc.solvers.Newton())
+        start = jc.init(system, method, state.q, state.v)
+        ends.append(jax.jit(jc.step)(system, method, start, None, H))
+    (new, info), (expected, other) = ends
+    assert new.status == expected.status == 0
+    # Atwood's machine: v = h g (m₂ − m₁) / (m₁ + m₂)
+    heights = np.asarray(new.v).reshape(6, 3)[2]
+    np.testing.assert_allclose(heights[1:], [H * 9.81 / 5, -H * 9.81 / 5], rtol=1e-6)
+    np.testing.assert_allclose(new.v, expected.v, atol=1e-12)
+    np.testing.assert_allclose(info.multipliers, other.multipliers, atol=1e-9)
+
+
+class Own(jc.Revolute):
+    """A joint with rows of its own, of a class whose rows depend on relative motion only."""
+
+    @staticmethod
+    def rows(p, a, b):
+        return jc.Revolute.rows(p, a, b)
+
+
+def test_only_the_class_that_defines_rows_says_on_what_they_depend():
+    assert jc.Revolute.relative
+    assert jc.joints.Spherical.relative  # with the rows of Coincident
+    assert not jc.extend.Joint.relative
+    assert not Own.relative

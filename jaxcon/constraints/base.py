@@ -57,6 +57,18 @@ class Joint(BetweenBodies):
     x_axis = None
     """The direction of the first coordinate normal to `axis`; None for a default direction."""
 
+    relative: ClassVar[bool] = False
+    """True if the rows depend only on the motion of the second body relative to the first.
+
+    Robots of such joints can be eliminated along the joints. A class that defines `rows` does not
+    inherit this attribute.
+    """
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "rows" in vars(cls) and "relative" not in vars(cls):
+            cls.relative = False
+
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the numbers of the joint by field; points and directions are in body frames.
 

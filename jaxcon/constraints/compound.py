@@ -48,6 +48,7 @@ class Freedoms(Element):
     hinges: int
     ball: bool
     in_b = ("axis_2", "first_2", "second_2")
+    relative = True
 
     @property
     def coordinates(self) -> dict[str, str]:

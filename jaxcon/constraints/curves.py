@@ -65,6 +65,7 @@ class PointOnCurve(Joint):
     curve: Callable[..., Array]
     point: Any = None
     params: PyTree = None
+    relative = True
 
     def attach(  # type: ignore[override]
         self, a: Pose, b: Pose, user_frame: Pose

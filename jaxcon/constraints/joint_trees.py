@@ -43,13 +43,13 @@ def tree_of_joints(system: System, joints: Jacobian, layout: RowLayout) -> Tree 
         layout: the layout of the equality rows.
 
     Returns:
-        The tree; None if there are particles, closed loops, or constraints other than joints and
-        rotors.
+        The tree; None if there are particles, closed loops, or constraints other than rotors and
+        joints whose rows depend on relative motion only.
     """
     if system.layout is None or len(system.layout.groups) != 1 or layout.loops:
         return None
-    # the rows of other constraints may depend on more than the relative motion of two bodies
-    if not all(isinstance(x, Joints | Armatures) for x in system.constraints):
+    others = (x for x in system.constraints if not isinstance(x, Armatures))
+    if not all(isinstance(x, Joints) and x.law.relative for x in others):
         return None
     (group,) = system.layout.groups
     if not isinstance(group.kind, SpatialRigid | PlanarRigid):

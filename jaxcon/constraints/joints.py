@@ -43,6 +43,7 @@ class Coincident(Joint):
     """
 
     point: Any
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in the frames of both bodies."""
@@ -82,6 +83,7 @@ class Distance(Joint):
     point_a: Any = None
     point_b: Any = None
     ranges = POSITIVE_LENGTH
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the points in the frames of their bodies, and the length."""
@@ -107,6 +109,7 @@ class Fixed(Joint):
 
     point: Any = None
     oriented = True
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in the frames of both bodies, and the orientation of b in a."""
@@ -141,6 +144,7 @@ class Revolute(Joint):
     oriented = True
     turns = True
     coordinates = MappingProxyType({"angle": "rad"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in the frames of both bodies, and references of the angle.
@@ -194,6 +198,7 @@ class Prismatic(Joint):
     point: Any = None
     oriented = True
     coordinates = MappingProxyType({"travel": "m"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in both frames, and the axis, its normals and b's orientation in a."""

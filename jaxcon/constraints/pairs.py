@@ -62,6 +62,7 @@ class PointOnLine(Joint):
     axis: Any
     point: Any = None
     coordinates = MappingProxyType({"travel": "m"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in the frames of both bodies, and the axis and its normals in a."""
@@ -100,6 +101,7 @@ class PointOnPlane(Joint):
     point: Any = None
     x_axis: Any = None
     coordinates = MappingProxyType({"x": "m", "y": "m"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in both frames, and the normal and the tangents of the plane in a."""
@@ -141,6 +143,7 @@ class Parallel(Joint):
     oriented = True
     dims = (3,)
     coordinates = MappingProxyType({"angle": "rad"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the axis in the frame of a, and its normals in the frames of both bodies."""
@@ -173,6 +176,7 @@ class Cylindrical(Parallel):
 
     point: Any = None
     coordinates = MappingProxyType({"travel": "m", "angle": "rad"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in both frames, the axis in a, and its normals in both frames."""
@@ -211,6 +215,7 @@ class Screw(Cylindrical):
 
     lead: Any = None
     nonzero = ("lead",)
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the numbers of the sleeve joint (`Cylindrical`), and the lead."""
@@ -255,6 +260,7 @@ class Planar(Parallel):
     point: Any = None
     x_axis: Any = None
     coordinates = MappingProxyType({"x": "m", "y": "m", "angle": "rad"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns point and tangents of the plane in both body frames, and its normal in a."""
@@ -316,6 +322,7 @@ class RevoluteSpherical(Joint):
     dims = (3,)
     coordinates = MappingProxyType({"angle": "rad"})
     ranges = POSITIVE_LENGTH
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the rod's ends in their bodies' frames, its length, and three directions in a.
@@ -394,6 +401,7 @@ class Universal(Joint):
     oriented = True
     dims = (3,)
     coordinates = MappingProxyType({"angle_a": "rad", "angle_b": "rad"})
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in both frames, both axes, and the reference directions of the angles.
@@ -467,6 +475,7 @@ class ConstantVelocity(Joint):
     axis_b: Any = None
     oriented = True
     dims = (3,)
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in both frames, and directions in each body normal to its shaft."""
@@ -527,6 +536,7 @@ class Span(Joint):
     point_b: Any = None
     coordinates = MappingProxyType({"stretch": "m"})
     ranges = POSITIVE_LENGTH
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the two points in the frames of their bodies, and the distance between them."""
@@ -569,6 +579,7 @@ class Twist(Joint):
     dims = (3,)
     coordinates = MappingProxyType({"twist": "rotation"})
     in_b = ("axis",)
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the point in both frames, the axis in b, and the orientation of b in a."""

@@ -74,6 +74,7 @@ class RollingSphere(Joint):
     oriented = True
     dims = (3,)
     ranges = POSITIVE_RADIUS
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the plane in the frame of a, the center in the frame of b, and the radius."""
@@ -131,6 +132,7 @@ class RollingCylinder(Joint):
     dims = (3,)
     ranges = POSITIVE_RADIUS
     in_b = ("axis",)
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the plane in the frame of a, center and axis in b's frame, and the radius."""
@@ -194,6 +196,7 @@ class RollingDisc(Joint):
     turns = True
     ranges = POSITIVE_RADIUS
     in_b = ("axis",)
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the plane in the frame of a, the center in the frame of b, and the radius.
@@ -376,6 +379,7 @@ class KnifeEdge(Joint):
     center: Any = None
     oriented = True
     in_b = ("edge",)
+    relative = True
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
         """Returns the plane of the ice in a, and the contact point and the edge in b."""

@@ -358,6 +358,18 @@ def saddle(
     return Saddle(mass, force, rows.jacobian, target, rows.compliance, noise, layout.loops, layout)
 
 
+def keeps_rows(system: Saddle, rows: Rows) -> bool:
+    """Returns True if a stabilizer has left J and C as they are.
+
+    `Penalty`, for example, makes joints compliant.
+
+    Args:
+        system: the saddle system of the rows that the stabilizer returned.
+        rows: the rows that it was given.
+    """
+    return system.jacobian is rows.jacobian and system.compliance is rows.compliance
+
+
 def components(rows: list[Row], blocks: list[Block], dim: int) -> list[tuple[int, ...]]:
     """Groups the rows of a joint that are components of one vector, either of lengths or of angles.
 

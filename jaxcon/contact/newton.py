@@ -79,12 +79,11 @@ class Newton(checks.Checked, ContactSolver):
     joints, too, are eliminated along the tree (`TreeEquations`). In single precision, accelerations
     then err by the order of the drift φ of the joints, relative to the arms of the bodies, and in
     double precision by φ². This also needs a stabilizer other than `Unstabilized()`, and in single
-    precision at most 12 joints between a body and the root of its tree. Joints must depend on the
-    relative motion of their bodies alone, as all joints of the library do.
+    precision at most 12 joints between a body and the root of its tree.
 
     Scenes with closed loops, particles, constraints other than joints and rotors, compliant joints,
-    or user inequalities are solved by `GaussSeidel()` instead. So is what an `ActiveSet` around
-    this solver leaves.
+    joints of your own (unless `Joint.relative` is True), or user inequalities are solved by
+    `GaussSeidel()` instead. So is what an `ActiveSet` around this solver leaves.
 
     Attributes:
         iterations: the largest number of iterations in a step; None for 12 in single precision and

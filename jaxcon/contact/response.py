@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.constraints.joint_trees import follows_tree, tree_equations
-from jaxcon.constraints.rows import Rows
+from jaxcon.constraints.rows import Rows, keeps_rows
 from jaxcon.contact import impacts
 from jaxcon.contact.body_space import tree_below
 from jaxcon.contact.limits import OneSided
@@ -117,7 +117,7 @@ class Response:
             change = self.rate_change(dynamics, bounds, q, v, t)
             bounds = dataclasses.replace(bounds, rate_change=change)
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
-        hard = system.compliance is rows.compliance
+        hard = keeps_rows(system, rows)
         impulse = self._impulse(dynamics, (q, v), base, system, length, bounds.acts, hard, share)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         seen, may = None, jnp.zeros_like(bounds.rate, bool)
@@ -234,7 +234,7 @@ class Response:
         force, target = (jnp.where(lasts, x, 0) for x in (system.force, system.target))
         system = dataclasses.replace(system, force=force, target=target)
         time = jnp.where(lasts, dt, jnp.ones_like(dt))
-        hard = system.compliance is linearized.compliance
+        hard = keeps_rows(system, linearized)
         impulse = self._impulse(dynamics, point[:2], rows, system, time, acts, hard)
         reactions = impulse.react(self.solver, None)
         solution = dynamics.system.complete(impulse.motion(reactions.multipliers))

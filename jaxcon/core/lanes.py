@@ -209,6 +209,8 @@ def take(x: Lane, indices: tuple[int, ...]) -> Lane:
 
     The cheapest operation is used: x itself, a strided slice, a few slices, or a gather.
     """
+    if isinstance(x, np.ndarray):
+        x = jnp.asarray(x)
     if not isinstance(x, jax.Array) or not x.ndim:
         return x
     first, n = indices[0], len(indices)

@@ -35,8 +35,9 @@ class Sparse(checks.Checked, Solver):
     reverse mode reuse the factorization and never differentiate it. If M is not diagonal, A is
     dense, and `Schur` solves the system.
 
-    In trees of bodies in space, `Method` eliminates the motions that joints allow instead of rows
-    (`TreeEquations`) if that is faster: with rotors, or with two bodies or more at each depth. In
+    In trees of bodies in space, accelerations are computed by elimination of the motions that
+    joints allow instead of rows (`TreeEquations`) where that is faster: for joints of up to
+    three freedoms, with rotors or in limbs side by side. Projection and `RATTLE` use the rows. In
     single precision, accelerations then err by the order of the drift φ of the joints, relative to
     the arms of the bodies, and in double precision by φ². `tikhonov`, `Unstabilized()`, and in
     single precision more than 12 joints in a row, exclude this.
