@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jax.extend.core import Jaxpr, JaxprEqn
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from jaxcon.core.typing import PyTree
+from jaxcon.core.typing import Array, PyTree
 
 CALLS = {
     "jit": "jaxpr",
@@ -36,6 +36,30 @@ def called(equation: JaxprEqn) -> Any:
     if hasattr(primitive, "expand"):
         return jax.make_jaxpr(primitive.expand)(*primitive.in_avals)
     return None
+
+
+def traced_once(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """Returns an equal function that is traced once for each shape of its argument.
+
+    Each call is a single equation. Without this, a function given to `lax.custom_linear_solve` is
+    traced up to three times a call.
+
+    Args:
+        function: a function of one array. It must not store anything that it computes.
+    """
+    traces: dict[Any, tuple[Callable[..., Any], list[Any]]] = {}
+
+    def call(x: Array) -> Array:
+        key = x.shape, x.dtype
+        if key not in traces:
+            closed = jax.make_jaxpr(function)(x)
+            # what the function closes over are arguments, since they may belong to an outer trace
+            evaluate = jax.jit(lambda c, x: jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, c))(x)[0])
+            traces[key] = evaluate, closed.consts
+        evaluate, consts = traces[key]
+        return evaluate(consts, x)
+
+    return call
 
 
 def each(function: Callable[[Any], Any], xs: PyTree) -> Any:

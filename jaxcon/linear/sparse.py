@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxcon.core import checks
+from jaxcon.core.jaxprs import traced_once
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Scalar
 from jaxcon.linear import ordering
@@ -111,13 +112,13 @@ class Sparse(checks.Checked, Solver):
         if not leaves_out:
             dependent = dependent | (~independent & elimination.finite)
 
+        multiply, substitute = traced_once(delassus), traced_once(elimination.substitute)
+
         def solve(force: Array, target: Array) -> Solution:
             free = system.mass.solve(force)
+            right = target - j.apply(free)
             multipliers = jax.lax.custom_linear_solve(
-                delassus,
-                target - j.apply(free),
-                lambda _, x: elimination.substitute(x),
-                symmetric=True,
+                multiply, right, lambda _, x: substitute(x), symmetric=True
             )
             acceleration = free + system.mass.solve(j.transpose(multipliers))
             return Solution(acceleration, multipliers, judge(acceleration, dependent))

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core.jaxprs import traced_once
 from jaxcon.core.lanes import Matrix, Vector, collect, minus, plus, take, times, total
 from jaxcon.core.numerics import finite_or_nan
 from jaxcon.core.typing import Array, Lane
@@ -264,6 +265,7 @@ class TreeEquations:
                 dependent = dependent | jnp.any(group.rows.dependent, axis=0)
 
         # one array, since JAX does not transpose a solve of which only a part is used
+        @traced_once
         def apply(x: Array) -> Array:
             a, ν = x[:n], x[n:]
             moved = j.apply(a)
@@ -271,12 +273,13 @@ class TreeEquations:
                 moved = moved - compliance * ν
             return jnp.concatenate([saddle.mass.apply(a) + j.transpose(ν), moved])
 
-        def inverse(_: object, right: Array) -> Array:
+        @traced_once
+        def inverse(right: Array) -> Array:
             return jnp.concatenate(self.solve(right[:n], right[n:]))
 
         def solve(force: Array, target: Array) -> Solution:
             right = jnp.concatenate([force, target])
-            x = jax.lax.custom_linear_solve(apply, right, inverse, symmetric=True)
+            x = jax.lax.custom_linear_solve(apply, right, lambda _, x: inverse(x), symmetric=True)
             a, ν = x[:n], x[n:]
             dependent_only = dependent & jnp.all(jnp.isfinite(a), axis=0)
             code = judge(a, saddle.mass.singular | dependent_only)
