@@ -291,3 +291,45 @@ def test_a_derivative_starts_its_iteration_from_the_solution():
     assert value(x, start) == 6.0
     many = jax.vmap(jax.grad(value))(jnp.ones(3), jnp.arange(3.0))
     np.testing.assert_allclose(many, np.arange(3.0) + 1)
+
+
+@jc.extend.pytree
+class Rosenbrock(jc.SemiImplicitEuler):
+    """An integrator of a user's own that differentiates the dynamics: it adds h/2 (∂a/∂q) v."""
+
+    def advance(self, dynamics, state, memory, dt):
+        advanced = super().advance(dynamics, state, memory, dt)
+
+        def acceleration(q):
+            return dynamics(q, state.v, state.instant)[0].acceleration
+
+        path = dynamics.system.kinematics(state.q, state.v)
+        change = jax.jvp(acceleration, (state.q,), (path,))[1]
+        (q, v, time), *others = advanced
+        return type(advanced)((q, v + dt[None] ** 2 / 2 * change, time), *others)
+
+
+@pytest.mark.parametrize("solver", [jc.solvers.RankSafe(), jc.solvers.Sparse()])
+def test_an_integrator_of_a_user_may_differentiate_the_dynamics(solver):
+    """The rules of derivatives are traced for it, but not for a step of the library."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("a", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    scene.add_body("b", mass=2.0, inertia=0.2, position=(1.0, -0.5))
+    scene.add(jc.Revolute("shoulder", jc.WORLD, "a", point=(0.0, 0.0)))
+    scene.add(jc.Revolute("elbow", "a", "b", point=(1.0, 0.0)))
+    system, state = scene.build()
+    v = jnp.asarray([0.0, 1.0, 0.5, 1.0, 0.0, 2.0, 2.0, 2.0])[: len(state.v)]
+    plain, own = jc.Method(solver=solver), jc.Method(Rosenbrock(), solver=solver)
+    assert own.has_own_parts
+    assert not plain.has_own_parts
+    state, h = jc.init(system, plain, state.q, v), 1e-3
+
+    def acceleration(x):
+        shifted = dataclasses.replace(state, q=state.q + x * v)
+        return jc.forward_dynamics(system, shifted, None, plain, h)[0]
+
+    eps = 1e-5
+    change = (acceleration(eps) - acceleration(-eps)) / (2 * eps)
+    added = jc.step(system, own, state, None, h)[0].v - jc.step(system, plain, state, None, h)[0].v
+    assert np.abs(change).max() > 1
+    np.testing.assert_allclose(added, h**2 / 2 * change, atol=1e-8 * h**2 * np.abs(change).max())

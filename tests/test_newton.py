@@ -80,10 +80,10 @@ def biped(dim, dtype=jnp.float64, limbs=False):
     return scene.build()
 
 
-def scissors(dim, dtype=jnp.float64):
-    """A trunk with two short legs that touch, with a rotor, a stop, and feet that slide and roll.
+def scissors(dim, dtype=jnp.float64, touching=True):
+    """A trunk with two short legs, a rotor, a stop, a rough hip, and feet that slide and roll.
 
-    It has all kinds of rows of `biped`, on fewer bodies.
+    With `touching`, the legs touch each other, with friction and rolling.
     """
 
     def at(x, z):
@@ -98,11 +98,14 @@ def scissors(dim, dtype=jnp.float64):
         scene.add_body(leg, mass=0.5, inertia=moments, position=at(x, 0.12))
         scene.add(jc.Revolute(hip, "trunk", leg, point=at(x, 0.22), **axis))
         foot = {"radius": 0.02, "center": at(x, 0.02), "friction": 0.6, "rolling": 2e-3}
+        foot |= {} if dim == 2 else {"spinning": 1e-3}
         scene.add(jc.PlaneContact(f"{side} foot", jc.WORLD, leg, **foot))
     scene.add(jc.joints.Armature("rotor", "left hip", 0.004))
     scene.add(jc.contacts.Limit("stop", "right hip", lower=-0.02, upper=0.5))
-    touch = {"radius_a": 0.1, "radius_b": 0.1, "friction": 0.5}
-    scene.add(jc.contacts.CapsuleContact("legs", "left leg", "right leg", **touch))
+    scene.add(jc.contacts.JointFriction("rub", "left hip", max_force=0.05))
+    if touching:
+        touch = {"radius_a": 0.1, "radius_b": 0.1, "friction": 0.5, "rolling": 1e-3}
+        scene.add(jc.contacts.CapsuleContact("legs", "left leg", "right leg", **touch))
     return scene.build()
 
 
@@ -308,10 +311,11 @@ def test_a_fall_is_that_of_many_sweeps(dim, limbs):
     np.testing.assert_allclose(w, v, atol=1e-4)
 
 
-@dims
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_a_batch_moves_like_its_worlds(dim, dtype):
-    system, state = scissors(dim, dtype)
+@pytest.mark.parametrize(
+    ("dim", "dtype", "touching"), [(2, jnp.float64, True), (3, jnp.float32, False)]
+)
+def test_a_batch_moves_like_its_worlds(dim, dtype, touching):
+    system, state = scissors(dim, dtype, touching)
     method = jc.Method(contact_solver=jc.solvers.Newton())
     starts = [begun(system, method, state, seed=seed) for seed in range(5)]
 
@@ -327,10 +331,10 @@ def test_a_batch_moves_like_its_worlds(dim, dtype):
         np.testing.assert_allclose(together.v[i], alone(start).v, atol=tight)
 
 
-@dims
-def test_gradients_are_differences(dim):
+@pytest.mark.parametrize(("dim", "touching"), [(2, False), (3, True)])
+def test_gradients_are_differences(dim, touching):
     """Of a motion in which no row begins or ends to act within the difference."""
-    system, state = scissors(dim)
+    system, state = scissors(dim, touching=touching)
 
     def loss(scale):
         start = begun(system, NEWTON, state, seed=2)

@@ -320,8 +320,8 @@ SIDES = [*scenes.parts(2, "between"), *scenes.parts(3, "between")]
 def test_relative_joints_do_not_resist_a_common_motion(name):
     built = scenes.build(name)
     system, q = built.system, built.state.q
-    joints = [x for x in system.constraints if isinstance(x, Joints) and x.law.relative]
-    assert joints
+    joints = [x for x in system.constraints if isinstance(x, Joints)]
+    assert all(x.relative for x in joints)
 
     def rates(v):
         snapshot = system.snapshot(q, v, 0.0)
@@ -390,16 +390,68 @@ def test_joints_of_a_user_are_not_eliminated_along_the_tree(contact):
     np.testing.assert_allclose(info.multipliers, other.multipliers, atol=1e-9)
 
 
-class Own(jc.Revolute):
-    """A joint with rows of its own, of a class whose rows depend on relative motion only."""
+class OwnRows:
+    """Rows of a user's own."""
 
     @staticmethod
     def rows(p, a, b):
         return jc.Revolute.rows(p, a, b)
 
 
+class OwnCoordinate(jc.Revolute):
+    """A joint of the library with a coordinate of a user's own."""
+
+    @staticmethod
+    def coordinate(name, p, a, b):
+        return jc.Revolute.coordinate(name, p, a, b)
+
+
+class Mixed(OwnRows, jc.Revolute):
+    """A joint of the library with rows from another class."""
+
+
+class Said(OwnRows, jc.Revolute):
+    """As above, and says that they depend on relative motion only."""
+
+    relative = True
+
+
+class Renamed(Said):
+    """A joint with all that `Said` has."""
+
+
 def test_only_the_class_that_defines_rows_says_on_what_they_depend():
-    assert jc.Revolute.relative
     assert jc.joints.Spherical.relative  # with the rows of Coincident
-    assert not jc.extend.Joint.relative
-    assert not Own.relative
+    assert [x.relative for x in (jc.extend.Joint, OwnCoordinate, Mixed)] == [False] * 3
+    assert [x.relative for x in (Said, Renamed)] == [True] * 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Pin:
+    """The rows of a joint whose law is no class of joints."""
+
+    coordinates = {}
+
+    @staticmethod
+    def rows(p, a, b):
+        return jc.extend.meet(a.point(p["anchor_a"]), b.point(p["anchor_b"]))
+
+
+class Pinned(jc.joints.Coincident):
+    """A joint whose rows a law of its own returns."""
+
+    kind = Pin()
+
+
+def test_a_law_that_is_no_class_of_joints_is_not_eliminated_along_the_tree():
+    scene = jc.Scene(dim=3)
+    scene.add_body("0", mass=1.0, inertia=(0.03, 0.04, 0.05), position=(0.5, 0.0, 1.0))
+    scene.add(Pinned("pin", jc.WORLD, "0", point=(0, 0, 1)))
+    system, state = scene.build()
+    (pins,) = system.constraints
+    assert not pins.relative
+    ends = [
+        jc.step(system, jc.Method(solver=solver), state, None, H)[0].v
+        for solver in (jc.solvers.RankSafe(), jc.solvers.Dense())
+    ]
+    np.testing.assert_allclose(*ends, atol=1e-13)

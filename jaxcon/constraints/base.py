@@ -58,15 +58,17 @@ class Joint(BetweenBodies):
     """The direction of the first coordinate normal to `axis`; None for a default direction."""
 
     relative: ClassVar[bool] = False
-    """True if the rows depend only on the motion of the second body relative to the first.
+    """True if rows and coordinates depend only on the motion of b relative to a, where φ = 0.
 
-    Robots of such joints can be eliminated along the joints. A class that defines `rows` does not
-    inherit this attribute.
+    Robots of such joints can be eliminated along the joints. A class with `rows`, `coordinate` or
+    `coordinate_rows` of its own does not inherit this attribute.
     """
 
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        if "rows" in vars(cls) and "relative" not in vars(cls):
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        found = ("relative", "rows", "coordinate", "coordinate_rows")
+        says, *others = (min(i for i, c in enumerate(cls.__mro__) if x in vars(c)) for x in found)
+        if min(others) < says:
             cls.relative = False
 
     def attach(self, a: Pose, b: Pose) -> dict[str, Array]:
@@ -121,6 +123,11 @@ class Joints(Elements, Constraint):
     """A group of joints of one class, `law`, between bodies of the same kinds."""
 
     has_vectors: ClassVar[bool] = True
+
+    @property
+    def relative(self) -> bool:
+        """True if the rows depend on relative motion only; see `Joint.relative`."""
+        return getattr(self.law, "relative", False)  # what a user's `kind` returns may lack it
 
     def rows(self, snapshot: Snapshot) -> list[Row]:
         """Returns the rows of the joints at one instant: φ, φ̇, γ and J = ∂φ̇/∂v by body."""

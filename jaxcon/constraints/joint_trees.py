@@ -49,7 +49,7 @@ def tree_of_joints(system: System, joints: Jacobian, layout: RowLayout) -> Tree 
     if system.layout is None or len(system.layout.groups) != 1 or layout.loops:
         return None
     others = (x for x in system.constraints if not isinstance(x, Armatures))
-    if not all(isinstance(x, Joints) and x.law.relative for x in others):
+    if not all(isinstance(x, Joints) and x.relative for x in others):
         return None
     (group,) = system.layout.groups
     if not isinstance(group.kind, SpatialRigid | PlanarRigid):

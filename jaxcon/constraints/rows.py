@@ -359,7 +359,7 @@ def saddle(
 
 
 def keeps_rows(system: Saddle, rows: Rows) -> bool:
-    """Returns True if a stabilizer has left J and C as they are.
+    """Returns True if a stabilizer has returned the very arrays of J and C that it was given.
 
     `Penalty`, for example, makes joints compliant.
 

@@ -11,6 +11,7 @@ from jax.errors import (
     TracerIntegerConversionError,
 )
 
+from jaxcon.core import derivatives
 from jaxcon.core.checks import shortened
 from jaxcon.core.typing import Array, PyTree
 
@@ -31,7 +32,8 @@ def call(owner: str, what: str, function: Callable[..., Any], *args: PyTree) -> 
         TypeError: the function reads the value of a tracer.
     """
     try:
-        return function(*args)
+        with derivatives.taken(True):  # the function may contain derivatives of its own
+            return function(*args)
     except UNKNOWN as error:
         raise TypeError(
             f"{owner}: {what}, {title(function)}, needs the value of a number that is traced, as"

@@ -42,10 +42,11 @@ def traced_once(function: Callable[[Array], Array]) -> Callable[[Array], Array]:
     """Returns an equal function that is traced once for each shape of its argument.
 
     Each call is a single equation. Without this, a function given to `lax.custom_linear_solve` is
-    traced up to three times a call.
+    traced up to three times a call. Outside of `jit`, each returned function is compiled.
 
     Args:
-        function: a function of one array. It must not store anything that it computes.
+        function: a function of one array. It must not store anything that it computes. JAX's
+            settings must not change between calls.
     """
     traces: dict[Any, tuple[Callable[..., Any], list[Any]]] = {}
 

@@ -25,12 +25,13 @@ import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
 from jaxcon.contact.rows import Reactions
-from jaxcon.core import status
+from jaxcon.core import derivatives, status
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.linear.saddle import Solution
 from jaxcon.methods.attempt import attempt
 from jaxcon.methods.method import Method
 from jaxcon.protocols import System
+from jaxcon.staging.batch_last import for_values_only
 from jaxcon.staging.failure import mask_failed_gradients
 from jaxcon.staging.worlds import batch_of, broadcast_worlds, per_world, where_tree
 from jaxcon.step import StepInfo
@@ -51,11 +52,13 @@ def masked_step(
     state = broadcast_worlds(state, batch_of(args, state.q.ndim - 1))
     args = (system, method, state, control, dt)
     take = attempt if method.events is None else method.events.attempt
+    with_rules = method.has_own_parts or not for_values_only()
 
     def frozen(
         system: System, method: Method, state: State, control: PyTree, dt: Array
     ) -> tuple[tuple[State, StepInfo], Array]:
-        return _freeze(state, take(system, method, state, control, dt))
+        with derivatives.taken(with_rules):
+            return _freeze(state, take(system, method, state, control, dt))
 
     def repaired(
         system: System, method: Method, state: State, tried: Attempted, dt: Array
@@ -98,13 +101,15 @@ def solve_at(
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
     state = broadcast_worlds(state, batch_of(args, state.q.ndim - 1))
+    with_rules = method.has_own_parts or not for_values_only()
 
     def solved(
         system: System, method: Method, state: State, control: PyTree, dt: Array
     ) -> tuple[tuple[Solution, Violation, Reactions | None], Array]:
         turning = with_turns(system, state.turns, state.angle_remainder)
         dynamics = method.dynamics(turning, state, control, dt)
-        solution, rows = dynamics(state.q, state.v, state.instant)
+        with derivatives.taken(with_rules):
+            solution, rows = dynamics(state.q, state.v, state.instant)
         reactions = None if rows.reactions is None else rows.reactions.without_jump()
         return (solution, rows.violation, reactions), solution.status
 

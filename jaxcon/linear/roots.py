@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import derivatives
 from jaxcon.core.somewhere import somewhere
 from jaxcon.core.typing import Array
 
@@ -23,6 +24,8 @@ def implicit(
     prepared: Callable[[], tuple[Operator, Operator]] | None = None,
 ) -> tuple[Array, Any]:
     """Finds a root x of f(x) = 0, with implicit derivatives of every order.
+
+    Where no derivative is taken, only the iteration is traced.
 
     The tangent equation f′(x) ẋ = y is solved iteratively, by ẋ ← ẋ + P (y − f′(x) ẋ). The
     transposed equation is solved in the same way, with Pᵀ. Both converge like the iteration
@@ -47,6 +50,8 @@ def implicit(
     Returns:
         The root and the auxiliary results.
     """
+    if not derivatives.are_taken():
+        return iterate(function, start)
 
     def refined(inverse: Operator) -> Callable[[Operator, Array], Array]:
         return lambda linear, right: refine(
@@ -58,6 +63,19 @@ def implicit(
         return jax.lax.custom_linear_solve(linear, right, refined(down), refined(up))
 
     return jax.lax.custom_root(function, start, iterate, tangent, has_aux=True)
+
+
+def solve_symmetric(multiply: Operator, right: Array, inverse: Operator) -> Array:
+    """Solves A x = b for a symmetric A, with implicit derivatives of every order.
+
+    Args:
+        multiply: x ↦ A x.
+        right: b, (n, …).
+        inverse: b ↦ A⁻¹ b; never differentiated.
+    """
+    if not derivatives.are_taken():
+        return inverse(right)
+    return jax.lax.custom_linear_solve(multiply, right, lambda _, b: inverse(b), symmetric=True)
 
 
 def refine(

@@ -23,6 +23,7 @@ from jaxcon.linear import ordering
 from jaxcon.linear.delassus import Delassus
 from jaxcon.linear.effort import structure_of
 from jaxcon.linear.elimination import Elimination
+from jaxcon.linear.roots import solve_symmetric
 from jaxcon.linear.saddle import Diagonal, Factored, Saddle, Solution, free_motion, judge
 from jaxcon.linear.schur import Schur
 from jaxcon.protocols import Solver
@@ -38,7 +39,8 @@ class Sparse(checks.Checked, Solver):
 
     In trees of bodies in space, accelerations are computed by elimination of the motions that
     joints allow instead of rows (`TreeEquations`) where that is faster: for joints of up to
-    three freedoms, with rotors or in limbs side by side. Projection and `RATTLE` use the rows. In
+    three freedoms, with rotors, or if there are on average two equal joints or more at each depth.
+    Joints of your own must say so (`Joint.relative`). Projection and `RATTLE` use the rows. In
     single precision, accelerations then err by the order of the drift φ of the joints, relative to
     the arms of the bodies, and in double precision by φ². `tikhonov`, `Unstabilized()`, and in
     single precision more than 12 joints in a row, exclude this.
@@ -117,9 +119,7 @@ class Sparse(checks.Checked, Solver):
         def solve(force: Array, target: Array) -> Solution:
             free = system.mass.solve(force)
             right = target - j.apply(free)
-            multipliers = jax.lax.custom_linear_solve(
-                multiply, right, lambda _, x: substitute(x), symmetric=True
-            )
+            multipliers = solve_symmetric(multiply, right, substitute)
             acceleration = free + system.mass.solve(j.transpose(multipliers))
             return Solution(acceleration, multipliers, judge(acceleration, dependent))
 

@@ -39,6 +39,7 @@ from jaxcon.linear.articulated import (
 )
 from jaxcon.linear.blocks import Block, freeze
 from jaxcon.linear.jacobian import Block as JacobianBlock
+from jaxcon.linear.roots import solve_symmetric
 from jaxcon.linear.saddle import Factored, Saddle, Solution, judge
 from jaxcon.linear.trees import WORLD, Tree
 
@@ -279,7 +280,7 @@ class TreeEquations:
 
         def solve(force: Array, target: Array) -> Solution:
             right = jnp.concatenate([force, target])
-            x = jax.lax.custom_linear_solve(apply, right, lambda _, x: inverse(x), symmetric=True)
+            x = solve_symmetric(apply, right, inverse)
             a, ν = x[:n], x[n:]
             dependent_only = dependent & jnp.all(jnp.isfinite(a), axis=0)
             code = judge(a, saddle.mass.singular | dependent_only)

@@ -26,7 +26,7 @@ import numpy as np
 
 from jaxcon.builders.vakonomic import Vakonomic
 from jaxcon.constraints.rows import Rows, linearize, saddle
-from jaxcon.core import checks, status
+from jaxcon.core import checks, derivatives, status
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.somewhere import everywhere
 from jaxcon.core.status import Status
@@ -376,7 +376,8 @@ def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
             carry: tuple[Array, Array, Array], yields: Array
         ) -> tuple[tuple[Array, Array, Array], None]:
             x, last, singular = carry
-            value, linear = jax.linearize(residual, x)
+            with derivatives.taken(True):
+                value, linear = jax.linearize(residual, x)
             if soft is not None:
                 value = value.at[len(inertia) :].add(yields * soft * equations.split(x)[1])
             correction, dependent = solve(linear, value, yields)
@@ -392,9 +393,12 @@ def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
         # `custom_root` differentiates auxiliary results, which must be real numbers
         return x, (jnp.max(moved, axis=0, initial=0), singular.astype(x.dtype))
 
-    x, (moved, singular) = jax.lax.custom_root(
-        equations, equations.guess, newton, lambda g, y: solve(g, y)[0], has_aux=True
-    )
+    if derivatives.are_taken():
+        x, (moved, singular) = jax.lax.custom_root(
+            equations, equations.guess, newton, lambda g, y: solve(g, y)[0], has_aux=True
+        )
+    else:
+        x, (moved, singular) = newton(equations, equations.guess)
     return x, moved, singular > 0
 
 

@@ -71,6 +71,16 @@ _CONSTANTS = ContextVar("constants", default=True)
 _IN_ORDER = ContextVar("in order", default=False)
 
 
+# Set while a native function is traced, except in derivatives: then no derivative is taken of the
+# trace. Read at the start of a step.
+_VALUES = ContextVar("values", default=False)
+
+
+def for_values_only() -> bool:
+    """Returns True in the trace of a native function of which no derivative is taken."""
+    return _VALUES.get()
+
+
 def order() -> int:
     """Returns the order of the derivative being traced: 0 for the native function itself."""
     return _ORDER.get()
@@ -170,7 +180,7 @@ class Native:
             TypeError: a user's function closes over a traced value, with respect to which the
                 derivative would silently be zero.
         """
-        with meshes.apart(), without_collections():
+        with meshes.apart(), without_collections(), during(_VALUES, True):
             closed = jax.make_jaxpr(self)(*(jax.ShapeDtypeStruct(*aval) for aval in avals))
         if any(isinstance(x, Tracer) for x in closed.consts):
             raise TypeError(
@@ -216,7 +226,7 @@ class TangentNative(Native):
             results = self.whole(*(replaced.get(i, x) for i, x in enumerate(primals)))
             return list(filter(is_real, results))
 
-        with during(_ORDER, order() + 1):
+        with during(_ORDER, order() + 1), during(_VALUES, False):
             return jax.jvp(along, [primals[i] for i in self.places], tangents)[1]
 
 
@@ -268,7 +278,7 @@ class TransposedNative(Native):
             return broadcast_worlds(self.whole(*merged), batch)
 
         cotangents = broadcast_worlds(list(args[self.fixed :]), batch)
-        with during(_TRANSPOSED, True):
+        with during(_TRANSPOSED, True), during(_VALUES, False):
             return list(jax.linear_transpose(along, *self._arguments(args))(cotangents))
 
 
