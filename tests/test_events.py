@@ -104,6 +104,27 @@ def test_bounces_and_their_derivatives_are_those_of_closed_forms():
     assert np.isfinite(by_e).all()
 
 
+def test_derivatives_are_right_after_the_value_was_computed():
+    """JAX may keep the trace of a branch from the value, which has no rules of derivatives."""
+    scene = jc.Scene(dim=2)
+    scene.add_body("disc", mass=1.0, inertia=0.1, position=(0.0, 0.1005))
+    touch = {"radius": 0.1, "friction": 0.5, "restitution": 0.5}
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "disc", **touch))
+    system, state = scene.build()
+    method = located(jc.SemiImplicitEuler())
+
+    def after(v):
+        start = dataclasses.replace(state, v=v)
+        return jc.rollout(system, method, start, None, 1e-3, 1)[0].v @ jnp.asarray([1.0, 0.3, -2.0])
+
+    total = jax.jit(jax.vmap(after))
+    v, eps = np.array([1.0, -1.0, 0.3]), 1e-6
+    up, down = np.split(total(np.concatenate([v + eps * np.eye(3), v - eps * np.eye(3)])), 2)
+    slope = jax.jit(jax.grad(lambda v: jnp.sum(total(v))))(jnp.asarray(v[None]))[0]
+    np.testing.assert_allclose(slope, (up - down) / (2 * eps), atol=1e-6)
+    np.testing.assert_allclose(slope[1], -0.894, atol=0.01)
+
+
 def test_derivatives_through_a_collision():
     """Uses forward mode along one direction that changes all four numbers."""
     case = references.load("grad_two_balls_nimble")

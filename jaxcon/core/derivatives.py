@@ -1,26 +1,22 @@
-"""Whether derivatives are taken of what is being traced.
+"""Whether derivatives may be taken of what is being traced.
 
 A step is traced once for its values, and anew from its Python code for each derivative
 (`staging.batch_last`). In the first trace, rules of derivatives would be traced for nothing.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
+from contextlib import AbstractContextManager
 
-_TAKEN = ContextVar("derivatives are taken", default=True)
+import jax
+
+# not a ContextVar: JAX keeps the traces of functions that it has seen, by a key that contains this
+_TAKEN = jax.make_user_context(default_value=True)
 
 
-def are_taken() -> bool:
+def may_be_taken() -> bool:
     """Returns False if no derivative is taken of the trace in progress."""
-    return _TAKEN.get()
+    return _TAKEN.value
 
 
-@contextmanager
-def taken(flag: bool) -> Iterator[None]:
-    """Says, for the duration of a `with` block, whether derivatives are taken of what is traced."""
-    before = _TAKEN.set(flag)
-    try:
-        yield
-    finally:
-        _TAKEN.reset(before)
+def taken(flag: bool) -> AbstractContextManager[None]:
+    """Says, for the duration of a `with` block, whether derivatives may be taken."""
+    return _TAKEN(flag)

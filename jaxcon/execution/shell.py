@@ -20,8 +20,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
+from numbers import Number
+from types import FunctionType
+from typing import Any
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.constraints.rows import Violation
 from jaxcon.contact.rows import Reactions
@@ -40,6 +46,9 @@ from jaxcon.system.state import State, with_turns
 Attempted = tuple[tuple[State, StepInfo], Array]
 """The new state with the step's info, and the status of the step."""
 
+CONSTANTS = (str, bytes, Number, np.ndarray, np.generic, np.dtype, jax.Array)
+"""Types of values without fields."""
+
 
 def masked_step(
     system: System, method: Method, state: State, control: PyTree, dt: Array
@@ -51,14 +60,19 @@ def masked_step(
     args = (system, method, state, control, dt)
     state = broadcast_worlds(state, batch_of(args, state.q.ndim - 1))
     args = (system, method, state, control, dt)
-    take = attempt if method.events is None else method.events.attempt
-    with_rules = method.has_own_parts or not for_values_only()
+    # the rule of `mask_failed_gradients` takes this value along: it is traced for derivatives only,
+    # and they start from this function
+    with_rules = not for_values_only() or has_user_parts(system, method)
+
+    def take(system: System, method: Method, state: State, control: PyTree, dt: Array) -> Attempted:
+        whole = attempt if method.events is None else method.events.attempt
+        with derivatives.taken(with_rules):
+            return whole(system, method, state, control, dt)
 
     def frozen(
         system: System, method: Method, state: State, control: PyTree, dt: Array
     ) -> tuple[tuple[State, StepInfo], Array]:
-        with derivatives.taken(with_rules):
-            return _freeze(state, take(system, method, state, control, dt))
+        return _freeze(state, take(system, method, state, control, dt))
 
     def repaired(
         system: System, method: Method, state: State, tried: Attempted, dt: Array
@@ -101,7 +115,7 @@ def solve_at(
         return one(system, method, state, control, dt)
     args = (system, method, state, control, dt)
     state = broadcast_worlds(state, batch_of(args, state.q.ndim - 1))
-    with_rules = method.has_own_parts or not for_values_only()
+    with_rules = not for_values_only() or has_user_parts(system, method)
 
     def solved(
         system: System, method: Method, state: State, control: PyTree, dt: Array
@@ -115,3 +129,34 @@ def solve_at(
 
     args = (system, method, state, control, dt)
     return mask_failed_gradients(solved, args, state.q.shape[1:])[0]
+
+
+def has_user_parts(system: System, method: Method) -> bool:
+    """Returns True if a class of a user's may take derivatives of a solution within a step.
+
+    Functions of users may take them anyway, see `core.functions.call`.
+    """
+    if system.layout is None:
+        return True
+    inside = [x for x in _parts_of(system) if not isinstance(x, FunctionType)]
+    return any(map(_is_of_user, [*inside, *_parts_of(method)]))
+
+
+def _is_of_user(x: Any) -> bool:
+    """Returns True if a value is of a class, or is a class, outside of this package."""
+    cls = x if isinstance(x, type) else type(x)
+    return x is not None and cls.__module__.split(".")[0] != __name__.split(".")[0]
+
+
+def _parts_of(x: Any) -> Iterator[Any]:
+    """Yields a value and those in its fields, however deep, other than arrays and constants."""
+    if x is None or isinstance(x, CONSTANTS):
+        return
+    if type(x) in (tuple, list, dict):
+        inner = x.values() if isinstance(x, dict) else x
+    else:
+        yield x
+        fields = dataclasses.is_dataclass(x) and not isinstance(x, type)
+        inner = [getattr(x, field.name) for field in dataclasses.fields(x)] if fields else ()
+    for part in inner:
+        yield from _parts_of(part)

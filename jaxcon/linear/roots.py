@@ -50,7 +50,7 @@ def implicit(
     Returns:
         The root and the auxiliary results.
     """
-    if not derivatives.are_taken():
+    if not derivatives.may_be_taken():
         return iterate(function, start)
 
     def refined(inverse: Operator) -> Callable[[Operator, Array], Array]:
@@ -73,7 +73,7 @@ def solve_symmetric(multiply: Operator, right: Array, inverse: Operator) -> Arra
         right: b, (n, …).
         inverse: b ↦ A⁻¹ b; never differentiated.
     """
-    if not derivatives.are_taken():
+    if not derivatives.may_be_taken():
         return inverse(right)
     return jax.lax.custom_linear_solve(multiply, right, lambda _, b: inverse(b), symmetric=True)
 

@@ -393,7 +393,7 @@ def root(equations: Equations, iterations: int) -> tuple[Array, Array, Array]:
         # `custom_root` differentiates auxiliary results, which must be real numbers
         return x, (jnp.max(moved, axis=0, initial=0), singular.astype(x.dtype))
 
-    if derivatives.are_taken():
+    if derivatives.may_be_taken():
         x, (moved, singular) = jax.lax.custom_root(
             equations, equations.guess, newton, lambda g, y: solve(g, y)[0], has_aux=True
         )

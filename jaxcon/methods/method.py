@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import jax
@@ -252,11 +251,6 @@ class Method:
         if reason:
             raise ValueError(f"{type(self.integrator).__name__}: {reason}.")
 
-    @property
-    def has_own_parts(self) -> bool:
-        """True if a class of the user's is part of the method; its code may take derivatives."""
-        return any(type(x).__module__.split(".")[0] != "jaxcon" for x in _parts_of(self))
-
     def irreversible(self) -> str | None:
         """Returns the reason why a step by −h does not undo a step by h; None if it does."""
         if not self.integrator.symmetric:
@@ -304,19 +298,6 @@ class Method:
         for name, *_ in PARTS:
             if (part := getattr(self, name)) is not None:
                 part.check()
-
-
-def _parts_of(x: Any) -> Iterator[Any]:
-    """Yields a value and all values in its fields that have fields themselves."""
-    if isinstance(x, Mapping):
-        x = tuple(x.values())
-    if isinstance(x, tuple | list):
-        for item in x:
-            yield from _parts_of(item)
-    elif dataclasses.is_dataclass(x) or callable(x):
-        yield x
-        for field in dataclasses.fields(x) if dataclasses.is_dataclass(x) else ():
-            yield from _parts_of(getattr(x, field.name))
 
 
 def _same_arrays(expected: PyTree, given: PyTree) -> bool:

@@ -71,13 +71,13 @@ _CONSTANTS = ContextVar("constants", default=True)
 _IN_ORDER = ContextVar("in order", default=False)
 
 
-# Set while a native function is traced, except in derivatives: then no derivative is taken of the
-# trace. Read at the start of a step.
+# Set while a native function is traced for its values, read at the start of a step. The functions
+# between the two belong to the caller.
 _VALUES = ContextVar("values", default=False)
 
 
 def for_values_only() -> bool:
-    """Returns True in the trace of a native function of which no derivative is taken."""
+    """Returns True while a native function is traced for its values, False in its derivatives."""
     return _VALUES.get()
 
 
@@ -543,12 +543,18 @@ def _in_stages(*args: Array, fun: Native) -> list[Array]:
     return fusion.run_staged(fun, lanes, squeezed)
 
 
+def _directly(*args: Array, fun: Native) -> list[Array]:
+    """Calls a native function for its values."""
+    with during(_VALUES, True):
+        return fun(*args)
+
+
 def _in_order(*args: Array, fun: Native) -> list[Array]:
     """Calls a native function whose arguments and results lie in memory with the batch last."""
     if _IN_ORDER.get():  # within another native function
-        return fun(*args)
+        return _directly(*args, fun=fun)
     with during(_IN_ORDER, True):
-        return list(map(_contiguous, fun(*map(_contiguous, args))))
+        return list(map(_contiguous, _directly(*map(_contiguous, args), fun=fun)))
 
 
 def _contiguous(x: Array) -> Array:
@@ -623,7 +629,7 @@ def _without_unused(
 
 native_p.def_impl(lambda *args, fun, asks: fun.eager(*args))
 native_p.def_abstract_eval(_abstract)
-mlir.register_lowering(native_p, _lowered(lambda *args, fun: fun(*args)))
+mlir.register_lowering(native_p, _lowered(_directly))
 mlir.register_lowering(native_p, _lowered(_in_stages), platform="cpu")
 mlir.register_lowering(native_p, _lowered(_in_order), platform="cuda")
 mlir.register_lowering(native_p, _lowered(_in_order), platform="rocm")
