@@ -16,6 +16,7 @@ from jaxcon.contact.body_space import tree_below
 from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
 from jaxcon.core.status import Status
+from jaxcon.execution.shell import has_user_parts
 from jaxcon.linear.articulated import Reflections
 from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.tree_equations import TreeEquations
@@ -383,6 +384,7 @@ def test_joints_of_a_user_are_not_eliminated_along_the_tree(contact):
         ends.append(jax.jit(jc.step)(system, method, start, None, H))
     (new, info), (expected, other) = ends
     assert new.status == expected.status == 0
+    assert has_user_parts(system, jc.Method())  # its rows may take derivatives
     # Atwood's machine: v = h g (m₂ − m₁) / (m₁ + m₂)
     heights = np.asarray(new.v).reshape(6, 3)[2]
     np.testing.assert_allclose(heights[1:], [H * 9.81 / 5, -H * 9.81 / 5], rtol=1e-6)
