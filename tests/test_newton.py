@@ -333,9 +333,9 @@ def test_a_batch_moves_like_its_worlds(dim, dtype, touching):
 
 @pytest.mark.parametrize(("dim", "touching"), [(2, False), (3, True)])
 def test_gradients_are_differences(dim, touching):
-    """Of a motion in which no row begins or ends to act.
+    """Checks a gradient of a rollout in which each row acts in all steps or in none.
 
-    Where one does, the laws are missed by the drift of the joints, and the derivative, too.
+    Where a contact begins, the drift of the joints is an error of the laws and of the gradient.
     """
     system, state = scissors(dim, touching=touching)
 

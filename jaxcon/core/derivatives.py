@@ -1,7 +1,7 @@
-"""Whether derivatives may be taken of what is being traced.
+"""A flag for traces of which no derivative is taken; they leave out the rules of derivatives.
 
 A step is traced once for its values, and anew from its Python code for each derivative
-(`staging.batch_last`). In the first trace, rules of derivatives would be traced for nothing.
+(`staging.batch_last`). In the first trace, these rules would be traced for nothing.
 """
 
 from contextlib import AbstractContextManager

@@ -70,7 +70,6 @@ _CONSTANTS = ContextVar("constants", default=True)
 # native functions within the function, with a fixed signature.
 _IN_ORDER = ContextVar("in order", default=False)
 
-
 # Set while a native function is traced for its values, read at the start of a step. The functions
 # between the two belong to the caller.
 _VALUES = ContextVar("values", default=False)
