@@ -50,8 +50,21 @@ def test_branches_with_loops_may_be_inside_or_outside_of_kernels(per_operand, si
     monkeypatch.setattr(fusion, "PER_OPERAND", per_operand)
     x, y = sign * jnp.asarray(X), jnp.asarray(Y)
     stages = fusion.Stages(jax.make_jaxpr(loops_in_branches)(x, y), apart=True)
-    assert stages.are_one_kernel == (per_operand > 0)
+    assert (len(stages.parts) == 1) == (per_operand > 0)
     compare(jax.jit(stages)(x, y), loops_in_branches(x, y))
+
+
+@pytest.mark.parametrize("per_operand", [0, 10**9], ids=["outside", "inside"])
+@pytest.mark.parametrize("function", FUNCTIONS, ids=lambda f: f.__name__)
+def test_a_last_function_takes_the_results(function, per_operand, monkeypatch):
+    monkeypatch.setattr(fusion, "PER_OPERAND", per_operand)
+    x, y = jnp.asarray(X), jnp.asarray(Y)
+
+    def negated(*results):
+        return [-jnp.asarray(z, float) for z in results]
+
+    run = jax.jit(lambda x, y: fusion.run_staged(Native(function), (x, y), negated))
+    compare(run(x, y), negated(*function(x, y)))
 
 
 @pytest.mark.parametrize("function", WIDE, ids=lambda f: f.__name__)

@@ -131,14 +131,7 @@ def run_staged(
     """
     if not staged():
         return function(*args) if last is None else last(*function(*args))
-    stages = Stages(traced(function, args), apart=True)
-    if last is None:
-        return stages(*args)
-
-    def ended(*args: Array) -> list[Array]:
-        return uninlined(last, stages(*args))
-
-    return _kernel(ended, list(args)) if stages.are_one_kernel else ended(*args)
+    return Stages(traced(function, args), apart=True)(*args, last=last)
 
 
 def staged() -> bool:
@@ -169,20 +162,42 @@ class Stages:
             _set_apart(steps)
         self.parts = _with_results(self.program, _in_parts(steps))
 
-    def __call__(self, *args: Array) -> list[Array]:
-        """Runs all parts; returns the results of the program."""
+    def __call__(self, *args: Array, last: Callable[..., list[Array]] | None = None) -> list[Array]:
+        """Runs all parts; returns the results of the program, or of `last` if it is given."""
         values: dict[int, Any] = dict(zip(self.program.inputs, args, strict=True))
-        for steps, wanted in self.parts:
-            if all(map(_fits, steps)):
+        for i, (steps, wanted) in enumerate(self.parts, 1):
+            if not all(map(_fits, steps)):
+                self._run(steps, values, wanted)
+            elif last is None or i < len(self.parts):
                 self._store(values, wanted, functools.partial(self._run, steps), _kernel)
             else:
-                self._run(steps, values, wanted)
+                return self._run_last(steps, values, last)
+        results = self._results(values)
+        return results if last is None else uninlined(last, results)
+
+    def _results(self, values: dict[int, Any]) -> list[Array]:
+        """Returns the results of the program, given the values of its parts."""
         return [self.program.evaluate(values, x) for x in self.program.outputs]
 
-    @property
-    def are_one_kernel(self) -> bool:
-        """True if one kernel can contain the whole program."""
-        return len(self.parts) == 1 and all(map(_fits, self.parts[0][0]))
+    def _run_last(
+        self, steps: list[Step], values: dict[int, Any], last: Callable[..., list[Array]]
+    ) -> list[Array]:
+        """Runs the last part, and a function of the program's results, as one kernel.
+
+        Args:
+            steps: the steps of the last part.
+            values: the values computed so far, by number.
+            last: the function, which becomes a stage.
+        """
+        outputs = [x for x in self.program.outputs if not isinstance(x, Constant)]
+        leaves, _ = self.program.between(values, outputs)
+
+        def ended(*given: Array) -> list[Array]:
+            local: dict[int, Any] = dict(zip(leaves, given, strict=True))
+            self._run(steps, local, [])
+            return uninlined(last, self._results(local))
+
+        return _kernel(ended, [values[x] for x in leaves])
 
     def _run(self, steps: list[Step], values: dict[int, Any], wanted: Sequence[int]) -> None:
         """Runs the steps of a part in order, and adds their results to `values`.
@@ -405,6 +420,8 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
         if name in needed:
             ends.add(name)
         moves = op.name in MOVES and op.name != "dynamic_slice"
+        # the index of a branch is a converted flag: outside of kernels it would be one more launch
+        moves = moves and not any(x.name == "cond" and x.inputs[0] == name for x in consumers)
         if not moves and (len(needed) > 1 or name in needed):
             stored.add(name)
             needed = {name}
