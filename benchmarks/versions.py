@@ -1,13 +1,13 @@
 """Tests the package on every supported pair of Python and JAX.
 
     python benchmarks/versions.py [--pairs 3.11:0.8.3 3.13:0.12.0 …] [--pythons 3.11 3.13 3.14]
-        [--stages import README guide tests] [--minutes 15] [--folder DIR] [--json FILE] [--list]
+        [--stages import README guide tests] [--minutes 30] [--folder DIR] [--json FILE] [--list]
 
 Each installed Python is tested with each minor version of JAX that pip offers for it, from the
 lower bound in pyproject.toml to the newest. A pair gets a virtual environment with the dependencies
 of the package. The first pair has their lower bounds, all other pairs the newest versions. There
 are four stages: the import, the programs of the README, the programs of every page of the guide,
-and the tests in `TESTS`. A DeprecationWarning is an error throughout.
+and the fast tests with those in `INTERNALS`. A DeprecationWarning is an error throughout.
 
 Pairs run in sequence with a time limit each. The table is printed row by row, and marks stages for
 which no time was left. The script needs only Python, and its exit status is 1 if a stage failed.
@@ -17,6 +17,7 @@ Environments are kept and reused if a folder is given.
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import re
@@ -33,10 +34,10 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 PYTHONS = ("3.11", "3.13", "3.14")
-TESTS = (
+INTERNALS = {
     *("native", "fusion", "worlds", "composition"),
     *("needed", "numerics", "lanes", "quaternion", "layout"),
-)
+}
 """Tests of modules that depend on JAX's internals or isolate the package from them."""
 TOOLS = ("pytest>=8", "pytest-xdist>=3.5", "flatbuffers")
 STAGES = ("import", "README", "guide", "tests")
@@ -45,28 +46,43 @@ LEFT_OUT = ("models-you-already-have", "train-policies")
 
 IMPORT = "import jaxcon; jaxcon.environments; jaxcon.learning"
 READER = """
-import re, sys, time, traceback
-failed = 0
-for page in sys.argv[1:]:
-    start = time.perf_counter()
+import os, re, sys, time, traceback
+
+def read(page):
+    start, names = time.perf_counter(), {}
     try:
-        names = {}
         for block in re.findall(r"```python\\n(.*?)```", open(page, encoding="utf-8").read(), re.S):
             exec(block, names)
         result = "ok"
     except BaseException as error:
-        failed += 1
         traceback.print_exc()
         result = f"{type(error).__name__}: {error}"
     print(f"PAGE {page} {time.perf_counter() - start:.0f} s {result}", flush=True)
-sys.exit(bool(failed))
+    return result != "ok"
+
+failed = False
+for page in sys.argv[1:]:
+    child = os.fork()  # nothing has imported JAX yet
+    if not child:
+        os._exit(read(page))
+    failed |= os.waitpid(child, 0)[1] != 0
+sys.exit(failed)
 """
-"""A script that runs the programs of each page in order, in a fresh namespace per page."""
+"""A script that runs the programs of each page in order, in a process of its own per page."""
 
 
 def project() -> dict[str, Any]:
     """Reads the `project` table of pyproject.toml."""
     return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def fast_tests() -> set[str]:
+    """Reads the set `FAST` of the names of fast tests from tests/conftest.py."""
+    tree = ast.parse((ROOT / "tests" / "conftest.py").read_text())
+    assigned = (x for x in tree.body if isinstance(x, ast.Assign))
+    return next(
+        ast.literal_eval(x.value) for x in assigned if getattr(x.targets[0], "id", "") == "FAST"
+    )
 
 
 def number(version: str) -> tuple[int, ...]:
@@ -131,9 +147,10 @@ class Pair:
         place = folder / f"python{self.python}-jax{self.jax}{'-lowest' * self.lowest}"
         if self._installed(place, end):
             command = [str(place / "venv" / "bin" / "python"), "-W", "error::DeprecationWarning"]
-            tests = [str(ROOT / "tests" / f"test_{name}.py") for name in TESTS]
+            names = sorted(fast_tests() | INTERNALS)
+            tests = [str(ROOT / "tests" / f"test_{name}.py") for name in names]
             guide = [str(p) for p in PAGES[1:] if p.stem not in LEFT_OUT]
-            options = ["-n0", "-q", "--durations=0", "-o", f"cache_dir={place / 'pytest'}"]
+            options = ["-n2", "-q", "--durations=0", "-o", f"cache_dir={place / 'pytest'}"]
             stages = (
                 ["-c", IMPORT],
                 ["-c", READER, str(PAGES[0])],
@@ -241,7 +258,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pairs", nargs="+", default=(), metavar="PYTHON:JAX")
     parser.add_argument("--pythons", nargs="+", default=PYTHONS)
     parser.add_argument("--stages", nargs="+", default=STAGES, choices=STAGES)
-    parser.add_argument("--minutes", type=float, default=15.0)
+    parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--folder", type=Path)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--list", action="store_true", help="print the pairs and exit")

@@ -175,6 +175,37 @@ def test_a_slide_through_a_valley_is_not_called_converged():
     assert "the loss still fell by" in found.stopped
 
 
+@pytest.mark.parametrize(
+    "optimizer", [optax.adam(0.5), optax.adam(0.05), optax.sgd(0.3, momentum=0.9)]
+)
+def test_leaps_across_a_valley_are_not_called_converged(optimizer):
+    """The search leaps between the sides of a curved valley, and hardly moves along it.
+
+    The minimum is at x = 3, the end at x < 0.01.
+    """
+
+    def valley(x):
+        return 1e-3 * (x[0] - 3) ** 2 + 1e3 * (x[1] - jnp.sin(x[0])) ** 2
+
+    found = jc.tune(valley, jnp.zeros(2), steps=200, optimizer=optimizer)
+    assert found.params[0] < 0.1
+    assert not found.converged
+    assert "before it converged" in found.stopped
+
+
+@pytest.mark.parametrize("curvatures", [(1.0, 5.0), (1.0, 200.0)])
+def test_adam_converges_in_a_bowl(curvatures):
+    target, curvatures = jnp.array([1.0, 2.0]), jnp.array(curvatures)
+    found = jc.tune(
+        lambda x: jnp.sum(curvatures * (x - target) ** 2),
+        jnp.zeros(2),
+        steps=400,
+        optimizer=optax.adam(optax.cosine_decay_schedule(0.2, 400)),
+    )
+    np.testing.assert_allclose(found.params, target, rtol=1e-3)
+    assert found.converged
+
+
 def test_batches_share_parameters_and_starts_are_searched_beside_each_other():
     """Four worlds differ in mass and share stiffness and damping.
 

@@ -7,6 +7,7 @@ import dataclasses
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 
 from jaxcon.constraints.rows import Violation
 from jaxcon.contact.newton import Newton
@@ -59,7 +60,7 @@ def step(
         control: control input u, (n_u,), with the channels of `system.layout.controls`; for
             generalized coordinates, the pytree that the user's force takes. None if no motor needs
             a control.
-        dt: step size h, () [s].
+        dt: step size h, () [s]; not negative.
 
     Shapes and dtypes are always checked. Values are checked if they are Python or NumPy numbers.
     JAX arrays are not checked, since a device may still be computing them; a bad value in one stops
@@ -95,6 +96,8 @@ def _checked(
     with checks.without_waiting():
         h = checks.real(owner, "dt", dt, state.q.dtype, least=0)
         method = method.known_at(dt, state.q.dtype)
+    if isinstance(dt, jax.Array):  # not read here; NaN ends the world with a status
+        h = jnp.where(h >= 0, h, jnp.nan)
     return system, method, state, control, h
 
 

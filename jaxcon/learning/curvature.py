@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
@@ -118,3 +119,36 @@ class Secants:
         mean = top / jnp.where(bottom > 0, bottom, 1)
         sums = jnp.sum(squares, axis=0)
         return jnp.where(sums > 0, jnp.sum(products, axis=0) / jnp.where(sums > 0, sums, 1), mean)
+
+    def cautious_step(self, slope: np.ndarray, free: np.ndarray) -> np.ndarray:
+        """Returns a bound on the Newton step where the pairs leave the curvature open, (n,).
+
+        L-BFGS assumes a large curvature along directions in which the search has hardly moved. Adam
+        may leap across a narrow valley and hardly move along it: the bottom then seems near. This
+        function instead fits the symmetric Hessian H to all pairs, Y ≈ S H, by least squares. An
+        eigenvalue of H is uncertain by δ = ‖Y − S H‖ / σ, with the smallest singular value σ of S.
+        The bound takes the smallest curvature that the pairs allow, λ − δ, along each eigenvector;
+        it is infinite if that is not positive. Each coordinate is in units of its largest step.
+
+        Args:
+            slope: the gradient g at the best point, (n,).
+            free: mask of the coordinates that may move, (n,).
+        """
+        s, y, g = (np.asarray(x, float)[..., free] for x in (self.steps, self.changes, slope))
+        valid = np.any(s != 0, axis=1)
+        unit = np.max(np.abs(s), axis=0, initial=0)
+        bound = np.full(len(slope), 0.0)
+        if np.sum(valid) < len(unit) or not np.all(unit > 0) or not np.all(np.isfinite(y)):
+            bound[free] = np.inf
+            return bound
+        s, y, g = s[valid] / unit, y[valid] * unit, g * unit
+        hessian = np.linalg.lstsq(s, y, rcond=None)[0]
+        hessian = (hessian + hessian.T) / 2
+        smallest = np.linalg.svd(s, compute_uv=False)[-1]
+        misfit = np.linalg.norm(y - s @ hessian)
+        curvature, axes = np.linalg.eigh(hessian)
+        least = curvature - np.divide(misfit, smallest, out=np.array(np.inf), where=smallest > 0)
+        along = np.abs(axes.T @ g)
+        far = np.divide(along, least, out=np.full_like(along, np.inf), where=least > 0)
+        bound[free] = unit * (np.abs(axes) @ np.where(along == 0, 0, far))
+        return bound

@@ -9,8 +9,10 @@ import jax
 import numpy as np
 
 from jaxcon.core.typing import Array
+from jaxcon.learning.curvature import PAIRS
 from jaxcon.learning.descent import Search, Stop
-from jaxcon.learning.leaves import Space
+from jaxcon.learning.leaves import Space, flat
+from jaxcon.learning.optimizer import OptimizerMemory
 
 REASONS = {
     Stop.RUNNING: "every step was taken",
@@ -169,9 +171,16 @@ class Outlook:
         """Estimates the distance to a minimum by the quasi-Newton step −H⁻¹ g at the best point.
 
         This step reveals slow progress through a narrow valley. There the gradient g is small and
-        the loss hardly decreases. But the curvature is small too, so the step is long.
+        the loss hardly decreases. But the curvature is small too, so the step is long. An optimizer
+        of the user may not have explored the curvature in all directions: the step is then at least
+        the bound `Secants.cautious_step`, if there are not more parameters than secant pairs.
         """
         steps = space.split(search.ahead)
+        if search.secants is not None and not isinstance(search.origin.memory, OptimizerMemory):
+            slope, free = flat(search.best.slope)[0], space.free(search.best.y, search.best.slope)
+            if slope.size <= PAIRS:
+                bound = search.secants.cautious_step(np.asarray(slope), np.asarray(free))
+                steps = space.split(np.maximum(np.abs(search.ahead), bound))
         leaves = zip(steps, search.best.y, start, space.positive, strict=True)
         distances = [
             float(np.max(np.abs(d) / _size(z, z0, log), initial=0)) for d, z, z0, log in leaves
@@ -193,7 +202,7 @@ class Outlook:
                 " a local one"
             )
         name = f"'{self.leaf}'" if self.leaf else "the parameter"
-        if np.isfinite(self.distance):
+        if not np.isnan(self.distance):
             far = f"by about {self.distance:.1g}" if self.distance < 1 else "far"
             pace = f"still fell by {self.pace:.1e} a step" if self.pace > 0 else "fell no more"
             return (

@@ -39,12 +39,11 @@ Carry = tuple[tuple[Array, ...], Array]
 FASTEST = 1e8
 """The speed [m/s, rad/s] above which a world counts as diverging."""
 
-LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.025, 0.03)
+LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.018, 0.02)
 """Rotations of a body in a step [rad] at which `newton_correction` begins and acts in full.
 
-In the plane, energy then drifts by less than 2 % of the largest kinetic energy in a minute. Bodies
-in space have more ways to exchange energy. They need a correction that begins at smaller rotations
-for an equally small drift.
+Below these rotations energy drifts, see `benchmarks.energy_drift`. Lower numbers would halve the
+drift and cost a tenth to a fifth of the rate of chains and closed loops.
 """
 
 
@@ -70,10 +69,11 @@ class SemiImplicitEuler(checks.Checked, Integrator):
     belongs to the time of q.
 
     `newton_correction` removes the linearization error of φ by a second solve with the factors of
-    the step. The correction begins if a body or a rod turns by more than 0.038 rad in a step (0.025
-    rad if bodies turn in space). It acts in full from 0.042 rad on (0.03 rad in space). A step with
+    the step. The correction begins if a body or a rod turns by more than 0.038 rad in a step (0.018
+    rad if bodies turn in space). It acts in full from 0.042 rad on (0.02 rad in space). A step with
     it takes about 1.5 times as long. Without the correction, energy would grow with (h|ω|)³, and
-    motions of a radian in a few steps would end with status NON_FINITE. In the plane, islands
+    motions of a radian in a few steps would end with status NON_FINITE. Below these rotations
+    energy still drifts, most where a light body carries a heavy one. In the plane, islands
     (bodies connected by constraints) on which a limit or contact acts are not corrected. In space,
     `Projection()` replaces the correction.
 

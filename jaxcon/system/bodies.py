@@ -127,6 +127,11 @@ class PlanarRigid(Particle):
         )
 
 
+def _orientation(q: Vector) -> Vector:
+    """Returns q / ‖q‖; NaN for q = 0, which is no orientation, so that the world fails."""
+    return q * (1.0 / numerics.norm(q))
+
+
 @dataclass(frozen=True)
 class SpatialRigid(Particle):
     """A rigid body in space: q = (x, quaternion wxyz), v = (ẋ, ω).
@@ -153,11 +158,11 @@ class SpatialRigid(Particle):
         body frame.
         """
         turned = quaternion.multiply(Vector(*q[3:]), quaternion.exp(Vector(*step[3:])))
-        return Vector(*(Vector(*q[:3]) + Vector(*step[:3])), *quaternion.normalize(turned))
+        return Vector(*(Vector(*q[:3]) + Vector(*step[:3])), *_orientation(turned))
 
     def normalize(self, q: Vector) -> Vector:
         """Returns q with the quaternion scaled to length one."""
-        return Vector(*q[:3], *quaternion.normalize(Vector(*q[3:])))
+        return Vector(*q[:3], *_orientation(Vector(*q[3:])))
 
     def mass(self, mass: Array, moments: Moments) -> Vector:
         """Returns the diagonal of the mass matrix: (m, m, m, I₁, I₂, I₃)."""

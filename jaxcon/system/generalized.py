@@ -22,6 +22,8 @@ from jaxcon.system.state import Energy
 
 OWNER = "GeneralizedSystem"
 """The first word of error messages."""
+SYMMETRY = 1e-6
+"""The largest difference |M − Mᵀ| of a symmetric mass matrix, relative to its largest entry."""
 
 
 @pytree
@@ -111,6 +113,8 @@ class GeneralizedCoordinates:
     def mass(self, q: Array) -> Mass:
         """Returns the mass matrix M(q, θ), (n_v, n_v), or its diagonal (n_v,).
 
+        A matrix that is not symmetric becomes NaN, which ends the world.
+
         Raises:
             ValueError: the user's function returns another shape.
         """
@@ -120,7 +124,11 @@ class GeneralizedCoordinates:
             raise ValueError(
                 f"GeneralizedSystem: mass must return ({n},) or ({n}, {n}), got {m.shape}."
             )
-        return Diagonal(m) if m.ndim == 1 else Full(m)
+        if m.ndim == 1:
+            return Diagonal(m)
+        # factorizations read one triangle: with another one the motion would be silently wrong
+        symmetric = jnp.max(jnp.abs(m - m.T), initial=0) <= SYMMETRY * jnp.max(jnp.abs(m), initial=0)
+        return Full(jnp.where(symmetric, m, jnp.nan))
 
     def force(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
         """Returns the generalized force f(q, v, t, u, θ), (n_v,).
@@ -145,7 +153,7 @@ class GeneralizedCoordinates:
         mass = self.mass(q)
         if isinstance(mass, Full) and checks.is_concrete(mass.values):
             values = np.asarray(mass.values)
-            if not np.max(np.abs(values - values.T), initial=0) <= 1e-6 * np.max(np.abs(values)):
+            if not np.max(np.abs(values - values.T), initial=0) <= SYMMETRY * np.max(np.abs(values)):
                 raise ValueError(
                     "GeneralizedSystem: mass must return a symmetric matrix, got"
                     f" {checks.clipped(checks.numerals(values))} at q = {checks.numerals(q)}."
