@@ -673,7 +673,14 @@ def doors() -> Iterator[Door]:
 
             yield Door(f"{kind.__name__}.{field}", call, takes, (rf"\b{field.rstrip('s')}",))
             yield _constructor(kind, arguments, field, takes)
-    for name, call, takes, *words in (*_simulation(), *_analysis(), *_search(), *_others()):
+    for name, call, takes, *words in (
+        *_simulation(),
+        *_analysis(),
+        *_search(),
+        *_environments(),
+        *_losses(),
+        *_others(),
+    ):
         yield Door(name, call, takes, tuple(words) or (rf"\b{re.split('[.(]', name)[-1]}\b",))
 
 
@@ -1039,6 +1046,19 @@ def _search() -> Iterator[Row]:
         lambda x: jc.tune(x, jnp.ones(2), steps=1),
         FUNCTION,
     )
+    low, high = (free(x, "any", "none", "infinity", shaped=False) for x in (0.0, 2.0))
+    yield "tune.bounds", lambda x: tune(steps=1, bounds=(x, None)), low
+    yield (
+        "tune.bounds of one name",
+        lambda x: tune(steps=1, bounds={"*": (None, x)}),
+        high,
+        "bounds",
+    )
+    yield (
+        "tune.progress",
+        lambda x: tune(steps=1, progress=x),
+        Takes("flag", allows=frozenset({"flag", "none"})),
+    )
     yield (
         "tune.key",
         lambda x: tune(steps=1, restarts=2, key=x),
@@ -1065,6 +1085,117 @@ def _search() -> Iterator[Row]:
         lambda x: jc.identify(x, jnp.ones(2), data),
         FUNCTION,
     )
+
+
+@functools.cache
+def cart() -> tuple[Any, Any, Any]:
+    """Returns the environment `CartPole`, an episode of it, and two copies of it."""
+    environment, key = environments.make("CartPole"), jax.random.key(0)
+    return environment, environment.reset(key), environments.begin(environment, key, 2)[0]
+
+
+def _environments() -> Iterator[Row]:
+    environment, episode, copies = cart()
+    name, key = type(environment).__name__, jax.random.key(0)
+    keys, any_number = Takes("other", allows=frozenset({"key"})), ("NaN", "infinity")
+    one = free(np.zeros(1), "any", *any_number)
+    yield f"{name}.reset.key", environment.reset, keys
+    yield f"{name}.step.action", lambda x: environment.step(episode, x), one
+    for what in ("step", "judge"):
+        act = getattr(environment, what)
+        rest = (episode,) if what == "judge" else ()
+        yield (
+            f"{name}.{what}.episode",
+            lambda x, act=act, rest=rest: act(x, np.zeros(1), *rest),
+            Takes("other"),
+        )
+    yield f"{name}.observe.episode", environment.observe, Takes("other")
+    draws = (environments.begin, environments.vary, environments.jitter)
+    for draw, rest in zip(
+        draws, (2, {"cart": {"mass": 0.1}}, {"cart": {"mass": 0.1}}), strict=True
+    ):
+        start = functools.partial(_with, draw, _named(draw, environment, key, rest))
+        yield f"{draw.__name__}.key", functools.partial(start, "key"), keys
+        yield (
+            f"{draw.__name__}.environment",
+            functools.partial(start, "environment"),
+            Takes("other"),
+        )
+    yield "begin.count", lambda x: environments.begin(environment, key, x), count()
+    optional = Takes("other", allows=frozenset({"none", "function"}))
+    yield "begin.randomize", lambda x: environments.begin(environment, key, 2, x), optional
+    advance = functools.partial(environments.advance, environment)
+    yield "advance.copies", lambda x: advance(x, np.zeros((2, 1))), Takes("other")
+    yield (
+        "advance.actions",
+        lambda x: advance(copies, x),
+        free(np.zeros((2, 1)), "any", *any_number),
+    )
+    yield "advance.mode", lambda x: advance(copies, np.zeros((2, 1)), x), Takes("other")
+    arguments = _named(
+        environments.feasible_action, environment, episode, np.zeros(1), lambda e: e.state.q[:1]
+    )
+    explore = functools.partial(_with, environments.feasible_action, arguments)
+    for field, takes in {
+        "episode": Takes("other"),
+        "action": one,
+        "limits": FUNCTION,
+        "noise": free(0.0, shaped=False),
+    }.items():
+        yield f"feasible_action.{field}", functools.partial(explore, field), takes
+    arguments = _named(environments.returns, environment, lambda x: jnp.zeros(1), key, 1)
+    run = functools.partial(_with, environments.returns, arguments | {"actions": 1})
+    for field, takes in {
+        "environment": Takes("other"),
+        "policy": FUNCTION,
+        "key": keys,
+        "count": count(),
+        "actions": count(1, "none"),
+    }.items():
+        yield f"returns.{field}", functools.partial(run, field), takes
+    soften = functools.partial(
+        _with,
+        environments.with_stiffness,
+        _named(environments.with_stiffness, environment, 1.0, 1.0),
+    )
+    for field in ("stiffness", "damping"):
+        takes = free(1.0, "not negative", shaped=False)
+        yield f"with_stiffness.{field}", functools.partial(soften, field), takes
+    yield "near.x", lambda x: environments.near(x, 1.0), free(1.0, "any", *any_number, shaped=False)
+    yield "near.scale", lambda x: environments.near(1.0, x), free(1.0, "positive", shaped=False)
+
+
+def _named(function: Any, *arguments: Any) -> dict[str, Any]:
+    """Returns the first arguments of a function by name."""
+    return dict(zip(inspect.signature(function).parameters, arguments, strict=False))
+
+
+def _losses() -> Iterator[Row]:
+    system, state = plain()
+    losses = jc.learning.losses
+    path, off = np.ones(2), jc.violation(system, state)
+    yield (
+        "losses.tracking.path",
+        lambda x: losses.tracking(x, path),
+        free(path, "any", "NaN", "infinity"),
+        "what is simulated",
+    )
+    yield (
+        "losses.tracking.scale",
+        lambda x: losses.tracking(path, path, x),
+        free(1.0, "positive", shaped=False),
+    )
+    for loss in (losses.violation, losses.mean_violation):
+        yield (
+            f"losses.{loss.__name__}.dt",
+            lambda x, loss=loss: loss(off, x),
+            real(1e-3, "positive"),
+        )
+        yield f"losses.{loss.__name__}.off", lambda x, loss=loss: loss(x, 1e-3), Takes("other")
+    weighted = losses.weighted
+    term = free(1.0, "any", "NaN", "infinity")
+    yield "losses.weighted.term", lambda x: weighted({"a": x}, {"a": 1.0}), term
+    yield "losses.weighted.weight", lambda x: weighted({"a": jnp.ones(())}, {"a": x}), free(1.0)
 
 
 def _others() -> Iterator[Row]:
@@ -1308,6 +1439,51 @@ SPECIAL: dict[str, Special] = {
         ("record",),
     ),
     "a record of strings": (lambda _: rollout(record=words), ("record",)),
+    **{
+        f"a policy of `returns` that {does}": (
+            lambda _, policy=policy: environments.returns(
+                cart()[0], policy, jax.random.key(0), 1, 1
+            ),
+            (words_of,),
+        )
+        for does, policy, words_of in (
+            ("has if", branching, r"returns: policy, 'branching' \(.*wrong_doors.py:\d+\)"),
+            ("returns nothing", nothing, "returns: policy must return"),
+            ("returns a string", words, "returns: policy must return"),
+            ("returns another shape", lambda x: jnp.ones(3), "CartPole: an action must have shape"),
+        )
+    },
+    **{
+        f"limits of an action that {does}": (
+            lambda _, limits=limits: environments.feasible_action(*cart()[:2], np.zeros(1), limits),
+            ("feasible_action: limits must return",),
+        )
+        for does, limits in (
+            ("return nothing", nothing),
+            ("return a string", words),
+            ("return no axis", lambda x: x.state.q[0]),
+        )
+    },
+    "a key of two": (
+        lambda _: cart()[0].reset(jax.random.split(jax.random.key(0))),
+        ("CartPole.reset: key must be a single key",),
+    ),
+    "no copies of an environment": (
+        lambda _: environments.begin(cart()[0], jax.random.key(0), 0),
+        ("begin: count",),
+    ),
+    "a stiffness of an unknown constraint": (
+        lambda _: environments.with_stiffness(cart()[0], {"zz": 1.0}, 1.0),
+        ("with_stiffness: there is no constraint",),
+    ),
+    "a simulation that returns complex numbers": (
+        lambda _: jc.identify(lambda p: p + 1j, jnp.ones(2), jnp.ones(2)),
+        ("identify: what simulate returns must be real numbers",),
+    ),
+    "a record of dates": (
+        lambda _: rollout(record=lambda s, i: np.datetime64("2026-01-01")),
+        ("rollout: record must return arrays",),
+    ),
     "no control for a motor": (lambda _: step(control=None), ("drive",)),
     "no controls for a motor": (lambda _: _motor_rollout(controls=None), ("drive",)),
     "a force that returns nothing": (lambda _: _custom(nothing), ("CustomForce 'it'",)),
