@@ -5,7 +5,7 @@ Shapes and dtypes are always checked. Values are checked only if they are concre
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, SupportsIndex, TypedDict, Unpack
@@ -123,7 +123,7 @@ def instance(owner: str, what: str, x: object, kind: type, expected: str) -> Non
         raise TypeError(f"{owner}: {what} must be {expected}, got {type(x).__name__}.")
 
 
-def random_key(owner: str, what: str, key: PyTree) -> None:
+def random_key(owner: str, what: str, key: Any) -> None:
     """Checks that an argument is one random key of JAX: typed, or raw with the dtype uint32.
 
     Raises:
@@ -137,6 +137,42 @@ def random_key(owner: str, what: str, key: PyTree) -> None:
         )
     if key.ndim != (0 if typed else 1):
         raise TypeError(f"{owner}: {what} must be a single key, got an array {key.shape} of keys.")
+
+
+def names(owner: str, what: str, x: Any) -> tuple[str, ...]:
+    """Returns one or several names as a tuple.
+
+    Raises:
+        ValueError: the value is neither a name nor an iterable of names.
+    """
+    given: tuple[Any, ...] = (None,)
+    if isinstance(x, Iterable):
+        given = (x,) if isinstance(x, str) else tuple(x)
+    if not all(isinstance(name, str) for name in given):
+        raise ValueError(f"{owner}: {what} must be names, got {shortened(x)}.")
+    return given
+
+
+def parameters(owner: str, params: PyTree) -> None:
+    """Checks the parameters of a user's function: finite real numbers, or arrays of other kinds.
+
+    Arrays of integers, of booleans and of random keys pass, because a function may use them as
+    indices, as masks and for random numbers.
+
+    Raises:
+        ValueError: a leaf is no number and no such array, or is not finite.
+    """
+    for path, x in jax.tree_util.tree_leaves_with_path(params):
+        if not is_discrete(x):
+            at = jax.tree_util.keystr(path, simple=True, separator="/")
+            check(owner, f"params '{at}'" if at else "params", x)
+
+
+def is_discrete(x: object) -> bool:
+    """Returns True if x is an array of integers, of booleans or of random keys."""
+    if not isinstance(x, jax.Array | np.ndarray | np.generic):
+        return False
+    return x.dtype.kind in "biu" or jnp.issubdtype(x.dtype, jax.dtypes.extended)
 
 
 def is_floating(x: PyTree) -> bool:

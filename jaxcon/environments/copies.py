@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from jaxcon.core import checks
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array, Scalar
+from jaxcon.core.typing import Array
 from jaxcon.environments.environment import Environment, Episode, Outcome, check_environment
 
 T = TypeVar("T")
@@ -128,7 +128,7 @@ def advance(
     return stepped, Outcome(observation, reward, terminated, truncated, info | final)
 
 
-def check_actions(environment: Environment, count: int, actions: Scalar) -> Any:
+def check_actions(environment: Environment, count: int, actions: Any) -> Any:
     """Checks the actions of all copies, and returns them as an array of NumPy or JAX.
 
     Args:
