@@ -12,6 +12,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import jax
@@ -95,6 +96,10 @@ def count(least: int = 1, *allows: str) -> Takes:
 
 FUNCTION = Takes("other", allows=frozenset({"function"}))
 """The valid values of an argument that is a function of the user."""
+
+
+PARAMETERS = Takes("other", allows=frozenset({"none", "key", "tree"}))
+"""The valid values of an argument with the parameters of a user's function, by kind."""
 
 
 def flag() -> Takes:
@@ -677,6 +682,8 @@ def doors() -> Iterator[Door]:
         *_simulation(),
         *_analysis(),
         *_search(),
+        *_names(),
+        *_pictures(),
         *_environments(),
         *_losses(),
         *_others(),
@@ -1087,6 +1094,106 @@ def _search() -> Iterator[Row]:
     )
 
 
+def _names() -> Iterator[Row]:
+    """Yields arguments that name bodies, joints and coordinates, and parameters of functions."""
+    one_body, two_bodies = (jc.forces.Force, jc.forces.ExternalWrench), (jc.Fixed, jc.Revolute)
+    for kind in (*one_body, *two_bodies, jc.joints.Universal):
+        arguments = dict(next(x for k, x, _ in ELEMENTS if k is kind))
+        for field in ("body",) if kind in one_body else ("body_a", "body_b"):
+
+            def call(x: Any, kind: Any = kind, arguments: Any = arguments, f: str = field) -> Any:
+                return with_element(bodies, kind, arguments | {f: x})
+
+            yield f"{kind.__name__}.{field}", call, Takes("other"), "body"
+    custom = {"bodies": ("bob",), "function": lambda *_: jnp.zeros(3)}
+    for field, takes in {"bodies": Takes("other"), "params": PARAMETERS}.items():
+        call = functools.partial(
+            _with, functools.partial(_it, jc.forces.CustomForce), custom, field
+        )
+        yield f"CustomForce.{field}", call, takes
+    named = Takes("other", allows=frozenset({"none"}))
+    for kind in (jc.Motor, jc.forces.JointSpring):
+        arguments = next(x for k, x, _ in ALONG if k is kind)
+        for field, takes in {"joint": Takes("other"), "coordinate": named}.items():
+            make = functools.partial(_on_joint, kind, arguments)
+            yield f"{kind.__name__}.{field}", functools.partial(make, field), takes, field
+    gears = {"left": "one", "right": "two", "carrier": "slide"}
+    make = functools.partial(_on_joint, jc.joints.Differential, gears)
+    yield "Differential.coordinates", functools.partial(make, "coordinates"), Takes("other")
+    drive = {"joint": "one", "motion": lambda t, p: 0.0 * t}
+    make = functools.partial(_on_joint, jc.joints.Drive, drive)
+    yield "Drive.params", functools.partial(make, "params"), PARAMETERS
+    yield (
+        "Drive.params of a name",
+        lambda x: make("params", {"a": x}),
+        PARAMETERS,
+        "params 'a'|params",
+    )
+    yield "GeneralizedSystem.params", lambda x: _generalized(params=x), PARAMETERS
+    for field in ("mass", "force"):
+        arguments = {"mass": lambda q, p: jnp.ones_like(q), "force": lambda q, v, t, u, p: -q}
+        builder = functools.partial(_with, jc.GeneralizedSystem, arguments, field)
+        yield f"GeneralizedSystem.{field}", builder, FUNCTION
+    optional = Takes("other", allows=frozenset({"function", "none"}))
+    yield "GeneralizedSystem.potential", lambda x: _generalized(potential=x), optional
+    system, state = motor()
+    for read in (jc.momentum, jc.angular_momentum):
+        name = f"{read.__name__}.bodies"
+        yield name, lambda x, read=read: read(system, state, bodies=x), named, "bodies|body"
+    integrability = functools.partial(jc.analysis.integrability, system, state)
+    yield "integrability.names", lambda x: integrability(names=x), named, "names|constraint"
+    hold = functools.partial(jc.assemble, system, np.asarray(state.q))
+    yield "assemble.hold", lambda x: hold(hold=x), Takes("other"), "hold|body|is held"
+    for field in ("memory", "angle_remainder"):
+
+        def go(x: Any, field: str = field) -> Any:
+            return step(state=dataclasses.replace(state, **{field: x}))
+
+        yield f"State.{field}", go, Takes("other"), "state.angle_remainder|memory"
+    systems = functools.partial(_with, jc.systems.vakonomic, {"system": system, "state": state})
+    for field in ("system", "state"):
+        yield f"vakonomic.{field}", functools.partial(systems, field), Takes("other"), "State"
+    over = functools.partial(jc.devices.over_devices)
+    yield "over_devices.function", over, FUNCTION
+    platform = lambda x: jc.Method.auto(system, state, platform=x)  # noqa: E731
+    yield "Method.auto.platform", platform, named
+    control = free(np.zeros(1), "any", "none")
+    yield "report.control", lambda x: jc.report(system, state, control=x), control
+    kind = free(np.zeros(1), "any", "none", "NaN", "infinity", "function")
+    memory = functools.partial(jc.analysis.gradient_memory, system, jc.Method(), state)
+    yield "gradient_memory.control", memory, kind
+    wait = jc.Method().stabilizer_for
+    yield "stabilizer_for.dt", wait, free(1e-3, "positive", shaped=False)
+    for integrator in (jc.SemiImplicitEuler(), jc.RK4()):
+        name = f"{type(integrator).__name__}.default_gains.dt"
+        takes = free(1e-3, "any", "NaN", "infinity", shaped=False)
+        yield name, integrator.default_gains, takes
+
+
+def _it(kind: Any, **arguments: Any) -> Any:
+    return with_element(bodies, kind, arguments)
+
+
+def _on_joint(kind: Any, arguments: dict[str, Any], name: str, x: Any) -> Any:
+    return with_element(jointed, kind, arguments | {name: x})
+
+
+def _pictures() -> Iterator[Row]:
+    if find_spec("matplotlib") is None:
+        return
+    system, state = plain()
+    q = free(np.asarray(state.q))
+    yield "view.links.q", functools.partial(jc.view.links, system), q
+    yield "view.draw.q", functools.partial(jc.view.draw, system), q
+    path = free(np.asarray(state.q)[None])
+    yield "view.animate.path", lambda x: jc.view.animate(system, x, 0.1), path
+    interval = lambda x: jc.view.animate(system, np.asarray(state.q)[None], x)  # noqa: E731
+    yield "view.animate.interval", interval, free(0.1, "positive")
+    for picture in (jc.view.links, jc.view.draw):
+        name = f"view.{picture.__name__}.system"
+        yield name, lambda x, picture=picture: picture(x, state.q), Takes("other")
+
+
 @functools.cache
 def cart() -> tuple[Any, Any, Any]:
     """Returns the environment `CartPole`, an episode of it, and two copies of it."""
@@ -1477,9 +1584,47 @@ SPECIAL: dict[str, Special] = {
         ("with_stiffness: there is no constraint",),
     ),
     "a simulation that returns complex numbers": (
-        lambda _: jc.identify(lambda p: p + 1j, jnp.ones(2), jnp.ones(2)),
+        lambda _: jc.identify(lambda p: jax.lax.complex(p, p), jnp.ones(2), jnp.ones(2)),
         ("identify: what simulate returns must be real numbers",),
     ),
+    "a function that returns a string for its gradient": (
+        lambda _: jc.check_gradients(words, jnp.ones(2)),
+        ("check_gradients: f must return arrays",),
+    ),
+    "gains of two lengths": (
+        lambda _: jc.stabilizers.frequency_response(np.ones(3), np.ones(2), 1.0),
+        ("frequency_response: .* do not broadcast",),
+    ),
+    "a state without memory": (
+        lambda _: step(state=dataclasses.replace(motor()[1], memory=None)),
+        ("memory",),
+    ),
+    "a remainder of angles that are none": (
+        lambda _: step(
+            state=dataclasses.replace(motor()[1], angle_remainder=jnp.ones(7, jnp.float32))
+        ),
+        ("state.angle_remainder",),
+    ),
+    "an animation of one state": (
+        lambda _: jc.view.animate(plain()[0], plain()[1].q, 0.1),
+        ("animate: path must have shape",),
+    ),
+    **{
+        f"controls of {what} for a diagnosis": (
+            lambda _, x=x: jc.analysis.diagnose(*plain()[:1], jc.Method(), plain()[1], x, 1e-3, 5),
+            ("diagnose: controls",),
+        )
+        for what, x in (("text", "x"), ("complex numbers", np.ones((5, 0)) + 1j))
+    },
+    **{
+        f"MJCF with a timestep of {x}": (
+            lambda _, x=x: jc.from_mjcf(
+                _text().replace("<mujoco>", f'<mujoco><option timestep="{x}"/>')
+            ),
+            ("timestep",),
+        )
+        for x in ("-1", "0")
+    },
     "a record of dates": (
         lambda _: rollout(record=lambda s, i: np.datetime64("2026-01-01")),
         ("rollout: record must return arrays",),

@@ -339,7 +339,8 @@ def _held(
     """
     if not checks.is_concrete(hold):
         raise ValueError("assemble: what is held is structure and cannot be traced.")
-    if not isinstance(hold, Iterable | jax.Array) or isinstance(hold, Mapping):
+    is_key = jnp.issubdtype(getattr(hold, "dtype", float), jax.dtypes.extended)
+    if not isinstance(hold, Iterable) or isinstance(hold, Mapping) or is_key:
         raise ValueError(
             f"assemble: hold takes names of bodies, indices in v from 0 to {n_v - 1}, or a mask"
             f" ({n_v},), got {checks.shortened(hold)}."

@@ -146,7 +146,7 @@ def names(owner: str, what: str, x: Any) -> tuple[str, ...]:
         ValueError: the value is neither a name nor an iterable of names.
     """
     given: tuple[Any, ...] = (None,)
-    if isinstance(x, Iterable):
+    if isinstance(x, Iterable) and getattr(x, "ndim", 1) == 1:
         given = (x,) if isinstance(x, str) else tuple(x)
     if not all(isinstance(name, str) for name in given):
         raise ValueError(f"{owner}: {what} must be names, got {shortened(x)}.")
@@ -169,8 +169,11 @@ def parameters(owner: str, params: PyTree) -> None:
 
 
 def is_discrete(x: object) -> bool:
-    """Returns True if x is an array of integers, of booleans or of random keys."""
-    if not isinstance(x, jax.Array | np.ndarray | np.generic):
+    """Returns True if x is an array of integers, of booleans or of random keys.
+
+    A single boolean of NumPy does not count: like `True`, it is probably a mistake.
+    """
+    if not isinstance(x, jax.Array | np.ndarray | np.generic) or isinstance(x, np.bool_):
         return False
     return x.dtype.kind in "biu" or jnp.issubdtype(x.dtype, jax.dtypes.extended)
 
