@@ -12,6 +12,7 @@ import inspect
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Any
 
 import jax
@@ -95,6 +96,10 @@ def count(least: int = 1, *allows: str) -> Takes:
 
 FUNCTION = Takes("other", allows=frozenset({"function"}))
 """The valid values of an argument that is a function of the user."""
+
+
+PARAMETERS = Takes("other", allows=frozenset({"none", "key", "tree"}))
+"""The valid values of an argument with the parameters of a user's function, by kind."""
 
 
 def flag() -> Takes:
@@ -673,7 +678,16 @@ def doors() -> Iterator[Door]:
 
             yield Door(f"{kind.__name__}.{field}", call, takes, (rf"\b{field.rstrip('s')}",))
             yield _constructor(kind, arguments, field, takes)
-    for name, call, takes, *words in (*_simulation(), *_analysis(), *_search(), *_others()):
+    for name, call, takes, *words in (
+        *_simulation(),
+        *_analysis(),
+        *_search(),
+        *_names(),
+        *_pictures(),
+        *_environments(),
+        *_losses(),
+        *_others(),
+    ):
         yield Door(name, call, takes, tuple(words) or (rf"\b{re.split('[.(]', name)[-1]}\b",))
 
 
@@ -1039,6 +1053,19 @@ def _search() -> Iterator[Row]:
         lambda x: jc.tune(x, jnp.ones(2), steps=1),
         FUNCTION,
     )
+    low, high = (free(x, "any", "none", "infinity", shaped=False) for x in (0.0, 2.0))
+    yield "tune.bounds", lambda x: tune(steps=1, bounds=(x, None)), low
+    yield (
+        "tune.bounds of one name",
+        lambda x: tune(steps=1, bounds={"*": (None, x)}),
+        high,
+        "bounds",
+    )
+    yield (
+        "tune.progress",
+        lambda x: tune(steps=1, progress=x),
+        Takes("flag", allows=frozenset({"flag", "none"})),
+    )
     yield (
         "tune.key",
         lambda x: tune(steps=1, restarts=2, key=x),
@@ -1065,6 +1092,217 @@ def _search() -> Iterator[Row]:
         lambda x: jc.identify(x, jnp.ones(2), data),
         FUNCTION,
     )
+
+
+def _names() -> Iterator[Row]:
+    """Yields arguments that name bodies, joints and coordinates, and parameters of functions."""
+    one_body, two_bodies = (jc.forces.Force, jc.forces.ExternalWrench), (jc.Fixed, jc.Revolute)
+    for kind in (*one_body, *two_bodies, jc.joints.Universal):
+        arguments = dict(next(x for k, x, _ in ELEMENTS if k is kind))
+        for field in ("body",) if kind in one_body else ("body_a", "body_b"):
+
+            def call(x: Any, kind: Any = kind, arguments: Any = arguments, f: str = field) -> Any:
+                return with_element(bodies, kind, arguments | {f: x})
+
+            yield f"{kind.__name__}.{field}", call, Takes("other"), "body"
+    custom = {"bodies": ("bob",), "function": lambda *_: jnp.zeros(3)}
+    for field, takes in {"bodies": Takes("other"), "params": PARAMETERS}.items():
+        call = functools.partial(
+            _with, functools.partial(_it, jc.forces.CustomForce), custom, field
+        )
+        yield f"CustomForce.{field}", call, takes
+    named = Takes("other", allows=frozenset({"none"}))
+    for kind in (jc.Motor, jc.forces.JointSpring):
+        arguments = next(x for k, x, _ in ALONG if k is kind)
+        for field, takes in {"joint": Takes("other"), "coordinate": named}.items():
+            make = functools.partial(_on_joint, kind, arguments)
+            yield f"{kind.__name__}.{field}", functools.partial(make, field), takes, field
+    gears = {"left": "one", "right": "two", "carrier": "slide"}
+    make = functools.partial(_on_joint, jc.joints.Differential, gears)
+    yield "Differential.coordinates", functools.partial(make, "coordinates"), Takes("other")
+    drive = {"joint": "one", "motion": lambda t, p: 0.0 * t}
+    make = functools.partial(_on_joint, jc.joints.Drive, drive)
+    yield "Drive.params", functools.partial(make, "params"), PARAMETERS
+    yield (
+        "Drive.params of a name",
+        lambda x: make("params", {"a": x}),
+        PARAMETERS,
+        "params 'a'|params",
+    )
+    yield "GeneralizedSystem.params", lambda x: _generalized(params=x), PARAMETERS
+    for field in ("mass", "force"):
+        arguments = {"mass": lambda q, p: jnp.ones_like(q), "force": lambda q, v, t, u, p: -q}
+        builder = functools.partial(_with, jc.GeneralizedSystem, arguments, field)
+        yield f"GeneralizedSystem.{field}", builder, FUNCTION
+    optional = Takes("other", allows=frozenset({"function", "none"}))
+    yield "GeneralizedSystem.potential", lambda x: _generalized(potential=x), optional
+    system, state = motor()
+    for read in (jc.momentum, jc.angular_momentum):
+        name = f"{read.__name__}.bodies"
+        yield name, lambda x, read=read: read(system, state, bodies=x), named, "bodies|body"
+    integrability = functools.partial(jc.analysis.integrability, system, state)
+    yield "integrability.names", lambda x: integrability(names=x), named, "names|constraint"
+    hold = functools.partial(jc.assemble, system, np.asarray(state.q))
+    yield "assemble.hold", lambda x: hold(hold=x), Takes("other"), "hold|body|is held"
+    for field in ("memory", "angle_remainder"):
+
+        def go(x: Any, field: str = field) -> Any:
+            return step(state=dataclasses.replace(state, **{field: x}))
+
+        yield f"State.{field}", go, Takes("other"), "state.angle_remainder|memory"
+    systems = functools.partial(_with, jc.systems.vakonomic, {"system": system, "state": state})
+    for field in ("system", "state"):
+        yield f"vakonomic.{field}", functools.partial(systems, field), Takes("other"), "State"
+    over = functools.partial(jc.devices.over_devices)
+    yield "over_devices.function", over, FUNCTION
+    platform = lambda x: jc.Method.auto(system, state, platform=x)  # noqa: E731
+    yield "Method.auto.platform", platform, named
+    control = free(np.zeros(1), "any", "none")
+    yield "report.control", lambda x: jc.report(system, state, control=x), control
+    kind = free(np.zeros(1), "any", "none", "NaN", "infinity", "function")
+    memory = functools.partial(jc.analysis.gradient_memory, system, jc.Method(), state)
+    yield "gradient_memory.control", memory, kind
+    wait = jc.Method().stabilizer_for
+    yield "stabilizer_for.dt", wait, free(1e-3, "positive", shaped=False)
+    for integrator in (jc.SemiImplicitEuler(), jc.RK4()):
+        name = f"{type(integrator).__name__}.default_gains.dt"
+        takes = free(1e-3, "any", "NaN", "infinity", shaped=False)
+        yield name, integrator.default_gains, takes
+
+
+def _it(kind: Any, **arguments: Any) -> Any:
+    return with_element(bodies, kind, arguments)
+
+
+def _on_joint(kind: Any, arguments: dict[str, Any], name: str, x: Any) -> Any:
+    return with_element(jointed, kind, arguments | {name: x})
+
+
+def _pictures() -> Iterator[Row]:
+    if find_spec("matplotlib") is None:
+        return
+    system, state = plain()
+    q = free(np.asarray(state.q))
+    yield "view.links.q", functools.partial(jc.view.links, system), q
+    yield "view.draw.q", functools.partial(jc.view.draw, system), q
+    path = free(np.asarray(state.q)[None])
+    yield "view.animate.path", lambda x: jc.view.animate(system, x, 0.1), path
+    interval = lambda x: jc.view.animate(system, np.asarray(state.q)[None], x)  # noqa: E731
+    yield "view.animate.interval", interval, free(0.1, "positive")
+    for picture in (jc.view.links, jc.view.draw):
+        name = f"view.{picture.__name__}.system"
+        yield name, lambda x, picture=picture: picture(x, state.q), Takes("other")
+
+
+@functools.cache
+def cart() -> tuple[Any, Any, Any]:
+    """Returns the environment `CartPole`, an episode of it, and two copies of it."""
+    environment, key = environments.make("CartPole"), jax.random.key(0)
+    return environment, environment.reset(key), environments.begin(environment, key, 2)[0]
+
+
+def _environments() -> Iterator[Row]:
+    environment, episode, copies = cart()
+    name, key = type(environment).__name__, jax.random.key(0)
+    keys, any_number = Takes("other", allows=frozenset({"key"})), ("NaN", "infinity")
+    one = free(np.zeros(1), "any", *any_number)
+    yield f"{name}.reset.key", environment.reset, keys
+    yield f"{name}.step.action", lambda x: environment.step(episode, x), one
+    for what in ("step", "judge"):
+        act = getattr(environment, what)
+        rest = (episode,) if what == "judge" else ()
+        yield (
+            f"{name}.{what}.episode",
+            lambda x, act=act, rest=rest: act(x, np.zeros(1), *rest),
+            Takes("other"),
+        )
+    yield f"{name}.observe.episode", environment.observe, Takes("other")
+    draws = (environments.begin, environments.vary, environments.jitter)
+    for draw, rest in zip(
+        draws, (2, {"cart": {"mass": 0.1}}, {"cart": {"mass": 0.1}}), strict=True
+    ):
+        start = functools.partial(_with, draw, _named(draw, environment, key, rest))
+        yield f"{draw.__name__}.key", functools.partial(start, "key"), keys
+        yield (
+            f"{draw.__name__}.environment",
+            functools.partial(start, "environment"),
+            Takes("other"),
+        )
+    yield "begin.count", lambda x: environments.begin(environment, key, x), count()
+    optional = Takes("other", allows=frozenset({"none", "function"}))
+    yield "begin.randomize", lambda x: environments.begin(environment, key, 2, x), optional
+    advance = functools.partial(environments.advance, environment)
+    yield "advance.copies", lambda x: advance(x, np.zeros((2, 1))), Takes("other")
+    yield (
+        "advance.actions",
+        lambda x: advance(copies, x),
+        free(np.zeros((2, 1)), "any", *any_number),
+    )
+    yield "advance.mode", lambda x: advance(copies, np.zeros((2, 1)), x), Takes("other")
+    arguments = _named(
+        environments.feasible_action, environment, episode, np.zeros(1), lambda e: e.state.q[:1]
+    )
+    explore = functools.partial(_with, environments.feasible_action, arguments)
+    for field, takes in {
+        "episode": Takes("other"),
+        "action": one,
+        "limits": FUNCTION,
+        "noise": free(0.0, shaped=False),
+    }.items():
+        yield f"feasible_action.{field}", functools.partial(explore, field), takes
+    arguments = _named(environments.returns, environment, lambda x: jnp.zeros(1), key, 1)
+    run = functools.partial(_with, environments.returns, arguments | {"actions": 1})
+    for field, takes in {
+        "environment": Takes("other"),
+        "policy": FUNCTION,
+        "key": keys,
+        "count": count(),
+        "actions": count(1, "none"),
+    }.items():
+        yield f"returns.{field}", functools.partial(run, field), takes
+    soften = functools.partial(
+        _with,
+        environments.with_stiffness,
+        _named(environments.with_stiffness, environment, 1.0, 1.0),
+    )
+    for field in ("stiffness", "damping"):
+        takes = free(1.0, "not negative", shaped=False)
+        yield f"with_stiffness.{field}", functools.partial(soften, field), takes
+    yield "near.x", lambda x: environments.near(x, 1.0), free(1.0, "any", *any_number, shaped=False)
+    yield "near.scale", lambda x: environments.near(1.0, x), free(1.0, "positive", shaped=False)
+
+
+def _named(function: Any, *arguments: Any) -> dict[str, Any]:
+    """Returns the first arguments of a function by name."""
+    return dict(zip(inspect.signature(function).parameters, arguments, strict=False))
+
+
+def _losses() -> Iterator[Row]:
+    system, state = plain()
+    losses = jc.learning.losses
+    path, off = np.ones(2), jc.violation(system, state)
+    yield (
+        "losses.tracking.path",
+        lambda x: losses.tracking(x, path),
+        free(path, "any", "NaN", "infinity"),
+        "what is simulated",
+    )
+    yield (
+        "losses.tracking.scale",
+        lambda x: losses.tracking(path, path, x),
+        free(1.0, "positive", shaped=False),
+    )
+    for loss in (losses.violation, losses.mean_violation):
+        yield (
+            f"losses.{loss.__name__}.dt",
+            lambda x, loss=loss: loss(off, x),
+            real(1e-3, "positive"),
+        )
+        yield f"losses.{loss.__name__}.off", lambda x, loss=loss: loss(x, 1e-3), Takes("other")
+    weighted = losses.weighted
+    term = free(1.0, "any", "NaN", "infinity")
+    yield "losses.weighted.term", lambda x: weighted({"a": x}, {"a": 1.0}), term
+    yield "losses.weighted.weight", lambda x: weighted({"a": jnp.ones(())}, {"a": x}), free(1.0)
 
 
 def _others() -> Iterator[Row]:
@@ -1308,6 +1546,89 @@ SPECIAL: dict[str, Special] = {
         ("record",),
     ),
     "a record of strings": (lambda _: rollout(record=words), ("record",)),
+    **{
+        f"a policy of `returns` that {does}": (
+            lambda _, policy=policy: environments.returns(
+                cart()[0], policy, jax.random.key(0), 1, 1
+            ),
+            (words_of,),
+        )
+        for does, policy, words_of in (
+            ("has if", branching, r"returns: policy, 'branching' \(.*wrong_doors.py:\d+\)"),
+            ("returns nothing", nothing, "returns: policy must return"),
+            ("returns a string", words, "returns: policy must return"),
+            ("returns another shape", lambda x: jnp.ones(3), "CartPole: an action must have shape"),
+        )
+    },
+    **{
+        f"limits of an action that {does}": (
+            lambda _, limits=limits: environments.feasible_action(*cart()[:2], np.zeros(1), limits),
+            ("feasible_action: limits must return",),
+        )
+        for does, limits in (
+            ("return nothing", nothing),
+            ("return a string", words),
+            ("return no axis", lambda x: x.state.q[0]),
+        )
+    },
+    "a key of two": (
+        lambda _: cart()[0].reset(jax.random.split(jax.random.key(0))),
+        ("CartPole.reset: key must be a single key",),
+    ),
+    "no copies of an environment": (
+        lambda _: environments.begin(cart()[0], jax.random.key(0), 0),
+        ("begin: count",),
+    ),
+    "a stiffness of an unknown constraint": (
+        lambda _: environments.with_stiffness(cart()[0], {"zz": 1.0}, 1.0),
+        ("with_stiffness: there is no constraint",),
+    ),
+    "a simulation that returns complex numbers": (
+        lambda _: jc.identify(lambda p: jax.lax.complex(p, p), jnp.ones(2), jnp.ones(2)),
+        ("identify: what simulate returns must be real numbers",),
+    ),
+    "a function that returns a string for its gradient": (
+        lambda _: jc.check_gradients(words, jnp.ones(2)),
+        ("check_gradients: f must return arrays",),
+    ),
+    "gains of two lengths": (
+        lambda _: jc.stabilizers.frequency_response(np.ones(3), np.ones(2), 1.0),
+        ("frequency_response: .* do not broadcast",),
+    ),
+    "a state without memory": (
+        lambda _: step(state=dataclasses.replace(motor()[1], memory=None)),
+        ("memory",),
+    ),
+    "a remainder of angles that are none": (
+        lambda _: step(
+            state=dataclasses.replace(motor()[1], angle_remainder=jnp.ones(7, jnp.float32))
+        ),
+        ("state.angle_remainder",),
+    ),
+    "an animation of one state": (
+        lambda _: jc.view.animate(plain()[0], plain()[1].q, 0.1),
+        ("animate: path must have shape",),
+    ),
+    **{
+        f"controls of {what} for a diagnosis": (
+            lambda _, x=x: jc.analysis.diagnose(*plain()[:1], jc.Method(), plain()[1], x, 1e-3, 5),
+            ("diagnose: controls",),
+        )
+        for what, x in (("text", "x"), ("complex numbers", np.ones((5, 0)) + 1j))
+    },
+    **{
+        f"MJCF with a timestep of {x}": (
+            lambda _, x=x: jc.from_mjcf(
+                _text().replace("<mujoco>", f'<mujoco><option timestep="{x}"/>')
+            ),
+            ("timestep",),
+        )
+        for x in ("-1", "0")
+    },
+    "a record of dates": (
+        lambda _: rollout(record=lambda s, i: np.datetime64("2026-01-01")),
+        ("rollout: record must return arrays",),
+    ),
     "no control for a motor": (lambda _: step(control=None), ("drive",)),
     "no controls for a motor": (lambda _: _motor_rollout(controls=None), ("drive",)),
     "a force that returns nothing": (lambda _: _custom(nothing), ("CustomForce 'it'",)),

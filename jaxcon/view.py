@@ -8,10 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.core.pictures import MISSING, pyplot
 from jaxcon.core.typing import Array
 from jaxcon.execution.rollout import rollout
 from jaxcon.methods.method import Method
+from jaxcon.system.body_system import BodySystem
 from jaxcon.system.elements import Elements
 
 if TYPE_CHECKING:
@@ -25,7 +27,6 @@ if TYPE_CHECKING:
 
     from jaxcon.demo import Tuning, Validation
     from jaxcon.protocols import Constraint
-    from jaxcon.system.body_system import BodySystem
     from jaxcon.system.state import State
 
 __all__ = [
@@ -71,9 +72,26 @@ def links(system: BodySystem, q: Array | np.ndarray) -> dict[str, np.ndarray]:
 
     Returns:
         For each body, n points in the world frame, (n, dim) [m].
+
+    Raises:
+        ValueError: the positions are not finite real numbers, or have another shape.
+        TypeError: the system is not a `BodySystem`.
     """
+    return _anchors_of("links", system, q)
+
+
+def _anchors_of(owner: str, system: BodySystem, q: Array | np.ndarray) -> dict[str, np.ndarray]:
+    """Returns `links` of checked arguments; error messages name the function `owner`."""
+    _check_system(owner, system)
+    q = jnp.asarray(checks.check(owner, "q", q, (system.layout.n_q,)), system.gravity.dtype)
     points = _links(system, q)
     return {name: np.asarray(points[name]) for name in system.layout.bodies}
+
+
+def _check_system(owner: str, system: BodySystem) -> None:
+    """Raises a TypeError that names the function `owner` if the argument is no `BodySystem`."""
+    expected = "a BodySystem, as scene.build() makes it"
+    checks.instance(owner, "system", system, BodySystem, expected)
 
 
 @jax.jit
@@ -131,11 +149,16 @@ def draw(
 
     Returns:
         The axes.
+
+    Raises:
+        ValueError: the positions are not finite real numbers, or have another shape.
+        TypeError: the system is not a `BodySystem`.
     """
+    bodies = _anchors_of("draw", system, q)  # before a figure is opened
     if axes is None:
         axes = cast("Axes", pyplot().subplots()[1])
     first, second = (0, 1) if system.layout.dim == 2 else (0, 2)
-    for i, (name, points) in enumerate(links(system, q).items()):
+    for i, (name, points) in enumerate(bodies.items()):
         options: dict[str, Any] = {"color": f"C{i}", "marker": "o", "markersize": 3, "lw": 2}
         options |= {"label": name} | style
         axes.plot(points[:, first], points[:, second], **options)
@@ -165,10 +188,23 @@ def animate(
     Returns:
         The animation. Write it with `save("motion.gif", writer="pillow")`, or show it in a notebook
         with `to_jshtml()`. Keep a reference to the animation until it is written or shown.
+
+    Raises:
+        ValueError: the path is not finite real numbers (frames, n_q), or the interval is not a
+            positive number.
+        TypeError: the system is not a `BodySystem`.
     """
     from matplotlib.animation import FuncAnimation
 
-    frames = [list(links(system, q).values()) for q in path]
+    _check_system("animate", system)
+    path, n_q = checks.check("animate", "path", path), system.layout.n_q
+    if path.ndim != 2 or not len(path) or path.shape[1] != n_q:
+        raise ValueError(
+            f"animate: path must have shape (frames, {n_q}), one row for each frame, got"
+            f" {path.shape}."
+        )
+    checks.check("animate", "interval", interval, (), above=0)
+    frames = [list(_anchors_of("animate", system, q).values()) for q in path]
     shown = [0, 1 if system.layout.dim == 2 else 2]
     if axes is None:
         figure = canvas(4.0, 3.2, 80).figure

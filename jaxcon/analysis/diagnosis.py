@@ -123,6 +123,8 @@ def diagnose(
     assembled = dataclasses.replace(assembled, status=state.status, memory=state.memory)
     finer = controls
     if controls is not None and not callable(controls):
+        for leaf in jax.tree.leaves(controls):
+            checks.numbers("diagnose", "controls", leaf)
         controls = controls_in(state.q.dtype, controls)
         finer = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), 2, axis=0), controls)
     end, φ_given = _simulate(system, method, state, controls, dt, steps)

@@ -208,12 +208,13 @@ def check_gradients(
 
     def at(moved: list[Array]) -> PyTree:
         replaced = dict(zip(floating, moved, strict=True))
-        return functions.call(
+        result = functions.call(
             "check_gradients",
             "f",
             f,
             structure.unflatten([replaced.get(i, leaf) for i, leaf in enumerate(all_leaves)]),
         )
+        return functions.tree("check_gradients", "f", result)
 
     here = [jnp.asarray(all_leaves[i]) for i in floating]
     for i, leaf in zip(floating, here, strict=True):

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxcon.constraints.rank import dependent_rows
 from jaxcon.constraints.rows import layout_of, linearize
+from jaxcon.core import checks
 from jaxcon.core.typing import Array
 from jaxcon.protocols import System
 from jaxcon.system.state import State, checked_system
@@ -107,7 +108,7 @@ def integrability(
     system = checked_system(system, state, "jc.analysis.integrability(system, s)")
     layout = layout_of(system, state.q, state.v, state.time)
     holding = tuple(name for name in layout.names if name not in layout.inertial)
-    chosen = holding if names is None else (names,) if isinstance(names, str) else tuple(names)
+    chosen = holding if names is None else checks.names("integrability", "names", names)
     if not chosen:
         raise ValueError("integrability: there is no constraint whose rows could be looked at.")
     rows = np.concatenate([layout.rows(name) for name in chosen])

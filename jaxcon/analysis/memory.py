@@ -17,11 +17,11 @@ from jaxcon.execution.adjoints import EVERY_STEP, check_adjoint
 from jaxcon.execution.rollout import rollout
 from jaxcon.execution.segments import bytes_of
 from jaxcon.execution.step import step_quietly
-from jaxcon.execution.validation import check_step, controls_in, idle
+from jaxcon.execution.validation import check_step, checked_control, idle
 from jaxcon.methods.method import Method
 from jaxcon.protocols import Adjoint, System
 from jaxcon.step import StepInfo
-from jaxcon.system.state import State
+from jaxcon.system.state import State, checked_system
 
 BATCHES = 64, 256
 """The two batch sizes for which programs are compiled.
@@ -164,10 +164,13 @@ def gradient_memory(
         RuntimeError: the compiler of this device does not report its memory plan.
     """
     policy = control if callable(control) else None
+    checked_system(system, state, "jc.analysis.gradient_memory(system, method, s)")
+    if not policy:
+        control = idle(system, control)
+        control = checked_control("gradient_memory", system, control, state.q.dtype)
 
     def planned(steps: int, worlds: int) -> int:
-        row = None if policy else controls_in(state.q.dtype, idle(system, control))
-        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), row)
+        controls = policy or jax.tree.map(lambda x: jnp.stack([jnp.asarray(x)] * steps), control)
 
         def end(moved: tuple[Array, Array], rest: State) -> Array:
             start = dataclasses.replace(rest, q=moved[0], v=moved[1])

@@ -17,7 +17,7 @@ from jaxcon.constraints.rank import UnitRows, dependent_rows, linearized
 from jaxcon.constraints.rows import Rows
 from jaxcon.core import checks, host
 from jaxcon.core.typing import Array, PyTree, Scalar
-from jaxcon.execution.validation import idle
+from jaxcon.execution.validation import checked_control, idle
 from jaxcon.methods.choice import Choice, choose
 from jaxcon.methods.method import Method, check_method
 from jaxcon.methods.stability import default_gains, parts
@@ -88,7 +88,9 @@ class Setup:
             state = begun(system, method, state)
         rows, jacobian, mass = linearized(system, state)
         h = None if dt is None else float(dt)
-        control = idle(system, control)
+        control = checked_control("report", system, idle(system, control), state.q.dtype)
+        for leaf in jax.tree.leaves(control):
+            checks.check("report", "control", leaf)
         return cls(system, state, method, h, control, batch, rows, mass, jacobian, measured)
 
     @cached_property

@@ -112,6 +112,8 @@ def tradeoff(
         )
     checked_system(system, state, "jc.tradeoff(system, s, horizon)")
     checks.flag("tradeoff", "gradients", gradients)
+    if progress is not None:
+        checks.flag("tradeoff", "progress", progress)
     dtypes = (dtypes,) if isinstance(dtypes, str) else dtypes
     dts = (dts,) if isinstance(dts, int | float) else dts
     _check(horizon, methods, dtypes, dts, batch, budget)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -339,6 +339,12 @@ def _held(
     """
     if not checks.is_concrete(hold):
         raise ValueError("assemble: what is held is structure and cannot be traced.")
+    is_key = jnp.issubdtype(getattr(hold, "dtype", float), jax.dtypes.extended)
+    if not isinstance(hold, Iterable) or isinstance(hold, Mapping) or is_key:
+        raise ValueError(
+            f"assemble: hold takes names of bodies, indices in v from 0 to {n_v - 1}, or a mask"
+            f" ({n_v},), got {checks.shortened(hold)}."
+        )
     parts = [hold] if isinstance(hold, str) else hold
     if isinstance(parts, np.ndarray | jax.Array):
         parts = np.asarray(parts)

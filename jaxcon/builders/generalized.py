@@ -35,9 +35,17 @@ def GeneralizedSystem(  # noqa: N802
         The system; `jc.init(system, method, q, v)` checks it and makes a state.
 
     Raises:
-        ValueError: two constraints have the same name, or a constraint names bodies or has params.
-        TypeError: a constraint is not a `Holonomic`, `VelocityLevel` or `Inequality`.
+        ValueError: two constraints have the same name, or a constraint names bodies or has params,
+            or a parameter is not a finite real number.
+        TypeError: a constraint is not a `Holonomic`, `VelocityLevel` or `Inequality`, or `mass`,
+            `force` or `potential` is no function of these arguments.
     """
+    owner = "GeneralizedSystem"
+    checks.takes(owner, "mass", mass, ("q", "params"))
+    checks.takes(owner, "force", force, ("q", "v", "t", "control", "params"))
+    if potential is not None:
+        checks.takes(owner, "potential", potential, ("q", "t", "params"))
+    checks.parameters(owner, params)
     names: set[str] = set()
     groups: list[Any] = []
     bounds: list[Any] = []

@@ -60,8 +60,9 @@ def lay_out(
     controls: list[tuple[str, int, int]] = []
     for element in elements:
         width = element.controls
-        if isinstance(element, ExternalWrench) and element.body in bodies:
-            kind = bodies[element.body].kind
+        name = element.body if isinstance(element, ExternalWrench) else None
+        if isinstance(name, str) and name in bodies:
+            kind = bodies[name].kind
             width = 0 if kind is None else kind.n_v
         if width:
             controls.append((element.name, u, u + width))
@@ -192,12 +193,9 @@ class Gather:
         """
 
         def convert(x: Scalar) -> Array:
-            array = jnp.asarray(x)
-            if isinstance(x, jax.Array | np.ndarray | np.generic) and not jnp.issubdtype(
-                x.dtype, jnp.floating
-            ):
-                return array
-            return checks.real(f"'{element.name}'", "params", x, self.dtype, array.shape)
+            if checks.is_discrete(x):
+                return jnp.asarray(x)
+            return checks.real(label(element), "params", x, self.dtype, np.shape(x))
 
         return jax.tree.map(convert, element.params)
 
@@ -246,9 +244,9 @@ class Gather:
         """
         owner, names = label(element), element.bodies
         for name in names:
-            if name not in self.poses:
+            if not isinstance(name, str) or name not in self.poses:
                 known = [WORLD, *self.layout.bodies, *self.layout.fixed]
-                raise ValueError(f"{owner}: body '{name}' is unknown; known are {known}.")
+                raise ValueError(f"{owner}: body {name!r} is unknown; known are {known}.")
         moving = [name for name in names if name in self.layout.places]
         if len(set(moving)) < len(moving) or len(names) == 2 and names[0] == names[1]:
             raise ValueError(f"{owner}: it joins body '{names[0]}' to itself.")

@@ -461,13 +461,14 @@ def vakonomic(
             "vakonomic: multipliers must be a mapping from names of constraints to μ, got"
             f" {checks.shortened(multipliers)}."
         )
+    checked = checked_system(system, state, "jc.systems.vakonomic(system, s)")
     if system.bounds:
         names = [name for group in system.bounds for name in group.names]
         raise ValueError(
             f"vakonomic: there is no variational form of the inequality rows of {names} here; build"
             " the scene without these elements."
         )
-    layout = layout_of(checked_system(system, state), state.q, state.v, state.instant)
+    layout = layout_of(checked, state.q, state.v, state.instant)
     result = Vakonomic(system, layout)
     μ = jnp.zeros(len(result.free), state.v.dtype)
     for name, given in (multipliers or {}).items():

@@ -226,7 +226,7 @@ class Differential(Coupling):
     @property
     def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
         """The names of the left, right and carrier joint, each with the name of its coordinate."""
-        if len(self.coordinates) != 3:
+        if not isinstance(self.coordinates, tuple | list) or len(self.coordinates) != 3:
             raise ValueError(
                 f"{label(self)}: coordinates must be three, of left, right and carrier, got"
                 f" {self.coordinates!r}."

@@ -5,7 +5,7 @@ Shapes and dtypes are always checked. Values are checked only if they are concre
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, SupportsIndex, TypedDict, Unpack
@@ -106,6 +106,78 @@ def derives(owner: str, what: str, value: object, protocol: type) -> None:
         )
 
 
+def instance(owner: str, what: str, x: object, kind: type, expected: str) -> None:
+    """Checks that an argument is an instance of a class.
+
+    Args:
+        owner: the function that takes the argument, for error messages.
+        what: the name of the argument, for error messages.
+        x: the user's value.
+        kind: the class.
+        expected: a description of the right value, for error messages.
+
+    Raises:
+        TypeError: the argument has another type.
+    """
+    if not isinstance(x, kind):
+        raise TypeError(f"{owner}: {what} must be {expected}, got {type(x).__name__}.")
+
+
+def random_key(owner: str, what: str, key: Any) -> None:
+    """Checks that an argument is one random key of JAX: typed, or raw with the dtype uint32.
+
+    Raises:
+        TypeError: the argument is no key, or an array of keys.
+    """
+    dtype = key.dtype if isinstance(key, jax.Array | np.ndarray) else np.dtype(bool)
+    typed = jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and dtype != np.uint32:
+        raise TypeError(
+            f"{owner}: {what} must be a random key such as jax.random.key(0), got {shortened(key)}."
+        )
+    if key.ndim != (0 if typed else 1):
+        raise TypeError(f"{owner}: {what} must be a single key, got an array {key.shape} of keys.")
+
+
+def names(owner: str, what: str, x: Any) -> tuple[str, ...]:
+    """Returns one or several names as a tuple.
+
+    Raises:
+        ValueError: the value is neither a name nor an iterable of names.
+    """
+    given: tuple[Any, ...] = (None,)
+    if isinstance(x, Iterable) and getattr(x, "ndim", 1) == 1:
+        given = (x,) if isinstance(x, str) else tuple(x)
+    if not all(isinstance(name, str) for name in given):
+        raise ValueError(f"{owner}: {what} must be names, got {shortened(x)}.")
+    return given
+
+
+def parameters(owner: str, params: PyTree) -> None:
+    """Checks the parameters of a user's function: finite real numbers, or arrays of other kinds.
+
+    Arrays of integers, of booleans and of random keys pass, because a function may use them as
+    indices, as masks and for random numbers.
+
+    Raises:
+        ValueError: a leaf is no number and no such array, or is not finite.
+    """
+    for path, x in jax.tree_util.tree_leaves_with_path(params):
+        if not is_discrete(x):
+            at = jax.tree_util.keystr(path, simple=True, separator="/")
+            check(owner, f"params '{at}'" if at else "params", x)
+
+
+def is_discrete(x: object) -> bool:
+    """Returns True if x is an array of integers, of booleans or of random keys.
+
+    A single boolean of NumPy does not count: like `True`, it is probably a mistake.
+    """
+    if not isinstance(x, jax.Array | np.ndarray | np.generic) or isinstance(x, np.bool_):
+        return False
+    return x.dtype.kind in "biu" or jnp.issubdtype(x.dtype, jax.dtypes.extended)
+
+
 def is_floating(x: PyTree) -> bool:
     """Returns True if x is a float or a floating array, and False for any other object."""
     return isinstance(x, float) or jnp.issubdtype(getattr(x, "dtype", bool), jnp.floating)
@@ -192,7 +264,7 @@ def check(
     """
     if x is None and optional:
         return None
-    array = _numbers(owner, what, x, "a real number" if shape == () else "real numbers")
+    array = numbers(owner, what, x, "a real number" if shape == () else "real numbers")
     batched = _constructing.get() and hasattr(x, "shape")
     if shape is not None and array.shape != shape and not batched:
         raise ValueError(f"{owner}: {what} must have shape {shape}, got {array.shape}.")
@@ -230,10 +302,11 @@ def _limits(above: float, least: float, most: float, finite: bool) -> str:
     return "be finite" if finite else "not be NaN"
 
 
-def _numbers(owner: str, what: str, x: PyTree, wanted: str = "real numbers") -> Any:
+def numbers(owner: str, what: str, x: PyTree, wanted: str = "real numbers") -> Any:
     """Converts a value of the user to an array of real numbers.
 
-    The result is a JAX array if x is or contains a JAX array, otherwise a NumPy array.
+    The result is a JAX array if x is or contains a JAX array, otherwise a NumPy array. Values are
+    not read, so NaN and infinity pass.
 
     Args:
         owner: the class or function that takes the value, for error messages.
@@ -304,7 +377,7 @@ def components(owner: str, **given: tuple[Any, tuple[int, ...]]) -> list[Any]:
     """
     arrays = []
     for what, (x, sizes) in given.items():
-        array = _numbers(owner, what, x)
+        array = numbers(owner, what, x)
         array = jnp.asarray(float(x) if isinstance(x, int | float) else array)  # weakly typed
         if array.shape[: len(sizes)] != sizes:
             wanted = f"({', '.join(map(str, sizes))}, …)" if sizes else "()"
@@ -404,7 +477,7 @@ def nonzero(owner: str, what: str, x: PyTree, dtype: DType | None = None) -> Non
     Raises:
         ValueError: the value is zero, not finite or not numeric.
     """
-    values = _numbers(owner, what, x)
+    values = numbers(owner, what, x)
     if is_concrete(values):
         values = np.asarray(values)
         if dtype is None:

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxcon.core import checks
 from jaxcon.core.typing import PyTree, T, Tree
 
 SHARED, APART = PartitionSpec(), PartitionSpec("worlds")
@@ -61,8 +62,9 @@ def over_devices(function: Callable[..., Any], mesh: Mesh | None = None) -> Call
         call raises a ValueError if the batch cannot be split over the devices; see `shard`.
 
     Raises:
-        TypeError: `mesh` is no mesh.
+        TypeError: `function` does not accept two arguments, or `mesh` is no mesh.
     """
+    checks.takes("over_devices", "function", function, ("shared", "batch"))
     line = _line(mesh)
     # without this check, values need no annotation of whether devices share them
     parts = {"in_specs": (SHARED, APART), "out_specs": APART, "check_vma": False}

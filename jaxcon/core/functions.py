@@ -71,10 +71,13 @@ def tree(owner: str, what: str, x: PyTree) -> PyTree:
     """Checks that the result of a user's function is a pytree of arrays; returns it unchanged.
 
     Raises:
-        TypeError: a leaf is not an array or a number.
+        TypeError: a leaf is not an array or a number, or an array of dates, strings or objects.
     """
     for path, leaf in jax.tree_util.tree_leaves_with_path(x):
-        if not hasattr(leaf, "dtype") and not isinstance(leaf, bool | int | float | complex):
+        valid = isinstance(leaf, bool | int | float | complex)
+        if hasattr(leaf, "dtype"):
+            valid = getattr(leaf.dtype, "kind", "?") not in "mMOSU"
+        if not valid:
             at = jax.tree_util.keystr(path)
             raise TypeError(
                 f"{owner}: {what} must return arrays, got {shortened(leaf)}"

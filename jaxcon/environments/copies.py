@@ -10,9 +10,10 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array
-from jaxcon.environments.environment import Environment, Episode, Outcome
+from jaxcon.environments.environment import Environment, Episode, Outcome, check_environment
 
 T = TypeVar("T")
 
@@ -55,7 +56,16 @@ def begin(
 
     Returns:
         The copies and their observations (n, …).
+
+    Raises:
+        ValueError: `count` is not a whole number from 1.
+        TypeError: another argument has the wrong type.
     """
+    check_environment("begin", environment)
+    checks.random_key("begin", "key", key)
+    checks.count("begin", "count", count)
+    if randomize is not None:
+        checks.takes("begin", "randomize", randomize, ("environment", "key"))
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(count))
     episode, world = _start(environment, keys, randomize)
     copies = Copies(episode, jnp.zeros(count, bool), world)
@@ -85,10 +95,14 @@ def advance(
         The copies, and the outcome of each, (n, …).
 
     Raises:
-        ValueError: the mode is unknown.
+        ValueError: the mode is unknown, or the actions are not real or have the wrong shape.
+        TypeError: the environment or the copies have the wrong type.
     """
+    check_environment("advance", environment)
+    checks.instance("advance", "copies", copies, Copies, "the first result of begin or advance")
     if mode not in MODES:
         raise ValueError(f"advance: mode must be one of {', '.join(MODES)}, got {mode!r}.")
+    actions = jnp.asarray(check_actions(environment, len(copies.done), actions))
     after = simulate(environment, copies, actions)
     reward, terminated, truncated = over(
         environment,
@@ -112,6 +126,27 @@ def advance(
         stepped = restart(environment, stepped, stepped.done, randomize)
     observation, info = look(environment, stepped)
     return stepped, Outcome(observation, reward, terminated, truncated, info | final)
+
+
+def check_actions(environment: Environment, count: int, actions: Any) -> Any:
+    """Checks the actions of all copies, and returns them as an array of NumPy or JAX.
+
+    Args:
+        environment: the environment given to `begin`.
+        count: n, the number of copies.
+        actions: (n, number of actions).
+
+    Raises:
+        ValueError: the actions are not real or have the wrong shape.
+    """
+    owner, shape = type(environment).__name__, (count, len(environment.actions))
+    array = checks.numbers(owner, "actions", actions)
+    if array.shape != shape:
+        raise ValueError(
+            f"{owner}: actions must have shape {shape}, got {array.shape}; the numbers of each are"
+            f" {', '.join(environment.actions)}."
+        )
+    return array
 
 
 def restart(

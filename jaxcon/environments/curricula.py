@@ -15,7 +15,8 @@ import numpy as np
 
 from jaxcon.core import checks
 from jaxcon.core.typing import Array, Scalar
-from jaxcon.environments.environment import Environment, Number
+from jaxcon.environments.environment import Environment, Number, check_environment
+from jaxcon.methods.gains import keyed
 from jaxcon.methods.penalty import Penalty
 
 OWNER = "vary and jitter"
@@ -100,7 +101,16 @@ def with_stiffness(
             values by constraint name.
         damping: the damping of `jc.stabilizers.Penalty`: one value for all constraints, or values
             by constraint name.
+
+    Raises:
+        ValueError: a value is negative or not a number, or a name is unknown.
     """
+    check_environment("with_stiffness", environment)
+    Penalty(stiffness, damping)  # checks the numbers before they are cast
+    names = tuple(name for group in environment.system.constraints for name in group.names)
+    for given in (stiffness, damping):
+        if isinstance(given, Mapping):
+            keyed(given, names, "with_stiffness")
     dtype = environment.dtype
     k, d = jax.tree.map(lambda x: jnp.asarray(x, dtype), (stiffness, damping))
     method = dataclasses.replace(environment.method, stabilizer=Penalty(k, d))
@@ -161,7 +171,10 @@ def _perturbed(
 
     Raises:
         ValueError: a size is negative or not a number, or a name or field is unknown.
+        TypeError: the environment or the key has the wrong type.
     """
+    check_environment(OWNER, environment)
+    checks.random_key(OWNER, "key", key)
     for name, fields in sizes.items() if isinstance(sizes, Mapping) else [("", sizes)]:
         if not isinstance(fields, Mapping):
             raise ValueError(

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.status import failed
 from jaxcon.core.typing import Array, DType, Scalar
@@ -199,7 +200,11 @@ class Environment:
 
         Args:
             key: a JAX key.
+
+        Raises:
+            TypeError: the key is no key, or an array of keys.
         """
+        checks.random_key(f"{type(self).__name__}.reset", "key", key)
         start_key, key = jax.random.split(key)
         state, goal = self.start(start_key)
         zero = jnp.zeros((), jnp.int32)
@@ -213,8 +218,10 @@ class Environment:
             action: (number of actions,); components are clipped to −1 to 1.
 
         Raises:
-            ValueError: the action has the wrong shape (at trace time).
+            ValueError: the action is not real or has the wrong shape (at trace time).
+            TypeError: `episode` is not an `Episode`.
         """
+        self._check_episode(episode)
         return self.act(episode, self.allowed(action))
 
     def act(self, episode: Episode, action: Array) -> Episode:
@@ -238,8 +245,10 @@ class Environment:
         """Returns the action as an array, clipped to −1 to 1.
 
         Raises:
-            ValueError: the action does not have one component for each name in `actions`.
+            ValueError: the action is not real, or does not have one component for each name in
+                `actions`.
         """
+        action = checks.numbers(type(self).__name__, "the action", action)
         action = jnp.asarray(action).astype(self.dtype)
         if action.shape != (len(self.actions),):
             raise ValueError(
@@ -249,7 +258,12 @@ class Environment:
         return jnp.clip(action, -1, 1)
 
     def observe(self, episode: Episode) -> Array:
-        """Returns the observation, clipped to the bounds of its channels, (n,)."""
+        """Returns the observation, clipped to the bounds of its channels, (n,).
+
+        Raises:
+            TypeError: `episode` is not an `Episode`.
+        """
+        self._check_episode(episode)
         least = jnp.asarray([channel.least for channel in self.observed], self.dtype)
         most = jnp.asarray([channel.most for channel in self.observed], self.dtype)
         return jnp.clip(self.observation(episode), least, most)
@@ -258,7 +272,13 @@ class Environment:
         """Returns reward, terminated and truncated, () each.
 
         The reward is 0 if the simulation diverged.
+
+        Raises:
+            ValueError: the action is not real or has the wrong shape (at trace time).
+            TypeError: `before` or `after` is not an `Episode`.
         """
+        self._check_episode(before)
+        self._check_episode(after)
         diverged = failed(after.state.status)
         # where the reward is masked, a NaN in the action would still make its gradient NaN
         action = jnp.nan_to_num(self.allowed(action))
@@ -287,12 +307,24 @@ class Environment:
             finite state.
 
         Raises:
-            ValueError: the action has the wrong shape (at trace time).
+            ValueError: the action is not real or has the wrong shape (at trace time).
+            TypeError: `episode` is not an `Episode`.
         """
         after = self.transition(episode, action)
         reward, terminated, truncated = self.judge(episode, action, after)
         observation, info = self.look(after)
         return after, Outcome(observation, reward, terminated, truncated, info)
+
+    def _check_episode(self, episode: Episode) -> None:
+        """Raises a TypeError if a value is not an `Episode`."""
+        expected = "an Episode, the result of reset or step"
+        checks.instance(type(self).__name__, "the episode", episode, Episode, expected)
+
+
+def check_environment(owner: str, environment: Environment) -> None:
+    """Raises a TypeError that names the function `owner` if a value is not an `Environment`."""
+    expected = "an Environment such as jc.environments.make('CartPole')"
+    checks.instance(owner, "environment", environment, Environment, expected)
 
 
 def near(x: Array, scale: float) -> Array:
@@ -303,7 +335,12 @@ def near(x: Array, scale: float) -> Array:
     Args:
         x: an error, of any shape.
         scale: s, in the unit of x.
+
+    Raises:
+        ValueError: x is not real, or the scale is not positive.
     """
+    checks.numbers("near", "x", x)
+    checks.check("near", "scale", scale, above=0)
     return 1 / (1 + (x / scale) ** 2)
 
 

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from jaxcon.core import checks, functions
 from jaxcon.core.typing import Array, Scalar
-from jaxcon.environments.environment import Environment, Episode
+from jaxcon.environments.environment import Environment, Episode, check_environment
 
 ITERATIONS = 30
 """The number of Newton iterations. Each reduces the barrier parameter μ at most fivefold."""
@@ -54,13 +55,25 @@ def feasible_action(
         The action, (k,), within −1 to 1.
 
     Raises:
-        ValueError: the action has the wrong shape for the environment (at trace time).
+        ValueError: the action or the noise is not real or has the wrong shape for the environment
+            (at trace time).
+        TypeError: another argument has the wrong type, or the limits are not an array (m,).
     """
-    desired = jnp.asarray(action, environment.dtype) + noise
+    owner = "feasible_action"
+    check_environment(owner, environment)
+    checks.instance(owner, "episode", episode, Episode, "an Episode, the result of reset or step")
+    checks.takes(owner, "limits", limits, ("episode",))
+    checks.numbers(owner, "action", action)
+    noise = checks.check(owner, "noise", noise)
+    desired = jnp.asarray(action, environment.dtype) + jnp.asarray(noise, environment.dtype)
     at = environment.allowed(desired)
 
     def after(a: Array) -> Array:
-        return limits(environment.act(episode, a))  # not clipped: a clip has zero slope
+        ahead = environment.act(episode, a)  # not clipped: a clip has zero slope
+        c = functions.array(owner, "limits", functions.call(owner, "limits", limits, ahead))
+        if c.ndim != 1:
+            raise TypeError(f"{owner}: limits must return an array (m,), got shape {c.shape}.")
+        return c
 
     # forward mode: there are few actions
     value, slope = scaled(after(at), jax.jacfwd(after)(at))

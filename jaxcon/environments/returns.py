@@ -7,9 +7,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core import checks
+from jaxcon.core import checks, functions
 from jaxcon.core.typing import Array
-from jaxcon.environments.environment import Environment, Episode
+from jaxcon.environments.environment import Environment, Episode, check_environment
 
 
 def returns(
@@ -35,7 +35,12 @@ def returns(
 
     Raises:
         ValueError: neither `actions` nor a horizon bounds an episode.
+        TypeError: an argument has the wrong type, or the policy does not return an array of numbers
+            or needs the value of a traced number.
     """
+    check_environment("returns", environment)
+    checks.takes("returns", "policy", policy, ("observation",))
+    checks.random_key("returns", "key", key)
     checks.count("returns", "count", count)
     if actions is not None:
         checks.count("returns", "actions", actions)
@@ -45,7 +50,9 @@ def returns(
 
     def act(carry: tuple[Episode, Array], _: None) -> tuple[tuple[Episode, Array], Array]:
         episode, running = carry
-        episode, outcome = environment.step(episode, policy(environment.observe(episode)))
+        action = functions.call("returns", "policy", policy, environment.observe(episode))
+        action = functions.array("returns", "policy", action)
+        episode, outcome = environment.step(episode, action)
         ended = outcome.terminated | outcome.truncated
         return (episode, running & ~ended), jnp.where(running, outcome.reward, 0)
 

@@ -19,7 +19,15 @@ from jaxcon.core.devices import over_devices, shard
 from jaxcon.core.typing import Array, PyTree
 from jaxcon.environments import adapters, render
 from jaxcon.environments.adapters import AutoresetMode, VectorEnv, batch_space, gymnasium
-from jaxcon.environments.copies import Copies, Randomize, advance, begin, look, restart
+from jaxcon.environments.copies import (
+    Copies,
+    Randomize,
+    advance,
+    begin,
+    check_actions,
+    look,
+    restart,
+)
 from jaxcon.environments.environment import Environment, Option
 from jaxcon.environments.registry import make
 
@@ -195,14 +203,9 @@ class GymnasiumVectorEnv(VectorEnv):
         """
         copies = self._running()
         # JAX arrays are not converted: `jnp.asarray` would cost a tenth of a CartPole step
+        actions = check_actions(self.environment, self.num_envs, actions)
         if not isinstance(actions, jax.Array):
             actions = np.asarray(actions, self.environment.dtype)
-        if actions.shape != self.action_space.shape:
-            raise ValueError(
-                f"{type(self.environment).__name__}: actions must have shape"
-                f" {self.action_space.shape}, got {actions.shape}; the numbers of each are"
-                f" {', '.join(self.environment.actions)}."
-            )
         mode, actions = self.autoreset_mode.value, self._spread(actions)
         self.copies, outcome = _advance(
             self.environment, copies, actions, mode, self.randomize, self.mesh

@@ -45,23 +45,34 @@ def check_step(
     """
     checked_system(system, state, CALLS[owner])
     check_method(method, wait=False)
+    control = checked_control(owner, system, control, state.q.dtype)
+    check_dtype(system, state.q.dtype)
+    method.check_system(system)
+    method.check_memory(system, state, owner)
+    return control
+
+
+def checked_control(owner: str, system: System, control: PyTree, dtype: DType) -> PyTree:
+    """Checks the control of one step, and returns it as arrays of the given dtype.
+
+    Raises:
+        ValueError: the control is not numeric, has a wrong shape or another dtype, or is None
+            although motors need one.
+    """
     layout = system.layout
     if layout is not None and control is not None:
-        control = _channels(owner, layout, control, state.q.dtype)
+        control = _channels(owner, layout, control, dtype)
     if layout is not None and control is None and (waiting := _motors(system)):
         raise ValueError(
             f"{owner}: control is None, but {listed(waiting)} (motors) wait for one, an array"
             f" ({layout.n_u},); its channels (name, first, end) are"
             f" {list(layout.controls)}."
         )
-    control = controls_in(state.q.dtype, control)
+    control = controls_in(dtype, control)
     for leaf in jax.tree.leaves(control):
-        got = getattr(leaf, "dtype", state.q.dtype)
-        if jnp.issubdtype(got, jnp.floating) and got != state.q.dtype:
-            raise ValueError(f"{owner}: control is {got}, but the state is {state.q.dtype}.")
-    check_dtype(system, state.q.dtype)
-    method.check_system(system)
-    method.check_memory(system, state, owner)
+        got = getattr(leaf, "dtype", dtype)
+        if jnp.issubdtype(got, jnp.floating) and got != dtype:
+            raise ValueError(f"{owner}: control is {got}, but the state is {dtype}.")
     return control
 
 

@@ -268,10 +268,11 @@ def from_mjcf(
         {"time": m.key_time[i], "qpos": m.key_qpos[i], "qvel": m.key_qvel[i], "ctrl": m.key_ctrl[i]}
         for i in range(m.nkey)
     ]
+    timestep = checks.check("from_mjcf", "timestep of the option", m.opt.timestep, (), above=0)
     return MujocoModel(
         system,
         state,
-        cast(m.opt.timestep),
+        cast(timestep),
         _tree(compiled, links, coordinates, cast),
         jax.tree.map(cast, tuple(keys)),
         tuple((compiled.name("joint", i), at) for i, at in sorted(coordinates.items())),

@@ -227,6 +227,8 @@ def identify(
     file = None if checkpoint is None else files.path(checkpoint, "identify")
     for x in jax.tree.leaves(noise):
         checks.check("identify", "noise", x, above=0)
+    if progress is not None:
+        checks.flag("identify", "progress", progress)
     _check_nodes(nodes)
     if isinstance(simulate, type):
         raise TypeError(f"identify: simulate must be a function, got the class {simulate!r}.")

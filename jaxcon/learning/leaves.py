@@ -265,6 +265,7 @@ def _limits(name: str, pair: Pair, leaf: Scalar, log: bool, owner: str) -> tuple
     try:
         low, high = pair
         ends = -jnp.inf if low is None else low, jnp.inf if high is None else high
+        ends = (checks.check(what, "bounds", x, finite=False) for x in ends)
         low, high = (jnp.broadcast_to(jnp.asarray(x, start.dtype), start.shape) for x in ends)
     except (TypeError, ValueError) as error:
         raise ValueError(

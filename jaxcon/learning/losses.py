@@ -52,8 +52,8 @@ def tracking(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> Array:
             a prefix of it. Its leaves must broadcast to those of `path`.
 
     Raises:
-        ValueError: path and reference differ in structure or shape, the scale does not broadcast,
-            or the reference is all NaN or not real.
+        ValueError: path and reference differ in structure or shape, one of them is not real, the
+            reference is all NaN, or the scale is not positive or does not broadcast.
     """
     reference = _known(reference)
     targets = [x for x in jax.tree.leaves(reference) if jnp.size(x)]
@@ -76,8 +76,8 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
         scale: divisor of each quantity; see `tracking`.
 
     Raises:
-        ValueError: path and reference differ in structure or shape, the scale does not broadcast,
-            or the reference is not real.
+        ValueError: path and reference differ in structure or shape, one of them is not real, or
+            the scale is not positive or does not broadcast.
     """
     reference = _known(reference)
     shapes = [jnp.shape(x) for x in jax.tree.leaves(path)]
@@ -97,6 +97,8 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
 
     def leaf_misfit(x: Array, target: Scalar, width: Scalar) -> Array:
         """Returns (x − target) / width of one leaf; 0 where the target is NaN."""
+        checks.numbers("losses", "what is simulated", x)
+        checks.check("losses", "a scale", width, above=0)
         shape, given = jnp.shape(x), jnp.shape(width)
         if not checks.fits(given, shape):
             raise ValueError(
@@ -128,7 +130,7 @@ def violation(off: Violation, dt: Scalar) -> Array:
         dt: step size h, () [s].
 
     Raises:
-        ValueError: the scene has no constraints.
+        ValueError: the scene has no constraints, or dt is not positive.
     """
     square = mean_violation(off, dt)
     return jnp.log10(jnp.maximum(square, jnp.finfo(square.dtype).tiny)) / 2
@@ -144,13 +146,15 @@ def mean_violation(off: Violation, dt: Scalar) -> Array:
         dt: step size h, () [s].
 
     Raises:
-        ValueError: the scene has no constraints.
+        ValueError: the scene has no constraints, or dt is not positive.
         TypeError: `off` is not a `Violation`.
     """
-    _check("mean_violation", "off", off, Violation, "info.violation of the recorded steps")
+    checks.instance(
+        "losses.mean_violation", "off", off, Violation, "info.violation of the recorded steps"
+    )
     if not off.position.size:
         raise ValueError("losses: the scene has no constraints that could be violated.")
-    h = checks.real("mean_violation", "dt", dt, off.velocity.dtype)
+    h = checks.real("mean_violation", "dt", dt, off.velocity.dtype, above=0)
     return jnp.mean(off.position**2) + jnp.mean((h * off.velocity) ** 2)
 
 
@@ -167,7 +171,13 @@ def energy_drift(energy: Energy, scale: Scalar | None = None) -> Array:
     Raises:
         TypeError: `energy` is not an `Energy`.
     """
-    _check("energy_drift", "energy", energy, Energy, "jc.energy(system, state) of recorded states")
+    checks.instance(
+        "losses.energy_drift",
+        "energy",
+        energy,
+        Energy,
+        "jc.energy(system, state) of recorded states",
+    )
     checks.check("energy_drift", "scale", scale, above=0, optional=True)
     scale = jnp.max(energy.kinetic) if scale is None else scale
     change = (energy.total - energy.total[:1]) / scale
@@ -184,7 +194,7 @@ def weighted(
         weights: weights by the same names.
 
     Raises:
-        ValueError: terms and weights have different names, or a term is not a single number.
+        ValueError: terms and weights have different names, or one is not a single real number.
         TypeError: `terms` or `weights` is not a mapping.
     """
     if not (isinstance(terms, Mapping) and isinstance(weights, Mapping)):
@@ -195,6 +205,8 @@ def weighted(
     if set(terms) != set(weights):
         raise ValueError(f"weights {sorted(weights)} must be named as terms {sorted(terms)}.")
     for name, x in terms.items():
+        checks.numbers("weighted", f"term '{name}'", x, "a real number")
+        checks.check("weighted", f"the weight of '{name}'", weights[name], ())
         if jnp.shape(x):
             raise ValueError(
                 f"weighted: term '{name}' must be one number, got shape {jnp.shape(x)}; take a mean"
@@ -218,7 +230,9 @@ def unless_failed(x: _T, state: State) -> _T:
     Raises:
         TypeError: `state` is not a `State`.
     """
-    _check("unless_failed", "state", state, State, "the state in which a rollout ended")
+    checks.instance(
+        "losses.unless_failed", "state", state, State, "the state in which a rollout ended"
+    )
     bad = failed(state.status)
 
     def masked(y: Array) -> Array:
@@ -229,20 +243,3 @@ def unless_failed(x: _T, state: State) -> _T:
         return jnp.where(mask, jnp.nan, y)
 
     return jax.tree.map(masked, x)
-
-
-def _check(owner: str, what: str, x: Violation | Energy | State, kind: type, expected: str) -> None:
-    """Checks that an argument has the right type.
-
-    Args:
-        owner: name of the function, for the error message.
-        what: name of the argument.
-        x: its value.
-        kind: the right type.
-        expected: description of the right value.
-
-    Raises:
-        TypeError: the argument has another type.
-    """
-    if not isinstance(x, kind):
-        raise TypeError(f"losses.{owner}: {what} must be {expected}, got {type(x).__name__}.")

@@ -73,7 +73,5 @@ def check_key(key: Array | None, needed: bool, owner: str) -> None:
         raise ValueError(
             f"{owner}: samples and restarts draw random numbers: give key=jax.random.key(0)."
         )
-    if key is not None and not isinstance(key, jax.Array):
-        raise TypeError(f"{owner}: key must be one of jax.random.key(0), got {key!r}.")
-    if key is not None and key.ndim != (not jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        raise TypeError(f"{owner}: key must be a single one, got an array {key.shape} of keys.")
+    if key is not None:
+        checks.random_key(owner, "key", key)

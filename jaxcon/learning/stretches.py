@@ -360,6 +360,7 @@ class Stretches:
         """Calls the user's `simulate`.
 
         Raises:
+            ValueError: the function returns numbers that are not real.
             TypeError: the function returns no arrays, or needs the value of a traced number.
         """
         result = functions.call("identify", "simulate", self.simulate, *args)
@@ -368,6 +369,8 @@ class Stretches:
                 "identify: simulate must return predictions of the data,"
                 f" {checks.described(self.data)}, got {result!r}; is a return missing?"
             )
+        for x in jax.tree.leaves(result):
+            checks.numbers("identify", "what simulate returns", x)
         return result
 
     def _onward(self, params: PyTree, node: Array) -> tuple[PyTree, PyTree]:

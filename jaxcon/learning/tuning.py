@@ -132,6 +132,8 @@ def tune(
         raise ValueError(
             f"tune: tolerance={tolerance} is what progress is within so many steps: give patience=."
         )
+    if progress is not None:
+        checks.flag("tune", "progress", progress)
     if not isinstance(forward, bool):
         raise TypeError(f"tune: forward must be True or False, got {forward!r}.")
     patience = NEVER if patience is None else _counts(patience=patience)[0]

@@ -188,6 +188,7 @@ class SemiImplicitEuler(checks.Checked, Integrator):
         0.1 m/s². In float32 this bound is active for h below 1.1 ms. `Baumgarte()` lets β rise to
         1/h if constraints accelerate fast.
         """
+        checks.numbers("SemiImplicitEuler.default_gains", "dt", dt)
         precision = float(jnp.finfo(jnp.result_type(dt)).eps)
         beta = 1.0 / jnp.maximum(dt, (precision / 0.1) ** 0.5)  # with a derivative at h = 0
         return beta / 2, beta
@@ -449,6 +450,7 @@ class RungeKutta(checks.Checked, Integrator):
 
     def default_gains(self, dt: Array) -> tuple[Array, Array]:
         """Returns α = β = 10/s, or 0.4/h if that is less."""
+        checks.numbers(f"{type(self).__name__}.default_gains", "dt", dt)
         rate = 0.4 / jnp.maximum(dt, 0.04)
         return rate, rate
 

@@ -146,11 +146,13 @@ class Method:
             ValueError: the memory is missing, or belongs to another method.
         """
         expected = self._memory_of_parts(system, state.q, state.v)
-        given = MethodMemory(*state.memory)
+        sizes = 0, len(MethodMemory._fields)
+        foreign = not isinstance(state.memory, tuple) or len(state.memory) not in sizes
+        given = MethodMemory() if foreign else MethodMemory(*state.memory)
         others = given._replace(contact_multipliers=())
         warm = self.contact_solver is not None and self.contact_solver.warm and bool(system.bounds)
         missing = warm and not given.has_contact_multipliers
-        if missing or not _same_arrays(expected, others):
+        if foreign or missing or not _same_arrays(expected, others):
             raise ValueError(
                 f"{owner}: the state does not have the memory that this method keeps; start with"
                 " state = jc.init(system, method, state.q, state.v)."
@@ -205,7 +207,18 @@ class Method:
         """Returns the stabilizer with all its gains set for the integrator and this step size.
 
         In float32, where rounding limits the default gains, they may rise (`RisingBaumgarte`).
+
+        Args:
+            dt: step size h, () [s].
+
+        Raises:
+            ValueError: dt is not a positive number.
         """
+        checks.check("Method.stabilizer_for", "dt", dt, above=0)
+        return self._stabilizer_for(dt)
+
+    def _stabilizer_for(self, dt: Array) -> Stabilizer:
+        """Returns `stabilizer_for` without a check, because a step may go back or stand still."""
         stabilizer = self.stabilizer
         coarse = jnp.finfo(jnp.result_type(dt)).bits <= 32
         if coarse and (limit := self.integrator.highest_rate(dt)) is not None:
@@ -225,7 +238,7 @@ class Method:
             dt: step size h, () [s].
             part: the part to advance if the step is split at impacts; None for the whole step.
         """
-        stabilizer, memory = self.stabilizer_for(dt), MethodMemory(*state.memory)
+        stabilizer, memory = self._stabilizer_for(dt), MethodMemory(*state.memory)
         if self.recovery is not None:
             stabilizer = self.recovery.relax(stabilizer, memory.recovery)
         contact = None

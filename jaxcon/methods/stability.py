@@ -298,8 +298,9 @@ def frequency_response(
 
     Raises:
         TypeError: the integrator is not a value such as `RK4()`.
-        ValueError: an argument is not a finite number, only one of integrator and dt is given, or
-            the integrator satisfies constraints by itself and uses no feedback.
+        ValueError: an argument is not a finite number, the shapes do not broadcast, only one of
+            integrator and dt is given, or the integrator satisfies constraints by itself and uses
+            no feedback.
 
     References:
         Åström and Wittenmark, Computer-Controlled Systems (1997), section 3.3.
@@ -309,6 +310,8 @@ def frequency_response(
     for what, x in numbers.items():
         checks.check(owner, what, x)
     checks.check(owner, "dt", dt, above=0, optional=True)
+    given = numbers if dt is None else numbers | {"dt": dt}
+    checks.components(owner, **{what: (x, ()) for what, x in given.items()})  # shapes broadcast
     if (integrator is None) != (dt is None):
         raise ValueError("frequency_response: integrator and dt go together; give both or neither.")
     ω, α, β, k = (jnp.asarray(x, jnp.result_type(float)) for x in numbers.values())

@@ -220,9 +220,7 @@ def _momentum(
     system = checked_system(system, state, f"jc.{caller}(system, s, bodies)")
     if system.layout is None:
         raise TypeError(f"{caller}: generalized coordinates have no bodies.")
-    names = (
-        system.layout.bodies if bodies is None else [bodies] if isinstance(bodies, str) else bodies
-    )
+    names = system.layout.bodies if bodies is None else checks.names(caller, "bodies", bodies)
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{caller}: bodies must be different names, got {list(names)}.")
     places = [Place(group, (i,)) for group, i in map(system.layout.locate, names)]

@@ -155,7 +155,7 @@ def find(
             f"{owner}: '{joint}' has no coordinate; a Span measures a distance, a Twist a turn."
         )
     chosen: Any = names[0] if name is None and len(names) == 1 else name
-    if chosen not in names:
+    if not isinstance(chosen, str) or chosen not in names:
         raise ValueError(
             f"{owner}: the coordinates of '{joint}' are {names}; say which, got {name!r}."
         )

@@ -240,8 +240,11 @@ class UserElement:
 
     def set(self, changes: Mapping[str, Any]) -> Self:
         """Returns the element with changed parameters; `changes` is {name: {"params": value}}."""
-        params = changes.get(self.law.name, {}).get("params", self.params)
-        return dataclasses.replace(self, params=params)
+        given = changes.get(self.law.name, {})
+        if "params" not in given:
+            return self
+        checks.parameters(self.law.name, given["params"])
+        return dataclasses.replace(self, params=given["params"])
 
     def anchors(self, snapshot: Snapshot) -> Vector | None:
         """Returns None: a user's function has no anchor."""

@@ -187,11 +187,28 @@ def checked_system(system: S, state: State, call: str = "f(system, s)") -> S:
     for what in ("time", "time_remainder", "status"):
         if got := np.shape(getattr(state, what)):
             raise ValueError(f"state.{what} must have shape (), got {got}.")
+    if not isinstance(state.angle_remainder, tuple):
+        _check_remainder(system, state.angle_remainder.shape)
     return with_turns(system, state.turns, state.angle_remainder)
 
 
+def _check_remainder(system: Any, shape: tuple[int, ...]) -> None:
+    """Raises a ValueError if an array is no `angle_remainder` of a system, because of its shape."""
+    if system.layout is None:
+        angles = len(system.no_remainder(np.dtype(np.float32)))
+    else:
+        where = system.layout.angles
+        angles = 0 if where is None else where.stop - where.start
+    if not angles or shape != (angles,):
+        expected = f"have shape ({angles},) or be ()" if angles else "be ()"
+        raise ValueError(
+            f"state.angle_remainder must {expected}, got an array {shape}; jc.init(system, method,"
+            " q, v) makes a state."
+        )
+
+
 def _check_kinds(state: State) -> None:
-    """Checks that a state has arrays of one floating dtype, and a status code.
+    """Checks that a state has arrays of one floating dtype, a memory and a status code.
 
     The check does not wait for values that a device still computes.
 
@@ -215,6 +232,11 @@ def _check_kinds(state: State) -> None:
                 f"state.{what} is {dtype}, but state.q is {state.q.dtype}: mixed dtypes are not"
                 " promoted."
             )
+    if not all(hasattr(leaf, "dtype") for leaf in jax.tree.leaves(state.memory)):
+        raise ValueError(
+            f"state.memory must be a tree of arrays, got {_kind(state.memory)};"
+            " jc.init(system, method, q, v) makes a state."
+        )
     code = state.status
     concrete = isinstance(code, int | np.integer) and not isinstance(code, bool | np.timedelta64)
     whole = concrete or getattr(getattr(code, "dtype", None), "kind", "?") in "iu"
