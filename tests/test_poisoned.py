@@ -223,3 +223,59 @@ def test_zero_axes_and_quaternions_beside_springs_about_several_axes():
     counts = study.run(cases)
     assert counts.clean, poisoned.words("zeros", counts)
     assert counts.tried >= 50
+
+
+@pytest.mark.parametrize("time", [np.nan, np.inf])
+def test_a_time_that_is_not_finite_is_told(pendulum, time):
+    system, state = pendulum
+    new = jax.jit(lambda t: jc.step(system, jc.Method(), state.replace(time=t), None, 1e-3)[0])
+    assert new(jnp.asarray(time, state.time.dtype)).status == jc.Status.NON_FINITE
+
+
+@pytest.mark.parametrize("run", [lambda f, h: f(h), lambda f, h: jax.jit(f)(h)])
+def test_a_negative_step_of_a_jax_array_is_told(pendulum, run):
+    """A Python number is refused at once; an array is not read."""
+    system, state = pendulum
+
+    def status(h):
+        return jc.rollout(system, jc.Method(), state, None, h, 3)[0].status
+
+    assert run(status, jnp.asarray(-1e-3)) == jc.Status.NON_FINITE
+    assert run(status, jnp.asarray(1e-3)) == jc.Status.OK
+    with pytest.raises(ValueError, match="dt"):
+        status(-1e-3)
+
+
+@pytest.mark.parametrize(
+    "integrator",
+    [
+        jc.SemiImplicitEuler(),
+        jc.RK4(),
+        jc.integrators.RATTLE(),
+        jc.integrators.GeneralizedAlpha(),
+    ],
+    ids=lambda x: type(x).__name__,
+)
+def test_a_quaternion_of_zero_is_told(integrator):
+    scene = jc.Scene()
+    scene.add_body("box", mass=1.0, inertia=(1.0, 2.0, 2.5))
+    system, state = scene.build()
+    method = jc.Method(integrator)
+    start = jc.init(system, method, jnp.zeros_like(state.q), state.v)
+    assert jc.step(system, method, start, None, 1e-3)[0].status == jc.Status.NON_FINITE
+
+
+@pytest.mark.parametrize("method", [jc.Method(), jc.Method(jc.RK4())])
+def test_a_mass_matrix_that_becomes_unsymmetric_is_told(method):
+    """At the start it is symmetric."""
+
+    def coupled(other):
+        def mass(q, params):
+            return jnp.stack([jnp.stack([2.0, q[0]]), jnp.stack([other * q[0], 2.0])])
+
+        system = jc.GeneralizedSystem(mass=mass, force=lambda q, v, t, u, params: -q)
+        start = jc.init(system, method, jnp.array([0.0, 0.1]), jnp.array([1.0, 0.0]))
+        return jc.rollout(system, method, start, None, 1e-2, 3)[0].status
+
+    assert coupled(1.0) == jc.Status.OK
+    assert coupled(0.0) == jc.Status.NON_FINITE

@@ -127,7 +127,8 @@ class GeneralizedCoordinates:
         if m.ndim == 1:
             return Diagonal(m)
         # factorizations read one triangle: with another one the motion would be silently wrong
-        symmetric = jnp.max(jnp.abs(m - m.T), initial=0) <= SYMMETRY * jnp.max(jnp.abs(m), initial=0)
+        skew, size = (jnp.max(jnp.abs(x), initial=0) for x in (m - m.T, m))
+        symmetric = skew <= SYMMETRY * size
         return Full(jnp.where(symmetric, m, jnp.nan))
 
     def force(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
@@ -153,7 +154,8 @@ class GeneralizedCoordinates:
         mass = self.mass(q)
         if isinstance(mass, Full) and checks.is_concrete(mass.values):
             values = np.asarray(mass.values)
-            if not np.max(np.abs(values - values.T), initial=0) <= SYMMETRY * np.max(np.abs(values)):
+            skew, size = (np.max(np.abs(x), initial=0) for x in (values - values.T, values))
+            if not skew <= SYMMETRY * size:
                 raise ValueError(
                     "GeneralizedSystem: mass must return a symmetric matrix, got"
                     f" {checks.clipped(checks.numerals(values))} at q = {checks.numerals(q)}."
