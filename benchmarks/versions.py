@@ -65,7 +65,10 @@ for page in sys.argv[1:]:
     child = os.fork()  # nothing has imported JAX yet
     if not child:
         os._exit(read(page))
-    failed |= os.waitpid(child, 0)[1] != 0
+    code = os.waitpid(child, 0)[1]
+    if os.WIFSIGNALED(code):
+        print(f"PAGE {page} 0 s ended by signal {os.WTERMSIG(code)}", flush=True)
+    failed |= code != 0
 sys.exit(failed)
 """
 """A script that runs the programs of each page in order, in a process of its own per page."""

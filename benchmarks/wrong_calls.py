@@ -132,7 +132,7 @@ VALUES: list[tuple[str, Any, frozenset[str]]] = [
         ("bytes", b"1.0", ""),
         ("True", True, "flag"),
         ("False", False, "flag"),
-        ("a boolean of NumPy", np.True_, ""),
+        ("a boolean of NumPy", np.True_, "mask"),
         ("a complex number", 1 + 1j, ""),
         ("a complex number without imaginary part", 1 + 0j, ""),
         ("a date", np.datetime64("2026-01-01"), ""),

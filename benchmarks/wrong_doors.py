@@ -98,7 +98,7 @@ FUNCTION = Takes("other", allows=frozenset({"function"}))
 """The valid values of an argument that is a function of the user."""
 
 
-PARAMETERS = Takes("other", allows=frozenset({"none", "key", "tree"}))
+PARAMETERS = Takes("other", allows=frozenset({"none", "key", "tree", "flag", "mask"}))
 """The valid values of an argument with the parameters of a user's function, by kind."""
 
 

@@ -774,3 +774,42 @@ def test_of_many_numbers_only_the_first_wrong_one_is_shown():
     masses[2, 3] = -1.0
     with pytest.raises(ValueError, match=r"got -1.0 at \[2, 3\] of an array \(5, 4\)\.$"):
         checks.check("body 'a'", "mass", masses, above=0)
+
+
+def test_parameters_of_functions_may_be_flags_indices_and_keys():
+    kinds = {"key": jax.random.key(0), "flag": True, "mask": np.bool_(True), "index": 3}
+    for name, x in kinds.items():
+        jc.GeneralizedSystem(
+            mass=lambda q, p: jnp.ones_like(q), force=lambda q, v, t, u, p: -q, params={name: x}
+        )
+        scene = jc.Scene(dim=2)
+        scene.add_body("a", mass=1.0, inertia=1.0)
+        pull = jc.forces.CustomForce(
+            "f", ("a",), lambda a, t, u, p: (jnp.zeros(3),), params={name: x}
+        )
+        scene.add(pull)
+        scene.build()
+    with pytest.raises(ValueError, match="params 'limit' must not be NaN, got nan"):
+        jc.GeneralizedSystem(
+            mass=lambda q, p: jnp.ones_like(q),
+            force=lambda q, v, t, u, p: -q,
+            params={"limit": np.nan},
+        )
+
+
+def test_controls_of_user_forces_may_be_flags():
+    system = jc.GeneralizedSystem(
+        mass=lambda q, p: jnp.ones_like(q),
+        force=lambda q, v, t, u, p: jnp.where(u["on"], -q, 0 * q),
+    )
+    state = jc.init(system, jc.Method(), jnp.ones(1), jnp.zeros(1))
+    control = {"on": jnp.array(True)}
+    assert jc.step(system, jc.Method(), state, control, 1e-3)[0].status == jc.Status.OK
+    jc.report(system, state, jc.Method(), 1e-3, control=control)
+
+
+def test_an_infinite_scale_ignores_a_part_of_a_loss():
+    path = {"a": jnp.ones(3), "b": 5 * jnp.ones(3)}
+    reference = {"a": jnp.zeros(3), "b": jnp.zeros(3)}
+    found = jc.learning.losses.tracking(path, reference, {"a": 1.0, "b": jnp.inf})
+    np.testing.assert_allclose(found, 0.5)

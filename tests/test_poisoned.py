@@ -228,8 +228,10 @@ def test_zero_axes_and_quaternions_beside_springs_about_several_axes():
 @pytest.mark.parametrize("time", [np.nan, np.inf])
 def test_a_time_that_is_not_finite_is_told(pendulum, time):
     system, state = pendulum
-    new = jax.jit(lambda t: jc.step(system, jc.Method(), state.replace(time=t), None, 1e-3)[0])
-    assert new(jnp.asarray(time, state.time.dtype)).status == jc.Status.NON_FINITE
+    start = state.replace(time=jnp.asarray(time, state.time.dtype))
+    new = jax.jit(lambda s: jc.step(system, jc.Method(), s, None, 1e-3)[0])(start)
+    assert new.status == jc.Status.NON_FINITE
+    assert "time" in str(jc.analysis.find_first_failure(system, jc.Method(), start, None, 1e-3, 3))
 
 
 @pytest.mark.parametrize("run", [lambda f, h: f(h), lambda f, h: jax.jit(f)(h)])
@@ -261,8 +263,13 @@ def test_a_quaternion_of_zero_is_told(integrator):
     scene.add_body("box", mass=1.0, inertia=(1.0, 2.0, 2.5))
     system, state = scene.build()
     method = jc.Method(integrator)
-    start = jc.init(system, method, jnp.zeros_like(state.q), state.v)
+    start = jc.init(system, method, state.q, state.v)
+    start = start.replace(q=jnp.zeros_like(state.q))
     assert jc.step(system, method, start, None, 1e-3)[0].status == jc.Status.NON_FINITE
+    found = jc.analysis.find_first_failure(system, method, start, None, 1e-3, 3)
+    assert "box has a quaternion of zeros" in str(found).replace("'", "")
+    with pytest.raises(ValueError, match="body 'box': its quaternion in q is zero"):
+        jc.init(system, method, start.q, state.v)
 
 
 @pytest.mark.parametrize("method", [jc.Method(), jc.Method(jc.RK4())])

@@ -193,17 +193,41 @@ def test_leaps_across_a_valley_are_not_called_converged(optimizer):
     assert "before it converged" in found.stopped
 
 
-@pytest.mark.parametrize("curvatures", [(1.0, 5.0), (1.0, 200.0)])
-def test_adam_converges_in_a_bowl(curvatures):
-    target, curvatures = jnp.array([1.0, 2.0]), jnp.array(curvatures)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    "optimizer",
+    [
+        optax.adam(optax.cosine_decay_schedule(0.2, 400)),
+        optax.adam(0.05),
+        optax.sgd(0.1),
+        optax.sgd(0.05, momentum=0.9),
+    ],
+    ids=["cosine", "adam", "sgd", "momentum"],
+)
+def test_other_optimizers_converge_in_a_bowl(optimizer, dtype):
+    """At the end, steps and gradients are mere rounding errors."""
+    turn = np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    curvature = jnp.asarray(turn @ np.diag([0.5, 4.0, 1.0]) @ turn.T, dtype)
+    target = jnp.asarray([1.0, 2.0, 0.7], dtype)
     found = jc.tune(
-        lambda x: jnp.sum(curvatures * (x - target) ** 2),
-        jnp.zeros(2),
+        lambda x: (x - target) @ curvature @ (x - target),
+        jnp.zeros(3, dtype),
         steps=400,
-        optimizer=optax.adam(optax.cosine_decay_schedule(0.2, 400)),
+        optimizer=optimizer,
     )
     np.testing.assert_allclose(found.params, target, rtol=1e-3)
     assert found.converged
+
+
+def test_a_search_may_end_with_every_parameter_on_a_bound():
+    found = jc.tune(
+        lambda x: jnp.sum((x - 5) ** 2),
+        jnp.zeros(1),
+        steps=30,
+        bounds=(-1.0, 1.0),
+        optimizer=optax.adam(0.1),
+    )
+    np.testing.assert_allclose(found.params, 1.0)
 
 
 def test_batches_share_parameters_and_starts_are_searched_beside_each_other():

@@ -124,7 +124,8 @@ def diagnose(
     finer = controls
     if controls is not None and not callable(controls):
         for leaf in jax.tree.leaves(controls):
-            checks.numbers("diagnose", "controls", leaf)
+            if not checks.is_discrete(leaf):
+                checks.numbers("diagnose", "controls", leaf)
         controls = controls_in(state.q.dtype, controls)
         finer = jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x), 2, axis=0), controls)
     end, φ_given = _simulate(system, method, state, controls, dt, steps)

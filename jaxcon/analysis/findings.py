@@ -17,6 +17,7 @@ from jaxcon.constraints.rows import Rows, linearize
 from jaxcon.core import checks
 from jaxcon.core.doubled import Doubled
 from jaxcon.core.typing import Array, PyTree
+from jaxcon.linear.saddle import Full
 from jaxcon.protocols import System
 from jaxcon.system.body_system import BodySystem
 from jaxcon.system.state import LARGEST_SPEED, State
@@ -42,12 +43,15 @@ class Finding:
 
 
 def given(system: System, state: State, control: PyTree) -> Iterator[Finding]:
-    """Yields a finding for each position, velocity, control or parameter that is not finite.
+    """Yields a finding for each position, velocity, time, control or parameter that is not finite.
 
-    Parameters that may be infinite, such as a missing stop of a `Limit`, are only checked for NaN.
+    A quaternion of zeros is a finding, too. Parameters that may be infinite, such as a missing stop
+    of a `Limit`, are only checked for NaN.
     """
     yield from positions(system, state.q)
     yield from velocities(system, state.v)
+    if not np.isfinite(state.time):
+        yield Finding("time", "the state", f"is {checks.numerals(state.time)}")
     channels = (("control", 0, None),) if system.layout is None else system.layout.controls
     for name, start, stop in channels:
         parts = [np.asarray(x)[start:stop] for x in jax.tree.leaves(control) if np.ndim(x)]
@@ -70,9 +74,12 @@ def given(system: System, state: State, control: PyTree) -> Iterator[Finding]:
 
 
 def positions(system: System, q: Array) -> Iterator[Finding]:
-    """Yields a finding for each body or coordinate whose position is not finite."""
+    """Yields a finding for each body or coordinate whose position is not finite, or no pose."""
     layout = system.layout
-    return _infinite("position", q, layout and {name: layout.q(name) for name in layout.bodies})
+    places = layout and {name: layout.q(name) for name in layout.bodies}
+    yield from _infinite("position", q, places)
+    for name in () if layout is None else layout.without_orientation(q):
+        yield Finding("position", name, "has a quaternion of zeros")
 
 
 def velocities(system: System, v: Array) -> Iterator[Finding]:
@@ -122,9 +129,13 @@ def _infinite(
 def masses(system: System, q: Array) -> Iterator[Finding]:
     """Yields a finding for each body whose mass or moment of inertia is not positive.
 
-    If there is no such body, yields a finding for a mass matrix that is not positive definite.
+    If there is no such body, yields a finding for a mass matrix that is not positive definite. A
+    matrix that is not symmetric is the only finding.
     """
     mass = system.mass(q)
+    if isinstance(mass, Full) and np.all(np.isnan(mass.values)):
+        yield Finding("mass", "the system", "is not symmetric, or NaN")
+        return
     wrong = jnp.where(mass.diagonal > 0, mass.diagonal, jnp.nan)
     yield from (Finding("mass", f.name, "is not positive") for f in entries(system, "mass", wrong))
     if np.all(mass.diagonal > 0) and mass.singular:

@@ -90,7 +90,8 @@ class Setup:
         h = None if dt is None else float(dt)
         control = checked_control("report", system, idle(system, control), state.q.dtype)
         for leaf in jax.tree.leaves(control):
-            checks.check("report", "control", leaf)
+            if not checks.is_discrete(leaf):
+                checks.check("report", "control", leaf)
         return cls(system, state, method, h, control, batch, rows, mass, jacobian, measured)
 
     @cached_property

@@ -45,7 +45,7 @@ def GeneralizedSystem(  # noqa: N802
     checks.takes(owner, "force", force, ("q", "v", "t", "control", "params"))
     if potential is not None:
         checks.takes(owner, "potential", potential, ("q", "t", "params"))
-    checks.parameters(owner, params)
+    checks.parameters(owner, params, finite=False)
     names: set[str] = set()
     groups: list[Any] = []
     bounds: list[Any] = []

@@ -135,6 +135,8 @@ def random_key(owner: str, what: str, key: Any) -> None:
         raise TypeError(
             f"{owner}: {what} must be a random key such as jax.random.key(0), got {shortened(key)}."
         )
+    if key.ndim == 0 and not typed:
+        raise TypeError(f"{owner}: {what} must be a random key, got the number {key}.")
     if key.ndim != (0 if typed else 1):
         raise TypeError(f"{owner}: {what} must be a single key, got an array {key.shape} of keys.")
 
@@ -153,29 +155,34 @@ def names(owner: str, what: str, x: Any) -> tuple[str, ...]:
     return given
 
 
-def parameters(owner: str, params: PyTree) -> None:
-    """Checks the parameters of a user's function: finite real numbers, or arrays of other kinds.
+def parameters(owner: str, params: PyTree, finite: bool = True) -> None:
+    """Checks the parameters of a user's function: real numbers, booleans, integers or random keys.
 
-    Arrays of integers, of booleans and of random keys pass, because a function may use them as
-    indices, as masks and for random numbers.
+    A function may use booleans and integers as flags, masks and indices.
+
+    Args:
+        owner: the class or function that takes the parameters, for error messages.
+        params: the parameters.
+        finite: True to refuse infinity; NaN is always refused.
 
     Raises:
-        ValueError: a leaf is no number and no such array, or is not finite.
+        ValueError: a leaf is of another kind, is NaN, or is infinite.
     """
     for path, x in jax.tree_util.tree_leaves_with_path(params):
         if not is_discrete(x):
             at = jax.tree_util.keystr(path, simple=True, separator="/")
-            check(owner, f"params '{at}'" if at else "params", x)
+            check(owner, f"params '{at}'" if at else "params", x, finite=finite)
 
 
 def is_discrete(x: object) -> bool:
-    """Returns True if x is an array of integers, of booleans or of random keys.
-
-    A single boolean of NumPy does not count: like `True`, it is probably a mistake.
-    """
-    if not isinstance(x, jax.Array | np.ndarray | np.generic) or isinstance(x, np.bool_):
+    """Returns True if x is a boolean, or an array of integers, of booleans or of random keys."""
+    if isinstance(x, bool):
+        return True
+    if not isinstance(x, jax.Array | np.ndarray | np.generic):
         return False
-    return x.dtype.kind in "biu" or jnp.issubdtype(x.dtype, jax.dtypes.extended)
+    # NumPy counts timedelta64 as an integer; keys have a dtype without `kind`
+    kind = getattr(x.dtype, "kind", "")
+    return kind in ("b", "i", "u") or jnp.issubdtype(x.dtype, jax.dtypes.extended)
 
 
 def is_floating(x: PyTree) -> bool:
@@ -321,6 +328,8 @@ def numbers(owner: str, what: str, x: PyTree, wanted: str = "real numbers") -> A
         array = x
     elif type(x) is float:
         return np.asarray(x)
+    elif type(x) is np.ndarray and x.dtype.kind in "fiu":
+        return x
     else:
         array = _from_host(owner, what, x, wanted)
     # tests dtype.kind, since NumPy counts timedelta64 as an integer; bfloat16 has an unusual kind

@@ -49,10 +49,10 @@ REPAIRS = (Status.ROLLED_BACK, Status.PROJECTED, Status.RELAXED)
 
 
 MEANING = {
-    Status.NON_FINITE: "a state, force or parameter is NaN or infinite, or velocities are beyond"
-    " 1e10; likely (a) a step too large for the fastest motion, (b) a NaN in the"
-    " control or parameters, (c) an unstable gain, (d) a start far off the constraints under gains"
-    " that are not gentle",
+    Status.NON_FINITE: "a state, its time, a force or a parameter is NaN or infinite, velocities"
+    " are beyond 1e10, h is negative, a quaternion is zero, or a mass matrix is not symmetric;"
+    " likely (a) a step too large for the fastest motion, (b) a NaN in the control or parameters,"
+    " (c) an unstable gain, (d) a start far off the constraints under gains that are not gentle",
     Status.SINGULAR: "the constraint rows are dependent, or the mass matrix is not positive"
     " definite; `report` names redundant rows; likely (a) a closed spatial loop of revolute joints,"
     " (b) the same constraint twice, (c) a singular position of the mechanism, (d) a motion that"

@@ -93,12 +93,17 @@ def _checked(
 ) -> tuple[System, Method, State, PyTree, Array]:
     """Checks the arguments of a step; returns the arguments of `masked_step`, as arrays."""
     control = check_step(system, method, state, control, owner)
+    h = _step_size(owner, state, dt)
+    with checks.without_waiting():
+        method = method.known_at(dt, state.q.dtype)
+    return system, method, state, control, h
+
+
+def _step_size(owner: str, state: State, dt: Scalar) -> Array:
+    """Returns h as an array; NaN, which ends the world, for a negative array, which is not read."""
     with checks.without_waiting():
         h = checks.real(owner, "dt", dt, state.q.dtype, least=0)
-        method = method.known_at(dt, state.q.dtype)
-    if isinstance(dt, jax.Array):  # not read here; NaN ends the world with a status
-        h = jnp.where(h >= 0, h, jnp.nan)
-    return system, method, state, control, h
+    return jnp.where(h >= 0, h, jnp.nan) if isinstance(dt, jax.Array) else h
 
 
 def _reported(
@@ -227,9 +232,7 @@ def forward_dynamics_for(
 ) -> SolutionAt:
     """Implements `forward_dynamics`; errors name `owner`, the public function that was called."""
     control = check_step(system, method, state, control, owner)
-    with checks.without_waiting():
-        h = checks.real(owner, "dt", dt, state.q.dtype, least=0)
-    given = (system, method, state, control, h)
+    given = (system, method, state, control, _step_size(owner, state, dt))
     (a, λ, status), violation, reactions = batch_last.call(solve_at, *given)
     where = without_memory(state)
     return with_origin(SolutionAt(a, λ, status, where, violation, reactions, control), system)

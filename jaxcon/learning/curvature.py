@@ -11,6 +11,8 @@ from jaxcon.core.typing import Array
 
 PAIRS = 10
 """The number of secant pairs that L-BFGS stores."""
+VANISHED = 1e-3
+"""The share of the gradient at the start below which a gradient has almost vanished."""
 
 
 @pytree
@@ -120,35 +122,45 @@ class Secants:
         sums = jnp.sum(squares, axis=0)
         return jnp.where(sums > 0, jnp.sum(products, axis=0) / jnp.where(sums > 0, sums, 1), mean)
 
-    def cautious_step(self, slope: np.ndarray, free: np.ndarray) -> np.ndarray:
+    def cautious_step(self, slope: np.ndarray, first: np.ndarray, free: np.ndarray) -> np.ndarray:
         """Returns a bound on the Newton step where the pairs leave the curvature open, (n,).
 
         L-BFGS assumes a large curvature along directions in which the search has hardly moved. Adam
         may leap across a narrow valley and hardly move along it: the bottom then seems near. This
         function instead fits the symmetric Hessian H to all pairs, Y ≈ S H, by least squares. An
         eigenvalue of H is uncertain by δ = ‖Y − S H‖ / σ, with the smallest singular value σ of S.
-        The bound takes the smallest curvature that the pairs allow, λ − δ, along each eigenvector;
-        it is infinite if that is not positive. Each coordinate is in units of its largest step.
+        The bound takes the smallest curvature that the pairs allow, λ − δ, along each eigenvector.
+        If that is not positive, the bound is infinite, unless the gradient along the eigenvector
+        has almost vanished since the start of the search: near a minimum, where pairs are mere
+        rounding errors, the bound is then zero. Each coordinate is in units of its largest step
+        among the scaled pairs.
 
         Args:
             slope: the gradient g at the best point, (n,).
+            first: the gradient at the start of the search, (n,).
             free: mask of the coordinates that may move, (n,).
         """
-        s, y, g = (np.asarray(x, float)[..., free] for x in (self.steps, self.changes, slope))
+        bound = np.zeros(len(slope))
+        if not np.any(free):
+            return bound
+        given = (self.steps, self.changes, slope, first)
+        s, y, g, g0 = (np.asarray(x, float)[..., free] for x in given)
         valid = np.any(s != 0, axis=1)
         unit = np.max(np.abs(s), axis=0, initial=0)
-        bound = np.full(len(slope), 0.0)
         if np.sum(valid) < len(unit) or not np.all(unit > 0) or not np.all(np.isfinite(y)):
-            bound[free] = np.inf
+            bound[free] = np.where(np.abs(g) <= VANISHED * np.abs(g0), 0, np.inf)
             return bound
-        s, y, g = s[valid] / unit, y[valid] * unit, g * unit
+        s, y, g, g0 = s[valid] / unit, y[valid] * unit, g * unit, g0 * unit
         hessian = np.linalg.lstsq(s, y, rcond=None)[0]
         hessian = (hessian + hessian.T) / 2
         smallest = np.linalg.svd(s, compute_uv=False)[-1]
         misfit = np.linalg.norm(y - s @ hessian)
         curvature, axes = np.linalg.eigh(hessian)
         least = curvature - np.divide(misfit, smallest, out=np.array(np.inf), where=smallest > 0)
-        along = np.abs(axes.T @ g)
-        far = np.divide(along, least, out=np.full_like(along, np.inf), where=least > 0)
-        bound[free] = unit * (np.abs(axes) @ np.where(along == 0, 0, far))
+        along, at_first = np.abs(axes.T @ g), np.abs(axes.T @ g0)
+        open_ends = np.where(along <= VANISHED * at_first, 0, np.inf)
+        far = np.divide(along, least, out=open_ends, where=least > 0)
+        # an infinite distance counts along each coordinate of which its eigenvector has a part
+        parts = np.abs(axes) * (far > 0)
+        bound[free] = unit * np.sum(np.where(parts > 0, parts * far, 0), axis=1)
         return bound

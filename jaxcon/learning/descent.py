@@ -97,6 +97,7 @@ class Search:
         origin: the accepted point from which the step to y was taken.
         best: the best point so far.
         first: loss at the first accepted point; NaN before there is one.
+        first_slope: gradient of the loss at this point; zero before there is one.
         highest: the largest loss of an accepted point.
         mark: the loss to beat: a loss that is lower by more than the tolerance counts as progress.
         since: the step at which `mark` was set.
@@ -114,6 +115,7 @@ class Search:
     origin: AcceptedPoint
     best: Best
     first: Array
+    first_slope: tuple[Array, ...]
     highest: Array
     mark: Array
     since: Array
@@ -168,6 +170,7 @@ class Descent:
             origin=AcceptedPoint(y, zeros, infinite, zeros, self.optimizer.init(y)),
             best=Best(y, zeros, infinite, nothing, all_lost, none),
             first=jnp.full_like(infinite, jnp.nan),
+            first_slope=zeros,
             highest=-infinite,
             mark=infinite,
             since=none,
@@ -279,7 +282,8 @@ class Descent:
             good &= ~self.runs_away(search, loss, search.origin.loss)
             learned = self.learned(search, search.secants, slope)
             secants = where_tree(good & search.accepted, learned, search.secants)
-            search = dataclasses.replace(search, secants=secants)
+            first_slope = where_tree(good & ~search.accepted, slope, search.first_slope)
+            search = dataclasses.replace(search, secants=secants, first_slope=first_slope)
             search = self.judge(self.accept(search, loss, good), point)
         origin = where_tree(good, self.leave(search, loss, slope, key), search.origin)
         share = jnp.where(good, jnp.minimum(1, RECOVERY * search.share), search.share / 2)

@@ -98,7 +98,7 @@ def misfit(path: PyTree, reference: PyTree, scale: PyTree = 1.0) -> PyTree:
     def leaf_misfit(x: Array, target: Scalar, width: Scalar) -> Array:
         """Returns (x − target) / width of one leaf; 0 where the target is NaN."""
         checks.numbers("losses", "what is simulated", x)
-        checks.check("losses", "a scale", width, above=0)
+        checks.check("losses", "a scale", width, above=0, finite=False)
         shape, given = jnp.shape(x), jnp.shape(width)
         if not checks.fits(given, shape):
             raise ValueError(

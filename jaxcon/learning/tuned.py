@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.typing import Array
@@ -177,10 +178,12 @@ class Outlook:
         """
         steps = space.split(search.ahead)
         if search.secants is not None and not isinstance(search.origin.memory, OptimizerMemory):
-            slope, free = flat(search.best.slope)[0], space.free(search.best.y, search.best.slope)
-            if slope.size <= PAIRS:
-                bound = search.secants.cautious_step(np.asarray(slope), np.asarray(free))
-                steps = space.split(np.maximum(np.abs(search.ahead), bound))
+            free = np.asarray(space.free(search.best.y, search.best.slope))
+            if free.size <= PAIRS:
+                slopes = (search.best.slope, search.first_slope)
+                slope, first = (np.asarray(flat(x)[0]) for x in slopes)
+                bound = search.secants.cautious_step(slope, first, free)
+                steps = space.split(jnp.maximum(jnp.abs(search.ahead), bound.astype(slope.dtype)))
         leaves = zip(steps, search.best.y, start, space.positive, strict=True)
         distances = [
             float(np.max(np.abs(d) / _size(z, z0, log), initial=0)) for d, z, z0, log in leaves

@@ -25,7 +25,7 @@ from jaxcon.methods.integrators import RungeKutta
 from jaxcon.protocols import ContactSolver, Solver, System
 from jaxcon.system.state import State, checked_system
 
-PLATFORMS = ("cpu", "gpu", "tpu")
+PLATFORMS = ("cpu", "gpu", "cuda", "rocm", "tpu")
 """The platforms for which a solver is chosen, besides JAX's default backend."""
 
 PROGRAM = 30_000
@@ -107,14 +107,14 @@ def choose(
         raise TypeError("Method.auto looks at numbers: call it outside jit, vmap and grad.")
     checks.count("Method.auto", "batch", batch)
     facts = look(checked_system(system, state, "jc.Method.auto(system, s)"), state, dependent)
-    if not facts.rows:
-        return Choice(RankSafe(), {}, ("there are no rows to solve for",))
     known = (None, *PLATFORMS, jax.default_backend())
     if not isinstance(platform, str | None) or platform not in known:
         raise ValueError(
             f"Method.auto: platform must be None or one of {', '.join(PLATFORMS)}, got"
             f" {checks.shortened(platform)}."
         )
+    if not facts.rows:
+        return Choice(RankSafe(), {}, ("there are no rows to solve for",))
     order = None if platform is None else "runs" if platform == "cpu" else "levels"
     efforts = weigh(facts, order or suits_device())
     width = batch * jnp.finfo(state.q.dtype).bits // 8

@@ -42,8 +42,8 @@ FASTEST = 1e8
 LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.018, 0.02)
 """Rotations of a body in a step [rad] at which `newton_correction` begins and acts in full.
 
-Below these rotations energy drifts, see `benchmarks.energy_drift`. Lower numbers would halve the
-drift and cost a tenth to a fifth of the rate of chains and closed loops.
+Below these rotations energy drifts, see `benchmarks.energy_drift`. Half of these numbers would cut
+the drift to a half or less, and cost up to a quarter of the rate of chains and closed loops.
 """
 
 

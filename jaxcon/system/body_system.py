@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 import jax
 import jax.numpy as jnp
 
-from jaxcon.core import numerics
+from jaxcon.core import checks, numerics
 from jaxcon.core.doubled import Doubled, rounded
 from jaxcon.core.lanes import Vector, collect, total, zeros
 from jaxcon.core.pytree import pytree, static
@@ -501,7 +501,16 @@ class BodySystem:
         return joined([x for g in self.layout.groups for x in g.kind.normalize(g.unpack(q, v)[0])])
 
     def check(self, q: Array) -> None:
-        """Checks nothing: the numbers of bodies do not depend on q."""
+        """Checks that concrete positions q have no quaternion of zeros.
+
+        Raises:
+            ValueError: the quaternion of a body is zero.
+        """
+        if checks.is_concrete(q) and (wrong := self.layout.without_orientation(q)):
+            raise ValueError(
+                f"body '{wrong[0]}': its quaternion in q is zero, which is no orientation; the"
+                " identity is (1, 0, 0, 0)."
+            )
 
     def columns(self, place: Place) -> Columns:
         """Returns the indices in v, as columns of J, of the bodies that a `Place` names."""

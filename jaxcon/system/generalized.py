@@ -22,8 +22,6 @@ from jaxcon.system.state import Energy
 
 OWNER = "GeneralizedSystem"
 """The first word of error messages."""
-SYMMETRY = 1e-6
-"""The largest difference |M − Mᵀ| of a symmetric mass matrix, relative to its largest entry."""
 
 
 @pytree
@@ -128,7 +126,7 @@ class GeneralizedCoordinates:
             return Diagonal(m)
         # factorizations read one triangle: with another one the motion would be silently wrong
         skew, size = (jnp.max(jnp.abs(x), initial=0) for x in (m - m.T, m))
-        symmetric = skew <= SYMMETRY * size
+        symmetric = skew <= float(jnp.finfo(m.dtype).eps) ** 0.5 * size
         return Full(jnp.where(symmetric, m, jnp.nan))
 
     def force(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
@@ -155,7 +153,7 @@ class GeneralizedCoordinates:
         if isinstance(mass, Full) and checks.is_concrete(mass.values):
             values = np.asarray(mass.values)
             skew, size = (np.max(np.abs(x), initial=0) for x in (values - values.T, values))
-            if not skew <= SYMMETRY * size:
+            if not skew <= 1e-6 * size:
                 raise ValueError(
                     "GeneralizedSystem: mass must return a symmetric matrix, got"
                     f" {checks.clipped(checks.numerals(values))} at q = {checks.numerals(q)}."

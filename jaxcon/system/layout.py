@@ -142,6 +142,12 @@ class Layout:
         g = self.groups[group]
         return g.q + index + len(g.names) * np.arange(g.kind.n_q)
 
+    def without_orientation(self, q: Array | np.ndarray) -> list[str]:
+        """Returns the names of the bodies whose quaternion is zero at positions q, (n_q,)."""
+        q = np.asarray(q)
+        turning = [n for n in self.bodies if self.groups[self.locate(n)[0]].kind.n_q == 7]
+        return [name for name in turning if not np.any(q[self.q(name)[3:]])]
+
     def v(self, name: str) -> np.ndarray:
         """Returns the indices of a body's velocities in v.
 

@@ -192,13 +192,9 @@ def checked_system(system: S, state: State, call: str = "f(system, s)") -> S:
     return with_turns(system, state.turns, state.angle_remainder)
 
 
-def _check_remainder(system: Any, shape: tuple[int, ...]) -> None:
+def _check_remainder(system: System, shape: tuple[int, ...]) -> None:
     """Raises a ValueError if an array is no `angle_remainder` of a system, because of its shape."""
-    if system.layout is None:
-        angles = len(system.no_remainder(np.dtype(np.float32)))
-    else:
-        where = system.layout.angles
-        angles = 0 if where is None else where.stop - where.start
+    angles = len(system.no_remainder(np.dtype(np.float32)))
     if not angles or shape != (angles,):
         expected = f"have shape ({angles},) or be ()" if angles else "be ()"
         raise ValueError(
