@@ -103,7 +103,7 @@ def _step_size(owner: str, state: State, dt: Scalar) -> Array:
     """Returns h as an array; NaN, which ends the world, for a negative array, which is not read."""
     with checks.without_waiting():
         h = checks.real(owner, "dt", dt, state.q.dtype, least=0)
-    return jnp.where(h >= 0, h, jnp.nan) if isinstance(dt, jax.Array) else h
+    return jnp.where(h >= 0, h, jnp.full_like(h, jnp.nan)) if isinstance(dt, jax.Array) else h
 
 
 def _reported(

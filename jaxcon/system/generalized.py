@@ -127,7 +127,7 @@ class GeneralizedCoordinates:
         # factorizations read one triangle: with another one the motion would be silently wrong
         skew, size = (jnp.max(jnp.abs(x), initial=0) for x in (m - m.T, m))
         symmetric = skew <= float(jnp.finfo(m.dtype).eps) ** 0.5 * size
-        return Full(jnp.where(symmetric, m, jnp.nan))
+        return Full(jnp.where(symmetric, m, jnp.full_like(m, jnp.nan)))
 
     def force(self, q: Array, v: Array, t: Doubled | Scalar, control: PyTree = None) -> Array:
         """Returns the generalized force f(q, v, t, u, θ), (n_v,).
