@@ -39,11 +39,14 @@ Carry = tuple[tuple[Array, ...], Array]
 FASTEST = 1e8
 """The speed [m/s, rad/s] above which a world counts as diverging."""
 
-LARGE, LARGE_IN_SPACE = (0.038, 0.042), (0.018, 0.02)
+LARGE = 0.038, 0.042
+LARGE_IN_SPACE = {np.dtype(np.float32): (0.025, 0.03), np.dtype(np.float64): (0.018, 0.02)}
 """Rotations of a body in a step [rad] at which `newton_correction` begins and acts in full.
 
-Below these rotations energy drifts, see `benchmarks.energy_drift`. Half of these numbers would cut
-the drift to a half or less, and cost up to a quarter of the rate of chains and closed loops.
+In space they depend on the dtype: in float32, at smaller rotations, rounding errors of φ over h²
+would disturb multipliers by more than 0.1 %. Below these rotations energy drifts, see
+`benchmarks.energy_drift`. Half of these numbers would cut the drift to a half or less, and cost up
+to a quarter of the rate of chains and closed loops.
 """
 
 
@@ -69,13 +72,13 @@ class SemiImplicitEuler(checks.Checked, Integrator):
     belongs to the time of q.
 
     `newton_correction` removes the linearization error of φ by a second solve with the factors of
-    the step. The correction begins if a body or a rod turns by more than 0.038 rad in a step (0.018
-    rad if bodies turn in space). It acts in full from 0.042 rad on (0.02 rad in space). A step with
-    it takes about 1.5 times as long. Without the correction, energy would grow with (h|ω|)³, and
-    motions of a radian in a few steps would end with status NON_FINITE. Below these rotations
-    energy still drifts, most where a light body carries a heavy one. In the plane, islands
-    (bodies connected by constraints) on which a limit or contact acts are not corrected. In space,
-    `Projection()` replaces the correction.
+    the step. The correction begins if a body or a rod turns by more than 0.038 rad in a step. It
+    acts in full from 0.042 rad on. If bodies turn in space, these numbers are 0.018 and 0.02 rad,
+    and 0.025 and 0.03 rad in float32. A step with it takes about 1.5 times as long. Without the
+    correction, energy would grow with (h|ω|)³, and motions of a radian in a few steps would end
+    with status NON_FINITE. Below these rotations energy still drifts, most where a light body
+    carries a heavy one. In the plane, islands (bodies connected by constraints) on which a limit or
+    contact acts are not corrected. In space, `Projection()` replaces the correction.
 
     A rod (`Distance`) that turns too fast changes its length, although the status stays OK: by 0.1
     % at 0.5 rad a step, 7 % at 1 rad, 40 % at 1.4 rad. `Recovery(limit=…)` ends such a run with
@@ -287,7 +290,7 @@ def newton_correction(
         dt: step size h, () [s].
     """
     h = dt[None]
-    least_turn, full_turn = LARGE_IN_SPACE if system.turns_in_space else LARGE
+    least_turn, full_turn = LARGE_IN_SPACE[v.dtype] if system.turns_in_space else LARGE
     splits_finely = system.turns_in_space and not system.bounds
     if skip_newton is None:
         turn = system.squared_turn(state.q, v, state.v, rows, h)
