@@ -36,7 +36,7 @@ def GeneralizedSystem(  # noqa: N802
 
     Raises:
         ValueError: two constraints have the same name, or a constraint names bodies or has params,
-            or a parameter is NaN, or of another kind than `checks.parameters` allows.
+            or a parameter is NaN, or is no real number, boolean, integer or random key.
         TypeError: a constraint is not a `Holonomic`, `VelocityLevel` or `Inequality`, or `mass`,
             `force` or `potential` is no function of these arguments.
     """
