@@ -71,6 +71,26 @@ def drift(quick: bool) -> list[Metric]:
     return [error(f"{row[0]}, {row[1]}", float(row[3]), "m", 1e-15) for row in rows]
 
 
+@entry("energy_drift")
+def energy_drift(quick: bool) -> list[Metric]:
+    """Measures how much energy double pendulums with random starts gain or lose."""
+    from benchmarks import energy_drift as study
+
+    metrics = []
+    pendulums = ("plane, 1 kg carries 0.5 kg",) if quick else tuple(study.PENDULUMS)
+    seconds, starts = (4.0, 8) if quick else (120.0, 128)
+    with jax.enable_x64(True):
+        for name in pendulums:
+            for label in ("default",) if quick else tuple(study.METHODS):
+                pendulum, method = study.PENDULUMS[name], study.METHODS[label]
+                row = study.measure(pendulum, method, 0.02, seconds, starts)
+                title = f"{name}, {label}"
+                metrics.append(error(f"{title}, gain", row.gain, floor=1e-6))
+                metrics.append(error(f"{title}, loss", row.loss, floor=1e-6))
+                metrics.append(count(f"{title}, failed", float(row.failed)))
+    return metrics
+
+
 @entry("stabilisation")
 def stabilisation(quick: bool) -> list[Metric]:
     """Measures the largest φ, φ̇ and energy error, by stabilizer and integrator."""
