@@ -146,6 +146,8 @@ MAY_IMPORT = {
     "staging/chunks.py": {"jax.core", "jax.extend", "jax.interpreters"},
     "core/jaxprs.py": {"jax.extend", "jax.interpreters"},
     "staging/program.py": {"jax.extend"},
+    "staging/constants.py": {"jax.core", "jax.extend"},
+    "core/selection.py": {"jax.core", "jax.extend", "jax.interpreters"},
     "staging/operations.py": {"jax.extend"},
     "core/closures.py": {"jax.extend"},
     "core/doubled.py": {"jax.extend"},

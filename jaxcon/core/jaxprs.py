@@ -7,6 +7,7 @@ import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
+from jaxcon.core.selection import chosen
 from jaxcon.core.typing import Array, PyTree
 
 CALLS = {
@@ -26,12 +27,15 @@ CALLS = {
 def called(equation: JaxprEqn) -> Any:
     """Returns the jaxpr that an equation calls; None if the equation is not a plain call.
 
-    From JAX 0.11 on, `lax.custom_root` is a `HiPrim`, a primitive with its own derivative rule. The
-    method `expand` of a `HiPrim` is the called function, which is traced to a jaxpr.
+    A selection of rows counts as a call of the operations that evaluate it. From JAX 0.11 on,
+    `lax.custom_root` is a `HiPrim`, a primitive with its own derivative rule. The method `expand`
+    of a `HiPrim` is the called function, which is traced to a jaxpr.
     """
     name, params = equation.primitive.name, equation.params
     if name in CALLS:
         return params[CALLS[name]]
+    if name == "rows":
+        return jax.make_jaxpr(lambda x: chosen(x, params["places"]))(equation.invars[0].aval)
     primitive: Any = params.get("_prim")
     if hasattr(primitive, "expand"):
         return jax.make_jaxpr(primitive.expand)(*primitive.in_avals)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.pytree import exportable
+from jaxcon.core.selection import select_rows, sum_rows
 from jaxcon.core.typing import Array, Lane, Scalar, T
 
 
@@ -200,31 +201,13 @@ def perpendicular(x: Vector) -> Vector:
     return Vector(times(-1, x[1]), x[0])
 
 
-GATHERED = 16
-"""The smallest number of indices for which `take` uses one gather instead of single slices."""
-
-
 def take(x: Lane, indices: tuple[int, ...]) -> Lane:
-    """Returns x[indices], along the first axis; a Python number is returned unchanged.
-
-    The cheapest operation is used: x itself, a strided slice, a few slices, or a gather.
-    """
+    """Returns x[indices], along the first axis; a Python number is returned unchanged."""
     if isinstance(x, np.ndarray):
         x = jnp.asarray(x)
     if not isinstance(x, jax.Array) or not x.ndim:
         return x
-    first, n = indices[0], len(indices)
-    stride = indices[1] - first if n > 1 else 1
-    last = first + stride * (n - 1)
-    if stride and indices == tuple(range(first, last + (1 if stride > 0 else -1), stride)):
-        if n == x.shape[0] and stride == 1:
-            return x
-        low, high = min(first, last), max(first, last) + 1
-        rows = jax.lax.slice_in_dim(x, low, high, abs(stride))
-        return rows if stride > 0 else jax.lax.rev(rows, (0,))
-    if n < GATHERED:
-        return jnp.concatenate([jax.lax.slice_in_dim(x, i, i + 1) for i in indices])
-    return x[np.asarray(indices)]
+    return select_rows(x, indices)
 
 
 def side_by_side(rows: Sequence[tuple[Lane, int]]) -> Lane:
@@ -250,13 +233,16 @@ def side_by_side(rows: Sequence[tuple[Lane, int]]) -> Lane:
 
 
 PIECES = 8
-"""The largest number of runs for which `collect` uses slices instead of gathers.
+"""The largest number of runs for which `collect` adds slices.
 
 A run is a sequence of consecutive bodies whose contributions are consecutive, too.
 """
 
+Terms = Sequence[tuple[tuple[int, ...], Lane]]
+"""Pairs (number of the body of each element, contributions (element, …)); see `collect`."""
 
-def collect(terms: Sequence[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
+
+def collect(terms: Terms, bodies: int) -> Lane:
     """Sums contributions of elements, such as joints, to the bodies on which they act.
 
     Args:
@@ -266,35 +252,70 @@ def collect(terms: Sequence[tuple[tuple[int, ...], Lane]], bodies: int) -> Lane:
     Returns:
         The sums, a lane (body, …).
     """
-    arrays: list[tuple[tuple[int, ...], Any]] = [(i, x) for i, x in terms if not _is(x, 0)]
-    if not arrays:
+    return collect_each([terms], bodies)[0]
+
+
+def collect_each(sums: Sequence[Terms], bodies: int) -> list[Lane]:
+    """Sums the contributions of elements to bodies, for each component; see `collect`.
+
+    Components whose contributions come in many pieces are summed together.
+    """
+    arrays = [[(i, x) for i, x in terms if isinstance(x, jax.Array)] for terms in sums]
+    results = [_in_pieces(terms, bodies) for terms in arrays]
+    scattered = [terms for terms, x in zip(arrays, results, strict=True) if x is None]
+    lanes = iter(_scattered(scattered, bodies))
+    return [next(lanes) if x is None else x for x in results]
+
+
+def _in_pieces(terms: Sequence[tuple[tuple[int, ...], Array]], bodies: int) -> Lane | None:
+    """Returns the sums of `collect`, added in at most `PIECES` pieces; None if there are more."""
+    if not terms:
         return 0.0
-    if all(indices == tuple(range(bodies)) for indices, _ in arrays):
-        return total(x for _, x in arrays)
-    shape = jnp.broadcast_shapes(*(x.shape[1:] for _, x in arrays))
+    if all(indices == tuple(range(bodies)) for indices, _ in terms):
+        return total(x for _, x in terms)
     sources: list[list[tuple[int, int]]] = [[] for _ in range(bodies)]
-    for t, (indices, _) in enumerate(arrays):
+    for t, (indices, _) in enumerate(terms):
         for element, body in enumerate(indices):
             sources[body].append((t, element))
     starts = [
         i for i in range(bodies) if not i or sources[i] != [(t, e + 1) for t, e in sources[i - 1]]
     ]
     if len(starts) > PIECES:
-        # the k-th terms of all bodies are one gather from the array of all terms, padded by zeros
-        rows = [jnp.broadcast_to(x, (x.shape[0], *shape)) for _, x in arrays]
-        every = jnp.concatenate([*rows, jnp.zeros((1, *shape), rows[0].dtype)])
-        first = np.cumsum([0, *(len(x) for x in rows)])
-        places = np.full((max(map(len, sources)), len(sources)), first[-1])
-        for body, members in enumerate(sources):
-            for k, (t, element) in enumerate(members):
-                places[k, body] = first[t] + element
-        return total(every[index] for index in places)
+        return None
+    shape = jnp.broadcast_shapes(*(x.shape[1:] for _, x in terms))
+    sizes = [b - a for a, b in itertools.pairwise((*starts, bodies))]
+    # one split of each term, since its transpose is one concatenation
+    parts: dict[tuple[int, int], Array] = {}
+    for t, (_, x) in enumerate(terms):
+        runs = [(e, n) for i, n in zip(starts, sizes, strict=True) for s, e in sources[i] if s == t]
+        runs.sort()
+        split = jax.lax.split(x, [n for _, n in runs])
+        parts |= {(t, e): part for (e, _), part in zip(runs, split, strict=True)}
     pieces = []
-    for first, end in zip(starts, [*starts[1:], bodies], strict=True):
-        rows = (jax.lax.slice_in_dim(arrays[t][1], e, e + end - first) for t, e in sources[first])
-        piece = total(rows) if sources[first] else jnp.zeros((), arrays[0][1].dtype)
-        pieces.append(jnp.broadcast_to(piece, (end - first, *shape)))
+    for i, n in zip(starts, sizes, strict=True):
+        piece = (
+            total(parts[x] for x in sources[i]) if sources[i] else jnp.zeros((), terms[0][1].dtype)
+        )
+        pieces.append(jnp.broadcast_to(piece, (n, *shape)))
     return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
+
+
+def _scattered(
+    sums: Sequence[Sequence[tuple[tuple[int, ...], Array]]], bodies: int
+) -> Sequence[Array]:
+    """Returns the sums of `collect` for each component, added in pairs of single rows."""
+    if not sums:
+        return []
+    flat = [(c, indices, x) for c, terms in enumerate(sums) for indices, x in terms]
+    shape = jnp.broadcast_shapes(*(x.shape[1:] for _, _, x in flat))
+    sources: list[list[int]] = [[] for _ in range(len(sums) * bodies)]
+    row = 0
+    for c, indices, _ in flat:
+        for body in indices:
+            sources[c * bodies + body].append(row)
+            row += 1
+    rows = jnp.concatenate([jnp.broadcast_to(x, (len(x), *shape)) for _, _, x in flat])
+    return jax.lax.split(sum_rows(rows, sources), [bodies] * len(sums))
 
 
 def componentwise(function: Callable[..., Any]) -> Callable[..., Any]:

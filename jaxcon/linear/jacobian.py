@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcon.core.lanes import Vector, add_rhs_axis, collect, plus, take, times, total
+from jaxcon.core.lanes import Vector, add_rhs_axis, collect_each, plus, take, times, total
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.typing import Array, Lane
 from jaxcon.linear.gauss_jordan import identity
@@ -152,9 +152,9 @@ class Jacobian:
         free = 0
         for start, (columns, sums) in sorted(terms.items()):
             lanes.append(jnp.zeros((start - free, *batch), dtype))
-            for pulls in sums:
-                lane = jnp.asarray(collect(pulls, columns.bodies), dtype)
-                lanes.append(jnp.broadcast_to(lane, (columns.bodies, *batch)))
+            for lane in collect_each(sums, columns.bodies):
+                wide = jnp.asarray(lane, dtype)
+                lanes.append(jnp.broadcast_to(wide, (columns.bodies, *batch)))
             free = start + columns.components * columns.bodies
         lanes.append(jnp.zeros((self.shape[1] - free, *batch), dtype))
         return jnp.concatenate([x for x in lanes if x.shape[0]])

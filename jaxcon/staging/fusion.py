@@ -20,6 +20,7 @@ JAXCON_STAGES=off turns staging off.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 import os
 from collections.abc import Callable, Container, Sequence
@@ -65,7 +66,10 @@ MOVES = _names(
 )
 """Primitives that only move data; kernels read their operands directly."""
 
-MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice")
+SCATTERED = _names("dynamic_slice")
+"""Moves whose result is worth storing if it is shared."""
+
+MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice gather")
 """Primitives whose result has the entries of its operand at other positions."""
 
 ARITHMETIC = _names(
@@ -149,14 +153,20 @@ class Stages:
             the values that a stage computes.
     """
 
-    def __init__(self, closed: ClosedJaxpr, apart: bool = False) -> None:
+    def __init__(
+        self,
+        closed: ClosedJaxpr,
+        apart: bool = False,
+        constants: Sequence[Constant | None] = (),
+    ) -> None:
         """Cuts a closed jaxpr into stages.
 
         Args:
             closed: the jaxpr.
             apart: True if branches with loops may stay out of kernels; False within a kernel.
+            constants: for each of the first arguments, the constant that takes its place, or None.
         """
-        self.program = Program(closed, _settled_body)
+        self.program = Program(closed, _settled_body, constants)
         steps = _in_stages(self.program, worth_storing(self.program))
         if apart:
             _set_apart(steps)
@@ -350,7 +360,7 @@ def worth_storing(program: Program) -> set[int]:
         unstored = (x for x in op.inputs if not isinstance(x, Constant) and x not in stored)
         parts = (work.get(x, frozenset()) for x in unstored)
         steps = frozenset().union(*parts)
-        if op.name == "dynamic_slice":
+        if op.name in SCATTERED:
             steps |= {*range(-WORTH, 0)}
         elif op.name not in MOVES:
             steps |= {name}
@@ -419,7 +429,7 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
                 needed.add(name)
         if name in needed:
             ends.add(name)
-        moves = op.name in MOVES and op.name != "dynamic_slice"
+        moves = op.name in MOVES and op.name not in SCATTERED
         # the index of a branch is a converted flag: outside of kernels it would be one more launch
         moves = moves and not any(x.name == "cond" and x.inputs[0] == name for x in consumers)
         if not moves and (len(needed) > 1 or name in needed):
@@ -628,13 +638,21 @@ def uninlined(
     return barred[: len(results)]
 
 
-def _settled_body(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, bool]:
+def _settled_body(
+    closed: ClosedJaxpr, constants: Sequence[Constant | None]
+) -> tuple[ClosedJaxpr, bool]:
     """Cuts the body of a loop or a branch into stages.
+
+    Args:
+        closed: the body.
+        constants: for each of the first arguments, the constant that takes its place, or None.
 
     Returns:
         The closed jaxpr of the body in stages, and True if one kernel may contain all of it.
     """
-    inputs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in closed.jaxpr.invars]
-    stages = Stages(closed)
+    stages = Stages(closed, constants=constants)
+    pairs = itertools.zip_longest(closed.jaxpr.invars, constants)
+    avals: list[Any] = [x.aval for x, known in pairs if known is None]
+    inputs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in avals]
     plain = all(_fits(step) for steps, _ in stages.parts for step in steps)
     return jax.make_jaxpr(stages)(*inputs), plain

@@ -16,13 +16,20 @@ from jax.extend import core as jex
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var
 
 from jaxcon.core.jaxprs import called, without_unused
-from jaxcon.core.typing import Array, Scalar
+from jaxcon.core.typing import Array
+from jaxcon.staging.constants import Constant, Operand, simplified, without_repetition
 
 if TYPE_CHECKING:
     from jaxcon.staging.batch_last import Native
 
 IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
 """Primitives that return their arguments. XLA removes even barriers before it forms kernels."""
+
+NARY = ("add", "sub", "mul", "div", "max", "min", "and", "or", "eq", "ne", "lt", "le", "gt", "ge")
+"""Elementwise primitives of two operands, one of which may be a single number."""
+
+COMMUTATIVE = ("add", "mul", "max", "min", "and", "or", "eq", "ne")
+"""Elementwise primitives whose two operands may change places."""
 
 REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
     "reduce_sum": jax.lax.add,
@@ -32,17 +39,6 @@ REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
     "reduce_or": jax.lax.bitwise_or,
 }
 """The elementwise operation by which `by_halves` replaces each reduction over the first axes."""
-
-
-class Constant:
-    """An operand of an operation that is a literal or an array over which the function closes."""
-
-    def __init__(self, value: Scalar) -> None:
-        self.value = value
-
-
-Operand = int | Constant
-"""An operand of an operation: the number of a value, or a constant."""
 
 
 @dataclass
@@ -85,12 +81,16 @@ def evaluated(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
     return jex.jaxpr_as_fun(closed)(*args)
 
 
+Inner = Callable[[ClosedJaxpr, Sequence[Constant | None]], tuple[ClosedJaxpr, bool]]
+"""Rewrites the body of a loop or a branch; see `Program`."""
+
+
 class Program:
     """A traced function as a flat list of operations on numbered values.
 
     Attributes:
         operations: the operations, in the order of the jaxpr.
-        inputs: the numbers of the arguments.
+        inputs: the numbers of the arguments, without those that are constants.
         outputs: the numbers of the results, or constants.
         makers: the operation that computes each value.
         sizes: the number of entries of each value.
@@ -98,14 +98,15 @@ class Program:
     """
 
     def __init__(
-        self, closed: ClosedJaxpr, inner: Callable[[ClosedJaxpr], tuple[ClosedJaxpr, bool]]
+        self, closed: ClosedJaxpr, inner: Inner, constants: Sequence[Constant | None] = ()
     ) -> None:
         """Flattens a closed jaxpr.
 
         Args:
             closed: the jaxpr.
-            inner: a function that rewrites the body of a loop or a branch, and also returns True
-                if a kernel may contain all of the body.
+            inner: a function that rewrites the body of a loop or a branch, for constants as below.
+                It also returns True if a kernel may contain all of the body.
+            constants: for each of the first arguments, the constant that takes its place, or None.
         """
         self.operations: list[Operation] = []
         self._inner = inner
@@ -113,8 +114,11 @@ class Program:
         self.sizes: dict[int, int] = {}
         self.bytes: dict[int, int] = {}
         self._lengths: dict[int, list[Any]] = {}  # of the operands of concatenations
-        self.inputs = [self._new(x) for x in closed.jaxpr.invars]
-        self.outputs = self._inline_closed(closed, list(self.inputs))
+        pairs = itertools.zip_longest(closed.jaxpr.invars, constants)
+        args: list[Operand] = [self._new(x) if known is None else known for x, known in pairs]
+        self.inputs = [x for x in args if not isinstance(x, Constant)]
+        outputs = self._inline_closed(closed, args)
+        self.outputs = list(map(self._spread, outputs))
         self._read_parts()
         self.makers = {name: op for op in self.operations for name in op.outputs}
         self._drop_unused()
@@ -225,7 +229,7 @@ class Program:
         names = dict(zip([*jaxpr.constvars, *jaxpr.invars], args, strict=True))
 
         def read(x: Var | Literal) -> Operand:
-            return Constant(x.val) if isinstance(x, Literal) else names[x]
+            return _literal(x) if isinstance(x, Literal) else names[x]
 
         for equation in jaxpr.eqns:
             results = self._append(equation, [read(x) for x in equation.invars])
@@ -252,9 +256,9 @@ class Program:
             return self._inline_closed(params["jaxprs"].solve, given)
         if name == "native":
             return self._inline_closed(traced(params["fun"], operands), args)
-        folded = _known_result(equation, args)
-        if folded is not None:
-            return folded
+        known = _known_result(equation, args)
+        if known is not None:
+            return [known]
         if name in REDUCTIONS and _leading(params["axes"], operands[0].shape):
             fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
             return self._inline_closed(jax.make_jaxpr(fold)(operands[0]), args)
@@ -262,15 +266,28 @@ class Program:
             parts = functools.partial(slices, params["sizes"], params["axis"])
             return self._inline_closed(jax.make_jaxpr(parts)(operands[0]), args)
         if name == "scan":
-            jaxpr, plain = self._inner(params["jaxpr"])
+            jaxpr, plain = self._inner(params["jaxpr"], ())
             return self._emit(equation, params | {"jaxpr": jaxpr}, args, plain)
-        if name == "while":  # its condition is outside of kernels, maybe on all devices
-            body = self._inner(params["body_jaxpr"])[0]
-            return self._emit(equation, params | {"body_jaxpr": body}, args, False)
+        if name == "while":
+            return self._append_while(equation, args)
         if name == "cond":
-            branches, plain = zip(*map(self._inner, params["branches"]), strict=True)
-            return self._emit(equation, params | {"branches": branches}, args, all(plain))
+            known = [x if isinstance(x, Constant) else None for x in args[1:]]
+            rewritten = [self._inner(x, known) for x in params["branches"]]
+            branches, plain = zip(*rewritten, strict=True)
+            given = [args[0], *(x for x in args[1:] if not isinstance(x, Constant))]
+            return self._emit(equation, params | {"branches": branches}, given, all(plain))
         return self._emit(equation, params, args, True)
+
+    def _append_while(self, equation: JaxprEqn, args: list[Operand]) -> list[Operand]:
+        """Appends a loop with a condition, which is outside of kernels, maybe on all devices."""
+        params = equation.params
+        first = params["cond_nconsts"]
+        last = first + params["body_nconsts"]
+        known = [x if isinstance(x, Constant) else None for x in args[first:last]]
+        body, _ = self._inner(params["body_jaxpr"], known)
+        given = [x for x in args[first:last] if not isinstance(x, Constant)]
+        params = params | {"body_jaxpr": body, "body_nconsts": len(given)}
+        return self._emit(equation, params, [*args[:first], *given, *args[last:]], False)
 
     def _emit(
         self, equation: JaxprEqn, params: dict[str, Any], args: list[Operand], plain: bool
@@ -286,6 +303,7 @@ class Program:
             plain: False if a kernel must not contain the operation.
         """
         primitive = equation.primitive
+        args = self._stored(equation, args)
         key = _key(primitive, params, args)
         if key is not None and key in self._known:
             return self._known[key]
@@ -303,6 +321,57 @@ class Program:
         if key is not None and not effects:
             self._known[key] = outputs
         return outputs
+
+    def _stored(self, equation: JaxprEqn, args: Sequence[Operand]) -> list[Operand]:
+        """Returns the operands of an equation without constants that repeat their entries.
+
+        An array of equal numbers becomes one number if the equation permits that, otherwise the
+        broadcast of a smaller array.
+
+        Args:
+            equation: the equation.
+            args: its operands.
+        """
+        avals: list[Any] = [x.aval for x in (*equation.invars, *equation.outvars)]
+        pairs = zip(args, avals, strict=False)
+        moving = [y.shape for x, y in pairs if not isinstance(x, Constant)]
+        if equation.primitive.name in NARY and avals[-1].shape in moving:
+            numbers = [x.number() if isinstance(x, Constant) else None for x in args]
+            pairs = zip(args, numbers, strict=True)
+            args = [x if number is None else Constant(number) for x, number in pairs]
+        return list(map(self._spread, args))
+
+    def _spread(self, operand: Operand) -> Operand:
+        """Returns an operand; a broadcast in place of a constant with axes that repeat entries."""
+        x = operand.value if isinstance(operand, Constant) else None
+        if not isinstance(x, np.ndarray) or without_repetition(x).size == x.size:
+            return operand
+        once = without_repetition(x)
+        if once.size == 1:
+            once = once.reshape(())
+        equation = _spreading(x.dtype, once.shape, x.shape)
+        (result,) = self._emit(equation, equation.params, [Constant(once)], True)
+        return result
+
+
+@functools.lru_cache(maxsize=256)
+def _spreading(dtype: Any, shape: tuple[int, ...], to: tuple[int, ...]) -> JaxprEqn:
+    """Returns the equation that broadcasts an array, without axes or with as many as the result.
+
+    Args:
+        dtype: dtype of the array.
+        shape: shape of the array.
+        to: shape of the result.
+    """
+    axes = range(len(shape))
+    spread = functools.partial(jax.lax.broadcast_in_dim, shape=to, broadcast_dimensions=axes)
+    return jax.make_jaxpr(spread)(jax.ShapeDtypeStruct(shape, dtype)).jaxpr.eqns[0]
+
+
+def _literal(x: Literal) -> Constant:
+    """Returns a literal as a constant of its type."""
+    aval: Any = x.aval
+    return Constant(x.val if _is_key(aval) else np.asarray(x.val, aval.dtype)[()])
 
 
 def _part(
@@ -381,7 +450,7 @@ def is_known(shape: Sequence[Any]) -> bool:
     return all(isinstance(n, int) for n in shape)
 
 
-def _known_result(equation: JaxprEqn, args: list[Operand]) -> list[Operand] | None:
+def _known_result(equation: JaxprEqn, args: list[Operand]) -> Operand | None:
     """Returns the result of an equation that equals a constant or one of its operands, else None.
 
     Examples are x⁰ and a selection by a constant. The compiler would also simplify such an
@@ -394,20 +463,18 @@ def _known_result(equation: JaxprEqn, args: list[Operand]) -> list[Operand] | No
     if not is_known(aval.shape):  # a constant cannot have a symbolic size
         return None
     if 0 in aval.shape and not _is_key(aval):
-        return [Constant(np.zeros(aval.shape, aval.dtype))]
+        return Constant(np.zeros(aval.shape, aval.dtype))
     exponent = args[1] if name == "pow" and len(args) == 2 else None
     power = equation.params.get("y") if name == "integer_pow" else exponent
-    if isinstance(power, Constant) and jnp.shape(power.value) == ():
-        power = power.value
+    if isinstance(power, Constant):
+        power = power.number()
     if isinstance(power, int | float | np.generic) and power == 0:
-        return [Constant(np.ones(aval.shape, aval.dtype))]
+        return Constant(np.ones(aval.shape, aval.dtype))
     if name == "pad" and not any(map(any, equation.params["padding_config"])):
-        return [args[0]]
+        return args[0]
     if name == "select_n" and all(x is args[1] or x == args[1] for x in args[2:]):
-        return [args[1]]
-    if name == "select_n" and isinstance(args[0], Constant) and jnp.shape(args[0].value) == ():
-        return [args[1 + int(args[0].value)]]
-    return None
+        return args[1]
+    return simplified(equation, args)
 
 
 def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> Any:
@@ -418,6 +485,8 @@ def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> A
     if primitive.name in ("scan", "while", "cond"):
         return None
     parts: list[Any] = []
+    if primitive.name in COMMUTATIVE:
+        args = sorted(args, key=lambda x: -1 if isinstance(x, Constant) else x)
     for x in args:
         if not isinstance(x, Constant):
             parts.append(x)

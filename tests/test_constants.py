@@ -1,0 +1,100 @@
+"""Operations on constants are simplified before a program is cut into stages."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcon.staging import constants, fusion
+from jaxcon.staging.batch_last import Native
+from jaxcon.staging.constants import Constant
+from jaxcon.staging.program import Program
+
+X = np.linspace(-0.7, 1.7, 24).reshape(4, 6)
+HALVES = np.arange(4.0)[:, None] / 2
+
+
+def full(number, x, shape=(4, 6)):
+    return jnp.full(shape, number, x.dtype)
+
+
+def halves(x):
+    return jnp.asarray(HALVES, x.dtype)
+
+
+# functions of an array, and the most operations that are left of them
+FUNCTIONS = {
+    "0 x": (lambda x: x * full(0, x), 1),
+    "x 0": (lambda x: full(0, x) * x, 1),
+    "1 x": (lambda x: 1.0 * x, 0),
+    "x + 0": (lambda x: x + full(0, x, (4, 1)), 0),
+    "0 + x": (lambda x: 0.0 + x, 0),
+    "x - 0": (lambda x: x - 0.0, 0),
+    "0 - x": (lambda x: 0.0 - x, 1),
+    "x / 1": (lambda x: x / full(1, x), 0),
+    "1 / x": (lambda x: 1.0 / x, 1),
+    "x + ∞": (lambda x: x + jnp.inf, 1),
+    "folded": (lambda x: x * (2.0 * full(1, x, (1, 6)) - 1.0)[:, ::-1], 0),
+    "compared": (lambda x: jnp.where(full(4, x, (4, 1)) < 5.0, x, 2 * x), 1),
+    "cast": (lambda x: x + jnp.zeros((4, 1), int).astype(x.dtype), 0),
+    "transposed": (lambda x: x * full(1, x, (6, 4)).T.reshape(4, 6), 0),
+    "other numbers": (lambda x: x * halves(x), 2),
+    "one of other numbers": (lambda x: x[2:3] * halves(x)[2:3] + x[:1] * halves(x)[:1], 1),
+    "beside": (lambda x: x * jnp.concatenate([full(1, x, (1, 6)), full(1, x, (3, 6))]), 0),
+    "twice": (lambda x: x[:1] * x[1:2] + x[1:2] * x[:1], 4),
+    "NaN": (lambda x: x + full(0, x, (1, 6)) * jnp.inf, 2),
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_products_and_sums_with_constants_are_left_out(name, dtype):
+    function, most = FUNCTIONS[name]
+    native = Native(lambda x: [function(x).astype(dtype)])
+    x = jnp.asarray(X, dtype)
+    closed = native.traced((x.shape, x.dtype))
+    program = Program(closed, fusion._settled_body)
+    assert len(program.operations) <= most
+    (found,) = jax.jit(lambda x: fusion.run_staged(native, [x]))(x)
+    np.testing.assert_allclose(found, function(x), rtol=1e-6)
+
+
+@pytest.mark.parametrize("index", [0, 1])
+def test_branches_know_constants(index):
+    def function(index, x):
+        branches = [lambda x, c: x * c, lambda x, c: x + c]
+        return [jax.lax.switch(index, branches, x, jnp.zeros((4, 6)))]
+
+    native, given = Native(function), [jnp.asarray(index), jnp.asarray(X)]
+    closed = native.traced(*((x.shape, x.dtype) for x in given))
+    program = Program(closed, fusion._settled_body)
+    (branch,) = (op for op in program.operations if op.name == "cond")
+    assert len(branch.inputs) == 2
+    assert not any("mul" in str(x) or "add" in str(x) for x in branch.params["branches"])
+    (found,) = jax.jit(lambda *x: fusion.run_staged(native, x))(*given)
+    np.testing.assert_array_equal(found, index * X)
+
+
+def test_loops_know_constants():
+    def function(x):
+        zero = jnp.zeros((4, 6))
+        count, x = jax.lax.while_loop(lambda c: c[0] < 3, lambda c: (c[0] + 1, c[1] + zero), (0, x))
+        return [x]
+
+    native = Native(function)
+    closed = native.traced((X.shape, np.dtype("float64")))
+    program = Program(closed, fusion._settled_body)
+    (loop,) = (op for op in program.operations if op.name == "while")
+    assert loop.params["body_nconsts"] == 0
+    (found,) = jax.jit(lambda x: fusion.run_staged(native, [x]))(jnp.asarray(X))
+    np.testing.assert_array_equal(found, X)
+
+
+def test_repeated_entries_are_stored_once():
+    wide = Constant(np.broadcast_to(HALVES, (4, 10**6)))
+    assert wide.number() is None
+    assert constants.without_repetition(wide.array()).shape == (4, 1)
+    assert Constant(np.broadcast_to(np.float32(3), (10**6, 5))).number() == 3
+    assert Constant(np.array([np.nan, np.nan])).number() is None
+    assert Constant(jnp.ones(constants.MOST + 1)).array() is None
+    assert Constant(jax.random.key(0)).array() is None
