@@ -41,6 +41,7 @@ FUNCTIONS = {
     "other numbers": (lambda x: x * halves(x), 2),
     "one of other numbers": (lambda x: x[2:3] * halves(x)[2:3] + x[:1] * halves(x)[:1], 1),
     "beside": (lambda x: x * jnp.concatenate([full(1, x, (1, 6)), full(1, x, (3, 6))]), 0),
+    "slice of a slice": (lambda x: x[1:, 2:][:2, 1:3], 1),
     "twice": (lambda x: x[:1] * x[1:2] + x[1:2] * x[:1], 4),
     "NaN": (lambda x: x + full(0, x, (1, 6)) * jnp.inf, 2),
 }

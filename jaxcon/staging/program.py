@@ -81,6 +81,9 @@ def evaluated(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
     return jex.jaxpr_as_fun(closed)(*args)
 
 
+Slice = tuple[list[Operand], dict[str, Any]]
+"""The operands and the parameters of a slice."""
+
 Inner = Callable[[ClosedJaxpr, Sequence[Constant | None]], tuple[ClosedJaxpr, bool]]
 """Rewrites the body of a loop or a branch; see `Program`."""
 
@@ -114,6 +117,7 @@ class Program:
         self.sizes: dict[int, int] = {}
         self.bytes: dict[int, int] = {}
         self._lengths: dict[int, list[Any]] = {}  # of the operands of concatenations
+        self._slices: dict[Operand, Slice] = {}  # slices of successive entries
         pairs = itertools.zip_longest(closed.jaxpr.invars, constants)
         args: list[Operand] = [self._new(x) if known is None else known for x, known in pairs]
         self.inputs = [x for x in args if not isinstance(x, Constant)]
@@ -259,6 +263,8 @@ class Program:
         known = _known_result(equation, args)
         if known is not None:
             return [known]
+        if name == "slice" and args[0] in self._slices:
+            args, params = _within(self._slices[args[0]], params)
         if name in REDUCTIONS and _leading(params["axes"], operands[0].shape):
             fold = functools.partial(by_halves, REDUCTIONS[name], len(params["axes"]))
             return self._inline_closed(jax.make_jaxpr(fold)(operands[0]), args)
@@ -309,6 +315,8 @@ class Program:
             return self._known[key]
         outputs = [self._new(x) for x in equation.outvars]
         operands: list[Any] = [x.aval for x in equation.invars]
+        if primitive.name == "slice" and params["strides"] is None:
+            self._slices[outputs[0]] = args, params
         if primitive.name == "concatenate":
             axis = params["dimension"]
             self._lengths[outputs[0]] = [x.shape[axis] for x in operands]
@@ -376,7 +384,7 @@ def _literal(x: Literal) -> Constant:
 
 def _part(
     reader: Operation, operands: list[Operand], lengths: list[Any], axis: int
-) -> tuple[list[Operand], dict[str, Any]] | None:
+) -> Slice | None:
     """Converts a slice of a concatenation to a slice of one operand of the concatenation.
 
     Returns the new inputs and parameters of the slice. The result is None if the reader is no
@@ -399,6 +407,22 @@ def _part(
             return [operand], reader.params | shifted
         start += length
     return None
+
+
+def _within(whole: Slice, params: dict[str, Any]) -> Slice:
+    """Returns a slice of a slice of successive entries, as a slice of the operand of the latter.
+
+    Args:
+        whole: the slice that is read.
+        params: the parameters of the slice that reads it.
+    """
+    args, outer = whole
+    first = outer["start_indices"]
+    moved = {
+        name: tuple(a + b for a, b in zip(first, params[name], strict=True))
+        for name in ("start_indices", "limit_indices")
+    }
+    return args, params | moved
 
 
 def _shifted(indices: Sequence[int], axis: int, by: int) -> tuple[int, ...]:
