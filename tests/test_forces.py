@@ -239,3 +239,19 @@ def test_a_spring_at_zero_length_keeps_its_stiffness():
         return changed.energy(jnp.array([0.3, 0.4]), state.v, state.time).potential
 
     np.testing.assert_allclose(jax.grad(stored)(0.0), -5.0)
+
+
+@both
+def test_a_control_may_be_an_array_of_numpy(dim):
+    """Bodies that take different forces in many pieces, and in few; an array of JAX is the same."""
+    for count in (2, 12):
+        scene = jc.Scene(dim=dim, gravity=(0.0,) * dim)
+        for i in range(count):
+            scene.add_particle(f"p{i}", mass=1.0, position=(float(i),) * dim)
+        for i in range(0, count, 2):
+            scene.add(jc.forces.ExternalWrench(f"w{i}", f"p{i}"))
+        system, state = scene.build()
+        control = np.arange(1.0, system.layout.n_u + 1)
+        given = [system.force(state.q, state.v, 0.0, u) for u in (control, jnp.asarray(control))]
+        np.testing.assert_array_equal(*given)
+        assert np.sum(given[0]) == np.sum(control)

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcon.core.selection import NOWHERE, rows_p, select_rows, sum_rows
+from jaxcon.core.selection import ZEROS, select_rows, select_rows_p, sum_rows
 
 X = np.random.default_rng(0).normal(size=(7, 3))
-MANY = tuple(int(i) for i in np.random.default_rng(1).integers(NOWHERE, 7, 40))
+MANY = tuple(int(i) for i in np.random.default_rng(1).integers(ZEROS, 7, 40))
 PLACES = [
     (0, 1, 2),
     (0, 1, 2, 3, 4, 5, 6),
@@ -18,9 +18,9 @@ PLACES = [
     (6, 5, 4),
     (3, 3, 3),
     (0, 0, 1, 1, 2, 2, 3, 3, 4, 4, 5, 5),
-    (1, NOWHERE, 2, 2, 5),
-    (NOWHERE, 0, 1),
-    (NOWHERE, NOWHERE),
+    (1, ZEROS, 2, 2, 5),
+    (ZEROS, 0, 1),
+    (ZEROS, ZEROS),
     MANY,
 ]
 SOURCES = [
@@ -33,13 +33,13 @@ SOURCES = [
 
 
 def selected(x, places):
-    return np.stack([x[p] if p != NOWHERE else np.zeros_like(x[0]) for p in places])
+    return np.stack([x[p] if p != ZEROS else np.zeros_like(x[0]) for p in places])
 
 
 def spread(y, places, rows):
     x = np.zeros((rows, *y.shape[1:]))
     for row, place in enumerate(places):
-        if place != NOWHERE:
+        if place != ZEROS:
             x[place] += y[row]
     return x
 
@@ -84,4 +84,17 @@ def test_derivatives_hold_neither_scatters_nor_padded_arrays():
     text = jax.jit(jax.grad(loss)).lower(jnp.asarray(X)).as_text()
     assert "scatter" not in text
     assert "stablehlo.pad" not in text
-    assert rows_p.name in str(jax.make_jaxpr(jax.grad(loss))(jnp.asarray(X)))
+    assert select_rows_p.name in str(jax.make_jaxpr(jax.grad(loss))(jnp.asarray(X)))
+
+
+def test_places_beyond_the_array_are_refused():
+    for places in ((7,), (0, -2)):
+        with pytest.raises(IndexError, match="7 rows"):
+            select_rows(jnp.asarray(X), places)
+
+
+def test_nothing_can_be_selected():
+    assert select_rows(jnp.asarray(X), ()).shape == (0, 3)
+    assert sum_rows(jnp.asarray(X), ()).shape == (0, 3)
+    gradient = jax.grad(lambda x: jnp.sum(select_rows(x, (ZEROS, ZEROS))))(jnp.zeros((0, 3)))
+    assert gradient.shape == (0, 3)

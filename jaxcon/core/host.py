@@ -122,10 +122,20 @@ def _broadcast(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     return np.broadcast_to(np.reshape(x, shape), params["shape"])
 
 
+def _reshape(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
+    order = params["dimensions"]
+    return np.reshape(x if order is None else np.transpose(x, order), params["new_sizes"])
+
+
 def _slice(params: Mapping[str, Any], x: np.ndarray) -> np.ndarray:
     strides = params["strides"] or (1,) * np.ndim(x)
     bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return x[tuple(slice(*bound) for bound in bounds)]
+
+
+def _rows(x: np.ndarray, places: Sequence[int]) -> np.ndarray:
+    rows = np.concatenate([x, np.zeros((1, *x.shape[1:]), x.dtype)])
+    return rows[list(places)]  # the place of zeros is −1, the last row
 
 
 def _select(_: Mapping[str, Any], which: np.ndarray, *cases: np.ndarray) -> np.ndarray:
@@ -152,8 +162,9 @@ STRUCTURAL: dict[str, Callable[..., Any]] = {
     "reduce_max": lambda params, x: np.max(x, tuple(params["axes"])),
     "reduce_min": lambda params, x: np.min(x, tuple(params["axes"])),
     "reduce_sum": lambda params, x: np.sum(x, tuple(params["axes"]), dtype=np.asarray(x).dtype),
-    "reshape": lambda params, x: np.reshape(x, params["new_sizes"]),
+    "reshape": _reshape,
     "select_n": _select,
+    "select_rows": lambda params, x: _rows(x, params["places"]),
     "slice": _slice,
     "squeeze": lambda params, x: np.squeeze(x, tuple(params["dimensions"])),
     "transpose": lambda params, x: np.transpose(x, params["permutation"]),

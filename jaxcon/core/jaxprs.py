@@ -1,13 +1,15 @@
 """Functions on jaxprs that hide differences between versions of JAX."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
-from jaxcon.core.selection import chosen
+from jaxcon.core.selection import evaluate_selection, select_rows_p
 from jaxcon.core.typing import Array, PyTree
 
 CALLS = {
@@ -34,12 +36,27 @@ def called(equation: JaxprEqn) -> Any:
     name, params = equation.primitive.name, equation.params
     if name in CALLS:
         return params[CALLS[name]]
-    if name == "rows":
-        return jax.make_jaxpr(lambda x: chosen(x, params["places"]))(equation.invars[0].aval)
+    if name == select_rows_p.name:
+        x: Any = equation.invars[0].aval
+        return _selection(x.shape, x.dtype, params["places"], settings())
     primitive: Any = params.get("_prim")
     if hasattr(primitive, "expand"):
         return jax.make_jaxpr(primitive.expand)(*primitive.in_avals)
     return None
+
+
+def settings() -> tuple[Any, ...]:
+    """Returns JAX's settings that operations keep when they are traced."""
+    return jax.sharding.get_abstract_mesh(), jnp.result_type(float)
+
+
+@functools.lru_cache(maxsize=1024)
+def _selection(
+    shape: tuple[Any, ...], dtype: Any, places: tuple[int, ...], settings: tuple[Any, ...]
+) -> ClosedJaxpr:
+    """Returns the jaxpr of a selection of rows; `settings` are only a part of the cache's key."""
+    select = functools.partial(evaluate_selection, places=places)
+    return jax.make_jaxpr(select)(jax.ShapeDtypeStruct(shape, dtype))
 
 
 def traced_once(function: Callable[[Array], Array]) -> Callable[[Array], Array]:

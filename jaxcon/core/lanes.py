@@ -260,11 +260,16 @@ def collect_each(sums: Sequence[Terms], bodies: int) -> list[Lane]:
 
     Components whose contributions come in many pieces are summed together.
     """
-    arrays = [[(i, x) for i, x in terms if isinstance(x, jax.Array)] for terms in sums]
+    arrays = [[(i, _array(x, len(i))) for i, x in t if not _is(x, 0)] for t in sums]
     results = [_in_pieces(terms, bodies) for terms in arrays]
-    scattered = [terms for terms, x in zip(arrays, results, strict=True) if x is None]
-    lanes = iter(_scattered(scattered, bodies))
+    others = [terms for terms, x in zip(arrays, results, strict=True) if x is None]
+    lanes = iter(_in_pairs(others, bodies))
     return [next(lanes) if x is None else x for x in results]
+
+
+def _array(x: Lane, elements: int) -> Array:
+    """Returns a lane as an array of JAX, (element, …)."""
+    return jnp.asarray(x) if np.ndim(x) else jnp.full(elements, x)
 
 
 def _in_pieces(terms: Sequence[tuple[tuple[int, ...], Array]], bodies: int) -> Lane | None:
@@ -300,7 +305,7 @@ def _in_pieces(terms: Sequence[tuple[tuple[int, ...], Array]], bodies: int) -> L
     return pieces[0] if len(pieces) == 1 else jnp.concatenate(pieces)
 
 
-def _scattered(
+def _in_pairs(
     sums: Sequence[Sequence[tuple[tuple[int, ...], Array]]], bodies: int
 ) -> Sequence[Array]:
     """Returns the sums of `collect` for each component, added in pairs of single rows."""

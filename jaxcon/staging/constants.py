@@ -2,14 +2,14 @@
 
 Parameters of a scene that are not traced are constants of the program. Many of them are 0 or 1:
 components of axes and of attachment points, for example. XLA keeps the product of a float and 0,
-because it is NaN if the float is infinite. Here it is 0. The program of a chain of 5 links becomes
-shorter by a sixth, and runs faster by as much.
+because it is NaN if the float is infinite or NaN, and has the float's sign otherwise. Here it is 0.
+A state that is not finite still ends with a status, since other components of it are used.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -17,10 +17,20 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend.core import JaxprEqn
 
+from jaxcon.core.host import ELEMENTWISE, STRUCTURAL
 from jaxcon.core.typing import Scalar
 
-MOST = 4096
-"""The largest number of entries of a constant on which operations are evaluated."""
+MAX_SIZE = 4096
+"""The largest number of different entries of a constant on which operations are evaluated."""
+
+EXACT = frozenset(
+    {"abs", "add", "and", "convert_element_type", "eq", "ge", "gt", "is_finite", "le", "lt", "max"}
+    | {"min", "mul", "ne", "neg", "not", "or", "select_n", "square", "sub"}
+)
+"""Elementwise primitives for which NumPy and XLA give the same bits."""
+
+MOVES = ("broadcast_in_dim", "concatenate", "reshape", "slice", "squeeze", "transpose")
+"""Primitives that only move entries."""
 
 
 class Constant:
@@ -35,11 +45,11 @@ class Constant:
         self.value = value
 
     def array(self) -> np.ndarray | None:
-        """Returns the value as a NumPy array; None if it is large, or no array of numbers."""
+        """Returns the value as a NumPy array; None if it is not one, and large or no numbers."""
         x = self.value
         if isinstance(x, np.ndarray):
             return x
-        if isinstance(x, Tracer) or np.size(x) > MOST:
+        if isinstance(x, Tracer) or np.size(x) > MAX_SIZE:
             return None
         dtype = jax.numpy.result_type(x)
         if isinstance(x, jax.Array) and not x.is_fully_addressable:
@@ -50,7 +60,7 @@ class Constant:
         """Returns the number to which all entries are equal; None if they are not equal."""
         x = self.array()
         once = None if x is None else without_repetition(x)
-        if once is None or not 0 < once.size <= MOST:
+        if once is None or not 0 < once.size <= MAX_SIZE:
             return None
         return once.flat[0] if np.all(once == once.flat[0]) else None
 
@@ -66,8 +76,8 @@ def without_repetition(x: np.ndarray, axes: Sequence[int] | None = None) -> np.n
         x: the array. It repeats its entries along the axes that have a stride of 0.
         axes: the axes to look at; None for all.
     """
-    chosen = range(x.ndim) if axes is None else axes
-    repeats = [a in chosen and n > 1 and x.strides[a] == 0 for a, n in enumerate(x.shape)]
+    among = range(x.ndim) if axes is None else axes
+    repeats = [a in among and n > 1 and x.strides[a] == 0 for a, n in enumerate(x.shape)]
     return x[tuple(slice(0, 1) if flag else slice(None) for flag in repeats)]
 
 
@@ -82,7 +92,7 @@ def simplified(equation: JaxprEqn, args: Sequence[Operand]) -> Operand | None:
     if not constants:
         return None
     if len(constants) < len(args):
-        return _same(equation, args)
+        return _equal_operand(equation, args)
     arrays = [x.array() for x in constants]
     known = [x for x in arrays if x is not None]
     result = _evaluated(equation, known) if len(known) == len(arrays) else None
@@ -90,129 +100,82 @@ def simplified(equation: JaxprEqn, args: Sequence[Operand]) -> Operand | None:
 
 
 def _evaluated(equation: JaxprEqn, args: Sequence[np.ndarray]) -> np.ndarray | None:
-    """Returns the result of an equation for constant operands; None if this is not possible."""
-    name = equation.primitive.name
+    """Returns the result of an equation for constant operands; None if it stays an operation."""
+    name, params = equation.primitive.name, equation.params
     aval: Any = equation.outvars[0].aval
     if name in MOVES:
-        result = MOVES[name](equation.params, *args)
-    elif name in ELEMENTWISE:
-        once = [without_repetition(x) for x in args]
-        if math.prod(np.broadcast_shapes(*(x.shape for x in once))) > MOST:
-            return None
-        with np.errstate(all="ignore"):
-            result = ELEMENTWISE[name](equation.params, *once)
+        result = _moved(name, params, args)
+    elif name in EXACT:
+        result = _computed(name, params, [without_repetition(x) for x in args])
     else:
         return None
     if result is None or result.dtype != aval.dtype:
         return None
-    return np.broadcast_to(result, aval.shape)
+    return (
+        None if without_repetition(result).size > MAX_SIZE else np.broadcast_to(result, aval.shape)
+    )
 
 
-def _same(equation: JaxprEqn, args: Sequence[Operand]) -> Operand | None:
-    """Returns the operand that an equation with other, constant operands returns, else None."""
+def _moved(name: str, params: Mapping[str, Any], args: Sequence[np.ndarray]) -> np.ndarray | None:
+    """Evaluates a primitive that moves entries; axes that repeat entries still do if they can."""
+    if name == "reshape":
+        once = without_repetition(args[0])
+        if once.size == 1:
+            return np.broadcast_to(once.reshape(()), params["new_sizes"])
+    if name == "concatenate":
+        axis = params["dimension"]
+        repeated = [
+            a
+            for a in range(args[0].ndim)
+            if a != axis and all(x.strides[a] == 0 or x.shape[a] == 1 for x in args)
+        ]
+        args = [without_repetition(x, repeated) for x in args]
+    views = name not in ("reshape", "concatenate")
+    if not views and sum(x.size for x in args) > MAX_SIZE:
+        return None
+    return STRUCTURAL[name](params, *args)
+
+
+def _computed(
+    name: str, params: Mapping[str, Any], args: Sequence[np.ndarray]
+) -> np.ndarray | None:
+    """Evaluates an elementwise primitive."""
+    if math.prod(np.broadcast_shapes(*(x.shape for x in args))) > MAX_SIZE:
+        return None
+    if name == "select_n":
+        return np.choose(args[0].astype(int), args[1:], mode="clip")
+    if name == "convert_element_type":
+        floating = np.issubdtype(args[0].dtype, np.inexact)
+        if floating and np.issubdtype(params["new_dtype"], np.integer):
+            return None  # XLA clamps numbers beyond the range, NumPy does not
+        return args[0].astype(params["new_dtype"])
+    with np.errstate(all="ignore"):
+        return ELEMENTWISE[name](*args)
+
+
+def _equal_operand(equation: JaxprEqn, args: Sequence[Operand]) -> Operand | None:
+    """Returns the operand that the result of an equation equals, or 0 for a product with 0."""
     name = equation.primitive.name
     aval: Any = equation.outvars[0].aval
     if name == "select_n":
         which = args[0].number() if isinstance(args[0], Constant) else None
-        return None if which is None else args[1 + int(which)]
-    if name not in NEUTRAL:
-        return None
-    for place, neutral, absorbing in NEUTRAL[name]:
+        return None if which is None else args[1 + min(max(int(which), 0), len(args) - 2)]
+    for place, neutral in NEUTRAL.get(name, ()):
         constant, other = args[place], args[1 - place]
         number = constant.number() if isinstance(constant, Constant) else None
-        if number is None:
-            continue
-        if absorbing is not None and number == absorbing:
-            return Constant(np.broadcast_to(np.asarray(absorbing, aval.dtype), aval.shape))
         whole: Any = equation.invars[1 - place].aval
-        if number == neutral and whole.shape == aval.shape:
+        if name == "mul" and number is not None and number == 0:
+            return Constant(np.broadcast_to(np.zeros((), aval.dtype), aval.shape))
+        if number is not None and number == neutral and whole.shape == aval.shape:
             return other
     return None
 
 
-NEUTRAL: dict[str, tuple[tuple[int, float | bool, float | bool | None], ...]] = {
-    "mul": ((0, 1, 0), (1, 1, 0)),
-    "add": ((0, 0, None), (1, 0, None)),
-    "sub": ((1, 0, None),),
-    "div": ((1, 1, None),),
+NEUTRAL: dict[str, tuple[tuple[int, int], ...]] = {
+    "mul": ((0, 1), (1, 1)),
+    "add": ((0, 0), (1, 0)),
+    "sub": ((1, 0),),
+    "div": ((1, 1),),
 }
-"""By primitive: the place of a constant operand, with which number the result is the other operand,
-and with which number it is this number (None for no such number)."""
-
-Params = Mapping[str, Any]
-
-
-def _broadcast(params: Params, x: np.ndarray) -> np.ndarray:
-    """Evaluates `broadcast_in_dim`."""
-    sizes = [1] * len(params["shape"])
-    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
-        sizes[axis] = size
-    return np.broadcast_to(x.reshape(sizes), params["shape"])
-
-
-def _reshape(params: Params, x: np.ndarray) -> np.ndarray | None:
-    """Evaluates `reshape`."""
-    once, sizes = without_repetition(x), params["new_sizes"]
-    if once.size == 1:
-        return np.broadcast_to(once.reshape(()), sizes)
-    return x.reshape(sizes) if math.prod(sizes) <= MOST else None
-
-
-def _slice(params: Params, x: np.ndarray) -> np.ndarray:
-    """Evaluates `slice`."""
-    steps = params["strides"] or [1] * x.ndim
-    return x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]
-
-
-def _concatenate(params: Params, *parts: np.ndarray) -> np.ndarray | None:
-    """Evaluates `concatenate`."""
-    axis = params["dimension"]
-    same = [
-        a
-        for a in range(parts[0].ndim)
-        if a != axis and all(x.strides[a] == 0 or x.shape[a] == 1 for x in parts)
-    ]
-    parts = tuple(without_repetition(x, same) for x in parts)
-    return np.concatenate(parts, axis) if sum(x.size for x in parts) <= MOST else None
-
-
-MOVES: dict[str, Callable[..., np.ndarray | None]] = {
-    "broadcast_in_dim": _broadcast,
-    "concatenate": _concatenate,
-    "reshape": _reshape,
-    "rev": lambda params, x: np.flip(x, params["dimensions"]),
-    "slice": _slice,
-    "squeeze": lambda params, x: np.squeeze(x, tuple(params["dimensions"])),
-    "transpose": lambda params, x: np.transpose(x, params["permutation"]),
-}
-"""Functions of (parameters, operands) that evaluate primitives which move entries."""
-
-
-def _of(operation: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a function of (parameters, operands) that ignores the parameters."""
-    return lambda params, *args: operation(*args)
-
-
-ELEMENTWISE: dict[str, Callable[..., np.ndarray]] = {
-    "convert_element_type": lambda params, x: x.astype(params["new_dtype"]),
-    "select_n": lambda params, which, *cases: np.choose(which.astype(int), cases),
-    "abs": _of(np.abs),
-    "add": _of(np.add),
-    "and": _of(np.bitwise_and),
-    "eq": _of(np.equal),
-    "ge": _of(np.greater_equal),
-    "gt": _of(np.greater),
-    "is_finite": _of(np.isfinite),
-    "le": _of(np.less_equal),
-    "lt": _of(np.less),
-    "max": _of(np.maximum),
-    "min": _of(np.minimum),
-    "mul": _of(np.multiply),
-    "ne": _of(np.not_equal),
-    "neg": _of(np.negative),
-    "not": _of(np.invert),
-    "or": _of(np.bitwise_or),
-    "square": _of(np.square),
-    "sub": _of(np.subtract),
-}
-"""Functions of (parameters, operands) that evaluate elementwise primitives as XLA does."""
+"""By primitive, pairs: the place of an operand, and the number with which the result equals the
+other operand."""

@@ -66,9 +66,6 @@ MOVES = _names(
 )
 """Primitives that only move data; kernels read their operands directly."""
 
-SCATTERED = _names("dynamic_slice")
-"""Moves whose result is worth storing if it is shared."""
-
 MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice gather")
 """Primitives whose result has the entries of its operand at other positions."""
 
@@ -114,8 +111,9 @@ PER_OPERAND = 20
 An untaken branch makes the kernel that holds it slower, by up to a quarter, and longer to compile.
 Outside of kernels, a branch costs launches, its operands are stored, and it runs slower when it is
 taken. Chains of links or particles have 15 to 17 instructions per operand, take their branch often,
-and run faster with the branch in the kernel. Closed kinematic chains have 23 to 44, and run faster
-with the branch outside. The mean over all branches with loops of a program decides for all of them.
+and run faster with the branch in the kernel. A four-bar and a Stewart platform have 45, and run
+faster with the branch outside. The mean over all branches with loops of a program decides for all
+of them.
 """
 
 Step = Operation | list[int]
@@ -360,7 +358,7 @@ def worth_storing(program: Program) -> set[int]:
         unstored = (x for x in op.inputs if not isinstance(x, Constant) and x not in stored)
         parts = (work.get(x, frozenset()) for x in unstored)
         steps = frozenset().union(*parts)
-        if op.name in SCATTERED:
+        if op.name == "dynamic_slice":
             steps |= {*range(-WORTH, 0)}
         elif op.name not in MOVES:
             steps |= {name}
@@ -429,7 +427,7 @@ def _needed_twice(program: Program) -> tuple[set[int], set[int]]:
                 needed.add(name)
         if name in needed:
             ends.add(name)
-        moves = op.name in MOVES and op.name not in SCATTERED
+        moves = op.name in MOVES and op.name != "dynamic_slice"
         # the index of a branch is a converted flag: outside of kernels it would be one more launch
         moves = moves and not any(x.name == "cond" and x.inputs[0] == name for x in consumers)
         if not moves and (len(needed) > 1 or name in needed):

@@ -17,7 +17,13 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Va
 
 from jaxcon.core.jaxprs import called, without_unused
 from jaxcon.core.typing import Array
-from jaxcon.staging.constants import Constant, Operand, simplified, without_repetition
+from jaxcon.staging.constants import (
+    MAX_SIZE,
+    Constant,
+    Operand,
+    simplified,
+    without_repetition,
+)
 
 if TYPE_CHECKING:
     from jaxcon.staging.batch_last import Native
@@ -25,8 +31,8 @@ if TYPE_CHECKING:
 IDENTITIES = ("stop_gradient", "copy", "copy_p", "optimization_barrier")
 """Primitives that return their arguments. XLA removes even barriers before it forms kernels."""
 
-NARY = ("add", "sub", "mul", "div", "max", "min", "and", "or", "eq", "ne", "lt", "le", "gt", "ge")
-"""Elementwise primitives of two operands, one of which may be a single number."""
+BINARY = ("add", "sub", "mul", "div", "max", "min", "and", "or", "eq", "ne", "lt", "le", "gt", "ge")
+"""Elementwise primitives of two operands, one of which may be a number without axes."""
 
 COMMUTATIVE = ("add", "mul", "max", "min", "and", "or", "eq", "ne")
 """Elementwise primitives whose two operands may change places."""
@@ -118,11 +124,12 @@ class Program:
         self.bytes: dict[int, int] = {}
         self._lengths: dict[int, list[Any]] = {}  # of the operands of concatenations
         self._slices: dict[Operand, Slice] = {}  # slices of successive entries
+        self._broadcasts: dict[Any, JaxprEqn] = {}  # by dtype and both shapes
         pairs = itertools.zip_longest(closed.jaxpr.invars, constants)
         args: list[Operand] = [self._new(x) if known is None else known for x, known in pairs]
         self.inputs = [x for x in args if not isinstance(x, Constant)]
         outputs = self._inline_closed(closed, args)
-        self.outputs = list(map(self._spread, outputs))
+        self.outputs = list(map(self._broadcast_repeated, outputs))
         self._read_parts()
         self.makers = {name: op for op in self.operations for name in op.outputs}
         self._drop_unused()
@@ -260,9 +267,9 @@ class Program:
             return self._inline_closed(params["jaxprs"].solve, given)
         if name == "native":
             return self._inline_closed(traced(params["fun"], operands), args)
-        known = _known_result(equation, args)
-        if known is not None:
-            return [known]
+        result = _known_result(equation, args)
+        if result is not None:
+            return [result]
         if name == "slice" and args[0] in self._slices:
             args, params = _within(self._slices[args[0]], params)
         if name in REDUCTIONS and _leading(params["axes"], operands[0].shape):
@@ -343,13 +350,13 @@ class Program:
         avals: list[Any] = [x.aval for x in (*equation.invars, *equation.outvars)]
         pairs = zip(args, avals, strict=False)
         moving = [y.shape for x, y in pairs if not isinstance(x, Constant)]
-        if equation.primitive.name in NARY and avals[-1].shape in moving:
+        if equation.primitive.name in BINARY and avals[-1].shape in moving:
             numbers = [x.number() if isinstance(x, Constant) else None for x in args]
             pairs = zip(args, numbers, strict=True)
             args = [x if number is None else Constant(number) for x, number in pairs]
-        return list(map(self._spread, args))
+        return list(map(self._broadcast_repeated, args))
 
-    def _spread(self, operand: Operand) -> Operand:
+    def _broadcast_repeated(self, operand: Operand) -> Operand:
         """Returns an operand; a broadcast in place of a constant with axes that repeat entries."""
         x = operand.value if isinstance(operand, Constant) else None
         if not isinstance(x, np.ndarray) or without_repetition(x).size == x.size:
@@ -357,23 +364,16 @@ class Program:
         once = without_repetition(x)
         if once.size == 1:
             once = once.reshape(())
-        equation = _spreading(x.dtype, once.shape, x.shape)
+        key = x.dtype, once.shape, x.shape
+        if key not in self._broadcasts:
+            axes = range(once.ndim)
+            wide = functools.partial(
+                jax.lax.broadcast_in_dim, shape=x.shape, broadcast_dimensions=axes
+            )
+            self._broadcasts[key] = jax.make_jaxpr(wide)(once).jaxpr.eqns[0]
+        equation = self._broadcasts[key]
         (result,) = self._emit(equation, equation.params, [Constant(once)], True)
         return result
-
-
-@functools.lru_cache(maxsize=256)
-def _spreading(dtype: Any, shape: tuple[int, ...], to: tuple[int, ...]) -> JaxprEqn:
-    """Returns the equation that broadcasts an array, without axes or with as many as the result.
-
-    Args:
-        dtype: dtype of the array.
-        shape: shape of the array.
-        to: shape of the result.
-    """
-    axes = range(len(shape))
-    spread = functools.partial(jax.lax.broadcast_in_dim, shape=to, broadcast_dimensions=axes)
-    return jax.make_jaxpr(spread)(jax.ShapeDtypeStruct(shape, dtype)).jaxpr.eqns[0]
 
 
 def _literal(x: Literal) -> Constant:
@@ -517,6 +517,8 @@ def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> A
         elif jnp.shape(x.value) == () and not _is_key(x.value):
             value = np.asarray(x.value, jnp.result_type(x.value))
             parts.append((str(value.dtype), value.tobytes()))
+        elif isinstance(x.value, np.ndarray) and x.value.size <= MAX_SIZE:
+            parts.append((str(x.value.dtype), x.value.shape, x.value.tobytes()))
         else:
             parts.append((type(x.value).__name__, id(x.value)))  # the operation keeps it alive
     key = (primitive, tuple(sorted(params.items(), key=lambda item: item[0])), tuple(parts))
