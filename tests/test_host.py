@@ -8,6 +8,7 @@ import scenes
 
 from jaxcon.constraints.rank import linearized
 from jaxcon.core import host
+from jaxcon.core.selection import ZEROS, select_rows, sum_rows
 
 X = np.linspace(-1.7, 2.3, 12).reshape(3, 4)
 FUNCTIONS = {
@@ -20,6 +21,8 @@ FUNCTIONS = {
     "choices": lambda x: (jnp.where(x > 0, x, -x), jnp.select([x > 1, x > 0], [x, 2 * x], 3 * x)),
     "integers": lambda x: (jnp.arange(5) // 2, jnp.arange(-3, 3) % 4, x.astype(int)),
     "shapes": lambda x: (x.T, x.reshape(2, 6), x[:, None], jnp.squeeze(x[:1]), x[::2, 1:3]),
+    "columns first": lambda x: (x.ravel(order="F"), x.reshape((2, 6), order="F")),
+    "rows": lambda x: (select_rows(x, (2, ZEROS, 0, 0)), sum_rows(x, ((0, 1, 2), (), (1,)))),
     "joined": lambda x: (
         jnp.concatenate([x, x[:1]]),
         jnp.stack([x, x]),
