@@ -2,8 +2,8 @@
 
 Parameters of a scene that are not traced are constants of the program. Many of them are 0 or 1:
 components of axes and of attachment points, for example. XLA keeps the product of a float and 0,
-because it is NaN if the float is infinite or NaN, and has the float's sign otherwise. Here it is 0.
-A state that is not finite still ends with a status, since other components of it are used.
+because it is NaN if the float is infinite or NaN, and has the float's sign otherwise. Here it is 0,
+so that 0·x does not tell whether x is finite; x − x does.
 """
 
 from __future__ import annotations
