@@ -145,7 +145,7 @@ MAY_IMPORT = {
     "staging/batch_last.py": {"jax.core", "jax.experimental", "jax.extend", "jax.interpreters"},
     "staging/chunks.py": {"jax.core", "jax.extend", "jax.interpreters"},
     "core/jaxprs.py": {"jax.extend", "jax.interpreters"},
-    "staging/program.py": {"jax.extend"},
+    "staging/program.py": {"jax.core", "jax.extend"},
     "staging/constants.py": {"jax.core", "jax.extend"},
     "core/selection.py": {"jax.core", "jax.extend", "jax.interpreters"},
     "staging/operations.py": {"jax.extend"},

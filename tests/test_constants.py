@@ -1,5 +1,7 @@
 """Operations on constants are simplified before a program is cut into stages."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -83,6 +85,8 @@ ON_CONSTANTS = {
     "+": lambda f, g, i, b: f + g,
     "-": lambda f, g, i, b: f - g,
     "*": lambda f, g, i, b: f * g,
+    "/": lambda f, g, i, b: f / g,
+    "integers /": lambda f, g, i, b: jax.lax.div(i, i + 8),
     "negative": lambda f, g, i, b: -f,
     "abs": lambda f, g, i, b: jnp.abs(f),
     "square": lambda f, g, i, b: jnp.square(f),
@@ -131,6 +135,20 @@ def test_a_large_constant_is_not_copied():
     native = Native(lambda x: [large[i:200] * x[0, 0] for i in range(10)])
     text = jax.jit(lambda x: fusion.run_staged(native, [x])).lower(jnp.asarray(X)).as_text()
     assert len(text) < 4 * large.size * 16
+
+
+def test_the_compiler_makes_no_constants_for_all_worlds():
+    """Devices would take their parts of such a constant by their numbers, which no kernel knows."""
+
+    def function(x):
+        parts = [full(0, x, (1, 128)), jnp.broadcast_to(jnp.sqrt(halves(x)[1:]), (3, 128))]
+        whole = jnp.concatenate(parts)
+        return [whole, x + whole]
+
+    x, native = jnp.ones((4, 128)), Native(function)
+    compiled = jax.jit(lambda x: fusion.run_staged(native, [x])).lower(x).compile()
+    assert not re.search(r"f64\[[34],128\]\S* constant\(", compiled.as_text())
+    np.testing.assert_allclose(compiled(x)[0], function(x)[0], rtol=1e-15)
 
 
 def test_equal_constants_are_one():

@@ -225,3 +225,29 @@ refused("num_envs=5 does not divide over 2 devices", 5, devices=2)
 
 def test_copies_over_two_devices_get_the_numbers_of_one():
     finished(started("-c", TWO_DEVICES))
+
+
+A_ROBOT = """
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+import jax.numpy as jnp
+import numpy as np
+import jaxcon as jc
+from benchmarks import legged
+
+robot = jc.from_mjcf(legged.load("hopper"), dtype=jnp.float32)
+method = robot.method()
+poses = np.stack([legged.start(legged.load("hopper"), i) for i in range(4)])
+states = jax.vmap(lambda q: legged.begun(robot, method, q))(jnp.asarray(poses, jnp.float32))
+u = jnp.zeros(robot.system.layout.n_u, jnp.float32)
+step = jax.jit(jax.vmap(lambda s: jc.step(robot.system, method, s, u, 0.002)[0]))
+together, apart = step(states), step(jc.shard(states))
+for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(apart), strict=True):
+    np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+"""
+
+
+def test_a_robot_with_constant_parameters_steps_on_two_devices():
+    """Constants of all worlds would be cut by the number of the device, which no kernel knows."""
+    pytest.importorskip("mujoco")
+    finished(started("-c", A_ROBOT))

@@ -25,7 +25,7 @@ MAX_SIZE = 4096
 
 EXACT = frozenset(
     {"abs", "add", "and", "convert_element_type", "eq", "ge", "gt", "is_finite", "le", "lt", "max"}
-    | {"min", "mul", "ne", "neg", "not", "or", "select_n", "square", "sub"}
+    | {"div", "min", "mul", "ne", "neg", "not", "or", "select_n", "square", "sub"}
 )
 """Elementwise primitives for which NumPy and XLA give the same bits."""
 
@@ -111,28 +111,26 @@ def _evaluated(equation: JaxprEqn, args: Sequence[np.ndarray]) -> np.ndarray | N
         return None
     if result is None or result.dtype != aval.dtype:
         return None
-    return (
-        None if without_repetition(result).size > MAX_SIZE else np.broadcast_to(result, aval.shape)
-    )
+    result = np.broadcast_to(result, aval.shape)
+    return result if without_repetition(result).size <= MAX_SIZE else None
 
 
 def _moved(name: str, params: Mapping[str, Any], args: Sequence[np.ndarray]) -> np.ndarray | None:
-    """Evaluates a primitive that moves entries; axes that repeat entries still do if they can."""
+    """Evaluates a primitive that moves entries; None if repeated entries would be stored singly."""
     if name == "reshape":
-        once = without_repetition(args[0])
+        (x,) = args
+        once = without_repetition(x)
         if once.size == 1:
             return np.broadcast_to(once.reshape(()), params["new_sizes"])
+        if once.size < x.size or x.size > MAX_SIZE:
+            return None
     if name == "concatenate":
-        axis = params["dimension"]
-        repeated = [
-            a
-            for a in range(args[0].ndim)
-            if a != axis and all(x.strides[a] == 0 or x.shape[a] == 1 for x in args)
-        ]
-        args = [without_repetition(x, repeated) for x in args]
-    views = name not in ("reshape", "concatenate")
-    if not views and sum(x.size for x in args) > MAX_SIZE:
-        return None
+        others = set(range(args[0].ndim)) - {params["dimension"]}
+        same = [a for a in others if all(x.strides[a] == 0 or x.shape[a] == 1 for x in args)]
+        args = [without_repetition(x, same) for x in args]
+        singly = any(without_repetition(x, [*others]).size < x.size for x in args)
+        if singly or sum(x.size for x in args) > MAX_SIZE:
+            return None
     return STRUCTURAL[name](params, *args)
 
 
@@ -149,6 +147,8 @@ def _computed(
         if floating and np.issubdtype(params["new_dtype"], np.integer):
             return None  # XLA clamps numbers beyond the range, NumPy does not
         return args[0].astype(params["new_dtype"])
+    if name == "div" and not np.issubdtype(args[0].dtype, np.inexact):
+        return None  # XLA rounds quotients of integers toward zero, NumPy makes them floats
     with np.errstate(all="ignore"):
         return ELEMENTWISE[name](*args)
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend import core as jex
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var
 
@@ -72,6 +73,8 @@ class Operation:
 
     def __call__(self, operands: list[Any]) -> list[Any]:
         """Applies the primitive to the values of the operands; returns its results."""
+        if self.plain and self.name not in ("scan", "cond"):
+            operands = list(map(_hidden, operands))
         results = self.primitive.bind(*operands, **self.params)
         return results if self.primitive.multiple_results else [results]
 
@@ -376,6 +379,17 @@ class Program:
         return result
 
 
+def _hidden(x: Any) -> Any:
+    """Hides a constant array of floats from the compiler by a barrier; returns other operands.
+
+    The compiler would otherwise fold its broadcast to a constant for all worlds, of which a device
+    then reads its part by its own number. A kernel cannot read that number.
+    """
+    if isinstance(x, Tracer) or not np.ndim(x) or not jnp.issubdtype(x.dtype, np.floating):
+        return x
+    return jax.lax.optimization_barrier(jnp.asarray(x))
+
+
 def _literal(x: Literal) -> Constant:
     """Returns a literal as a constant of its type."""
     aval: Any = x.aval
@@ -487,13 +501,13 @@ def _known_result(equation: JaxprEqn, args: list[Operand]) -> Operand | None:
     if not is_known(aval.shape):  # a constant cannot have a symbolic size
         return None
     if 0 in aval.shape and not _is_key(aval):
-        return Constant(np.zeros(aval.shape, aval.dtype))
+        return Constant(np.broadcast_to(np.zeros((), aval.dtype), aval.shape))
     exponent = args[1] if name == "pow" and len(args) == 2 else None
     power = equation.params.get("y") if name == "integer_pow" else exponent
     if isinstance(power, Constant):
         power = power.number()
     if isinstance(power, int | float | np.generic) and power == 0:
-        return Constant(np.ones(aval.shape, aval.dtype))
+        return Constant(np.broadcast_to(np.ones((), aval.dtype), aval.shape))
     if name == "pad" and not any(map(any, equation.params["padding_config"])):
         return args[0]
     if name == "select_n" and all(x is args[1] or x == args[1] for x in args[2:]):
