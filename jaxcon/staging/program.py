@@ -57,6 +57,7 @@ class Operation:
         plain: True if a kernel may contain the operation; False for random keys, for side effects
             such as printing, and for loops and branches that do not fit into a kernel.
         effects: True if the operation has side effects.
+        fixed: True if no operand depends on the arguments of the program.
     """
 
     primitive: Primitive
@@ -65,6 +66,7 @@ class Operation:
     outputs: list[int]
     plain: bool
     effects: bool
+    fixed: bool
 
     @property
     def name(self) -> str:
@@ -73,7 +75,7 @@ class Operation:
 
     def __call__(self, operands: list[Any]) -> list[Any]:
         """Applies the primitive to the values of the operands; returns its results."""
-        if self.plain and self.name not in ("scan", "cond"):
+        if self.fixed:
             operands = list(map(_hidden, operands))
         results = self.primitive.bind(*operands, **self.params)
         return results if self.primitive.multiple_results else [results]
@@ -126,6 +128,7 @@ class Program:
         self.sizes: dict[int, int] = {}
         self.bytes: dict[int, int] = {}
         self._lengths: dict[int, list[Any]] = {}  # of the operands of concatenations
+        self._fixed: set[Operand] = set()  # values that do not depend on the arguments
         self._slices: dict[Operand, Slice] = {}  # slices of successive entries
         self._broadcasts: dict[Any, JaxprEqn] = {}  # by dtype and both shapes
         pairs = itertools.zip_longest(closed.jaxpr.invars, constants)
@@ -334,7 +337,10 @@ class Program:
         avals = [x.aval for x in (*equation.invars, *equation.outvars)]
         keys = any(map(_is_key, avals))
         plain = plain and not keys and not effects
-        op = Operation(primitive, params, args, outputs, plain, effects)
+        fixed = all(isinstance(x, Constant) or x in self._fixed for x in args)
+        if fixed:
+            self._fixed.update(outputs)
+        op = Operation(primitive, params, args, outputs, plain, effects, fixed)
         self.operations.append(op)
         if key is not None and not effects:
             self._known[key] = outputs
