@@ -44,7 +44,7 @@ from jax.extend.core.primitives import stop_gradient_p
 from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core import notices
-from jaxcon.core.jaxprs import without_unused
+from jaxcon.core.jaxprs import settings, without_unused
 from jaxcon.core.somewhere import asking
 from jaxcon.core.typing import Array, PyTree, Scalar, T
 from jaxcon.staging import fusion, meshes
@@ -160,8 +160,7 @@ class Native:
         JAX's current settings are part of the key of the cache, because operations keep the mesh
         and the default precision under which they were traced.
         """
-        mesh, real = jax.sharding.get_abstract_mesh(), jnp.result_type(float)
-        return self.among((mesh, real, notices.is_observing()), *avals)
+        return self.among((*settings(), notices.is_observing()), *avals)
 
     def _among(self, settings: tuple[Any, ...], *avals: Aval) -> ClosedJaxpr:
         """Returns `_traced(*avals)`, and is cached by settings, shapes and dtypes.

@@ -45,7 +45,11 @@ class Constant:
         self.value = value
 
     def array(self) -> np.ndarray | None:
-        """Returns the value as a NumPy array; None if it is not one, and large or no numbers."""
+        """Returns the value as a NumPy array.
+
+        None for values that are traced, on other processes or random keys, and for large arrays of
+        JAX, which would be copied from their device.
+        """
         x = self.value
         if isinstance(x, np.ndarray):
             return x
@@ -63,6 +67,11 @@ class Constant:
         if once is None or not 0 < once.size <= MAX_SIZE:
             return None
         return once.flat[0] if np.all(once == once.flat[0]) else None
+
+
+def uniform(number: int, aval: Any) -> Constant:
+    """Returns an array of equal numbers as a constant, with the shape and dtype of `aval`."""
+    return Constant(np.broadcast_to(np.asarray(number, aval.dtype), aval.shape))
 
 
 Operand = int | Constant
@@ -165,7 +174,7 @@ def _equal_operand(equation: JaxprEqn, args: Sequence[Operand]) -> Operand | Non
         number = constant.number() if isinstance(constant, Constant) else None
         whole: Any = equation.invars[1 - place].aval
         if name == "mul" and number is not None and number == 0:
-            return Constant(np.broadcast_to(np.zeros((), aval.dtype), aval.shape))
+            return uniform(0, aval)
         if number is not None and number == neutral and whole.shape == aval.shape:
             return other
     return None
@@ -177,5 +186,7 @@ NEUTRAL: dict[str, tuple[tuple[int, int], ...]] = {
     "sub": ((1, 0),),
     "div": ((1, 1),),
 }
-"""By primitive, pairs: the place of an operand, and the number with which the result equals the
-other operand."""
+"""Neutral elements: pairs (place of an operand, its neutral number) of each primitive.
+
+With that number in that place, the result is the other operand: 1·x = x, x + 0 = x.
+"""

@@ -66,7 +66,7 @@ MOVES = _names(
 )
 """Primitives that only move data; kernels read their operands directly."""
 
-MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice gather")
+MOVED = _names("slice rev transpose broadcast_in_dim dynamic_slice")
 """Primitives whose result has the entries of its operand at other positions."""
 
 ARITHMETIC = _names(

@@ -23,6 +23,7 @@ from jaxcon.staging.constants import (
     Constant,
     Operand,
     simplified,
+    uniform,
     without_repetition,
 )
 
@@ -507,13 +508,13 @@ def _known_result(equation: JaxprEqn, args: list[Operand]) -> Operand | None:
     if not is_known(aval.shape):  # a constant cannot have a symbolic size
         return None
     if 0 in aval.shape and not _is_key(aval):
-        return Constant(np.broadcast_to(np.zeros((), aval.dtype), aval.shape))
+        return uniform(0, aval)
     exponent = args[1] if name == "pow" and len(args) == 2 else None
     power = equation.params.get("y") if name == "integer_pow" else exponent
     if isinstance(power, Constant):
         power = power.number()
     if isinstance(power, int | float | np.generic) and power == 0:
-        return Constant(np.broadcast_to(np.ones((), aval.dtype), aval.shape))
+        return uniform(1, aval)
     if name == "pad" and not any(map(any, equation.params["padding_config"])):
         return args[0]
     if name == "select_n" and all(x is args[1] or x == args[1] for x in args[2:]):
