@@ -296,6 +296,19 @@ def size(quick: bool) -> Found:
     return Found(tuple(metrics), lambda path: study.picture(everything, str(path), what))
 
 
+@entry("gpu")
+def gpu(quick: bool) -> list[Metric]:
+    """Counts the instructions of the kernel of a step on a GPU; this needs no GPU."""
+    from benchmarks import gpu as study
+
+    metrics = []
+    for name in study.SCENES[: 2 if quick else 5]:
+        kernels, instructions = study.written(name)
+        metrics.append(Metric(f"{name}, kernels a step", kernels, "", LOWER, 1.0))
+        metrics.append(Metric(f"{name}, instructions a step", instructions, "", LOWER, 1.2))
+    return metrics
+
+
 @entry("environment_peers", GYMNASIUM)
 def environment_peers(quick: bool) -> list[Metric]:
     """Compares actions per second of many copies with the best of Gymnasium and Brax."""

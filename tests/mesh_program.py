@@ -28,6 +28,12 @@ def same(found, expected):
         np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
 
 
+def kernels(function, worlds):
+    """Returns the number of kernels that a program for NVIDIA's GPUs calls."""
+    traced = jax.jit(function).trace(1.0, worlds)
+    return traced.lower(lowering_platforms=("cuda",)).as_text().count("__gpu$xla.gpu.ptx")
+
+
 def check(name):
     make, solver = SCENES[name]
     (system, state), method = make(), jc.Method(solver=solver)
@@ -59,9 +65,14 @@ def check(name):
     inside = jax.shard_map(jax.grad(summed, has_aux=True), out_specs=(whole, laid), **parts)
     compiled = jax.jit(inside).lower(1.0, worlds).compile()
     same(compiled(1.0, worlds), (slope, expected))
+    # a kernel of a GPU cannot be split over devices by the compiler
+    placed = jax.device_put(worlds, NamedSharding(mesh, laid))
+    mapped = jax.shard_map(run, out_specs=laid, **parts)
+    if name == "turns":
+        assert kernels(mapped, placed) == 1
+    assert kernels(run, placed) == 0
     if name == "turns":  # the only communication is one sum at the end
         assert devices.exchanges(compiled.as_text()) == {"all-reduce": 1}
-        mapped = jax.shard_map(run, out_specs=laid, **parts)
         same(jax.jit(jax.grad(lambda x: jnp.sum(mapped(x, worlds).q)))(1.0), slope)
 
     mesh = jax.make_mesh((2,), ("x",), axis_types=(AxisType.Explicit,))

@@ -1,0 +1,212 @@
+"""Native functions as one kernel of an NVIDIA GPU, in which each world has a thread of its own.
+
+XLA computes a step by many kernels, which pass every value from one to the next through memory: a
+chain of 5 links takes 70 kernels and 42 KB a world. Here a step is one kernel that reads the state
+and writes the next one. A branch or a loop runs in the threads that need it, and the host waits for
+none of them.
+
+Functions that use an operation without instructions here are compiled by XLA, as before. The
+environment variable JAXCON_KERNELS=off does this for all functions.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import mlir
+
+from jaxcon.core.typing import Array
+from jaxcon.staging.entries import Body, Evaluation
+from jaxcon.staging.program import traced
+from jaxcon.staging.ptx import BLOCK, Thread, UnsupportedError
+
+if TYPE_CHECKING:
+    from jaxcon.staging.batch_last import Native
+
+TARGET = "__gpu$xla.gpu.ptx"
+"""XLA's name of a call of a kernel that is given as text."""
+
+MOST_LINES = 75_000
+"""The largest number of instructions of a kernel; longer programs are compiled by XLA.
+
+The driver assigns registers for longer than a minute, and in tens of gigabytes, for twice as many.
+"""
+
+MOST_POINTERS = 500
+"""The largest number of arrays of a kernel; NVIDIA's limit is 4 KB of addresses."""
+
+NAME = "native"
+
+kernel_p = Primitive("kernel")
+kernel_p.multiple_results = True
+
+
+def run(fun: Native, args: Sequence[Array], rank: int) -> list[Array]:
+    """Calls a native function as one kernel.
+
+    Args:
+        fun: the native function.
+        args: its arguments, (…, worlds) with `rank` trailing batch axes, of the batch's size or 1.
+        rank: the number of batch axes.
+
+    Raises:
+        UnsupportedError: the function needs an operation that has no instructions here.
+    """
+    batch = jnp.broadcast_shapes(*(x.shape[x.ndim - rank :] for x in args))
+    flat = [_merged(x, batch) for x in args]
+    worlds = math.prod(batch)
+    text, shapes = _written(fun.alone(), [(x.shape, x.dtype) for x in flat], worlds)
+    results = kernel_p.bind(*flat, text=text, shapes=shapes, worlds=worlds)
+    apart = [y.reshape((*y.shape[:-1], *batch)) for y in results]
+    like = fun.shapes([ShapedArray(x.shape, x.dtype) for x in args])
+    return [_reduced(y, x.shape, fun.sums) for y, x in zip(apart, like, strict=True)]
+
+
+def _reduced(x: Array, shape: tuple[int, ...], sums: bool) -> Array:
+    """Returns the sum over batch axes that have size 1 in `shape`, or the first of equal worlds."""
+    axes = [a for a, (n, m) in enumerate(zip(x.shape, shape, strict=True)) if n != m]
+    if sums:
+        return jnp.sum(x, axis=axes, keepdims=True) if axes else x
+    for axis in axes:
+        x = jax.lax.slice_in_dim(x, 0, 1, axis=axis)
+    return x
+
+
+def _merged(x: Array, batch: tuple[int, ...]) -> Array:
+    """Returns an array with all its batch axes as one, of size 1 if all worlds share it."""
+    own = x.shape[x.ndim - len(batch) :]
+    shape = x.shape[: x.ndim - len(batch)]
+    if math.prod(own) == 1:
+        return x.reshape((*shape, 1))
+    return jnp.broadcast_to(x, (*shape, *batch)).reshape((*shape, math.prod(batch)))
+
+
+def _written(
+    fun: Native, avals: Sequence[tuple[tuple[int, ...], Any]], worlds: int
+) -> tuple[str, tuple[tuple[tuple[int, ...], Any], ...]]:
+    """Writes a native function as a kernel.
+
+    Args:
+        fun: the native function.
+        avals: shapes and dtypes of its arguments, with one batch axis.
+        worlds: the number of worlds.
+
+    Returns:
+        The text, and shapes and dtypes of the results.
+    """
+    one = [jax.ShapeDtypeStruct((*shape[:-1], 1), dtype) for shape, dtype in avals]
+    closed = traced(fun, one)
+    results = [x.aval for x in closed.jaxpr.outvars]
+    count = len(avals) + len(results)
+    if count > MOST_POINTERS:
+        raise UnsupportedError(f"{count} arrays")
+    thread = Thread()
+    shared = [shape[-1] != worlds for shape, _ in avals] + [False] * len(results)
+    dtypes = [dtype for _, dtype in avals] + [x.dtype for x in results]
+    thread.start(worlds, [0 if s else _size(d) for s, d in zip(shared, dtypes, strict=True)])
+
+    def address(array: int, entry: int) -> str:
+        apart = 1 if shared[array] else worlds
+        return thread.address(array, entry * apart * _size(dtypes[array]))
+
+    given = []
+    for k, x in enumerate(one):
+        array = np.empty(x.shape, object)
+        for entry, place in enumerate(np.ndindex(x.shape)):
+            array[place] = thread.load(address(k, entry), x.dtype)
+        given.append(array)
+    for k, y in enumerate(Evaluation(thread)(Body(closed, ()), given), len(avals)):
+        for entry, number in enumerate(y.ravel()):
+            thread.store(address(k, entry), number)
+    text = thread.text(NAME, count)
+    if (lines := text.count("\n")) > MOST_LINES:
+        raise UnsupportedError(f"{lines} instructions")
+    return text, tuple(((*x.shape[:-1], worlds), x.dtype) for x in results)
+
+
+def _size(dtype: Any) -> int:
+    """Returns the bytes of a number in memory."""
+    return np.dtype(dtype).itemsize
+
+
+def _abstract(*args: ShapedArray, text: str, shapes: Any, worlds: int) -> list[ShapedArray]:
+    """The abstract evaluation rule: returns the shapes and dtypes of the results."""
+    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
+
+
+def _lowered(
+    ctx: mlir.LoweringRuleContext, *args: Any, text: str, shapes: Any, worlds: int
+) -> Sequence[Any]:
+    """The lowering rule: a call of the kernel, whose arrays lie in memory with the batch last."""
+    number = mlir.ir.IntegerType.get_signless(32)
+
+    def integer(x: int) -> Any:
+        return mlir.ir.IntegerAttr.get(number, x)
+
+    blocks = -(-worlds // BLOCK)
+    config = {"name": mlir.ir.StringAttr.get(NAME)}
+    config |= {"kernel_type": mlir.ir.StringAttr.get("ptx")}
+    config |= {"kernel_data": mlir.ir.StringAttr.get(text)}
+    config |= {f"grid_{axis}": integer(n) for axis, n in zip("xyz", (blocks, 1, 1), strict=True)}
+    config |= {f"block_{axis}": integer(n) for axis, n in zip("xyz", (BLOCK, 1, 1), strict=True)}
+    config |= {"shared_mem_bytes": integer(0)}
+    last = range(len(args), len(args) + len(shapes))
+    config |= {"output_indices": mlir.ir.ArrayAttr.get(list(map(integer, last)))}
+    call = jax.ffi.ffi_lowering(
+        TARGET,
+        operand_layouts=list(map(_batch_last, ctx.avals_in)),
+        result_layouts=list(map(_batch_last, ctx.avals_out)),
+        operand_output_aliases=_in_place(ctx.avals_in, ctx.avals_out),
+        backend_config=config,
+    )
+    return call(ctx, *args)
+
+
+def _in_place(args: Sequence[Any], results: Sequence[Any]) -> dict[int, int]:
+    """Returns which argument lends its memory to which result, of the same shape and dtype.
+
+    A loop then carries a state without copies. Each thread reads its world before it writes.
+    """
+    free = list(range(len(args)))
+    pairs = {}
+    for k, y in enumerate(results):
+        like = [i for i in free if (args[i].shape, args[i].dtype) == (y.shape, y.dtype)]
+        if like:
+            pairs[like[0]] = k
+            free.remove(like[0])
+    return pairs
+
+
+def _batch_last(aval: Any) -> Sequence[int]:
+    """Returns the axes of an array from the one contiguous in memory, the last, to the first."""
+    return tuple(reversed(range(aval.ndim)))
+
+
+def is_possible(ctx: mlir.LoweringRuleContext) -> bool:
+    """Returns True if a program may call kernels.
+
+    XLA cannot split a kernel over devices, and exported programs must not depend on this version
+    of XLA. Within `shard_map`, the program of each device is on its own.
+    """
+    if os.environ.get("JAXCON_KERNELS") == "off":
+        return False
+    module = ctx.module_context
+    place: Any = module.axis_context
+    mesh = getattr(place, "mesh", None)
+    if mesh is None:
+        alone = getattr(place, "num_devices", 1) == 1
+    else:
+        alone = mesh.size == 1 or set(place.manual_axes) == set(mesh.axis_names)
+    return alone and not module.lowering_parameters.for_export
+
+
+kernel_p.def_abstract_eval(_abstract)
+mlir.register_lowering(kernel_p, _lowered, platform="cuda")

@@ -1,0 +1,480 @@
+"""Evaluates a program entry by entry, as the instructions of one thread.
+
+An array becomes an object array of scalars. Operations that move entries, such as slices and
+transposes, move these objects and write no instructions. All other operations write the
+instructions of each entry of their results.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from jaxcon.core.host import STRUCTURAL
+from jaxcon.staging.elementary import FUNCTIONS, rounded
+from jaxcon.staging.program import Constant, Operand, Operation, Program
+from jaxcon.staging.ptx import Register, Scalar, Thread, UnsupportedError
+
+Entries = np.ndarray[Any, np.dtype[np.object_]]
+"""An array of scalars."""
+
+MOVES = ("broadcast_in_dim", "concatenate", "reshape", "slice", "squeeze", "transpose")
+"""Primitives that move entries, which NumPy does with object arrays as well."""
+
+PAIRS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and"}
+PAIRS |= {"reduce_or": "or"}
+"""The operation on two entries by which each reduction combines them."""
+
+PLACINGS = ("mesh_cast", "pvary", "reshard", "sharding_constraint")
+"""Primitives that only say on which devices an array lies."""
+
+MOST_ROUNDS = 64
+"""The largest number of rounds of a loop that is written round by round."""
+
+
+class Body(NamedTuple):
+    """The body of a loop or a branch.
+
+    Attributes:
+        closed: the jaxpr.
+        constants: for each of its first arguments, the constant that takes its place, or None.
+    """
+
+    closed: ClosedJaxpr
+    constants: Sequence[Constant | None]
+
+
+def _body(closed: ClosedJaxpr, constants: Sequence[Constant | None]) -> Any:
+    """Keeps a body as it is; `Program` asks for this function."""
+    return Body(closed, constants), True
+
+
+class Evaluation:
+    """The evaluation of programs by one thread."""
+
+    def __init__(self, thread: Thread) -> None:
+        self.thread = thread
+        self._programs: dict[int, tuple[Body, Program]] = {}
+
+    def __call__(self, body: Body, args: Sequence[Entries]) -> list[Entries]:
+        """Evaluates a jaxpr.
+
+        Args:
+            body: the jaxpr, with constants.
+            args: object arrays of scalars, without those that are constants.
+
+        Returns:
+            The results, as object arrays.
+
+        Raises:
+            UnsupportedError: the thread has no instructions for an operation.
+        """
+        if id(body) not in self._programs:
+            self._programs[id(body)] = body, Program(body.closed, _body, body.constants)
+        program = self._programs[id(body)][1]
+        values: dict[int, Entries] = dict(zip(program.inputs, args, strict=True))
+
+        def read(x: Operand) -> Entries:
+            return entries(x.value) if isinstance(x, Constant) else values[x]
+
+        for operation in program.operations:
+            results = self._apply(operation, list(map(read, operation.inputs)))
+            values.update(zip(operation.outputs, results, strict=True))
+        return list(map(read, program.outputs))
+
+    def _apply(self, operation: Operation, operands: list[Entries]) -> Sequence[Entries]:
+        """Writes an operation; returns its results."""
+        name, params = operation.name, operation.params
+        if operation.effects:
+            raise UnsupportedError(f"{name}, which has side effects")
+        if name in OTHERS:
+            return OTHERS[name](self, params, operands)
+        if name in MOVES:
+            return [STRUCTURAL[name](params, *operands)]
+        return [self._each(name, params, operands)]
+
+    def _each(self, name: str, params: Mapping[str, Any], operands: Sequence[Entries]) -> Entries:
+        """Writes an elementwise operation on all entries; returns its result."""
+        result = np.empty(np.broadcast_shapes(*(x.shape for x in operands)), object)
+        given = [np.broadcast_to(x, result.shape) for x in operands]
+        for i in np.ndindex(result.shape):
+            result[i] = self._one(name, params, *(x[i] for x in given))
+        return result
+
+    def _one(self, name: str, params: Mapping[str, Any], *operands: Any) -> Any:
+        """Writes an elementwise operation on single entries; returns its result."""
+        thread = self.thread
+        if name == "select_n":
+            if len(operands) != 3 or operands[0].dtype != bool:
+                raise UnsupportedError("a selection among more than two cases")
+            return thread.select(operands[0], operands[2], operands[1])
+        if name == "convert_element_type":
+            return thread.convert(operands[0], params["new_dtype"])
+        if name == "integer_pow":
+            return _power(thread, operands[0], params["y"])
+        if name == "round":
+            even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
+            return rounded(thread, operands[0], even)
+        if name in FUNCTIONS and isinstance(operands[0], Register):
+            return FUNCTIONS[name](thread, *operands)
+        return thread.apply(name, *operands)
+
+    def _combine(self, name: str, numbers: Iterable[Any]) -> Any:
+        """Combines numbers in pairs, then the results, until one is left."""
+        left = list(numbers)
+        while len(left) > 1:
+            pairs = itertools.zip_longest(left[::2], left[1::2])
+            left = [a if b is None else self.thread.apply(name, a, b) for a, b in pairs]
+        return left[0]
+
+    def _reduce(self, name: str, params: Mapping[str, Any], x: Entries) -> Entries:
+        """Writes a reduction."""
+        axes = params["axes"]
+        others = [a for a in range(x.ndim) if a not in axes]
+        shape = tuple(x.shape[a] for a in others)
+        rows = np.transpose(x, [*others, *axes]).reshape(*shape, -1)
+        if rows.shape[-1] == 0:
+            raise UnsupportedError(f"{name} of no entries")
+        result = np.empty(shape, object)
+        for i in np.ndindex(shape):
+            result[i] = self._combine(PAIRS[name], rows[i])
+        return result
+
+    def _dot(self, params: Mapping[str, Any], x: Entries, y: Entries) -> Entries:
+        """Writes a product of arrays, as `lax.dot_general`."""
+        (left, right), (first, second) = params["dimension_numbers"]
+        rows, columns = _contracted(x, left, first), _contracted(y, right, second)
+        batch, dtype = len(first), params.get("preferred_element_type")
+        free = rows.ndim - 1
+        result = np.empty((*rows.shape[:-1], *columns.shape[batch:-1]), object)
+        for place in np.ndindex(result.shape):
+            pairs: Any = zip(rows[place[:free]], columns[place[:batch] + place[free:]], strict=True)
+            terms = [self.thread.apply("mul", a, b) for a, b in pairs]
+            if not terms:
+                raise UnsupportedError("a product of no entries")
+            total: Any = self._combine("add", terms)
+            result[place] = total if dtype is None else self.thread.convert(total, dtype)
+        return result
+
+    def _somewhere(self, flags: Entries) -> Entries:
+        """Writes `somewhere`: a thread is a batch of one world, and combines its own flags."""
+        return _scalar(self._combine("or", flags.ravel()))
+
+    def _cond(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
+        """Writes a conditional of two branches."""
+        branches: tuple[Body, ...] = params["branches"]
+        which: Any = operands[0][()]
+        given = operands[1:]
+        if len(branches) != 2:
+            raise UnsupportedError("a conditional of more than two branches")
+        taken = self.thread.convert(which, bool)
+        if isinstance(taken, np.generic):
+            return self(branches[int(taken)], given)
+        shapes: list[tuple[int, ...]] = []
+
+        def write(body: Body) -> Callable[[], list[Scalar]]:
+            def written() -> list[Scalar]:
+                results = self(body, given)
+                shapes[:] = [x.shape for x in results]
+                return _flat(results)
+
+            return written
+
+        results = self.thread.branch(taken, write(branches[1]), write(branches[0]))
+        return _apart(results, shapes)
+
+    def _while(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
+        """Writes a loop with a condition."""
+        first = params["cond_nconsts"]
+        last = first + params["body_nconsts"]
+        outside, inside, start = operands[:first], operands[first:last], operands[last:]
+        condition = self._once(params, "cond_jaxpr")
+        body: Body = params["body_jaxpr"]
+        shapes = [x.shape for x in start]
+
+        def goes_on(carried: Sequence[Scalar]) -> Any:
+            return self(condition, [*outside, *_apart(carried, shapes)])[0][()]
+
+        def run(carried: Sequence[Scalar]) -> list[Scalar]:
+            return _flat(self(body, [*inside, *_apart(carried, shapes)]))
+
+        return _apart(self.thread.loop(goes_on, run, _flat(start)), shapes)
+
+    def _once(self, params: Mapping[str, Any], key: str) -> Body:
+        """Returns a jaxpr in the parameters of an operation as a body without constants."""
+        value = params[key]
+        return value if isinstance(value, Body) else Body(value, ())
+
+    def _scan(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
+        """Writes a loop of a known number of rounds."""
+        constants, carries = _counts(params)
+        length, body = params["length"], self._once(params, "jaxpr")
+        fixed, rows = operands[:constants], operands[constants + carries :]
+        carried = operands[constants : constants + carries]
+        if not rows and len(body.closed.jaxpr.outvars) == carries and length > 1:
+            return self._repeat(body, fixed, carried, length)
+        if not 0 < length <= MOST_ROUNDS:
+            raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
+        by_round = [_rows(x, 0) for x in rows]
+        results: list[list[Entries]] = []
+        order = range(length)
+        for k in reversed(order) if params["reverse"] else order:
+            both = self(body, [*fixed, *carried, *(x[k] for x in by_round)])
+            carried = both[:carries]
+            results.append(both[carries:])
+        if params["reverse"]:
+            results.reverse()
+        return [*carried, *(np.stack(x) for x in zip(*results, strict=True))]
+
+    def _repeat(
+        self, body: Body, fixed: list[Entries], start: list[Entries], length: int
+    ) -> list[Entries]:
+        """Writes a loop that runs a body `length` times on carried values."""
+        shapes = [x.shape for x in start]
+        one, end = np.int32(1), np.int32(length)
+
+        def goes_on(carried: Sequence[Scalar]) -> Scalar:
+            return self.thread.apply("lt", carried[0], end)
+
+        def run(carried: Sequence[Scalar]) -> list[Scalar]:
+            results = self(body, [*fixed, *_apart(carried[1:], shapes)])
+            return [self.thread.apply("add", carried[0], one), *_flat(results)]
+
+        return _apart(self.thread.loop(goes_on, run, [np.int32(0), *_flat(start)])[1:], shapes)
+
+    def _index(self, starts: Sequence[Any], sizes: Sequence[int], shape: tuple[int, ...]) -> Any:
+        """Returns, for a slice that starts at traced indices, each possible start and its flag.
+
+        Raises:
+            UnsupportedError: two of the indices are traced.
+        """
+        limits = [n - size for n, size in zip(shape, sizes, strict=True)]
+        traced = [
+            a
+            for a, (x, most) in enumerate(zip(starts, limits, strict=True))
+            if most and not isinstance(x, np.generic)
+        ]
+        if len(traced) > 1:
+            raise UnsupportedError("a slice from several traced indices")
+        known = [
+            min(max(int(x), 0), most) if isinstance(x, np.generic) else 0
+            for x, most in zip(starts, limits, strict=True)
+        ]
+        if not traced:
+            return [(tuple(known), np.True_)]
+        (axis,) = traced
+        index, places = starts[axis], []
+        for k in range(limits[axis] + 1):
+            # a start beyond the array moves to the nearest one within
+            name = "le" if k == 0 else "ge" if k == limits[axis] else "eq"
+            flag = self.thread.apply(name, index, index.dtype.type(k))
+            places.append(((*known[:axis], k, *known[axis + 1 :]), flag))
+        return places
+
+    def _dynamic_slice(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
+        """Writes a slice from a traced index, as selections among all possible slices."""
+        x, starts = operands[0], [y[()] for y in operands[1:]]
+        sizes = params["slice_sizes"]
+        result: Any = None
+        for start, flag in self._index(starts, sizes, x.shape):
+            part = x[tuple(slice(a, a + n) for a, n in zip(start, sizes, strict=True))]
+            result = (
+                part
+                if result is None
+                else self._each("select_n", {}, [_scalar(flag), result, part])
+            )
+        return [result]
+
+    def _dynamic_update_slice(
+        self, params: Mapping[str, Any], operands: list[Entries]
+    ) -> list[Entries]:
+        """Writes the replacement of a slice from a traced index."""
+        x, new, starts = operands[0], operands[1], [y[()] for y in operands[2:]]
+        result = x.copy()
+        for start, flag in self._index(starts, new.shape, x.shape):
+            place = tuple(slice(a, a + n) for a, n in zip(start, new.shape, strict=True))
+            result[place] = self._each("select_n", {}, [_scalar(flag), result[place], new])
+        return [result]
+
+    def _extreme_index(self, name: str, params: Mapping[str, Any], x: Entries) -> Entries:
+        """Writes argmax or argmin: the first index of the extreme; of NaN, if there is one."""
+        (axis,) = params["axes"]
+        rows = np.moveaxis(x, axis, -1)
+        result = np.empty(rows.shape[:-1], object)
+        dtype, thread = np.dtype(params["index_dtype"]), self.thread
+        for i in np.ndindex(result.shape):
+            best, index = rows[i][0], dtype.type(0)
+            for k, y in enumerate(rows[i][1:], 1):
+                beats = thread.apply("gt" if name == "argmax" else "lt", y, best)
+                nan = thread.apply("ne", y, y), thread.apply("eq", best, best)
+                beats = thread.apply("or", beats, thread.apply("and", *nan))
+                best, index = (
+                    thread.select(beats, y, best),
+                    thread.select(beats, dtype.type(k), index),
+                )
+            result[i] = index
+        return result
+
+    def _cumulative(self, params: Mapping[str, Any], x: Entries) -> Entries:
+        """Writes a cumulative sum."""
+        rows = np.moveaxis(x, params["axis"], 0)
+        rows = rows[::-1] if params["reverse"] else rows
+        sums = [rows[0]]
+        for row in rows[1:]:
+            sums.append(self._each("add", {}, [sums[-1], row]))
+        whole = np.stack(sums[::-1] if params["reverse"] else sums)
+        return np.moveaxis(whole, 0, params["axis"])
+
+
+def entries(x: Any) -> Entries:
+    """Returns a known array as an object array of NumPy numbers."""
+    if not isinstance(x, np.ndarray | np.generic | int | float | bool) and not hasattr(x, "dtype"):
+        raise UnsupportedError(f"a constant of type {type(x).__name__}")
+    try:
+        array = np.asarray(x)
+    except TypeError as error:  # a random key
+        raise UnsupportedError("a constant that is no array of numbers") from error
+    result = np.empty(array.shape, object)
+    for i in np.ndindex(array.shape):
+        result[i] = array[i]
+    return result
+
+
+def _zeros(params: Mapping[str, Any]) -> Entries:
+    """Returns zeros in place of an array whose entries may be anything."""
+    return entries(np.zeros(params.get("shape", ()), params["dtype"]))
+
+
+def _scalar(x: Scalar) -> Entries:
+    """Returns a scalar as an object array, ()."""
+    result = np.empty((), object)
+    result[()] = x
+    return result
+
+
+def _flat(arrays: Sequence[Entries]) -> list[Scalar]:
+    """Returns the entries of arrays, one after the other."""
+    return [x for array in arrays for x in array.ravel()]
+
+
+def _apart(flat: Sequence[Scalar], shapes: Sequence[tuple[int, ...]]) -> list[Entries]:
+    """Returns arrays of these shapes with the given entries; reverses `_flat`."""
+    given = iter(flat)
+    arrays = []
+    for shape in shapes:
+        array = np.empty(shape, object)
+        for i in np.ndindex(shape):
+            array[i] = next(given)
+        arrays.append(array)
+    return arrays
+
+
+def _contracted(x: Entries, summed: Sequence[int], batch: Sequence[int]) -> Entries:
+    """Moves batch axes of an array first and those that are summed last, as one axis."""
+    free = [a for a in range(x.ndim) if a not in (*summed, *batch)]
+    moved = np.transpose(x, [*batch, *free, *summed])
+    return moved.reshape(*moved.shape[: len(batch) + len(free)], -1)
+
+
+def _counts(params: Mapping[str, Any]) -> tuple[int, int]:
+    """Returns the numbers of constants and of carried values of a scan.
+
+    From JAX 0.11 on, a tree of the arguments takes the place of these numbers.
+    """
+    if "num_consts" in params:
+        return params["num_consts"], params["num_carry"]
+    constants, carried, _ = (len(group) for group in params["ft_in"].unpack())
+    return constants, carried
+
+
+def _power(thread: Thread, x: Scalar, exponent: int) -> Scalar:
+    """Writes xⁿ by repeated squaring."""
+    result, square, left = None, x, abs(exponent)
+    while left:
+        if left & 1:
+            result = square if result is None else thread.apply("mul", result, square)
+        left >>= 1
+        square = thread.apply("mul", square, square) if left else square
+    one = x.dtype.type(1)
+    if result is None:
+        return one
+    return thread.apply("div", one, result) if exponent < 0 else result
+
+
+def _pad(params: Mapping[str, Any], x: Entries, value: Entries) -> Entries:
+    """Pads an array with a value, also between entries, or cuts its ends off."""
+    config = params["padding_config"]
+    inner = [
+        n + max(n - 1, 0) * between for n, (_, _, between) in zip(x.shape, config, strict=True)
+    ]
+    spread = np.empty(inner, object)
+    spread[...] = value[()]
+    spread[tuple(slice(None, None, between + 1) for _, _, between in config)] = x
+    ends = [(max(low, 0), max(high, 0)) for low, high, _ in config]
+    padded = np.empty([n + a + b for n, (a, b) in zip(inner, ends, strict=True)], object)
+    padded[...] = value[()]
+    padded[tuple(slice(a, a + n) for n, (a, _) in zip(inner, ends, strict=True))] = spread
+    cut = [
+        slice(max(-low, 0), n - max(-high, 0))
+        for n, (low, high, _) in zip(padded.shape, config, strict=True)
+    ]
+    return padded[tuple(cut)]
+
+
+def _gather(params: Mapping[str, Any], x: Entries, indices: Entries) -> Entries:
+    """Takes rows at known indices, as in x[indices].
+
+    Raises:
+        UnsupportedError: the indices are traced, or the gather takes anything but whole rows.
+    """
+    numbers = params["dimension_numbers"]
+    rank = x.ndim
+    whole = tuple(params["slice_sizes"]) == (1, *x.shape[1:])
+    plain = tuple(numbers.start_index_map) == (0,) and tuple(numbers.collapsed_slice_dims) == (0,)
+    last = tuple(numbers.offset_dims) == tuple(range(indices.ndim - 1, indices.ndim + rank - 2))
+    known = all(isinstance(i, np.generic) for i in indices.ravel())
+    if not (whole and plain and last and known) or indices.shape[-1] != 1:
+        raise UnsupportedError("a gather at traced indices")
+    places = np.clip(indices[..., 0].astype(int), 0, len(x) - 1)
+    return x[places]
+
+
+def _rows(x: Entries, axis: int) -> list[Entries]:
+    """Returns the slices of an array at each index along an axis, without this axis."""
+    return [np.take(x, [k], axis).squeeze(axis) for k in range(x.shape[axis])]
+
+
+Other = Callable[[Evaluation, Mapping[str, Any], list[Entries]], Sequence[Entries]]
+
+OTHERS: dict[str, Other] = {
+    "argmax": lambda run, params, x: [run._extreme_index("argmax", params, *x)],
+    "argmin": lambda run, params, x: [run._extreme_index("argmin", params, *x)],
+    "cond": Evaluation._cond,
+    "cumsum": lambda run, params, x: [run._cumulative(params, *x)],
+    "dot_general": lambda run, params, x: [run._dot(params, *x)],
+    "dynamic_slice": Evaluation._dynamic_slice,
+    "dynamic_update_slice": Evaluation._dynamic_update_slice,
+    "empty": lambda run, params, x: [_zeros(params)],
+    "empty2": lambda run, params, x: [_zeros(params)],
+    "expand_dims": lambda run, params, x: [np.expand_dims(x[0], params["dimensions"])],
+    "gather": lambda run, params, x: [_gather(params, *x)],
+    "iota": lambda run, params, x: [entries(STRUCTURAL["iota"](params))],
+    "pad": lambda run, params, x: [_pad(params, *x)],
+    "rev": lambda run, params, x: [np.flip(x[0], params["dimensions"])],
+    "scan": Evaluation._scan,
+    "somewhere": lambda run, params, x: [run._somewhere(*x)],
+    "stack": lambda run, params, x: [np.stack(x, params["axis"])],
+    "unstack": lambda run, params, x: _rows(x[0], params["axis"]),
+    "while": Evaluation._while,
+}
+"""Operations that are neither elementwise nor in `MOVES`."""
+OTHERS |= {name: lambda run, params, x: x for name in PLACINGS}
+OTHERS |= {
+    name: lambda run, params, x, name=name: [run._reduce(name, params, *x)]  # type: ignore[misc]
+    for name in PAIRS
+}

@@ -1,0 +1,391 @@
+"""Kernels for NVIDIA's GPUs, run on the CPU by `ptx_machine`."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import ptx_machine
+import pytest
+from jax.extend.core import Literal
+
+import jaxcon as jc
+from benchmarks import legged, mechanisms
+from jaxcon.staging import batch_last, cuda
+from jaxcon.staging.elementary import FUNCTIONS
+from jaxcon.staging.entries import Body, Evaluation
+from jaxcon.staging.ptx import Thread, UnsupportedError
+
+DT = 0.002
+CALL = "__gpu$xla.gpu.ptx"
+
+
+@cuda.kernel_p.def_impl
+def _(*args: Any, text: str, shapes: Any, worlds: int) -> list[Any]:
+    results = [np.full(shape, 77, dtype) for shape, dtype in shapes]  # every entry is written
+    ptx_machine.run(text, [np.array(x) for x in args] + results)
+    return list(map(jnp.asarray, results))
+
+
+def by_threads(function: Callable[..., Any], *args: Any) -> Any:
+    """Evaluates a function, with each native function in it as a kernel."""
+    closed, shapes = jax.make_jaxpr(function, return_shape=True)(*args)
+    values = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+    values |= dict(zip(closed.jaxpr.invars, jax.tree.leaves(args), strict=True))
+    kernels = 0
+
+    def read(x: Any) -> Any:
+        return jnp.asarray(x.val, x.aval.dtype) if isinstance(x, Literal) else values[x]
+
+    for equation in closed.jaxpr.eqns:
+        given, params = [jnp.asarray(read(x)) for x in equation.invars], equation.params
+        if equation.primitive is batch_last.native_p:
+            results: Any = cuda.run(params["fun"], given, params["rank"])
+            kernels += 1
+        else:
+            results = equation.primitive.bind(*given, **params)
+        if not equation.primitive.multiple_results:
+            results = [results]
+        values.update(zip(equation.outvars, results, strict=True))
+    assert kernels
+    return jax.tree.unflatten(jax.tree.structure(shapes), list(map(read, closed.jaxpr.outvars)))
+
+
+def assert_close(x: Any, y: Any, share: float) -> None:
+    """Asserts that two trees differ by at most a share of the largest entry of each array."""
+    for a, b in zip(jax.tree.leaves(x), jax.tree.leaves(y), strict=True):
+        assert (a.shape, a.dtype) == (b.shape, b.dtype)
+        np.testing.assert_allclose(a, b, rtol=0, atol=share * np.abs(b).max(initial=1e-30))
+
+
+def batch(name: str, dtype: Any, worlds: int = 3) -> tuple[Any, jc.State]:
+    """Returns a scene, and a batch of states of different speeds."""
+    system, state = mechanisms.find(name).build(dtype)
+    random = np.random.default_rng(0).standard_normal((worlds, *state.v.shape))
+    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (worlds, *x.shape)), state)
+    return system, dataclasses.replace(states, v=states.v + jnp.asarray(0.3 * random, dtype))
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "share"),
+    [
+        ("pendulum", np.float32, 1e-6),
+        ("four-bar", np.float32, 1e-5),
+        ("four-bar", np.float64, 1e-14),
+        ("chain-5", np.float64, 1e-13),
+    ],
+)
+def test_a_step_is_that_on_the_cpu(name, dtype, share):
+    with jax.enable_x64(dtype == np.float64):
+        system, states = batch(name, dtype)
+        step = jax.vmap(lambda s: jc.step(system, jc.Method(), s, None, DT)[0])
+        assert_close(by_threads(step, states), jax.jit(step)(states), share)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "four-bar"])
+def test_a_gradient_is_that_on_the_cpu(name):
+    with jax.enable_x64(True):
+        system, states = batch(name, np.float64)
+
+        def loss(v: Any, dt: Any) -> Any:
+            moved = dataclasses.replace(states, v=v)
+            step = jax.vmap(lambda s: jc.step(system, jc.Method(), s, None, dt)[0])
+            return jnp.sum(step(moved).q ** 2)
+
+        slope = jax.grad(loss, argnums=(0, 1))  # dt is shared: its slope is a sum over worlds
+        h = jnp.asarray(DT)
+        assert_close(by_threads(slope, states.v, h), jax.jit(slope)(states.v, h), 1e-12)
+
+
+def test_a_robot_on_the_floor_steps_as_on_the_cpu():
+    with jax.enable_x64(True):
+        robot = jc.from_mjcf(str(legged.ASSETS / "hopper.xml"), dtype=jnp.float64)
+        method, system, model = robot.method(), robot.system, legged.load("hopper")
+        poses = jnp.asarray([legged.start(model, seed) for seed in range(2)])
+        states = jax.jit(jax.vmap(lambda q: legged.begun(robot, method, q)))(poses)
+        u = jnp.zeros((400, system.layout.n_u))
+
+        def fall(state: jc.State) -> jc.State:
+            return jc.rollout(system, method, state, u, DT, 400, record=lambda s, i: None)[0]
+
+        landed = jax.jit(jax.vmap(fall))(states)
+        step = jax.vmap(lambda s: jc.step(system, method, s, u[0], DT)[0])
+        here, there = by_threads(step, landed), jax.jit(step)(landed)
+        assert any(np.abs(x).max(initial=0) > 0 for x in there.memory)  # it stands on the floor
+        assert_close((here.q, here.v), (there.q, there.v), 1e-9)
+
+
+def test_nested_batches_and_single_worlds():
+    system, states = batch("pendulum", np.float32, 6)
+    step = lambda s: jc.step(system, jc.Method(), s, None, DT)[0]  # noqa: E731
+    twice = jax.tree.map(lambda x: x.reshape(2, 3, *x.shape[1:]), states)
+    assert_close(by_threads(jax.vmap(jax.vmap(step)), twice), jax.vmap(jax.vmap(step))(twice), 1e-6)
+    one = jax.tree.map(lambda x: x[0], states)
+    text = lowered(step, one)
+    assert text.count(CALL) == 1
+
+
+def evaluated(function: Callable[..., Any], *args: np.ndarray) -> list[np.ndarray]:
+    """Evaluates a function of arrays by one thread."""
+    closed = jax.make_jaxpr(function)(*args)
+    thread, args = Thread(), [np.array(x, order="C") for x in args]
+    arrays = [*args, *(np.zeros(x.shape, x.dtype) for x in closed.out_avals)]
+    thread.start(1, [0] * len(arrays))
+
+    def address(k: int, entry: int) -> str:
+        return thread.address(k, entry * arrays[k].dtype.itemsize)
+
+    given = []
+    for k, x in enumerate(args):
+        loaded = np.empty(x.shape, object)
+        for entry, place in enumerate(np.ndindex(x.shape)):
+            loaded[place] = thread.load(address(k, entry), x.dtype)
+        given.append(loaded)
+    for k, y in enumerate(Evaluation(thread)(Body(closed, ()), given), len(args)):
+        for entry, number in enumerate(y.ravel()):
+            thread.store(address(k, entry), number)
+    ptx_machine.run(thread.text("tried", len(arrays)), arrays)
+    return arrays[len(args) :]
+
+
+def expected(function: Callable[..., Any], *args: np.ndarray) -> list[Any]:
+    """Evaluates a function of arrays by XLA."""
+    return jax.tree.leaves(jax.jit(function)(*args))
+
+
+SPECIAL = np.array([0.0, -0.0, 1.0, -1.5, 2.5, 0.5, 3e7, np.inf, -np.inf, np.nan])
+GRID = np.stack(np.meshgrid(SPECIAL, SPECIAL), -1).reshape(-1, 2)
+BINARY = {
+    "max": jnp.maximum,
+    "min": jnp.minimum,
+    "eq": jnp.equal,
+    "ne": jnp.not_equal,
+    "lt": jnp.less,
+    "ge": jnp.greater_equal,
+    "add": jnp.add,
+    "sub": jnp.subtract,
+    "div": jnp.divide,
+    "atan2": jnp.arctan2,
+}
+UNARY = {
+    "floor": jnp.floor,
+    "ceil": jnp.ceil,
+    "round": jnp.round,
+    "sign": jax.lax.sign,
+    "is_finite": jnp.isfinite,
+    "abs": jnp.abs,
+    "neg": jnp.negative,
+    "integer": lambda x: x.astype(jnp.int32),
+    "bool": lambda x: x.astype(bool),
+    "power": lambda x: x**-3,
+    "rsqrt": jax.lax.rsqrt,
+    "clamp": lambda x: jnp.clip(x, -1, 1),
+    "halves away": lambda x: jax.lax.round(x, jax.lax.RoundingMethod.AWAY_FROM_ZERO),
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", [*BINARY, *UNARY])
+def test_special_numbers(name, dtype):
+    with jax.enable_x64(dtype == np.float64):
+        function = BINARY.get(name) or UNARY[name]
+        args = GRID.T.astype(dtype) if name in BINARY else [SPECIAL.astype(dtype)]
+        (here,), (there,) = evaluated(function, *args), expected(function, *args)
+        np.testing.assert_allclose(here, there, rtol=4 * np.finfo(dtype).eps)
+        if np.issubdtype(here.dtype, np.floating) and name not in ("max", "min", "sub", "add"):
+            numbers = ~np.isnan(here)
+            signs = np.signbit(here)[numbers], np.signbit(np.asarray(there))[numbers]
+            np.testing.assert_array_equal(*signs)
+
+
+REAL = np.linspace(-30, 30, 61)
+RANGES = {
+    "sin": np.concatenate([REAL, [1e3, -1e5, 1e8, np.inf, np.nan]]),
+    "cos": np.concatenate([REAL, [1e3, -1e5, 1e8, np.inf, np.nan]]),
+    "tan": REAL,
+    "atan": np.concatenate([REAL, np.linspace(-2, 2, 41), [np.inf, -np.inf, np.nan]]),
+    "asin": np.linspace(-1, 1, 41),
+    "acos": np.concatenate([np.linspace(-1, 1, 41), [1.5]]),
+    "exp": np.concatenate([REAL, [-800, 800, 88.5, -103, 0, np.inf, -np.inf, np.nan]]),
+    "log": np.concatenate([np.geomspace(1e-40, 1e30, 71), [0, 1, -1, np.inf, np.nan]]),
+    "tanh": np.concatenate([REAL, np.linspace(-0.2, 0.2, 21), [np.inf, np.nan]]),
+    "logistic": REAL,
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", [x for x in FUNCTIONS if x != "atan2"])
+def test_elementary_functions(name, dtype):
+    """Against the exact values of the rounded arguments, in 80 bits."""
+    x = RANGES[name].astype(dtype)
+    function = getattr(jax.lax, name)
+    with jax.enable_x64(dtype == np.float64), np.errstate(all="ignore"):
+        wide = x.astype(np.longdouble)
+        exact = {
+            "asin": np.arcsin,
+            "acos": np.arccos,
+            "atan": np.arctan,
+            "logistic": lambda y: 1 / (1 + np.exp(-y)),
+        }.get(name) or getattr(np, name)
+        if name in ("tanh", "logistic") and dtype == np.float64:
+            with pytest.raises(UnsupportedError):
+                evaluated(function, x)
+            return
+        (here,) = evaluated(function, x)
+        right = exact(wide).astype(dtype)
+        bound = 3e-7 if dtype == np.float32 else 1e-15
+        error = np.abs(here - right) / np.maximum(np.abs(right), 1)
+        error = np.where((here == right) | (np.isnan(here) & np.isnan(right)), 0, error)
+        # tan is steep near its poles, and the tiniest results have few bits
+        assert np.max(error) <= (8 if name == "tan" else 1) * bound, x[np.argmax(error)]
+
+
+def swapped(x: Any, y: Any) -> Any:
+    """Carries values that change places, under a condition on one of them."""
+    return jax.lax.while_loop(
+        lambda c: c[2] < 5, lambda c: (c[1], c[0] + 1, c[2] + 1), (x, y, jnp.int32(0))
+    )
+
+
+def branched(x: Any, y: Any) -> Any:
+    def deep() -> Any:
+        return jax.lax.cond(y > 1, lambda: (x * 2, y), lambda: (x, y + x))
+
+    return jax.lax.cond(x > 0, deep, lambda: (y, x))
+
+
+def scanned(x: Any) -> Any:
+    def body(carry: Any, row: Any) -> Any:
+        return carry * 2 + row[0], carry + row[1]
+
+    return jax.lax.scan(body, x[0, 0], x), jax.lax.scan(body, x[0, 0], x, reverse=True)
+
+
+def repeated(x: Any) -> Any:
+    return jax.lax.fori_loop(0, 7, lambda i, c: c * 0.5 + 1, x)
+
+
+def moved(x: Any) -> Any:
+    wide = jnp.pad(x, ((1, 2), (0, 1)), constant_values=3)
+    cut = jax.lax.pad(x, jnp.float32(5), ((-1, 0, 0), (0, 1, 1)))
+    parts = jnp.concatenate([x.T, x.T + 1], 1), x[::-1, 1:], x[jnp.array([2, 0])], jnp.stack([x, x])
+    return wide, cut, parts, jnp.cumsum(x, 0), jnp.cumsum(x[::-1], 1), x.reshape(2, 3) @ x
+
+
+def reduced(x: Any) -> Any:
+    flags = x > 1
+    return (
+        jax.lax.scan(lambda c, y: (c + y, c), x[0, 0], x[:, 0]),
+        jnp.sum(x, 1),
+        jnp.max(x),
+        jnp.min(x, 0),
+        flags.any(),
+        flags.all(0),
+        jnp.argmax(x, 1),
+        jnp.argmin(x),
+        jnp.einsum("ij,kj->ik", x, x),
+    )
+
+
+def at_place(x: Any, k: Any) -> Any:
+    return jax.lax.dynamic_index_in_dim(x, k, 0), jax.lax.dynamic_update_slice_in_dim(
+        x, x[:1], k, 0
+    )
+
+
+def whole(x: Any) -> Any:
+    k = x.astype(jnp.int32)
+    return (
+        k // 2,
+        k * 3 - 1,
+        jnp.abs(k),
+        k & 3,
+        k | 4,
+        k ^ 1,
+        ~k,
+        -k,
+        jnp.sign(k),
+        k.astype(jnp.float32),
+    )
+
+
+def logical(x: Any) -> Any:
+    p, q = x > 0, x > 1
+    return (
+        p & q,
+        p | q,
+        p ^ q,
+        ~p,
+        p == q,
+        jnp.where(p, q, ~q),
+        p & True,
+        q | False,
+        p.astype(jnp.int32),
+    )
+
+
+ARRAY = np.array([[1.0, -2.0], [3.5, 0.25], [2.0, 7.0]], np.float32)
+PLACES = [-4, 0, 1, 2, 9]
+CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
+    (swapped, (np.float32(1), np.float32(5))),
+    *[(branched, (np.float32(x), np.float32(y))) for x in (-1, 1) for y in (0, 2)],
+    (scanned, (ARRAY,)),
+    (repeated, (ARRAY,)),
+    (moved, (ARRAY,)),
+    (reduced, (ARRAY,)),
+    *[(at_place, (ARRAY, np.int32(k))) for k in PLACES],
+    (whole, (4 * ARRAY,)),
+    (logical, (ARRAY,)),
+]
+
+
+@pytest.mark.parametrize(("function", "args"), CASES)
+def test_operations(function, args):
+    here = evaluated(function, *map(np.asarray, args))
+    for x, y in zip(here, expected(function, *args), strict=True):
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(x, y, rtol=1e-6)
+
+
+def lowered(function: Callable[..., Any], *args: Any) -> str:
+    """Returns the program for NVIDIA's GPUs before XLA compiles it; this needs no GPU."""
+    return jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",)).as_text()
+
+
+@functools.cache
+def pendulums(worlds: int = 64) -> tuple[Callable[..., Any], Any]:
+    system, states = batch("pendulum", np.float32, worlds)
+    return jax.vmap(lambda s: jc.step(system, jc.Method(), s, None, DT)[0]), states
+
+
+def test_a_step_is_one_kernel():
+    step, states = pendulums()
+    text = lowered(step, states)
+    assert text.count(CALL) == 1
+    for other in ("multiply", "case", "while", "select"):
+        assert f"stablehlo.{other}" not in text
+
+
+def test_kernels_can_be_turned_off(monkeypatch):
+    step, states = pendulums()
+    monkeypatch.setenv("JAXCON_KERNELS", "off")
+    assert CALL not in lowered(lambda s: step(s), states)
+
+
+def test_exported_programs_have_no_kernels():
+    step, states = pendulums()
+    exported = jax.export.export(jax.jit(step), platforms=["cuda"])(states)
+    assert CALL not in exported.mlir_module()
+
+
+def test_what_has_no_instructions_is_left_to_xla():
+    x = jnp.ones((4, 3))
+    assert CALL in lowered(jax.vmap(lambda x: batch_last.call(jnp.sin, x)), x)
+    assert CALL not in lowered(jax.vmap(lambda x: batch_last.call(jax.lax.erf, x)), x)
+    with pytest.raises(UnsupportedError, match="erf"):
+        evaluated(jax.lax.erf, np.float32(1))
+    with pytest.raises(UnsupportedError, match="int8"):
+        evaluated(lambda x: x.astype(jnp.int8), np.float32(1))
