@@ -106,9 +106,9 @@ def _run_thread(
         elif name == "mad.wide.u32":
             array, offset = values[operands[3]]
             values[operands[0]] = array, offset + int(values[operands[1]]) * int(operands[2])
-        elif name == "add.u64" and isinstance(values[operands[1]], tuple):
+        elif name in ("add.u64", "add.s64") and isinstance(values.get(operands[1]), tuple):
             array, offset = values[operands[1]]
-            values[operands[0]] = array, offset + int(operands[2])
+            values[operands[0]] = array, offset + int(read(operands[2], kind))
         else:
             like = registers[operands[0]] if kind.startswith("b") else kind
             given = [read(x, like) for x in operands[1:]]

@@ -14,9 +14,9 @@ from jax.extend.core import Literal
 
 import jaxcon as jc
 from benchmarks import legged, mechanisms
-from jaxcon.staging import batch_last, cuda
+from jaxcon.staging import batch_last, chunks, cuda
 from jaxcon.staging.elementary import FUNCTIONS
-from jaxcon.staging.entries import Body, Evaluation
+from jaxcon.staging.entries import Evaluation, Stored
 from jaxcon.staging.ptx import Thread, UnsupportedError
 
 DT = 0.002
@@ -24,7 +24,7 @@ CALL = "__gpu$xla.gpu.ptx"
 
 
 @cuda.kernel_p.def_impl
-def _(*args: Any, text: str, shapes: Any, worlds: int) -> list[Any]:
+def _(*args: Any, text: str, shapes: Any, worlds: int, in_place: bool) -> list[Any]:
     results = [np.full(shape, 77, dtype) for shape, dtype in shapes]  # every entry is written
     ptx_machine.run(text, [np.array(x) for x in args] + results)
     return list(map(jnp.asarray, results))
@@ -44,6 +44,9 @@ def by_threads(function: Callable[..., Any], *args: Any) -> Any:
         given, params = [jnp.asarray(read(x)) for x in equation.invars], equation.params
         if equation.primitive is batch_last.native_p:
             results: Any = cuda.run(params["fun"], given, params["rank"])
+            kernels += 1
+        elif equation.primitive is chunks.worlds_p:
+            results = chunks.in_kernel(*given, fun=params["fun"], batch=params["batch"])
             kernels += 1
         else:
             results = equation.primitive.bind(*given, **params)
@@ -128,25 +131,65 @@ def test_nested_batches_and_single_worlds():
     assert text.count(CALL) == 1
 
 
+def rollouts(name: str, worlds: int = 3, steps: int = 6, **options: Any) -> tuple[Any, Any, Any]:
+    """Returns a rollout of a scene, that of a batch as one kernel, and the batch.
+
+    The rollout is traced as for more worlds than fit into a chunk.
+    """
+    system, states = batch(name, np.float64, worlds)
+
+    def run(state: jc.State) -> Any:
+        return jc.rollout(system, jc.Method(), state, None, DT, steps, **options)
+
+    many = jax.tree.map(lambda x: jax.ShapeDtypeStruct((4096, *x.shape[1:]), x.dtype), states)
+    closed, shapes = jax.make_jaxpr(jax.vmap(run), return_shape=True)(many)
+    (equation,) = (x for x in closed.jaxpr.eqns if x.primitive is chunks.worlds_p)
+    fun, axes = equation.params["fun"], equation.params["batch"].axes
+
+    def kernel(states: jc.State) -> Any:
+        leaves = iter(jax.tree.leaves(states))
+        args = [jnp.arange(steps) if a is None else next(leaves) for a in axes]
+        results = cuda.run_worlds(fun.closed, args, axes, worlds)
+        results = [jnp.moveaxis(x, -1, 0) for x in results]
+        return jax.tree.unflatten(jax.tree.structure(shapes), results)
+
+    return jax.jit(jax.vmap(run)), kernel, states
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"every": 3}, {"record": lambda state, info: None}, {"record": lambda s, i: s.v[0] > 0}],
+    ids=["all", "every third", "none", "flag"],
+)
+@pytest.mark.parametrize("name", ["pendulum", "four-bar"])
+def test_a_rollout_is_that_on_the_cpu(name, options):
+    with jax.enable_x64(True):
+        run, kernel, states = rollouts(name, **options)
+        assert_close(kernel(states), run(states), 1e-13)
+
+
+def test_the_gradient_of_a_rollout_of_many_worlds():
+    """The kernel also returns what the reverse pass needs of each step."""
+    system, states = batch("pendulum", np.float32, 513)  # more than fit into a chunk
+
+    def loss(v: Any) -> Any:
+        run = jax.vmap(lambda s: jc.rollout(system, jc.Method(), s, None, DT, 3)[0].q)
+        return jnp.sum(run(dataclasses.replace(states, v=v)) ** 2)
+
+    assert_close(by_threads(jax.grad(loss), states.v), jax.jit(jax.grad(loss))(states.v), 1e-5)
+
+
 def evaluated(function: Callable[..., Any], *args: np.ndarray) -> list[np.ndarray]:
     """Evaluates a function of arrays by one thread."""
-    closed = jax.make_jaxpr(function)(*args)
-    thread, args = Thread(), [np.array(x, order="C") for x in args]
+    args = [np.array(x, order="C") for x in args]
+    closed, thread = jax.make_jaxpr(function)(*args), Thread()
     arrays = [*args, *(np.zeros(x.shape, x.dtype) for x in closed.out_avals)]
     thread.start(1, [0] * len(arrays))
-
-    def address(k: int, entry: int) -> str:
-        return thread.address(k, entry * arrays[k].dtype.itemsize)
-
-    given = []
-    for k, x in enumerate(args):
-        loaded = np.empty(x.shape, object)
-        for entry, place in enumerate(np.ndindex(x.shape)):
-            loaded[place] = thread.load(address(k, entry), x.dtype)
-        given.append(loaded)
-    for k, y in enumerate(Evaluation(thread)(Body(closed, ()), given), len(args)):
-        for entry, number in enumerate(y.ravel()):
-            thread.store(address(k, entry), number)
+    stored = [
+        Stored(thread, thread.pointer(k), x.dtype.itemsize, x.shape, x.dtype)
+        for k, x in enumerate(arrays)
+    ]
+    Evaluation(thread).store(closed, stored[: len(args)], stored[len(args) :], streams=True)
     ptx_machine.run(thread.text("tried", len(arrays)), arrays)
     return arrays[len(args) :]
 
@@ -367,6 +410,17 @@ def test_a_step_is_one_kernel():
     assert text.count(CALL) == 1
     for other in ("multiply", "case", "while", "select"):
         assert f"stablehlo.{other}" not in text
+
+
+def test_a_rollout_of_many_worlds_is_one_kernel():
+    system, states = batch("pendulum", np.float32, 4096)
+    run = jax.vmap(lambda s: jc.rollout(system, jc.Method(), s, None, DT, 100))
+    text = lowered(run, states)
+    assert text.count(CALL) == 1
+    assert "stablehlo.while" not in text
+    # loops that would take seconds are left to several kernels
+    run = jax.vmap(lambda s: jc.rollout(system, jc.Method(), s, None, DT, 10**6)[0])
+    assert "stablehlo.while" in lowered(run, states)
 
 
 def test_kernels_can_be_turned_off(monkeypatch):

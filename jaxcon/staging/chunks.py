@@ -29,9 +29,10 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core.jaxprs import without_unused
 from jaxcon.core.typing import Array, PyTree, T
-from jaxcon.staging import batch_last, meshes
+from jaxcon.staging import batch_last, cuda, meshes
 from jaxcon.staging.operations import inside
 from jaxcon.staging.program import is_known
+from jaxcon.staging.ptx import UnsupportedError
 
 Flags = tuple[bool, ...]
 """A truth value for each array of a list."""
@@ -554,6 +555,23 @@ def _in_chunks(*args: Array, fun: OneWorld, batch: Batch, devices: int) -> list[
     return list(merged(differ, list(map(plan.join, results, axes)), unbatched))
 
 
+def _at_once(*args: Array, fun: OneWorld, batch: Batch) -> list[Array]:
+    """Evaluates a function in all worlds at once."""
+    return fun.vmapped(batch)(*args)
+
+
+def in_kernel(*args: Array, fun: OneWorld, batch: Batch) -> list[Array]:
+    """Evaluates a function as one kernel, which runs all steps; at once if that cannot be."""
+    if batch.size is None:
+        return _at_once(*args, fun=fun, batch=batch)
+    try:
+        results = cuda.run_worlds(fun.closed, args, batch.axes, batch.size)
+    except UnsupportedError:
+        return _at_once(*args, fun=fun, batch=batch)
+    pairs = zip(results, batch.out_axes, strict=True)
+    return [y[..., 0] if axis is None else jnp.moveaxis(y, -1, axis) for y, axis in pairs]
+
+
 def _pullback_in_chunks(*args: Array, pull: Pullback, devices: int) -> list[Array]:
     """Evaluates a pullback in chunks of worlds, and adds up what worlds share."""
     plan = plan_chunks(pull.batch.size, pull.function.chunk_size, devices)
@@ -694,9 +712,19 @@ def plan_chunks(worlds: int | None, chunk_size: int, devices: int) -> Chunks | N
 
 
 def _lower(
-    primitive: Primitive, at_once: Callable[..., Any], in_chunks: Callable[..., Any]
+    primitive: Primitive,
+    at_once: Callable[..., Any],
+    in_chunks: Callable[..., Any],
+    in_kernel: Callable[..., Any] | None = None,
 ) -> None:
-    """Registers the lowering rules of a primitive: in chunks on CPUs, at once elsewhere."""
+    """Registers the lowering rules of a primitive.
+
+    Args:
+        primitive: the primitive.
+        at_once: evaluates it in all worlds at once.
+        in_chunks: evaluates it in chunks, on CPUs.
+        in_kernel: evaluates it as one kernel, on NVIDIA's GPUs; None for `at_once`.
+    """
 
     def rule(ctx: mlir.LoweringRuleContext, *args: Any, jaxpr: ClosedJaxpr, **params: Any) -> Any:
         # the devices over which the compiler may spread a batch
@@ -707,8 +735,13 @@ def _lower(
     def whole(ctx: mlir.LoweringRuleContext, *args: Any, jaxpr: ClosedJaxpr, **params: Any) -> Any:
         return mlir.lower_fun(at_once, multiple_results=True)(ctx, *args, **params)
 
+    def kernel(ctx: mlir.LoweringRuleContext, *args: Any, jaxpr: ClosedJaxpr, **params: Any) -> Any:
+        function = in_kernel if in_kernel and cuda.is_possible(ctx) else at_once
+        return mlir.lower_fun(function, multiple_results=True)(ctx, *args, **params)
+
     mlir.register_lowering(primitive, whole)
     mlir.register_lowering(primitive, rule, platform="cpu")
+    mlir.register_lowering(primitive, kernel, platform="cuda")
 
 
 worlds_p.def_impl(lambda *args, fun, batch, jaxpr: fun.compiled(*args, batch=batch))
@@ -717,7 +750,7 @@ batching.primitive_batchers[worlds_p] = _batched
 ad.primitive_jvps[worlds_p] = _jvp
 ad.primitive_transposes[worlds_p] = _transpose
 partial_eval.dce_rules[worlds_p] = _without_unused
-_lower(worlds_p, lambda *args, fun, batch: fun.vmapped(batch)(*args), _in_chunks)
+_lower(worlds_p, _at_once, _in_chunks, in_kernel)
 
 pullback_p.def_impl(lambda *args, pull, jaxpr: pull.function.pullback(*args, masks=pull[1:]))
 pullback_p.def_abstract_eval(

@@ -20,11 +20,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Primitive
 from jax.interpreters import mlir
 
 from jaxcon.core.typing import Array
-from jaxcon.staging.entries import Body, Evaluation
+from jaxcon.staging.entries import Evaluation, Stored
 from jaxcon.staging.program import traced
 from jaxcon.staging.ptx import BLOCK, Thread, UnsupportedError
 
@@ -64,7 +64,7 @@ def run(fun: Native, args: Sequence[Array], rank: int) -> list[Array]:
     flat = [_merged(x, batch) for x in args]
     worlds = math.prod(batch)
     text, shapes = _written(fun.alone(), [(x.shape, x.dtype) for x in flat], worlds)
-    results = kernel_p.bind(*flat, text=text, shapes=shapes, worlds=worlds)
+    results = kernel_p.bind(*flat, text=text, shapes=shapes, worlds=worlds, in_place=True)
     apart = [y.reshape((*y.shape[:-1], *batch)) for y in results]
     like = fun.shapes([ShapedArray(x.shape, x.dtype) for x in args])
     return [_reduced(y, x.shape, fun.sums) for y, x in zip(apart, like, strict=True)]
@@ -89,61 +89,90 @@ def _merged(x: Array, batch: tuple[int, ...]) -> Array:
     return jnp.broadcast_to(x, (*shape, *batch)).reshape((*shape, math.prod(batch)))
 
 
-def _written(
-    fun: Native, avals: Sequence[tuple[tuple[int, ...], Any]], worlds: int
-) -> tuple[str, tuple[tuple[tuple[int, ...], Any], ...]]:
-    """Writes a native function as a kernel.
+def run_worlds(
+    closed: ClosedJaxpr, args: Sequence[Array], axes: Sequence[int | None], worlds: int
+) -> list[Array]:
+    """Evaluates a function of one world in many worlds, as one kernel.
 
     Args:
-        fun: the native function.
-        avals: shapes and dtypes of its arguments, with one batch axis.
+        closed: the jaxpr of the function.
+        args: its arguments.
+        axes: the axis of worlds of each argument; None if they share it.
         worlds: the number of worlds.
 
     Returns:
-        The text, and shapes and dtypes of the results.
+        The results, with the worlds along the last axis.
+
+    Raises:
+        UnsupportedError: see `run`.
     """
+    pairs = zip(args, axes, strict=True)
+    last = [x[..., None] if a is None else jnp.moveaxis(x, a, -1) for x, a in pairs]
+    text, shapes = _kernel(closed, [(x.shape, x.dtype) for x in last], worlds, streams=True)
+    return kernel_p.bind(*last, text=text, shapes=shapes, worlds=worlds, in_place=False)
+
+
+def _written(
+    fun: Native, avals: Sequence[tuple[tuple[int, ...], Any]], worlds: int
+) -> tuple[str, tuple[tuple[tuple[int, ...], Any], ...]]:
+    """Writes a native function as a kernel; see `_kernel`."""
     one = [jax.ShapeDtypeStruct((*shape[:-1], 1), dtype) for shape, dtype in avals]
-    closed = traced(fun, one)
+    text, shapes = _kernel(traced(fun, one), avals, worlds, streams=False)
+    return text, tuple(((*shape[:-2], worlds), dtype) for shape, dtype in shapes)
+
+
+def _kernel(
+    closed: ClosedJaxpr,
+    avals: Sequence[tuple[tuple[int, ...], Any]],
+    worlds: int,
+    streams: bool,
+) -> tuple[str, tuple[tuple[tuple[int, ...], Any], ...]]:
+    """Writes a function of one world as a kernel.
+
+    Args:
+        closed: the jaxpr of the function.
+        avals: shapes and dtypes of the arrays of its arguments, whose last axis is that of worlds,
+            of size 1 if the worlds share the array.
+        worlds: the number of worlds.
+        streams: True if loops may write their rows to results; see `Evaluation.store`.
+
+    Returns:
+        The text of the kernel; shapes and dtypes of the results, with the worlds along a last axis.
+    """
     results = [x.aval for x in closed.jaxpr.outvars]
     count = len(avals) + len(results)
     if count > MOST_POINTERS:
         raise UnsupportedError(f"{count} arrays")
     thread = Thread()
-    shared = [shape[-1] != worlds for shape, _ in avals] + [False] * len(results)
-    dtypes = [dtype for _, dtype in avals] + [x.dtype for x in results]
-    thread.start(worlds, [0 if s else _size(d) for s, d in zip(shared, dtypes, strict=True)])
-
-    def address(array: int, entry: int) -> str:
-        apart = 1 if shared[array] else worlds
-        return thread.address(array, entry * apart * _size(dtypes[array]))
-
-    given = []
-    for k, x in enumerate(one):
-        array = np.empty(x.shape, object)
-        for entry, place in enumerate(np.ndindex(x.shape)):
-            array[place] = thread.load(address(k, entry), x.dtype)
-        given.append(array)
-    for k, y in enumerate(Evaluation(thread)(Body(closed, ()), given), len(avals)):
-        for entry, number in enumerate(y.ravel()):
-            thread.store(address(k, entry), number)
+    each = [worlds > 1 and shape[-1] == worlds for shape, _ in avals] + [True] * len(results)
+    kinds = [x.aval for x in closed.jaxpr.invars] + results
+    sizes = [np.dtype(x.dtype).itemsize for x in kinds]
+    thread.start(worlds, [n if own else 0 for n, own in zip(sizes, each, strict=True)])
+    arrays = [
+        Stored(thread, thread.pointer(k), worlds * n if own else n, x.shape, x.dtype)
+        for k, (x, n, own) in enumerate(zip(kinds, sizes, each, strict=True))
+    ]
+    Evaluation(thread).store(closed, arrays[: len(avals)], arrays[len(avals) :], streams)
     text = thread.text(NAME, count)
     if (lines := text.count("\n")) > MOST_LINES:
         raise UnsupportedError(f"{lines} instructions")
-    return text, tuple(((*x.shape[:-1], worlds), x.dtype) for x in results)
+    return text, tuple(((*x.shape, worlds), x.dtype) for x in results)
 
 
-def _size(dtype: Any) -> int:
-    """Returns the bytes of a number in memory."""
-    return np.dtype(dtype).itemsize
-
-
-def _abstract(*args: ShapedArray, text: str, shapes: Any, worlds: int) -> list[ShapedArray]:
+def _abstract(
+    *args: ShapedArray, text: str, shapes: Any, worlds: int, in_place: bool
+) -> list[ShapedArray]:
     """The abstract evaluation rule: returns the shapes and dtypes of the results."""
     return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
 def _lowered(
-    ctx: mlir.LoweringRuleContext, *args: Any, text: str, shapes: Any, worlds: int
+    ctx: mlir.LoweringRuleContext,
+    *args: Any,
+    text: str,
+    shapes: Any,
+    worlds: int,
+    in_place: bool,
 ) -> Sequence[Any]:
     """The lowering rule: a call of the kernel, whose arrays lie in memory with the batch last."""
     number = mlir.ir.IntegerType.get_signless(32)
@@ -164,13 +193,13 @@ def _lowered(
         TARGET,
         operand_layouts=list(map(_batch_last, ctx.avals_in)),
         result_layouts=list(map(_batch_last, ctx.avals_out)),
-        operand_output_aliases=_in_place(ctx.avals_in, ctx.avals_out),
+        operand_output_aliases=_pairs(ctx.avals_in, ctx.avals_out) if in_place else {},
         backend_config=config,
     )
     return call(ctx, *args)
 
 
-def _in_place(args: Sequence[Any], results: Sequence[Any]) -> dict[int, int]:
+def _pairs(args: Sequence[Any], results: Sequence[Any]) -> dict[int, int]:
     """Returns which argument lends its memory to which result, of the same shape and dtype.
 
     A loop then carries a state without copies. Each thread reads its world before it writes.

@@ -7,7 +7,9 @@ instructions of each entry of their results.
 
 from __future__ import annotations
 
+import functools
 import itertools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -16,6 +18,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from jaxcon.core.host import STRUCTURAL
+from jaxcon.core.jaxprs import read_arguments
 from jaxcon.staging.elementary import FUNCTIONS, rounded
 from jaxcon.staging.program import Constant, Operand, Operation, Program
 from jaxcon.staging.ptx import Register, Scalar, Thread, UnsupportedError
@@ -35,6 +38,82 @@ PLACINGS = ("mesh_cast", "pvary", "reshard", "sharding_constraint")
 
 MOST_ROUNDS = 64
 """The largest number of rounds of a loop that is written round by round."""
+
+
+MOST_LOADS = 4096
+"""The largest number of entries of an array in memory that are read outside of loops."""
+
+MOST_WORK = 10**8
+"""The largest number of instructions of a loop, over all rounds: about half a second.
+
+A GPU that also shows a screen stops kernels that run for seconds.
+"""
+
+
+class Stored:
+    """An array in memory, whose entries are read where they are needed.
+
+    Attributes:
+        shape, dtype: those of the array.
+    """
+
+    def __init__(
+        self, thread: Thread, pointer: Register, apart: int, shape: tuple[int, ...], dtype: Any
+    ) -> None:
+        """Names an array in memory.
+
+        Args:
+            thread: the thread that reads or writes it.
+            pointer: the address of its first entry.
+            apart: the bytes from one entry to the next.
+            shape: its shape.
+            dtype: its dtype.
+        """
+        self.thread, self.pointer, self.apart = thread, pointer, apart
+        self.shape, self.dtype = tuple(shape), np.dtype(dtype)
+
+    def address(self, entry: int) -> str:
+        """Returns the address of an entry, by its number in the flat array."""
+        return self.thread.address(self.pointer, entry * self.apart)
+
+    @functools.cached_property
+    def entries(self) -> Entries:
+        """All entries, which are read once."""
+        if math.prod(self.shape) > MOST_LOADS:
+            raise UnsupportedError(f"an array of shape {self.shape} outside of a loop")
+        result = np.empty(self.shape, object)
+        for entry, place in enumerate(np.ndindex(self.shape)):
+            result[place] = self.thread.load(self.address(entry), self.dtype)
+        return result
+
+    def write(self, values: Entries) -> None:
+        """Writes all entries."""
+        for entry, number in enumerate(values.ravel()):
+            self.thread.store(self.address(entry), number)
+
+    def reshaped(self, shape: tuple[int, ...]) -> Stored:
+        """Returns the array in another shape."""
+        return Stored(self.thread, self.pointer, self.apart, shape, self.dtype)
+
+    def row(self, index: Scalar) -> Stored:
+        """Returns the slice at an index of the first axis."""
+        stride = math.prod(self.shape[1:]) * self.apart
+        pointer = self.thread.moved(self.pointer, index, stride)
+        return Stored(self.thread, pointer, self.apart, self.shape[1:], self.dtype)
+
+
+class _Nowhere:
+    """Takes the place of an array in memory for a result that nothing reads."""
+
+    def row(self, index: Scalar) -> _Nowhere:
+        """Returns itself."""
+        return self
+
+    def write(self, values: Entries) -> None:
+        """Writes nothing."""
+
+
+NOWHERE = _Nowhere()
 
 
 class Body(NamedTuple):
@@ -59,14 +138,43 @@ class Evaluation:
 
     def __init__(self, thread: Thread) -> None:
         self.thread = thread
+        # where the results of a loop go, by the number of the value in the outermost program
+        self._sinks: dict[int, Stored | _Nowhere] = {}
         self._programs: dict[int, tuple[Body, Program]] = {}
 
-    def __call__(self, body: Body, args: Sequence[Entries]) -> list[Entries]:
-        """Evaluates a jaxpr.
+    def store(
+        self, closed: ClosedJaxpr, args: Sequence[Stored], results: Sequence[Stored], streams: bool
+    ) -> None:
+        """Evaluates a jaxpr of arrays in memory, and writes its results to memory.
 
         Args:
-            body: the jaxpr, with constants.
-            args: object arrays of scalars, without those that are constants.
+            closed: the jaxpr.
+            args: its arguments.
+            results: where to write its results.
+            streams: True if loops may write rows of the results. The memory of results must then
+                not be that of arguments.
+        """
+        program = Program(closed, _body)
+        if streams:
+            read = program.readers()
+            for x in (x for operation in program.operations for x in operation.outputs):
+                if x not in read and x not in program.outputs:
+                    self._sinks[x] = NOWHERE
+            for x, place in zip(program.outputs, results, strict=True):
+                if isinstance(x, int) and x not in read and program.outputs.count(x) == 1:
+                    self._sinks[x] = place
+        pairs = zip(self._run(program, args), results, strict=True)
+        # a loop has written the results that are where they belong
+        values = [(_read(x), place) for x, place in pairs if x is not place]
+        for x, place in values:
+            place.write(x)
+
+    def __call__(self, body: Body, args: Sequence[Any]) -> list[Any]:
+        """Evaluates the body of a loop or a branch.
+
+        Args:
+            body: the body.
+            args: object arrays of scalars or arrays in memory, without those that are constants.
 
         Returns:
             The results, as object arrays.
@@ -76,10 +184,16 @@ class Evaluation:
         """
         if id(body) not in self._programs:
             self._programs[id(body)] = body, Program(body.closed, _body, body.constants)
-        program = self._programs[id(body)][1]
-        values: dict[int, Entries] = dict(zip(program.inputs, args, strict=True))
+        sinks, self._sinks = self._sinks, {}
+        results = self._run(self._programs[id(body)][1], args)
+        self._sinks = sinks
+        return list(map(_read, results))
 
-        def read(x: Operand) -> Entries:
+    def _run(self, program: Program, args: Sequence[Any]) -> list[Any]:
+        """Evaluates a program; its results may be arrays in memory."""
+        values: dict[int, Any] = dict(zip(program.inputs, args, strict=True))
+
+        def read(x: Operand) -> Any:
             return entries(x.value) if isinstance(x, Constant) else values[x]
 
         for operation in program.operations:
@@ -87,11 +201,16 @@ class Evaluation:
             values.update(zip(operation.outputs, results, strict=True))
         return list(map(read, program.outputs))
 
-    def _apply(self, operation: Operation, operands: list[Entries]) -> Sequence[Entries]:
+    def _apply(self, operation: Operation, operands: list[Any]) -> Sequence[Any]:
         """Writes an operation; returns its results."""
         name, params = operation.name, operation.params
         if operation.effects:
             raise UnsupportedError(f"{name}, which has side effects")
+        if name == "reshape" and isinstance(operands[0], Stored) and params["dimensions"] is None:
+            return [operands[0].reshaped(params["new_sizes"])]
+        if name == "scan":
+            return self._scan(params, operands, [self._sinks.get(x) for x in operation.outputs])
+        operands = list(map(_read, operands))
         if name in OTHERS:
             return OTHERS[name](self, params, operands)
         if name in MOVES:
@@ -210,21 +329,37 @@ class Evaluation:
         value = params[key]
         return value if isinstance(value, Body) else Body(value, ())
 
-    def _scan(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
-        """Writes a loop of a known number of rounds."""
+    def _scan(
+        self, params: Mapping[str, Any], operands: list[Any], sinks: Sequence[Any]
+    ) -> list[Any]:
+        """Writes a loop of a known number of rounds.
+
+        Args:
+            params: the parameters of the scan.
+            operands: its operands.
+            sinks: where each of its results goes, if it is a result of the whole program.
+        """
         constants, carries = _counts(params)
         length, body = params["length"], self._once(params, "jaxpr")
+        used = read_arguments(body.closed.jaxpr)
         fixed, rows = operands[:constants], operands[constants + carries :]
-        carried = operands[constants : constants + carries]
-        if not rows and len(body.closed.jaxpr.outvars) == carries and length > 1:
-            return self._repeat(body, fixed, carried, length)
+        fixed = list(map(_read, fixed))
+        carried = list(map(_read, operands[constants : constants + carries]))
+        rows = [
+            x if flag else None for x, flag in zip(rows, used[constants + carries :], strict=True)
+        ]
+        places = sinks[carries:]
+        inputs_fit = all(isinstance(x, Stored | None) for x in rows)
+        if length > 1 and inputs_fit and all(places) and not params["reverse"]:
+            return self._repeat(body, fixed, carried, rows, places, length)
         if not 0 < length <= MOST_ROUNDS:
             raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
-        by_round = [_rows(x, 0) for x in rows]
+        kinds = [x.aval for x in body.closed.jaxpr.invars[constants + carries :]]
         results: list[list[Entries]] = []
         order = range(length)
         for k in reversed(order) if params["reverse"] else order:
-            both = self(body, [*fixed, *carried, *(x[k] for x in by_round)])
+            given = [_row(x, k, aval) for x, aval in zip(rows, kinds, strict=True)]
+            both = self(body, [*fixed, *carried, *given])
             carried = both[:carries]
             results.append(both[carries:])
         if params["reverse"]:
@@ -232,20 +367,43 @@ class Evaluation:
         return [*carried, *(np.stack(x) for x in zip(*results, strict=True))]
 
     def _repeat(
-        self, body: Body, fixed: list[Entries], start: list[Entries], length: int
-    ) -> list[Entries]:
-        """Writes a loop that runs a body `length` times on carried values."""
+        self,
+        body: Body,
+        fixed: list[Entries],
+        start: list[Entries],
+        rows: Sequence[Stored | None],
+        places: Sequence[Any],
+        length: int,
+    ) -> list[Any]:
+        """Writes a loop that runs a body `length` times on carried values.
+
+        Args:
+            body: the body.
+            fixed: its first arguments, the same in all rounds.
+            start: the carried values at the start.
+            rows: arrays of which each round reads a row; None if the body does not read it.
+            places: arrays of which each round writes a row.
+            length: the number of rounds.
+        """
         shapes = [x.shape for x in start]
         one, end = np.int32(1), np.int32(length)
+        kinds = [x.aval for x in body.closed.jaxpr.invars[len(fixed) + len(start) :]]
+        before = len(self.thread.lines)
 
         def goes_on(carried: Sequence[Scalar]) -> Scalar:
             return self.thread.apply("lt", carried[0], end)
 
         def run(carried: Sequence[Scalar]) -> list[Scalar]:
-            results = self(body, [*fixed, *_apart(carried[1:], shapes)])
-            return [self.thread.apply("add", carried[0], one), *_flat(results)]
+            given = [_row(x, carried[0], aval) for x, aval in zip(rows, kinds, strict=True)]
+            results = self(body, [*fixed, *_apart(carried[1:], shapes), *given])
+            for x, place in zip(results[len(start) :], places, strict=True):
+                place.row(carried[0]).write(x)
+            return [self.thread.apply("add", carried[0], one), *_flat(results[: len(start)])]
 
-        return _apart(self.thread.loop(goes_on, run, [np.int32(0), *_flat(start)])[1:], shapes)
+        final = self.thread.loop(goes_on, run, [np.int32(0), *_flat(start)])
+        if (len(self.thread.lines) - before) * length > MOST_WORK:
+            raise UnsupportedError(f"a loop of {length} rounds, which would take too long")
+        return [*_apart(final[1:], shapes), *places]
 
     def _index(self, starts: Sequence[Any], sizes: Sequence[int], shape: tuple[int, ...]) -> Any:
         """Returns, for a slice that starts at traced indices, each possible start and its flag.
@@ -329,6 +487,20 @@ class Evaluation:
             sums.append(self._each("add", {}, [sums[-1], row]))
         whole = np.stack(sums[::-1] if params["reverse"] else sums)
         return np.moveaxis(whole, 0, params["axis"])
+
+
+def _read(x: Any) -> Any:
+    """Returns an array with its entries in registers."""
+    return x.entries if isinstance(x, Stored) else x
+
+
+def _row(x: Any, index: Any, aval: Any) -> Any:
+    """Returns the slice of an array at an index of its first axis; zeros if it is not needed."""
+    if x is None:
+        return entries(np.zeros(aval.shape, np.int32))
+    if isinstance(x, Stored):
+        return x.row(np.int32(index) if isinstance(index, int) else index)
+    return np.take(x, [index], 0).squeeze(0)
 
 
 def entries(x: Any) -> Entries:
@@ -466,7 +638,6 @@ OTHERS: dict[str, Other] = {
     "iota": lambda run, params, x: [entries(STRUCTURAL["iota"](params))],
     "pad": lambda run, params, x: [_pad(params, *x)],
     "rev": lambda run, params, x: [np.flip(x[0], params["dimensions"])],
-    "scan": Evaluation._scan,
     "somewhere": lambda run, params, x: [run._somewhere(*x)],
     "stack": lambda run, params, x: [np.stack(x, params["axis"])],
     "unstack": lambda run, params, x: _rows(x[0], params["axis"]),

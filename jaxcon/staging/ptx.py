@@ -338,17 +338,20 @@ class Thread:
                 self._keep(f"mad.wide.u32 {first.name}, {place.name}, {stride}, {first.name};")
             self._arrays.append(first)
 
-    def address(self, array: int, offset: int) -> str:
-        """Returns the address of an entry of an array.
+    def pointer(self, array: int) -> Register:
+        """Returns the address of the first entry of an array, in this thread's world."""
+        return self._arrays[array]
 
-        Args:
-            array: the number of the array.
-            offset: the bytes from its first entry of this world to the entry.
-        """
-        first = self._arrays[array]
+    def moved(self, pointer: Register, by: Scalar, stride: int) -> Register:
+        """Returns the address `by` strides further, where `by` is an index of a loop [B]."""
+        far = self.apply("mul", self.convert(by, np.int64), np.int64(stride))
+        return self.emit("add.s64", np.uint64, pointer, far)
+
+    def address(self, pointer: Register, offset: int) -> str:
+        """Returns the address of an entry, at an offset from another address [B]."""
         if offset < MAX_OFFSET:
-            return f"{first.name}+{offset}"
-        return self.emit("add.u64", np.uint64, first, np.uint64(offset)).name
+            return f"{pointer.name}+{offset}"
+        return self.emit("add.u64", np.uint64, pointer, np.uint64(offset)).name
 
     def text(self, name: str, pointers: int) -> str:
         """Returns the whole program, without instructions whose result is not used.
