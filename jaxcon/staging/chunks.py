@@ -3,7 +3,8 @@
 A step of a thousand worlds reads and writes more numbers than the cache of a core holds, and then
 waits for memory. `by_world` wraps a function of one world, such as a rollout, in a primitive. If
 `vmap` maps it over many worlds, a CPU evaluates it for some of them at a time, from the first step
-to the last. Other devices evaluate all worlds at once.
+to the last. On an NVIDIA GPU the function is one kernel, in which each world has a thread. Other
+devices evaluate all worlds at once, step by step.
 
 The primitive keeps the function of one world, and notes which arguments differ between worlds. In
 reverse mode, the derivative is split into two functions of one world: one returns the results and
