@@ -177,8 +177,11 @@ def _converted(how: list[str], kind: str, x: Any) -> Any:
         x = whole[rounding](x)
         if np.issubdtype(target, np.integer):
             info = np.iinfo(target)
-            limited = 0 if np.isnan(x) else min(max(float(x), float(info.min)), float(info.max))
-            return target(int(limited) if abs(limited) < 2**63 else info.max)
+            if np.isnan(x):  # 0 in 32 bits; else only the first bit is set
+                wide = x.dtype.itemsize == 8 or info.bits == 64
+                return target(info.min if info.min else 1 << (info.bits - 1)) if wide else target(0)
+            limited = min(max(float(x), float(info.min)), float(info.max))
+            return target(min(max(int(limited), int(info.min)), int(info.max)))
     return target(x)
 
 

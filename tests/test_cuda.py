@@ -179,6 +179,61 @@ def test_the_gradient_of_a_rollout_of_many_worlds():
     assert_close(by_threads(jax.grad(loss), states.v), jax.jit(jax.grad(loss))(states.v), 1e-5)
 
 
+def test_a_result_that_worlds_share_counts_once():
+    """Its cotangent belongs to no world, so that XLA evaluates the transpose."""
+    shared = lambda p, x: (2 * p, p * x)  # noqa: E731
+
+    def loss(p: Any, x: Any) -> Any:
+        a, b = jax.vmap(lambda x: batch_last.call(shared, p, x))(x)
+        return a[0] + b.sum()
+
+    p, x = jnp.asarray(3.0), jnp.arange(1.0, 5.0)
+    assert jax.grad(loss)(p, x) == 12
+    with pytest.raises(UnsupportedError, match="share a cotangent"):
+        by_threads(jax.grad(loss), p, x)
+
+
+UNSUPPORTED = {
+    "erf": lambda x: jax.lax.erf(x),
+    "int8": lambda x: x.astype(jnp.int8),
+    "product of nothing": lambda x: jnp.prod(x[:0]) + x[0],
+    "scatter": lambda x: x.at[jnp.array([0, 2])].add(1.0),
+    "beyond": lambda x: x.at[jnp.array([0, 7])].get(mode="fill"),
+    "remainder": lambda x: x % 3,
+    "unsigned": lambda x: -x.astype(jnp.uint32),
+    "sort": jnp.sort,
+    "keys": lambda x: x + jax.random.uniform(jax.random.key(0), x.shape),
+    "long": lambda x: jax.lax.fori_loop(
+        0, 10**5, lambda i, y: jax.lax.fori_loop(0, 10**5, lambda j, z: z * 0.5 + 1, y), x
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNSUPPORTED)
+def test_what_has_no_instructions_is_left_to_xla(name):
+    x = jnp.ones((4, 3))
+    assert CALL in lowered(jax.vmap(lambda x: batch_last.call(jnp.sin, x)), x)
+    function = UNSUPPORTED[name]
+    assert CALL not in lowered(jax.vmap(lambda x: batch_last.call(function, x)), x)
+
+
+def test_keys_and_empty_batches_are_left_to_xla():
+    draw = lambda x, key: (x + 1, key)  # noqa: E731
+    keys = jax.random.split(jax.random.key(0), 4)
+    mapped = jax.vmap(lambda x, key: batch_last.call(draw, x, key))
+    assert CALL not in lowered(mapped, jnp.ones(4), keys)
+    assert CALL not in lowered(jax.vmap(lambda x: batch_last.call(jnp.sin, x)), jnp.ones((0, 3)))
+
+
+def test_a_call_outside_of_jit_has_a_thread_for_each_world():
+    step, states = pendulums()
+    closed = jax.make_jaxpr(step)(states)
+    (equation,) = (x for x in closed.jaxpr.eqns if x.primitive is batch_last.native_p)
+    fun, rank = equation.params["fun"], equation.params["rank"]
+    args = [jnp.zeros(x.aval.shape, x.aval.dtype) for x in equation.invars]
+    assert "grid_x = 2" in lowered(functools.partial(fun.compiled, rank=rank), *args)
+
+
 def evaluated(function: Callable[..., Any], *args: np.ndarray) -> list[np.ndarray]:
     """Evaluates a function of arrays by one thread."""
     args = [np.array(x, order="C") for x in args]
@@ -222,6 +277,8 @@ UNARY = {
     "abs": jnp.abs,
     "neg": jnp.negative,
     "integer": lambda x: x.astype(jnp.int32),
+    "integer of its size": lambda x: x.astype(int),
+    "sine of zeros": lambda x: jnp.sin(jnp.where(x == 0, x, 0)),
     "bool": lambda x: x.astype(bool),
     "power": lambda x: x**-3,
     "rsqrt": jax.lax.rsqrt,
@@ -433,13 +490,3 @@ def test_exported_programs_have_no_kernels():
     step, states = pendulums()
     exported = jax.export.export(jax.jit(step), platforms=["cuda"])(states)
     assert CALL not in exported.mlir_module()
-
-
-def test_what_has_no_instructions_is_left_to_xla():
-    x = jnp.ones((4, 3))
-    assert CALL in lowered(jax.vmap(lambda x: batch_last.call(jnp.sin, x)), x)
-    assert CALL not in lowered(jax.vmap(lambda x: batch_last.call(jax.lax.erf, x)), x)
-    with pytest.raises(UnsupportedError, match="erf"):
-        evaluated(jax.lax.erf, np.float32(1))
-    with pytest.raises(UnsupportedError, match="int8"):
-        evaluated(lambda x: x.astype(jnp.int8), np.float32(1))

@@ -136,7 +136,7 @@ class Native:
         self.function, self.staged = function, staged
         self.guess: tuple[int, int] | None = None
         self.sums = False
-        self.compiled = jax.jit(lambda *args: bound(args, self))
+        self.compiled = jax.jit(lambda *args, rank: bound(args, self, rank), static_argnames="rank")
         self.tangent = functools.lru_cache(maxsize=64)(functools.partial(TangentNative, self))
         self.transposed = functools.lru_cache(maxsize=64)(functools.partial(TransposedNative, self))
         self.part = functools.lru_cache(maxsize=64)(functools.partial(PartialNative, self))
@@ -146,13 +146,28 @@ class Native:
         """Calls the wrapped function directly, not through the primitive; returns its results."""
         return list(self.function(*args))
 
-    def alone(self) -> Native:
+    def without_batch(self) -> Native:
         """Returns the function as it was before `vmap` added any batch axes to it."""
         return self
 
-    def eager(self, *args: Array) -> list[Array]:
-        """Evaluates the function for a call outside jit: compiled, unless jit is disabled."""
-        return self(*args) if jax.config.values["jax_disable_jit"] else self.compiled(*args)
+    def sums_shared(self, shared: Sequence[bool]) -> bool:
+        """Returns True if a sum over the worlds contains a cotangent that they share.
+
+        Args:
+            shared: for each argument, True if it has size 1 along an axis of several worlds.
+        """
+        return False
+
+    def eager(self, *args: Array, rank: int) -> list[Array]:
+        """Evaluates the function for a call outside jit: compiled, unless jit is disabled.
+
+        Args:
+            args: its arguments.
+            rank: the number of their batch axes.
+        """
+        if jax.config.values["jax_disable_jit"]:
+            return self(*args)
+        return self.compiled(*args, rank=rank)
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
         """Returns the shapes and dtypes of the results, for arguments of these shapes.
@@ -209,10 +224,16 @@ class TangentNative(Native):
         self.places = [i for i, flag in enumerate(moved) if flag]
         self.moved, self.sums = moved, whole.sums
 
-    def alone(self) -> Native:
+    def without_batch(self) -> Native:
         """Returns the tangent map as it was before `vmap` added any batch axes to it."""
-        whole = self.whole.alone()
+        whole = self.whole.without_batch()
         return self if whole is self.whole else whole.tangent(self.moved)
+
+    def sums_shared(self, shared: Sequence[bool]) -> bool:
+        """Returns True if a sum over the worlds contains a cotangent that they share."""
+        tangents = dict(zip(self.places, shared[self.count :], strict=True))
+        either = [flag or tangents.get(i, False) for i, flag in enumerate(shared[: self.count])]
+        return self.whole.sums_shared(either)
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
         """Returns the shapes and dtypes of the tangents of the results, without a trace of them.
@@ -270,10 +291,18 @@ class TransposedNative(Native):
         self.axes, self.sums = axes, True
         self.fixed = linear.count(False)
 
-    def alone(self) -> Native:
+    def without_batch(self) -> Native:
         """Returns the transpose as it was before `vmap` added any batch axes to it."""
         avals = tuple((shape[: len(shape) - self.axes], dtype) for shape, dtype in self.avals)
-        return self.whole.alone().transposed(self.linear, avals, self.rank - self.axes, 0)
+        return self.whole.without_batch().transposed(self.linear, avals, self.rank - self.axes, 0)
+
+    def sums_shared(self, shared: Sequence[bool]) -> bool:
+        """Returns True if a sum over the worlds contains a cotangent that they share.
+
+        A result that the worlds share is computed once, so its cotangent counts once. If it is a
+        sum over the worlds, its cotangent is that of the term of each world.
+        """
+        return not self.whole.sums and any(shared[self.fixed :])
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
         """Returns the shapes and dtypes of the cotangents of the linear arguments."""
@@ -318,10 +347,14 @@ class PartialNative(Native):
         super().__init__(self._chosen, whole.staged)
         self.whole, self.wanted, self.sums = whole, wanted, whole.sums
 
-    def alone(self) -> Native:
+    def without_batch(self) -> Native:
         """Returns the function as it was before `vmap` added any batch axes to it."""
-        whole = self.whole.alone()
+        whole = self.whole.without_batch()
         return self if whole is self.whole else whole.part(self.wanted)
+
+    def sums_shared(self, shared: Sequence[bool]) -> bool:
+        """Returns True if a sum over the worlds contains a cotangent that they share."""
+        return self.whole.sums_shared(shared)
 
     def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
         """Returns the shapes and dtypes of the wanted results."""
@@ -692,7 +725,7 @@ def _without_unused(
     return [True] * len(equation.invars), pruned
 
 
-native_p.def_impl(lambda *args, fun, rank, asks: fun.eager(*args))
+native_p.def_impl(lambda *args, fun, rank, asks: fun.eager(*args, rank=rank))
 native_p.def_abstract_eval(_abstract)
 mlir.register_lowering(native_p, _lowered(_directly))
 mlir.register_lowering(native_p, _lowered(_in_stages), platform="cpu")

@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 TARGET = "__gpu$xla.gpu.ptx"
 """XLA's name of a call of a kernel that is given as text."""
 
-MOST_LINES = 75_000
+MAX_LINES = 75_000
 """The largest number of instructions of a kernel; longer programs are compiled by XLA.
 
 The driver assigns registers for longer than a minute, and in tens of gigabytes, for twice as many.
 """
 
-MOST_POINTERS = 500
+MAX_POINTERS = 500
 """The largest number of arrays of a kernel; NVIDIA's limit is 4 KB of addresses."""
 
 NAME = "native"
@@ -61,9 +61,12 @@ def run(fun: Native, args: Sequence[Array], rank: int) -> list[Array]:
         UnsupportedError: the function needs an operation that has no instructions here.
     """
     batch = jnp.broadcast_shapes(*(x.shape[x.ndim - rank :] for x in args))
+    shared = [x.shape[x.ndim - rank :] != batch for x in args]
+    if fun.sums_shared(shared):
+        raise UnsupportedError("a sum over worlds that share a cotangent")
     flat = [_merged(x, batch) for x in args]
     worlds = math.prod(batch)
-    text, shapes = _written(fun.alone(), [(x.shape, x.dtype) for x in flat], worlds)
+    text, shapes = _written(fun.without_batch(), [(x.shape, x.dtype) for x in flat], worlds)
     results = kernel_p.bind(*flat, text=text, shapes=shapes, worlds=worlds, in_place=True)
     apart = [y.reshape((*y.shape[:-1], *batch)) for y in results]
     like = fun.shapes([ShapedArray(x.shape, x.dtype) for x in args])
@@ -82,9 +85,8 @@ def _reduced(x: Array, shape: tuple[int, ...], sums: bool) -> Array:
 
 def _merged(x: Array, batch: tuple[int, ...]) -> Array:
     """Returns an array with all its batch axes as one, of size 1 if all worlds share it."""
-    own = x.shape[x.ndim - len(batch) :]
     shape = x.shape[: x.ndim - len(batch)]
-    if math.prod(own) == 1:
+    if x.size == math.prod(shape):
         return x.reshape((*shape, 1))
     return jnp.broadcast_to(x, (*shape, *batch)).reshape((*shape, math.prod(batch)))
 
@@ -140,8 +142,11 @@ def _kernel(
         The text of the kernel; shapes and dtypes of the results, with the worlds along a last axis.
     """
     results = [x.aval for x in closed.jaxpr.outvars]
+    dtypes = [x.dtype for x in (*closed.in_avals, *results)]
+    if not worlds or any(jnp.issubdtype(x, jax.dtypes.extended) for x in dtypes):
+        raise UnsupportedError("no worlds, or random keys")
     count = len(avals) + len(results)
-    if count > MOST_POINTERS:
+    if count > MAX_POINTERS:
         raise UnsupportedError(f"{count} arrays")
     thread = Thread()
     each = [worlds > 1 and shape[-1] == worlds for shape, _ in avals] + [True] * len(results)
@@ -154,7 +159,7 @@ def _kernel(
     ]
     Evaluation(thread).store(closed, arrays[: len(avals)], arrays[len(avals) :], streams)
     text = thread.text(NAME, count)
-    if (lines := text.count("\n")) > MOST_LINES:
+    if (lines := text.count("\n")) > MAX_LINES:
         raise UnsupportedError(f"{lines} instructions")
     return text, tuple(((*x.shape, worlds), x.dtype) for x in results)
 

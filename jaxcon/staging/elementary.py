@@ -65,6 +65,11 @@ def _sine_of(thread: Thread, x: Scalar, shift: int) -> Scalar:
     return thread.select(_bit(thread, quarter, 2), thread.apply("neg", value), value)
 
 
+def _odd(thread: Thread, x: Scalar, value: Scalar) -> Scalar:
+    """Returns the value of an odd function at x, which keeps the sign of 0."""
+    return thread.select(thread.apply("eq", x, x.dtype.type(0)), x, value)
+
+
 def _bit(thread: Thread, x: Scalar, bit: int) -> Scalar:
     """Returns True if a bit of an integer is set."""
     return thread.apply("ne", thread.apply("and", x, np.int64(bit)), np.int64(0))
@@ -232,9 +237,9 @@ def _logistic(thread: Thread, x: Scalar) -> Scalar:
 
 
 FUNCTIONS: dict[str, Callable[..., Scalar]] = {
-    "sin": lambda thread, x: _sine_of(thread, x, 0),
+    "sin": lambda thread, x: _odd(thread, x, _sine_of(thread, x, 0)),
     "cos": lambda thread, x: _sine_of(thread, x, 1),
-    "tan": _tan,
+    "tan": lambda thread, x: _odd(thread, x, _tan(thread, x)),
     "atan": _atan,
     "atan2": _atan2,
     "asin": _asin,

@@ -17,36 +17,39 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from jaxcon.core.host import STRUCTURAL
+from jaxcon.core.host import ELEMENTWISE, STRUCTURAL
 from jaxcon.core.jaxprs import read_arguments
+from jaxcon.staging.constants import MOVES
 from jaxcon.staging.elementary import FUNCTIONS, rounded
 from jaxcon.staging.program import Constant, Operand, Operation, Program
-from jaxcon.staging.ptx import Register, Scalar, Thread, UnsupportedError
+from jaxcon.staging.ptx import INSTRUCTIONS, Register, Scalar, Thread, UnsupportedError
 
 Entries = np.ndarray[Any, np.dtype[np.object_]]
 """An array of scalars."""
-
-MOVES = ("broadcast_in_dim", "concatenate", "reshape", "slice", "squeeze", "transpose")
-"""Primitives that move entries, which NumPy does with object arrays as well."""
 
 PAIRS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and"}
 PAIRS |= {"reduce_or": "or"}
 """The operation on two entries by which each reduction combines them."""
 
+ELEMENTARY = {*INSTRUCTIONS, *FUNCTIONS, *ELEMENTWISE}
+ELEMENTARY |= {"convert_element_type", "integer_pow", "round", "select_n"}
+"""Elementwise primitives. Some of them are only evaluated if all operands are known."""
+
 PLACINGS = ("mesh_cast", "pvary", "reshard", "sharding_constraint")
 """Primitives that only say on which devices an array lies."""
 
-MOST_ROUNDS = 64
+MAX_ROUNDS = 64
 """The largest number of rounds of a loop that is written round by round."""
 
 
-MOST_LOADS = 4096
+MAX_LOADS = 4096
 """The largest number of entries of an array in memory that are read outside of loops."""
 
-MOST_WORK = 10**8
-"""The largest number of instructions of a loop, over all rounds: about half a second.
+MAX_WORK = 10**8
+"""The largest number of instructions of all loops, over all rounds: about half a second.
 
-A GPU that also shows a screen stops kernels that run for seconds.
+A GPU that also shows a screen stops kernels that run for seconds. Rounds of loops that end under a
+condition are not counted, since their number is not known.
 """
 
 
@@ -79,7 +82,7 @@ class Stored:
     @functools.cached_property
     def entries(self) -> Entries:
         """All entries, which are read once."""
-        if math.prod(self.shape) > MOST_LOADS:
+        if math.prod(self.shape) > MAX_LOADS:
             raise UnsupportedError(f"an array of shape {self.shape} outside of a loop")
         result = np.empty(self.shape, object)
         for entry, place in enumerate(np.ndindex(self.shape)):
@@ -140,6 +143,7 @@ class Evaluation:
         self.thread = thread
         # where the results of a loop go, by the number of the value in the outermost program
         self._sinks: dict[int, Stored | _Nowhere] = {}
+        self._extra = 0  # instructions of loops, beyond their first round
         self._programs: dict[int, tuple[Body, Program]] = {}
 
     def store(
@@ -215,6 +219,8 @@ class Evaluation:
             return OTHERS[name](self, params, operands)
         if name in MOVES:
             return [STRUCTURAL[name](params, *operands)]
+        if name not in ELEMENTARY:
+            raise UnsupportedError(name)
         return [self._each(name, params, operands)]
 
     def _each(self, name: str, params: Mapping[str, Any], operands: Sequence[Entries]) -> Entries:
@@ -239,7 +245,7 @@ class Evaluation:
         if name == "round":
             even = params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN
             return rounded(thread, operands[0], even)
-        if name in FUNCTIONS and isinstance(operands[0], Register):
+        if name in FUNCTIONS and any(isinstance(x, Register) for x in operands):
             return FUNCTIONS[name](thread, *operands)
         return thread.apply(name, *operands)
 
@@ -266,6 +272,8 @@ class Evaluation:
 
     def _dot(self, params: Mapping[str, Any], x: Entries, y: Entries) -> Entries:
         """Writes a product of arrays, as `lax.dot_general`."""
+        if x.size and y.size and x.flat[0].dtype != y.flat[0].dtype:
+            raise UnsupportedError("a product of different dtypes")
         (left, right), (first, second) = params["dimension_numbers"]
         rows, columns = _contracted(x, left, first), _contracted(y, right, second)
         batch, dtype = len(first), params.get("preferred_element_type")
@@ -305,7 +313,7 @@ class Evaluation:
             return written
 
         results = self.thread.branch(taken, write(branches[1]), write(branches[0]))
-        return _apart(results, shapes)
+        return _unflattened(results, shapes)
 
     def _while(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
         """Writes a loop with a condition."""
@@ -317,12 +325,12 @@ class Evaluation:
         shapes = [x.shape for x in start]
 
         def goes_on(carried: Sequence[Scalar]) -> Any:
-            return self(condition, [*outside, *_apart(carried, shapes)])[0][()]
+            return self(condition, [*outside, *_unflattened(carried, shapes)])[0][()]
 
         def run(carried: Sequence[Scalar]) -> list[Scalar]:
-            return _flat(self(body, [*inside, *_apart(carried, shapes)]))
+            return _flat(self(body, [*inside, *_unflattened(carried, shapes)]))
 
-        return _apart(self.thread.loop(goes_on, run, _flat(start)), shapes)
+        return _unflattened(self.thread.loop(goes_on, run, _flat(start)), shapes)
 
     def _once(self, params: Mapping[str, Any], key: str) -> Body:
         """Returns a jaxpr in the parameters of an operation as a body without constants."""
@@ -352,7 +360,7 @@ class Evaluation:
         inputs_fit = all(isinstance(x, Stored | None) for x in rows)
         if length > 1 and inputs_fit and all(places) and not params["reverse"]:
             return self._repeat(body, fixed, carried, rows, places, length)
-        if not 0 < length <= MOST_ROUNDS:
+        if not 0 < length <= MAX_ROUNDS:
             raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
         kinds = [x.aval for x in body.closed.jaxpr.invars[constants + carries :]]
         results: list[list[Entries]] = []
@@ -388,22 +396,23 @@ class Evaluation:
         shapes = [x.shape for x in start]
         one, end = np.int32(1), np.int32(length)
         kinds = [x.aval for x in body.closed.jaxpr.invars[len(fixed) + len(start) :]]
-        before = len(self.thread.lines)
+        before = len(self.thread.lines) + self._extra
 
         def goes_on(carried: Sequence[Scalar]) -> Scalar:
             return self.thread.apply("lt", carried[0], end)
 
         def run(carried: Sequence[Scalar]) -> list[Scalar]:
             given = [_row(x, carried[0], aval) for x, aval in zip(rows, kinds, strict=True)]
-            results = self(body, [*fixed, *_apart(carried[1:], shapes), *given])
+            results = self(body, [*fixed, *_unflattened(carried[1:], shapes), *given])
             for x, place in zip(results[len(start) :], places, strict=True):
                 place.row(carried[0]).write(x)
             return [self.thread.apply("add", carried[0], one), *_flat(results[: len(start)])]
 
         final = self.thread.loop(goes_on, run, [np.int32(0), *_flat(start)])
-        if (len(self.thread.lines) - before) * length > MOST_WORK:
+        self._extra += (len(self.thread.lines) + self._extra - before) * (length - 1)
+        if self._extra > MAX_WORK:
             raise UnsupportedError(f"a loop of {length} rounds, which would take too long")
-        return [*_apart(final[1:], shapes), *places]
+        return [*_unflattened(final[1:], shapes), *places]
 
     def _index(self, starts: Sequence[Any], sizes: Sequence[int], shape: tuple[int, ...]) -> Any:
         """Returns, for a slice that starts at traced indices, each possible start and its flag.
@@ -509,8 +518,8 @@ def entries(x: Any) -> Entries:
         raise UnsupportedError(f"a constant of type {type(x).__name__}")
     try:
         array = np.asarray(x)
-    except TypeError as error:  # a random key
-        raise UnsupportedError("a constant that is no array of numbers") from error
+    except (TypeError, RuntimeError) as error:  # a random key, or numbers of another process
+        raise UnsupportedError("a constant that is no array of numbers here") from error
     result = np.empty(array.shape, object)
     for i in np.ndindex(array.shape):
         result[i] = array[i]
@@ -534,7 +543,7 @@ def _flat(arrays: Sequence[Entries]) -> list[Scalar]:
     return [x for array in arrays for x in array.ravel()]
 
 
-def _apart(flat: Sequence[Scalar], shapes: Sequence[tuple[int, ...]]) -> list[Entries]:
+def _unflattened(flat: Sequence[Scalar], shapes: Sequence[tuple[int, ...]]) -> list[Entries]:
     """Returns arrays of these shapes with the given entries; reverses `_flat`."""
     given = iter(flat)
     arrays = []
@@ -612,8 +621,11 @@ def _gather(params: Mapping[str, Any], x: Entries, indices: Entries) -> Entries:
     known = all(isinstance(i, np.generic) for i in indices.ravel())
     if not (whole and plain and last and known) or indices.shape[-1] != 1:
         raise UnsupportedError("a gather at traced indices")
-    places = np.clip(indices[..., 0].astype(int), 0, len(x) - 1)
-    return x[places]
+    places = indices[..., 0].astype(int)
+    inside = np.clip(places, 0, len(x) - 1)
+    if params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP and (places != inside).any():
+        raise UnsupportedError("a gather beyond the array")
+    return x[inside]
 
 
 def _rows(x: Entries, axis: int) -> list[Entries]:

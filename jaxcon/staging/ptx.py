@@ -30,6 +30,9 @@ HEADER = ".version 7.0\n.target sm_70\n.address_size 64\n"
 BLOCK = 32
 """Threads in a block. A block is one warp, so that small batches spread over the whole GPU."""
 
+MAX_REGISTERS = 250_000
+"""The largest number of registers that a thread may name, so that writing ends in seconds."""
+
 MAX_OFFSET = 2**31
 """The bytes that an address within an instruction may add."""
 
@@ -40,7 +43,7 @@ TYPES |= {"uint64": "u64", "bool": "pred"}
 BITS = {"f32": "b32", "s32": "b32", "u32": "b32", "f64": "b64", "s64": "b64", "u64": "b64"}
 """The type of the bits of a register."""
 
-COMPARISONS = {"eq": "eq", "ne": "ne", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge"}
+COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 LOGICAL = ("and", "or", "xor")
 
 
@@ -104,7 +107,10 @@ class Thread:
         dtype = np.dtype(dtype)
         if dtype.name not in TYPES:
             raise UnsupportedError(f"numbers of dtype {dtype.name}")
-        name = f"%v{next(self._count)}"
+        number = next(self._count)
+        if number > MAX_REGISTERS:
+            raise UnsupportedError(f"more than {MAX_REGISTERS} registers")
+        name = f"%v{number}"
         self._registers.setdefault(TYPES[dtype.name], []).append(name)
         return Register(name, dtype)
 
@@ -233,7 +239,11 @@ class Thread:
             rounding = ".rn"
         else:
             rounding = ""
-        return self.emit(f"cvt{rounding}.{new}.{old}", target, x)
+        result = self.emit(f"cvt{rounding}.{new}.{old}", target, x)
+        if floating and whole and "64" in old + new:  # NaN becomes 0 in 32 bits only
+            nan = self.emit(f"setp.nan.{old}", bool, x, x)
+            return self.select(nan, target.type(0), result)
+        return result
 
     def bits(self, x: Scalar, dtype: Any) -> Register:
         """Returns the bits of a number as a number of another dtype of the same size."""
@@ -253,8 +263,8 @@ class Thread:
             others: the same for False.
         """
         label = f"B{next(self._count)}"
-        first, x = self._apart(taken)
-        second, y = self._apart(others)
+        first, x = self._captured(taken)
+        second, y = self._captured(others)
         pairs = list(zip(x, y, strict=True))
         results = [a if is_same(a, b) else self.new(a.dtype) for a, b in pairs]
         moved = [(r, a, b) for r, (a, b) in zip(results, pairs, strict=True) if not is_same(a, b)]
@@ -270,7 +280,7 @@ class Thread:
         self._keep(f"{label}_end:")
         return results
 
-    def _apart(self, write: Callable[[], Sequence[Scalar]]) -> tuple[list[Line], list[Scalar]]:
+    def _captured(self, write: Callable[[], Sequence[Scalar]]) -> tuple[list[Line], list[Scalar]]:
         """Returns the lines that a function writes, and its results."""
         before, self.lines = self.lines, []
         self._known.append({})
@@ -406,6 +416,7 @@ def _text(x: Scalar) -> str:
         return "0f" + struct.pack(">f", float(x)).hex().upper()
     if x.dtype == np.float64:
         return "0d" + struct.pack(">d", float(x)).hex().upper()
+    _type(x.dtype)  # an error if there is none
     return str(int(x))
 
 
@@ -432,6 +443,17 @@ def _float_only(instruction: str) -> Callable[..., Scalar]:
         if not _is_float(x):
             raise UnsupportedError(f"{instruction} of {x.dtype.name}")
         return thread.emit(instruction.format(_type(x.dtype)), x.dtype, *operands)
+
+    return write
+
+
+def _signed(name: str) -> Callable[..., Scalar]:
+    """Makes an operation of one instruction on numbers that have a sign."""
+
+    def write(thread: Thread, x: Scalar) -> Scalar:
+        if x.dtype.name.startswith("uint"):
+            raise UnsupportedError(f"{name} of {x.dtype.name}")
+        return thread.emit(f"{name}.{_type(x.dtype)}", x.dtype, x)
 
     return write
 
@@ -489,6 +511,8 @@ def _extremum(name: str) -> Callable[..., Scalar]:
 
 
 def _sign(thread: Thread, x: Scalar) -> Scalar:
+    if x.dtype.name.startswith("uint"):
+        raise UnsupportedError(f"sign of {x.dtype.name}")
     zero, one = x.dtype.type(0), x.dtype.type(1)
     negative = thread.select(thread.apply("lt", x, zero), x.dtype.type(-1), x)
     return thread.select(thread.apply("gt", x, zero), one, negative)  # of ±0 and NaN, x itself
@@ -512,8 +536,10 @@ def _clamp(thread: Thread, low: Scalar, x: Scalar, high: Scalar) -> Scalar:
     return thread.apply("min", thread.apply("max", low, x), high)
 
 
-def _power_of_two(shift: str) -> Callable[..., Scalar]:
+def _shift(shift: str) -> Callable[..., Scalar]:
     def write(thread: Thread, x: Scalar, by: Scalar) -> Scalar:
+        if x.dtype.name.startswith("uint"):
+            raise UnsupportedError(f"{shift} of {x.dtype.name}")
         kind = BITS[_type(x.dtype)] if shift == "shl" else _type(x.dtype)
         return thread.emit(f"{shift}.{kind}", x.dtype, x, thread.convert(by, np.uint32))
 
@@ -527,8 +553,8 @@ INSTRUCTIONS: dict[str, Callable[..., Scalar]] = {
     "mul": _plain("mul", integers="mul.lo"),
     "div": _plain("div.rn", integers="div"),
     "rem": _remainder,
-    "neg": _plain("neg"),
-    "abs": _plain("abs"),
+    "neg": _signed("neg"),
+    "abs": _signed("abs"),
     "square": lambda thread, x: thread.apply("mul", x, x),
     "sqrt": _float_only("sqrt.rn.{}"),
     "rsqrt": _rsqrt,
@@ -540,8 +566,8 @@ INSTRUCTIONS: dict[str, Callable[..., Scalar]] = {
     "sign": _sign,
     "is_finite": _finite,
     "not": _not,
-    "shift_left": _power_of_two("shl"),
-    "shift_right_arithmetic": _power_of_two("shr"),
+    "shift_left": _shift("shl"),
+    "shift_right_arithmetic": _shift("shr"),
 }
 """The instructions of each elementwise primitive: (thread, *operands) → result."""
 INSTRUCTIONS |= {name: _compare(name) for name in COMPARISONS}
