@@ -197,7 +197,7 @@ UNSUPPORTED = {
     "erf": lambda x: jax.lax.erf(x),
     "int8": lambda x: x.astype(jnp.int8),
     "product of nothing": lambda x: jnp.prod(x[:0]) + x[0],
-    "scatter": lambda x: x.at[jnp.array([0, 2])].add(1.0),
+    "scatter": lambda x: x.at[x[0, 0].astype(int)].set(0.0),
     "beyond": lambda x: x.at[jnp.array([0, 7])].get(mode="fill"),
     "remainder": lambda x: x % 3,
     "unsigned": lambda x: -x.astype(jnp.uint32),
@@ -350,6 +350,11 @@ def swapped(x: Any, y: Any) -> Any:
     )
 
 
+def each_row(x: Any) -> Any:
+    """Halves each number until it is small: `vmap` gives the loop a condition for each of them."""
+    return jax.vmap(lambda y: jax.lax.while_loop(lambda z: jnp.abs(z) > 0.3, lambda z: z / 2, y))(x)
+
+
 def branched(x: Any, y: Any) -> Any:
     def deep() -> Any:
         return jax.lax.cond(y > 1, lambda: (x * 2, y), lambda: (x, y + x))
@@ -373,6 +378,18 @@ def moved(x: Any) -> Any:
     cut = jax.lax.pad(x, jnp.float32(5), ((-1, 0, 0), (0, 1, 1)))
     parts = jnp.concatenate([x.T, x.T + 1], 1), x[::-1, 1:], x[jnp.array([2, 0])], jnp.stack([x, x])
     return wide, cut, parts, jnp.cumsum(x, 0), jnp.cumsum(x[::-1], 1), x.reshape(2, 3) @ x
+
+
+def replaced(x: Any) -> Any:
+    twice = jnp.array([2, 0, 2])
+    return (
+        x.at[1].set(0),
+        x.at[jnp.array([2, 0])].set(x[:2]),
+        x.at[twice].add(x),
+        x.at[:, 1].set(x[:, 0]),
+        x.at[1:, 0].add(jnp.float32(1)),
+        x.at[jnp.array([0, 2]), jnp.array([1, 0])].set(jnp.array([5, 6], jnp.float32)),
+    )
 
 
 def reduced(x: Any) -> Any:
@@ -432,9 +449,11 @@ PLACES = [-4, 0, 1, 2, 9]
 CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
     (swapped, (np.float32(1), np.float32(5))),
     *[(branched, (np.float32(x), np.float32(y))) for x in (-1, 1) for y in (0, 2)],
+    (each_row, (ARRAY[:, 0],)),
     (scanned, (ARRAY,)),
     (repeated, (ARRAY,)),
     (moved, (ARRAY,)),
+    (replaced, (ARRAY,)),
     (reduced, (ARRAY,)),
     *[(at_place, (ARRAY, np.int32(k))) for k in PLACES],
     (whole, (4 * ARRAY,)),

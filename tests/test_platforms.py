@@ -57,5 +57,8 @@ def test_programs_are_lowered_for_a_gpu(build, method, form):
     program = jax.jit(function).trace(v).lower(lowering_platforms=("cuda",))
     text = program.as_text()
     assert "stablehlo.while" in text
-    # worlds are contiguous within a step, however the caller stores them
-    assert ("LayoutConstraint" in text) == (form == "batch")
+    # a step is one kernel, or worlds are contiguous within it, however the caller stores them
+    by_xla = "__gpu$xla.gpu.ptx" not in text
+    assert ("LayoutConstraint" in text) == (form == "batch" and by_xla)
+    dense = isinstance(method.integrator, jc.integrators.GeneralizedAlpha)
+    assert by_xla == (dense or build is ball)  # dense matrices, and gathers at traced indices

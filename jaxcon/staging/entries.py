@@ -324,11 +324,20 @@ class Evaluation:
         body: Body = params["body_jaxpr"]
         shapes = [x.shape for x in start]
 
+        flags: Any = None
+
         def goes_on(carried: Sequence[Scalar]) -> Any:
-            return self(condition, [*outside, *_unflattened(carried, shapes)])[0][()]
+            nonlocal flags
+            (flags,) = self(condition, [*outside, *_unflattened(carried, shapes)])
+            return self._combine("or", flags.ravel())
 
         def run(carried: Sequence[Scalar]) -> list[Scalar]:
-            return _flat(self(body, [*inside, *_unflattened(carried, shapes)]))
+            before = _unflattened(carried, shapes)
+            after = self(body, [*inside, *before])
+            if flags.ndim:  # a batched loop: the rows whose flag is False are done
+                pairs = zip(before, after, strict=True)
+                after = [self._each("select_n", {}, [_led(flags, x), x, y]) for x, y in pairs]
+            return _flat(after)
 
         return _unflattened(self.thread.loop(goes_on, run, _flat(start)), shapes)
 
@@ -468,6 +477,31 @@ class Evaluation:
             result[place] = self._each("select_n", {}, [_scalar(flag), result[place], new])
         return [result]
 
+    def _scatter(self, params: Mapping[str, Any], operands: list[Entries], adds: bool) -> Entries:
+        """Writes the replacement of entries at known indices, or additions to them.
+
+        Raises:
+            UnsupportedError: the indices are traced, or beyond the array.
+        """
+        x, indices, updates = operands
+        numbers = params["dimension_numbers"]
+        known = all(isinstance(i, np.generic) for i in indices.ravel())
+        if not known or numbers.operand_batching_dims:
+            raise UnsupportedError("a scatter at traced indices")
+        result, window = x.copy(), numbers.update_window_dims
+        outer = [a for a in range(updates.ndim) if a not in window]
+        inner = [a for a in range(x.ndim) if a not in numbers.inserted_window_dims]
+        for entry in np.ndindex(updates.shape):
+            place = np.zeros(x.ndim, int)
+            place[inner] = [entry[a] for a in window]
+            index = indices[tuple(entry[a] for a in outer)]
+            place[list(numbers.scatter_dims_to_operand_dims)] += index.astype(int)
+            if (place < 0).any() or (place >= x.shape).any():
+                raise UnsupportedError("a scatter beyond the array")
+            at, new = tuple(place), updates[entry]
+            result[at] = self._one("add", {}, result[at], new) if adds else new
+        return result
+
     def _extreme_index(self, name: str, params: Mapping[str, Any], x: Entries) -> Entries:
         """Writes argmax or argmin: the first index of the extreme; of NaN, if there is one."""
         (axis,) = params["axes"]
@@ -536,6 +570,11 @@ def _scalar(x: Scalar) -> Entries:
     result = np.empty((), object)
     result[()] = x
     return result
+
+
+def _led(flags: Entries, like: Entries) -> Entries:
+    """Adds axes of size 1 to flags, so that they stand for the first axes of another array."""
+    return flags.reshape(flags.shape + (1,) * (like.ndim - flags.ndim))
 
 
 def _flat(arrays: Sequence[Entries]) -> list[Scalar]:
@@ -650,6 +689,9 @@ OTHERS: dict[str, Other] = {
     "iota": lambda run, params, x: [entries(STRUCTURAL["iota"](params))],
     "pad": lambda run, params, x: [_pad(params, *x)],
     "rev": lambda run, params, x: [np.flip(x[0], params["dimensions"])],
+    "scatter": lambda run, params, x: [run._scatter(params, x, adds=False)],
+    "scatter-add": lambda run, params, x: [run._scatter(params, x, adds=True)],
+    "scatter_add": lambda run, params, x: [run._scatter(params, x, adds=True)],
     "somewhere": lambda run, params, x: [run._somewhere(*x)],
     "stack": lambda run, params, x: [np.stack(x, params["axis"])],
     "unstack": lambda run, params, x: _rows(x[0], params["axis"]),
