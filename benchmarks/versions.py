@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 PYTHONS = ("3.11", "3.13", "3.14")
 INTERNALS = {
-    *("native", "fusion", "worlds", "composition"),
+    *("native", "fusion", "cuda", "worlds", "composition"),
     *("needed", "numerics", "lanes", "quaternion", "layout"),
 }
 """Tests of modules that depend on JAX's internals or isolate the package from them."""

@@ -136,7 +136,9 @@ class Native:
         self.function, self.staged = function, staged
         self.guess: tuple[int, int] | None = None
         self.sums = False
-        self.compiled = jax.jit(lambda *args, rank: bound(args, self, rank), static_argnames="rank")
+        self.compiled = jax.jit(
+            lambda *args, rank=0: bound(args, self, rank), static_argnames="rank"
+        )
         self.tangent = functools.lru_cache(maxsize=64)(functools.partial(TangentNative, self))
         self.transposed = functools.lru_cache(maxsize=64)(functools.partial(TransposedNative, self))
         self.part = functools.lru_cache(maxsize=64)(functools.partial(PartialNative, self))
