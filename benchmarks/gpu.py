@@ -27,6 +27,7 @@ import jaxcon as jc
 from benchmarks import legged, mechanisms, peers, timing
 from benchmarks.mjcf import DT
 from benchmarks.throughput import numbers, worlds
+from jaxcon.staging import cuda
 
 SCENES = ("pendulum", "four-bar", "planar-chain-10", "chain-5", "chain-10", "stewart")
 ROBOTS = ("hopper", "ant")
@@ -187,7 +188,7 @@ def written(name: str, batch: int = 64) -> tuple[int, int]:
     rollouts, states = scene(name, batch)
     traced = jax.jit(rollouts(1)).trace(states)
     text = traced.lower(lowering_platforms=("cuda",)).as_text()
-    return text.count("__gpu$xla.gpu.ptx"), text.count("\\0A")
+    return text.count(cuda.TARGET), text.count("\\0A")
 
 
 def attempt(function: Callable[..., Any], *args: Any) -> Any:

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxcon.core.host import ELEMENTWISE
+
 DTYPES = {"f32": np.float32, "f64": np.float64, "s32": np.int32, "s64": np.int64}
 DTYPES |= {"u32": np.uint32, "u64": np.uint64, "pred": np.bool_, "u8": np.uint8}
 
@@ -185,25 +187,7 @@ def _converted(how: list[str], kind: str, x: Any) -> Any:
     return target(x)
 
 
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "neg": np.negative,
-    "abs": np.abs,
-    "sqrt": np.sqrt,
-    "max": np.maximum,
-    "min": np.minimum,
-    "mov": lambda x: x,
-    "and": np.bitwise_and,
-    "or": np.bitwise_or,
-    "xor": np.bitwise_xor,
-    "not": np.invert,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-}
+SAME = ("add", "sub", "mul", "div", "neg", "abs", "sqrt", "max", "min", "and", "or", "xor", "not")
+SAME += ("eq", "ne", "lt", "le", "gt", "ge")
+FUNCTIONS: dict[str, Callable[..., Any]] = {name: ELEMENTWISE[name] for name in SAME}
+FUNCTIONS["mov"] = lambda x: x

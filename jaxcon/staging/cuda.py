@@ -27,6 +27,7 @@ from jaxcon.core.typing import Array
 from jaxcon.staging.entries import Evaluation, Stored
 from jaxcon.staging.program import traced
 from jaxcon.staging.ptx import BLOCK, Thread, UnsupportedError
+from jaxcon.staging.worlds import batch_of, broadcast_worlds
 
 if TYPE_CHECKING:
     from jaxcon.staging.batch_last import Native
@@ -60,7 +61,7 @@ def run(fun: Native, args: Sequence[Array], rank: int) -> list[Array]:
     Raises:
         UnsupportedError: the function needs an operation that has no instructions here.
     """
-    batch = jnp.broadcast_shapes(*(x.shape[x.ndim - rank :] for x in args))
+    batch = batch_of(args, rank)
     shared = [x.shape[x.ndim - rank :] != batch for x in args]
     if fun.sums_shared(shared):
         raise UnsupportedError("a sum over worlds that share a cotangent")
@@ -88,7 +89,7 @@ def _merged(x: Array, batch: tuple[int, ...]) -> Array:
     shape = x.shape[: x.ndim - len(batch)]
     if x.size == math.prod(shape):
         return x.reshape((*shape, 1))
-    return jnp.broadcast_to(x, (*shape, *batch)).reshape((*shape, math.prod(batch)))
+    return broadcast_worlds(x, batch).reshape((*shape, math.prod(batch)))
 
 
 def run_worlds(

@@ -154,8 +154,7 @@ def _exp(thread: Thread, x: Scalar) -> Scalar:
     half = thread.apply("shift_right_arithmetic", power, np.int64(1))
     for part in (half, thread.apply("sub", power, half)):
         value = thread.apply("mul", value, _two_to(thread, part))
-    nan = thread.emit(f"setp.nan.{'f32' if x.dtype == np.float32 else 'f64'}", bool, x, x)
-    return thread.select(nan, x, thread.convert(value, x.dtype))
+    return thread.select(thread.apply("ne", x, x), x, thread.convert(value, x.dtype))
 
 
 def _two_to(thread: Thread, n: Scalar) -> Register:

@@ -41,7 +41,6 @@ PLACINGS = ("mesh_cast", "pvary", "reshard", "sharding_constraint")
 MAX_ROUNDS = 64
 """The largest number of rounds of a loop that is written round by round."""
 
-
 MAX_LOADS = 4096
 """The largest number of entries of an array in memory that are read outside of loops."""
 

@@ -122,13 +122,15 @@ class Thread:
             dtype: the dtype of the result.
             operands: the operands.
         """
-        key = instruction, np.dtype(dtype).name, tuple(map(_text, operands))
+        texts = tuple(map(_text, operands))
+        key = instruction, np.dtype(dtype).name, texts
         for known in reversed(self._known):
             if key in known:
                 return known[key]
         result = self.new(dtype)
-        given = ", ".join([result.name, *map(_text, operands)])
-        self.lines.append(Line(f"{instruction} {given};", result.name, operands))
+        self.lines.append(
+            Line(f"{instruction} {', '.join((result.name, *texts))};", result.name, operands)
+        )
         self._known[-1][key] = result
         return result
 
