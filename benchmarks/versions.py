@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 PYTHONS = ("3.11", "3.13", "3.14")
 INTERNALS = {
-    *("native", "fusion", "cuda", "worlds", "composition"),
+    *("native", "fusion", "kernels", "worlds", "composition"),
     *("needed", "numerics", "lanes", "quaternion", "layout"),
 }
 """Tests of modules that depend on JAX's internals or isolate the package from them."""
@@ -186,7 +186,9 @@ class Pair:
                     return False
             record.write_text(text)
         packages = dict(x.split("==") for x in record.read_text().splitlines() if "==" in x)
-        self.found["install"] = ", ".join(f"{x} {packages[x]}" for x in ("numpy", "optax"))
+        self.found["install"] = ", ".join(
+            f"{x} {packages[x]}" for x in ("llvmlite", "numpy", "optax")
+        )
         return True
 
     def _stage(self, name: str, command: list[str], place: Path, end: float) -> str | None:

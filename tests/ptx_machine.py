@@ -70,7 +70,7 @@ def _run_thread(
     position = 0
 
     def read(x: str, kind: str) -> Any:
-        if x.startswith("%v"):
+        if x.startswith(("%v", "%w")):
             return values[x]
         if x in ("%ctaid.x", "%tid.x"):
             return np.uint32(place[x == "%tid.x"])

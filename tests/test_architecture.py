@@ -144,7 +144,9 @@ INNER = ("jax.extend", "jax.interpreters", "jax.experimental", "jax.core")
 MAY_IMPORT = {
     "staging/batch_last.py": {"jax.core", "jax.experimental", "jax.extend", "jax.interpreters"},
     "staging/chunks.py": {"jax.core", "jax.extend", "jax.interpreters"},
-    "staging/cuda.py": {"jax.core", "jax.extend", "jax.interpreters"},
+    "staging/cpu.py": {"jax.interpreters"},
+    "staging/cuda.py": {"jax.interpreters"},
+    "staging/kernels.py": {"jax.core", "jax.experimental", "jax.extend", "jax.interpreters"},
     "staging/entries.py": {"jax.extend"},
     "core/jaxprs.py": {"jax.extend", "jax.interpreters"},
     "staging/program.py": {"jax.core", "jax.extend"},

@@ -143,7 +143,7 @@ def test_a_function_is_traced_once_for_a_shape():
     for _ in range(3):
         batch_last.call(traced, jnp.ones(2))
         jax.vmap(lambda x: batch_last.call(traced, x))(jnp.ones((4, 2)))
-    assert traces == [(2, 1), (2, 4, 1)], "the batch is the last axis but for one of one"
+    assert traces == [(2, 1)], "a batch has the program of one world"
 
 
 def test_gains_that_are_python_numbers_batch():

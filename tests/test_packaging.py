@@ -55,7 +55,7 @@ def test_the_wheel_has_the_package_whole_and_nothing_else(built):
     assert names - about == own
     assert [name for name in about if name.endswith("licenses/LICENSE")]
     needed = {re.split(r"[^\w-]", x)[0] for x in metadata.get_all("Requires-Dist") if ";" not in x}
-    assert needed == {"jax", "numpy", "optax", "tqdm"}
+    assert needed == {"jax", "llvmlite", "numpy", "optax", "tqdm"}
     assert metadata["License-Expression"] == "Apache-2.0"
     assert metadata.get_payload() == README
 

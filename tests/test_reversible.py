@@ -219,11 +219,12 @@ def planned(steps, adjoint, worlds=300):
 
 
 def test_memory_does_not_grow_with_the_steps():
-    """Only the step numbers grow, once for all worlds; the estimate agrees with XLA's plan."""
+    """Only the step numbers grow, in each pass once for all worlds; the estimate is XLA's plan."""
     short, long = planned(100, jc.adjoints.Reversible()), planned(10_000, jc.adjoints.Reversible())
-    assert long - short < 10 * 9_900
+    assert long - short < 2 * 8 * 9_900
     memory = jc.analysis.gradient_memory(SYSTEM, METHOD, STATE)
-    assert abs(memory.of(300, 10_000, jc.adjoints.Reversible()) / long - 1) < 0.1
+    told = memory.of(300, 10_000, jc.adjoints.Reversible())
+    assert abs(told - long) < 0.1 * long + 8 * 10_000  # the step numbers of one pass
     assert long < memory.of(300, 100)
 
 

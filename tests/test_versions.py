@@ -23,7 +23,7 @@ def test_the_lower_bound_and_the_last_patch_of_each_minor_version_are_tried():
 
 def test_the_lower_bounds_are_those_of_the_package():
     least = versions.lower_bounds(versions.project()["dependencies"])
-    assert set(least) == {"jax", "numpy", "optax", "tqdm"}
+    assert set(least) == {"jax", "llvmlite", "numpy", "optax", "tqdm"}
     assert f"jax>={least['jax']}" in (ROOT / "pyproject.toml").read_text()
 
 

@@ -40,7 +40,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray, Tracer
 from jax.experimental.layout import Layout, with_layout_constraint
-from jax.extend.core import ClosedJaxpr, JaxprEqn, Primitive
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Primitive
 from jax.extend.core.primitives import stop_gradient_p
 from jax.interpreters import ad, batching, mlir, partial_eval
 
@@ -48,8 +48,8 @@ from jaxcon.core import notices
 from jaxcon.core.jaxprs import settings, without_unused
 from jaxcon.core.somewhere import asking
 from jaxcon.core.typing import Array, PyTree, Scalar, T
-from jaxcon.staging import cuda, fusion, meshes
-from jaxcon.staging.ptx import UnsupportedError
+from jaxcon.staging import cpu, cuda, fusion, kernels, meshes
+from jaxcon.staging.thread import UnsupportedError
 from jaxcon.staging.worlds import broadcast_worlds
 
 FEW = 64
@@ -143,6 +143,7 @@ class Native:
         self.transposed = functools.lru_cache(maxsize=64)(functools.partial(TransposedNative, self))
         self.part = functools.lru_cache(maxsize=64)(functools.partial(PartialNative, self))
         self.among = functools.lru_cache(maxsize=64)(self._among)
+        self._pruned: dict[ClosedJaxpr, ClosedJaxpr] = {}
 
     def __call__(self, *args: Array) -> list[Array]:
         """Calls the wrapped function directly, not through the primitive; returns its results."""
@@ -171,13 +172,26 @@ class Native:
             return self(*args)
         return self.compiled(*args, rank=rank)
 
-    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+    def shapes(self, args: Sequence[Array | ShapedArray], rank: int) -> list[Any]:
         """Returns the shapes and dtypes of the results, for arguments of these shapes.
 
-        The function is traced with a further last axis of size 1: a trace that `_in_stages` reuses.
+        The function is traced for one world. A result has the batch of the arguments that it may
+        depend on.
+
+        Args:
+            args: its arguments, with `rank` trailing batch axes.
+            rank: the number of batch axes.
         """
-        avals = self.traced(*(((*x.shape, 1), x.dtype) for x in args)).out_avals
-        return [ShapedArray(y.shape[:-1], y.dtype) for y in avals]
+        closed = self.traced(*(((*x.shape[: x.ndim - rank], 1), x.dtype) for x in args))
+        batches = [x.shape[x.ndim - rank :] for x in args]
+        shared = (1,) * rank
+        return [
+            ShapedArray(
+                (*y.shape[:-1], *jnp.broadcast_shapes(shared, *(batches[i] for i in sources))),
+                y.dtype,
+            )
+            for y, sources in zip(closed.out_avals, sources_of(closed), strict=True)
+        ]
 
     def traced(self, *avals: Aval) -> ClosedJaxpr:
         """Returns the closed jaxpr for arguments of these shapes and dtypes, from a cache.
@@ -186,6 +200,13 @@ class Native:
         and the default precision under which they were traced.
         """
         return self.among((*settings(), notices.is_observing()), *avals)
+
+    def pruned(self, *avals: Aval) -> ClosedJaxpr:
+        """Returns the closed jaxpr without unused equations, from a cache."""
+        closed = self.traced(*avals)
+        if closed not in self._pruned:
+            self._pruned[closed] = ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
+        return self._pruned[closed]
 
     def _among(self, settings: tuple[Any, ...], *avals: Aval) -> ClosedJaxpr:
         """Returns `_traced(*avals)`, and is cached by settings, shapes and dtypes.
@@ -214,6 +235,27 @@ class Native:
         return closed
 
 
+@functools.lru_cache(maxsize=256)
+def sources_of(closed: ClosedJaxpr) -> list[list[int]]:
+    """Returns the arguments that each result of a jaxpr may depend on, by their numbers."""
+    jaxpr = closed.jaxpr
+    # sets of arguments as the bits of integers
+    known = {x: 1 << i for i, x in enumerate(jaxpr.invars)}
+
+    def sources(xs: Sequence[Any]) -> int:
+        bits = 0
+        for x in xs:
+            if not isinstance(x, Literal):
+                bits |= known.get(x, 0)
+        return bits
+
+    for equation in jaxpr.eqns:
+        bits = sources(equation.invars)
+        known.update((x, bits) for x in equation.outvars)
+    every = [sources([x]) for x in jaxpr.outvars]
+    return [[i for i in range(len(jaxpr.invars)) if bits >> i & 1] for bits in every]
+
+
 class TangentNative(Native):
     """The tangent map of a native function: (x, ẋ) → tangents of the floating results.
 
@@ -237,7 +279,7 @@ class TangentNative(Native):
         either = [flag or tangents.get(i, False) for i, flag in enumerate(shared[: self.count])]
         return self.whole.sums_shared(either)
 
-    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+    def shapes(self, args: Sequence[Array | ShapedArray], rank: int) -> list[Any]:
         """Returns the shapes and dtypes of the tangents of the results, without a trace of them.
 
         They are those of the floating results of the function itself, whose trace is cached.
@@ -246,7 +288,7 @@ class TangentNative(Native):
         for i, x in zip(self.places, args[self.count :], strict=True):
             shape = jnp.broadcast_shapes(x.shape, given[i].shape)
             given[i] = jax.ShapeDtypeStruct(shape, given[i].dtype)
-        return list(filter(is_real, self.whole.shapes(given)))
+        return list(filter(is_real, self.whole.shapes(given, rank)))
 
     def _along(self, *args: Array) -> list[Array]:
         """Returns the tangents of the floating results, for arguments (x, ẋ)."""
@@ -306,7 +348,7 @@ class TransposedNative(Native):
         """
         return not self.whole.sums and any(shared[self.fixed :])
 
-    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+    def shapes(self, args: Sequence[Array | ShapedArray], rank: int) -> list[Any]:
         """Returns the shapes and dtypes of the cotangents of the linear arguments."""
         return [ShapedArray(x.shape, x.dtype) for x in self._arguments(args)]
 
@@ -358,9 +400,9 @@ class PartialNative(Native):
         """Returns True if a sum over the worlds contains a cotangent that they share."""
         return self.whole.sums_shared(shared)
 
-    def shapes(self, args: Sequence[Array | ShapedArray]) -> list[Any]:
+    def shapes(self, args: Sequence[Array | ShapedArray], rank: int) -> list[Any]:
         """Returns the shapes and dtypes of the wanted results."""
-        return self._among_wanted(self.whole.shapes(args))
+        return self._among_wanted(self.whole.shapes(args, rank))
 
     def _chosen(self, *args: Array) -> list[Array]:
         """Evaluates the whole function; returns the wanted results."""
@@ -538,7 +580,7 @@ def is_real(x: Array | ShapedArray | jax.ShapeDtypeStruct) -> bool:
 
 def _abstract(*args: ShapedArray, fun: Native, rank: int, asks: ClosedJaxpr) -> list[Any]:
     """The abstract evaluation rule: returns the shapes, dtypes and placement of the results."""
-    return meshes.typed(fun.shapes(args), args)
+    return meshes.typed(fun.shapes(args, rank), args)
 
 
 def _batched(
@@ -628,14 +670,23 @@ def _in_order(*args: Array, fun: Native, rank: int) -> list[Array]:
         return list(map(_contiguous, _directly(*map(_contiguous, args), fun=fun, rank=rank)))
 
 
-def _in_kernel(*args: Array, fun: Native, rank: int) -> list[Array]:
-    """Calls a native function as one kernel, or as `_in_order` if no kernel can be written."""
-    lanes = args if rank else [jnp.expand_dims(x, -1) for x in args]
-    try:
-        results = cuda.run(fun, lanes, max(rank, 1))
-    except UnsupportedError:
-        return _in_order(*args, fun=fun, rank=rank)
-    return results if rank else squeezed(*results)
+def _in_kernel(
+    platform: kernels.Platform, otherwise: Callable[..., list[Array]]
+) -> Callable[..., list[Array]]:
+    """Makes a function that calls a native function as one kernel.
+
+    Args:
+        platform: the devices that run it.
+        otherwise: calls it if no kernel can be written.
+    """
+
+    def call(*args: Array, fun: Native, rank: int, spreads: bool = False) -> list[Array]:
+        try:
+            return kernels.run(platform, fun, args, rank, spreads)
+        except UnsupportedError:
+            return otherwise(*args, fun=fun, rank=rank)
+
+    return call
 
 
 def _contiguous(x: Array) -> Array:
@@ -654,30 +705,51 @@ def _lowered(function: Callable[..., Any]) -> Callable[..., Any]:
     """Makes a lowering rule for the primitive `native_p`.
 
     Args:
-        function: (*args, fun=native function, rank=number of batch axes) → results. Types of args
-            are without placement.
+        function: (*args, fun=native function, rank=number of batch axes, …) → results. Types of
+            args are without placement.
     """
-    rule = mlir.lower_fun(function, multiple_results=True)
 
-    def lower(
-        ctx: mlir.LoweringRuleContext, *args: Any, fun: Native, rank: int, asks: ClosedJaxpr
-    ) -> Any:
+    def fitted(*args: Array, results: Sequence[Any], **params: Any) -> list[Array]:
+        ys = function(*args, **params)
+        return [_fitted(y, like.shape) for y, like in zip(ys, results, strict=True)]
+
+    rule = mlir.lower_fun(fitted, multiple_results=True)
+
+    def lower(ctx: mlir.LoweringRuleContext, *args: Any, asks: ClosedJaxpr, **params: Any) -> Any:
         with meshes.apart(), without_collections():
             avals: Sequence[Any] = ctx.avals_in
             plain = [meshes.plain(x) for x in avals]
-            return rule(ctx.replace(avals_in=plain), *args, fun=fun, rank=rank)
+            results = ctx.avals_out
+            return rule(ctx.replace(avals_in=plain), *args, results=results, **params)
 
     return lower
 
 
-_ONE_KERNEL, _SEVERAL_KERNELS = _lowered(_in_kernel), _lowered(_in_order)
+def _fitted(x: Array, shape: tuple[int, ...]) -> Array:
+    """Returns a result with batch axes of these sizes; values along other axes are equal."""
+    for axis, (n, m) in enumerate(zip(x.shape, shape, strict=True)):
+        if n != m and m == 1:
+            x = jax.lax.slice_in_dim(x, 0, 1, axis=axis)
+    return jnp.broadcast_to(x, shape)
+
+
+_CUDA_KERNEL, _SEVERAL_KERNELS = _lowered(_in_kernel(cuda.Cuda(), _in_order)), _lowered(_in_order)
+_CPU_KERNEL, _STAGES = _lowered(_in_kernel(cpu.Cpu(), _in_stages)), _lowered(_in_stages)
 _EXPORTED = _lowered(_directly)
 
 
 def _lowered_for_cuda(ctx: mlir.LoweringRuleContext, *args: Any, **params: Any) -> Any:
     """The lowering rule for NVIDIA's GPUs."""
-    one = cuda.is_possible(ctx) and not _IN_ORDER.get()
-    return (_ONE_KERNEL if one else _lowered_for_gpu)(ctx, *args, **params)
+    one = kernels.are_possible(ctx) and kernels.is_alone(ctx) and not _IN_ORDER.get()
+    return (_CUDA_KERNEL if one else _lowered_for_gpu)(ctx, *args, **params)
+
+
+def _lowered_for_cpu(ctx: mlir.LoweringRuleContext, *args: Any, **params: Any) -> Any:
+    """The lowering rule for CPUs."""
+    alone = kernels.is_alone(ctx)
+    if kernels.are_possible(ctx) and (alone or kernels.can_spread(ctx)):
+        return _CPU_KERNEL(ctx, *args, spreads=not alone, **params)
+    return _STAGES(ctx, *args, **params)
 
 
 def _lowered_for_gpu(ctx: mlir.LoweringRuleContext, *args: Any, **params: Any) -> Any:
@@ -730,7 +802,7 @@ def _without_unused(
 native_p.def_impl(lambda *args, fun, rank, asks: fun.eager(*args, rank=rank))
 native_p.def_abstract_eval(_abstract)
 mlir.register_lowering(native_p, _lowered(_directly))
-mlir.register_lowering(native_p, _lowered(_in_stages), platform="cpu")
+mlir.register_lowering(native_p, _lowered_for_cpu, platform="cpu")
 mlir.register_lowering(native_p, _lowered_for_cuda, platform="cuda")
 mlir.register_lowering(native_p, _lowered_for_gpu, platform="rocm")
 batching.primitive_batchers[native_p] = _batched

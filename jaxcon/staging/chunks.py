@@ -30,10 +30,10 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 
 from jaxcon.core.jaxprs import without_unused
 from jaxcon.core.typing import Array, PyTree, T
-from jaxcon.staging import batch_last, cuda, meshes
+from jaxcon.staging import batch_last, cuda, kernels, meshes
 from jaxcon.staging.operations import inside
 from jaxcon.staging.program import is_known
-from jaxcon.staging.ptx import UnsupportedError
+from jaxcon.staging.thread import UnsupportedError
 
 Flags = tuple[bool, ...]
 """A truth value for each array of a list."""
@@ -561,16 +561,23 @@ def _at_once(*args: Array, fun: OneWorld, batch: Batch) -> list[Array]:
     return fun.vmapped(batch)(*args)
 
 
-def in_kernel(*args: Array, fun: OneWorld, batch: Batch) -> list[Array]:
-    """Evaluates a function as one kernel, which runs all steps; at once if that cannot be."""
-    if batch.size is None:
-        return _at_once(*args, fun=fun, batch=batch)
-    try:
-        results = cuda.run_worlds(fun.closed, args, batch.axes, batch.size)
-    except UnsupportedError:
-        return _at_once(*args, fun=fun, batch=batch)
-    pairs = zip(results, batch.out_axes, strict=True)
-    return [y[..., 0] if axis is None else jnp.moveaxis(y, -1, axis) for y, axis in pairs]
+def in_kernel(platform: kernels.Platform) -> Callable[..., list[Array]]:
+    """Makes a function that evaluates another one as one kernel, which runs all steps.
+
+    Functions without such a kernel are evaluated in all worlds at once.
+    """
+
+    def evaluate(*args: Array, fun: OneWorld, batch: Batch) -> list[Array]:
+        if batch.size is None:
+            return _at_once(*args, fun=fun, batch=batch)
+        try:
+            results = kernels.run_worlds(platform, fun.closed, args, batch.axes, batch.size)
+        except UnsupportedError:
+            return _at_once(*args, fun=fun, batch=batch)
+        pairs = zip(results, batch.out_axes, strict=True)
+        return [y[..., 0] if axis is None else jnp.moveaxis(y, -1, axis) for y, axis in pairs]
+
+    return evaluate
 
 
 def _pullback_in_chunks(*args: Array, pull: Pullback, devices: int) -> list[Array]:
@@ -737,7 +744,8 @@ def _lower(
         return mlir.lower_fun(at_once, multiple_results=True)(ctx, *args, **params)
 
     def kernel(ctx: mlir.LoweringRuleContext, *args: Any, jaxpr: ClosedJaxpr, **params: Any) -> Any:
-        function = in_kernel if in_kernel and cuda.is_possible(ctx) else at_once
+        possible = kernels.are_possible(ctx) and kernels.is_alone(ctx)
+        function = in_kernel if in_kernel and possible else at_once
         return mlir.lower_fun(function, multiple_results=True)(ctx, *args, **params)
 
     mlir.register_lowering(primitive, whole)
@@ -751,7 +759,7 @@ batching.primitive_batchers[worlds_p] = _batched
 ad.primitive_jvps[worlds_p] = _jvp
 ad.primitive_transposes[worlds_p] = _transpose
 partial_eval.dce_rules[worlds_p] = _without_unused
-_lower(worlds_p, _at_once, _in_chunks, in_kernel)
+_lower(worlds_p, _at_once, _in_chunks, in_kernel(cuda.Cuda()))
 
 pullback_p.def_impl(lambda *args, pull, jaxpr: pull.function.pullback(*args, masks=pull[1:]))
 pullback_p.def_abstract_eval(

@@ -14,13 +14,16 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxcon.staging.ptx import Register, Scalar, Thread, UnsupportedError
+from jaxcon.staging.thread import Scalar, Thread, UnsupportedError
 
 HALF_PI = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487959506e-21)
 """Three numbers whose sum is π/2. The first two have 33 bits: products with integers are exact."""
 
 LOG_2 = (0.6931471804855391, 7.440617110012397e-11)
 """Two numbers whose sum is the logarithm of 2; the first has 33 bits."""
+
+SHIFT = np.float64(1.5 * 2.0**52)
+"""A number whose sum with an integer of less than 2⁵¹ has no bits for a fraction."""
 
 TERMS = {"float32": 5, "float64": 9}
 """The number of terms of the series of sine and cosine, for angles up to π/4."""
@@ -38,13 +41,22 @@ def _series(thread: Thread, x: Scalar, coefficients: Sequence[float]) -> Scalar:
 def _quarter_turns(thread: Thread, x: Scalar) -> tuple[Scalar, Scalar]:
     """Returns an angle less the nearest multiple of π/2, and the number of quarter turns."""
     wide = thread.convert(x, np.float64)
-    turns = thread.apply("mul", wide, np.float64(2 / math.pi))
-    turns = thread.emit("cvt.rni.f64.f64", np.float64, turns)
+    turns, bits = _nearest(thread, wide, np.float64(2 / math.pi))
     back = thread.apply("neg", turns)
     rest: Scalar = wide
     for part in HALF_PI:
         rest = thread.fma(back, np.float64(part), rest)
-    return thread.convert(rest, x.dtype), thread.emit("cvt.rzi.s64.f64", np.int64, turns)
+    return thread.convert(rest, x.dtype), bits
+
+
+def _nearest(thread: Thread, x: Scalar, by: np.float64) -> tuple[Scalar, Scalar]:
+    """Returns the integer next to a product of less than 2⁵¹, as a float and as an integer.
+
+    The sum with `SHIFT` has no bits for a fraction, and ends with the bits of the integer.
+    """
+    shifted = thread.fma(x, by, SHIFT)
+    bits = thread.apply("sub", thread.bits(shifted, np.int64), SHIFT.view(np.int64))
+    return thread.apply("sub", shifted, SHIFT), bits
 
 
 def _sine_of(thread: Thread, x: Scalar, shift: int) -> Scalar:
@@ -95,8 +107,8 @@ def _atan2(thread: Thread, y: Scalar, x: Scalar) -> Scalar:
     # the sign bit, since x may be −0
     left = thread.apply("lt", thread.bits(wide_x, np.int64), np.int64(0))
     angle = thread.select(left, thread.apply("sub", double(math.pi), angle), angle)
-    angle = thread.emit("copysign.f64", double, wide_y, angle)
-    nan = thread.emit("setp.nan.f64", bool, wide_x, wide_y)
+    angle = thread.emit("copysign", double, angle, wide_y)
+    nan = thread.emit("unordered", bool, wide_x, wide_y)
     return thread.convert(thread.select(nan, double(np.nan), angle), dtype)
 
 
@@ -106,7 +118,7 @@ def _atan_within(thread: Thread, x: Scalar) -> Scalar:
     With c the nearest of 0, 1/4, 1/2, 3/4 and 1, it is atan(c) + atan(t), t = (x − c) / (1 + c x).
     """
     double = np.float64
-    quarters = thread.emit("cvt.rni.f64.f64", double, thread.apply("mul", x, double(4)))
+    quarters = thread.emit("round", double, thread.apply("mul", x, double(4)))
     c = thread.apply("mul", quarters, double(0.25))
     start: Scalar = double(0)
     for k in range(1, 5):
@@ -143,21 +155,19 @@ def _exp(thread: Thread, x: Scalar) -> Scalar:
     """Returns eˣ = 2ⁿ eʳ, with r = x − n log 2."""
     double = np.float64
     wide = thread.convert(x, double)
-    wide = thread.emit("max.f64", double, wide, double(-800))
-    wide = thread.emit("min.f64", double, wide, double(800))
-    n = thread.emit("cvt.rni.f64.f64", double, thread.apply("mul", wide, double(1 / math.log(2))))
+    wide = thread.apply("clamp", double(-800), wide, double(800))
+    n, power = _nearest(thread, wide, double(1 / math.log(2)))
     back = thread.apply("neg", n)
     rest = thread.fma(back, double(LOG_2[1]), thread.fma(back, double(LOG_2[0]), wide))
     value = _series(thread, rest, [1 / math.factorial(k) for k in range(14)])
     # 2ⁿ as the product of two powers: it may be too large or too small for one number
-    power = thread.emit("cvt.rzi.s64.f64", np.int64, n)
     half = thread.apply("shift_right_arithmetic", power, np.int64(1))
     for part in (half, thread.apply("sub", power, half)):
         value = thread.apply("mul", value, _two_to(thread, part))
     return thread.select(thread.apply("ne", x, x), x, thread.convert(value, x.dtype))
 
 
-def _two_to(thread: Thread, n: Scalar) -> Register:
+def _two_to(thread: Thread, n: Scalar) -> Scalar:
     """Returns 2ⁿ for an integer n from −1022 to 1023, by its bits."""
     raised = thread.apply("add", n, np.int64(1023))
     return thread.bits(thread.apply("shift_left", raised, np.int64(52)), np.float64)
@@ -192,12 +202,11 @@ def _log(thread: Thread, x: Scalar) -> Scalar:
 
 def rounded(thread: Thread, x: Scalar, to_even: bool) -> Scalar:
     """Returns the nearest integer; of two, the even one, or that farther from 0."""
-    kind = "f32" if x.dtype == np.float32 else "f64"
     if to_even:
-        return thread.emit(f"cvt.rni.{kind}.{kind}", x.dtype, x)
-    down = thread.emit(f"cvt.rzi.{kind}.{kind}", x.dtype, x)
+        return thread.emit("round", x.dtype, x)
+    down = thread.emit("truncate", x.dtype, x)
     rest = thread.apply("abs", thread.apply("sub", x, down))
-    one = thread.emit(f"copysign.{kind}", x.dtype, x, x.dtype.type(1))
+    one = thread.emit("copysign", x.dtype, x.dtype.type(1), x)
     farther = thread.apply("ge", rest, x.dtype.type(0.5))
     return thread.select(farther, thread.apply("add", down, one), down)
 
@@ -226,7 +235,7 @@ def _tanh(thread: Thread, x: Scalar) -> Scalar:
     near = thread.apply("mul", size, series)
     small = thread.apply("lt", size, double(0.1))
     value = thread.select(small, near, far)
-    return thread.emit("copysign.f64", double, x, value)
+    return thread.emit("copysign", double, value, x)
 
 
 def _logistic(thread: Thread, x: Scalar) -> Scalar:

@@ -1,4 +1,4 @@
-"""Evaluates a program entry by entry, as the instructions of one thread.
+"""Evaluates a program entry by entry, as the instructions of a thread.
 
 An array becomes an object array of scalars. Operations that move entries, such as slices and
 transposes, move these objects and write no instructions. All other operations write the
@@ -22,7 +22,15 @@ from jaxcon.core.jaxprs import read_arguments
 from jaxcon.staging.constants import MOVES
 from jaxcon.staging.elementary import FUNCTIONS, rounded
 from jaxcon.staging.program import Constant, Operand, Operation, Program
-from jaxcon.staging.ptx import INSTRUCTIONS, Register, Scalar, Thread, UnsupportedError
+from jaxcon.staging.thread import (
+    INSTRUCTIONS,
+    Address,
+    Counter,
+    Register,
+    Scalar,
+    Thread,
+    UnsupportedError,
+)
 
 Entries = np.ndarray[Any, np.dtype[np.object_]]
 """An array of scalars."""
@@ -59,24 +67,21 @@ class Stored:
         shape, dtype: those of the array.
     """
 
-    def __init__(
-        self, thread: Thread, pointer: Register, apart: int, shape: tuple[int, ...], dtype: Any
-    ) -> None:
+    def __init__(self, thread: Thread, first: Address, shape: tuple[int, ...], dtype: Any) -> None:
         """Names an array in memory.
 
         Args:
             thread: the thread that reads or writes it.
-            pointer: the address of its first entry.
-            apart: the bytes from one entry to the next.
+            first: the address of its first entry.
             shape: its shape.
             dtype: its dtype.
         """
-        self.thread, self.pointer, self.apart = thread, pointer, apart
+        self.thread, self.first = thread, first
         self.shape, self.dtype = tuple(shape), np.dtype(dtype)
 
-    def address(self, entry: int) -> str:
+    def address(self, entry: int) -> Address:
         """Returns the address of an entry, by its number in the flat array."""
-        return self.thread.address(self.pointer, entry * self.apart)
+        return self.first._replace(entry=self.first.entry + entry)
 
     @functools.cached_property
     def entries(self) -> Entries:
@@ -95,19 +100,22 @@ class Stored:
 
     def reshaped(self, shape: tuple[int, ...]) -> Stored:
         """Returns the array in another shape."""
-        return Stored(self.thread, self.pointer, self.apart, shape, self.dtype)
+        return Stored(self.thread, self.first, shape, self.dtype)
 
-    def row(self, index: Scalar) -> Stored:
-        """Returns the slice at an index of the first axis."""
-        stride = math.prod(self.shape[1:]) * self.apart
-        pointer = self.thread.moved(self.pointer, index, stride)
-        return Stored(self.thread, pointer, self.apart, self.shape[1:], self.dtype)
+    def row(self, index: int | Counter) -> Stored:
+        """Returns the slice at an index of the first axis, which may be the round of a loop."""
+        size, first = math.prod(self.shape[1:]), self.first
+        if isinstance(index, Counter):
+            first = first._replace(moves=(*first.moves, (index, size)))
+        else:
+            first = first._replace(entry=first.entry + index * size)
+        return Stored(self.thread, first, self.shape[1:], self.dtype)
 
 
 class _Nowhere:
     """Takes the place of an array in memory for a result that nothing reads."""
 
-    def row(self, index: Scalar) -> _Nowhere:
+    def row(self, index: int | Counter) -> _Nowhere:
         """Returns itself."""
         return self
 
@@ -402,25 +410,21 @@ class Evaluation:
             length: the number of rounds.
         """
         shapes = [x.shape for x in start]
-        one, end = np.int32(1), np.int32(length)
         kinds = [x.aval for x in body.closed.jaxpr.invars[len(fixed) + len(start) :]]
-        before = len(self.thread.lines) + self._extra
+        before = self.thread.length + self._extra
 
-        def goes_on(carried: Sequence[Scalar]) -> Scalar:
-            return self.thread.apply("lt", carried[0], end)
-
-        def run(carried: Sequence[Scalar]) -> list[Scalar]:
-            given = [_row(x, carried[0], aval) for x, aval in zip(rows, kinds, strict=True)]
-            results = self(body, [*fixed, *_unflattened(carried[1:], shapes), *given])
+        def run(counter: Counter, carried: Sequence[Scalar]) -> list[Scalar]:
+            given = [_row(x, counter, aval) for x, aval in zip(rows, kinds, strict=True)]
+            results = self(body, [*fixed, *_unflattened(carried, shapes), *given])
             for x, place in zip(results[len(start) :], places, strict=True):
-                place.row(carried[0]).write(x)
-            return [self.thread.apply("add", carried[0], one), *_flat(results[: len(start)])]
+                place.row(counter).write(x)
+            return _flat(results[: len(start)])
 
-        final = self.thread.loop(goes_on, run, [np.int32(0), *_flat(start)])
-        self._extra += (len(self.thread.lines) + self._extra - before) * (length - 1)
+        final = self.thread.repeat(length, run, _flat(start))
+        self._extra += (self.thread.length + self._extra - before) * (length - 1)
         if self._extra > MAX_WORK:
             raise UnsupportedError(f"a loop of {length} rounds, which would take too long")
-        return [*_unflattened(final[1:], shapes), *places]
+        return [*_unflattened(final, shapes), *places]
 
     def _index(self, starts: Sequence[Any], sizes: Sequence[int], shape: tuple[int, ...]) -> Any:
         """Returns, for a slice that starts at traced indices, each possible start and its flag.
@@ -536,12 +540,12 @@ def _read(x: Any) -> Any:
     return x.entries if isinstance(x, Stored) else x
 
 
-def _row(x: Any, index: Any, aval: Any) -> Any:
+def _row(x: Any, index: int | Counter, aval: Any) -> Any:
     """Returns the slice of an array at an index of its first axis; zeros if it is not needed."""
     if x is None:
         return entries(np.zeros(aval.shape, np.int32))
     if isinstance(x, Stored):
-        return x.row(np.int32(index) if isinstance(index, int) else index)
+        return x.row(index)
     return np.take(x, [index], 0).squeeze(0)
 
 

@@ -16,7 +16,7 @@ from jax.core import Tracer
 from jax.extend import core as jex
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, Var
 
-from jaxcon.core.jaxprs import called, without_unused
+from jaxcon.core.jaxprs import called
 from jaxcon.core.typing import Array
 from jaxcon.staging.constants import (
     MAX_SIZE,
@@ -84,8 +84,7 @@ class Operation:
 
 def traced(function: Native, args: Sequence[Any]) -> ClosedJaxpr:
     """Returns the closed jaxpr of a native function, without unused equations."""
-    closed = function.traced(*((x.shape, x.dtype) for x in args))
-    return ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
+    return function.pruned(*((x.shape, x.dtype) for x in args))
 
 
 def evaluated(closed: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:

@@ -1,0 +1,124 @@
+"""Kernels for CPUs, compiled by LLVM and called by XLA as a function of another library.
+
+XLA computes a step by hundreds of loops over the batch. Here a step is one function: its vector
+registers hold a number of as many worlds as they have lanes, so that all values of a world stay in
+the first cache.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import llvmlite.binding
+import numpy as np
+from jax.interpreters import mlir
+
+from jaxcon.staging import llvm
+from jaxcon.staging.kernels import NAME, batch_last, kernel_p, shared_memory
+from jaxcon.staging.thread import Instruction, Layout, Statement
+
+OPTIMIZATION = 1
+"""LLVM's level of optimization. At level 2, code is no faster and takes longer to compile."""
+
+
+class Cpu:
+    """The CPU of this machine; see `Platform`."""
+
+    max_length = 1_000_000
+    max_arrays = 10_000
+
+    def text(
+        self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int
+    ) -> str:
+        """Returns the text of a kernel."""
+        lanes = min(_register_bytes() // _size(program), 1 << (worlds.bit_length() - 1))
+        return llvm.text(program, NAME, worlds, arrays, results, lanes)
+
+
+def _size(program: Sequence[Statement]) -> int:
+    """Returns the bytes of most numbers that a program reads."""
+    loads = [x for x in program if isinstance(x, Instruction) and x.name == "load"]
+    sizes = [x.result.dtype.itemsize for x in loads if x.result and x.result.dtype.kind == "f"]
+    return int(np.median(sizes)) if sizes else 4
+
+
+@functools.cache
+def _machine() -> Any:
+    """Returns LLVM's compiler for the CPU of this machine."""
+    llvmlite.binding.initialize_native_target()
+    llvmlite.binding.initialize_native_asmprinter()
+    return llvmlite.binding.Target.from_default_triple().create_target_machine(
+        cpu=llvmlite.binding.get_host_cpu_name(),
+        features=llvmlite.binding.get_host_cpu_features().flatten(),
+        opt=OPTIMIZATION,
+        jit=True,
+        codemodel="jitdefault",
+    )
+
+
+@functools.cache
+def _register_bytes() -> int:
+    """Returns the size of a vector register."""
+    features = llvmlite.binding.get_host_cpu_features()
+    for feature, size in (("avx512f", 64), ("avx2", 32)):
+        if features.get(feature):
+            return size
+    return 16
+
+
+class _Compiler:
+    """Compiles kernels, and keeps their machine code as long as the process lives."""
+
+    def __init__(self) -> None:
+        self._engine = llvmlite.binding.create_mcjit_compiler(
+            llvmlite.binding.parse_assembly(""), _machine()
+        )
+        self._names: set[str] = set()
+
+    def target(self, text: str) -> str:
+        """Returns the name by which XLA calls a kernel; compiles it if it is new."""
+        name = f"jaxcon_{hashlib.sha256(text.encode()).hexdigest()[:40]}"
+        if name not in self._names:
+            self._register(name, text.replace(f"@{NAME}(", f"@{name}("))
+            self._names.add(name)
+        return name
+
+    def _register(self, name: str, text: str) -> None:
+        module = llvmlite.binding.parse_assembly(text)
+        code = _machine().emit_object(module)
+        self._engine.add_object_file(llvmlite.binding.ObjectFileRef.from_data(code))
+        self._engine.finalize_object()
+        address = self._engine.get_function_address(name)
+        function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(address)
+        jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
+
+
+@functools.cache
+def _compiler() -> _Compiler:
+    return _Compiler()
+
+
+def _lowered(
+    ctx: mlir.LoweringRuleContext,
+    *args: Any,
+    text: str,
+    shapes: Any,
+    worlds: int,
+    in_place: bool,
+) -> Sequence[Any]:
+    """The lowering rule: a call of the kernel, whose arrays lie in memory with the batch last."""
+    call = jax.ffi.ffi_lowering(
+        _compiler().target(text),
+        operand_layouts=list(map(batch_last, ctx.avals_in)),
+        result_layouts=list(map(batch_last, ctx.avals_out)),
+        operand_output_aliases=shared_memory(ctx.avals_in, ctx.avals_out) if in_place else {},
+    )
+    return call(ctx, *args)
+
+
+mlir.register_lowering(kernel_p, _lowered, platform="cpu")

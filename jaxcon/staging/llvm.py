@@ -1,0 +1,659 @@
+"""The program of a thread as text in LLVM's language, for the vector registers of a CPU.
+
+Each lane of a vector register is a thread, and has a world of its own. Lanes take a branch
+together: it is skipped if no lane needs it, and otherwise leaves the other lanes as they are. A
+loop ends when the last lane has ended, and a lane keeps the values with which its own loop ended.
+
+The program is cut into pieces of some hundred instructions, each of which is a function. A value
+that another piece reads lies in memory, at a place that later values reuse. LLVM would find such
+places itself in a single function, but in a time that grows faster than the program.
+
+The function has the interface that XLA defines for functions of other libraries: its argument is a
+description of the call, with the addresses of arrays.
+
+References: LLVM Language Reference Manual, version 20; OpenXLA, XLA FFI, `xla/ffi/api/c_api.h`.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxcon.staging.thread import (
+    Address,
+    Branch,
+    Counter,
+    Instruction,
+    Layout,
+    Loop,
+    Piece,
+    Register,
+    Repeat,
+    Scalar,
+    Statement,
+    is_float,
+    moved_by,
+)
+
+KINDS = {"float32": "float", "float64": "double", "int32": "i32", "int64": "i64", "uint32": "i32"}
+KINDS |= {"uint64": "i64", "bool": "i1"}
+TYPES = {np.dtype(name): kind for name, kind in KINDS.items()}
+"""The type of a register for each dtype. The name of a dtype takes NumPy a microsecond to find."""
+
+SUFFIXES = {"float": "f32", "double": "f64"}
+"""How the names of LLVM's functions call types."""
+
+FLOAT_COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
+FUNCTIONS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "ceil": "ceil", "round": "rint"}
+FUNCTIONS |= {"truncate": "trunc", "fma": "fma", "copysign": "copysign"}
+"""LLVM's functions of floats."""
+
+INTEGERS = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor"}
+INTEGERS |= {"shift_left": "shl", "shift_right_arithmetic": "ashr"}
+
+PIECE = 500
+"""The number of instructions of a piece."""
+
+FEW = 50
+"""The fewest instructions that are a function of their own."""
+
+FRAME = {"extension": 8, "api": 16, "arguments": 72, "results": 112}
+"""The offsets of fields in the description of a call, in bytes."""
+
+API_VERSION, METADATA, METADATA_VERSION, METADATA_TRAITS, DATA = 32, 24, 24, 32, 24
+"""Offsets of fields: the version in the description of XLA's interface; the metadata in a request
+for it; the version and the traits in the metadata; the address of the numbers of an array."""
+
+
+def text(
+    program: Sequence[Statement],
+    name: str,
+    worlds: int,
+    arrays: Sequence[Layout],
+    results: int,
+    lanes: int,
+) -> str:
+    """Returns the text of a function that evaluates a program in all worlds.
+
+    If the number of worlds is no multiple of the lanes, some worlds are evaluated twice.
+
+    Args:
+        program: the program of a thread.
+        name: the name of the function.
+        worlds: the number of worlds, at least as many as lanes.
+        arrays: the layouts of all arrays.
+        results: the number of arrays that are results; they are the last ones.
+        lanes: the number of worlds that are evaluated together.
+    """
+    parts = _in_pieces(program)
+    writer = _Writer(lanes, arrays, _Places(parts))
+    writer.start(len(arrays) - results)
+    writer.worlds(parts, worlds)
+    lines = [f"define ptr @{name}(ptr %frame) nounwind {{", *writer.entry, *writer.lines, "}"]
+    return "\n".join([*lines, *writer.functions, *writer.declarations, ""])
+
+
+def _in_pieces(statements: Sequence[Statement], depth: int = 0) -> list[Statement]:
+    """Returns a block in which pieces take the place of instructions, also in blocks within it.
+
+    Args:
+        statements: the statements of the block.
+        depth: the number of branches and loops with a condition around it. Within these, some lanes
+            may not take part, and what is written for all lanes belongs to the main function.
+    """
+    parts: list[Statement] = []
+
+    def is_common(statement: Statement) -> bool:
+        """Returns True for instructions that all lanes may execute."""
+        if not isinstance(statement, Instruction):
+            return False
+        return statement.result is not None or (statement.name == "store" and not depth)
+
+    for common, group in itertools.groupby(statements, is_common):
+        if common:
+            run: Any = list(group)
+            count = -(-len(run) // PIECE)
+            size = -(-len(run) // count)
+            for k in range(0, len(run), size):
+                parts.append(Piece(run[k : k + size], len(run) >= FEW))
+            continue
+        for statement in group:
+            match statement:
+                case Instruction():
+                    parts.append(Piece([statement], False))
+                case Branch(which, taken, others):
+                    inner = (_in_pieces(x, depth + 1) for x in (taken, others))
+                    parts.append(Branch(which, *inner))
+                case Loop(condition, goes_on, body):
+                    before, after = (_in_pieces(x, depth + 1) for x in (condition, body))
+                    parts.append(Loop(before, goes_on, after))
+                case Repeat(counter, length, body):
+                    parts.append(Repeat(counter, length, _in_pieces(body, depth)))
+    return parts
+
+
+class _Places:
+    """Places in memory for values that several pieces of a program use.
+
+    Attributes:
+        of: the place of each register that has one: the type, and the number among those of the
+            type.
+        count: the number of places of each type.
+    """
+
+    def __init__(self, program: Sequence[Statement]) -> None:
+        self._position = self._piece = 0
+        self._made: dict[int, tuple[int, int]] = {}  # positions and pieces of registers
+        self._last: dict[int, int] = {}  # the position of the last use of each register
+        self._shared: dict[int, Register] = {}
+        self._loops: list[set[int]] = []  # registers that are used in each loop around the position
+        self._walk(program)
+        self.of: dict[int, tuple[str, int]] = {}
+        self.count: dict[str, int] = {}
+        self._give()
+
+    def _walk(self, parts: Sequence[Statement]) -> None:
+        """Notes where registers are made and used in a block."""
+        for part in parts:
+            self._piece += 1
+            match part:
+                case Piece(instructions):
+                    for instruction in instructions:
+                        self._instruction(instruction)
+                case Branch(which, taken, others):
+                    self._use(which)
+                    self._walk(taken)
+                    self._walk(others)
+                case Loop(condition, goes_on, body):
+                    start = self._enter()
+                    self._walk(condition)
+                    self._piece += 1
+                    self._use(goes_on)
+                    self._walk(body)
+                    self._leave(start)
+                case Repeat(_, _, body):
+                    start = self._enter()
+                    self._walk(body)
+                    self._leave(start)
+
+    def _instruction(self, instruction: Instruction) -> None:
+        self._position += 1
+        for x in instruction.operands:
+            self._use(x)
+        if instruction.name in ("set", "assign"):
+            register: Any = instruction.operands[0]
+            self._shared[register.number] = register
+        elif instruction.result is not None:
+            self._made[instruction.result.number] = self._position, self._piece
+
+    def _use(self, x: Scalar) -> None:
+        if not isinstance(x, Register):
+            return
+        number = x.number
+        _, piece = self._made.setdefault(number, (self._position, self._piece))
+        self._last[number] = self._position
+        if piece != self._piece:
+            self._shared[number] = x
+        if self._loops:
+            self._loops[-1].add(number)
+
+    def _enter(self) -> int:
+        self._loops.append(set())
+        return self._position
+
+    def _leave(self, start: int) -> None:
+        """Ends a loop: what it reads from before must be kept until its last round."""
+        used = self._loops.pop()
+        for number in used:
+            if self._made[number][0] <= start:
+                self._last[number] = self._position
+        if self._loops:
+            self._loops[-1] |= used
+
+    def _give(self) -> None:
+        """Gives places to registers in the order in which they are made."""
+        free: dict[str, list[int]] = {}
+        ends: list[tuple[int, str, int]] = []
+        for register in sorted(self._shared.values(), key=lambda x: self._made[x.number]):
+            number, kind = register.number, TYPES[register.dtype]
+            while ends and ends[0][0] < self._made[number][0]:
+                _, other, place = heapq.heappop(ends)
+                free[other].append(place)
+            if not free.setdefault(kind, []):
+                free[kind].append(self.count.get(kind, 0))
+                self.count[kind] = self.count.get(kind, 0) + 1
+            place = free[kind].pop()
+            self.of[number] = kind, place
+            heapq.heappush(ends, (self._last[number], kind, place))
+
+
+class _Writer:
+    """Writes the lines of a function.
+
+    Attributes:
+        lanes: the number of lanes.
+        arrays: the layouts of all arrays.
+        places: the places of values in memory.
+        entry: the lines of the first block, which reserve memory.
+        lines: the lines after it, written so far.
+        functions: the lines of the pieces that are functions of their own.
+        declarations: the declarations of the functions that it calls; a mapping keeps each once.
+    """
+
+    def __init__(self, lanes: int, arrays: Sequence[Layout], places: _Places) -> None:
+        self.lanes, self.arrays, self.places = lanes, arrays, places
+        self._types = {dtype: self._vector(kind) for dtype, kind in TYPES.items()}
+        self.entry = ["entry:"]
+        for kind, count in places.count.items():
+            every = f"[{count} x {self._vector(kind)}]"
+            self.entry.append(f"%{kind}s = alloca {every}, align 64")
+        self.lines: list[str] = []
+        self.functions: list[str] = []
+        self.declarations: dict[str, None] = {}
+        self._count = itertools.count()
+        self._block = "entry"
+        self._pointers: dict[tuple[int, tuple[tuple[Counter, int], ...]], str] = {}
+        self._mask: str | None = None  # the lanes that take part; None for all
+        self._fresh: str | None = None  # the lanes whose worlds are new; None for all
+        self._read: dict[int, str] = {}  # values of places, in the current piece
+
+    def _new(self) -> str:
+        return f"%w{next(self._count)}"
+
+    def _line(self, line: str) -> None:
+        self.lines.append(line)
+
+    def _result(self, line: str) -> str:
+        """Writes an instruction; returns the name of its result."""
+        name = self._new()
+        self.lines.append(f"{name} = {line}")
+        return name
+
+    def _label(self, label: str) -> None:
+        """Begins a block."""
+        self.lines.append(f"{label}:")
+        self._block = label
+        self._read = {}
+
+    def _vector(self, kind: str) -> str:
+        return kind if self.lanes == 1 else f"<{self.lanes} x {kind}>"
+
+    def _type(self, x: Scalar) -> str:
+        return self._types[x.dtype]
+
+    def _value(self, x: Scalar) -> str:
+        """Returns an operand."""
+        if isinstance(x, Register):
+            if x.number not in self.places.of:
+                return f"%v{x.number}"
+            if x.number not in self._read:
+                place = self._place(x.number)
+                self._read[x.number] = self._result(f"load {self._type(x)}, ptr {place}")
+            return self._read[x.number]
+        if x.dtype == bool:
+            number = "true" if x else "false"
+        elif is_float(x):  # LLVM reads floats as 64-bit numbers
+            number = f"0x{int(np.float64(x).view(np.uint64)):016X}"
+        else:
+            number = str(int(x))
+        return number if self.lanes == 1 else f"splat ({TYPES[x.dtype]} {number})"
+
+    def _place(self, number: int) -> str:
+        """Returns the address of a place."""
+        kind, place = self.places.of[number]
+        return self._result(f"getelementptr {self._vector(kind)}, ptr %{kind}s, i64 {place}")
+
+    def _keep(self, register: Register, value: str) -> None:
+        """Stores the value of a register, if it has a place."""
+        if register.number in self.places.of:
+            place = self._place(register.number)
+            self._line(f"store {self._type(register)} {value}, ptr {place}")
+            self._read[register.number] = value
+
+    def start(self, arguments: int) -> None:
+        """Writes the start, which answers XLA's question for metadata and finds all arrays."""
+        extension = self._field("%frame", FRAME["extension"])
+        asked = self._result(f"icmp ne ptr {extension}, null")
+        self._line(f"br i1 {asked}, label %metadata, label %arrays")
+        self._label("metadata")
+        api = self._field("%frame", FRAME["api"])
+        version = self._field(api, API_VERSION, "i64")
+        metadata = self._field(extension, METADATA)
+        for offset, x in ((METADATA_VERSION, f"i64 {version}"), (METADATA_TRAITS, "i32 0")):
+            place = self._result(f"getelementptr i8, ptr {metadata}, i64 {offset}")
+            self._line(f"store {x}, ptr {place}")
+        self._line("ret ptr null")
+        self._label("arrays")
+        lists = [self._field("%frame", FRAME[key]) for key in ("arguments", "results")]
+        for k in range(len(self.arrays)):
+            of_results = k >= arguments
+            place = 8 * (k - arguments if of_results else k)
+            array = self._field(lists[of_results], place)
+            self._pointers[k, ()] = self._field(array, DATA)
+
+    def _field(self, pointer: str, offset: int, kind: str = "ptr") -> str:
+        """Writes the reading of a field of a structure."""
+        place = self._result(f"getelementptr i8, ptr {pointer}, i64 {offset}")
+        return self._result(f"load {kind}, ptr {place}")
+
+    def worlds(self, program: Sequence[Statement], worlds: int) -> None:
+        """Writes a loop over groups of worlds. The last group ends with the last world."""
+        last = worlds - self.lanes
+        self._line("br label %group")
+        self._label("group")
+        self._line("%begun = phi i64 [0, %arrays], [%next, %ended]")
+        beyond = self._result(f"icmp sgt i64 %begun, {last}")
+        first = self._result(f"select i1 {beyond}, i64 {last}, i64 %begun")
+        if worlds % self.lanes:
+            # of worlds that two groups have, the second one may find results in place of arguments
+            self._fresh = "%fresh"
+            index = self._vector("i64")
+            numbers = ", ".join(f"i64 {k}" for k in range(self.lanes))
+            done = self._result(f"sub i64 %begun, {first}")
+            done = self._result(f"insertelement {index} poison, i64 {done}, i32 0")
+            done = self._result(self._repeated(index, done))
+            self._line(f"%fresh = icmp uge {index} <{numbers}>, {done}")
+        for k, array in enumerate(self.arrays):
+            if array.world:
+                far = self._result(f"mul i64 {first}, {array.world}")
+                start = self._pointers[k, ()]
+                self._pointers[k, ()] = self._result(f"getelementptr i8, ptr {start}, i64 {far}")
+        self.block(program)
+        self._line("br label %ended")
+        self._label("ended")
+        self._line(f"%next = add i64 %begun, {self.lanes}")
+        more = self._result(f"icmp slt i64 %next, {worlds}")
+        self._line(f"br i1 {more}, label %group, label %end")
+        self._label("end")
+        self._line("ret ptr null")
+
+    def block(self, parts: Sequence[Statement]) -> None:
+        """Writes the parts of a block."""
+        for part in parts:
+            self._read = {}
+            match part:
+                case Piece(apart=True):
+                    self._function(part)
+                case Piece(instructions):
+                    self._instructions(instructions)
+                case Branch():
+                    self._branch(part)
+                case Loop():
+                    self._loop(part)
+                case Repeat():
+                    self._repeat(part)
+
+    def _function(self, piece: Piece) -> None:
+        """Writes a piece as a function, and its call."""
+        used = {(x.address.array, x.address.moves) for x in piece.instructions if x.address}
+        pointers = [
+            *(f"%{kind}s" for kind in self.places.count),
+            *(self._pointers[x] for x in sorted(used)),
+        ]
+        arguments = [f"ptr {x}" for x in pointers]
+        if self._fresh and any(x.name == "store" for x in piece.instructions):
+            arguments.append(f"{self._vector('i1')} {self._fresh}")
+        given = ", ".join(arguments)
+        name = f"@piece{next(self._count)}"
+        outside, self.lines = self.lines, []
+        self._instructions(piece.instructions)
+        body, self.lines = self.lines, outside
+        self.functions += [f"define internal void {name}({given}) noinline nounwind {{"]
+        self.functions += [*body, "ret void", "}"]
+        self._line(f"call void {name}({given})")
+        self._read = {}
+
+    def _instructions(self, instructions: Sequence[Instruction]) -> None:
+        """Writes the instructions of a piece."""
+        for instruction in instructions:
+            match instruction:
+                case Instruction("load", Register() as result, _, Address() as address):
+                    self._load(result, address)
+                    self._keep(result, f"%v{result.number}")
+                case Instruction("store", _, (x,), Address() as address):
+                    self._store(x, address)
+                case Instruction("set" | "assign" as name, _, (Register() as register, x)):
+                    self._assign(register, x, keeps=name == "assign")
+                case Instruction(name, Register() as result, operands):
+                    value = f"%v{result.number}"
+                    self._line(f"{value} = {self._operation(name, result, operands)}")
+                    self._keep(result, value)
+
+    def _any(self, mask: str) -> str:
+        """Returns a bit: True if it is in any lane."""
+        if self.lanes == 1:
+            return mask
+        bits = self._result(f"bitcast {self._vector('i1')} {mask} to i{self.lanes}")
+        return self._result(f"icmp ne i{self.lanes} {bits}, 0")
+
+    def _both(self, x: str, y: str | None) -> str:
+        """Returns the lanes that are in both masks; y may be None for all."""
+        if y is None or self.lanes == 1:
+            return x
+        return self._result(f"and {self._vector('i1')} {x}, {y}")
+
+    def _branch(self, branch: Branch) -> None:
+        label, before = f"b{next(self._count)}", self._mask
+        which = self._value(branch.which)
+        kind = self._vector("i1")
+        inverse = self._result(f"xor {kind} {which}, {self._value(np.True_)}")
+        for part, mask, body in (("", which, branch.taken), ("e", inverse, branch.others)):
+            if not body:
+                continue
+            self._mask = self._both(mask, before)
+            some = self._any(self._mask)
+            self._line(f"br i1 {some}, label %{label}{part}, label %{label}{part}n")
+            self._label(f"{label}{part}")
+            self.block(body)
+            self._line(f"br label %{label}{part}n")
+            self._label(f"{label}{part}n")
+        self._mask = before
+
+    def _loop(self, loop: Loop) -> None:
+        label, before, entered = f"l{next(self._count)}", self._mask, self._block
+        kind, mask, active = self._vector("i1"), self._new(), self._new()
+        self._line(f"br label %{label}")
+        self._label(label)
+        every = self._value(np.True_) if before is None else before
+        self._line(f"{mask} = phi {kind} [{every}, %{entered}], [{active}, %{label}r]")
+        self._mask = mask
+        self.block(loop.condition)
+        # in a single lane, all that is executed takes part
+        goes_on, known = self._value(loop.goes_on), self._value(np.True_)
+        alone = self.lanes == 1
+        self._line(f"{active} = and {kind} {goes_on}, {known if alone else mask}")
+        some = self._any(active)
+        self._line(f"br i1 {some}, label %{label}b, label %{label}n")
+        self._label(f"{label}b")
+        self._mask = active
+        self.block(loop.body)
+        self._line(f"br label %{label}r")
+        self._label(f"{label}r")
+        self._line(f"br label %{label}")
+        self._label(f"{label}n")
+        self._mask = before
+
+    def _repeat(self, repeat: Repeat) -> None:
+        label, entered = f"r{next(self._count)}", self._block
+        counter, following = self._new(), self._new()
+        self._line(f"br label %{label}")
+        self._label(label)
+        self._line(f"{counter} = phi i64 [0, %{entered}], [{following}, %{label}r]")
+        for array, _, moves in moved_by(repeat.counter, repeat.body):
+            *others, (_, entries) = moves
+            stride = entries * self.arrays[array].entry
+            far = self._result(f"mul i64 {counter}, {stride}")
+            start = self._pointers[array, tuple(others)]
+            pointer = self._result(f"getelementptr i8, ptr {start}, i64 {far}")
+            self._pointers[array, moves] = pointer
+        self.block(repeat.body)
+        self._line(f"br label %{label}r")
+        self._label(f"{label}r")
+        self._line(f"{following} = add i64 {counter}, 1")
+        more = self._result(f"icmp slt i64 {following}, {repeat.length}")
+        self._line(f"br i1 {more}, label %{label}, label %{label}n")
+        self._label(f"{label}n")
+
+    def _address(self, address: Address) -> str:
+        pointer = self._pointers[address.array, address.moves]
+        offset = address.entry * self.arrays[address.array].entry
+        return self._result(f"getelementptr i8, ptr {pointer}, i64 {offset}")
+
+    def _load(self, result: Register, address: Address) -> None:
+        name, kind = f"%v{result.number}", TYPES[result.dtype]
+        stored = "i8" if kind == "i1" else kind
+        whole, place = self._vector(stored), self._address(address)
+        if not self.arrays[address.array].world and self.lanes > 1:
+            one = self._result(f"load {stored}, ptr {place}")
+            one = self._result(f"insertelement {whole} poison, {stored} {one}, i32 0")
+            read = self._repeated(whole, one)
+        else:
+            read = f"load {whole}, ptr {place}, align {result.dtype.itemsize}"
+        if kind == "i1":
+            zero = "0" if self.lanes == 1 else "zeroinitializer"
+            read = f"icmp ne {whole} {self._result(read)}, {zero}"
+        self._line(f"{name} = {read}")
+
+    def _repeated(self, kind: str, x: str) -> str:
+        """Returns the first number of a vector in all lanes."""
+        first = f"<{self.lanes} x i32> zeroinitializer"
+        return f"shufflevector {kind} {x}, {kind} poison, {first}"
+
+    def _store(self, x: Scalar, address: Address) -> None:
+        kind, value, place = self._type(x), self._value(x), self._address(address)
+        if x.dtype == bool:
+            kind, bits = self._vector("i8"), kind
+            value = self._result(f"zext {bits} {value} to {kind}")
+        for mask in filter(None, (self._mask, self._fresh)):
+            if self.lanes > 1:
+                before = self._result(f"load {kind}, ptr {place}, align {x.dtype.itemsize}")
+                value = self._selected(mask, kind, value, before)
+        self._line(f"store {kind} {value}, ptr {place}, align {x.dtype.itemsize}")
+
+    def _selected(self, mask: str, kind: str, x: str, y: str) -> str:
+        """Returns x in the lanes of a mask, and y in the others."""
+        return self._result(f"select {self._vector('i1')} {mask}, {kind} {x}, {kind} {y}")
+
+    def _assign(self, register: Register, x: Scalar, keeps: bool) -> None:
+        kind, value = self._type(register), self._value(x)
+        if keeps and self._mask is not None and self.lanes > 1:
+            value = self._selected(self._mask, kind, value, self._value(register))
+        self._keep(register, value)
+
+    def _operation(self, name: str, result: Register, operands: Sequence[Scalar]) -> str:
+        """Returns an operation on numbers."""
+        x, kind = operands[0], self._type(operands[0])
+        floats, values = is_float(x), list(map(self._value, operands))
+        pair = ", ".join(values[:2])
+        unsigned = x.dtype.kind == "u"
+        match name:
+            case "add" | "sub" | "mul" | "div" if floats:
+                return f"f{name} contract {kind} {pair}"
+            case "select":
+                _, x, _ = operands
+                which, *cases = values
+                typed = ", ".join(f"{self._type(x)} {y}" for y in cases)
+                return f"select {kind} {which}, {typed}"
+            case "convert":
+                return self._conversion(result, x, values[0])
+            case "bits":
+                return f"bitcast {kind} {values[0]} to {self._type(result)}"
+            case "eq" | "ne" | "lt" | "le" | "gt" | "ge" if floats:
+                return f"fcmp {FLOAT_COMPARISONS[name]} {kind} {pair}"
+            case "eq" | "ne":
+                return f"icmp {name} {kind} {pair}"
+            case "lt" | "le" | "gt" | "ge":
+                return f"icmp {'u' if unsigned else 's'}{name} {kind} {pair}"
+            case "unordered":
+                return f"fcmp uno {kind} {pair}"
+            case "finite":
+                if not floats:
+                    return f"icmp eq {kind} {values[0]}, {values[0]}"
+                size = self._result(self._call("fabs", kind, values))
+                return f"fcmp one {kind} {size}, {self._value(x.dtype.type(np.inf))}"
+            case "max" | "min":
+                return self._extremum(name, operands)
+            case "not":
+                ones = np.True_ if x.dtype == bool else x.dtype.type(-1)
+                return f"xor {kind} {values[0]}, {self._value(ones)}"
+            case "neg" if floats:
+                return f"fneg {kind} {values[0]}"
+            case "neg":
+                return f"sub {kind} {self._value(x.dtype.type(0))}, {values[0]}"
+            case "abs" if not floats:
+                return self._call("abs", kind, values, "i1 false")
+            case "div" | "rem":
+                return f"{'u' if unsigned else 's'}{name} {kind} {pair}"
+        if name in FUNCTIONS:
+            return self._call(FUNCTIONS[name], kind, values)
+        return f"{INTEGERS[name]} {kind} {pair}"
+
+    def _call(
+        self, name: str, kind: str, values: Sequence[str], *others: str, result: str | None = None
+    ) -> str:
+        """Returns the call of a function of LLVM's.
+
+        Args:
+            name: its name.
+            kind: the type of its operands.
+            values: these operands.
+            others: operands of other types.
+            result: the type of its result; None for `kind`.
+        """
+        result = result or kind
+        suffixes = (
+            [self._suffix(result)] if result == kind else [self._suffix(result), self._suffix(kind)]
+        )
+        function = f"@llvm.{name}.{'.'.join(suffixes)}"
+        types = [*(kind for _ in values), *(x.split()[0] for x in others)]
+        self.declarations[f"declare {result} {function}({', '.join(types)})"] = None
+        given = ", ".join([*(f"{kind} {x}" for x in values), *others])
+        flags = "contract " if SUFFIXES.get(result.split()[-1].rstrip(">")) else ""
+        return f"call {flags}{result} {function}({given})"
+
+    def _suffix(self, kind: str) -> str:
+        """Returns how the names of functions call a type."""
+        single = kind.split()[-1].rstrip(">")
+        name = SUFFIXES.get(single, single)
+        return name if self.lanes == 1 else f"v{self.lanes}{name}"
+
+    def _extremum(self, name: str, operands: Sequence[Scalar]) -> str:
+        """Returns max or min, which is NaN if an operand is."""
+        x, y = operands
+        kind, mask = self._type(x), self._vector("i1")
+        if not is_float(x):
+            sign = "u" if x.dtype.kind == "u" else "s"
+            return self._call(f"{sign}{name}", kind, [self._value(x), self._value(y)])
+        if not isinstance(y, Register):
+            x, y = y, x
+        first, second = self._value(x), self._value(y)
+        how = "ogt" if name == "max" else "olt"
+        # the second one if one of them is NaN
+        wins = self._result(f"fcmp {how} {kind} {first}, {second}")
+        larger = f"select {mask} {wins}, {kind} {first}, {kind} {second}"
+        if not isinstance(x, Register) and not np.isnan(x):
+            return larger
+        larger, bad = self._result(larger), self._result(f"fcmp uno {kind} {first}, {first}")
+        return f"select {mask} {bad}, {kind} {first}, {kind} {larger}"
+
+    def _conversion(self, result: Register, x: Scalar, value: str) -> str:
+        """Returns the conversion of a number to another dtype."""
+        old, new = self._type(x), self._type(result)
+        unsigned = (result if is_float(x) else x).dtype.kind == "u"
+        if is_float(x) and is_float(result):
+            wider = result.dtype.itemsize > x.dtype.itemsize
+            return f"{'fpext' if wider else 'fptrunc'} {old} {value} to {new}"
+        if is_float(x):
+            sign = "u" if unsigned else "s"
+            return self._call(f"fpto{sign}i.sat", old, [value], result=new)
+        if is_float(result):
+            return f"{'ui' if unsigned else 'si'}tofp {old} {value} to {new}"
+        if result.dtype.itemsize == x.dtype.itemsize:
+            return f"bitcast {old} {value} to {new}"
+        if result.dtype.itemsize < x.dtype.itemsize:
+            return f"trunc {old} {value} to {new}"
+        return f"{'z' if unsigned else 's'}ext {old} {value} to {new}"
