@@ -18,7 +18,7 @@ from jax.extend.core import Literal
 
 import jaxcon as jc
 from benchmarks import legged, mechanisms
-from jaxcon.staging import batch_last, chunks, cpu, cuda, kernels, ptx
+from jaxcon.staging import batch_last, chunks, cpu, cuda, entries, kernels, llvm, ptx
 from jaxcon.staging.elementary import FUNCTIONS
 from jaxcon.staging.thread import UnsupportedError
 
@@ -187,7 +187,8 @@ def rollouts(
     ids=["all", "every third", "none", "flag"],
 )
 @pytest.mark.parametrize("name", ["pendulum", "four-bar"])
-def test_a_rollout_is_that_on_the_cpu(platform, name, options):
+def test_a_rollout_is_that_on_the_cpu(platform, name, options, monkeypatch):
+    monkeypatch.setattr(entries, "MAX_UNROLLED", 0)
     with jax.enable_x64(True):
         run, kernel, states = rollouts(platform, name, **options)
         assert_close(kernel(states), run(states), 1e-13)
@@ -405,6 +406,16 @@ def scanned(x: Any) -> Any:
     return jax.lax.scan(body, x[0, 0], x), jax.lax.scan(body, x[0, 0], x, reverse=True)
 
 
+def at_each(x: Any) -> Any:
+    """Reads and replaces the row of each round."""
+
+    def body(i: Any, y: Any) -> Any:
+        row = jax.lax.dynamic_index_in_dim(y, i, 0, keepdims=False)
+        return jax.lax.dynamic_update_index_in_dim(y, 2 * row + i, i, 0)
+
+    return jax.lax.fori_loop(0, 3, body, x)
+
+
 def repeated(x: Any) -> Any:
     return jax.lax.fori_loop(0, 7, lambda i, c: c * 0.5 + 1, x)
 
@@ -488,6 +499,7 @@ CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
     (each_row, (ARRAY[:, 0],)),
     (scanned, (ARRAY,)),
     (repeated, (ARRAY,)),
+    (at_each, (ARRAY,)),
     (moved, (ARRAY,)),
     (replaced, (ARRAY,)),
     (reduced, (ARRAY,)),
@@ -499,6 +511,16 @@ CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
 
 @pytest.mark.parametrize(("function", "args"), CASES)
 def test_operations(platform, function, args):
+    check_operations(platform, function, args)
+
+
+@pytest.mark.parametrize("function", [scanned, repeated, reduced, at_each])
+def test_loops_that_are_not_written_round_by_round(platform, function, monkeypatch):
+    monkeypatch.setattr(entries, "MAX_UNROLLED", 0)
+    check_operations(platform, function, (ARRAY,))
+
+
+def check_operations(platform, function, args):
     here = evaluated(platform, function, *map(np.asarray, args))
     for x, y in zip(here, expected(function, *args), strict=True):
         assert x.dtype == y.dtype
@@ -517,6 +539,50 @@ def test_worlds_take_their_own_branches_and_rounds(platform, function, worlds):
     here = kernels.run_worlds(platform, one, given, [0] * count, worlds)
     for x, y in zip(here, expected(jax.vmap(function), *args), strict=True):
         np.testing.assert_allclose(np.moveaxis(np.asarray(x), -1, 0), y, rtol=1e-6)
+
+
+@pytest.mark.parametrize("worlds", [1, 5, 16, 19])
+def test_worlds_that_two_groups_of_lanes_have_step_once(worlds):
+    """A kernel on a CPU writes its results in place of its arguments."""
+    with jax.enable_x64(True):
+        system, states = batch("four-bar", np.float64, worlds)
+
+        def end(state: jc.State) -> jc.State:
+            record = lambda state, info: None  # noqa: E731
+            return jc.rollout(system, jc.Method(), state, None, DT, 5, record=record)[0]
+
+        fall = jax.vmap(end)
+        assert_close(jax.jit(fall)(states), by_xla(fall, states), 1e-12)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder for compiled programs, in place of that of other tests."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_machine_code_is_kept_beside_the_programs_of_jax(folder):
+    assert cpu.kept("name", lambda: b"code") == b"code"
+    assert cpu.kept("name", lambda: b"other") == b"code"
+    (file,) = folder.iterdir()
+    file.write_bytes(file.read_bytes()[:-1])  # as after a full disk
+    assert cpu.kept("name", lambda: b"again") == b"again"
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert cpu.kept("name", lambda: b"other") == b"other"
+
+
+def test_long_programs_have_memory_of_their_own(monkeypatch):
+    """Places of values are then a result that nothing reads, and not on the stack."""
+    system, states = batch("chain-5", np.float32, 16)
+    step = lambda s: jc.step(system, jc.Method(), s, None, DT)[0]  # noqa: E731
+    assert "xui8>" not in jax.jit(jax.vmap(step)).lower(states).as_text()
+    monkeypatch.setattr(llvm, "MAX_STACK", 0)
+    program = jax.jit(jax.vmap(lambda s: step(s)))
+    assert "xui8>" in program.lower(states).as_text()
+    assert_close(program(states), by_xla(jax.vmap(step), states), 1e-5)
 
 
 def lowered(function: Callable[..., Any], *args: Any) -> str:

@@ -7,15 +7,20 @@ the first cache.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
-from collections.abc import Sequence
+import os
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import llvmlite.binding
 import numpy as np
+from jax.core import ShapedArray
 from jax.interpreters import mlir
 
 from jaxcon.staging import llvm
@@ -29,8 +34,9 @@ OPTIMIZATION = 1
 class Cpu:
     """The CPU of this machine; see `Platform`."""
 
-    max_length = 1_000_000
+    max_length = 400_000
     max_arrays = 10_000
+    max_places = 16
 
     def text(
         self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int
@@ -72,30 +78,71 @@ def _register_bytes() -> int:
 
 
 class _Compiler:
-    """Compiles kernels, and keeps their machine code as long as the process lives."""
+    """Compiles kernels, and keeps their machine code as long as the process lives.
+
+    Where JAX keeps compiled programs on disk, the machine code of kernels is kept beside them.
+    """
 
     def __init__(self) -> None:
         self._engine = llvmlite.binding.create_mcjit_compiler(
             llvmlite.binding.parse_assembly(""), _machine()
         )
         self._names: set[str] = set()
+        self._lock = threading.Lock()
 
     def target(self, text: str) -> str:
         """Returns the name by which XLA calls a kernel; compiles it if it is new."""
         name = f"jaxcon_{hashlib.sha256(text.encode()).hexdigest()[:40]}"
-        if name not in self._names:
-            self._register(name, text.replace(f"@{NAME}(", f"@{name}("))
-            self._names.add(name)
+        with self._lock:
+            if name not in self._names:
+                self._register(name, text.replace(f"@{NAME}(", f"@{name}("))
+                self._names.add(name)
         return name
 
     def _register(self, name: str, text: str) -> None:
-        module = llvmlite.binding.parse_assembly(text)
-        code = _machine().emit_object(module)
+        code = kept(name, lambda: _machine().emit_object(llvmlite.binding.parse_assembly(text)))
         self._engine.add_object_file(llvmlite.binding.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         address = self._engine.get_function_address(name)
         function = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(address)
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
+
+
+def kept(name: str, compiled: Callable[[], bytes]) -> bytes:
+    """Returns machine code from JAX's folder of compiled programs; compiles and stores new code.
+
+    Args:
+        name: the name of the kernel.
+        compiled: returns the machine code.
+    """
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    if not (folder and jax.config.values["jax_enable_compilation_cache"]) or "://" in folder:
+        return compiled()
+    path = Path(folder) / f"{name}-{_processor()}.o"
+    size = hashlib.sha256().digest_size
+    with contextlib.suppress(OSError):
+        stored = path.read_bytes()
+        if hashlib.sha256(stored[size:]).digest() == stored[:size]:
+            return stored[size:]
+    code = compiled()
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}")
+        part.write_bytes(hashlib.sha256(code).digest() + code)
+        part.replace(path)  # at once, since other processes may read it
+    return code
+
+
+@functools.cache
+def _processor() -> str:
+    """Returns a name for all on which the machine code of a kernel depends besides its text."""
+    machine = _machine()
+    parts = machine.triple, llvmlite.binding.get_host_cpu_name(), str(OPTIMIZATION)
+    parts += (
+        llvmlite.binding.get_host_cpu_features().flatten(),
+        str(llvmlite.binding.llvm_version_info),
+    )
+    return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
 
 
 @functools.cache
@@ -112,13 +159,16 @@ def _lowered(
     in_place: bool,
 ) -> Sequence[Any]:
     """The lowering rule: a call of the kernel, whose arrays lie in memory with the batch last."""
+    results = list(ctx.avals_out)
+    if size := llvm.scratch(text):
+        results.append(ShapedArray((size,), np.dtype(np.uint8)))
     call = jax.ffi.ffi_lowering(
         _compiler().target(text),
         operand_layouts=list(map(batch_last, ctx.avals_in)),
-        result_layouts=list(map(batch_last, ctx.avals_out)),
+        result_layouts=list(map(batch_last, results)),
         operand_output_aliases=shared_memory(ctx.avals_in, ctx.avals_out) if in_place else {},
     )
-    return call(ctx, *args)
+    return list(call(ctx.replace(avals_out=results), *args))[: len(shapes)]
 
 
 mlir.register_lowering(kernel_p, _lowered, platform="cpu")

@@ -31,6 +31,7 @@ class Cuda:
 
     max_length = 75_000
     max_arrays = 500
+    max_places = 64
 
     def text(
         self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int

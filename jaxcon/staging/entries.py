@@ -49,6 +49,9 @@ PLACINGS = ("mesh_cast", "pvary", "reshard", "sharding_constraint")
 MAX_ROUNDS = 64
 """The largest number of rounds of a loop that is written round by round."""
 
+MAX_UNROLLED = 50_000
+"""The largest number of instructions of such a loop, if it can be written as a loop."""
+
 MAX_LOADS = 4096
 """The largest number of entries of an array in memory that are read outside of loops."""
 
@@ -146,10 +149,18 @@ def _body(closed: ClosedJaxpr, constants: Sequence[Constant | None]) -> Any:
 class Evaluation:
     """The evaluation of programs by one thread."""
 
-    def __init__(self, thread: Thread) -> None:
-        self.thread = thread
+    def __init__(self, thread: Thread, max_places: int) -> None:
+        """Begins an evaluation.
+
+        Args:
+            thread: the thread.
+            max_places: the largest number of places of a slice at an index that is not known,
+                within a loop that is not written round by round.
+        """
+        self.thread, self._max_places = thread, max_places
         # where the results of a loop go, by the number of the value in the outermost program
         self._sinks: dict[int, Stored | _Nowhere] = {}
+        self._repeating = False  # within a loop of a known number of rounds
         self._extra = 0  # instructions of loops, beyond their first round
         self._programs: dict[int, tuple[Body, Program]] = {}
 
@@ -232,11 +243,12 @@ class Evaluation:
 
     def _each(self, name: str, params: Mapping[str, Any], operands: Sequence[Entries]) -> Entries:
         """Writes an elementwise operation on all entries; returns its result."""
-        result = np.empty(np.broadcast_shapes(*(x.shape for x in operands)), object)
-        given = [np.broadcast_to(x, result.shape) for x in operands]
-        for i in np.ndindex(result.shape):
-            result[i] = self._one(name, params, *(x[i] for x in given))
-        return result
+        shape = np.broadcast_shapes(*(x.shape for x in operands))
+        given = [x if x.shape == shape else np.broadcast_to(x, shape) for x in operands]
+        result = np.empty(math.prod(shape), object)
+        for i, numbers in enumerate(zip(*(x.ravel() for x in given), strict=True)):
+            result[i] = self._one(name, params, *numbers)
+        return result.reshape(shape)
 
     def _one(self, name: str, params: Mapping[str, Any], *operands: Any) -> Any:
         """Writes an elementwise operation on single entries; returns its result."""
@@ -374,16 +386,25 @@ class Evaluation:
         ]
         places = sinks[carries:]
         inputs_fit = all(isinstance(x, Stored | None) for x in rows)
-        if length > 1 and inputs_fit and all(places) and not params["reverse"]:
+        repeats = length > 1 and inputs_fit and all(places) and not params["reverse"]
+        if length > MAX_ROUNDS and repeats:
             return self._repeat(body, fixed, carried, rows, places, length)
         if not 0 < length <= MAX_ROUNDS:
             raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
         kinds = [x.aval for x in body.closed.jaxpr.invars[constants + carries :]]
         results: list[list[Entries]] = []
+
+        def one(k: int) -> list[Entries]:
+            given = [_row(x, k, aval) for x, aval in zip(rows, kinds, strict=True)]
+            return self(body, [*fixed, *carried, *given])
+
         order = range(length)
         for k in reversed(order) if params["reverse"] else order:
-            given = [_row(x, k, aval) for x, aval in zip(rows, kinds, strict=True)]
-            both = self(body, [*fixed, *carried, *given])
+            # indices that count rounds are known numbers if the loop is written round by round
+            most = MAX_UNROLLED // length if repeats and k == 0 else None
+            both = self.thread.tried(lambda k=k: one(k), most)
+            if both is None:
+                return self._repeat(body, fixed, carried, rows, places, length)
             carried = both[:carries]
             results.append(both[carries:])
         if params["reverse"]:
@@ -420,7 +441,9 @@ class Evaluation:
                 place.row(counter).write(x)
             return _flat(results[: len(start)])
 
+        outside, self._repeating = self._repeating, True
         final = self.thread.repeat(length, run, _flat(start))
+        self._repeating = outside
         self._extra += (self.thread.length + self._extra - before) * (length - 1)
         if self._extra > MAX_WORK:
             raise UnsupportedError(f"a loop of {length} rounds, which would take too long")
@@ -447,6 +470,8 @@ class Evaluation:
         if not traced:
             return [(tuple(known), np.True_)]
         (axis,) = traced
+        if self._repeating and limits[axis] >= self._max_places:
+            raise UnsupportedError(f"a slice at one of {limits[axis] + 1} places")
         index, places = starts[axis], []
         for k in range(limits[axis] + 1):
             # a start beyond the array moves to the nearest one within

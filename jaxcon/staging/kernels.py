@@ -62,10 +62,14 @@ class Platform(Protocol):
     Attributes:
         max_length: the largest number of instructions of a kernel.
         max_arrays: the largest number of arrays of a kernel.
+        max_places: the largest number of places of a slice at an index that is not known, within a
+            loop of a known number of rounds. An entry is chosen among those of all places, and such
+            loops take many slices.
     """
 
     max_length: int
     max_arrays: int
+    max_places: int
 
     def text(
         self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int
@@ -232,7 +236,7 @@ def _kernel(
         raise UnsupportedError("no worlds, or random keys")
     if len(dtypes) > platform.max_arrays:
         raise UnsupportedError(f"{len(dtypes)} arrays")
-    program = _program(closed, streams)
+    program = _program(closed, streams, platform.max_places)
     if isinstance(program, str):
         raise UnsupportedError(program)
     if (length := count_of(program)) > platform.max_length:
@@ -248,14 +252,14 @@ def _kernel(
 
 
 @functools.lru_cache(maxsize=64)
-def _program(closed: ClosedJaxpr, streams: bool) -> list[Statement] | str:
+def _program(closed: ClosedJaxpr, streams: bool, max_places: int) -> list[Statement] | str:
     """Returns the program of a thread that evaluates a jaxpr, or why there is none."""
     thread = Thread()
     kinds = [x.aval for x in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
     arrays = [Stored(thread, Address(k), x.shape, x.dtype) for k, x in enumerate(kinds)]
     count = len(closed.jaxpr.invars)
     try:
-        Evaluation(thread).store(closed, arrays[:count], arrays[count:], streams)
+        Evaluation(thread, max_places).store(closed, arrays[:count], arrays[count:], streams)
     except UnsupportedError as error:
         return str(error)
     return thread.program()

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from jaxcon.staging.thread import (
+    WRITES,
     Address,
     Branch,
     Counter,
@@ -35,6 +36,7 @@ from jaxcon.staging.thread import (
     Repeat,
     Scalar,
     Statement,
+    inner,
     is_float,
     moved_by,
 )
@@ -43,6 +45,9 @@ KINDS = {"float32": "float", "float64": "double", "int32": "i32", "int64": "i64"
 KINDS |= {"uint64": "i64", "bool": "i1"}
 TYPES = {np.dtype(name): kind for name, kind in KINDS.items()}
 """The type of a register for each dtype. The name of a dtype takes NumPy a microsecond to find."""
+
+BYTES = {"float": 4, "double": 8, "i32": 4, "i64": 8}
+"""The size of a number of each type in memory; i1 takes a bit of a vector."""
 
 SUFFIXES = {"float": "f32", "double": "f64"}
 """How the names of LLVM's functions call types."""
@@ -55,11 +60,21 @@ FUNCTIONS |= {"truncate": "trunc", "fma": "fma", "copysign": "copysign"}
 INTEGERS = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor"}
 INTEGERS |= {"shift_left": "shl", "shift_right_arithmetic": "ashr"}
 
-PIECE = 500
+PIECE = 300
 """The number of instructions of a piece."""
+
+WRITE = 5
+"""How many instructions one counts for that writes to a register which others keep in memory."""
 
 FEW = 50
 """The fewest instructions that are a function of their own."""
+
+MAX_STACK = 65_536
+"""The most bytes of places on the stack, whose size in XLA's threads is not known."""
+
+SCRATCH = "; bytes of memory: "
+LINE = 64
+"""The bytes of a line of the cache. Addresses of places are multiples of it."""
 
 FRAME = {"extension": 8, "api": 16, "arguments": 72, "results": 112}
 """The offsets of fields in the description of a call, in bytes."""
@@ -79,7 +94,8 @@ def text(
 ) -> str:
     """Returns the text of a function that evaluates a program in all worlds.
 
-    If the number of worlds is no multiple of the lanes, some worlds are evaluated twice.
+    If the number of worlds is no multiple of the lanes, some worlds are evaluated twice. A further
+    result is the memory that the function needs; see `scratch`.
 
     Args:
         program: the program of a thread.
@@ -93,46 +109,28 @@ def text(
     writer = _Writer(lanes, arrays, _Places(parts))
     writer.start(len(arrays) - results)
     writer.worlds(parts, worlds)
-    lines = [f"define ptr @{name}(ptr %frame) nounwind {{", *writer.entry, *writer.lines, "}"]
+    lines = [f"{SCRATCH}{writer.scratch}"]
+    lines += [f"define ptr @{name}(ptr %frame) nounwind {{", "entry:", *writer.lines, "}"]
     return "\n".join([*lines, *writer.functions, *writer.declarations, ""])
 
 
-def _in_pieces(statements: Sequence[Statement], depth: int = 0) -> list[Statement]:
-    """Returns a block in which pieces take the place of instructions, also in blocks within it.
+def scratch(text: str) -> int:
+    """Returns the bytes of memory that the function of a text needs."""
+    return int(text.splitlines()[0].removeprefix(SCRATCH))
 
-    Args:
-        statements: the statements of the block.
-        depth: the number of branches and loops with a condition around it. Within these, some lanes
-            may not take part, and what is written for all lanes belongs to the main function.
-    """
+
+def _in_pieces(statements: Sequence[Statement]) -> list[Statement]:
+    """Returns a block in which pieces take the place of instructions, also in blocks within it."""
     parts: list[Statement] = []
-
-    def is_common(statement: Statement) -> bool:
-        """Returns True for instructions that all lanes may execute."""
-        if not isinstance(statement, Instruction):
-            return False
-        return statement.result is not None or (statement.name == "store" and not depth)
-
-    for common, group in itertools.groupby(statements, is_common):
-        if common:
+    for is_run, group in itertools.groupby(statements, lambda x: isinstance(x, Instruction)):
+        if is_run:
             run: Any = list(group)
-            count = -(-len(run) // PIECE)
-            size = -(-len(run) // count)
-            for k in range(0, len(run), size):
-                parts.append(Piece(run[k : k + size], len(run) >= FEW))
-            continue
-        for statement in group:
-            match statement:
-                case Instruction():
-                    parts.append(Piece([statement], False))
-                case Branch(which, taken, others):
-                    inner = (_in_pieces(x, depth + 1) for x in (taken, others))
-                    parts.append(Branch(which, *inner))
-                case Loop(condition, goes_on, body):
-                    before, after = (_in_pieces(x, depth + 1) for x in (condition, body))
-                    parts.append(Loop(before, goes_on, after))
-                case Repeat(counter, length, body):
-                    parts.append(Repeat(counter, length, _in_pieces(body, depth)))
+            weights = itertools.accumulate(WRITE if x.name in WRITES else 1 for x in run)
+            pieces = itertools.groupby(zip(weights, run, strict=True), lambda x: x[0] // PIECE)
+            for _, pairs in pieces:
+                parts.append(Piece([x for _, x in pairs], len(run) >= FEW))
+        else:
+            parts += [inner(x, _in_pieces) for x in group]
     return parts
 
 
@@ -238,8 +236,8 @@ class _Writer:
         lanes: the number of lanes.
         arrays: the layouts of all arrays.
         places: the places of values in memory.
-        entry: the lines of the first block, which reserve memory.
-        lines: the lines after it, written so far.
+        scratch: the bytes of memory that it needs besides the stack.
+        lines: the lines written so far.
         functions: the lines of the pieces that are functions of their own.
         declarations: the declarations of the functions that it calls; a mapping keeps each once.
     """
@@ -247,10 +245,10 @@ class _Writer:
     def __init__(self, lanes: int, arrays: Sequence[Layout], places: _Places) -> None:
         self.lanes, self.arrays, self.places = lanes, arrays, places
         self._types = {dtype: self._vector(kind) for dtype, kind in TYPES.items()}
-        self.entry = ["entry:"]
-        for kind, count in places.count.items():
-            every = f"[{count} x {self._vector(kind)}]"
-            self.entry.append(f"%{kind}s = alloca {every}, align 64")
+        sizes = {kind: n * self._bytes(kind) for kind, n in places.count.items()}
+        starts = itertools.accumulate((-(-n // LINE) * LINE for n in sizes.values()), initial=0)
+        *self._starts, total = starts
+        self.scratch = total + LINE if total > MAX_STACK else 0
         self.lines: list[str] = []
         self.functions: list[str] = []
         self.declarations: dict[str, None] = {}
@@ -281,6 +279,10 @@ class _Writer:
 
     def _vector(self, kind: str) -> str:
         return kind if self.lanes == 1 else f"<{self.lanes} x {kind}>"
+
+    def _bytes(self, kind: str) -> int:
+        """Returns the size of a vector register of this type in memory."""
+        return self.lanes * BYTES[kind] if kind in BYTES else -(-self.lanes // 8)
 
     def _type(self, x: Scalar) -> str:
         return self._types[x.dtype]
@@ -316,6 +318,10 @@ class _Writer:
 
     def start(self, arguments: int) -> None:
         """Writes the start, which answers XLA's question for metadata and finds all arrays."""
+        if not self.scratch:
+            for kind, count in self.places.count.items():
+                every = f"[{count} x {self._vector(kind)}]"
+                self._line(f"%{kind}s = alloca {every}, align {LINE}")
         extension = self._field("%frame", FRAME["extension"])
         asked = self._result(f"icmp ne ptr {extension}, null")
         self._line(f"br i1 {asked}, label %metadata, label %arrays")
@@ -334,6 +340,13 @@ class _Writer:
             place = 8 * (k - arguments if of_results else k)
             array = self._field(lists[of_results], place)
             self._pointers[k, ()] = self._field(array, DATA)
+        if self.scratch:
+            memory = self._field(self._field(lists[True], 8 * (len(self.arrays) - arguments)), DATA)
+            memory = self._result(f"getelementptr i8, ptr {memory}, i64 {LINE - 1}")
+            self.declarations["declare ptr @llvm.ptrmask.p0.i64(ptr, i64)"] = None
+            first = self._result(f"call ptr @llvm.ptrmask.p0.i64(ptr {memory}, i64 {-LINE})")
+            for kind, start in zip(self.places.count, self._starts, strict=True):
+                self._line(f"%{kind}s = getelementptr i8, ptr {first}, i64 {start}")
 
     def _field(self, pointer: str, offset: int, kind: str = "ptr") -> str:
         """Writes the reading of a field of a structure."""
@@ -394,9 +407,12 @@ class _Writer:
             *(f"%{kind}s" for kind in self.places.count),
             *(self._pointers[x] for x in sorted(used)),
         ]
-        arguments = [f"ptr {x}" for x in pointers]
-        if self._fresh and any(x.name == "store" for x in piece.instructions):
-            arguments.append(f"{self._vector('i1')} {self._fresh}")
+        names = {x.name for x in piece.instructions}
+        masks = [self._fresh] if "store" in names else []
+        masks += [self._mask] if names & {"store", "assign"} else []
+        count = len(self.places.count)  # places lie apart from each other and from all arrays
+        arguments = [f"ptr {'noalias ' if k < count else ''}{x}" for k, x in enumerate(pointers)]
+        arguments += [f"{self._vector('i1')} {x}" for x in masks if x]
         given = ", ".join(arguments)
         name = f"@piece{next(self._count)}"
         outside, self.lines = self.lines, []
@@ -411,10 +427,10 @@ class _Writer:
         """Writes the instructions of a piece."""
         for instruction in instructions:
             match instruction:
-                case Instruction("load", Register() as result, _, Address() as address):
+                case Instruction("load", Register() as result, address=Address() as address):
                     self._load(result, address)
                     self._keep(result, f"%v{result.number}")
-                case Instruction("store", _, (x,), Address() as address):
+                case Instruction("store", _, (x,), address=Address() as address):
                     self._store(x, address)
                 case Instruction("set" | "assign" as name, _, (Register() as register, x)):
                     self._assign(register, x, keeps=name == "assign")

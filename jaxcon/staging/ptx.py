@@ -134,9 +134,9 @@ class _Writer:
         """Writes the statements of a block."""
         for statement in statements:
             match statement:
-                case Instruction("load", Register() as result, _, Address() as address):
+                case Instruction("load", Register() as result, address=Address() as address):
                     self._load(result, address)
-                case Instruction("store", _, (x,), Address() as address):
+                case Instruction("store", _, (x,), address=Address() as address):
                     self._store(x, address)
                 case Instruction("set" | "assign", _, (Register() as register, x)):
                     self._assign(register, x)

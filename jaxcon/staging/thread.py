@@ -11,6 +11,7 @@ vector register are the threads. There is no limit on registers: compilers of th
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,9 @@ MAX_REGISTERS = 600_000
 
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "int32", "int64", "uint32", "uint64", "bool")}
 """The dtypes of registers."""
+
+WRITES = ("set", "assign")
+"""Instructions that write their first operand."""
 
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
 LOGICAL = ("and", "or", "xor")
@@ -98,12 +102,14 @@ class Instruction(NamedTuple):
         result: the register of its result, which no other instruction writes; None if the
             instruction must be kept.
         operands: its operands.
+        reads: the numbers of the registers that it reads.
         address: the place in memory of `load` and `store`.
     """
 
     name: str
     result: Register | None
     operands: tuple[Scalar, ...]
+    reads: tuple[int, ...]
     address: Address | None = None
 
 
@@ -208,7 +214,7 @@ class Thread:
             if key in known:
                 return known[key]
         result = self.new(dtype)
-        self._append(Instruction(name, result, operands))
+        self._append(Instruction(name, result, operands, _numbers(operands)))
         self._known[-1][key] = result
         return result
 
@@ -222,12 +228,12 @@ class Thread:
         All numbers must be read before any is written, since arrays may share memory.
         """
         result = self.new(dtype)
-        self._append(Instruction("load", result, (), address))
+        self._append(Instruction("load", result, (), (), address))
         return result
 
     def store(self, address: Address, x: Scalar) -> None:
         """Writes a number to memory; a bool as a byte."""
-        self._append(Instruction("store", None, (x,), address))
+        self._append(Instruction("store", None, (x,), _numbers((x,)), address))
 
     def copied(self, x: Scalar) -> Register:
         """Returns a new register that holds x, and that may be written again."""
@@ -237,7 +243,7 @@ class Thread:
 
     def assign(self, register: Register, x: Scalar, name: str = "assign") -> None:
         """Writes x to a register that may be written again; see `Instruction`."""
-        self._append(Instruction(name, None, (register, x)))
+        self._append(Instruction(name, None, (register, x), _numbers((x,))))
 
     def apply(self, name: str, *operands: Scalar) -> Scalar:
         """Returns the result of an elementwise primitive of JAX.
@@ -326,8 +332,8 @@ class Thread:
                 results.append(a)
                 continue
             result = self.new(a.dtype)
-            first.append(Instruction("set", None, (result, a)))
-            second.append(Instruction("assign", None, (result, b)))
+            first.append(Instruction("set", None, (result, a), _numbers((a,))))
+            second.append(Instruction("assign", None, (result, b), _numbers((b,))))
             results.append(result)
         self.statements.append(Branch(which, first, second))
         return results
@@ -340,6 +346,28 @@ class Thread:
         self._known.pop()
         written, self.statements = self.statements, before
         return written, results
+
+    def tried(self, write: Callable[[], T], max_length: int | None) -> T | None:
+        """Writes what a function writes; nothing, and returns None, if that is too long.
+
+        Args:
+            write: the function; returns its results.
+            max_length: the largest number of instructions; None if there is no limit.
+        """
+        if max_length is None:
+            return write()
+        before = self.length
+        self._known.append({})
+        outside, self.statements = self.statements, []
+        results = write()
+        written, self.statements = self.statements, outside
+        known = self._known.pop()
+        if self.length - before > max_length:
+            self.length = before
+            return None
+        self.statements += written
+        self._known[-1] |= known
+        return results
 
     def loop(
         self,
@@ -402,7 +430,26 @@ class Thread:
 
         Each number is computed where it is first needed, so that few are kept at a time.
         """
-        return _ordered(_used(self.statements, set()))
+        every = set().union(*map(_reads, self.statements))
+        return _ordered(_used(_written(self.statements, every), set()))
+
+
+def _written(statements: Sequence[Statement], read: set[int]) -> list[Statement]:
+    """Returns a block without what is written to registers that nothing reads.
+
+    Args:
+        statements: the statements of the block.
+        read: the numbers of the registers that are read anywhere.
+    """
+
+    def is_needed(statement: Statement) -> bool:
+        if not isinstance(statement, Instruction) or statement.name not in WRITES:
+            return True
+        register: Any = statement.operands[0]
+        return register.number in read
+
+    change = functools.partial(_written, read=read)
+    return [inner(x, change) for x in statements if is_needed(x)]
 
 
 def _used(statements: Sequence[Statement], read: set[int]) -> list[Statement]:
@@ -416,10 +463,10 @@ def _used(statements: Sequence[Statement], read: set[int]) -> list[Statement]:
     kept: list[Statement] = []
     for statement in reversed(statements):
         match statement:
-            case Instruction(_, result, operands):
+            case Instruction(_, result, _):
                 if result is not None and result.number not in read:
                     continue
-                read.update(x.number for x in operands if isinstance(x, Register))
+                read.update(statement.reads)
             case Branch(which, taken, others):
                 statement = Branch(which, _used(taken, read), _used(others, read))
                 read.add(which.number)
@@ -446,10 +493,10 @@ def _ordered(statements: Sequence[Statement]) -> list[Statement]:
     needs: dict[int, int] = {}  # the number of registers that each of them needs
     for statement in statements:
         if isinstance(statement, Instruction) and statement.result is not None:
-            inner = sorted((needs.get(x, 0) for x in _operands(statement)), reverse=True)
+            below = sorted((needs.get(x, 0) for x in statement.reads), reverse=True)
             number = statement.result.number
             free[number] = statement
-            needs[number] = max([1, *(need + k for k, need in enumerate(inner))])
+            needs[number] = max([1, *(need + k for k, need in enumerate(below))])
     placed: list[Statement] = []
 
     def place(wanted: Sequence[int]) -> None:
@@ -463,7 +510,7 @@ def _ordered(statements: Sequence[Statement]) -> list[Statement]:
                 placed.append(free.pop(number))
                 continue
             stack.append((number, True))
-            operands = [x for x in _operands(free[number]) if x in free]
+            operands = [x for x in free[number].reads if x in free]
             # the last one on the stack is placed first
             stack += [(x, False) for x in sorted(operands, key=needs.__getitem__)]
 
@@ -472,28 +519,28 @@ def _ordered(statements: Sequence[Statement]) -> list[Statement]:
 
     kept = (x for x in statements if not isinstance(x, Instruction) or x.result is None)
     for writes, group in itertools.groupby(kept, is_write):
-        roots = list(group)
+        roots: list[Any] = list(group)
         if writes:
-            place([x for root in roots for x in _operands(root)])
+            place([x for root in roots for x in root.reads])
             placed += roots
             continue
         for root in roots:
             place(sorted(_reads(root)))
-            placed.append(_inner(root, _ordered))
+            placed.append(inner(root, _ordered))
     place(list(free))
     return placed
 
 
-def _operands(statement: Any) -> list[int]:
-    """Returns the numbers of the registers that an instruction reads."""
-    return [x.number for x in statement.operands if isinstance(x, Register)]
+def _numbers(operands: Sequence[Scalar]) -> tuple[int, ...]:
+    """Returns the numbers of the registers among operands."""
+    return tuple([x.number for x in operands if isinstance(x, Register)])
 
 
 def _reads(statement: Statement) -> set[int]:
     """Returns the numbers of the registers that a statement reads, in its blocks, too."""
     match statement:
         case Instruction():
-            return set(_operands(statement))
+            return set(statement.reads)
         case Branch(which, first, second):
             return {which.number}.union(*map(_reads, first), *map(_reads, second))
         case Loop(condition, goes_on, body):
@@ -505,7 +552,7 @@ def _reads(statement: Statement) -> set[int]:
             return set().union(*map(_reads, instructions))
 
 
-def _inner(
+def inner(
     statement: Statement, change: Callable[[Sequence[Statement]], list[Statement]]
 ) -> Statement:
     """Returns a statement with its blocks changed."""
