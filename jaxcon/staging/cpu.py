@@ -54,13 +54,22 @@ def _size(program: Sequence[Statement]) -> int:
 
 
 @functools.cache
+def _features() -> Any:
+    """Returns which instructions this machine has, by name; none if LLVM cannot tell."""
+    try:
+        return llvmlite.binding.get_host_cpu_features()
+    except RuntimeError:
+        return llvmlite.binding.FeatureMap()
+
+
+@functools.cache
 def _machine() -> Any:
     """Returns LLVM's compiler for the CPU of this machine."""
     llvmlite.binding.initialize_native_target()
     llvmlite.binding.initialize_native_asmprinter()
     return llvmlite.binding.Target.from_default_triple().create_target_machine(
         cpu=llvmlite.binding.get_host_cpu_name(),
-        features=llvmlite.binding.get_host_cpu_features().flatten(),
+        features=_features().flatten(),
         opt=OPTIMIZATION,
         jit=True,
         codemodel="jitdefault",
@@ -70,9 +79,8 @@ def _machine() -> Any:
 @functools.cache
 def _register_bytes() -> int:
     """Returns the size of a vector register."""
-    features = llvmlite.binding.get_host_cpu_features()
     for feature, size in (("avx512f", 64), ("avx2", 32)):
-        if features.get(feature):
+        if _features().get(feature):
             return size
     return 16
 
@@ -139,7 +147,7 @@ def _processor() -> str:
     machine = _machine()
     parts = machine.triple, llvmlite.binding.get_host_cpu_name(), str(OPTIMIZATION)
     parts += (
-        llvmlite.binding.get_host_cpu_features().flatten(),
+        _features().flatten(),
         str(llvmlite.binding.llvm_version_info),
     )
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]

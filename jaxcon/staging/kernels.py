@@ -251,7 +251,7 @@ def _kernel(
     return text, tuple(((*x.shape, worlds), x.dtype) for x in results)
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=8)  # a program of a robot takes tens of megabytes
 def _program(closed: ClosedJaxpr, streams: bool, max_places: int) -> list[Statement] | str:
     """Returns the program of a thread that evaluates a jaxpr, or why there is none."""
     thread = Thread()
